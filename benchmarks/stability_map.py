@@ -72,9 +72,8 @@ class LoopCase:
             wrist_bandwidth_per_s=BANDWIDTH_PER_S, ramp_nm_per_s=1e3, torque_limit_nm=1e3, speed_limit_rad_per_s=1e6,
             acceleration_limit_rad_per_s2=1e9, travel_limit_rad=1e6, age_limit_s=10.0, stale_periods=np.inf,
         )  # fmt: skip
-        controller = TwistController(settings)
         # Enough known measurements for a gain of kp from the start.
-        controller.start(0, 0.0, 0.0, 1e9)
+        controller = TwistController(settings, 0, 0.0, 0.0, 1e9)
         controller.set_point(0.0)
         return controller
 

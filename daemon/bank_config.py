@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import BankDefinition
@@ -14,8 +14,9 @@ from shearloop.bank.eit.fingertip import ElectrodePlace, Fingertip, Side
 from shearloop.bank.eit.mesh import Mesh, load_mesh
 from shearloop.bank.eit.models import QUARTER_DEG, Variation
 from shearloop.bank.errors import GeometryError
-from shearloop.daemon.config_file import ConfigModel, load_yaml_model, mistakes
+from shearloop.daemon.config_file import ConfigModel, load_yaml_model
 from shearloop.daemon.errors import UserError
+from shearloop.yaml_files import validated
 
 ModelName = Literal["step", "linear", "cut_linear", "gaussian_derivative", "modulated_gaussian"]
 MeshSize = Annotated[float, Field(ge=0.005, le=10)]
@@ -215,11 +216,10 @@ def load_geometry(path: Path) -> Mesh:
 
 
 def _fingertip_mesh(path: Path, **changed: float) -> Mesh:
-    config = load_yaml_model(path, FingertipGeometryConfig)
+    content = load_yaml_model(path, FingertipGeometryConfig).model_dump() | changed
+    config = validated(content, FingertipGeometryConfig, f"{path}, with {_shown(changed)}", UserError)
     try:
-        return FingertipGeometryConfig.model_validate(config.model_dump() | changed).fingertip().mesh()
-    except ValidationError as error:
-        raise UserError(f"{path}, with {_shown(changed)}: {mistakes(error, FingertipGeometryConfig)}") from error
+        return config.fingertip().mesh()
     except GeometryError as error:
         raise GeometryError(f"{path}{f', with {_shown(changed)}' if changed else ''}: {error}") from error
 

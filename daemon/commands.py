@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,38 +11,26 @@ from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefus
 from shearloop.daemon.rig import Rig
 from shearloop.daemon.sensing.fingertip_task import FingertipTask
 
-# The reply to the `stop` that ends the daemon is sent within this time.
 STOP_DELAY_S = 0.05
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Commands:
-    """Executes the commands of the command socket."""
+    """Executes the commands of the command socket.
 
-    def __init__(
-        self,
-        *,
-        rig: Rig | None,
-        tares: Mapping[str, Callable[[], None]],
-        fingertips: Mapping[str, FingertipTask],
-        experiment: Path | None,
-        start: Callable[[Path], Awaitable[str | None]],
-        call_off_experiment: Callable[[], Path | None],
-        tasks: Callable[[], Any],
-        stop: Callable[[], None],
-    ) -> None:
-        """`tares` sets the zero of each sensor, `experiment` is the configured one, `tasks` returns their health.
+    `tares` sets the zero of each sensor, `experiment` is the configured one, `tasks` returns their health. `start`
+    starts an experiment or returns the reason of its refusal. `call_off_experiment` cancels an experiment that waits to
+    start and returns it. `stop` stops the daemon.
+    """
 
-        `start` starts an experiment or returns the reason of its refusal. `call_off_experiment` cancels an
-        experiment that waits to start and returns it. `stop` stops the daemon.
-        """
-        self._rig = rig
-        self._tares = tares
-        self._fingertips = fingertips
-        self._experiment = experiment
-        self._start_experiment = start
-        self._call_off_experiment = call_off_experiment
-        self._tasks = tasks
-        self._stop_daemon = stop
+    rig: Rig | None
+    tares: Mapping[str, Callable[[], None]]
+    fingertips: Mapping[str, FingertipTask]
+    experiment: Path | None
+    start: Callable[[Path], Awaitable[str | None]]
+    call_off_experiment: Callable[[], Path | None]
+    tasks: Callable[[], Any]
+    stop: Callable[[], None]
 
     def handlers(self) -> Mapping[str, Handler]:
         """Return the handler of every command."""
@@ -67,68 +56,63 @@ class Commands:
         return {name: own if name in (STOP, STATUS) else refuse for name, own in self.handlers().items()}
 
     async def _start(self, request: Request) -> Reply:
-        path = request.get("experiment") or self._experiment
+        path = request.get("experiment") or self.experiment
         if not isinstance(path, str | Path):
             raise CommandRefusedError("no experiment is given: name its file, or one in the configuration")
         try:
-            reason = await self._start_experiment(Path(path))
+            reason = await self.start(Path(path))
         except UserError as error:
             raise CommandRefusedError(str(error)) from error
         _refuse_if(reason)
         return {"experiment": str(path)}
 
     async def _pause(self, _request: Request) -> Reply:
-        _refuse_if(required_rig(self._rig).control_loop.pause())
+        _refuse_if(required_rig(self.rig).control_loop.pause())
         return {}
 
     async def _resume(self, _request: Request) -> Reply:
-        _refuse_if(required_rig(self._rig).control_loop.resume())
+        _refuse_if(required_rig(self.rig).control_loop.resume())
         return {}
 
     async def _unlock(self, _request: Request) -> Reply:
-        _refuse_if(await required_rig(self._rig).runner.unlock())
+        _refuse_if(await required_rig(self.rig).runner.unlock())
         return {}
 
     async def _tare(self, request: Request) -> Reply:
-        source = request.get("source")
-        if source is not None and not (isinstance(source, str) and source in self._tares):
-            raise CommandRefusedError(f"there is no sensor {source!r} to tare; there are {', '.join(self._tares)}")
-        experiment = self._rig.control_loop.experiment if self._rig is not None else None
+        names = _requested(request, self.tares, "sensor {source!r} to tare")
+        experiment = self.rig.control_loop.experiment if self.rig is not None else None
         if experiment is not None and experiment.running:
             raise CommandRefusedError(
                 f"the experiment {experiment.file.name!r} is running, and a new zero would change its "
                 "torques; stop it first, or give it a step `tare`"
             )
-        tared = [source] if source is not None else list(self._tares)
-        for name in tared:
-            self._tares[name]()
-        return {"tared": tared}
+        for name in names:
+            self.tares[name]()
+        return {"tared": names}
 
     async def _set(self, request: Request) -> Reply:
         """Change a setting of the running daemon; none of them moves the robot."""
-        source, heatmap = request.get("source"), request.get("heatmap")
+        heatmap = request.get("heatmap")
         if heatmap not in ("always", "on_request"):
             raise CommandRefusedError("only `heatmap` can be set while the daemon runs, to always or on_request")
-        if source is not None and not (isinstance(source, str) and source in self._fingertips):
-            raise CommandRefusedError(f"there is no fingertip {source!r}; there are {', '.join(self._fingertips)}")
-        names = [source] if source is not None else list(self._fingertips)
+        names = _requested(request, self.fingertips, "fingertip {source!r}")
         for name in names:
-            self._fingertips[name].always_heatmap = heatmap == "always"
+            self.fingertips[name].always_heatmap = heatmap == "always"
         return {"set": names, "heatmap": heatmap}
 
     async def _status(self, _request: Request) -> Reply:
-        return {"tasks": self._tasks()}
+        return {"tasks": self.tasks()}
 
     async def _stop(self, request: Request) -> Reply:
-        stopped = self._rig.stop() if self._rig is not None else ""
-        waiting = self._call_off_experiment()
+        stopped = self.rig.stop() if self.rig is not None else ""
+        waiting = self.call_off_experiment()
         if stopped:
             return {"stopped": stopped}
         if request.get("spare_daemon"):
             # The live page's stop button stops motion, but not the daemon.
             return {"stopped": f"the start of {waiting.name}" if waiting is not None else ""}
-        # Nothing moves, so the daemon itself stops after the reply.
-        asyncio.get_running_loop().call_later(STOP_DELAY_S, self._stop_daemon)
+        # Nothing moves, so the daemon itself stops, once the reply is sent.
+        asyncio.get_running_loop().call_later(STOP_DELAY_S, self.stop)
         return {}
 
 
@@ -137,6 +121,16 @@ def required_rig(rig: Rig | None) -> Rig:
     if rig is None:
         raise CommandRefusedError("the configuration has no robot; add `robot: ur.yaml` to it")
     return rig
+
+
+def _requested(request: Request, known: Mapping[str, object], kind: str) -> list[str]:
+    """Return the source that a request names, or all; raises CommandRefusedError for an unknown one."""
+    source = request.get("source")
+    if source is None:
+        return list(known)
+    if not (isinstance(source, str) and source in known):
+        raise CommandRefusedError(f"there is no {kind.format(source=source)}; there are {', '.join(known)}")
+    return [source]
 
 
 def _refuse_if(reason: str | None) -> None:

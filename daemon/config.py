@@ -1,13 +1,12 @@
 """The daemon's configuration. Units are in the keys; unknown keys are refused; loaded values do not change."""
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from shearloop.daemon.config_file import ConfigModel, load_yaml_model
+from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model
 from shearloop.daemon.control.settings import LoopConfig
 from shearloop.daemon.messaging.addresses import (
     COMMAND_ADDRESS,
@@ -51,11 +50,7 @@ class SerialDevice(ConfigModel):
     serial_number: str | None = Field(None, min_length=1, description="USB serial number, as the port's maker set it")
     path: Path | None = Field(None, description="path of the port, such as /dev/serial/by-id/…")
 
-    @model_validator(mode="after")
-    def _one_name(self) -> "SerialDevice":
-        if (self.serial_number is None) == (self.path is None):
-            raise ValueError("give either serial_number or path, and not both")
-        return self
+    _one_name = either("serial_number", "path")
 
 
 EstimatorName = Literal["paper", "bank", "regression", "reconstruction", "motion_regression"]
@@ -124,11 +119,7 @@ class SkinSourceConfig(ConfigModel):
     current_ma: float = Field(5.0, gt=0, le=20)
     compliance_v: float = Field(1.0, gt=0, le=5)
 
-    @model_validator(mode="after")
-    def _one_way_in(self) -> "SkinSourceConfig":
-        if (self.socket is None) == (self.serial is None):
-            raise ValueError("give either socket or serial, and not both")
-        return self
+    _one_way_in = either("socket", "serial")
 
 
 class ScannerConfig(ConfigModel):
@@ -161,11 +152,7 @@ class SkinDaqConfig(ConfigModel):
     adc: AdcConfig | None = None
     rate_hz: float = Field(10.0, ge=1, le=1000)
 
-    @model_validator(mode="after")
-    def _one_way_in(self) -> "SkinDaqConfig":
-        if (self.scanner is None) == (self.adc is None):
-            raise ValueError("give either scanner or adc, and not both")
-        return self
+    _one_way_in = either("scanner", "adc")
 
 
 class SkinConfig(ConfigModel):
@@ -198,11 +185,7 @@ class GripperConfig(ConfigModel):
         None, description="made by `shearloop calibrate gripper`; default: the maker's data"
     )
 
-    @model_validator(mode="after")
-    def _one_way_in(self) -> "GripperConfig":
-        if (self.socket is None) == (self.modbus is None):
-            raise ValueError("give either socket or modbus, and not both")
-        return self
+    _one_way_in = either("socket", "modbus")
 
 
 class RecordingConfig(ConfigModel):
@@ -280,7 +263,7 @@ class DaemonConfig(ConfigModel):
     def _ports(self) -> dict[str, list[str]]:
         """Return the configuration keys of each serial port and socket."""
         found: dict[str, list[str]] = {}
-        for key, section in _sections(self, ""):
+        for key, section in self.walk():
             match section:
                 case SerialDevice(serial_number=str(number)):
                     found.setdefault(f"the port with the serial number {number}", []).append(key)
@@ -300,14 +283,3 @@ class DaemonConfig(ConfigModel):
 def load_daemon_config(path: Path) -> DaemonConfig:
     """Return the configuration of a YAML file; raises UserError with every mistake."""
     return load_yaml_model(path, DaemonConfig)
-
-
-def _sections(section: ConfigModel, key: str) -> Iterator[tuple[str, ConfigModel]]:
-    """Yield every section within a section, with its key in the file."""
-    for name in type(section).model_fields:
-        value, own = getattr(section, name), f"{key}.{name}".lstrip(".")
-        inner = {f"{own}.{part}": item for part, item in value.items()} if isinstance(value, dict) else {own: value}
-        for path, item in inner.items():
-            if isinstance(item, ConfigModel):
-                yield path, item
-                yield from _sections(item, path)

@@ -2,10 +2,8 @@
 
 import asyncio
 import os
-import resource
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from shearloop.daemon.clock import Clock
@@ -16,20 +14,6 @@ from shearloop.daemon.supervisor import Supervisor
 
 HEALTH_PERIOD_S = 1.0
 TaskFacts = Mapping[str, Scalar | Mapping[str, int]]
-
-
-@dataclass(slots=True)
-class _Usage:
-    """Measures the CPU use since the last message."""
-
-    cpu_s: float
-    at_s: float
-
-    def percent_since(self) -> float:
-        cpu_s, at_s = time.process_time(), time.monotonic()
-        percent = 100.0 * (cpu_s - self.cpu_s) / max(at_s - self.at_s, 1e-9)
-        self.cpu_s, self.at_s = cpu_s, at_s
-        return percent
 
 
 class HealthReporter:
@@ -61,9 +45,9 @@ class HealthReporter:
 
     async def run(self) -> None:
         """Publish once a second until cancelled."""
-        usage = _Usage(time.process_time(), time.monotonic())
         loop = asyncio.get_running_loop()
-        due_s = loop.time()
+        due_s = measured_s = loop.time()
+        cpu_s = time.process_time()
         while True:
             due_s += HEALTH_PERIOD_S
             await asyncio.sleep(max(0.0, due_s - loop.time()))
@@ -71,6 +55,8 @@ class HealthReporter:
             if lag_s > HEALTH_PERIOD_S:
                 # After a long stall, send one late message instead of a burst.
                 due_s = loop.time()
+            used_s, passed_s = time.process_time() - cpu_s, max(loop.time() - measured_s, 1e-9)
+            cpu_s, measured_s = cpu_s + used_s, measured_s + passed_s
             self._clock.synchronise()
             self._notify_systemd()
             self._publisher.publish(
@@ -80,7 +66,7 @@ class HealthReporter:
                     tasks=self.tasks(),
                     loop_lag_s=lag_s,
                     memory_mb=resident_memory_mb(),
-                    cpu_percent=usage.percent_since(),
+                    cpu_percent=100.0 * used_s / passed_s,
                 )
             )
 
@@ -94,8 +80,5 @@ class HealthReporter:
 
 
 def resident_memory_mb() -> float:
-    """Return the resident memory of this process in megabytes (the peak, if the system reports no more)."""
-    statistics = Path("/proc/self/statm")
-    if statistics.exists():
-        return int(statistics.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    """Return the resident memory of this process in megabytes."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6

@@ -28,6 +28,7 @@ from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
 from shearloop.daemon.sensing.skin_task import SKIN
+from shearloop.drivers.calibration_files import load_calibration
 from shearloop.drivers.connection import LinkEvent
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
@@ -37,7 +38,6 @@ from shearloop.drivers.robotiq.width import WidthCalibration
 from shearloop.drivers.serial_sensor import OnRaw, ignore_raw
 from shearloop.drivers.ur.client import UrLinkEvent, UrRobot
 from shearloop.drivers.ur.settings import read_settings
-from shearloop.drivers.yaml_files import load_calibration
 
 
 def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:

@@ -89,18 +89,6 @@ class TwistProgramme:
         return grip, self.torque_nm * float(twist)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SyntheticFrame:
-    """One line, (1024,) in volts, and the true state in the middle of its acquisition."""
-
-    line: FloatArray
-    t_s: float
-    torque_nm: float
-    grip: float
-    k: float
-    sigma: float
-
-
 class Synthesiser:
     """Makes lines of RMS magnitudes, as the board's ADC reads them, at and between a bank's cells."""
 

@@ -25,7 +25,6 @@ class SyntheticSkin:
     """One skin and the tool on it. Forces in N; positive shear stretches gauge 1."""
 
     def __init__(self, *, radius_mm: float = RADIUS_MM, normal_n: float = NORMAL_N, seed: int = 0) -> None:
-        """Start unstretched, touched with a normal force at a radius."""
         self.membrane = paper_membrane()
         self.radius_mm = radius_mm
         self.normal_n = normal_n

@@ -10,7 +10,7 @@ import os
 import re
 import time
 from collections import Counter
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -52,10 +52,7 @@ STARTS_BEFORE_REOPENING = 5
 
 _SEPARATOR = b", "
 _DECIMAL = re.compile(rb"-?\d+\.\d{4}")
-_DIGITS_TO_0 = bytes.maketrans(b"0123456789", b"0" * 10)
-_ZERO_LINE = b"0.0000, " * N_VALUES
-# A cell's digits times these give its value in ten thousandths.
-_PLACES = np.array([10_000, 0, 1_000, 100, 10, 1, 0, 0], dtype=np.float64)
+_LINE = re.compile(rb"(?:\d\.\d{4}, ){%d}" % N_VALUES)
 
 
 class FrameErrorKind(Enum):
@@ -94,11 +91,9 @@ def read_line(line: bytes, zero_slots: NDArray[np.bool_]) -> NDArray[np.float64]
 
     `zero_slots` (1024,) is true where the board writes 0. Values must have the board's own form, `d.dddd`.
     """
-    if len(line) != LINE_BYTES or line.translate(_DIGITS_TO_0) != _ZERO_LINE:
+    if not _LINE.fullmatch(line):
         return _find_error(line)
-    digits = np.frombuffer(line, np.uint8).reshape(N_VALUES, CELL_BYTES) - np.uint8(ord("0"))
-    # The quotient of whole numbers below 10⁵ is the same double that float() reads.
-    values = digits.astype(np.float64) @ _PLACES / 10_000.0
+    values = np.array([float(value) for value in line.split(_SEPARATOR)[:-1]])
     zeros = values == 0.0
     for kind, bad in (
         (FrameErrorKind.OUT_OF_RANGE, values > ADC_REFERENCE_V),
@@ -165,7 +160,6 @@ class FrameParser:
         zero_slots: NDArray[np.bool_],
         *,
         nominal_period_ns: int = NOMINAL_PERIOD_NS,
-        dead_after: int = DEAD_AFTER_FRAMES,
     ) -> None:
         if zero_slots.shape != (N_VALUES,):
             raise ValueError(f"the mask of zero slots has the shape {zero_slots.shape} instead of ({N_VALUES},)")
@@ -176,7 +170,6 @@ class FrameParser:
         self.partial_lines = 0
         self._zero_slots = zero_slots
         self._slots = np.flatnonzero(~zero_slots)
-        self._dead_after = dead_after
         self._lines = LineSplitter(MAX_LINE_BYTES)
         self._first = True
         self._rejected_since_frame = False
@@ -196,24 +189,18 @@ class FrameParser:
         """Process a live or recorded event; return the frames that it completes."""
         match event.kind:
             case InputKind.OPENED:
-                self.port_opened()
+                # Drop a half-received line; the first line may lack its beginning.
+                self._lines.restart()
+                self._first = True
+                self._rejected_since_frame = False
+                self._restarted_at = 0
+                self.clock.restart()
             case InputKind.STARTED:
-                self.board_started()
+                # A restarted board continues its line or begins another.
+                self._restarted_at = len(self._lines.partial)
             case InputKind.DATA:
                 return self.feed(event.data, event.t_ns)
         return []
-
-    def port_opened(self) -> None:
-        """Drop a half-received line; the first line may lack its beginning."""
-        self._lines.restart()
-        self._first = True
-        self._rejected_since_frame = False
-        self._restarted_at = 0
-        self.clock.restart()
-
-    def board_started(self) -> None:
-        """Note a restart of a silent board: it continues its line or begins another."""
-        self._restarted_at = len(self._lines.partial)
 
     def feed(self, data: bytes, t_arrival_ns: int) -> list[Frame]:
         """Return the frames that `data` completes, in order; all of it had arrived at `t_arrival_ns`."""
@@ -238,14 +225,14 @@ class FrameParser:
             return None
         line = line.removesuffix(b"\r")
         values = read_line(line, self._zero_slots)
-        if isinstance(values, FrameError) and self._restarted_at:
+        if not isinstance(values, FrameError):
+            return line, values
+        if self._restarted_at:
             rest = line[self._restarted_at :]
             rest_values = read_line(rest, self._zero_slots)
             if not isinstance(rest_values, FrameError):
                 self._restarted_lines += 1
                 return rest, rest_values
-        if not isinstance(values, FrameError):
-            return line, values
         if self._first and values.kind in _PARTIAL_ERRORS and len(line) < LINE_BYTES:
             self.partial_lines += 1
         else:
@@ -264,7 +251,7 @@ class FrameParser:
             self._equal_readings = np.where(channels == self._last_channels, self._equal_readings + 1, 1)
         self._last_line, self._last_channels = line, channels
         saturated = channels > FULL_SCALE_SINE_RMS_V
-        dead = self._equal_readings >= self._dead_after
+        dead = self._equal_readings >= DEAD_AFTER_FRAMES
         # Time stays in order when the clock learns a new period.
         self._last_mid_ns = max(sent_ns - TRANSFER_NS - self.clock.period_ns // 2, self._last_mid_ns + 1)
         for array in (channels, values, saturated, dead):
@@ -309,10 +296,6 @@ class EitKit(SerialSensor[Frame]):
         self._parser = FrameParser(zero_slots, nominal_period_ns=round(frame_period_s * 1e9))
         self._on_frame = on_frame
         self._silences = 0
-
-    def frames(self) -> AsyncGenerator[Frame]:
-        """Yield every frame that arrives; see `values`."""
-        return self.values()
 
     @property
     def period_s(self) -> float:

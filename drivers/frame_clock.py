@@ -30,12 +30,12 @@ class FrameClock:
     """Straightens the arrival times of frames, causally, and learns the board's period.
 
     All times are integer nanoseconds of one monotonic clock. A straightened time is never later than the arrival. The
-    nominal period applies until the real one is learned.
+    nominal period applies until the real one is `learned`.
     """
 
     def __init__(self, nominal_period_ns: int) -> None:
         self._period_ns = float(nominal_period_ns)
-        self._learned = False
+        self.learned = False
         # (frame number, arrival) of the last frames across restarts, and the last spacings.
         self._latest: deque[tuple[int, int]] = deque(maxlen=SPACING_FRAMES + 1)
         self._spacings: deque[float] = deque(maxlen=LEARN_FROM)
@@ -47,11 +47,6 @@ class FrameClock:
     def period_ns(self) -> int:
         """The learned period, or the nominal one until it is learned."""
         return round(self._period_ns)
-
-    @property
-    def learned(self) -> bool:
-        """Whether the period is learned."""
-        return self._learned
 
     def restart(self) -> None:
         """Forget the phase and keep the period: the board was restarted."""
@@ -67,7 +62,7 @@ class FrameClock:
         if self._seen:
             number, last_ns = self._seen[-1]
             elapsed = (arrival_ns - self._straight_ns) / self._period_ns
-            steps = max(1, round(elapsed)) if missed and self._learned else 1
+            steps = max(1, round(elapsed)) if missed and self.learned else 1
             number += steps
             late = elapsed - steps
             late_before = (last_ns - self._straight_ns) / self._period_ns
@@ -88,17 +83,17 @@ class FrameClock:
 
     def _learn(self, number: int) -> None:
         due = number % LEARN_EVERY == 0
-        if len(self._spacings) < LEARN_FROM or (self._learned and not due):
+        if len(self._spacings) < LEARN_FROM or (self.learned and not due):
             return
         spacing = median(self._spacings)
         if spacing <= 0:
             return
         if abs(self._period_ns - spacing) > PLAUSIBLE * spacing:
-            self._period_ns, self._learned = spacing, True
+            self._period_ns, self.learned = spacing, True
         if due and len(self._seen) >= LEARN_FROM:
             slope = slope_below(self._seen)
             if abs(slope - spacing) <= PLAUSIBLE * spacing:
-                self._period_ns, self._learned = slope, True
+                self._period_ns, self.learned = slope, True
 
 
 def slope_below(points: Iterable[tuple[int, int]]) -> float:

@@ -9,22 +9,13 @@ import os
 import re
 import time
 from collections import Counter
-from collections.abc import AsyncGenerator, Callable
-from contextlib import aclosing
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Self
 
+from shearloop.drivers import serial_sensor
+from shearloop.drivers.calibration_files import CalibrationModel, Finite, Positive
 from shearloop.drivers.connection import Diagnostics, LinkEvent, ReconnectPolicy, SerialLink
-from shearloop.drivers.serial_sensor import (
-    InputKind,
-    LineSplitter,
-    OnRaw,
-    RawEvent,
-    SerialSensor,
-    ignore_raw,
-    transfer_ns,
-)
-from shearloop.drivers.yaml_files import CalibrationModel, Finite, Positive
 
 BAUD_RATE = 115200
 # Measured on the paper's rig (4882 lines in 447 s); the data sheet says 10 samples a second.
@@ -154,25 +145,24 @@ class LoadParser:
     """Turns the board's bytes, however they are sliced, into samples; counts rejected lines by kind. No I/O."""
 
     def __init__(self, calibration: LoadCalibration, rate_hz: float = RATE_HZ) -> None:
-        """Start before the first byte of a board that sends `rate_hz` lines a second."""
         self._period_ns = round(1e9 / rate_hz)
         self._stuck_after = max(STUCK_AFTER, round(STUCK_AFTER * rate_hz / RATE_HZ))
-        self._lines = LineSplitter(MAX_LINE_BYTES)
+        self._lines = serial_sensor.LineSplitter(MAX_LINE_BYTES)
         self._errors: Counter[str] = Counter()
         self._seq = 0
         self._last_mid_ns: int | None = None
         self.calibration = calibration
         self.restart()
 
-    def handle(self, event: RawEvent) -> list[LoadSample]:
+    def handle(self, event: serial_sensor.RawEvent) -> list[LoadSample]:
         """Process a live or recorded event; return the samples that it completes."""
         match event.kind:
-            case InputKind.OPENED:
+            case serial_sensor.InputKind.OPENED:
                 self.restart()
-            case InputKind.TARE:
+            case serial_sensor.InputKind.TARE:
                 self.calibration = self.calibration.tared(float(event.data))
                 self._spikes = SpikeFilter(self._period_ns)
-            case InputKind.DATA:
+            case serial_sensor.InputKind.DATA:
                 return self.feed(event.data, event.t_ns)
         return []
 
@@ -210,7 +200,7 @@ class LoadParser:
 
     def _sample(self, raw: float, n_bytes: int, t_arrival_ns: int, *, partial: bool) -> LoadSample:
         torque_nm = self.calibration.torque_nm(raw)
-        t_mid_ns = t_arrival_ns - transfer_ns(n_bytes, BAUD_RATE) - self._period_ns // 2
+        t_mid_ns = t_arrival_ns - serial_sensor.transfer_ns(n_bytes, BAUD_RATE) - self._period_ns // 2
         if self._last_mid_ns is not None:
             t_mid_ns = max(t_mid_ns, self._last_mid_ns + 1)
         self._last_mid_ns = t_mid_ns
@@ -239,7 +229,7 @@ def describe_errors(errors: Counter[str], sentences: dict[str, str] = LINE_ERROR
     return " ".join(f"{sentences[kind]} ({count} times)" for kind, count in sorted(errors.items()))
 
 
-class LoadCell(SerialSensor[LoadSample]):
+class LoadCell(serial_sensor.SerialSensor[LoadSample]):
     """One board, by USB serial number or path; it only sends."""
 
     silence_hint = "check that it is the load cell's board and that the HX711 has power and its DT and SCK wires."
@@ -253,9 +243,8 @@ class LoadCell(SerialSensor[LoadSample]):
         rate_hz: float = RATE_HZ,
         policy: ReconnectPolicy | None = None,
         on_event: Callable[[LinkEvent], None] = lambda _: None,
-        on_raw: OnRaw = ignore_raw,
+        on_raw: serial_sensor.OnRaw = serial_sensor.ignore_raw,
     ) -> None:
-        """Name the board and its lines per second; nothing is opened yet."""
         link = SerialLink(serial_number=serial_number, path=path, baud=BAUD_RATE, policy=policy, on_event=on_event)
         # A fast board may seem silent to a busy computer; reopening would reset it.
         super().__init__(link, 1.0 / min(rate_hz, RATE_HZ), on_raw)
@@ -270,15 +259,7 @@ class LoadCell(SerialSensor[LoadSample]):
 
     def tare(self, raw_at_rest: float) -> None:
         """Make a raw value the zero of the samples to come."""
-        self._dispatch(InputKind.TARE, time.monotonic_ns(), repr(raw_at_rest).encode())
-
-    async def samples(self) -> AsyncGenerator[LoadSample]:
-        """Yield every sample that arrives; see `values`."""
-        async with aclosing(self.values()) as samples:
-            async for sample in samples:
-                self._samples += 1
-                self._flagged += not sample.trusted
-                yield sample
+        self._dispatch(serial_sensor.InputKind.TARE, time.monotonic_ns(), repr(raw_at_rest).encode())
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
@@ -291,5 +272,8 @@ class LoadCell(SerialSensor[LoadSample]):
             "error_details": describe_errors(errors),
         }
 
-    def _parse(self, event: RawEvent) -> list[LoadSample]:
-        return self._parser.handle(event)
+    def _parse(self, event: serial_sensor.RawEvent) -> list[LoadSample]:
+        samples = self._parser.handle(event)
+        self._samples += len(samples)
+        self._flagged += sum(not sample.trusted for sample in samples)
+        return samples

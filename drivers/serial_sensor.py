@@ -52,12 +52,12 @@ def transfer_ns(n_bytes: int, baud: int) -> int:
 class LineSplitter:
     """Splits a byte stream into lines, however it is sliced. A line that is too long is counted once and dropped whole.
 
-    `too_long` and `unfinished` count since the beginning: lines beyond `max_bytes`, and lines cut off by a reopening.
+    `too_long` and `unfinished` count since the beginning: lines of more than `max_bytes`, without the newline, and
+    lines cut off by a reopening.
     `too_long_start` is the beginning of the last line that was too long.
     """
 
     def __init__(self, max_bytes: int) -> None:
-        """Wait for the first line; `max_bytes` excludes the newline."""
         self._max_bytes = max_bytes
         self._dropping = False
         self.partial = b""
@@ -115,7 +115,7 @@ class SerialSensor(ABC, Generic[ValueT]):
         self._has_sent = False
         self._timeouts = 0
 
-    async def values(self) -> AsyncGenerator[ValueT]:
+    async def readings(self) -> AsyncGenerator[ValueT]:
         """Yield the values of every line, in order and without end; reconnects when the board disappears.
 
         Nothing is lost while the receiver is busy: the bytes wait in the kernel, then on the board. Iterate within

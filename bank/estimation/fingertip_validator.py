@@ -182,11 +182,17 @@ class FingertipSet:
         self.alive: BoolArray = np.isfinite(noise)
         self._jump_limits_v = np.maximum(_JUMP_NOISES * np.sqrt(2.0) * noise, _JUMP_V)
         self._frames = np.stack([self.idle, self.gripped], axis=1)
-        self._all_references = ReferenceFrames(self._frames)
 
     def too_few_channels(self, usable: BoolArray) -> list[str]:
         """Return for each side the reason why too few channels are usable, empty where there are enough."""
-        return [_too_few_channels(one.side, mask) for one, mask in zip(self.sides, usable, strict=True)]
+        unusable = 1.0 - np.count_nonzero(usable, axis=1) / N_CHANNELS
+        return [
+            f"{one.side} fingertip: {100 * share:.0f} % of the channels are dead or saturated; check the ribbon cable "
+            "and the gel's contact with the electrodes"
+            if share > LARGEST_UNUSABLE_SHARE
+            else ""
+            for one, share in zip(self.sides, unusable.tolist(), strict=True)
+        ]
 
     def check(self, frame: FloatArray, usable: BoolArray) -> tuple[list[str], BoolArray]:
         """Return for each side a reason against it or an empty text, and which (m, 896) channels are lost.
@@ -194,13 +200,12 @@ class FingertipSet:
         A side is refused with too few usable channels or as another fingertip. A lost channel reads a value that
         neither grip nor twist explains: a lost electrode or a crossed wire.
         """
-        complete = bool(usable.all())
-        references = self._all_references if complete else ReferenceFrames(self._frames, usable[:, None])
-        deviations, medians = references.compare(frame)
+        deviations, medians = ReferenceFrames(self._frames, usable[:, None]).compare(frame)
         lost = deviations > _LOST_SHARE
-        reasons = [_other_fingertip(one.side, *medians[2 * i : 2 * i + 2]) for i, one in enumerate(self.sides)]
-        if not complete:
-            reasons = [few or other for few, other in zip(self.too_few_channels(usable), reasons, strict=True)]
+        reasons = [
+            few or _other_fingertip(one.side, *medians[2 * i : 2 * i + 2])
+            for i, (one, few) in enumerate(zip(self.sides, self.too_few_channels(usable), strict=True))
+        ]
         return reasons, lost[:, 0] & lost[:, 1]
 
     def jumping_shares(self, frame: FloatArray, before: FloatArray, usable: BoolArray) -> list[float]:
@@ -218,10 +223,6 @@ class FingertipSet:
                     "was gripped, released or knocked, or the board is disturbed"
                 )
         return ""
-
-    def grip_scores(self, frame: FloatArray, idle: FloatArray) -> list[float]:
-        """Return each side's grip score."""
-        return [one.grip_score(*both) for one, *both in zip(self.sides, frame, idle, strict=True)]
 
 
 class GripDetector:
@@ -312,16 +313,6 @@ def _discriminant(parts: list[FloatArray]) -> FloatArray:
     q = np.linalg.qr(np.array(nuisance).T)[0]
     direction = step - q @ (q.T @ step)
     return np.asarray(direction / float(direction @ step))
-
-
-def _too_few_channels(side: str, usable: BoolArray) -> str:
-    unusable = 1.0 - np.count_nonzero(usable) / N_CHANNELS
-    if unusable <= LARGEST_UNUSABLE_SHARE:
-        return ""
-    return (
-        f"{side} fingertip: {100 * unusable:.0f} % of the channels are dead or saturated; check the ribbon cable and "
-        "the gel's contact with the electrodes"
-    )
 
 
 def _other_fingertip(side: str, from_idle: float, from_gripped: float) -> str:

@@ -21,7 +21,7 @@ from shearloop.bank.estimation.interval_regressor import (
     STRENGTHS,
     IntervalRegressor,
     Intervals,
-    error_on_later,
+    best_strength,
     fit_interval_regressor,
     is_one_sided,
 )
@@ -166,7 +166,7 @@ def _fit_torque(
     # The recordings decide whether the gel's position adds to its motion.
     n_motion = temporal.n_lags * temporal.directions.shape[0] * temporal.directions.shape[1]
     choices = {False: features[:, :n_motion], True: features}
-    errors = {used: error_on_later(one, torque, fit, _MOTION_STRENGTHS) for used, one in choices.items()}
+    errors = {used: best_strength(one, torque, fit, _MOTION_STRENGTHS)[1] for used, one in choices.items()}
     unexplained = errors[False] / float(torque.var())
     used = unexplained > _MOTION_MAY_LEAVE and errors[True] < _POSITION_MUST_GAIN * errors[False]
     regressor = fit_interval_regressor(

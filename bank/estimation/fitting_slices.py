@@ -51,9 +51,11 @@ def fit_slices(
     diameter = np.concatenate([one.diameter_mm for one in recordings])
     matcher = blank.matcher(physics.bank)
     models: dict[Quantity, OutputModel] = {}
-    for quantity, values in _quantities(torque, diameter):
-        # Cylinders were twisted too, but at one torque each, which determines no torque.
-        known = np.isfinite(values) & (np.isfinite(diameter) if quantity == "diameter" else ~np.isfinite(diameter))
+    # Cylinders were twisted too, but at one torque each, which determines no torque.
+    torque = np.where(np.isfinite(diameter), np.nan, torque)
+    truths: dict[Quantity, FloatArray] = {"torque": torque, "diameter": diameter}
+    for quantity, values in truths.items():
+        known = np.isfinite(values)
         if not known.any():
             continue
         n, least = int(known.sum()), _LEAST_FOR_CURVE if is_curve else _LEAST_TORQUE_SLICES
@@ -90,10 +92,6 @@ def fit_slices(
     if not models:
         raise CalibrationError("the slices come with neither torque nor diameter")
     return replace(blank, torque=models.get("torque"), diameter=models.get("diameter"))
-
-
-def _quantities(torque: FloatArray, diameter: FloatArray) -> tuple[tuple[Quantity, FloatArray], ...]:
-    return ("torque", torque), ("diameter", diameter)
 
 
 def _features_of(

@@ -21,7 +21,6 @@ from shearloop.bank.estimation.regressors import (
     InverseCalibration,
     Regressor,
     TobitRidge,
-    best_strength,
     later_splits,
     left_out_blocks,
 )
@@ -165,11 +164,11 @@ class IntervalRegressor:
         be twisted the other way as far as the frames allow.
         """
         rows = features[None] if complete is None else np.array([features, complete])
-        raw, *others = self.point.predict(rows).tolist()
+        raws = self.point.predict(rows)
+        raw, (value, *others) = float(raws[0]), _reported(self.point, raws).tolist()
         widening /= math.sqrt(max(usable_share, 0.1))
         half = widening * self.intervals.half_width(raw)
-        value = reported_value(self.point, raw)
-        moved = reported_value(self.point, others[0]) - value if others else 0.0
+        moved = others[0] - value if others else 0.0
         below = max(half + max(-moved, 0.0), limit_share * self.contamination_below)
         above = max(half + max(moved, 0.0), limit_share * self.contamination_above)
         if self.misses_loads:
@@ -221,9 +220,9 @@ class PolynomialRegressor:
         )
 
 
-def reported_value(point: Regressor, raw: float) -> float:
-    """Return the value that a raw prediction means: no torque where the lever would not touch."""
-    return point.sign * max(raw, 0.0) if isinstance(point, TobitRidge) else raw
+def _reported(point: Regressor, raw: FloatArray) -> FloatArray:
+    """Return the values that (n,) raw predictions mean: no torque where the lever would not touch."""
+    return point.sign * np.maximum(raw, 0.0) if isinstance(point, TobitRidge) else raw
 
 
 def fit_interval_regressor(
@@ -253,7 +252,7 @@ def fit_interval_regressor(
             f"{len(values)} frames with values between {np.min(values, initial=np.inf):.3g} and "
             f"{np.max(values, initial=-np.inf):.3g} determine no calibration; record more, at different loads"
         )
-    strength = strengths[0] if len(strengths) == 1 else _best_strength(features, values, fit, strengths)
+    strength = strengths[0] if len(strengths) == 1 else best_strength(features, values, fit, strengths)[0]
     blocks = list(left_out or left_out_blocks(len(values)))
     validated = [_validate(features, values, fit, strength, past, future) for past, future in blocks]
     predicted, residuals = (np.concatenate([pair[i] for pair in validated]) for i in (0, 1))
@@ -313,10 +312,7 @@ def _contamination(
         if not len(mixed.rows):
             continue
         own, which = np.unique(mixed.rows, return_inverse=True)
-        pure, contaminated = (
-            np.array([reported_value(point, one) for one in point.predict(rows)])
-            for rows in (features[own], mixed.features)
-        )
+        pure, contaminated = (_reported(point, point.predict(rows)) for rows in (features[own], mixed.features))
         pure = pure[which]
         # More slices reduce the error of the slices, not the contamination.
         errors.append((inflation * (pure - values[mixed.rows]) + contaminated - pure) / mixed.limit_shares)
@@ -342,7 +338,7 @@ def _range_end(
     out, kept = order[:n_out], np.sort(order[n_out:])
 
     def median(by: Regressor, rows: IntArray) -> float:
-        return float(np.median([sign * reported_value(by, one) for one in by.predict(features[rows])]))
+        return float(np.median(sign * _reported(by, by.predict(features[rows]))))
 
     end, outermost = float(outward.min()), median(point, order[: max(n_out // 2, 1)])
     if len(kept) < _LEAST_FRAMES or np.ptp(values[kept]) == 0:
@@ -367,27 +363,22 @@ def _misses_loads(truth: FloatArray, inside: BoolArray) -> bool:
     return bool(loaded.any() and not loaded.all() and inside[loaded].mean() < _LEAST_COVERED)
 
 
-def error_on_later(features: FloatArray, values: FloatArray, fit: RegressorFit, strengths: tuple[float, ...]) -> float:
-    """Return the mean squared error on parts later than those fitted to, with the best of the strengths."""
-    return _error(features, values, fit, _best_strength(features, values, fit, strengths))
+def best_strength(
+    features: FloatArray, values: FloatArray, fit: RegressorFit, strengths: Sequence[float]
+) -> tuple[float, float]:
+    """Return the strength with the least mean squared error on later parts, and that error; of equals, the strongest.
 
-
-def _error(features: FloatArray, values: FloatArray, fit: RegressorFit, strength: float) -> float:
-    found = [
-        float((_validate(features, values, fit, strength, *split)[1] ** 2).mean()) for split in _time_splits(values)
-    ]
-    return float(np.mean(found))
-
-
-def _time_splits(values: FloatArray) -> list[tuple[IntArray, IntArray]]:
-    return [(past, future) for past, future in later_splits(len(values)) if np.ptp(values[past]) > 0]
-
-
-def _best_strength(features: FloatArray, values: FloatArray, fit: RegressorFit, strengths: tuple[float, ...]) -> float:
-    def error(strength: float, past: IntArray, future: IntArray) -> float:
-        return float((_validate(features, values, fit, strength, past, future)[1] ** 2).mean())
-
-    return best_strength(strengths, error, _time_splits(values))
+    Raises CalibrationError where the values do not change within the earlier parts.
+    """
+    splits = [(past, future) for past, future in later_splits(len(values)) if np.ptp(values[past]) > 0]
+    if not splits:
+        raise CalibrationError("the values do not change within the earlier part; begin with the calibration's loads")
+    errors = {
+        strength: float(np.mean([(_validate(features, values, fit, strength, *one)[1] ** 2).mean() for one in splits]))
+        for strength in strengths
+    }
+    best = max(strength for strength, error in errors.items() if error <= min(errors.values()) * 1.001)
+    return best, errors[best]
 
 
 def _validate(
@@ -396,7 +387,7 @@ def _validate(
     """Return the raw predictions of the future by a fit to the past, and their errors."""
     point = fit(features[past], values[past], strength)
     raw = point.predict(features[future])
-    return raw, np.array([reported_value(point, one) for one in raw]) - values[future]
+    return raw, _reported(point, raw) - values[future]
 
 
 def is_one_sided(torque_nm: FloatArray) -> bool:

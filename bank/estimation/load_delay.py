@@ -8,6 +8,7 @@ stretches of time left out, is the delay; its uncertainty comes from resampled s
 second). Emulated rigs without the filter give −0.08 to 0.05 s.
 """
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -79,10 +80,9 @@ def check_load_delay(recordings: Sequence[FrameSeries], find: DelayFinder = find
     for one in recordings:
         found = find(one)
         if found is not None and (unusual := _unusual(one, found)):
-            order, usual_s = unusual
+            what, usual_s = unusual
             raise CalibrationError(
-                f"the frames move {abs(found.delay_s):.2f} ± {found.error_s:.2f} s {order} the load that moves them is "
-                f"stamped, and this load cell's own delay is {usual_s:.2f} s: a calibration would learn the torque of "
+                f"{what}, and this load cell's own delay is {usual_s:.2f} s: a calibration would learn the torque of "
                 "another moment; correct the load cell's clock and record again, or calibrate with "
                 f"--load-cell-delay-s {found.delay_s - usual_s:.2f}"
             )
@@ -105,11 +105,10 @@ def load_delay_warning(series: FrameSeries, find: DelayFinder = find_load_delay)
         return ""
     if not (unusual := _unusual(series, found)):
         return ""
-    order, usual_s = unusual
+    what, usual_s = unusual
     sure = "" if n >= _SURE_FRAMES else f" (though {n} gripped frames are too few to be sure)"
     return (
-        f"the frames move {abs(found.delay_s):.2f} ± {found.error_s:.2f} s {order} the load that moves them is "
-        f"stamped{sure}; check the load cell's clock, or calibrate with --load-cell-delay-s "
+        f"{what}{sure}; check the load cell's clock, or calibrate with --load-cell-delay-s "
         f"{found.delay_s - usual_s:.2f}"
     )
 
@@ -124,16 +123,12 @@ def timing_references(
     """
     if any(find(one) is not None for one in recordings):
         return recordings
-    return [one for one in others if _shows_delay(one, find)] or recordings
-
-
-def _shows_delay(series: FrameSeries, find: DelayFinder) -> bool:
-    if not np.isfinite(series.channels).all():
-        return False
-    try:
-        return find(series) is not None
-    except CalibrationError:
-        return False
+    showing = []
+    for one in others:
+        with contextlib.suppress(CalibrationError):
+            if np.isfinite(one.channels).all() and find(one) is not None:
+                showing.append(one)
+    return showing or recordings
 
 
 def timing_uncertainty_s(recordings: Sequence[FrameSeries], find: DelayFinder = find_load_delay) -> float:
@@ -157,13 +152,17 @@ def torque_bounds(series: FrameSeries, uncertainty_s: float) -> tuple[FloatArray
 
 
 def _unusual(series: FrameSeries, found: LoadDelay) -> tuple[str, float] | None:
-    """Return the order of frames and torques, and the load cell's own delay; None for a usual delay."""
+    """Return what is unusual as a sentence, and the load cell's own delay; None for a usual delay."""
     period_s = float(np.median(np.diff(series.torque_t_s)))
     earliest_s, latest_s = (each * period_s for each in _USUAL_PERIODS[is_filtered(series.torque_nm)])
     tolerance_s = _STAMPS_S + _CERTAIN * found.error_s
     if earliest_s - tolerance_s <= found.delay_s <= latest_s + tolerance_s:
         return None
-    return "before" if found.delay_s > 0 else "after", (earliest_s + latest_s) / 2
+    order = "before" if found.delay_s > 0 else "after"
+    what = (
+        f"the frames move {abs(found.delay_s):.2f} ± {found.error_s:.2f} s {order} the load that moves them is stamped"
+    )
+    return what, (earliest_s + latest_s) / 2
 
 
 def is_filtered(torque_nm: FloatArray) -> bool | None:

@@ -6,7 +6,7 @@ side only: where it reads nothing the twist may be anything below, so these fram
 generalised least squares). Unlike a ridge it does not pull estimates towards the mean.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Self, TypeAlias
 
@@ -65,16 +65,12 @@ class Ridge:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TobitRidge:
+class TobitRidge(Ridge):
     """A ridge with readings of no load as bounds; `sign` is the direction of the lever's push.
 
-    It predicts a latent value. Where that is below zero along the sign, the lever does not touch: no torque.
+    It predicts a latent value along the sign. Where that is below zero, the lever does not touch: no torque.
     """
 
-    mean: FloatArray
-    weights: FloatArray
-    offset: float
-    strength: float
     sigma: float
     sign: float
 
@@ -103,10 +99,6 @@ class TobitRidge:
         offset = float(latent.mean())
         weights = vt.T @ (gain * (u.T @ (latent - offset)))
         return cls(mean, weights, offset, strength, sigma, sign)
-
-    def predict(self, features: FloatArray) -> FloatArray:
-        """Return the latent values of (…, d) features along the lever's direction."""
-        return np.asarray(self.offset + (features - self.mean) @ self.weights)
 
 
 def _moments_below_zero(mean: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
@@ -186,57 +178,30 @@ class InverseCalibration:
 
         A time before the last fitted one counts as that one: the user started counting again.
         """
-        costs: dict[tuple[float, bytes], _CostGrid] = {}
-        values = []
-        for frame in features.reshape(-1, features.shape[-1]):
-            x, t = frame[self.channels] / self.spread, float(frame[-1])
-            keep = np.isfinite(x)
-            # Hundreds of mixtures share a few times.
-            key = t, keep.tobytes()
-            if key not in costs:
-                costs[key] = self._cost_grid(keep, t)
-            values.append(costs[key].minimum(x[keep]))
+        values = [self._value(frame) for frame in features.reshape(-1, features.shape[-1])]
         return np.array(values).reshape(features.shape[:-1])
 
-    def _cost_grid(self, keep: BoolArray, t: float) -> "_CostGrid":
-        """Return the cost of values at the time t for a frame's (q,) channels to keep."""
+    def _value(self, frame: FloatArray) -> float:
+        """Return the value of least cost on a grid, refined by a parabola through the least three."""
+        x, t = frame[self.channels] / self.spread, float(frame[-1])
+        keep = np.isfinite(x)
         b, v = self.coefficients[:, keep], self.drift[:, keep]
         age = float(_log_age(np.array([max(t, self.last_t)]), self.first_t, self.last_t)[0])
         b[: len(self.trend)] += age * self.trend[:, keep]
         inner = np.linalg.inv(np.diag(self.noise**2 / self.drift_variance) + v @ v.T)
-
-        def whitened(rows: FloatArray) -> FloatArray:
-            return np.asarray((rows - (rows @ v.T) @ inner @ v) / self.noise**2)
-
+        weights = (b - (b @ v.T) @ inner @ v) / self.noise**2
         grid = np.linspace(self.low, self.high, 401)
         powers = np.vander((grid - self.centre) / self.scale, len(b), increasing=True)
-        weights = whitened(b)
-        return _CostGrid(grid, powers, weights, np.einsum("ij,jk,ik->i", powers, weights @ b.T, powers))
+        cost = np.einsum("ij,jk,ik->i", powers, weights @ b.T, powers) - 2 * powers @ (weights @ x[keep])
+        i = int(np.argmin(cost))
+        if i in (0, len(grid) - 1):
+            return float(grid[i])
+        before, here, after = cost[i - 1 : i + 2]
+        bend = before - 2 * here + after
+        return float(grid[i] + (0.5 * (before - after) / bend if bend > 0 else 0.0) * (grid[1] - grid[0]))
 
 
 Regressor: TypeAlias = Ridge | TobitRidge | InverseCalibration
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _CostGrid:
-    """Cost of values on a grid (g,): a fixed part (g,), and powers (g, p) times weights (p, q) times the frame."""
-
-    grid: FloatArray
-    powers: FloatArray
-    weights: FloatArray
-    fixed: FloatArray
-
-    def minimum(self, x: FloatArray) -> float:
-        """Return the value of least cost for a scaled frame (q,), refined by a parabola through the least three."""
-        cost = self.fixed - 2 * self.powers @ (self.weights @ x)
-        i = int(np.argmin(cost))
-        if i in (0, len(self.grid) - 1):
-            return float(self.grid[i])
-        before, here, after = cost[i - 1 : i + 2]
-        bend = before - 2 * here + after
-        return float(
-            self.grid[i] + (0.5 * (before - after) / bend if bend > 0 else 0.0) * (self.grid[1] - self.grid[0])
-        )
 
 
 def _log_age(t: FloatArray, first_t: float, last_t: float) -> FloatArray:
@@ -329,15 +294,3 @@ def ranked_channels(frames: FloatArray, values: FloatArray) -> IntArray:
     spread = frames.std(axis=0)
     covariance = np.abs((frames - frames.mean(axis=0)).T @ (values - values.mean()))
     return np.argsort(-covariance / np.where(spread > 0, spread, np.inf), kind="stable")
-
-
-def best_strength(
-    strengths: Sequence[float],
-    error_of: Callable[[float, IntArray, IntArray], float],
-    splits: Sequence[tuple[IntArray, IntArray]],
-) -> float:
-    """Return the strength with the least mean squared error on the later parts; of equals, the strongest."""
-    if not splits:
-        raise CalibrationError("the values do not change within the earlier part; begin with the calibration's loads")
-    errors = [float(np.mean([error_of(strength, *split) for split in splits])) for strength in strengths]
-    return max(strength for strength, error in zip(strengths, errors, strict=True) if error <= min(errors) * 1.001)

@@ -91,10 +91,6 @@ class EstimatorSession:
                 "torque differs: calibrate with this tool",
             )
 
-    def reset(self) -> None:
-        """Forget the session: the next frame is its first."""
-        self._begin()
-
     def tare(self, frames: int | None = None) -> None:
         """Forget the session and average the next `frames` usable frames, of untouched fingertips, into the idle frame.
 
@@ -102,9 +98,10 @@ class EstimatorSession:
         """
         if self.calibration.kind != "raw":
             raise CalibrationError("slices are differences already: they have no zero")
-        self._begin(frames or self._baseline_frames)
+        self.reset(frames or self._baseline_frames)
 
-    def _begin(self, idle_frames: int = 0) -> None:
+    def reset(self, idle_frames: int = 0) -> None:
+        """Forget the session: the next frame is its first, and the next `idle_frames` usable ones are untouched."""
         calibration = self.calibration
         self._state: SessionState | PaperState | None = None
         if calibration.has_curves_only:

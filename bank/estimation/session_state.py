@@ -52,15 +52,19 @@ _POOLED_FREEDOM = 30
 class ProcessedFrame:
     """A frame after the session's checks, with the reasons against it.
 
-    channels (m, 896) have unusable ones filled in; difference (m, 896) is to the idle frame. usable (m, 896) excludes
-    channels that the board or the frame itself shows to be lost or saturated. lag_s is the lag of an average.
+    difference (m, 896) is to the idle frame. usable (m, 896) excludes channels that the board or the frame itself
+    shows to be lost or saturated. lag_s is the lag of an average.
     """
 
-    channels: FloatArray
     difference: FloatArray
     reasons: tuple[str, ...]
     usable: BoolArray
     lag_s: float = 0.0
+
+    @classmethod
+    def refused(cls, usable: BoolArray, *reasons: str) -> Self:
+        """Return a frame with reasons against it, without a difference."""
+        return cls(np.zeros(usable.shape), reasons, usable)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,19 +95,18 @@ class TemporalFeatures:
         found = np.einsum("...mc,mpc->...mp", channels, self.directions)
         return np.asarray(found.reshape(*found.shape[:-2], -1))
 
-    def impute_motion(self, layer: int, moved: FloatArray, usable: BoolArray, noise: FloatArray) -> FloatArray:
-        """Return the motion of all (896,) channels of a side along the directions, from the usable channels."""
-        return _fit_along(self._modes(layer, noise), moved, usable, noise)
-
-    def impute_difference(
-        self, layer: int, difference: FloatArray, usable: BoolArray, validator: FingertipValidator
+    def impute(
+        self, layer: int, moved: FloatArray, usable: BoolArray, noise: FloatArray, *grip: FloatArray
     ) -> FloatArray:
-        """Return the same for a (896,) difference to idle, with the grip itself as one more direction."""
-        modes = np.vstack([self._modes(layer, validator.noise), validator.gripped - validator.idle])
-        return _fit_along(modes, difference, usable, validator.noise)
+        """Return the motion of all (896,) channels of a side, from the usable ones.
 
-    def _modes(self, layer: int, noise: FloatArray) -> FloatArray:
-        return np.asarray(self.directions[layer] * np.where(np.isfinite(noise), noise, 0.0) ** 2)
+        It is along the directions and along the (896,) grip, if given.
+        """
+        alive = np.isfinite(noise)
+        modes = np.vstack([self.directions[layer] * np.where(alive, noise, 0.0) ** 2, *grip])
+        weights = np.where(usable & alive, 1.0 / noise, 0.0)
+        found = np.linalg.lstsq((modes * weights).T, moved * weights, rcond=None)[0]
+        return np.asarray(found @ modes)
 
     def features(self, positions: Sequence[FloatArray], from_idle: FloatArray) -> FloatArray:
         """Return n_lags · m·p features of motion, nearest lag first, and m·p of position where it is used.
@@ -140,8 +143,9 @@ class SessionState:
         # The calibration's idle frame until the session has its own, and (m, 1) gains of the session's over it.
         self._baselines = self._fingertips.idle.copy()
         self._gains: FloatArray = np.ones((len(validators), 1))
-        self._mean_difference: FloatArray = np.zeros_like(self._baselines)
-        self._n_held = 0
+        # Mean (m, 896) difference to the idle frame over this grip's last valid frames, and their number.
+        self.mean_difference: FloatArray = np.zeros_like(self._baselines)
+        self.held_frames = 0
         self._begun = False
         self._before: FloatArray | None = None
         self._disturbed: FloatArray | None = None
@@ -175,16 +179,6 @@ class SessionState:
             return None
         return self._temporal.features(self._positions, self._from_idle)
 
-    @property
-    def mean_difference(self) -> FloatArray:
-        """Mean (m, 896) difference to the idle frame over this grip's last valid frames, updated in place."""
-        return self._mean_difference
-
-    @property
-    def held_frames(self) -> int:
-        """Number of frames in `mean_difference`."""
-        return self._n_held
-
     def process(self, frame: TactileFrame) -> ProcessedFrame:
         """Take the next frame and return it with the reasons against it."""
         self._advance_time(frame.t_s)
@@ -193,7 +187,7 @@ class SessionState:
             # One garbled frame is no other fingertip: skip it like a disturbed one.
             self._disturbed = None
             self._skip()
-            return self._refuse(channels, usable, *filter(None, reasons))
+            return ProcessedFrame.refused(usable, *filter(None, reasons))
         if jumping_shares and (disturbance := self._fingertips.disturbance(jumping_shares)):
             return self._bridge(channels, disturbance, usable)
         if self._before is None and not self._begun and not self._tare_frames:
@@ -202,15 +196,11 @@ class SessionState:
             return self._add_to_tare(channels, usable)
         if self._before is None:
             self._before = channels
-            return self._refuse(channels, usable, "there is no earlier frame to compare with")
+            return ProcessedFrame.refused(usable, "there is no earlier frame to compare with")
         self._disturbed, self._before, self._skipped_in_a_row = None, channels, 0
         self._update_baseline(channels, frame)
         self._detect_release(channels)
         return self._finish(channels, usable)
-
-    @staticmethod
-    def _refuse(channels: FloatArray, usable: BoolArray, *reasons: str) -> ProcessedFrame:
-        return ProcessedFrame(channels, np.zeros_like(channels), reasons, usable)
 
     def _check(self, frame: TactileFrame) -> tuple[FloatArray, BoolArray, list[str], list[float]]:
         """Return the filled channels, the usable ones, each side's reason, and its share of jumping channels.
@@ -284,26 +274,26 @@ class SessionState:
             for layer, idle in enumerate(self._idle):
                 idle.extend(one[layer] for one in self._tare_frames)
             self._update_gains()
-        return self._refuse(channels, usable, f"taking the homogeneous frame, {n} of {wanted}")
+        return ProcessedFrame.refused(usable, f"taking the homogeneous frame, {n} of {wanted}")
 
     def _difference(self, channels: FloatArray, usable: BoolArray) -> FloatArray:
         """Return the (m, 896) difference to the idle frame, unusable channels imputed."""
         difference = channels - self._baselines
         if self._temporal is not None and not usable.all():
             for layer, one in enumerate(self._fingertips.sides):
-                imputed = self._temporal.impute_difference(layer, difference[layer], usable[layer], one)
+                grip = one.gripped - one.idle
+                imputed = self._temporal.impute(layer, difference[layer], usable[layer], one.noise, grip)
                 difference[layer] = np.where(usable[layer], difference[layer], imputed)
         return difference
 
     def _finish(self, channels: FloatArray, usable: BoolArray) -> ProcessedFrame:
-        scores = self._fingertips.grip_scores(channels, self._baselines)
         # At the calibration's gain. It does not change while gripped.
         difference = self._difference(channels, usable) / self._gains
-        gripped = [self._is_gripped(layer, score) for layer, score in enumerate(scores)]
-        loose = [
-            one.side for layer, one in enumerate(self._fingertips.sides) if self._released[layer] or not gripped[layer]
-        ]
-        reason = ""
+        loose, reason = [], ""
+        for layer, one in enumerate(self._fingertips.sides):
+            gripped = self._is_gripped(layer, one.grip_score(channels[layer], self._baselines[layer]))
+            if self._released[layer] or not gripped:
+                loose.append(one.side)
         if loose:
             self._forget_grip()
             reason = f"no grip at the {' and '.join(loose)} fingertip"
@@ -317,13 +307,10 @@ class SessionState:
             elif sum(self._bridged) > _LARGEST_BRIDGED:
                 reason = "too many of the last frames were disturbed or are missing"
         if reason:
-            return ProcessedFrame(channels, difference, (reason,), usable)
-        self._n_held = min(self._n_held + 1, _HELD_FRAMES)
-        if self._n_held == 1:
-            self._mean_difference = difference.copy()
-        else:
-            self._mean_difference += (difference - self._mean_difference) / self._n_held
-        return ProcessedFrame(channels, difference, (), usable)
+            return ProcessedFrame(difference, (reason,), usable)
+        self.held_frames = min(self.held_frames + 1, _HELD_FRAMES)
+        self.mean_difference = self.mean_difference + (difference - self.mean_difference) / self.held_frames
+        return ProcessedFrame(difference, (), usable)
 
     def _is_gripped(self, layer: int, score: float) -> bool:
         """Return whether a fingertip is gripped; with a baseline of a few frames only a strong grip counts."""
@@ -361,7 +348,7 @@ class SessionState:
         else:
             self._disturbed = channels
             self._skip()
-        return self._refuse(channels, usable, disturbance)
+        return ProcessedFrame.refused(usable, disturbance)
 
     def _fill(self, channels: FloatArray, usable: BoolArray) -> FloatArray:
         """Return the channels with unusable ones moved on from the last frame as the usable ones moved."""
@@ -373,7 +360,7 @@ class SessionState:
         if self._temporal is not None:
             for layer, one in enumerate(self._fingertips.sides):
                 moved = channels[layer] - self._before[layer]
-                assumed[layer] += self._temporal.impute_motion(layer, moved, usable[layer], one.noise)
+                assumed[layer] += self._temporal.impute(layer, moved, usable[layer], one.noise)
         return np.where(usable, channels, assumed)
 
     def _update_baseline(self, channels: FloatArray, frame: TactileFrame) -> None:
@@ -416,7 +403,7 @@ class SessionState:
     def _forget_grip(self) -> None:
         self._positions.clear()
         self._bridged.clear()
-        self._n_held = 0
+        self.mean_difference, self.held_frames = np.zeros_like(self._baselines), 0
 
 
 class PaperState:
@@ -447,16 +434,15 @@ class PaperState:
         channels = frame.channels
         unusable = int(np.count_nonzero(~frame.usable))
         if unusable > _PAPER_UNUSABLE_SHARE * channels.size:
-            return self._refuse(
-                frame,
+            return ProcessedFrame.refused(
+                frame.usable,
                 f"{unusable} of {channels.size} channels are saturated or dead; "
                 "check the ribbon cable and the gel's contact with the electrodes",
             )
         if self.taring:
             self._tare_frames.append(channels[0])
-            return self._refuse(
-                frame, f"taking the homogeneous frame, {len(self._tare_frames)} of {self._baseline_frames}"
-            )
+            n, wanted = len(self._tare_frames), self._baseline_frames
+            return ProcessedFrame.refused(frame.usable, f"taking the homogeneous frame, {n} of {wanted}")
         if self._latest and frame.t_s - self._latest[-1][0] > self._max_gap_s:
             self._latest.clear()
         self._latest.append((frame.t_s, channels[0]))
@@ -465,13 +451,9 @@ class PaperState:
         n = len(self._latest)
         noise = self._noise * math.sqrt(1.0 / n + 1.0 / self._baseline_frames)
         if (silent := signal_above_noise(difference, noise)) is not None:
-            return self._refuse(frame, silent.why)
+            return ProcessedFrame.refused(frame.usable, silent.why)
         lag_s = frame.t_s - sum(t_s for t_s, _ in self._latest) / n
-        return ProcessedFrame(channels, difference[None], (), frame.usable, lag_s)
-
-    @staticmethod
-    def _refuse(frame: TactileFrame, reason: str) -> ProcessedFrame:
-        return ProcessedFrame(frame.channels, np.zeros_like(frame.channels), (reason,), frame.usable)
+        return ProcessedFrame(difference[None], (), frame.usable, lag_s)
 
     @cached_property
     def _homogeneous(self) -> FloatArray:
@@ -489,9 +471,3 @@ class PaperState:
         own = (np.array(self._tare_frames) - self._homogeneous).var(axis=0, ddof=1)
         variance = (freedom * own + _POOLED_FREEDOM * own.mean()) / (freedom + _POOLED_FREEDOM)
         return np.asarray(np.sqrt(np.maximum(variance, LEAST_NOISE_V**2)))
-
-
-def _fit_along(modes: FloatArray, moved: FloatArray, usable: BoolArray, noise: FloatArray) -> FloatArray:
-    weights = np.where(usable & np.isfinite(noise), 1.0 / noise, 0.0)
-    found = np.linalg.lstsq((modes * weights).T, moved * weights, rcond=None)[0]
-    return np.asarray(found @ modes)

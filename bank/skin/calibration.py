@@ -13,8 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 from scipy.special import stdtrit
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
@@ -27,9 +26,10 @@ from shearloop.bank.skin.membrane import (
     ShearInterval,
     measured_response,
 )
-from shearloop.files import replace_file
+from shearloop.yaml_files import read_yaml, save_yaml, validated
 
 FORMAT = "shearloop skin calibration 1"
+_LISTS = ("tension_n", "response", "rest_ohm")
 COLUMNS = ("r1_ohm", "r2_ohm", "shear_n", "normal_n")
 # A load cell at rest may read slightly negative; a skin cannot be pulled off its core.
 MAX_PULL_N = 0.05
@@ -188,35 +188,20 @@ class _CalibrationFile(BaseModel):
 
 def save_calibration(calibration: SkinCalibration, path: Path) -> None:
     """Write a calibration as YAML, replacing the file at once."""
-    lists = {name: list(getattr(calibration, name)) for name in ("tension_n", "response", "rest_ohm")}
-    document = {"format": FORMAT, **asdict(calibration), **lists}
-    try:
-        with replace_file(path) as file:
-            file.write(yaml.safe_dump(document, sort_keys=False).encode())
-    except OSError as error:
-        raise CalibrationError(f"{path}: the calibration cannot be written: {error}.") from error
+    lists = {name: list(getattr(calibration, name)) for name in _LISTS}
+    save_yaml(path, {"format": FORMAT, **asdict(calibration), **lists}, CalibrationError)
 
 
 def load_calibration(path: Path) -> SkinCalibration:
     """Return the calibration in a YAML file; raises CalibrationError naming the file and every wrong key."""
+    document = read_yaml(path, CalibrationError, "calibration", "; make it with `shearloop skin calibrate`.")
+    if not (isinstance(document, dict) and "format" in document):
+        raise CalibrationError(
+            f"{path} is not a calibration as `shearloop skin calibrate` writes it: it has no `format: {FORMAT}`."
+        )
+    values = validated(document, _CalibrationFile, str(path), CalibrationError).model_dump(exclude={"format"})
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-        values = _CalibrationFile.model_validate(document).model_dump(exclude={"format"})
-        lists = {name: tuple(values[name]) for name in ("tension_n", "response", "rest_ohm")}
-        return SkinCalibration(**values | lists)
-    except OSError as error:
-        raise CalibrationError(
-            f"{path}: the calibration cannot be read: {error.strerror}; make it with `shearloop skin calibrate`."
-        ) from error
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise CalibrationError(f"{path}: the calibration cannot be read: {' '.join(str(error).split())}.") from error
-    except ValidationError as error:
-        wrong = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'the file'}: {e['msg']}" for e in error.errors())
-        if not (isinstance(document, dict) and "format" in document):
-            wrong = f"it has no `format: {FORMAT}`"
-        raise CalibrationError(
-            f"{path} is not a calibration as `shearloop skin calibrate` writes it: {wrong}."
-        ) from error
+        return SkinCalibration(**values | {name: tuple(values[name]) for name in _LISTS})
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from error
 

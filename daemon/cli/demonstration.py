@@ -55,7 +55,6 @@ class EventInjector:
     """A listener that sends the configured events to the emulators, each at its step of the experiment."""
 
     def __init__(self, emulators: "tuple[EmulatorConfig, ...]", processes: Sequence["Popen[bytes]"]) -> None:
-        """Use the emulators and their processes, in the same order."""
         self._waiting = [
             (event, process)
             for emulator, process in zip(emulators, processes, strict=True)
@@ -85,7 +84,6 @@ class EmulatorMonitor:
     """A listener that reports once when an emulator's process has ended."""
 
     def __init__(self, emulators: "tuple[EmulatorConfig, ...]", processes: Sequence["Popen[bytes]"]) -> None:
-        """Use the emulators and their processes, in the same order."""
         self._alive = [(emulator.device, process) for emulator, process in zip(emulators, processes, strict=True)]
 
     def __call__(self, topic: str, _: Mapping[str, Any]) -> None:

@@ -1,7 +1,10 @@
 """`shearloop import mat SRC… --out REC`: import recordings of other programs."""
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
+
+from shearloop.daemon.cli.output import print_result
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -15,8 +18,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Import and print the counts."""
-    import json
-
     from mcap.writer import MCAP0_MAGIC
 
     from shearloop.daemon.cli.options import check_overwrite
@@ -24,12 +25,7 @@ def run(args: argparse.Namespace) -> int:
 
     check_overwrite(args.out, "a recording", MCAP0_MAGIC)
     imported = import_mat(args.sources, args.out)
-    if args.json:
-        counted = {"path": str(args.out), "frames": imported.frames, "torques": imported.torques}
-        print(json.dumps({**counted, "remarks": list(imported.remarks)}, ensure_ascii=False))
-        return 0
     counts = [f"{count} frames of the {side} side" for side, count in imported.frames.items()]
-    print(f"{args.out}: {', '.join(counts)}, {imported.torques} torques.")
-    for remark in imported.remarks:
-        print(remark)
+    sentence = f"{args.out}: {', '.join(counts)}, {imported.torques} torques."
+    print_result({"path": str(args.out), **asdict(imported)}, [sentence, *imported.remarks], as_json=args.json)
     return 0

@@ -3,7 +3,6 @@
 import argparse
 import sys
 
-from shearloop.daemon.cli import EXIT_OK
 from shearloop.daemon.cli.options import add_connection, client_keys
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.signals import interrupt_status
@@ -64,4 +63,4 @@ def run(args: argparse.Namespace) -> int:
                 break
     except KeyboardInterrupt as interrupt:
         return interrupt_status(interrupt)
-    return EXIT_OK
+    return 0

@@ -11,8 +11,6 @@ from shearloop.daemon.cli.output import print_result, progress_bar
 if TYPE_CHECKING:
     from shearloop.daemon.recording.repair import RecordingSummary
 
-FORMS = ("csv", "parquet", "mat")
-
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add a sub-parser for each action."""
@@ -36,7 +34,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "export", help="as CSV, Parquet or for MATLAB", description="Write a recording's topics as tables."
     )
     export.add_argument("recording", type=Path, metavar="REC", help="a recording (.mcap or .mcap.partial)")
-    export.add_argument("--format", choices=FORMS, default="csv", help="format of the tables (default: %(default)s)")
+    export.add_argument(
+        "--format", choices=("csv", "parquet", "mat"), default="csv", help="format of the tables (default: %(default)s)"
+    )
     export.add_argument(
         "--out", type=Path, metavar="PATH", help="folder of one file per topic; for mat a file (default: next to REC)"
     )
@@ -97,15 +97,11 @@ def _repair(args: argparse.Namespace) -> int:
     with progress_bar(args.recording.name, size, "B") as progress:
         result = repair(args.recording, args.out, progress)
     condition = result.condition
-    lost = [f"{condition.torn_bytes} incomplete bytes at the end"] if condition.torn_bytes else []
-    if condition.damaged_chunks:
-        lost.append(f"{condition.damaged_chunks} damaged chunks")
-    content = {
-        "path": str(result.path),
-        "messages": result.messages,
-        "torn_bytes": condition.torn_bytes,
-        "damaged_chunks": condition.damaged_chunks,
-    }
+    torn_bytes, damaged_chunks = condition.torn_bytes, condition.damaged_chunks
+    lost = [f"{torn_bytes} incomplete bytes at the end"] if torn_bytes else []
+    lost += [f"{damaged_chunks} damaged chunks"] if damaged_chunks else []
+    content = {"path": str(result.path), "messages": result.messages}
+    content |= {"torn_bytes": torn_bytes, "damaged_chunks": damaged_chunks}
     sentence = f"{result.path}: {result.messages} messages are saved; left out: {' and '.join(lost) or 'nothing'}."
     print_result(content, [sentence], as_json=args.json)
     return 0

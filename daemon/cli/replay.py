@@ -59,12 +59,9 @@ def run(args: argparse.Namespace) -> int:
     for line in _comparison_text(comparison, same_code):
         print(line, file=sys.stderr)
     if args.json:
-        counts = {"compared": dict(comparison.compared), "different": dict(comparison.different)}
-        print_result(
-            {**counts, "unrecorded": comparison.unrecorded, "examples": comparison.examples, "same_code": same_code},
-            (),
-            as_json=True,
-        )
+        counts = {"compared": comparison.compared, "different": comparison.different}
+        others = {"unrecorded": comparison.unrecorded, "examples": comparison.examples, "same_code": same_code}
+        print_result({**counts, **others}, (), as_json=True)
     return 1 if args.check and (comparison.different or not comparison.compared) else 0
 
 
@@ -101,7 +98,7 @@ async def _replay(
             publisher.add_listener(EstimatePrinter(sys.stdout))
         while args.wait and not publisher.has_subscribers():  # noqa: ASYNC110 - the publisher has no event
             await asyncio.sleep(0.05)
-        progress = opened.enter_context(progress_bar(run.path.name, run.message_count, "message"))
+        progress = opened.enter_context(progress_bar(run.path.name, sum(run.counts.values()), "message"))
         await replay.play(speed, progress)
         # The last messages are still being sent.
         await asyncio.sleep(0.1)

@@ -176,8 +176,7 @@ class ControlLoop:
         match self._command.action:
             case Tare() if not error:
                 # The tool was identified with another zero.
-                self._driving_wrist.reset()
-                self._reset_creep()
+                self._forget_tool()
             case GripTo() as grip if not error:
                 self._on_gripped(grip)
             case _:
@@ -308,10 +307,10 @@ class ControlLoop:
         self._origin_rad = arm.wrist_rad if arm is not None else None
         # An unexpected object is watched as well.
         self._grips = grip.expect_object or (gripper is not None and gripper.holding)
-        self._driving_wrist.reset()
-        self._reset_creep()
+        self._forget_tool()
 
-    def _reset_creep(self) -> None:
+    def _forget_tool(self) -> None:
+        self._driving_wrist.reset()
         for creep in self._creep.values():
             creep.reset()
 

@@ -38,14 +38,11 @@ _JUMP_SLACK, _JUMP_SUM = 1.0, 4.5
 _KNOWN_AFTER_JUMP = 3.0
 # A drift is extrapolated over at most this many dropped measurements.
 _MOST_MISSED = 4
-# The angle history is trimmed after this many new samples.
-_TRIM_EVERY = 512
 
 
 class ControllerReason(StrEnum):
     """Why the wrist does not follow the torque; the text is for the operator."""
 
-    NOT_STARTED = "the controller has not been started"
     HELD = "the wrist is held on command"
     NO_SET_POINT = "no torque set point has been given"
     NOT_MEASURED = "no torque has been measured since the start"
@@ -60,7 +57,6 @@ class ControllerRefusal(StrEnum):
     """Why a measurement was rejected."""
 
     NOT_A_NUMBER = "not a number"
-    NOT_STARTED = "before the start"
     OUT_OF_ORDER = "not later than the one before it"
     FROM_THE_FUTURE = "stamped in the future"
     LATE = "too old when it arrived"
@@ -85,12 +81,12 @@ class WristCommand:
 
 @dataclass(frozen=True, slots=True)
 class ControllerState:
-    """The controller's estimates; torques in N·m, None before the start."""
+    """The controller's estimates; torques in N·m, None before the first set point or measurement."""
 
     set_point_nm: float | None
     ramp_nm: float | None
-    torque_nm: float | None
-    offset_nm: float | None
+    torque_nm: float
+    offset_nm: float
     creep_nm_per_s: float
     innovation_nm: float | None
 
@@ -119,8 +115,9 @@ class AngleHistory:
             self._integral.append(0.0)
         self._t_ns.append(t_ns)
         self._angle_rad.append(angle_rad)
-        if len(self._t_ns) % _TRIM_EVERY == 0:
-            self._trim(t_ns - self.span_ns)
+        # One sample is kept from before the span, for its beginning.
+        old = max(bisect_right(self._t_ns, t_ns - self.span_ns) - 1, 0)
+        del self._t_ns[:old], self._angle_rad[:old], self._integral[:old]
         return True
 
     def mean(self, from_ns: int, to_ns: int) -> float | None:
@@ -140,27 +137,39 @@ class AngleHistory:
             angle += (following - angle) * since_ns / (self._t_ns[last + 1] - self._t_ns[last])
         return angle, self._integral[last] + 0.5 * (angle + self._angle_rad[last]) * since_ns
 
-    def _trim(self, before_ns: int) -> None:
-        cut = max(bisect_right(self._t_ns, before_ns) - 1, 0)
-        del self._t_ns[:cut], self._angle_rad[:cut], self._integral[:cut]
-
 
 class TwistController:
     """Drives the wrist so that the tool's torque reaches and keeps a set point. Times are CLOCK_MONOTONIC ns."""
 
-    def __init__(self, settings: ControllerSettings) -> None:
+    def __init__(
+        self,
+        settings: ControllerSettings,
+        t_ns: int,
+        angle_rad: float,
+        torque_nm: float,
+        known_measurements: float = 0.0,
+    ) -> None:
+        """Begin at a wrist angle and its torque, known as well as the mean of `known_measurements`.
+
+        The first measurements are averaged with that torque (gain 1/(n+1)) until kp is the greater gain. There is no
+        set point yet. Raises UserError for values that are not numbers.
+        """
+        if not (math.isfinite(angle_rad) and math.isfinite(torque_nm) and known_measurements >= 0.0):
+            raise UserError("controller: it cannot start without a wrist angle and a torque that are numbers")
         self.settings = settings
         span_s = settings.age_limit_s + settings.window_s + abs(settings.lag_s)
         self._history = AngleHistory(int(1e9 * (span_s + 1.0)))
-        self._started = self._held = self._measured = self._moving = self._lost = False
+        self._history.add(t_ns, angle_rad)
+        self._held = self._measured = self._moving = self._lost = False
         self._set_point_nm: float | None = None
         self._ramp_nm: float | None = None
         self._innovation_nm: float | None = None
-        self._origin_rad = self._angle_rad = 0.0
-        self._offset_nm = self._first_offset_nm = 0.0
+        self._origin_rad = self._angle_rad = angle_rad
+        self._offset_nm = self._first_offset_nm = torque_nm
         self._creep_nm = 0.0  # per measurement
-        self._known = self._sum_up = self._sum_down = 0.0
-        self._t_mid_ns = self._fresh_ns = self._t_ns = 0
+        self._known = known_measurements
+        self._sum_up = self._sum_down = 0.0
+        self._t_mid_ns = self._fresh_ns = self._t_ns = t_ns
         self._wanted = self._sent = 0.0
 
     @property
@@ -169,40 +178,18 @@ class TwistController:
         return ControllerState(
             set_point_nm=self._set_point_nm,
             ramp_nm=self._ramp_nm,
-            torque_nm=self._expected_nm(self._angle_rad) if self._started else None,
-            offset_nm=self._offset_nm if self._started else None,
+            torque_nm=self._expected_nm(self._angle_rad),
+            offset_nm=self._offset_nm,
             creep_nm_per_s=self._creep_nm / self.settings.sample_period_s,
             innovation_nm=self._innovation_nm,
         )
 
-    def start(self, t_ns: int, angle_rad: float, torque_nm: float, known_measurements: float = 0.0) -> None:
-        """Reset, and begin at a wrist angle and its torque, known as well as the mean of `known_measurements`.
-
-        The first measurements are averaged with that torque (gain 1/(n+1)) until kp is the greater gain. There is no
-        set point afterwards. Raises UserError for values that are not numbers.
-        """
-        if not (math.isfinite(angle_rad) and math.isfinite(torque_nm) and known_measurements >= 0.0):
-            raise UserError("controller: it cannot start without a wrist angle and a torque that are numbers")
-        self._history = AngleHistory(self._history.span_ns)
-        self._history.add(t_ns, angle_rad)
-        self._started, self._held, self._measured = True, False, False
-        self._moving = self._lost = False
-        self._set_point_nm = self._ramp_nm = self._innovation_nm = None
-        self._origin_rad = self._angle_rad = angle_rad
-        self._offset_nm = self._first_offset_nm = torque_nm
-        self._creep_nm = self._sum_up = self._sum_down = 0.0
-        self._known = known_measurements
-        self._t_mid_ns = self._fresh_ns = self._t_ns = t_ns
-        self._wanted = self._sent = 0.0
-
     def set_point(self, torque_nm: float) -> None:
         """Change the set point; the ramp continues, or begins at the present torque.
 
-        Raises UserError for a torque beyond the limit, and before the start.
+        Raises UserError for a torque beyond the limit.
         """
         limit = self.settings.torque_limit_nm
-        if not self._started:
-            raise UserError("controller: a set point can only be given after the start")
         if not abs(torque_nm) <= limit:
             raise UserError(f"controller: a set point of {torque_nm:g} N·m is not within the limit of {limit:g} N·m")
         self._set_point_nm = torque_nm
@@ -245,8 +232,6 @@ class TwistController:
         own = self.settings
         if torque_nm is None or not math.isfinite(torque_nm):
             return ControllerRefusal.NOT_A_NUMBER
-        if not self._started:
-            return ControllerRefusal.NOT_STARTED
         if t_mid_ns > t_ns:
             return ControllerRefusal.FROM_THE_FUTURE
         if t_mid_ns <= self._t_mid_ns:
@@ -289,8 +274,6 @@ class TwistController:
 
     def _against_motion(self, t_ns: int, wrist_angle_rad: float) -> tuple[ControllerReason, ...]:
         """Store the angle, and return everything that forbids motion now."""
-        if not self._started:
-            return (ControllerReason.NOT_STARTED,)
         stale_ns = self.settings.stale_periods * self.settings.sample_period_s * 1e9
         reasons = []
         if math.isfinite(wrist_angle_rad):

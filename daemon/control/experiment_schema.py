@@ -3,13 +3,11 @@
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, Field
+
+from shearloop.daemon.config_file import ConfigModel, either
 
 MOST_ANGLES = 1000
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 def _angles(given: object) -> object:
@@ -28,13 +26,7 @@ def _angles(given: object) -> object:
     return tuple(np.linspace(start, stop, steps).tolist())
 
 
-def _finite(angles: tuple[float, ...]) -> tuple[float, ...]:
-    if not np.isfinite(angles).all():
-        raise ValueError("angles must be finite numbers")
-    return angles
-
-
-Angles = Annotated[tuple[float, ...], BeforeValidator(_angles), AfterValidator(_finite), Field(min_length=1)]
+Angles = Annotated[tuple[float, ...], BeforeValidator(_angles), Field(min_length=1)]
 Seconds = Annotated[float, Field(ge=0, le=24 * 3600)]
 TorqueNm = Annotated[float, Field(ge=-5, le=5)]
 PositiveTorqueNm = Annotated[float, Field(gt=0, le=5)]
@@ -42,14 +34,14 @@ WristSpeed = Annotated[float, Field(gt=0, le=3.14, description="rad/s")]
 Pose = Annotated[tuple[float, float, float, float, float, float], Field(description="x, y, z in m; rotation vector")]
 
 
-class ExperimentLimits(_Section):
+class ExperimentLimits(ConfigModel):
     """Limits of all steps; a step's limits can only be tighter."""
 
     torque_nm: PositiveTorqueNm = 0.5
     angle_rad: Annotated[float, Field(gt=0, le=6.28, description="from the angle at which the tool was gripped")] = 3.2
 
 
-class _Step(_Section):
+class _Step(ConfigModel):
     timeout_s: Annotated[float, Field(gt=0, le=24 * 3600)] | None = None
     limits: ExperimentLimits | None = None
 
@@ -62,11 +54,7 @@ class ApproachStep(_Step):
     along_tool_m: Annotated[float, Field(ge=-0.5, le=0.5)] | None = None
     speed_m_per_s: Annotated[float, Field(gt=0, le=0.5)] = 0.1
 
-    @model_validator(mode="after")
-    def _one_end(self) -> "ApproachStep":
-        if (self.pose_m_rad is None) == (self.along_tool_m is None):
-            raise ValueError("give either pose_m_rad or along_tool_m, and not both")
-        return self
+    _one_end = either("pose_m_rad", "along_tool_m")
 
 
 class RetreatStep(ApproachStep):
@@ -167,7 +155,7 @@ Step = Annotated[
 ]
 
 
-class ExperimentFile(_Section):
+class ExperimentFile(ConfigModel):
     """One experiment: its torque source, its limits and its steps in order."""
 
     name: Annotated[str, Field(min_length=1, max_length=80)]

@@ -98,17 +98,12 @@ def _wrist_response(period_s: float, bandwidth_per_s: float, actuation_s: float)
 
 
 def pulse_response(model: LoopModel, lag_s: float = 0.0) -> FloatArray:
-    """Return the coefficients (n,) of D in x; `lag_s` moves the windows back. See `window_response`."""
-    return window_response(wrist_response(model), model, lag_s)
+    """Return the coefficients (n,) of D in x: the growth of the windows' mean angle, measurement by measurement.
 
-
-def window_response(angle: FloatArray, model: LoopModel, lag_s: float = 0.0) -> FloatArray:
-    """Return the growth of the windows' mean angle from each measurement to the next (n,).
-
-    `angle` (m,) is the wrist's step response at multiples of the command period, after a unit correction made with
-    measurement 0. Coefficient k is the mean angle of measurement k minus the one of k−1. Raises ValueError if a
-    measurement would see its own correction.
+    After a unit correction made with measurement 0, coefficient k is the mean angle of measurement k minus the one of
+    k−1. `lag_s` moves the windows back. Raises ValueError if a measurement would see its own correction.
     """
+    angle = wrist_response(model)
     period = model.command_period_s
     running = np.concatenate([[0.0], np.cumsum(0.5 * (angle[1:] + angle[:-1])) * period])
     t_s = np.arange(angle.size) * period

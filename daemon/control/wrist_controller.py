@@ -111,9 +111,8 @@ class WristController:
             raise ValueError("a loop is closed on an identified tool")
         if self.controller is None:
             settings = controller_settings(self._config, tool, self.source, setpoint, torque_limit_nm)
-            self.controller = TwistController(settings)
             here_nm = tool.torque_nm + tool.stiffness_nm_per_rad * (wrist_rad - tool.angle_rad)
-            self.controller.start(t_ns, wrist_rad, here_nm, tool.known_measurements)
+            self.controller = TwistController(settings, t_ns, wrist_rad, here_nm, tool.known_measurements)
         self.controller.set_point(setpoint.torque_nm)
         self.tracked = setpoint
 

@@ -129,7 +129,7 @@ async def _check_fingertip(name: str, config: FingertipConfig, seconds: float) -
         path=config.device.path,
         frame_period_s=config.frame_period_s,
     )
-    frames = await _received(board.frames(), seconds)
+    frames = await _received(board.readings(), seconds)
     facts = board.diagnostics()
     if not frames and facts["last_loss"]:
         return [port, from_error(f"rate of {name}", str(facts["last_loss"]), "no frame came")]
@@ -163,7 +163,7 @@ async def _check_load_cell(config: LoadCellConfig, seconds: float) -> list[Findi
         path=config.device.path,
         rate_hz=config.rate_hz,
     )
-    samples = await _received(cell.samples(), seconds)
+    samples = await _received(cell.readings(), seconds)
     measured_hz = _rate_hz([sample.t_arrival_ns for sample in samples])
     findings = [port, check_rate("rate of load_cell", measured_hz, config.rate_hz)]
     if saturated := sum(sample.saturated for sample in samples):

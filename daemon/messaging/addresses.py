@@ -1,5 +1,6 @@
 """Default ZeroMQ addresses and timeouts, and which addresses need CURVE keys."""
 
+import errno
 import ipaddress
 import socket
 from urllib.parse import urlsplit
@@ -59,13 +60,8 @@ def stop_address(address: str) -> str:
     local = local_stop_address(address)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
-        try:
-            probe.connect("\0" + local.removeprefix("ipc://@"))
-        except BlockingIOError:
-            return local
-        except OSError:
-            return address
-    return local
+        error = probe.connect_ex("\0" + local.removeprefix("ipc://@"))
+    return local if error in (0, errno.EAGAIN) else address
 
 
 def network_refusal(address: str, key: str) -> str:

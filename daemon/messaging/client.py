@@ -63,15 +63,14 @@ def send_command(
     with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.SNDTIMEO, int(timeout_s * 1000))
+        socket.setsockopt(zmq.RCVTIMEO, int(timeout_s * 1000))
         connect(socket, address, keys)
         try:
             socket.send(encode(content))
-            answered = bool(socket.poll(int(timeout_s * 1000)))
-        except zmq.Again:
-            answered = False
-        if not answered:
-            raise no_reply(address, timeout_s, keys)
-        return decode_reply(socket.recv(), address)
+            reply = socket.recv()
+        except zmq.Again as error:
+            raise no_reply(address, timeout_s, keys) from error
+        return decode_reply(reply, address)
 
 
 def no_reply(address: str, timeout_s: float, keys: ClientKeys | None) -> UserError:

@@ -21,7 +21,6 @@ from shearloop.daemon.messaging.publisher import bind
 LARGEST_REQUEST_BYTES = 64 * 1024
 MAX_CONCURRENT = 16
 STOP, STATUS = "stop", "status"
-_LONGEST_NAME = 40
 
 # A person, a script and a polling page stay far below these limits. A client in an endless loop does not.
 CLIENT_BURST, CLIENT_PER_S = 20.0, 10.0
@@ -45,12 +44,11 @@ class TokenBucket:
         self._burst = burst
         self._per_s = per_s
         self._tokens = burst
-        self._updated_ns: int | None = None
+        self._updated_ns = 0
 
     def allow(self, t_ns: int) -> bool:
         """Use one token at monotonic time t_ns; return False if no token is left."""
-        if self._updated_ns is not None:
-            self._tokens = min(self._burst, self._tokens + self._per_s * max(0, t_ns - self._updated_ns) / 1e9)
+        self._tokens = min(self._burst, self._tokens + self._per_s * (t_ns - self._updated_ns) / 1e9)
         self._updated_ns = t_ns
         if self._tokens < 1.0:
             return False
@@ -70,12 +68,10 @@ class RateLimit:
 
         Requests above a client's own limit do not count against the total.
         """
-        bucket = self._clients.get(client)
-        if bucket is None:
-            bucket = self._clients[client] = TokenBucket(CLIENT_BURST, CLIENT_PER_S)
-            if len(self._clients) > MAX_CLIENTS:
-                self._clients.popitem(last=False)
+        bucket = self._clients.setdefault(client, TokenBucket(CLIENT_BURST, CLIENT_PER_S))
         self._clients.move_to_end(client)
+        if len(self._clients) > MAX_CLIENTS:
+            self._clients.popitem(last=False)
         return bucket.allow(t_ns) and self._total.allow(t_ns)
 
 
@@ -118,18 +114,22 @@ class CommandServer:
 
     def check(self, client: bytes, frames: list[bytes], t_ns: int) -> tuple[str, Request] | Reply:
         """Return the name and content of a valid request, or the refusal; t_ns is the monotonic time."""
-        request, problem = _decoded(frames)
+        request, problem = {}, ""
+        try:
+            (frame,) = frames
+            request = decode(frame)
+        except ValueError as error:
+            problem = str(error) if len(frames) == 1 else f"{len(frames)} frames, expected one"
         name = request.get("command")
         if name == STOP and STOP in self._handlers:
             return STOP, request
         if not self._limit.allow(client, t_ns):
-            return self._refuse(
-                "too many requests", f"too many requests; send at most {CLIENT_PER_S:g} a second", frequent=True
-            )
+            reason = f"too many requests; send at most {CLIENT_PER_S:g} a second"
+            return self._refuse("too many requests", reason, frequent=True)
         if problem:
             return self._refuse("malformed request", f"the request is {problem}")
         if not isinstance(name, str) or name not in self._handlers:
-            known, shown = ", ".join(sorted(self._handlers)), repr(name)[:_LONGEST_NAME]
+            known, shown = ", ".join(sorted(self._handlers)), repr(name)[:40]
             return self._refuse("unknown command", f"there is no command {shown}; the commands are {known}")
         if len(self._running) >= MAX_CONCURRENT:
             return self._refuse("too many at once", "too many commands at once; wait")
@@ -137,16 +137,16 @@ class CommandServer:
 
     async def execute(self, name: str, request: Request) -> Reply:
         """Call the handler and return the reply; a handler's exception becomes a refusal."""
+        log = structlog.get_logger()
         try:
             reply = await self._handlers[name](request)
         except CommandRefusedError as error:
             return self._refuse(f"{name} refused", str(error), frequent=name == STOP)
-        except Exception as error:  # noqa: BLE001 - a bug in one handler must not stop the server
-            structlog.get_logger().exception("command failed", command=name)
-            return self._refuse(
-                f"{name} failed", f"{name} failed ({type(error).__name__}: {error}); see the daemon's log"
-            )
-        log = structlog.get_logger()
+        except Exception as error:
+            # A bug in one handler must not stop the server.
+            log.exception("command failed", command=name)
+            reason = f"{name} failed ({type(error).__name__}: {error}); see the daemon's log"
+            return self._refuse(f"{name} failed", reason)
         # Pages and scripts ask for the status every second.
         (log.debug if name == STATUS else log.info)("command executed", command=name)
         return {"ok": True, **reply}
@@ -171,13 +171,3 @@ class CommandServer:
     def close(self) -> None:
         """Close the socket after the last replies are sent."""
         self._socket.close()
-
-
-def _decoded(frames: list[bytes]) -> tuple[Request, str]:
-    """Return the content of a request, or an empty one and the problem."""
-    if len(frames) != 1:
-        return {}, f"{len(frames)} frames, expected one"
-    try:
-        return decode(frames[0]), ""
-    except ValueError as error:
-        return {}, str(error)

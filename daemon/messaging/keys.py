@@ -23,7 +23,6 @@ from shearloop.daemon.errors import UserError
 # The unit's `SetCredential` gives this value until the server key exists.
 _NO_CREDENTIAL = "none"
 _DOMAIN = "shearloop"
-KEY_LENGTH = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,13 +157,13 @@ class CurveAuthenticator:
             self.refused["allow-list cannot be read"] += 1
             log.warning("client refused", reason=str(error))
             return False
-        if name is None:
-            self.refused["key is not allowed"] += 1
-            if self.refused["key is not allowed"] == 1:
-                log.warning("client refused: its key is not in the allow-list", key=key.decode())
-            return False
-        log.info("client accepted", client=name)
-        return True
+        if name is not None:
+            log.info("client accepted", client=name)
+            return True
+        self.refused["key is not allowed"] += 1
+        if self.refused["key is not allowed"] == 1:
+            log.warning("client refused: its key is not in the allow-list", key=key.decode())
+        return False
 
     async def run(self) -> None:
         """Answer libzmq's authentication requests until cancelled."""
@@ -187,20 +186,13 @@ def _load(path: Path) -> tuple[bytes, bytes | None]:
         raise UserError(f"{path}: the key cannot be read: {reason}; make it with `shearloop keys`") from error
     except ValueError as error:
         raise UserError(f"{path} is no key file; make one with `shearloop keys`") from error
-    for key in (public, secret):
-        if key is not None and not _is_key(key):
-            raise UserError(f"{path} holds a damaged key; make a new one with `shearloop keys`")
-    return public, secret
-
-
-def _is_key(key: bytes) -> bool:
-    if len(key) != KEY_LENGTH:
-        return False
     try:
-        z85.decode(key)
-    except (KeyError, struct.error):
-        return False
-    return True
+        sizes = {len(z85.decode(key)) for key in (public, secret) if key is not None}
+    except (KeyError, ValueError, struct.error):
+        sizes = set()
+    if sizes != {32}:
+        raise UserError(f"{path} holds a damaged key; make a new one with `shearloop keys`")
+    return public, secret
 
 
 def _key_file(public: bytes, secret: bytes | None = None) -> str:

@@ -1,5 +1,6 @@
 """The publisher: sends messages over ZeroMQ and passes them to listeners in this process."""
 
+import errno
 import os
 import socket as sockets
 import stat
@@ -130,16 +131,12 @@ def _check_ipc_path(address: str, key: str) -> None:
     with sockets.socket(sockets.AF_UNIX, sockets.SOCK_STREAM) as probe:
         # A listener whose queue is full must not block.
         probe.setblocking(False)
-        try:
-            probe.connect(path)
-        except ConnectionRefusedError:
-            # A killed daemon left the socket behind.
-            return
-        except BlockingIOError:
-            pass
-        except OSError as error:
-            raise UserError(f"`{key}: {address}` cannot be bound ({error.strerror}); choose another address") from error
+        error = probe.connect_ex(path)
+    if error in (0, errno.EAGAIN):
         raise _in_use(address, key)
+    # A killed daemon leaves the socket behind.
+    if error != errno.ECONNREFUSED:
+        raise UserError(f"`{key}: {address}` cannot be bound ({os.strerror(error)}); choose another address")
 
 
 def _in_use(address: str, key: str) -> UserError:

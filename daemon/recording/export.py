@@ -11,10 +11,9 @@ import numpy as np
 from scipy.io import savemat
 
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.reader import check_identity, open_recording
-from shearloop.daemon.recording.schema import METADATA, schema_name, with_missing_keys
 
-_LOG_TIME = "log_time_ns"
 Rows = list[dict[str, Any]]
 Progress = Callable[[int], None]
 
@@ -22,7 +21,7 @@ Progress = Callable[[int], None]
 def count_messages(path: Path) -> dict[str, int]:
     """Return the number of messages of each topic; raises UserError for a file that cannot be used."""
     with open_recording(path) as recording:
-        check_identity(path, recording.metadata().get(METADATA))
+        check_identity(path, recording.metadata().get(schema.METADATA))
         return recording.counts
 
 
@@ -34,15 +33,12 @@ def export(path: Path, form: str, out: Path, topics: list[str], progress: Progre
     """
     done = itertools.count(1)
 
-    def count() -> None:
-        progress(next(done))
+    def rows(topic: str) -> Rows:
+        return _read_rows(path, topic, lambda: progress(next(done)))
 
     try:
         if form == "mat":
-            structs = {
-                topic.replace(".", "_").replace("-", "_"): _matlab_struct(read_rows(path, topic, count))
-                for topic in topics
-            }
+            structs = {topic.replace(".", "_").replace("-", "_"): _matlab_struct(rows(topic)) for topic in topics}
             # savemat changes names and hides the reason if it opens the file itself.
             with out.open("wb") as file:
                 # The stubs allow only names.
@@ -50,24 +46,23 @@ def export(path: Path, form: str, out: Path, topics: list[str], progress: Progre
             return [out]
         out.mkdir(parents=True, exist_ok=True)
         write = {"csv": _write_csv, "parquet": _write_parquet}[form]
-        written = []
-        for topic in topics:
-            written.append(out / f"{topic}.{form}")
-            write(written[-1], read_rows(path, topic, count))
+        written = [out / f"{topic}.{form}" for topic in topics]
+        for topic, file_path in zip(topics, written, strict=True):
+            write(file_path, rows(topic))
     except OSError as error:
         raise UserError(f"{out}: the export cannot be written: {error.strerror or error}") from error
     return written
 
 
-def read_rows(path: Path, topic: str, count: Callable[[], None] = lambda: None) -> Rows:
+def _read_rows(path: Path, topic: str, count: Callable[[], None]) -> Rows:
     """Return a topic's messages by time: log_time_ns first, maps as JSON text, None for a missing value."""
     rows = []
     with open_recording(path) as recording:
-        live = schema_name(topic)
+        live = schema.schema_name(topic)
         for _, message in recording.messages([topic]):
-            content = with_missing_keys(live, json.loads(message.data))
+            content = schema.with_missing_keys(live, json.loads(message.data))
             row = {key: json.dumps(value) if isinstance(value, dict) else value for key, value in content.items()}
-            rows.append({_LOG_TIME: message.log_time, **row})
+            rows.append({"log_time_ns": message.log_time, **row})
             count()
     return rows
 

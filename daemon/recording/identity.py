@@ -2,12 +2,11 @@
 
 import hashlib
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from pydantic_core import PydanticSerializationError
@@ -15,12 +14,9 @@ from pydantic_core import PydanticSerializationError
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.config_file import ConfigModel
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.schema import CONFIGURATION, DIAMETER_NOTE, FORMAT_VERSION
-
-Model = TypeVar("Model", bound=ConfigModel)
 
 # Configuration keys of files to attach. Secret keys are never attached, and a bank is identified by its hash.
 _ATTACHED = ("calibration", "robot", "experiment")
@@ -79,14 +75,11 @@ def daemon_identity(config: DaemonConfig) -> Identity:
             metadata[f"bank_{name}"] = Bank.open(fingertip.bank).identity
     attached = {CONFIGURATION: AttachedFile(CONFIGURATION, "application/json", _as_json(config))}
 
-    def attach(key: str, path: Path) -> Path:
-        if key in _ATTACHED:
+    for key, path in config.walk():
+        if isinstance(path, Path) and key.rpartition(".")[2] in _ATTACHED:
             for file in AttachedFile.read(path):
                 attached[file.name] = file
                 metadata[f"sha256 {path}"] = hashlib.sha256(file.data).hexdigest()
-        return path
-
-    map_paths(config, attach)
     return Identity(metadata, tuple(attached.values()))
 
 
@@ -113,22 +106,6 @@ def code_digest() -> str:
             digest.update(f"{path.relative_to(root)}\0".encode())
             digest.update(path.read_bytes())
     return digest.hexdigest()
-
-
-def map_paths(section: Model, change: Callable[[str, Path], Path]) -> Model:
-    """Return a copy of a configuration with each path replaced by `change(key, path)`."""
-    changed: dict[str, object] = {}
-    for key in type(section).model_fields:
-        value = getattr(section, key)
-        if isinstance(value, Path):
-            changed[key] = change(key, value)
-        elif isinstance(value, ConfigModel):
-            changed[key] = map_paths(value, change)
-        elif isinstance(value, dict):
-            changed[key] = {
-                name: map_paths(item, change) if isinstance(item, ConfigModel) else item for name, item in value.items()
-            }
-    return section.model_copy(update=changed)
 
 
 def _as_json(config: DaemonConfig) -> bytes:

@@ -121,11 +121,8 @@ def _diameter_mm(files: Sequence[Path]) -> str | None:
 def _mat_files(sources: Sequence[Path]) -> list[Path]:
     found: list[Path] = []
     for source in sources:
-        if source.is_dir():
-            inside = sorted(source.glob("*.mat"))
-            if not inside:
-                raise UserError(f"{source} holds no .mat files; name the folder of one recording")
-            found += inside
-        else:
-            found.append(source)
+        inside = sorted(source.glob("*.mat")) if source.is_dir() else [source]
+        if not inside:
+            raise UserError(f"{source} holds no .mat files; name the folder of one recording")
+        found += inside
     return found

@@ -8,7 +8,7 @@ import math
 import re
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -41,14 +41,8 @@ _COMPLEX_FLAG = 0x0800
 _LARGEST_VARIABLE_BYTES = 1 << 30
 
 
-@dataclass(frozen=True, slots=True)
-class NotAMatrix:
-    """A variable that is no matrix of real numbers, with a description."""
-
-    description: str
-
-
-Variable: TypeAlias = FloatArray | NotAMatrix
+# A matrix of real numbers, or the description of something else.
+Variable: TypeAlias = FloatArray | str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,10 +101,8 @@ def read_stream(path: str | Path, side: str | None = None) -> Stream:
     """
     path = Path(path)
     variables = _load(path)
-    sides = _SIDES if side is None else {side: _SIDES[side]}
-    table = _one_of(path, variables, [name for names in sides.values() for name in names])
-    unix_s, lines = _timed(path, table, N_LINE_VALUES)
-    return Stream(unix_s, lines)
+    names = sum(_SIDES.values(), ()) if side is None else _SIDES[side]
+    return Stream(*_timed(path, _one_of(path, variables, names), N_LINE_VALUES))
 
 
 def read_load_stream(path: str | Path) -> LoadStream:
@@ -131,49 +123,37 @@ def read_torque_slices(folder: str | Path) -> TorqueSlices:
 
     Raises UserError for a folder without any, and for a file that cannot be used.
     """
-    folder = Path(folder)
-    files = sorted((int(found[1]), path) for path, found in _matching(folder, _TORQUE_SLICE))
-    if not files:
-        raise UserError(f"{folder} has no torque slices: expected files named Data_Slice_1.mat, Data_Slice_2.mat …")
-    slices = [_slice(path, "torque_value") for _, path in files]
-    return TorqueSlices(
-        np.array([difference for difference, _ in slices]),
-        np.array([torque for _, torque in slices]),
-        np.array([number for number, _ in files]),
-    )
+    examples = "Data_Slice_1.mat, Data_Slice_2.mat"
+    numbers, differences, torque_nm = _read_slices(folder, "torque", _TORQUE_SLICE, "torque_value", examples)
+    return TorqueSlices(differences, torque_nm, numbers[:, 0].astype(int))
 
 
 def read_diameter_slices(folder: str | Path) -> DiameterSlices:
     """Return the slices DDmm_Data_N.mat of a folder by rising diameter, then N; raises as `read_torque_slices` does."""
-    folder = Path(folder)
-    files = sorted((float(found[1]), int(found[2]), path) for path, found in _matching(folder, _DIAMETER_SLICE))
-    if not files:
-        raise UserError(f"{folder} has no diameter slices: expected files named 10mm_Data_1.mat, 20mm_Data_1.mat …")
-    slices = [_slice(path, "mean_torque") for *_, path in files]
-    return DiameterSlices(
-        np.array([difference for difference, _ in slices]),
-        np.array([diameter for diameter, *_ in files]),
-        np.array([torque for _, torque in slices]),
-    )
+    examples = "10mm_Data_1.mat, 20mm_Data_1.mat"
+    numbers, differences, torque_nm = _read_slices(folder, "diameter", _DIAMETER_SLICE, "mean_torque", examples)
+    return DiameterSlices(differences, numbers[:, 0], torque_nm)
 
 
-def _matching(folder: Path, pattern: re.Pattern[str]) -> Iterator[tuple[Path, re.Match[str]]]:
+def _read_slices(
+    folder: str | Path, kind: str, pattern: re.Pattern[str], torque_name: str, examples: str
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the numbers (n, m) in the files' names in rising order, the differences (n, 896) and torques (n,)."""
     try:
-        paths = list(folder.iterdir())
+        found = [(pattern.fullmatch(path.name), path) for path in Path(folder).iterdir()]
     except OSError as error:
         raise UserError(f"{folder}: the recordings cannot be listed: {error.strerror}") from error
-    for path in paths:
-        if found := pattern.fullmatch(path.name):
-            yield path, found
-
-
-def _slice(path: Path, torque_name: str) -> tuple[FloatArray, float]:
-    variables = _load(path)
-    difference = _row(path, _one_of(path, variables, ["data_diff"]), N_CHANNELS)
-    if not difference.any():
-        raise UserError(f"{path}: data_diff is zero in all channels; leave this slice out")
-    torque = _row(path, _one_of(path, variables, [torque_name]), 1)
-    return difference, float(torque[0])
+    files = sorted((tuple(map(float, match.groups())), path) for match, path in found if match)
+    if not files:
+        raise UserError(f"{folder} has no {kind} slices: expected files named {examples} …")
+    differences, torques = [], []
+    for _, path in files:
+        variables = _load(path)
+        differences.append(_row(path, _one_of(path, variables, ["data_diff"]), N_CHANNELS))
+        if not differences[-1].any():
+            raise UserError(f"{path}: data_diff is zero in all channels; leave this slice out")
+        torques.append(_row(path, _one_of(path, variables, [torque_name]), 1)[0])
+    return np.array([numbers for numbers, _ in files]), np.array(differences), np.array(torques)
 
 
 def _load(path: Path) -> dict[str, Variable]:
@@ -200,8 +180,8 @@ def _one_of(path: Path, variables: dict[str, Variable], names: Sequence[str]) ->
         others = ", ".join(variables) or "no variable"
         raise UserError(f"{path} holds {others}, expected {' or '.join(names)}")
     values = variables[present[0]]
-    if isinstance(values, NotAMatrix):
-        raise UserError(f"{path}: {present[0]} is {values.description}, expected a matrix of real numbers")
+    if isinstance(values, str):
+        raise UserError(f"{path}: {present[0]} is {values}, expected a matrix of real numbers")
     if not np.isfinite(values).all():
         raise UserError(f"{path}: {int((~np.isfinite(values)).sum())} values of {present[0]} are not finite numbers")
     return values
@@ -297,9 +277,9 @@ def _variable(parts: _Elements) -> tuple[str, Variable]:
     number_class, is_complex = int(flags[0]) & 0xFF, bool(int(flags[0]) & _COMPLEX_FLAG)
     size = " × ".join(map(str, shape))
     if number_class not in _NUMBER_CLASSES:
-        return name, NotAMatrix(f"{size} {_OTHER_CLASSES.get(number_class, f'of the unknown class {number_class}')}")
+        return name, f"{size} {_OTHER_CLASSES.get(number_class, f'of the unknown class {number_class}')}"
     if is_complex or len(shape) != 2:
-        return name, NotAMatrix(f"{size} {'complex' if is_complex else 'real'} numbers")
+        return name, f"{size} {'complex' if is_complex else 'real'} numbers"
     values = parts.numbers(_STORED)
     if len(values) != math.prod(shape):
         raise MatFileError(f"{name} has {len(values)} numbers for a matrix of {size}")

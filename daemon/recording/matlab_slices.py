@@ -31,7 +31,6 @@ MIN_FRAMES = 3
 CLIPPED_V = 0.45
 # More than a minute of frames and torques at 1.85 and 10.9 Hz.
 MAX_FRAMES, MAX_TORQUES = 256, 4096
-_FINAL_PHASES = ("done", "stopped")
 TORQUE_FOLDER, DIAMETER_FOLDER = "torque_slices", "diameter_slices"
 RAW_FRAME, RAW_HOMOGENEOUS = "TorqueSlice.mat", "TorqueSliceHom.mat"
 
@@ -72,8 +71,7 @@ class SliceRecorder:
         self._lock = threading.Lock()
         self._frames: dict[str, deque[_SliceFrame]] = {}
         self._torques: deque[tuple[int, float]] = deque(maxlen=MAX_TORQUES)
-        # The frames of the running `tare` step and its start, None outside such a step.
-        self._tare_frames: dict[str, list[_SliceFrame]] = {}
+        # The start of the running `tare` step.
         self._tare_from_ns: int | None = None
         self._homogeneous: dict[str, tuple[FloatArray, FloatArray]] = {}
         self._diameter_mm: float | None = None
@@ -121,16 +119,13 @@ class SliceRecorder:
         source, t_ns = content["source"], content["t_mono_ns"]
         frame = _SliceFrame(t_ns, _wire_array(content["channels"]), _wire_array(content["line"]))
         self._frames.setdefault(source, deque(maxlen=MAX_FRAMES)).append(frame)
-        if self._tare_from_ns is not None:
-            self._tare_frames.setdefault(source, []).append(frame)
         if self._pending is not None and source == self._pending.source and t_ns > self._pending.to_ns:
             self._write_pending()
 
     def _update_loop(self, content: Mapping[str, Any]) -> None:
-        now_ns, ended = content["t_mono_ns"], content["phase"] in _FINAL_PHASES
+        now_ns, ended = content["t_mono_ns"], content["phase"] in ("done", "stopped")
         tares = content["step_name"] == "tare" and content["phase"] == "running"
         if tares and self._tare_from_ns is None:
-            self._tare_frames.clear()
             self._tare_from_ns = now_ns
         elif self._tare_from_ns is not None and not tares:
             self._end_tare(self._tare_from_ns)
@@ -155,21 +150,18 @@ class SliceRecorder:
         return torque_source
 
     def _end_tare(self, began_ns: int) -> None:
-        for source, frames in self._tare_frames.items():
+        for source, frames in self._frames.items():
             # The acquisition of the first frame began before the step, maybe with a tool in the fingers.
-            from_ns = began_ns + _half_period_ns(self._frames[source])
+            from_ns = began_ns + _half_period_ns(frames)
             lines = [frame.line for frame in frames if frame.t_ns >= from_ns]
             if lines:
                 mean = np.mean(lines, axis=0)
                 self._homogeneous[source] = (channels_of_line(mean), mean)
-        self._tare_frames.clear()
 
     def _write_pending(self) -> None:
-        if self._pending is not None:
-            hold, self._pending = self._pending, None
-            self._write(hold)
-
-    def _write(self, hold: _Hold) -> None:
+        if self._pending is None:
+            return
+        hold, self._pending = self._pending, None
         known = self._frames.get(hold.source, ())
         # The whole acquisition of a frame must lie in the hold.
         half_ns = _half_period_ns(known)

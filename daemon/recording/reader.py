@@ -1,48 +1,31 @@
 """Reads recordings that were closed; refuses foreign, damaged and outdated files with one sentence."""
 
 import json
-import mmap
-import struct
 import zlib
+from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
-from mcap.records import Channel, Message
-from mcap.summary import Summary
+from mcap.records import Channel, Footer, Message
+from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_LINE_VALUES
 from shearloop.bank.estimation import Measured
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.schema import (
-    DIAMETER_NOTE,
-    EXPERIMENT_METADATA,
-    FORMAT_VERSION,
-    FRAME_TOPIC,
-    LOAD_TOPIC,
-    METADATA,
-    input_event,
-    input_topic,
-)
+from shearloop.daemon.recording import schema
 from shearloop.daemon.sensing.tool_diameter import tool_from_bytes
 from shearloop.drivers.serial_sensor import InputKind
 
 # Metadata of every recording; the other keys are notes of this one.
 _IDENTITY_KEYS = ("format_version", "channel_table_hash", "software", "code_sha256")
-# The end of an MCAP file (https://mcap.dev/spec): the footer's opcode and length, the offsets of summary and summary
-# offsets, the summary's checksum, and the magic bytes. Before the summary: the opcode, length and checksum of DataEnd.
-_END = struct.Struct("<BQQQI8s")
-_DATA_END = struct.Struct("<BQI")
-_FOOTER_OPCODE, _FOOTER_BYTES, _DATA_END_OPCODE = 0x02, 20, 0x0F
-# The summary's checksum covers the footer up to the checksum itself.
-_AFTER_CHECKSUM = 4 + len(MCAP0_MAGIC)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,20 +55,17 @@ class OpenRecording:
     """An open recording: its topics, metadata, attachments and messages."""
 
     def __init__(self, file: IO[bytes]) -> None:
-        """Check that the file was closed and matches its checksums; raises McapError or ValueError."""
+        """Check that the file was closed and matches its checksums; raises many types of errors."""
+        file.seek(0)
         _check_checksums(file)
         file.seek(0)
         self._reader = make_reader(file, validate_crcs=True)
         summary = self._reader.get_summary()
         if summary is None or summary.statistics is None:
             raise McapError("it has no index")
-        self.summary: Summary = summary
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """The number of messages of each topic."""
-        counts = self.summary.statistics.channel_message_counts if self.summary.statistics is not None else {}
-        return {channel.topic: counts.get(channel.id, 0) for channel in self.summary.channels.values()}
+        counts = summary.statistics.channel_message_counts
+        # The number of messages of each topic.
+        self.counts = {channel.topic: counts.get(channel.id, 0) for channel in summary.channels.values()}
 
     def metadata(self) -> dict[str, dict[str, str]]:
         """Return the metadata records by name."""
@@ -138,8 +118,8 @@ def check_identity(path: Path, identity: dict[str, str] | None) -> dict[str, str
     """Return the identity of a recording; raises UserError for other files and other versions."""
     if identity is None:
         raise _unusable(path, "it is an MCAP file, but not a recording of shearloop")
-    if identity.get("format_version") != FORMAT_VERSION:
-        raise _unusable(path, f"it has format version {identity.get('format_version')}, expected {FORMAT_VERSION}")
+    if (version := identity.get("format_version")) != schema.FORMAT_VERSION:
+        raise _unusable(path, f"it has format version {version}, expected {schema.FORMAT_VERSION}")
     found = str(identity.get("channel_table_hash"))
     if found != CHANNEL_TABLE_HASH:
         raise _unusable(path, f"it has the channel table {found[:12]}…, expected {CHANNEL_TABLE_HASH[:12]}…")
@@ -154,15 +134,15 @@ def read_recording(path: str | Path) -> Recording:
     tools: list[tuple[int, Measured | None]] = []
     with open_recording(path) as recording:
         metadata = recording.metadata()
-        identity = check_identity(path, metadata.get(METADATA))
-        frame_topics = [topic for topic in recording.counts if topic.startswith(f"{FRAME_TOPIC}.")]
-        sides = {topic: topic.removeprefix(f"{FRAME_TOPIC}.") for topic in frame_topics}
-        inputs = [input_topic(side) for side in sides.values()]
-        for channel, message in recording.messages([LOAD_TOPIC, *sides, *inputs]):
+        identity = check_identity(path, metadata.get(schema.METADATA))
+        prefix = f"{schema.FRAME_TOPIC}."
+        sides = {topic: topic.removeprefix(prefix) for topic in recording.counts if topic.startswith(prefix)}
+        inputs = [schema.input_topic(side) for side in sides.values()]
+        for channel, message in recording.messages([schema.LOAD_TOPIC, *sides, *inputs]):
             topic, t_ns = channel.topic, message.log_time
             try:
-                content = _json_object(message.data)
-                if topic == LOAD_TOPIC:
+                content = dict(json.loads(message.data))
+                if topic == schema.LOAD_TOPIC:
                     if "torque_nm" in content and content.get("valid", True):
                         torques.append((t_ns, float(content["torque_nm"])))
                 elif topic in sides:
@@ -174,13 +154,13 @@ def read_recording(path: str | Path) -> Recording:
                     if not rows or rows[-1][2] != line:
                         rows.append((t_ns, int(content["arrival_unix_ns"]), line))
                 elif content["kind"] == InputKind.TOOL.value:
-                    tools.append((t_ns, tool_from_bytes(input_event(content).data)[1]))
+                    tools.append((t_ns, tool_from_bytes(schema.input_event(content).data)[1]))
             except (KeyError, TypeError, ValueError) as error:
                 raise _unusable(path, f"a message on {topic} does not match its schema ({error!r})") from error
     notes = {key: value for key, value in identity.items() if key not in _IDENTITY_KEYS}
-    experiment = metadata.get(EXPERIMENT_METADATA, {})
-    if DIAMETER_NOTE in experiment:
-        notes[DIAMETER_NOTE] = experiment[DIAMETER_NOTE]
+    experiment = metadata.get(schema.EXPERIMENT_METADATA, {})
+    if schema.DIAMETER_NOTE in experiment:
+        notes[schema.DIAMETER_NOTE] = experiment[schema.DIAMETER_NOTE]
     return Recording(
         path,
         notes.pop("source", ""),
@@ -197,28 +177,16 @@ def _side_frames(rows: list[tuple[int, int, list[float]]]) -> SideFrames:
     return SideFrames(np.array(t_mid_ns, np.int64), np.array(arrival_ns, np.int64), np.array(lines, np.float64))
 
 
-def _json_object(data: bytes) -> dict[str, Any]:
-    content = json.loads(data)
-    if not isinstance(content, dict):
-        raise TypeError("not a JSON object")
-    return content
-
-
 def _check_checksums(file: IO[bytes]) -> None:
-    """Raise McapError for a file that was not closed, ValueError for one that does not match its checksums."""
-    with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped, memoryview(mapped) as content:
-        size = len(content)
-        if size < len(MCAP0_MAGIC) + _END.size:
-            raise McapError(f"it ends after {size} bytes")
-        opcode, length, summary_start, _, summary_crc, magic = _END.unpack_from(content, size - _END.size)
-        if (opcode, length, magic) != (_FOOTER_OPCODE, _FOOTER_BYTES, MCAP0_MAGIC) or not summary_start:
-            raise McapError("it has no index at its end")
-        if summary_crc and zlib.crc32(content[summary_start : size - _AFTER_CHECKSUM]) != summary_crc:
-            raise ValueError("its index does not match its checksum")
-        data_end = summary_start - _DATA_END.size
-        opcode, _, data_crc = _DATA_END.unpack_from(content, data_end)
-        if opcode != _DATA_END_OPCODE or (data_crc and zlib.crc32(content[:data_end]) != data_crc):
-            raise ValueError("its data does not match its checksum")
+    """Raise an error for a file that was not closed or does not match its checksums; mcap does not check the index."""
+    (footer,) = deque(StreamReader(file, emit_chunks=True, validate_crcs=True).records, maxlen=1)
+    if not isinstance(footer, Footer) or not footer.summary_start:
+        raise McapError("it has no index at its end")
+    file.seek(footer.summary_start)
+    # The checksum covers the footer up to itself.
+    index = file.read()[: -4 - len(MCAP0_MAGIC)]
+    if footer.summary_crc and zlib.crc32(index) != footer.summary_crc:
+        raise ValueError("its index does not match its checksum")
 
 
 def _unusable(path: Path, reason: str) -> UserError:

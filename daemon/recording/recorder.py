@@ -12,26 +12,16 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeAlias
+from typing import Any
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import Scalar
+from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.identity import AttachedFile, Identity
-from shearloop.daemon.recording.schema import (
-    CLOCK_TOPIC,
-    END_METADATA,
-    EXPERIMENT_METADATA,
-    METADATA,
-    NoJsonError,
-    as_json,
-    input_json,
-    input_topic,
-    message_json,
-    recorded_topic,
-)
 from shearloop.daemon.recording.writer import McapFile
 from shearloop.drivers.serial_sensor import InputKind, OnRaw, RawEvent
 
@@ -42,34 +32,16 @@ MAX_WAITING_BYTES = 32 << 20
 LONGEST_IDLE_FILE_S = 3600.0
 # Memory of a message apart from its arrays.
 _OVERHEAD_BYTES = 1000
-# Files that begin in the same second.
-_MAX_PER_SECOND = 100
 
 
 @dataclass(frozen=True, slots=True)
-class _Message:
-    topic: str
-    content: Mapping[str, Any]
-    offset_ns: int
-    now_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class _Input:
-    source: str
-    event: RawEvent
-    offset_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class _Experiment:
-    name: str
-    attached: tuple[AttachedFile, ...]
-    notes: Mapping[str, str]
-    t_unix_ns: int
-
-
-_Item: TypeAlias = _Message | _Input | _Experiment
+class _Item:
+    # Adds it to the current file.
+    add: Callable[[], None]
+    size: int
+    # Items dropped before this one.
+    dropped: int
+    begins_experiment: bool
 
 
 class Recorder:
@@ -98,8 +70,7 @@ class Recorder:
         self._on_failure = on_failure
         self._open_file = open_file
         self._max_waiting_bytes = max_waiting_bytes
-        # Each item with its size and the number of items dropped before it.
-        self._queue: deque[tuple[_Item, int, int]] = deque()
+        self._queue: deque[_Item] = deque()
         # One thread counts each of these up. Their difference is the size of the queue.
         self._queued_bytes = 0
         self._done_bytes = 0
@@ -131,13 +102,14 @@ class Recorder:
         """Queue a published message."""
         # A float32 becomes about eight bytes of JSON.
         size = _OVERHEAD_BYTES + 2 * sum(len(value) for value in content.values() if isinstance(value, bytes))
-        self._enqueue(_Message(topic, content, self._clock.offset_ns, self._clock.now_ns()), size)
+        self._enqueue(size, partial(self._add_message, topic, content, self._clock.now_ns(), self._clock.offset_ns))
 
     def input_recorder(self, source: str) -> OnRaw:
         """Return a function that records the raw input of one source."""
 
         def record_input(event: RawEvent) -> None:
-            self._enqueue(_Input(source, event, self._clock.offset_ns), _OVERHEAD_BYTES + len(event.data))
+            add = partial(self._add_input, source, event, self._clock.offset_ns)
+            self._enqueue(_OVERHEAD_BYTES + len(event.data), add)
 
         return record_input
 
@@ -145,7 +117,9 @@ class Recorder:
         self, name: str, attached: tuple[AttachedFile, ...] = (), notes: Mapping[str, str] = MappingProxyType({})
     ) -> None:
         """Record the start of an experiment: a new file begins, unless the current one has no experiment yet."""
-        self._enqueue(_Experiment(name, attached, notes, self._clock.now_ns() + self._clock.offset_ns), _OVERHEAD_BYTES)
+        t_unix_ns = self._clock.now_ns() + self._clock.offset_ns
+        add = partial(self._add_experiment, name, attached, notes, t_unix_ns)
+        self._enqueue(_OVERHEAD_BYTES, add, begins_experiment=True)
 
     async def run(self) -> None:
         """Write every FLUSH_S until cancelled."""
@@ -197,24 +171,24 @@ class Recorder:
     def _waiting_bytes(self) -> int:
         return self._queued_bytes - self._done_bytes + self._file.bytes_waiting
 
-    def _enqueue(self, item: _Item, size: int) -> None:
+    def _enqueue(self, size: int, add: Callable[[], None], *, begins_experiment: bool = False) -> None:
         if self._waiting_bytes + size > self._max_waiting_bytes:
             self._dropped += 1
             return
         self._queued_bytes += size
-        self._queue.append((item, size, self._dropped))
+        self._queue.append(_Item(add, size, self._dropped, begins_experiment))
 
     def _write(self) -> None:
         self.failure = ""
         # Items that arrive meanwhile wait for the next flush.
         for _ in range(len(self._queue)):
-            item, size, dropped = self._queue.popleft()
-            if self._needs_new_file(item):
-                self._change_file(dropped)
+            item = self._queue.popleft()
+            if self._experiment if item.begins_experiment else self._is_idle_too_long():
+                self._change_file(item.dropped)
             try:
-                self._add(item)
+                item.add()
             finally:
-                self._done_bytes += size
+                self._done_bytes += item.size
         self._flush()
 
     def _flush(self) -> bool:
@@ -225,9 +199,7 @@ class Recorder:
             return False
         return True
 
-    def _needs_new_file(self, item: _Item) -> bool:
-        if isinstance(item, _Experiment):
-            return bool(self._experiment)
+    def _is_idle_too_long(self) -> bool:
         return (self._clock.now_ns() - self._began_ns) / 1e9 > LONGEST_IDLE_FILE_S and not self._is_busy()
 
     def _change_file(self, dropped: int) -> None:
@@ -243,13 +215,13 @@ class Recorder:
         self._finish_file(previous, experiment, dropped + self._unwritable)
         for source, event in self._tools.items():
             # The tool is still held, and a replay of this file must know it.
-            self._add(_Input(source, replace(event, t_ns=self._began_ns), self._clock.offset_ns))
+            self._add_input(source, replace(event, t_ns=self._began_ns), self._clock.offset_ns)
 
     def _begin_file(self) -> None:
         now_ns, offset_ns = self._clock.now_ns(), self._clock.offset_ns
         file = self._create_file(datetime.fromtimestamp((now_ns + offset_ns) / 1e9, UTC).strftime("%Y-%m-%dT%H-%M-%SZ"))
         try:
-            file.add_metadata(METADATA, self._identity.metadata)
+            file.add_metadata(schema.METADATA, self._identity.metadata)
             for one in self._identity.attached:
                 file.attach(one.name, one.media_type, one.data, now_ns + offset_ns)
             file.flush()
@@ -263,12 +235,14 @@ class Recorder:
         self._experiment = ""
 
     def _create_file(self, name: str) -> McapFile:
-        for number in range(2, _MAX_PER_SECOND):
+        number, path = 1, self._folder / f"{name}.mcap"
+        while True:
             try:
-                return self._open_file(self._folder / f"{name}.mcap")
+                return self._open_file(path)
             except FileExistsError:
-                name = f"{name.partition('Z')[0]}Z-{number}"
-        raise FileExistsError(17, f"there are {_MAX_PER_SECOND} files of this second")
+                # It began in the same second.
+                number += 1
+                path = self._folder / f"{name}-{number}.mcap"
 
     def _finish_file(self, file: McapFile, experiment: str, lost: int) -> None:
         """Close a file under a name with its experiment; if that fails, the PARTIAL file stays for a repair."""
@@ -276,40 +250,42 @@ class Recorder:
         if slug:
             file.path = file.path.with_name(f"{file.path.stem}_{slug}.mcap")
         try:
-            file.add_metadata(END_METADATA, {"dropped": str(lost - self._lost_before)})
+            file.add_metadata(schema.END_METADATA, {"dropped": str(lost - self._lost_before)})
             self.finished.append(file.close())
         except OSError as error:
             self.failure = f"{file.partial}: {error.strerror}"
         self._lost_before = lost
 
-    def _add(self, item: _Item) -> None:
-        match item:
-            case _Message(topic, content, offset_ns, now_ns):
-                self._add_clock(now_ns, offset_ns)
-                name = recorded_topic(topic, content["source"])
-                try:
-                    data = message_json(topic, content, offset_ns)
-                except NoJsonError as error:
-                    self._unwritable += 1
-                    self._last_unwritable = f"a message of {name} has no JSON form and is left out: {error}"
-                    return
-                self._file.add(name, content["t_mono_ns"] + offset_ns, now_ns + offset_ns, data)
-            case _Input(source, event, offset_ns):
-                if event.kind is InputKind.TOOL:
-                    self._tools[source] = event
-                self._add_clock(event.t_ns, offset_ns)
-                t_unix_ns = event.t_ns + offset_ns
-                self._file.add(input_topic(source), t_unix_ns, t_unix_ns, input_json(event))
-            case _Experiment(name, attached, notes, t_unix_ns):
-                self._experiment = name
-                self._file.add_metadata(EXPERIMENT_METADATA, {**notes, "name": name, "t_unix_ns": str(t_unix_ns)})
-                for one in attached:
-                    if one not in self._identity.attached:
-                        self._file.attach(one.name, one.media_type, one.data, t_unix_ns)
+    def _add_message(self, topic: str, content: Mapping[str, Any], now_ns: int, offset_ns: int) -> None:
+        self._add_clock(now_ns, offset_ns)
+        name = schema.recorded_topic(topic, content["source"])
+        try:
+            data = schema.message_json(topic, content, offset_ns)
+        except schema.NoJsonError as error:
+            self._unwritable += 1
+            self._last_unwritable = f"a message of {name} has no JSON form and is left out: {error}"
+            return
+        self._file.add(name, content["t_mono_ns"] + offset_ns, now_ns + offset_ns, data)
+
+    def _add_input(self, source: str, event: RawEvent, offset_ns: int) -> None:
+        if event.kind is InputKind.TOOL:
+            self._tools[source] = event
+        self._add_clock(event.t_ns, offset_ns)
+        t_unix_ns = event.t_ns + offset_ns
+        self._file.add(schema.input_topic(source), t_unix_ns, t_unix_ns, schema.input_json(event))
+
+    def _add_experiment(
+        self, name: str, attached: tuple[AttachedFile, ...], notes: Mapping[str, str], t_unix_ns: int
+    ) -> None:
+        self._experiment = name
+        self._file.add_metadata(schema.EXPERIMENT_METADATA, {**notes, "name": name, "t_unix_ns": str(t_unix_ns)})
+        for one in attached:
+            if one not in self._identity.attached:
+                self._file.attach(one.name, one.media_type, one.data, t_unix_ns)
 
     def _add_clock(self, now_ns: int, offset_ns: int) -> None:
         if offset_ns == self._offset_ns:
             return
         self._offset_ns = offset_ns
-        content = {"t_mono_ns": now_ns, "offset_ns": offset_ns}
-        self._file.add(CLOCK_TOPIC, now_ns + offset_ns, now_ns + offset_ns, as_json(content))
+        data = schema.as_json({"t_mono_ns": now_ns, "offset_ns": offset_ns})
+        self._file.add(schema.CLOCK_TOPIC, now_ns + offset_ns, now_ns + offset_ns, data)

@@ -4,13 +4,11 @@ It reads record by record up to the first damaged one. Without it, a user who lo
 readers need the index that is written when a file is closed.
 """
 
-import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
@@ -154,8 +152,6 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
                 summary.dropped = int(record.metadata.get("dropped", "0"))
             case Attachment():
                 summary.attachments.append(record.name)
-            case _:
-                pass
     return summary
 
 
@@ -165,7 +161,9 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
     The copy is `out`, or the source without `.partial`, or NAME.repaired.mcap. Raises UserError if the copy exists or
     cannot be written, and if the source has no intact message.
     """
-    out = out or _default_copy(source)
+    if out is None:
+        name = source.name.removesuffix(PARTIAL)
+        out = source.with_name(name if name != source.name else f"{source.stem}.repaired.mcap")
     if out.exists():
         raise UserError(f"{out} exists already; move it away, or name another file with --out")
     condition = FileCondition.of_file(source)
@@ -176,6 +174,7 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
         with replace_file(out) as file:
             writer = new_writer(file)
             for record in intact_records(source, condition, progress):
+                # The copy has its own header and index.
                 match record:
                     case Schema() if record.id not in schemas:
                         schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
@@ -198,9 +197,6 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
                         writer.add_attachment(
                             record.create_time, record.log_time, record.name, record.media_type, record.data
                         )
-                    case _:
-                        # The copy has its own header and index.
-                        pass
             writer.finish()  # type: ignore[no-untyped-call]  # mcap has no return annotation here
             if not messages:
                 raise UserError(f"{source}: it holds no intact message, so nothing can be saved")
@@ -223,29 +219,23 @@ def intact_records(path: Path, condition: FileCondition, progress: Progress = la
         raise UserError(f"{path}: the recording cannot be read: {error.strerror}") from error
 
 
-def _default_copy(source: Path) -> Path:
-    if source.name.endswith(PARTIAL):
-        return source.with_name(source.name.removesuffix(PARTIAL))
-    return source.with_name(f"{source.stem}.repaired.mcap")
-
-
 def _intact_records(file: IO[bytes], condition: FileCondition, progress: Progress) -> Iterator[McapRecord]:
     reader = StreamReader(file, emit_chunks=True, record_size_limit=_LARGEST_RECORD_BYTES).records
     while True:
         try:
-            record = next(reader, None)
+            record = next(reader)
             inside = _chunk_records(record, condition) if isinstance(record, Chunk) else [record]
+        except OSError:
+            raise
         # The library raises many types of exceptions for a damaged record.
-        except (McapError, ValueError, EOFError, ArithmeticError, LookupError, TypeError, struct.error, MemoryError):
-            return
-        if record is None:
+        except Exception:  # noqa: BLE001
             return
         condition.intact_bytes = file.tell()
         progress(condition.intact_bytes)
         if isinstance(record, Footer):
             condition.closed = True
             return
-        yield from (one for one in inside if one is not None)
+        yield from inside
 
 
 def _chunk_records(chunk: Chunk, condition: FileCondition) -> list[McapRecord]:

@@ -6,7 +6,6 @@ estimates bit for bit.
 
 import asyncio
 import json
-import math
 import tempfile
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -16,31 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from shearloop.bank.eit.channels import N_LINE_VALUES, ZERO_SLOTS
 from shearloop.bank.estimation import Measured
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.config_file import mistakes
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import EitEstimate, EitFrame, EitHeatmap, LoadTorque, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.recording.identity import map_paths
+from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.reader import check_identity, open_recording, reading
-from shearloop.daemon.recording.schema import (
-    CLOCK_TOPIC,
-    CONFIGURATION,
-    FRAME_TOPIC,
-    INPUT,
-    METADATA,
-    input_event,
-    input_topic,
-    message_json,
-    recorded_topic,
-    schema_name,
-    with_missing_keys,
-)
 from shearloop.daemon.rig import load_cell_calibration
 from shearloop.daemon.sensing.estimators import COMBINED, LiveEstimator, open_combined, open_estimator
 from shearloop.daemon.sensing.fingertip_task import FramePairing, estimate_message, frame_message
@@ -50,6 +34,7 @@ from shearloop.daemon.sensing.tool_diameter import tool_from_bytes
 from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.load_cell import LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.yaml_files import validated
 
 # Topics that a replay computes. All others are sent as they were recorded.
 COMPUTED_TOPICS = (EitFrame.topic, EitEstimate.topic, LoadTorque.topic, SkinShear.topic)
@@ -101,41 +86,35 @@ class RecordedRun:
         self.path = path
         with open_recording(path) as recording:
             self.counts = recording.counts
-            self.metadata = check_identity(path, recording.metadata().get(METADATA))
+            self.metadata = check_identity(path, recording.metadata().get(schema.METADATA))
             self._attached = recording.attachments()
 
     @property
     def has_inputs(self) -> bool:
         """Whether it holds raw input; an imported recording holds only lines."""
-        return any(topic.startswith(f"{INPUT}.") and topic != CLOCK_TOPIC for topic in self.counts)
-
-    @property
-    def message_count(self) -> int:
-        """The number of messages."""
-        return sum(self.counts.values())
+        return any(topic.startswith(schema.input_topic("")) and topic != schema.CLOCK_TOPIC for topic in self.counts)
 
     @contextmanager
     def configuration(self) -> Iterator[DaemonConfig]:
         """Yield the recorded configuration, with the attached files in a temporary folder."""
-        if CONFIGURATION not in self._attached:
+        if schema.CONFIGURATION not in self._attached:
             raise UserError(
                 f"{self.path} has no configuration because no daemon recorded it; give one with --config CONFIG"
             )
-        with reading(self.path):
-            content = json.loads(self._attached[CONFIGURATION])
-        try:
-            config = DaemonConfig.model_validate(content)
-        except ValidationError as error:
-            raise UserError(
-                f"{self.path}: its configuration does not fit this version: {mistakes(error, DaemonConfig)}; "
-                "give one with --config CONFIG"
-            ) from error
         with tempfile.TemporaryDirectory(prefix="shearloop-replay-") as folder:
-            files: dict[Path, Path] = {}
+            files: dict[str, str] = {}
             for number, (name, data) in enumerate(self._attached.items()):
-                files[Path(name)] = Path(folder) / f"{number}-{Path(name).name}"
-                files[Path(name)].write_bytes(data)
-            yield map_paths(config, lambda _, path: files.get(path, path))
+                copy = Path(folder) / f"{number}-{Path(name).name}"
+                copy.write_bytes(data)
+                files[name] = str(copy)
+
+            def with_copies(section: dict[str, Any]) -> dict[str, Any]:
+                return {key: files.get(str(value), value) for key, value in section.items()}
+
+            with reading(self.path):
+                content = json.loads(self._attached[schema.CONFIGURATION], object_hook=with_copies)
+            where = f"{self.path}: its configuration does not fit this version"
+            yield validated(content, DaemonConfig, where, UserError, cure="; give one with --config CONFIG")
 
     def events(self) -> Iterator[RecordedEvent]:
         """Yield the events in recorded order."""
@@ -187,7 +166,7 @@ class ReplayPipeline:
         self._skin = RecordedSkin(config.skin) if config.skin is not None else None
 
     @property
-    def published_sources(self) -> tuple[str, ...]:
+    def sources(self) -> tuple[str, ...]:
         """The sources of the messages that are computed."""
         load_cell = (LOAD_CELL,) if self._load_parser is not None else ()
         return (*self._estimators, *load_cell, *((SKIN,) if self._skin is not None else ()))
@@ -200,7 +179,7 @@ class ReplayPipeline:
                 await self._estimate(source, frame)
                 pair = self._pairing.add(source, frame.t_mid_ns, frame) if self._pairing is not None else None
                 if pair is not None:
-                    await self._estimate(COMBINED, *pair[1])
+                    await self._estimate(COMBINED, *pair)
         elif source == LOAD_CELL and self._load_parser is not None:
             for sample in self._load_parser.handle(event):
                 self._publisher.publish(load_message(sample))
@@ -244,10 +223,6 @@ class ReplayClock(Clock):
         """Return the time of the current event."""
         return self._now_ns
 
-    def synchronise(self) -> float:
-        """Do nothing: the recording holds the offset of its clocks."""
-        return 0.0
-
     def set(self, now_ns: int, offset_ns: int | None = None) -> None:
         """Set the time, and the offset to Unix time if it is given."""
         self._now_ns = now_ns
@@ -273,10 +248,10 @@ class ReplayComparison:
         """Store a message that the replay published."""
         if topic not in COMPUTED_TOPICS:
             return
-        if recorded_topic(topic, content["source"]) not in self.recorded_topics:
+        if schema.recorded_topic(topic, content["source"]) not in self.recorded_topics:
             self._foreign += 1
         else:
-            plain = json.loads(message_json(topic, content, 0))
+            plain = json.loads(schema.message_json(topic, content, 0))
             self._computed.setdefault((topic, content["source"]), deque()).append(plain)
 
     def compare(self, event: RecordedEvent) -> None:
@@ -323,9 +298,9 @@ class Replay:
             # The time of a message lies before its sending. Only a raw input has its arrival time.
             if event.raw is not None or not self._run.has_inputs:
                 first_ns = event.t_mono_ns if first_ns is None else first_ns
-                if math.isfinite(speed):
-                    due_s = began_s + (event.t_mono_ns - first_ns) / 1e9 / speed
-                    await asyncio.sleep(max(0.0, due_s - loop.time()))
+                due_s = began_s + (event.t_mono_ns - first_ns) / 1e9 / speed
+                if due_s > loop.time():
+                    await asyncio.sleep(due_s - loop.time())
             await self._process(event)
             progress(number)
             if number % 100 == 0:
@@ -333,14 +308,12 @@ class Replay:
                 await asyncio.sleep(0)
 
     async def _process(self, event: RecordedEvent) -> None:
-        if event.topic == CLOCK_TOPIC:
+        if event.topic == schema.CLOCK_TOPIC:
             self._clock.set(event.t_mono_ns, int(event.content["offset_ns"]))
         elif event.raw is not None:
             self._clock.set(event.t_mono_ns)
             await self._pipeline.process(event.source, event.raw)
-        elif (
-            event.topic in COMPUTED_TOPICS and self._run.has_inputs and event.source in self._pipeline.published_sources
-        ):
+        elif self._run.has_inputs and event.topic in COMPUTED_TOPICS and event.source in self._pipeline.sources:
             self.comparison.compare(event)
         elif event.topic != EitHeatmap.topic:
             self._publisher.forward(event.topic, restored_wire_map(event.content))
@@ -359,24 +332,24 @@ def restored_wire_map(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _live_event(topic: str, content: dict[str, Any]) -> RecordedEvent:
-    if topic == CLOCK_TOPIC:
+    if topic == schema.CLOCK_TOPIC:
         return RecordedEvent(topic, content["t_mono_ns"], content)
-    if topic.startswith(f"{INPUT}."):
-        raw = input_event(content)
-        return RecordedEvent(topic, raw.t_ns, content, topic.removeprefix(f"{INPUT}."), raw)
-    live = schema_name(topic)
-    return RecordedEvent(live, content["t_mono_ns"], with_missing_keys(live, content), content["source"])
+    live = schema.schema_name(topic)
+    if live == schema.INPUT:
+        raw = schema.input_event(content)
+        return RecordedEvent(topic, raw.t_ns, content, topic.removeprefix(schema.input_topic("")), raw)
+    return RecordedEvent(live, content["t_mono_ns"], schema.with_missing_keys(live, content), content["source"])
 
 
 def _imported_event(topic: str, content: dict[str, Any], log_ns: int, number: int) -> RecordedEvent:
-    if topic.startswith(f"{FRAME_TOPIC}."):
+    if topic.startswith(f"{schema.FRAME_TOPIC}."):
         # The line as the board sent it: four decimals, each followed by a comma and a space.
         values = np.asarray(content["line"], dtype=np.float64)
         if values.shape != (N_LINE_VALUES,):
             raise ValueError(f"a line of {values.size} values")
         text = "".join(f"{value:.4f}, " for value in values.tolist()) + "\r\n"
-        side, t_ns = topic.removeprefix(f"{FRAME_TOPIC}."), int(content["arrival_unix_ns"])
-        return RecordedEvent(input_topic(side), t_ns, {}, side, RawEvent(InputKind.DATA, t_ns, text.encode()))
+        side, t_ns = topic.removeprefix(f"{schema.FRAME_TOPIC}."), int(content["arrival_unix_ns"])
+        return RecordedEvent(schema.input_topic(side), t_ns, {}, side, RawEvent(InputKind.DATA, t_ns, text.encode()))
     complete = {
         "source": topic.partition(".")[0],
         "raw": content.get("torque_nm"),

@@ -36,7 +36,6 @@ METADATA = "shearloop"
 EXPERIMENT_METADATA = "shearloop.experiment"
 END_METADATA = "shearloop.end"
 CONFIGURATION = "configuration.json"
-PROFILE = "shearloop"
 SIDES = ("right", "left")
 # Metadata key of the tool's diameter in mm. The gripper opens no wider than the largest.
 DIAMETER_NOTE = "diameter_mm"
@@ -45,9 +44,6 @@ LARGEST_DIAMETER_MM = 140.0
 _FINGERTIP_TOPICS = (EitFrame.topic, EitEstimate.topic, EitHeatmap.topic)
 _SCALARS = {float: "number", int: "integer", str: "string", bool: "boolean"}
 _TIME = {"type": "integer", "description": "CLOCK_MONOTONIC in ns"}
-# Decimals of array elements: a microvolt, a microradian.
-_DECIMALS = 6
-_SHAPE = "_shape"
 
 
 class NoJsonError(ValueError):
@@ -57,11 +53,6 @@ class NoJsonError(ValueError):
 def recorded_topic(topic: str, source: str) -> str:
     """Return the topic under which a message is recorded."""
     return f"{topic}.{source}" if topic in _FINGERTIP_TOPICS else topic
-
-
-def frame_topic(side: str) -> str:
-    """Return the topic of a side's frames."""
-    return recorded_topic(FRAME_TOPIC, side)
 
 
 def input_topic(source: str) -> str:
@@ -116,10 +107,9 @@ def message_json(topic: str, content: Mapping[str, Any], offset_ns: int) -> byte
             if math.isfinite(value):
                 plain[key] = value
         elif isinstance(value, bytes):
-            rounded = np.round(np.frombuffer(value, "<f4").astype(np.float64), _DECIMALS)
-            # Elements that are not finite become null.
-            plain[key] = rounded.tolist()
-        elif value is not None and not key.endswith(_SHAPE):
+            # To a microvolt or microradian. Elements that are not finite become null.
+            plain[key] = np.round(np.frombuffer(value, "<f4").astype(np.float64), 6).tolist()
+        elif value is not None and not key.endswith("_shape"):
             plain[key] = value
     if topic == EitFrame.topic:
         plain["arrival_unix_ns"] = content["t_mono_ns"] + round(content["age_s"] * 1e9) + offset_ns
@@ -157,8 +147,8 @@ def _mapping_as_dict(value: Any) -> Any:
 def _optional_keys(topic: str) -> tuple[str, ...]:
     """Return the keys that a message leaves out if they have no finite value."""
     hints = typing.get_type_hints(TOPICS[topic])
-    fields = [item.name for item in dataclasses.fields(TOPICS[topic])]
-    return tuple(name for name in fields if hints[name] is float or type(None) in typing.get_args(hints[name]))
+    names = (item.name for item in dataclasses.fields(TOPICS[topic]))
+    return tuple(name for name in names if hints[name] is float or type(None) in typing.get_args(hints[name]))
 
 
 def _message_schema(topic: str) -> dict[str, Any]:
@@ -169,10 +159,8 @@ def _message_schema(topic: str) -> dict[str, Any]:
     hints = typing.get_type_hints(TOPICS[topic])
     for item in dataclasses.fields(TOPICS[topic]):
         unit, meaning = item.metadata.get("unit", ""), item.metadata.get("meaning", "")
-        properties[item.name] = {
-            **json_type(hints[item.name]),
-            "description": f"{meaning} ({unit})" if unit else meaning,
-        }
+        described = f"{meaning} ({unit})" if unit else meaning
+        properties[item.name] = {**json_type(hints[item.name]), "description": described}
     required = [name for name in properties if name not in _optional_keys(topic)]
     if topic == FRAME_TOPIC:
         properties["arrival_unix_ns"] = {"type": "integer", "description": "arrival of the line's last byte"}

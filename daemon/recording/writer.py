@@ -3,9 +3,9 @@
 import io
 import json
 import os
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Self, cast
 
 import numpy as np
@@ -13,23 +13,13 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.identity import basic_identity
-from shearloop.daemon.recording.schema import (
-    LOAD_TOPIC,
-    METADATA,
-    PROFILE,
-    as_json,
-    frame_topic,
-    schema_name,
-    schemas,
-)
 from shearloop.files import sync_directory
 
 PARTIAL = ".partial"
 # Larger than the data between two flushes, so that each flush writes one chunk.
 _CHUNK_BYTES = 1 << 24
-# Decimals of a volt: the board sends four.
-_DECIMALS = 6
 # Messages in a chunk of about a megabyte.
 _FLUSH_EVERY = 128
 
@@ -37,7 +27,7 @@ _FLUSH_EVERY = 128
 def new_writer(stream: IO[bytes]) -> Writer:
     """Return a started MCAP writer that stores checksums of all its data."""
     writer = Writer(stream, _CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
-    writer.start(profile=PROFILE, library="shearloop")
+    writer.start(profile="shearloop", library="shearloop")
     return writer
 
 
@@ -88,8 +78,12 @@ class McapFile:
         self._writer = new_writer(cast(IO[bytes], self._stream))
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        self._sequence: dict[str, int] = {}
-        self.messages = 0
+        self._counts: Counter[str] = Counter()
+
+    @property
+    def messages(self) -> int:
+        """The number of messages."""
+        return self._counts.total()
 
     @property
     def bytes_written(self) -> int:
@@ -111,13 +105,10 @@ class McapFile:
 
     def add(self, topic: str, log_ns: int, publish_ns: int, data: bytes) -> None:
         """Append a message to the open chunk; `data` is JSON of the topic's schema."""
-        channel = self._channels.get(topic)
-        if channel is None:
-            channel = self._channels[topic] = self._register(topic)
-        sequence = self._sequence.get(topic, 0)
-        self._sequence[topic] = sequence + 1
-        self._writer.add_message(channel, log_time=log_ns, publish_time=publish_ns, sequence=sequence, data=data)
-        self.messages += 1
+        if topic not in self._channels:
+            self._channels[topic] = self._register(topic)
+        self._writer.add_message(self._channels[topic], log_ns, data, publish_ns, self._counts[topic])
+        self._counts[topic] += 1
 
     def flush(self) -> None:
         """End the chunk and write it to the disk; raises OSError, after which a later flush tries again."""
@@ -146,9 +137,9 @@ class McapFile:
         self.partial.unlink(missing_ok=True)
 
     def _register(self, topic: str) -> int:
-        name = schema_name(topic)
+        name = schema.schema_name(topic)
         if name not in self._schemas:
-            text = json.dumps(schemas()[name], sort_keys=True, ensure_ascii=False).encode()
+            text = json.dumps(schema.schemas()[name], sort_keys=True, ensure_ascii=False).encode()
             self._schemas[name] = self._writer.register_schema(name, "jsonschema", text)
         return self._writer.register_channel(topic, "json", self._schemas[name])
 
@@ -164,36 +155,32 @@ class RecordingWriter:
             self._file = McapFile(self.path, io.FileIO(partial, "wb"))
         except OSError as error:
             raise self._write_error(error) from error
-        self._file.add_metadata(METADATA, {**basic_identity(source), **(notes or {})})
+        self._file.add_metadata(schema.METADATA, {**basic_identity(source), **(notes or {})})
 
     def add_frame(self, side: str, t_mid_unix_ns: int, arrival_unix_ns: int, line: NDArray[np.float64]) -> None:
         """Append one frame: the (1024,) values of its line in volts."""
-        values = [round(value, _DECIMALS) for value in line.tolist()]
-        self._add(frame_topic(side), t_mid_unix_ns, {"arrival_unix_ns": arrival_unix_ns, "line": values})
+        # The board sends four decimals of a volt.
+        values = [round(value, 6) for value in line.tolist()]
+        content = {"arrival_unix_ns": arrival_unix_ns, "line": values}
+        self._add(schema.recorded_topic(schema.FRAME_TOPIC, side), t_mid_unix_ns, content)
 
     def add_torque(self, t_unix_ns: int, torque_nm: float) -> None:
         """Append one torque of the load cell in N·m."""
-        self._add(LOAD_TOPIC, t_unix_ns, {"torque_nm": torque_nm})
-
-    def close(self, complete: bool = True) -> None:
-        """Write the index, flush to the disk and, if complete, rename the file."""
-        try:
-            self._file.close(complete)
-        except OSError as error:
-            raise self._write_error(error) from error
+        self._add(schema.LOAD_TOPIC, t_unix_ns, {"torque_nm": torque_nm})
 
     def __enter__(self) -> Self:
         """Return the writer itself."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Close the file, as complete if there was no error."""
-        self.close(complete=kind is None)
+        try:
+            self._file.close(complete=kind is None)
+        except OSError as error:
+            raise self._write_error(error) from error
 
     def _add(self, topic: str, time_ns: int, content: dict[str, object]) -> None:
-        self._file.add(topic, time_ns, time_ns, as_json(content))
+        self._file.add(topic, time_ns, time_ns, schema.as_json(content))
         if self._file.messages % _FLUSH_EVERY == 0:
             try:
                 self._file.flush()

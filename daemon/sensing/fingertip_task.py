@@ -3,11 +3,11 @@
 import asyncio
 import contextlib
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from typing import Generic, TypeVar
 
 import numpy as np
 
-from shearloop.bank.arrays import FloatArray
 from shearloop.bank.estimation import Estimate, Measured
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.loop_inputs import TorqueSample
@@ -38,8 +38,8 @@ class FramePairing(Generic[Item]):
         self._apart_ns = round(_MAX_APART_PERIODS * period_ns)
         self._latest: dict[str, tuple[int, Item]] = {}
 
-    def add(self, side: str, t_ns: int, item: Item) -> tuple[int, tuple[Item, ...]] | None:
-        """Return the mean time and the frames of the set that this one completes, or None."""
+    def add(self, side: str, t_ns: int, item: Item) -> tuple[Item, ...] | None:
+        """Return the frames of the set that this one completes, or None."""
         if side not in self._sides:
             return None
         self._latest[side] = (t_ns, item)
@@ -51,9 +51,9 @@ class FramePairing(Generic[Item]):
             return None
         if len(self._latest) < len(self._sides):
             return None
-        found = [self._latest[name] for name in self._sides]
+        found = tuple(self._latest[name][1] for name in self._sides)
         self._latest.clear()
-        return sum(at_ns for at_ns, _ in found) // len(found), tuple(one for _, one in found)
+        return found
 
 
 class EstimatorTask:
@@ -184,7 +184,7 @@ class CombinedFingertipTask:
         Call this when the frame arrives: the order of arrival decides the pairs, and a replay finds the same ones.
         """
         if (pair := self._pairing.add(side, frame.t_mid_ns, frame)) is not None:
-            self.estimator_task.submit(*pair[1])
+            self.estimator_task.submit(*pair)
 
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the values for the health message."""
@@ -214,7 +214,7 @@ class FingertipTask:
 
     async def read(self) -> None:
         """Publish and queue every frame until cancelled."""
-        async with contextlib.aclosing(self._board.frames()) as frames:
+        async with contextlib.aclosing(self._board.readings()) as frames:
             async for frame in frames:
                 self._publisher.publish(frame_message(self.name, frame))
                 self.estimator_task.submit(frame)
@@ -247,7 +247,19 @@ class FingertipTask:
         if scores is None or estimator.grids is None:
             return
         k_grid, sigma_grid = estimator.grids
-        self._publisher.publish(heatmap_message(self.name, frame, scores, k_grid, sigma_grid, estimator.model))
+        self._publisher.publish(
+            EitHeatmap(
+                source=self.name,
+                t_mono_ns=frame.t_mid_ns,
+                scores=scores,
+                k_low=float(k_grid[0]),
+                k_high=float(k_grid[-1]),
+                sigma_low=float(sigma_grid[0]),
+                sigma_high=float(sigma_grid[-1]),
+                model=estimator.model,
+                frame=frame.seq,
+            )
+        )
 
 
 def frame_message(name: str, frame: Frame) -> EitFrame:
@@ -267,40 +279,15 @@ def frame_message(name: str, frame: Frame) -> EitFrame:
 
 def estimate_message(name: str, frames: tuple[Frame, ...], estimate: Estimate, now_ns: int) -> EitEstimate:
     """Return the message of an estimate from frames of one time, as published at now_ns."""
+    values = asdict(estimate)
+    del values["reasons"], values["lag_s"]
     return EitEstimate(
         source=name,
         t_mono_ns=sum(frame.t_mid_ns for frame in frames) // len(frames),
-        torque_nm=estimate.torque_nm,
-        torque_low_nm=estimate.torque_low_nm,
-        torque_high_nm=estimate.torque_high_nm,
-        diameter_mm=estimate.diameter_mm,
-        diameter_low_mm=estimate.diameter_low_mm,
-        diameter_high_mm=estimate.diameter_high_mm,
-        k=estimate.k,
-        sigma=estimate.sigma,
-        score=estimate.score,
-        runner_up=estimate.runner_up,
-        valid=estimate.valid,
+        **values,
         reason="; ".join(estimate.reasons),
         frame=frames[0].seq,
         latency_s=(now_ns - max(frame.t_arrival_ns for frame in frames)) / 1e9,
-    )
-
-
-def heatmap_message(
-    name: str, frame: Frame, scores: FloatArray, k_grid: FloatArray, sigma_grid: FloatArray, model: str
-) -> EitHeatmap:
-    """Return the message of a frame's scores."""
-    return EitHeatmap(
-        source=name,
-        t_mono_ns=frame.t_mid_ns,
-        scores=scores,
-        k_low=float(k_grid[0]),
-        k_high=float(k_grid[-1]),
-        sigma_low=float(sigma_grid[0]),
-        sigma_high=float(sigma_grid[-1]),
-        model=model,
-        frame=frame.seq,
     )
 
 

@@ -1,6 +1,5 @@
 """The load cell's task: reads it, publishes its torque, takes its zero."""
 
-import asyncio
 import contextlib
 from collections.abc import Callable, Mapping
 
@@ -10,6 +9,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
 from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.waiters import Waiters
 from shearloop.drivers.load_cell import LoadCell, LoadSample
 
 LOAD_CELL = "load_cell"
@@ -19,34 +19,6 @@ ZERO_SAMPLES = 22
 SETTLING_PERIODS = 4
 # A zero takes two seconds; with a slower board twice the time of its readings.
 ZERO_TIMEOUT_S = 15.0
-
-
-class ZeroWaiters:
-    """Callers that wait for the same zero of a sensor."""
-
-    def __init__(self) -> None:
-        """Start without waiters."""
-        self._futures: list[asyncio.Future[str]] = []
-
-    def __bool__(self) -> bool:
-        """Whether there are waiters."""
-        return bool(self._futures)
-
-    async def wait(self, timeout_s: float) -> str:
-        """Return the zero's error, empty for success; raises TimeoutError."""
-        future: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        self._futures.append(future)
-        try:
-            async with asyncio.timeout(timeout_s):
-                return await future
-        finally:
-            self._futures.remove(future)
-
-    def finish(self, error: str) -> None:
-        """Return the error, or an empty text, to all waiters."""
-        for future in self._futures:
-            if not future.done():
-                future.set_result(error)
 
 
 class LoadCellTask:
@@ -70,12 +42,12 @@ class LoadCellTask:
         self._zeroing: list[float] | None = None
         self._zero_from_ns = self._zero_until_ns = 0
         self._zero_error = ""
-        self._zero_waiters = ZeroWaiters()
+        self._zero_waiters = Waiters()
         self._reason = ""
 
     async def read(self) -> None:
         """Publish every sample and pass it on, until cancelled."""
-        async with contextlib.aclosing(self._board.samples()) as samples:
+        async with contextlib.aclosing(self._board.readings()) as samples:
             async for sample in samples:
                 self._publisher.publish(load_message(sample))
                 torque_nm = sample.torque_nm if sample.trusted else None
@@ -128,7 +100,7 @@ class LoadCellTask:
         if len(self._zeroing) == ZERO_SAMPLES:
             self._board.tare(sum(self._zeroing) / ZERO_SAMPLES)
             self._zeroing = None
-            self._zero_waiters.finish("")
+            self._zero_waiters.notify("")
 
 
 def load_message(sample: LoadSample) -> LoadTorque:

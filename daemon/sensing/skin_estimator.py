@@ -55,7 +55,6 @@ class SkinZeroTaker:
     """Averages resistances until they make a zero, or a reason against it."""
 
     def __init__(self, n_samples: int, rest_ohm: tuple[float, float], slope_per_n: float) -> None:
-        """Use the number of samples, and the calibration's resistances at rest and response per newton."""
         self.n_samples = n_samples
         self._rest_ohm = rest_ohm
         self._slope_per_n = slope_per_n

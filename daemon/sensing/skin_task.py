@@ -13,26 +13,12 @@ from shearloop.daemon.errors import UserError
 from shearloop.daemon.logs import log_link
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sensing.load_cell_task import ZeroWaiters
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
+from shearloop.daemon.waiters import Waiters
+from shearloop.drivers import shear_skin
 from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkEvent, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, OnRaw, RawEvent, ignore_raw
-from shearloop.drivers.shear_skin import (
-    SOURCE_PERIOD_S,
-    AdcBoard,
-    Daq,
-    Keithley6430,
-    PairParser,
-    RecordedInstrument,
-    SampleValidator,
-    ScpiScanner,
-    ShearSkin,
-    SkinSample,
-    SourceReading,
-    Voltages,
-    recorded_scanner,
-    recorded_source,
-)
+from shearloop.drivers.shear_skin import SOURCE_PERIOD_S, Keithley6430, PairParser, SkinSample, Voltages
 
 SKIN = "skin"
 # The instruments' names in health and in recordings.
@@ -60,7 +46,7 @@ class SkinTask:
         """
         calibration = load_calibration(config.calibration)
         check_circuit(config, calibration)
-        self._skin = ShearSkin(
+        self._skin = shear_skin.ShearSkin(
             _current_source(config, on_raw(SKIN_SOURCE)), _daq(config, on_raw(SKIN_DAQ)), _gauge_ohm(calibration)
         )
         self._estimator = _estimator(config, calibration)
@@ -69,7 +55,7 @@ class SkinTask:
         self._on_torque = on_torque
         self._on_raw = on_raw(SKIN)
         self._radius_m = _radius_m(config)
-        self._zero_waiters = ZeroWaiters()
+        self._zero_waiters = Waiters()
         self._reason = ""
         self._valid = 0
 
@@ -84,9 +70,9 @@ class SkinTask:
                 reading = self._estimator.update(sample)
                 self._publish(sample, reading)
                 if self._estimator.refused:
-                    self._zero_waiters.finish(f"the skin's zero was refused: {self._estimator.refused}")
+                    self._zero_waiters.notify(f"the skin's zero was refused: {self._estimator.refused}")
                 elif self._estimator.zero is not None:
-                    self._zero_waiters.finish("")
+                    self._zero_waiters.notify("")
 
     def tare(self) -> None:
         """Take a new zero from samples measured from now on."""
@@ -141,14 +127,14 @@ class RecordedSkin:
         self._estimator = _estimator(config, calibration)
         current_a = config.source.current_ma * 1e-3
         daq_period_s = 1.0 / config.daq.rate_hz
-        self._validator = SampleValidator(current_a, SOURCE_PERIOD_S, daq_period_s, _gauge_ohm(calibration))
+        self._validator = shear_skin.SampleValidator(current_a, SOURCE_PERIOD_S, daq_period_s, _gauge_ohm(calibration))
         self._radius_m = _radius_m(config)
-        self._source = recorded_source()
+        self._source = shear_skin.recorded_source()
         adc = config.daq.adc
-        self._daq: RecordedInstrument[Voltages] | PairParser = (
-            recorded_scanner() if adc is None else PairParser(config.daq.rate_hz, adc.full_scale_v)
+        self._daq: shear_skin.RecordedInstrument[Voltages] | PairParser = (
+            shear_skin.recorded_scanner() if adc is None else PairParser(config.daq.rate_hz, adc.full_scale_v)
         )
-        self._latest: SourceReading | None = None
+        self._latest: shear_skin.SourceReading | None = None
 
     def handle(self, source: str, event: RawEvent) -> list[SkinShear]:
         """Return the messages that a source's event leads to, without processing time."""
@@ -258,14 +244,14 @@ def _current_source(config: SkinConfig, on_raw: OnRaw) -> Keithley6430:
     return Keithley6430(link, source.current_ma * 1e-3, source.compliance_v, SOURCE_PERIOD_S, on_raw=on_raw)
 
 
-def _daq(config: SkinConfig, on_raw: OnRaw) -> Daq:
+def _daq(config: SkinConfig, on_raw: OnRaw) -> shear_skin.Daq:
     rate_hz, scanner, adc = config.daq.rate_hz, config.daq.scanner, config.daq.adc
     on_event = partial(log_link, "skin daq")
     if scanner is not None:
         link = _link(scanner.socket, None, DEFAULT_BAUD, on_event)
-        return ScpiScanner(link, scanner.channels, rate_hz, scanner.range_v, on_raw=on_raw)
+        return shear_skin.ScpiScanner(link, scanner.channels, rate_hz, scanner.range_v, on_raw=on_raw)
     if adc is not None:
-        return AdcBoard(_link(None, adc.device, DEFAULT_BAUD, on_event), rate_hz, adc.full_scale_v, on_raw)
+        return shear_skin.AdcBoard(_link(None, adc.device, DEFAULT_BAUD, on_event), rate_hz, adc.full_scale_v, on_raw)
     raise ValueError("a skin needs an instrument that reads its voltages")
 
 

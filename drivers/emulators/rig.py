@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S
+from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.boards import LOAD_PERIOD_S, EitKitBoard, Hx711Board, Sketch
 from shearloop.drivers.emulators.robotiq.gripper import Gripper
 from shearloop.drivers.emulators.robotiq.servers import URCAP_PORT, GripperPlayer, ModbusServer, UrcapServer
@@ -164,12 +165,9 @@ class EmulatedRig:
     def _devices(self) -> tuple[str, ...]:
         return ("load", "gripper", "robot", *SIDES, *(("skin",) if self.skin is not None else ()))
 
-    def _check_device(self, device: str) -> None:
+    def _command_device(self, device: str, text: str) -> None:
         if device not in self._devices:
             raise ValueError(f"there is no device {device!r}; there are {', '.join(self._devices)}")
-
-    def _command_device(self, device: str, text: str) -> None:
-        self._check_device(device)
         kind = text.split(maxsplit=1)[0]
         if device == "robot":
             apply_fault(self.controller, text)
@@ -246,10 +244,4 @@ class EmulatedRig:
 
 
 def _torque(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not abs(value) <= 5.0:
-        raise ValueError(f"{text!r} is no torque in N·m of at most 5; write for instance 0.05")
-    return value
+    return number_between(text, -5.0, 5.0, "no torque in N·m of at most 5; write for instance 0.05")

@@ -64,13 +64,6 @@ class TwinSettings:
     tightening_nm_per_rad: float = 0.15
     stripping_torque_nm: float = 0.22
 
-    def __post_init__(self) -> None:
-        """Refuse unphysical constants."""
-        if not 0.0 <= self.relaxing_share < 1.0:
-            raise ValueError(f"relaxing_share is {self.relaxing_share}, outside 0 to 1")
-        if min(self.gel_stiffness_nm_per_rad, self.joint_stiffness_nm_per_rad, self.relaxation_s) <= 0:
-            raise ValueError("stiffnesses and relaxation time must be positive")
-
 
 @dataclass(frozen=True, slots=True)
 class TwinState:

@@ -1,11 +1,12 @@
 """SCPI instruments, emulated: headers in long or short form, an error queue, outages. Over a socket or RS-232."""
 
 import asyncio
-import math
 import re
+import sys
 from collections import deque
 from collections.abc import Callable, Mapping
 
+from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.ports import PtyServer, SocketServer
 
 # Returns the answer to a query, or None for a command; the argument is the text after the header.
@@ -84,6 +85,16 @@ def accept_number(low: float, high: float) -> Handler:
     return check
 
 
+def accept_word(*words: str) -> Handler:
+    """Return a handler that refuses other words."""
+
+    def check(text: str) -> None:
+        if text.upper() not in words:
+            raise ScpiError(ILLEGAL_VALUE)
+
+    return check
+
+
 def parse_boolean(text: str) -> bool:
     """Return a command's truth value; ScpiError for other text."""
     values = {"ON": True, "1": True, "OFF": False, "0": False}
@@ -117,7 +128,11 @@ class FaultyServer:
         """Execute a command; ValueError, with a sentence, for an unknown one."""
         match text.split():
             case ["silence" | "unplug" as kind, *seconds] if len(seconds) < 2:
-                duration_s = _parse_seconds(seconds[0]) if seconds else None
+                duration_s = (
+                    number_between(seconds[0], 0.0, sys.float_info.max, "no time in seconds; write for instance 2.5")
+                    if seconds
+                    else None
+                )
                 self._recover()
                 self._server.silent = kind == "silence"
                 self._connect(kind == "silence")
@@ -150,13 +165,3 @@ class FaultyServer:
             self._timer = None
         self._server.silent = self._server.breaks_off = False
         self._connect(True)
-
-
-def _parse_seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 <= value < math.inf:
-        raise ValueError(f"{text!r} is no time in seconds; write for instance 2.5")
-    return value

@@ -8,18 +8,9 @@ from pathlib import Path
 from random import Random
 from typing import TypeAlias
 
+from shearloop.drivers.emulators import number_between, scpi
 from shearloop.drivers.emulators.boards import EmulatedAdcBoard
 from shearloop.drivers.emulators.ports import PtyServer, SocketServer
-from shearloop.drivers.emulators.scpi import (
-    ILLEGAL_VALUE,
-    SETTINGS_CONFLICT,
-    FaultyServer,
-    ScpiError,
-    ScpiInterpreter,
-    accept_number,
-    parse_boolean,
-    parse_number,
-)
 
 # The conductance of an open circuit's insulation.
 OPEN_OHM = 1e9
@@ -118,11 +109,11 @@ class Circuit:
             case ["swapped"]:
                 self.swapped = True
             case ["drift", ("1" | "2") as gauge, share]:
-                per_s = _parse_between(share, -1.0, 1.0, "a share per second")
+                per_s = number_between(share, -1.0, 1.0, "not a share per second from -1 to 1")
                 self._drifted[gauge] = self._drift(gauge, time_s)
                 self._drifting[gauge] = (per_s, time_s)
             case ["leads", ohm]:
-                self.lead_ohm = _parse_between(ohm, 0.0, OPEN_OHM, "a resistance in Ω")
+                self.lead_ohm = number_between(ohm, 0.0, OPEN_OHM, "not a resistance in Ω from 0 to 1e+09")
             case ["mend"]:
                 self.mend()
             case _:
@@ -145,37 +136,27 @@ class Circuit:
         return self._drifted.get(gauge, 0.0) + per_s * (time_s - since_s)
 
 
-def _parse_between(text: str, low: float, high: float, what: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not low <= value <= high:
-        raise ValueError(f"{text!r} is not {what} from {low:g} to {high:g}")
-    return value
-
-
-class EmulatedKeithley6430:
+class EmulatedKeithley6430(scpi.ScpiInterpreter):
     """The current source; replies as its manual (6430-901-01, sections 13 and 17) gives them."""
 
     def __init__(self, circuit: Circuit, seed: int = 0) -> None:
-        """Switch the instrument on, with the output off."""
         self.circuit = circuit
         self._random = Random(seed)
         self._reset("")
-        self.interpreter = ScpiInterpreter(
+        super().__init__(
             SOURCE_IDENTITY,
             {
                 "*RST": self._reset,
-                "SOURce:FUNCtion[:MODE]": self._set_function,
-                "SOURce:CURRent:MODE": self._set_mode,
-                "SOURce:CURRent:RANGe": accept_number(-MAX_A, MAX_A),
+                # Sourcing a voltage is not emulated.
+                "SOURce:FUNCtion[:MODE]": scpi.accept_word("CURR", "CURRENT"),
+                "SOURce:CURRent:MODE": scpi.accept_word("FIX", "FIXED"),
+                "SOURce:CURRent:RANGe": scpi.accept_number(-MAX_A, MAX_A),
                 "SOURce:CURRent[:LEVel][:IMMediate][:AMPLitude]": self._set_level,
-                "SENSe:FUNCtion:CONCurrent": self._set_concurrent,
+                "SENSe:FUNCtion:CONCurrent": scpi.accept_word("ON", "1", "OFF", "0"),
                 "SENSe:FUNCtion[:ON]": self._set_measured,
                 "SENSe:VOLTage[:DC]:PROTection[:LEVel]": self._set_compliance,
-                "SENSe:VOLTage[:DC]:RANGe[:UPPer]": accept_number(-MAX_V, MAX_V),
-                "SENSe:VOLTage[:DC]:NPLCycles": accept_number(0.01, 10.0),
+                "SENSe:VOLTage[:DC]:RANGe[:UPPer]": scpi.accept_number(-MAX_V, MAX_V),
+                "SENSe:VOLTage[:DC]:NPLCycles": scpi.accept_number(0.01, 10.0),
                 "FORMat:ELEMents[:SENSe]": self._set_elements,
                 "OUTPut[:STATe]": self._switch,
                 "OUTPut[:STATe]?": lambda _: str(int(circuit.output_on)),
@@ -184,10 +165,6 @@ class EmulatedKeithley6430:
             SOURCE_NO_ERROR,
         )
 
-    def feed(self, data: bytes) -> bytes:
-        """Return the replies to received bytes."""
-        return self.interpreter.feed(data)
-
     def _reset(self, _: str) -> None:
         self._measured = {"CURR"}
         self._elements = set(ELEMENTS)
@@ -195,42 +172,24 @@ class EmulatedKeithley6430:
         self.circuit.level_a = 0.0
         self.circuit.compliance_v = 21.0
 
-    def _set_function(self, text: str) -> None:
-        if text.upper() not in ("CURR", "CURRENT"):
-            # Sourcing a voltage is not emulated.
-            raise ScpiError(ILLEGAL_VALUE)
-
-    def _set_mode(self, text: str) -> None:
-        if text.upper() not in ("FIX", "FIXED"):
-            raise ScpiError(ILLEGAL_VALUE)
-
-    def _set_concurrent(self, text: str) -> None:
-        parse_boolean(text)
-
     def _set_level(self, text: str) -> None:
-        self.circuit.level_a = parse_number(text, -MAX_A, MAX_A)
+        self.circuit.level_a = scpi.parse_number(text, -MAX_A, MAX_A)
 
     def _set_compliance(self, text: str) -> None:
-        self.circuit.compliance_v = parse_number(text, 2e-4, MAX_V)
+        self.circuit.compliance_v = scpi.parse_number(text, 2e-4, MAX_V)
 
     def _set_measured(self, text: str) -> None:
-        names = {part.strip().strip("'\"").upper().removesuffix(":DC")[:4] for part in text.split(",")}
-        if not names <= {"VOLT", "CURR", "RES"}:
-            raise ScpiError(ILLEGAL_VALUE)
-        self._measured = names
+        self._measured = _parse_names(text, {"VOLT", "CURR", "RES"})
 
     def _set_elements(self, text: str) -> None:
-        names = {part.strip().upper()[:4] for part in text.split(",")}
-        if not names <= {*ELEMENTS}:
-            raise ScpiError(ILLEGAL_VALUE)
-        self._elements = names
+        self._elements = _parse_names(text, {*ELEMENTS})
 
     def _switch(self, text: str) -> None:
-        self.circuit.output_on = parse_boolean(text)
+        self.circuit.output_on = scpi.parse_boolean(text)
 
     def _read(self, _: str) -> str:
         if not self.circuit.output_on:
-            raise ScpiError(OUTPUT_IS_OFF)
+            raise scpi.ScpiError(OUTPUT_IS_OFF)
         now_s = time.monotonic()
         state = self.circuit.state(now_s)
         volts = state.source_v + self._random.gauss(0.0, SOURCE_NOISE_V)
@@ -241,52 +200,51 @@ class EmulatedKeithley6430:
             "TIME": now_s % 1e5,
             "STAT": float(_STATUS | (_COMPLIANCE if state.compliance else 0)),
         }
-        return ",".join(_scientific(values[name]) for name in ELEMENTS if name in self._elements)
+        return ",".join(f"{values[name]:+.6E}" for name in ELEMENTS if name in self._elements)
 
 
-def _scientific(value: float) -> str:
-    return f"{value:+.6E}"
+def _parse_names(text: str, allowed: set[str]) -> set[str]:
+    """Return the short forms of comma-separated names, quoted or not; ScpiError for an unknown one."""
+    names = {part.strip().strip("'\"").upper().removesuffix(":DC")[:4] for part in text.split(",")}
+    if not names <= allowed:
+        raise scpi.ScpiError(scpi.ILLEGAL_VALUE)
+    return names
 
 
-class EmulatedScanner:
+class EmulatedScanner(scpi.ScpiInterpreter):
     """A scanning multimeter; the first two channels of a scan are the gauges."""
 
     def __init__(self, circuit: Circuit, seed: int = 0) -> None:
-        """Switch the instrument on, with an empty scan list."""
         self._circuit = circuit
         self._random = Random(seed)
         self._reset("")
-        self._interpreter = ScpiInterpreter(
+        super().__init__(
             SCANNER_IDENTITY,
             {
                 "*RST": self._reset,
                 "CONFigure:VOLTage:DC": self._configure,
-                "[SENSe:]VOLTage:DC:NPLCycles": accept_number(0.02, 200.0),
+                "[SENSe:]VOLTage:DC:NPLCycles": scpi.accept_number(0.02, 200.0),
                 "ROUTe:SCAN": self._set_scan,
                 "READ?": self._read,
             },
             SCANNER_NO_ERROR,
         )
 
-    def feed(self, data: bytes) -> bytes:
-        """Return the replies to received bytes."""
-        return self._interpreter.feed(data)
-
     def _reset(self, _: str) -> None:
         self._range_v = 300.0
         self._channels = 0
 
     def _configure(self, text: str) -> None:
-        self._range_v = parse_number(text.split(",", 1)[0], 0.0, 300.0)
+        self._range_v = scpi.parse_number(text.split(",", 1)[0], 0.0, 300.0)
 
     def _set_scan(self, text: str) -> None:
         if not (text.startswith("(@") and text.endswith(")")):
-            raise ScpiError(ILLEGAL_VALUE)
+            raise scpi.ScpiError(scpi.ILLEGAL_VALUE)
         self._channels = text.count(",") + 1
 
     def _read(self, _: str) -> str:
         if not self._channels:
-            raise ScpiError(SETTINGS_CONFLICT)
+            raise scpi.ScpiError(scpi.SETTINGS_CONFLICT)
         return ",".join(self._digits(volts) for volts in self._circuit.voltages()[: self._channels])
 
     def _digits(self, volts: float) -> str:
@@ -298,21 +256,21 @@ class EmulatedScanner:
 
 def play_source(
     circuit: Circuit, address: Address | None, on_port: Callable[[str], None], *, speed: float = 1.0, seed: int = 0
-) -> FaultyServer:
+) -> scpi.FaultyServer:
     """Return the current source at an address; None for a new pseudo-terminal."""
     feed = EmulatedKeithley6430(circuit, seed).feed
     if isinstance(address, tuple):
-        return FaultyServer(SocketServer(lambda: feed, *address, on_port=on_port, answer_s=ANSWER_S / speed))
-    return FaultyServer(PtyServer(feed, address, on_port, answer_s=ANSWER_S / speed))
+        return scpi.FaultyServer(SocketServer(lambda: feed, *address, on_port=on_port, answer_s=ANSWER_S / speed))
+    return scpi.FaultyServer(PtyServer(feed, address, on_port, answer_s=ANSWER_S / speed))
 
 
 def play_daq(
     circuit: Circuit, address: Address | None, on_port: Callable[[str], None], *, speed: float = 1.0, seed: int = 0
-) -> FaultyServer | EmulatedAdcBoard:
+) -> scpi.FaultyServer | EmulatedAdcBoard:
     """Return a scanner on a socket, or a converter board on a pseudo-terminal."""
     if isinstance(address, tuple):
         feed = EmulatedScanner(circuit, seed).feed
-        return FaultyServer(SocketServer(lambda: feed, *address, on_port=on_port, answer_s=ANSWER_S / speed))
+        return scpi.FaultyServer(SocketServer(lambda: feed, *address, on_port=on_port, answer_s=ANSWER_S / speed))
     period_s = DAQ_PERIOD_S / speed
     return EmulatedAdcBoard(
         circuit.voltages, period_s=period_s, noise_v=NOISE_V, link=address, on_port=on_port, seed=seed

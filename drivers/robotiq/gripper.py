@@ -8,29 +8,7 @@ from typing import TypeVar
 
 from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.robotiq.messages import (
-    FIRST_MAJOR_CODE,
-    FORCE_MAX_N,
-    FORCE_MIN_N,
-    MA_PER_COUNT,
-    SPEED_MAX_MM_S,
-    SPEED_MIN_MM_S,
-    Activate,
-    ActivationStatus,
-    GripperClient,
-    GripperCommand,
-    GripperFaultError,
-    GripperHalt,
-    GripperMove,
-    GripperRefusedError,
-    GripperState,
-    ObjectStatus,
-    Readout,
-    Request,
-    Reset,
-    SentCommand,
-    fault_of,
-)
+from shearloop.drivers.robotiq import messages
 from shearloop.drivers.robotiq.width import COUNTS_MAX, WidthCalibration
 
 T = TypeVar("T")
@@ -58,7 +36,7 @@ class RobotiqGripper:
 
     def __init__(
         self,
-        client: GripperClient,
+        client: messages.GripperClient,
         calibration: WidthCalibration,
         *,
         poll_s: float = POLL_S,
@@ -75,12 +53,12 @@ class RobotiqGripper:
         self._clock_ns = clock_ns
         self._exchange = asyncio.Lock()
         self._seq = 0
-        self._last_move: GripperMove | None = None
+        self._last_move: messages.GripperMove | None = None
         self._connections = 0
         self._loss: DriverError | None = None
         self.connected = False
         self.last_error = ""
-        self.latest: GripperState | None = None
+        self.latest: messages.GripperState | None = None
 
     def diagnostics(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:
         """Return the gripper's part of `health`; counts are since the process began."""
@@ -91,7 +69,7 @@ class RobotiqGripper:
             "last_loss": self.last_error,
         }
 
-    async def connect(self) -> GripperState:
+    async def connect(self) -> messages.GripperState:
         """Open the connection and return the first state; DeviceNotFoundError or DeviceLostError."""
         await self._client.connect()
         self._connections += 1
@@ -105,42 +83,44 @@ class RobotiqGripper:
         self.connected, self.latest = False, None
         await self._client.close()
 
-    async def read(self) -> GripperState:
+    async def read(self) -> messages.GripperState:
         """Return the gripper's present state."""
         readout, t_ns = await self._read()
         self.latest = self._state(readout, t_ns)
         return self.latest
 
-    async def activate(self, *, operator_confirmed: bool = False) -> GripperState:
+    async def activate(self, *, operator_confirmed: bool = False) -> messages.GripperState:
         """Return the state of the active gripper; one that is not active opens and closes its fingers once.
 
         After a major fault the operator has to confirm that the fingers are clear. `operator_confirmed` activates in
         any state. Raises GripperFaultError when the activation is refused or fails.
         """
         readout, t_ns = await _uninterrupted(self._read())
-        fault = fault_of(readout.flt)
+        fault = messages.fault_of(readout.flt)
         if not operator_confirmed:
             if fault.needs_activation:
-                raise GripperFaultError(f"{fault.sentence} An operator has to confirm that the fingers are clear.")
+                raise messages.GripperFaultError(
+                    f"{fault.sentence} An operator has to confirm that the fingers are clear."
+                )
             if blocking_fault(readout) is None:
                 return self._state(readout, t_ns)
         self._last_move = None
-        await _uninterrupted(self._write(Reset()))
+        await _uninterrupted(self._write(messages.Reset()))
         not_reset = "The gripper does not take the reset; check that nothing else commands it."
         await self._wait_until(
-            lambda now: not now.act and now.sta is ActivationStatus.RESET, RESET_DEADLINE_NS, not_reset
+            lambda now: not now.act and now.sta is messages.ActivationStatus.RESET, RESET_DEADLINE_NS, not_reset
         )
         resume_ns = self._clock_ns() + PAUSE_NS
         await self._wait_until(lambda _: self._clock_ns() >= resume_ns, RESET_DEADLINE_NS, not_reset)
         # A rising edge of ACT, which also ends every fault.
-        await _uninterrupted(self._write(Activate()))
+        await _uninterrupted(self._write(messages.Activate()))
         return await self._wait_until(
             _is_active,
             ACTIVATION_DEADLINE_NS,
             "The gripper's activation does not end; clear the fingers and activate it again.",
         )
 
-    async def move(self, command: GripperCommand) -> SentCommand:
+    async def move(self, command: messages.GripperCommand) -> messages.SentCommand:
         """Start a motion and return the command as sent; `finish` waits for its end.
 
         Raises GripperRefusedError for a command that is not finite, GripperFaultError when the gripper would not move.
@@ -149,21 +129,23 @@ class RobotiqGripper:
         readout, _ = await _uninterrupted(self._read())
         blocking = blocking_fault(readout)
         if blocking is not None:
-            raise GripperFaultError(blocking)
+            raise messages.GripperFaultError(blocking)
         self._last_move = sent.request
         await _uninterrupted(self._write(sent.request))
         return sent
 
-    async def finish(self, sent: SentCommand) -> GripperState:
+    async def finish(self, sent: messages.SentCommand) -> messages.GripperState:
         """Return the state at the end of the motion: at its target, or on an object."""
 
-        def has_finished(readout: Readout) -> bool:
+        def has_finished(readout: messages.Readout) -> bool:
             if self._last_move is not sent.request:
-                raise GripperRefusedError("Another command took over before the gripper had finished its motion.")
+                raise messages.GripperRefusedError(
+                    "Another command took over before the gripper had finished its motion."
+                )
             blocking = blocking_fault(readout)
             if blocking is not None:
-                raise GripperFaultError(blocking)
-            return object_status(readout, sent.request) is not ObjectStatus.MOVING
+                raise messages.GripperFaultError(blocking)
+            return object_status(readout, sent.request) is not messages.ObjectStatus.MOVING
 
         return await self._wait_until(
             has_finished,
@@ -171,7 +153,9 @@ class RobotiqGripper:
             "The gripper does not finish its motion; check that nothing else commands it.",
         )
 
-    async def _wait_until(self, done: Callable[[Readout], bool], deadline_ns: int, failure: str) -> GripperState:
+    async def _wait_until(
+        self, done: Callable[[messages.Readout], bool], deadline_ns: int, failure: str
+    ) -> messages.GripperState:
         """Return the first state that is `done`; GripperFaultError after the deadline."""
         since_ns = self._clock_ns()
         while True:
@@ -179,18 +163,18 @@ class RobotiqGripper:
             if done(readout):
                 return self._state(readout, t_ns)
             if t_ns - since_ns > deadline_ns:
-                raise GripperFaultError(failure)
+                raise messages.GripperFaultError(failure)
             await asyncio.sleep(self._poll_s)
 
     async def halt(self) -> None:
         """Stop the fingers where they are; they keep their grip. An activation is ended by a reset."""
         self._last_move = None
-        await _uninterrupted(self._write(GripperHalt()))
+        await _uninterrupted(self._write(messages.GripperHalt()))
         readout, _ = await _uninterrupted(self._read())
-        if readout.sta is ActivationStatus.ACTIVATING:
-            await _uninterrupted(self._write(Reset()))
+        if readout.sta is messages.ActivationStatus.ACTIVATING:
+            await _uninterrupted(self._write(messages.Reset()))
 
-    async def states(self) -> AsyncGenerator[GripperState]:
+    async def states(self) -> AsyncGenerator[messages.GripperState]:
         """Yield a state every poll period and reconnect after losses, for ever.
 
         Iterate within `contextlib.aclosing`, which closes the connection at the end.
@@ -211,7 +195,7 @@ class RobotiqGripper:
         finally:
             await self.close()
 
-    async def _next_state(self) -> GripperState:
+    async def _next_state(self) -> messages.GripperState:
         if self.connected:
             return await self.read()
         if self._loss is not None:
@@ -229,30 +213,39 @@ class RobotiqGripper:
         self._on_event(LinkEvent(up=False, sentence=self.last_error, repeated=retry.repeated))
         await asyncio.sleep(retry.wait_s)
 
-    def clip(self, command: GripperCommand) -> SentCommand:
+    def clip(self, command: messages.GripperCommand) -> messages.SentCommand:
         """Return the command clipped to this gripper's limits and rounded to counts."""
         if not all(map(math.isfinite, (command.width_mm, command.speed_mm_s, command.force_n))):
-            raise GripperRefusedError(f"{command} is no command: width, speed and force must be finite numbers.")
+            raise messages.GripperRefusedError(
+                f"{command} is no command: width, speed and force must be finite numbers."
+            )
         clipped: list[str] = []
         calibration = self._calibration
         narrowest_mm, widest_mm = calibration.width_mm(COUNTS_MAX), calibration.width_mm(0)
         width_mm = _clip("width", command.width_mm, narrowest_mm, widest_mm, "mm", clipped)
-        speed_mm_s = _clip("speed", command.speed_mm_s, SPEED_MIN_MM_S, SPEED_MAX_MM_S, "mm/s", clipped)
-        force_n = _clip("force", command.force_n, FORCE_MIN_N, FORCE_MAX_N, "N", clipped)
-        request = GripperMove(
-            calibration.counts(width_mm),
-            round((speed_mm_s - SPEED_MIN_MM_S) / (SPEED_MAX_MM_S - SPEED_MIN_MM_S) * COUNTS_MAX),
-            round((force_n - FORCE_MIN_N) / (FORCE_MAX_N - FORCE_MIN_N) * COUNTS_MAX),
+        speed_mm_s = _clip(
+            "speed", command.speed_mm_s, messages.SPEED_MIN_MM_S, messages.SPEED_MAX_MM_S, "mm/s", clipped
         )
-        return SentCommand(
+        force_n = _clip("force", command.force_n, messages.FORCE_MIN_N, messages.FORCE_MAX_N, "N", clipped)
+        request = messages.GripperMove(
+            calibration.counts(width_mm),
+            round(
+                (speed_mm_s - messages.SPEED_MIN_MM_S)
+                / (messages.SPEED_MAX_MM_S - messages.SPEED_MIN_MM_S)
+                * COUNTS_MAX
+            ),
+            round((force_n - messages.FORCE_MIN_N) / (messages.FORCE_MAX_N - messages.FORCE_MIN_N) * COUNTS_MAX),
+        )
+        return messages.SentCommand(
             width_mm=calibration.width_mm(request.position),
-            speed_mm_s=SPEED_MIN_MM_S + request.speed / COUNTS_MAX * (SPEED_MAX_MM_S - SPEED_MIN_MM_S),
-            force_n=FORCE_MIN_N + request.force / COUNTS_MAX * (FORCE_MAX_N - FORCE_MIN_N),
+            speed_mm_s=messages.SPEED_MIN_MM_S
+            + request.speed / COUNTS_MAX * (messages.SPEED_MAX_MM_S - messages.SPEED_MIN_MM_S),
+            force_n=messages.FORCE_MIN_N + request.force / COUNTS_MAX * (messages.FORCE_MAX_N - messages.FORCE_MIN_N),
             request=request,
             clipped=tuple(clipped),
         )
 
-    async def _read(self) -> tuple[Readout, int]:
+    async def _read(self) -> tuple[messages.Readout, int]:
         async with self._exchange:
             t_ns = self._clock_ns()
             try:
@@ -261,7 +254,7 @@ class RobotiqGripper:
                 self._note_loss(error)
                 raise
 
-    async def _write(self, request: Request) -> None:
+    async def _write(self, request: messages.Request) -> None:
         async with self._exchange:
             try:
                 await self._client.write(request)
@@ -275,8 +268,8 @@ class RobotiqGripper:
             self._loss = error
         self.connected, self.latest = False, None
 
-    def _state(self, readout: Readout, t_ns: int) -> GripperState:
-        state = GripperState(
+    def _state(self, readout: messages.Readout, t_ns: int) -> messages.GripperState:
+        state = messages.GripperState(
             t_ns=t_ns,
             seq=self._seq,
             position_counts=readout.pos,
@@ -285,39 +278,39 @@ class RobotiqGripper:
             width_std_mm=self._calibration.width_std_mm,
             object=object_status(readout, self._last_move),
             activation=readout.sta,
-            current_ma=None if readout.current is None else readout.current * MA_PER_COUNT,
-            fault=fault_of(readout.flt),
+            current_ma=None if readout.current is None else readout.current * messages.MA_PER_COUNT,
+            fault=messages.fault_of(readout.flt),
         )
         self._seq += 1
         return state
 
 
-def _is_active(readout: Readout) -> bool:
+def _is_active(readout: messages.Readout) -> bool:
     if readout.act and readout.flt >= _LEAST_ACTIVATION_FAULT and readout.flt != _NO_COMMUNICATION:
-        raise GripperFaultError(fault_of(readout.flt).sentence)
-    return readout.act and readout.sta is ActivationStatus.ACTIVE
+        raise messages.GripperFaultError(messages.fault_of(readout.flt).sentence)
+    return readout.act and readout.sta is messages.ActivationStatus.ACTIVE
 
 
-def object_status(readout: Readout, last: GripperMove | None) -> ObjectStatus:
+def object_status(readout: messages.Readout, last: messages.GripperMove | None) -> messages.ObjectStatus:
     """Return what the fingers met in the last motion requested.
 
     Until the gripper has taken up a target (GTO is 1 and the echo PRE equals it), OBJ belongs to the motion before.
     """
-    if readout.sta is not ActivationStatus.ACTIVE:
-        return ObjectStatus.UNKNOWN
+    if readout.sta is not messages.ActivationStatus.ACTIVE:
+        return messages.ObjectStatus.UNKNOWN
     if last is not None and not (readout.gto and readout.pre == last.position):
-        return ObjectStatus.MOVING
-    return readout.obj if readout.gto else ObjectStatus.UNKNOWN
+        return messages.ObjectStatus.MOVING
+    return readout.obj if readout.gto else messages.ObjectStatus.UNKNOWN
 
 
-def blocking_fault(readout: Readout) -> str | None:
+def blocking_fault(readout: messages.Readout) -> str | None:
     """Return why the gripper would not move now, as a sentence, or None."""
-    if readout.flt >= FIRST_MAJOR_CODE or readout.flt == _OVER_TEMPERATURE:
-        return fault_of(readout.flt).sentence
-    if readout.sta is ActivationStatus.ACTIVATING:
-        return fault_of(5).sentence
-    if not readout.act or readout.sta is not ActivationStatus.ACTIVE:
-        return fault_of(7).sentence
+    if readout.flt >= messages.FIRST_MAJOR_CODE or readout.flt == _OVER_TEMPERATURE:
+        return messages.fault_of(readout.flt).sentence
+    if readout.sta is messages.ActivationStatus.ACTIVATING:
+        return messages.fault_of(5).sentence
+    if not readout.act or readout.sta is not messages.ActivationStatus.ACTIVE:
+        return messages.fault_of(7).sentence
     return None
 
 

@@ -11,16 +11,7 @@ from pymodbus.pdu import ModbusPDU
 
 from shearloop.drivers.connection import find_port
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, ProtocolError
-from shearloop.drivers.robotiq.messages import (
-    Activate,
-    ActivationStatus,
-    GripperHalt,
-    GripperMove,
-    ObjectStatus,
-    Readout,
-    Request,
-    Reset,
-)
+from shearloop.drivers.robotiq import messages
 
 T = TypeVar("T")
 
@@ -35,29 +26,29 @@ FIRST_COMMAND_REGISTER, FIRST_STATUS_REGISTER, N_STATUS_REGISTERS = 0x03E8, 0x07
 _ACT, _GTO = 1 << 0, 1 << 3
 
 
-def command_registers(request: Request, last: GripperMove) -> list[int]:
+def command_registers(request: messages.Request, last: messages.GripperMove) -> list[int]:
     """Return the three registers from 0x03E8 for a request; one without a target keeps the last target."""
     match request:
-        case Reset():
+        case messages.Reset():
             action = 0
-        case Activate() | GripperHalt():
+        case messages.Activate() | messages.GripperHalt():
             action = _ACT
-        case GripperMove():
+        case messages.GripperMove():
             action, last = _ACT | _GTO, request
     return [action << 8, last.position, last.speed << 8 | last.force]
 
 
-def readout_of(registers: Sequence[int]) -> Readout:
+def readout_of(registers: Sequence[int]) -> messages.Readout:
     """Return the readout of the three registers from 0x07D0; ProtocolError for another number of them."""
     if len(registers) != N_STATUS_REGISTERS:
         raise ProtocolError(f"The gripper answered with {len(registers)} registers instead of {N_STATUS_REGISTERS}.")
     status, fault_and_echo, position_and_current = registers
     gripper = status >> 8
-    return Readout(
+    return messages.Readout(
         act=bool(gripper & _ACT),
         gto=bool(gripper & _GTO),
-        sta=ActivationStatus(gripper >> 4 & 3),
-        obj=ObjectStatus(gripper >> 6 & 3),
+        sta=messages.ActivationStatus(gripper >> 4 & 3),
+        obj=messages.ObjectStatus(gripper >> 6 & 3),
         # The upper four bits belong to an optional controller that a USB gripper does not have.
         flt=fault_and_echo >> 8 & 0x0F,
         pre=fault_and_echo & 0xFF,
@@ -83,7 +74,7 @@ class ModbusClient:
         self._path = path
         self._deadline_s = reply_deadline_s
         self._client: AsyncModbusSerialClient | None = None
-        self._last = GripperMove(0, 0, 0)
+        self._last = messages.GripperMove(0, 0, 0)
 
     @property
     def name(self) -> str:
@@ -99,21 +90,16 @@ class ModbusClient:
             path, baudrate=BAUD_RATE, timeout=self._deadline_s, retries=0, reconnect_delay=0
         )
         try:
-            opened = await _cancellable(client.connect())
-        except BaseException:
-            client.close()
-            raise
-        if not opened:
-            client.close()
-            raise DeviceNotFoundError(f"{path} cannot be opened; is another program using the gripper?")
-        self._client = client
-        # The registers are written together, so that the first write has to repeat the gripper's present target.
-        try:
+            if not await _cancellable(client.connect()):
+                raise DeviceNotFoundError(f"{path} cannot be opened; is another program using the gripper?")
+            self._client = client
+            # The registers are written together, so that the first write has to repeat the gripper's present target.
             readout = await self.read()
         except BaseException:
-            await self.close()
+            client.close()
+            self._client = None
             raise
-        self._last = GripperMove(readout.pre, self._last.speed, self._last.force)
+        self._last = messages.GripperMove(readout.pre, self._last.speed, self._last.force)
 
     async def close(self) -> None:
         """Close the port; closing twice is allowed."""
@@ -121,15 +107,15 @@ class ModbusClient:
             self._client.close()
         self._client = None
 
-    async def read(self) -> Readout:
+    async def read(self) -> messages.Readout:
         """Return the status registers; DeviceLostError or ProtocolError."""
         response = await self._exchange(None)
         return readout_of(response.registers)
 
-    async def write(self, request: Request) -> None:
+    async def write(self, request: messages.Request) -> None:
         """Write the command registers; DeviceLostError or ProtocolError."""
         await self._exchange(command_registers(request, self._last))
-        if isinstance(request, GripperMove):
+        if isinstance(request, messages.GripperMove):
             self._last = request
 
     async def _exchange(self, command: list[int] | None) -> ModbusPDU:

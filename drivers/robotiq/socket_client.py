@@ -10,16 +10,7 @@ from contextlib import suppress
 from functools import partial
 
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, ProtocolError
-from shearloop.drivers.robotiq.messages import (
-    Activate,
-    ActivationStatus,
-    GripperHalt,
-    GripperMove,
-    ObjectStatus,
-    Readout,
-    Request,
-    Reset,
-)
+from shearloop.drivers.robotiq import messages
 
 PORT = 63352
 CONNECT_DEADLINE_S = 2.0
@@ -33,16 +24,16 @@ READ_ORDER = ("ACT", "STA", "GTO", "PRE", "OBJ", "POS", "FLT", "COU")
 _OPTIONAL = ("COU",)
 
 
-def set_lines(request: Request) -> list[bytes]:
+def set_lines(request: messages.Request) -> list[bytes]:
     """Return the lines of a request; each is acknowledged before the next."""
     match request:
-        case Reset():
+        case messages.Reset():
             return [b"SET ACT 0\n", b"SET ATR 0\n"]
-        case Activate():
+        case messages.Activate():
             return [b"SET ACT 1\n"]
-        case GripperHalt():
+        case messages.GripperHalt():
             return [b"SET GTO 0\n"]
-        case GripperMove(position, speed, force):
+        case messages.GripperMove(position, speed, force):
             return [f"SET POS {position} SPE {speed} FOR {force} GTO 1\n".encode()]
 
 
@@ -99,15 +90,15 @@ def value_of(variable: str, text: str) -> int | None:
     return int(text)
 
 
-def readout_of(values: dict[str, int | None]) -> Readout:
+def readout_of(values: dict[str, int | None]) -> messages.Readout:
     """Return the readout of the values of READ_ORDER; ProtocolError for a status that is not in the manual."""
     known = {name: value for name, value in values.items() if value is not None}
     try:
-        return Readout(
+        return messages.Readout(
             act=bool(known["ACT"]),
             gto=bool(known["GTO"]),
-            sta=ActivationStatus(known["STA"]),
-            obj=ObjectStatus(known["OBJ"]),
+            sta=messages.ActivationStatus(known["STA"]),
+            obj=messages.ObjectStatus(known["OBJ"]),
             flt=known["FLT"],
             pre=known["PRE"],
             pos=known["POS"],
@@ -158,14 +149,14 @@ class SocketClient:
             with suppress(OSError):
                 await streams[1].wait_closed()
 
-    async def read(self) -> Readout:
+    async def read(self) -> messages.Readout:
         """Return the status registers, requested one by one; DeviceLostError or ProtocolError."""
         answers = await self._ask(
             [(f"GET {name}\n".encode(), partial(ReplyParser.take_value, variable=name)) for name in READ_ORDER]
         )
         return readout_of({name: value_of(name, text) for name, text in zip(READ_ORDER, answers, strict=True)})
 
-    async def write(self, request: Request) -> None:
+    async def write(self, request: messages.Request) -> None:
         """Send a request and wait for its acknowledgement; DeviceLostError or ProtocolError."""
         await self._ask([(line, ReplyParser.take_ack) for line in set_lines(request)])
 

@@ -12,8 +12,8 @@ from typing import Self
 import numpy as np
 from pydantic import model_validator
 
+from shearloop.drivers.calibration_files import CalibrationModel, Finite, Positive
 from shearloop.drivers.errors import DeviceCalibrationError
-from shearloop.drivers.yaml_files import CalibrationModel, Finite, Positive
 
 COUNTS_MAX = 255
 STROKE_MM = 140.0

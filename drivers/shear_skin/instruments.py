@@ -2,31 +2,14 @@
 
 import re
 from collections import Counter
-from collections.abc import AsyncGenerator
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from shearloop.drivers import serial_sensor
 from shearloop.drivers.connection import Diagnostics, Link
 from shearloop.drivers.errors import DeviceLostError, DeviceSilentError, DriverError, ProtocolError
 from shearloop.drivers.load_cell import describe_errors
-from shearloop.drivers.serial_sensor import (
-    InputKind,
-    LineSplitter,
-    OnRaw,
-    RawEvent,
-    SerialSensor,
-    ignore_raw,
-    transfer_ns,
-)
-from shearloop.drivers.shear_skin.scpi import (
-    NOT_A_NUMBER,
-    OVERLOAD,
-    REPLY_TIMEOUT_S,
-    PolledInstrument,
-    RecordedInstrument,
-    Reply,
-    parse_numbers,
-)
+from shearloop.drivers.shear_skin import scpi
 
 # The current source. Commands and status word: manual 6430-901-01, section 17; the 2400 series understands them too.
 MODELS = ("MODEL 6430", "MODEL 24")
@@ -78,28 +61,28 @@ class SourceReading:
     compliance: bool = False
 
 
-def read_elements(reply: Reply) -> SourceReading:
+def read_elements(reply: scpi.Reply) -> SourceReading:
     """Return the reading in a reply to READ with the elements VOLT, CURR, STAT; ProtocolError for a bad reply."""
-    voltage_v, current_a, status = parse_numbers(reply.text, 3, "The current source")
-    if not 0 <= status < 1 << 24 or max(abs(voltage_v), abs(current_a)) >= NOT_A_NUMBER:
+    voltage_v, current_a, status = scpi.parse_numbers(reply.text, 3, "The current source")
+    if not 0 <= status < 1 << 24 or max(abs(voltage_v), abs(current_a)) >= scpi.NOT_A_NUMBER:
         raise ProtocolError(f"The current source sent {reply.text[:60]!r}, which is not a reading; was it set by hand?")
     bad = _OVERFLOW | _COMPLIANCE | _OVERVOLTAGE | _RANGE_COMPLIANCE
     return SourceReading(reply.t_arrival_ns, True, voltage_v, current_a, compliance=bool(int(status) & bad))
 
 
-def read_output(reply: Reply) -> SourceReading | None:
+def read_output(reply: scpi.Reply) -> SourceReading | None:
     """Return a reading if a reply to OUTPUT says off, None if on; ProtocolError for a bad reply."""
     if reply.text not in ("0", "1"):
         raise ProtocolError(f"The current source sent {reply.text[:60]!r} instead of 0 or 1.")
     return SourceReading(reply.t_arrival_ns, output_on=False) if reply.text == "0" else None
 
 
-def recorded_source() -> RecordedInstrument[SourceReading]:
+def recorded_source() -> scpi.RecordedInstrument[SourceReading]:
     """Return a parser for the recorded replies of a source."""
-    return RecordedInstrument({OUTPUT: read_output, READ: read_elements})
+    return scpi.RecordedInstrument({OUTPUT: read_output, READ: read_elements})
 
 
-class Keithley6430(PolledInstrument[SourceReading]):
+class Keithley6430(scpi.PolledInstrument[SourceReading]):
     """The current source: set up, switched on, read until the iteration ends, then switched off."""
 
     def __init__(
@@ -108,10 +91,9 @@ class Keithley6430(PolledInstrument[SourceReading]):
         current_a: float = CURRENT_A,
         compliance_v: float = COMPLIANCE_V,
         period_s: float = SOURCE_PERIOD_S,
-        timeout_s: float = REPLY_TIMEOUT_S,
-        on_raw: OnRaw = ignore_raw,
+        timeout_s: float = scpi.REPLY_TIMEOUT_S,
+        on_raw: serial_sensor.OnRaw = serial_sensor.ignore_raw,
     ) -> None:
-        """Use the link, not yet open; `on_raw` receives queries and replies."""
         super().__init__(link, "The current source", period_s, timeout_s, on_raw)
         self.current_a = current_a
         self.compliance_v = compliance_v
@@ -191,20 +173,20 @@ class Voltages:
     over_2: bool = False
 
 
-def read_scan(reply: Reply) -> Voltages:
+def read_scan(reply: scpi.Reply) -> Voltages:
     """Return the voltages in a reply to SCAN, stamped between query and answer; ProtocolError for a bad reply."""
-    v1_v, v2_v = parse_numbers(reply.text, 2, "The scanner")
+    v1_v, v2_v = scpi.parse_numbers(reply.text, 2, "The scanner")
     return Voltages(
         v1_v,
         v2_v,
         t_mid_ns=(reply.t_asked_ns + reply.t_arrival_ns) // 2,
         t_arrival_ns=reply.t_arrival_ns,
-        over_1=abs(v1_v) >= OVERLOAD,
-        over_2=abs(v2_v) >= OVERLOAD,
+        over_1=abs(v1_v) >= scpi.OVERLOAD,
+        over_2=abs(v2_v) >= scpi.OVERLOAD,
     )
 
 
-class ScpiScanner(PolledInstrument[Voltages]):
+class ScpiScanner(scpi.PolledInstrument[Voltages]):
     """A scanning multimeter on a socket (Keysight 34970A/34972A/DAQ970A and compatible): two channels a scan."""
 
     def __init__(
@@ -213,10 +195,9 @@ class ScpiScanner(PolledInstrument[Voltages]):
         channels: tuple[int, int] = SCANNER_CHANNELS,
         rate_hz: float = DAQ_RATE_HZ,
         range_v: float = SCANNER_RANGE_V,
-        timeout_s: float = REPLY_TIMEOUT_S,
-        on_raw: OnRaw = ignore_raw,
+        timeout_s: float = scpi.REPLY_TIMEOUT_S,
+        on_raw: serial_sensor.OnRaw = serial_sensor.ignore_raw,
     ) -> None:
-        """Use the link, not yet open; `on_raw` receives queries and replies."""
         super().__init__(link, "The scanner", 1.0 / rate_hz, timeout_s, on_raw)
         self._channels = f"(@{channels[0]},{channels[1]})"
         self._range_v = range_v
@@ -237,9 +218,9 @@ class ScpiScanner(PolledInstrument[Voltages]):
         return read_scan(await self._session.ask(SCAN))
 
 
-def recorded_scanner() -> RecordedInstrument[Voltages]:
+def recorded_scanner() -> scpi.RecordedInstrument[Voltages]:
     """Return a parser for the recorded replies of a scanner."""
-    return RecordedInstrument({SCAN: read_scan})
+    return scpi.RecordedInstrument({SCAN: read_scan})
 
 
 class PairParser:
@@ -249,7 +230,7 @@ class PairParser:
     """
 
     def __init__(self, rate_hz: float = DAQ_RATE_HZ, full_scale_v: float = ADC_FULL_SCALE_V) -> None:
-        self._lines = LineSplitter(MAX_PAIR_BYTES)
+        self._lines = serial_sensor.LineSplitter(MAX_PAIR_BYTES)
         self._errors: Counter[str] = Counter()
         self.partial_lines = 0
         self._period_ns = round(1e9 / rate_hz)
@@ -267,11 +248,11 @@ class PairParser:
         self._lines.restart()
         self._first = True
 
-    def handle(self, event: RawEvent) -> list[Voltages]:
+    def handle(self, event: serial_sensor.RawEvent) -> list[Voltages]:
         """Process a live or recorded event; return the voltages that it completes."""
-        if event.kind is InputKind.OPENED:
+        if event.kind is serial_sensor.InputKind.OPENED:
             self.restart()
-        elif event.kind is InputKind.DATA:
+        elif event.kind is serial_sensor.InputKind.DATA:
             return self.feed(event.data, event.t_ns)
         return []
 
@@ -289,7 +270,7 @@ class PairParser:
             elif line is not None:
                 text = line.strip(b"\r")
                 if match := _PAIR.fullmatch(text):
-                    sent_ns = t_arrival_ns - age * self._period_ns - transfer_ns(len(line) + 1, ADC_BAUD)
+                    sent_ns = t_arrival_ns - age * self._period_ns - serial_sensor.transfer_ns(len(line) + 1, ADC_BAUD)
                     found.append(self._voltages(float(match[1]), float(match[2]), sent_ns, t_arrival_ns))
                 else:
                     self._errors["not two decimals" if text else "empty"] += 1
@@ -309,7 +290,7 @@ class PairParser:
         )
 
 
-class AdcBoard(SerialSensor[Voltages]):
+class AdcBoard(serial_sensor.SerialSensor[Voltages]):
     """A cheap converter board on a serial port: sends a line `v1,v2` in volts for each pair of conversions."""
 
     silence_hint = "check that it is the skin's converter board and that it has power."
@@ -319,17 +300,12 @@ class AdcBoard(SerialSensor[Voltages]):
         link: Link,
         rate_hz: float = DAQ_RATE_HZ,
         full_scale_v: float = ADC_FULL_SCALE_V,
-        on_raw: OnRaw = ignore_raw,
+        on_raw: serial_sensor.OnRaw = serial_sensor.ignore_raw,
     ) -> None:
-        """Use the link, not yet open; `on_raw` receives every input of the parser."""
         super().__init__(link, 1.0 / rate_hz, on_raw)
         self.period_s = 1.0 / rate_hz
         self._parser = PairParser(rate_hz, full_scale_v)
         self._count = 0
-
-    def readings(self) -> AsyncGenerator[Voltages]:
-        """Yield the voltages of every line; see `values`."""
-        return self.values()
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
@@ -342,7 +318,7 @@ class AdcBoard(SerialSensor[Voltages]):
             "error_details": describe_errors(errors, _PAIR_ERRORS),
         }
 
-    def _parse(self, event: RawEvent) -> list[Voltages]:
+    def _parse(self, event: serial_sensor.RawEvent) -> list[Voltages]:
         found = self._parser.handle(event)
         self._count += len(found)
         return found

@@ -83,7 +83,6 @@ class RecordedInstrument(Generic[ReadingT]):
     """Parses an instrument's recorded replies. No I/O."""
 
     def __init__(self, parsers: Mapping[str, Callable[[Reply], ReadingT | None]]) -> None:
-        """Use a parser for the replies to each query."""
         self._parsers = parsers
         self._query, self._asked_ns = "", 0
 

@@ -81,11 +81,6 @@ class SkinSample:
         """Whether there are no faults."""
         return not self.faults
 
-    @property
-    def reason(self) -> str:
-        """The faults, in sentences."""
-        return "; ".join(self.faults)
-
 
 class SampleValidator:
     """Turns readings of voltages and current into samples, one by one. No I/O; times are passed in."""
@@ -219,7 +214,6 @@ class ShearSkin:
     """Source and DAQ of one skin. Run `watch_source` next to `samples`: without it every sample has a fault."""
 
     def __init__(self, source: Keithley6430, daq: Daq, gauge_ohm: float = GAUGE_OHM) -> None:
-        """Use both instruments, not yet open."""
         self._source = source
         self._daq = daq
         self._validator = SampleValidator(source.current_a, source.period_s, daq.period_s, gauge_ohm)

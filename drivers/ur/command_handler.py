@@ -7,24 +7,8 @@ between cycles. After a motion has ended, only a new command begins one.
 from dataclasses import fields
 from typing import TYPE_CHECKING, Final
 
-from shearloop.drivers.ur import error_messages
+from shearloop.drivers.ur import error_messages, messages
 from shearloop.drivers.ur.limits import violation
-from shearloop.drivers.ur.messages import (
-    RUNTIME_STOPPED,
-    SAFETY_EMERGENCY_STOPS,
-    SAFETY_PROTECTIVE_STOP,
-    Command,
-    CommandReply,
-    Disconnect,
-    Enable,
-    MoveLinear,
-    RobotState,
-    RtdeSample,
-    Stop,
-    Unlock,
-    WristSpeed,
-    ZeroForceTorque,
-)
 from shearloop.drivers.ur.motion_executor import MotionExecutor, tool_axis_torque
 from shearloop.drivers.ur.recovery import (
     ENDS_ITSELF_S,
@@ -38,7 +22,7 @@ from shearloop.drivers.ur.settings import UrSettings
 if TYPE_CHECKING:
     from shearloop.drivers.ur.arm import UrArm
 
-_SAMPLE_FIELDS: Final = tuple(field.name for field in fields(RtdeSample))
+_SAMPLE_FIELDS: Final = tuple(field.name for field in fields(messages.RtdeSample))
 
 
 class CommandHandler:
@@ -88,7 +72,7 @@ class CommandHandler:
         just_now = self._starting_ns is not None and now_ns - self._starting_ns <= ENDS_ITSELF_S * 1e9
         return self.owns_program or just_now
 
-    def owns_paused_program(self, sample: RtdeSample) -> bool:
+    def owns_paused_program(self, sample: messages.RtdeSample) -> bool:
         """Return whether a program of ours is paused and could be resumed at the pendant."""
         return self.owns_program and sample.program_paused
 
@@ -104,27 +88,29 @@ class CommandHandler:
         """Note that the daemon sent something."""
         self._daemon_alive_ns = now_ns
 
-    def request(self, number: int, command: Command, sample: RtdeSample, now_ns: int) -> CommandReply | None:
+    def request(
+        self, number: int, command: messages.Command, sample: messages.RtdeSample, now_ns: int
+    ) -> messages.CommandReply | None:
         """Return the reply to a command; None when `tick` returns it later (`Unlock`)."""
-        if self._leaving and not isinstance(command, Stop | Disconnect):
-            return CommandReply(refusal=error_messages.LEAVING)
+        if self._leaving and not isinstance(command, messages.Stop | messages.Disconnect):
+            return messages.CommandReply(refusal=error_messages.LEAVING)
         match command:
-            case Stop():
+            case messages.Stop():
                 return self._stop(number, command, sample, now_ns)
-            case Enable():
+            case messages.Enable():
                 return self._enable(sample)
-            case Unlock():
+            case messages.Unlock():
                 return self._unlock(number, sample, now_ns)
-            case ZeroForceTorque():
+            case messages.ZeroForceTorque():
                 return self._zero_wrench(sample)
-            case WristSpeed():
+            case messages.WristSpeed():
                 return self._turn(number, command, sample, now_ns)
-            case MoveLinear():
+            case messages.MoveLinear():
                 return self._move(number, command, sample, now_ns)
-            case Disconnect():
+            case messages.Disconnect():
                 return self._leave(sample, now_ns)
 
-    def tick(self, sample: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
+    def tick(self, sample: messages.RtdeSample, now_ns: int) -> tuple[int, messages.CommandReply] | None:
         """Run one cycle: check the sample and send what is due; return the reply to an `Unlock` that has ended."""
         self._executor.watch(sample, now_ns)
         announced, self._stops_paused = self._stops_paused, False
@@ -134,7 +120,7 @@ class CommandHandler:
         foreign = self._foreign_program.update(
             now_ns, plays_without_us=without_us and sample.program_running and self._is_recent(sample)
         )
-        if sample.runtime_state == RUNTIME_STOPPED or foreign:
+        if sample.runtime_state == messages.RUNTIME_STOPPED or foreign:
             # The next program may be anyone's, and ours may have ended between two samples.
             self._owns_program = False
             self._paused_program.reset()
@@ -161,14 +147,14 @@ class CommandHandler:
         self._executor.keep(sample, now_ns)
         return None
 
-    def state(self, sample: RtdeSample, cycle: int) -> RobotState:
+    def state(self, sample: messages.RtdeSample, cycle: int) -> messages.RobotState:
         """Return the sample with the state of the driver."""
         executor = self._executor
-        return RobotState(
+        return messages.RobotState(
             **{name: getattr(sample, name) for name in _SAMPLE_FIELDS},
             wrist_torque_nm=tool_axis_torque(sample),
-            protective_stop=sample.safety_mode == SAFETY_PROTECTIVE_STOP,
-            emergency_stop=sample.safety_mode in SAFETY_EMERGENCY_STOPS,
+            protective_stop=sample.safety_mode == messages.SAFETY_PROTECTIVE_STOP,
+            emergency_stop=sample.safety_mode in messages.SAFETY_EMERGENCY_STOPS,
             blocked=self._why_blocked(sample),
             recovering=self.recovering,
             motion=executor.motion,
@@ -181,7 +167,9 @@ class CommandHandler:
             failed_program_stops=self._paused_program.failed_stops,
         )
 
-    def _turn(self, number: int, asked: WristSpeed, sample: RtdeSample, now_ns: int) -> CommandReply:
+    def _turn(
+        self, number: int, asked: messages.WristSpeed, sample: messages.RtdeSample, now_ns: int
+    ) -> messages.CommandReply:
         refusal = self._why_blocked(sample)
         if not refusal and asked.acceleration_rad_per_s2 <= 0:
             refusal = f"An acceleration of {asked.acceleration_rad_per_s2:g} rad/s² is not above 0."
@@ -190,53 +178,59 @@ class CommandHandler:
         if not refusal and self._executor.motion == "linear":
             refusal = "A linear move is under way: stop it."
         if refusal:
-            return CommandReply(refusal=refusal)
+            return messages.CommandReply(refusal=refusal)
         return self._reply(taken=self._executor.turn(number, asked, sample, now_ns))
 
-    def _move(self, number: int, asked: MoveLinear, sample: RtdeSample, now_ns: int) -> CommandReply:
+    def _move(
+        self, number: int, asked: messages.MoveLinear, sample: messages.RtdeSample, now_ns: int
+    ) -> messages.CommandReply:
         refusal = self._why_blocked(sample)
         if not refusal and min(asked.speed_m_per_s, asked.acceleration_m_per_s2) <= 0:
             refusal = "A linear move needs a speed and an acceleration above 0."
         if not refusal and not (self._executor.motion in ("idle", "wrist") and sample.rests):
             refusal = "The arm moves: stop it before a linear move."
         if refusal:
-            return CommandReply(refusal=refusal)
+            return messages.CommandReply(refusal=refusal)
         return self._reply(taken=self._executor.move(number, asked, sample, now_ns))
 
-    def _reply(self, *, taken: bool) -> CommandReply:
+    def _reply(self, *, taken: bool) -> messages.CommandReply:
         if not taken:
-            return CommandReply(refusal=self._executor.disabled_reason)
-        return CommandReply(sent=self._executor.sent, clipped=self._executor.clipped)
+            return messages.CommandReply(refusal=self._executor.disabled_reason)
+        return messages.CommandReply(sent=self._executor.sent, clipped=self._executor.clipped)
 
-    def _stop(self, number: int, asked: Stop, sample: RtdeSample, now_ns: int) -> CommandReply:
+    def _stop(
+        self, number: int, asked: messages.Stop, sample: messages.RtdeSample, now_ns: int
+    ) -> messages.CommandReply:
         if asked.deceleration_rad_per_s2 <= 0:
-            return CommandReply(refusal=f"A deceleration of {asked.deceleration_rad_per_s2:g} rad/s² is not above 0.")
+            return messages.CommandReply(
+                refusal=f"A deceleration of {asked.deceleration_rad_per_s2:g} rad/s² is not above 0."
+            )
         if self._recovery is not None and self._unlock_number is not None:
             self._recovery.give_up("Unlocking was ended by a stop.")
         unfit = self._why_unfit(sample)
         if unfit:
-            return CommandReply(refusal=f"Nothing can be sent, and the arm stops by itself. {unfit}")
+            return messages.CommandReply(refusal=f"Nothing can be sent, and the arm stops by itself. {unfit}")
         self._executor.stop_on_command(number, asked, sample, now_ns)
         return self._reply(taken=not self._executor.disabled_reason)
 
-    def _leave(self, sample: RtdeSample, now_ns: int) -> CommandReply:
+    def _leave(self, sample: messages.RtdeSample, now_ns: int) -> messages.CommandReply:
         self._leaving = True
         if self._recovery is not None:
             self._recovery.give_up(error_messages.LEAVING)
         self._executor.stop_now(sample, now_ns, "the daemon disconnects")
-        return CommandReply()
+        return messages.CommandReply()
 
-    def _enable(self, sample: RtdeSample) -> CommandReply:
+    def _enable(self, sample: messages.RtdeSample) -> messages.CommandReply:
         refusal = self._why_unfit(sample) or violation(sample, self._limits)
         if self._recovery is not None:
             refusal = error_messages.BEING_MADE_READY
         if not refusal:
             self._held_reason = ""
-        return CommandReply(refusal=refusal)
+        return messages.CommandReply(refusal=refusal)
 
-    def _unlock(self, number: int, sample: RtdeSample, now_ns: int) -> CommandReply | None:
+    def _unlock(self, number: int, sample: messages.RtdeSample, now_ns: int) -> messages.CommandReply | None:
         if self._unlock_number is not None:
-            return CommandReply(refusal="Unlocking is under way.")
+            return messages.CommandReply(refusal="Unlocking is under way.")
         unfit = self._why_unfit(sample)
         if not unfit:
             return self._enable(sample)
@@ -246,28 +240,28 @@ class CommandHandler:
         self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, operator_asked=True)
         return None
 
-    def _zero_wrench(self, sample: RtdeSample) -> CommandReply:
+    def _zero_wrench(self, sample: messages.RtdeSample) -> messages.CommandReply:
         # A new zero would only hide a value beyond its limit.
         refusal = self._why_unfit(sample) or violation(sample, self._limits)
         if not refusal and not (self.at_rest and sample.rests):
             refusal = "The wrench is zeroed only at rest: stop the arm first."
         if not refusal and not self._arm.zero_wrench():
             refusal = "The robot did not zero its force-torque sensor."
-        return CommandReply(refusal=refusal)
+        return messages.CommandReply(refusal=refusal)
 
-    def _why_unfit(self, sample: RtdeSample) -> str:
+    def _why_unfit(self, sample: messages.RtdeSample) -> str:
         """Return why nothing can be sent to the robot, or the empty string."""
         unfit = error_messages.why_unfit(sample, self._settings.host, self._settings.state_timeout_s)
         return unfit or self._executor.disabled_reason
 
-    def _why_blocked(self, sample: RtdeSample) -> str:
+    def _why_blocked(self, sample: messages.RtdeSample) -> str:
         """Return why motion is refused, or the empty string."""
         if self._recovery is not None:
             return error_messages.BEING_MADE_READY
         reason = self._why_unfit(sample) or violation(sample, self._limits) or self._held_reason
         return f"{reason} {self._paused_program.failure}" if self._paused_program.failure else reason
 
-    def _stop_paused_program(self, sample: RtdeSample, now_ns: int, *, announced: bool) -> None:
+    def _stop_paused_program(self, sample: messages.RtdeSample, now_ns: int, *, announced: bool) -> None:
         """Stop a paused program of ours, in the cycle after the one that has announced it."""
         if self._leaving or not (self._owns_program and sample.program_paused and self._is_recent(sample)):
             return
@@ -276,10 +270,12 @@ class CommandHandler:
                 self._paused_program.stop(now_ns)
             self._stops_paused = not announced
 
-    def _is_recent(self, sample: RtdeSample) -> bool:
+    def _is_recent(self, sample: messages.RtdeSample) -> bool:
         return sample.connected and sample.age_ns <= self._settings.state_timeout_s * 1e9
 
-    def _recover(self, recovery: Recovery, sample: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
+    def _recover(
+        self, recovery: Recovery, sample: messages.RtdeSample, now_ns: int
+    ) -> tuple[int, messages.CommandReply] | None:
         # Samples may stay old for minutes without counting as lost; the operator gets an answer all the same.
         if not self._is_recent(sample) and not recovery.has_ended(now_ns):
             return None
@@ -295,4 +291,4 @@ class CommandHandler:
             return None
         if outcome is Outcome.DONE:
             self._held_reason = ""
-        return number, CommandReply(refusal=recovery.refusal)
+        return number, messages.CommandReply(refusal=recovery.refusal)

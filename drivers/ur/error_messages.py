@@ -1,13 +1,6 @@
 """Messages for the operator: why motion is not possible, and what to do about it. Format those with {fields}."""
 
-from shearloop.drivers.ur.messages import (
-    ROBOT_MODE_RUNNING,
-    SAFETY_EMERGENCY_STOPS,
-    SAFETY_NORMAL,
-    SAFETY_PROTECTIVE_STOP,
-    SAFETY_REDUCED,
-    RtdeSample,
-)
+from shearloop.drivers.ur import messages
 
 NOT_INSTALLED = (
     "The robot needs the package ur-rtde, which is not installed here. It has wheels for CPython up to 3.12 on x86-64 "
@@ -56,7 +49,7 @@ _SAFETY = {
 }
 
 
-def why_unfit(sample: RtdeSample, host: str, state_timeout_s: float) -> str:
+def why_unfit(sample: messages.RtdeSample, host: str, state_timeout_s: float) -> str:
     """Return why the controller cannot take motion commands, or the empty string."""
     if not sample.connected:
         return f"The connection to the robot at {host} is lost."
@@ -65,13 +58,13 @@ def why_unfit(sample: RtdeSample, host: str, state_timeout_s: float) -> str:
             f"The latest state from the controller at {host} is {sample.age_ns / 1e9:.2f} s old: check its cable, "
             "other traffic on the network, and with a simulator whether its clock is slower than real time."
         )
-    if sample.safety_mode == SAFETY_PROTECTIVE_STOP:
+    if sample.safety_mode == messages.SAFETY_PROTECTIVE_STOP:
         return "Protective stop: look for its cause, clear the workspace, then unlock (not in the first 5 s)."
-    if sample.safety_mode in SAFETY_EMERGENCY_STOPS:
+    if sample.safety_mode in messages.SAFETY_EMERGENCY_STOPS:
         return "Emergency stop: make the cell safe, release the button, then unlock."
-    if sample.safety_mode not in (SAFETY_NORMAL, SAFETY_REDUCED):
+    if sample.safety_mode not in (messages.SAFETY_NORMAL, messages.SAFETY_REDUCED):
         return _SAFETY.get(sample.safety_mode, f"The robot's safety system is in mode {sample.safety_mode}.")
-    if sample.robot_mode != ROBOT_MODE_RUNNING:
+    if sample.robot_mode != messages.ROBOT_MODE_RUNNING:
         return f"The arm is not powered and released (robot mode {sample.robot_mode}): unlock to power it."
     if sample.program_paused:
         return PAUSED

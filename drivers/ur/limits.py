@@ -1,7 +1,6 @@
 """Commands clipped to the limits, and measured states checked against them."""
 
 import math
-from typing import NamedTuple
 
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
 from shearloop.drivers.ur.settings import Bound, UrLimits
@@ -14,22 +13,10 @@ LONGEST_STOP_S = 1.0
 _NO_OVERSHOOT = math.e
 
 
-class ClippedSpeed(NamedTuple):
-    """A wrist speed as it may be sent, and every reason for changing it."""
-
-    sent: WristSpeed
-    reasons: tuple[str, ...]
-
-
-class ClippedMove(NamedTuple):
-    """A linear move as it may be sent, and every reason for changing it."""
-
-    sent: MoveLinear
-    reasons: tuple[str, ...]
-
-
-def clip_wrist(asked: WristSpeed, sample: RtdeSample, limits: UrLimits, reaction_s: float) -> ClippedSpeed:
-    """Return the wrist speed clipped to the limits of speed, acceleration, force and range.
+def clip_wrist(
+    asked: WristSpeed, sample: RtdeSample, limits: UrLimits, reaction_s: float
+) -> tuple[WristSpeed, tuple[str, ...]]:
+    """Return the wrist speed within the limits of speed, acceleration, force and range, and each reason for a change.
 
     Near the end of the range the speed is the one that can still be braked within it: v·t + v²/2a = distance, with
     t = e·`reaction_s`. Between the inner and the hard limit of force or torque the speed falls linearly to zero.
@@ -57,7 +44,7 @@ def clip_wrist(asked: WristSpeed, sample: RtdeSample, limits: UrLimits, reaction
     ramp = _safe_ramp(acceleration, target, sample, limits, reaction_s)
     if ramp > acceleration:
         reasons.append(f"wrist 3 at {sample.wrist_rad:.3f} rad has to brake harder to stay within its range")
-    return ClippedSpeed(WristSpeed(target, ramp), tuple(reasons))
+    return WristSpeed(target, ramp), tuple(reasons)
 
 
 def clip_stop(asked: Stop, sample: RtdeSample, limits: UrLimits, reaction_s: float) -> Stop:
@@ -70,8 +57,8 @@ def clip_stop(asked: Stop, sample: RtdeSample, limits: UrLimits, reaction_s: flo
     return Stop(min(safe, limits.wrist_acceleration_rad_per_s2.hard))
 
 
-def clip_linear(asked: MoveLinear, limits: UrLimits) -> ClippedMove:
-    """Return the linear move with its end in the inner workspace and its speed and acceleration within their limits.
+def clip_linear(asked: MoveLinear, limits: UrLimits) -> tuple[MoveLinear, tuple[str, ...]]:
+    """Return the linear move within the inner workspace, speed and acceleration, and each reason for a change.
 
     The box is convex: a line between two points inside it stays inside.
     """
@@ -89,7 +76,7 @@ def clip_linear(asked: MoveLinear, limits: UrLimits) -> ClippedMove:
     )
     reasons += reason
     x, y, z = position
-    return ClippedMove(MoveLinear((x, y, z, *asked.pose[3:]), speed, acceleration), tuple(reasons))
+    return MoveLinear((x, y, z, *asked.pose[3:]), speed, acceleration), tuple(reasons)
 
 
 def violation(sample: RtdeSample, limits: UrLimits) -> str:

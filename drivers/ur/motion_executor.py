@@ -7,17 +7,8 @@ robot's watchdog: nothing more is sent to the program, and only a new program ma
 import math
 from typing import TYPE_CHECKING
 
-from shearloop.drivers.ur import error_messages
+from shearloop.drivers.ur import error_messages, messages
 from shearloop.drivers.ur.limits import clip_linear, clip_stop, clip_wrist, line_violation
-from shearloop.drivers.ur.messages import (
-    ARRIVED,
-    STOPPED_ON_COMMAND,
-    MotionKind,
-    MoveLinear,
-    RtdeSample,
-    Stop,
-    WristSpeed,
-)
 from shearloop.drivers.ur.settings import Six, UrSettings
 
 if TYPE_CHECKING:
@@ -44,29 +35,29 @@ class MotionExecutor:
         self._settings = settings
         self._limits = settings.limits
         self._arm = arm
-        self.motion: MotionKind = "idle"
+        self.motion: messages.MotionKind = "idle"
         # The number of the motion's command, why the motion ended, and the command last sent.
         self.motion_id = 0
         self.end_reason = ""
-        self.sent: WristSpeed | MoveLinear | Stop | None = None
+        self.sent: messages.WristSpeed | messages.MoveLinear | messages.Stop | None = None
         self.clipped: tuple[str, ...] = ()
         self.disabled_reason = error_messages.NOT_OURS
         # Whether the robot rejected a command; the caller clears it.
         self.command_rejected = False
-        self._asked, self._braking = WristSpeed(0.0, 0.0), Stop(0.0)
+        self._asked, self._braking = messages.WristSpeed(0.0, 0.0), messages.Stop(0.0)
         self._speed_thread = False
         self._asked_ns = self._rested_ns = now_ns
         self._deadline_ns = self._move_ns = 0
         self._move_seen = False
         self._move_end: Six = (0.0,) * 6
 
-    def turn(self, motion_id: int, asked: WristSpeed, sample: RtdeSample, now_ns: int) -> bool:
+    def turn(self, motion_id: int, asked: messages.WristSpeed, sample: messages.RtdeSample, now_ns: int) -> bool:
         """Turn the wrist at this speed from now on; return whether the robot took it."""
         self.motion, self.motion_id, self.end_reason = "wrist", motion_id, ""
         self._asked, self._asked_ns = asked, now_ns
         return self._send_clipped_speed(sample)
 
-    def move(self, motion_id: int, asked: MoveLinear, sample: RtdeSample, now_ns: int) -> bool:
+    def move(self, motion_id: int, asked: messages.MoveLinear, sample: messages.RtdeSample, now_ns: int) -> bool:
         """Begin a linear move of an arm at rest; return whether the robot took it."""
         self._end_speed_thread()
         sent, clipped = clip_linear(asked, self._limits)
@@ -80,24 +71,26 @@ class MotionExecutor:
             self._reject("linear move")
         return taken
 
-    def stop_on_command(self, motion_id: int, asked: Stop, sample: RtdeSample, now_ns: int) -> None:
+    def stop_on_command(self, motion_id: int, asked: messages.Stop, sample: messages.RtdeSample, now_ns: int) -> None:
         """Stop at once, as hard as commanded within the needed and the allowed deceleration."""
         sent = clip_stop(asked, sample, self._limits, self._settings.reaction_s)
         if self.motion == "stopping":
             sent = _harder(sent, self._braking)
         self.motion_id = motion_id
         self.sent, self.clipped = sent, ()
-        self.stop_now(sample, now_ns, STOPPED_ON_COMMAND, sent)
+        self.stop_now(sample, now_ns, messages.STOPPED_ON_COMMAND, sent)
 
-    def stop_now(self, sample: RtdeSample, now_ns: int, reason: str, stop: Stop | None = None) -> None:
+    def stop_now(
+        self, sample: messages.RtdeSample, now_ns: int, reason: str, stop: messages.Stop | None = None
+    ) -> None:
         """Begin to stop and send it at once, without waiting for the next cycle."""
         self.stop(sample, now_ns, reason, stop)
         if self.motion == "stopping" and self._speed_thread:
             self._keep_stopping(sample, now_ns)
 
-    def stop(self, sample: RtdeSample, now_ns: int, reason: str, stop: Stop | None = None) -> None:
+    def stop(self, sample: messages.RtdeSample, now_ns: int, reason: str, stop: messages.Stop | None = None) -> None:
         """Begin to stop, by default as hard as allowed; the harder of two stops counts."""
-        asked = stop or Stop(self._limits.wrist_acceleration_rad_per_s2.hard)
+        asked = stop or messages.Stop(self._limits.wrist_acceleration_rad_per_s2.hard)
         if self.motion == "idle" or (self.motion == "stopping" and _harder(self._braking, asked) is self._braking):
             return
         if self.motion != "stopping":
@@ -120,12 +113,12 @@ class MotionExecutor:
         self._speed_thread = False
         self.disabled_reason = disabled_reason
 
-    def watch(self, sample: RtdeSample, now_ns: int) -> None:
+    def watch(self, sample: messages.RtdeSample, now_ns: int) -> None:
         """Note whether an idle arm rests; call this in every cycle."""
         if self.motion != "idle" or sample.fastest_rad_per_s < ASTRAY_RAD_PER_S:
             self._rested_ns = now_ns
 
-    def keep(self, sample: RtdeSample, now_ns: int) -> None:
+    def keep(self, sample: messages.RtdeSample, now_ns: int) -> None:
         """Send what this cycle needs."""
         if self.disabled_reason:
             return
@@ -142,36 +135,36 @@ class MotionExecutor:
             case "idle":
                 self._arm.send_heartbeat()
 
-    def _keep_turning(self, sample: RtdeSample, now_ns: int) -> None:
+    def _keep_turning(self, sample: messages.RtdeSample, now_ns: int) -> None:
         if now_ns - self._asked_ns > self._settings.command_timeout_s * 1e9:
             late = f"the wrist speed was not renewed within {self._settings.command_timeout_s:g} s"
-            self.stop_now(sample, now_ns, late, Stop(self._limits.wrist_acceleration_rad_per_s2.inner))
+            self.stop_now(sample, now_ns, late, messages.Stop(self._limits.wrist_acceleration_rad_per_s2.inner))
         else:
             self._send_clipped_speed(sample)
 
-    def _keep_moving(self, sample: RtdeSample, now_ns: int) -> None:
+    def _keep_moving(self, sample: messages.RtdeSample, now_ns: int) -> None:
         self._move_seen = self._move_seen or sample.moving_linearly
         reason = line_violation(sample, self._limits)
         if now_ns > self._deadline_ns:
             reason = "the linear move did not end within its time"
         # The end of the move and the joint speeds come over two connections, and one may lag.
         if not sample.moving_linearly and sample.rests and (self._move_seen or self._is_at_end(sample, now_ns)):
-            self.motion, self.end_reason = "idle", ARRIVED
+            self.motion, self.end_reason = "idle", messages.ARRIVED
         elif reason:
             self.stop(sample, now_ns, reason)
             return
         self._arm.send_heartbeat()
 
-    def _is_at_end(self, sample: RtdeSample, now_ns: int) -> bool:
+    def _is_at_end(self, sample: messages.RtdeSample, now_ns: int) -> bool:
         waited = now_ns - self._move_ns > ARRIVED_AFTER_S * 1e9
         return waited and is_close(sample.tcp_pose, self._move_end, CLOSE)
 
-    def _keep_stopping(self, sample: RtdeSample, now_ns: int) -> None:
+    def _keep_stopping(self, sample: messages.RtdeSample, now_ns: int) -> None:
         if now_ns > self._deadline_ns:
             self.leave_to_watchdog(error_messages.NOT_STOPPING)
         elif self._speed_thread:
             braking = clip_stop(self._braking, sample, self._limits, self._settings.reaction_s)
-            if self._send_speed(WristSpeed(0.0, braking.deceleration_rad_per_s2)) and sample.rests:
+            if self._send_speed(messages.WristSpeed(0.0, braking.deceleration_rad_per_s2)) and sample.rests:
                 self._end_speed_thread()
                 self.motion = "idle"
         else:
@@ -179,11 +172,11 @@ class MotionExecutor:
                 self.motion = "idle"
             self._arm.send_heartbeat()
 
-    def _send_clipped_speed(self, sample: RtdeSample) -> bool:
+    def _send_clipped_speed(self, sample: messages.RtdeSample) -> bool:
         self.sent, self.clipped = clip_wrist(self._asked, sample, self._limits, self._settings.reaction_s)
         return self._send_speed(self.sent)
 
-    def _send_speed(self, command: WristSpeed) -> bool:
+    def _send_speed(self, command: messages.WristSpeed) -> bool:
         self._speed_thread = True
         taken = self._arm.wrist(command)
         if not taken:
@@ -201,11 +194,11 @@ class MotionExecutor:
             self._speed_thread = False
 
 
-def _harder(one: Stop, other: Stop) -> Stop:
+def _harder(one: messages.Stop, other: messages.Stop) -> messages.Stop:
     return one if one.deceleration_rad_per_s2 >= other.deceleration_rad_per_s2 else other
 
 
-def _longest_move_s(move: MoveLinear, sample: RtdeSample) -> float:
+def _longest_move_s(move: messages.MoveLinear, sample: messages.RtdeSample) -> float:
     distance_m = math.dist(move.pose[:3], sample.tcp_pose[:3])
     # At most half a turn; a move that only turns takes its speed as rad/s.
     way = max(distance_m, math.pi if distance_m < 1e-3 else 0.0)
@@ -213,14 +206,14 @@ def _longest_move_s(move: MoveLinear, sample: RtdeSample) -> float:
     return MOVE_SLACK * nominal_s / max(SLOWEST_SCALING, sample.speed_scaling) + MOVE_SLACK_S
 
 
-def _longest_stop_s(stop: Stop, sample: RtdeSample) -> float:
+def _longest_stop_s(stop: messages.Stop, sample: messages.RtdeSample) -> float:
     nominal_s = sample.fastest_rad_per_s / stop.deceleration_rad_per_s2
     if not math.isfinite(nominal_s):
         return STOP_SLACK_S
     return STOP_SLACK * nominal_s / max(SLOWEST_SCALING, sample.speed_scaling) + STOP_SLACK_S
 
 
-def tool_axis_torque(sample: RtdeSample) -> float:
+def tool_axis_torque(sample: messages.RtdeSample) -> float:
     """Return the torque about the tool's z axis: the third column of the pose's rotation, times the torque."""
     x, y, z = sample.tcp_pose[3:]
     angle = math.hypot(x, y, z)

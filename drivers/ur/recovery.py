@@ -9,18 +9,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.ur import error_messages
-from shearloop.drivers.ur.messages import (
-    ROBOT_MODE_IDLE,
-    ROBOT_MODE_POWER_OFF,
-    ROBOT_MODE_RUNNING,
-    RUNTIME_STOPPED,
-    SAFETY_EMERGENCY_STOPS,
-    SAFETY_NORMAL,
-    SAFETY_PROTECTIVE_STOP,
-    SAFETY_REDUCED,
-    RtdeSample,
-)
+from shearloop.drivers.ur import error_messages, messages
 
 if TYPE_CHECKING:
     from shearloop.drivers.ur.arm import UrArm
@@ -70,7 +59,7 @@ class Recovery:
         """Whether `advance` will refuse every sample."""
         return bool(self.refusal) or now_ns > self._deadline_ns
 
-    def advance(self, sample: RtdeSample, now_ns: int) -> Outcome:
+    def advance(self, sample: messages.RtdeSample, now_ns: int) -> Outcome:
         """Do the step that is due in this cycle."""
         if self.refusal:
             return Outcome.REFUSED
@@ -84,15 +73,15 @@ class Recovery:
         except DriverError as error:
             return self._refuse(f"The controller refused: {error}")
 
-    def _step(self, sample: RtdeSample, now_ns: int) -> Outcome:
-        safe = sample.safety_mode in (SAFETY_NORMAL, SAFETY_REDUCED)
-        if not (safe and sample.robot_mode == ROBOT_MODE_RUNNING):
+    def _step(self, sample: messages.RtdeSample, now_ns: int) -> Outcome:
+        safe = sample.safety_mode in (messages.SAFETY_NORMAL, messages.SAFETY_REDUCED)
+        if not (safe and sample.robot_mode == messages.ROBOT_MODE_RUNNING):
             return self._make_safe(sample, now_ns)
         self._close_popups(now_ns)
         if self._uploaded and sample.program_running:
             # The control connection may see the program a sample later; then try again in the next cycle.
             return Outcome.DONE if self._arm.arm_watchdog() else Outcome.UNDER_WAY
-        if sample.runtime_state != RUNTIME_STOPPED:
+        if sample.runtime_state != messages.RUNTIME_STOPPED:
             if not (self._operator_asked or (self._takes_over and sample.program_paused)):
                 return self._await_foreign_program(now_ns)
             self._every_second("stop", now_ns, self._arm.stop_program)
@@ -113,24 +102,24 @@ class Recovery:
         since_ns = self._asked_ns.setdefault("end", now_ns)
         return self._refuse("") if now_ns > since_ns + int(ENDS_ITSELF_S * 1e9) else Outcome.UNDER_WAY
 
-    def _make_safe(self, sample: RtdeSample, now_ns: int) -> Outcome:
+    def _make_safe(self, sample: messages.RtdeSample, now_ns: int) -> Outcome:
         if not self._operator_asked:
             return self._refuse("")
-        if sample.safety_mode in SAFETY_EMERGENCY_STOPS:
+        if sample.safety_mode in messages.SAFETY_EMERGENCY_STOPS:
             return self._refuse(
                 "The emergency stop is still pressed: make the cell safe, release it, and unlock again."
             )
-        if sample.safety_mode == SAFETY_PROTECTIVE_STOP:
+        if sample.safety_mode == messages.SAFETY_PROTECTIVE_STOP:
             if "unlock" not in self._asked_ns:
                 self._asked_ns["unlock"] = now_ns
                 self._arm.unlock()
             return Outcome.UNDER_WAY
-        if sample.safety_mode not in (SAFETY_NORMAL, SAFETY_REDUCED):
+        if sample.safety_mode not in (messages.SAFETY_NORMAL, messages.SAFETY_REDUCED):
             return self._refuse(f"Safety mode {sample.safety_mode} cannot be cured from here: look at the pendant.")
         self._close_popups(now_ns)
-        if sample.robot_mode == ROBOT_MODE_POWER_OFF:
+        if sample.robot_mode == messages.ROBOT_MODE_POWER_OFF:
             self._every_second("power", now_ns, self._arm.power_on)
-        elif sample.robot_mode == ROBOT_MODE_IDLE:
+        elif sample.robot_mode == messages.ROBOT_MODE_IDLE:
             self._every_second("brakes", now_ns, self._arm.release_brakes)
         return Outcome.UNDER_WAY
 

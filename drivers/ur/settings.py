@@ -26,14 +26,17 @@ _CLIENT_BOUNDS = {
 _LONGEST_S = {"command_timeout_s": 1.0, "silence_timeout_s": 1.0, "state_timeout_s": 1.0, "reaction_s": 0.5}
 _LEAST_WATCHDOG_HZ = 1.0
 
-_CHECKED: dict[str, object] = {"extra": "forbid", "allow_inf_nan": False}
+
+class _Checked:
+    """Makes pydantic refuse unknown keys and numbers that are not finite."""
+
+    __slots__ = ()
+    __pydantic_config__: ClassVar = {"extra": "forbid", "allow_inf_nan": False}
 
 
 @dataclass(frozen=True, slots=True)
-class Bound:
+class Bound(_Checked):
     """A limit: commands stay at or below `inner`, measured values below `hard`."""
-
-    __pydantic_config__: ClassVar = _CHECKED
 
     inner: float
     hard: float
@@ -45,10 +48,8 @@ class Bound:
 
 
 @dataclass(frozen=True, slots=True)
-class JointRange:
+class JointRange(_Checked):
     """The hard ends of each joint's range in rad, and the margin that commands keep from them."""
-
-    __pydantic_config__: ClassVar = _CHECKED
 
     lower_rad: Six
     upper_rad: Six
@@ -60,10 +61,8 @@ class JointRange:
 
 
 @dataclass(frozen=True, slots=True)
-class Workspace:
+class Workspace(_Checked):
     """The box for the tool centre point in m, in the base frame, and the margin that commands keep from its faces."""
-
-    __pydantic_config__: ClassVar = _CHECKED
 
     lower_m: Three
     upper_m: Three
@@ -75,10 +74,8 @@ class Workspace:
 
 
 @dataclass(frozen=True, slots=True)
-class UrLimits:
+class UrLimits(_Checked):
     """The limits on commands and on measured states."""
-
-    __pydantic_config__: ClassVar = _CHECKED
 
     joints: JointRange
     workspace: Workspace
@@ -100,10 +97,8 @@ class UrLimits:
 
 
 @dataclass(frozen=True, slots=True)
-class UrSettings:
+class UrSettings(_Checked):
     """The robot's address, its limits, and the deadlines of the driver."""
-
-    __pydantic_config__: ClassVar = _CHECKED
 
     host: str
     limits: UrLimits
@@ -163,18 +158,6 @@ def read_settings(path: Path) -> UrSettings:
     Raises:
         DriverError: the file cannot be read, or settings are wrong; the message names every mistake.
     """
-    from pydantic import TypeAdapter, ValidationError
+    from shearloop.yaml_files import load_model
 
-    from shearloop.drivers.yaml_files import read_yaml
-
-    content = read_yaml(path)
-    try:
-        return TypeAdapter(UrSettings).validate_python(content)
-    except ValidationError as error:
-        known = {"missing": "it is missing", "unexpected_keyword_argument": "this is not a known key"}
-        mistakes = "; ".join(
-            f"{'.'.join(map(str, mistake['loc'])) or 'the file'}: "
-            + known.get(mistake["type"], mistake["msg"].removeprefix("Value error, "))
-            for mistake in error.errors()
-        )
-        raise DriverError(f"{path}: {mistakes}.") from error
+    return load_model(path, UrSettings, DriverError)

@@ -14,27 +14,9 @@ import time
 import traceback
 from typing import TYPE_CHECKING, NoReturn
 
-from shearloop.drivers.ur import error_messages
+from shearloop.drivers.ur import error_messages, messages
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.controller import ProbeError, probe_controller
-from shearloop.drivers.ur.messages import (
-    RECOVERY_HANG_S,
-    Command,
-    CommandReply,
-    Configure,
-    Disconnect,
-    Failed,
-    FailureKind,
-    Heartbeat,
-    Message,
-    MessageDecoder,
-    MoveLinear,
-    RtdeSample,
-    Stop,
-    WorkerPhase,
-    WristSpeed,
-    encode,
-)
 from shearloop.drivers.ur.settings import UrSettings
 
 if TYPE_CHECKING:
@@ -52,7 +34,7 @@ class Pipe:
 
     def __init__(self, stdin: int, stdout: int) -> None:
         self._in, self._out = stdin, stdout
-        self._decoder = MessageDecoder()
+        self._decoder = messages.MessageDecoder()
         self._unsent = b""
         self.open = True
         os.set_blocking(stdin, False)
@@ -62,7 +44,7 @@ class Pipe:
         """Wait for input and return whether there is any."""
         return bool(select.select([self._in], [], [], timeout_s)[0])
 
-    def receive(self) -> list[tuple[int, Message]]:
+    def receive(self) -> list[tuple[int, messages.Message]]:
         """Return the messages that have arrived; `open` is False once the daemon is gone."""
         try:
             data = os.read(self._in, 1 << 16)
@@ -71,14 +53,14 @@ class Pipe:
         self.open = self.open and bool(data)
         return self._decoder.feed(data)
 
-    def send(self, message: Message, number: int = 0) -> None:
+    def send(self, message: messages.Message, number: int = 0) -> None:
         """Send a message that must arrive."""
-        self._unsent += encode(message, number)
+        self._unsent += messages.encode(message, number)
         self._flush()
         if len(self._unsent) > MOST_UNSENT:
             self.open = False
 
-    def send_latest(self, message: Message) -> None:
+    def send_latest(self, message: messages.Message) -> None:
         """Send a message, or drop it while earlier ones are unsent."""
         self._flush()
         if not self._unsent:
@@ -115,26 +97,26 @@ def main() -> NoReturn:
         _exit(EXIT_FAILED)
 
 
-def _receive_configuration(pipe: Pipe) -> Configure | None:
+def _receive_configuration(pipe: Pipe) -> messages.Configure | None:
     while pipe.open:
         pipe.wait(60.0)
         for _, message in pipe.receive():
-            if isinstance(message, Configure):
+            if isinstance(message, messages.Configure):
                 return message
     return None
 
 
 def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
     _set_alarm(settings.connect_timeout_s)
-    pipe.send(WorkerPhase("loading ur-rtde"))
+    pipe.send(messages.WorkerPhase("loading ur-rtde"))
     try:
         from shearloop.drivers.ur.arm import UrArm
     except ImportError:
         _fail(pipe, "not-installed", error_messages.NOT_INSTALLED)
     try:
-        pipe.send(WorkerPhase("greeting the controller"))
+        pipe.send(messages.WorkerPhase("greeting the controller"))
         version = probe_controller(settings.host, settings.connect_timeout_s / 3)
-        pipe.send(WorkerPhase("connecting"))
+        pipe.send(messages.WorkerPhase("connecting"))
         return UrArm(settings, version)
     except ProbeError as error:
         _fail(pipe, error.kind, str(error))
@@ -147,7 +129,7 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
         _fail(pipe, "unreachable", error_messages.REFUSED_BY_CLIENT.format(host=settings.host, text=text.strip()))
 
 
-def _control(pipe: Pipe, configured: Configure, arm: "UrArm") -> NoReturn:
+def _control(pipe: Pipe, configured: messages.Configure, arm: "UrArm") -> NoReturn:
     settings = configured.settings
     handler = CommandHandler(settings, arm, time.monotonic_ns(), takes_over=configured.takes_over)
     period_s, due_s, cycle = 1.0 / settings.rate_hz, time.monotonic(), 0
@@ -160,12 +142,12 @@ def _control(pipe: Pipe, configured: Configure, arm: "UrArm") -> NoReturn:
         if _handle_commands(pipe, handler, sample):
             leave_s = time.monotonic() + FAREWELL_S
         if not pipe.open and not leave_s:
-            handler.request(0, Disconnect(), sample, time.monotonic_ns())
+            handler.request(0, messages.Disconnect(), sample, time.monotonic_ns())
             leave_s = time.monotonic() + FAREWELL_S
         if handler.recovering:
             # Announce a cycle that may take long.
             pipe.send_latest(handler.state(sample, cycle))
-            _set_alarm(RECOVERY_HANG_S)
+            _set_alarm(messages.RECOVERY_HANG_S)
         ended = handler.tick(sample, time.monotonic_ns())
         if ended is not None:
             pipe.send(ended[1], ended[0])
@@ -196,31 +178,37 @@ def _end_program(settings: UrSettings, handler: CommandHandler, arm: "UrArm") ->
         arm.stop_program()
 
 
-def _handle_commands(pipe: Pipe, handler: CommandHandler, sample: RtdeSample) -> bool:
+def _handle_commands(pipe: Pipe, handler: CommandHandler, sample: messages.RtdeSample) -> bool:
     """Carry out the daemon's commands; return whether it disconnects."""
     disconnects = False
     for number, command in _newest_commands(pipe, handler):
         reply = handler.request(number, command, sample, time.monotonic_ns())
         if reply is not None:
             pipe.send(reply, number)
-        disconnects = disconnects or isinstance(command, Disconnect)
+        disconnects = disconnects or isinstance(command, messages.Disconnect)
     return disconnects
 
 
-def _newest_commands(pipe: Pipe, handler: CommandHandler) -> list[tuple[int, Command]]:
+def _newest_commands(pipe: Pipe, handler: CommandHandler) -> list[tuple[int, messages.Command]]:
     """Return the commands to carry out; of several motions only the latest, the others are refused as overtaken."""
-    commands: list[tuple[int, Command]] = []
+    commands: list[tuple[int, messages.Command]] = []
     for number, message in pipe.receive():
         handler.note_daemon_alive(time.monotonic_ns())
-        if isinstance(message, Command):
+        if isinstance(message, messages.Command):
             commands.append((number, message))
-        elif not isinstance(message, Heartbeat):
+        elif not isinstance(message, messages.Heartbeat):
             raise TypeError(f"the daemon sent a {type(message).__name__}, which is no command")
-    motions = [n for n, (_, command) in enumerate(commands) if isinstance(command, WristSpeed | MoveLinear | Stop)]
+    motions = [
+        n
+        for n, (_, command) in enumerate(commands)
+        if isinstance(command, messages.WristSpeed | messages.MoveLinear | messages.Stop)
+    ]
     # A stop is never overtaken: a later motion finds the arm stopping.
-    overtaken = [n for n in motions[:-1] if not isinstance(commands[n][1], Stop)]
+    overtaken = [n for n in motions[:-1] if not isinstance(commands[n][1], messages.Stop)]
     for index in overtaken:
-        pipe.send(CommandReply(refusal="A newer command came before this one could be sent."), commands[index][0])
+        pipe.send(
+            messages.CommandReply(refusal="A newer command came before this one could be sent."), commands[index][0]
+        )
     return [entry for index, entry in enumerate(commands) if index not in overtaken]
 
 
@@ -228,8 +216,8 @@ def _set_alarm(seconds: float) -> None:
     signal.setitimer(signal.ITIMER_REAL, seconds)
 
 
-def _fail(pipe: Pipe, kind: FailureKind, sentence: str) -> NoReturn:
-    pipe.send(Failed(kind, sentence))
+def _fail(pipe: Pipe, kind: messages.FailureKind, sentence: str) -> NoReturn:
+    pipe.send(messages.Failed(kind, sentence))
     _exit(EXIT_FAILED)
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from shearloop.daemon.messaging.messages import Message
 
 
-def sample(kind: type[Message]) -> Message:
-    """Return a message with something in every key."""
+def sample(kind: type[Message], **changes: Any) -> Message:
+    """Return a message of this moment with something in every key."""
     values: dict[str, Any] = {}
     for item in dataclasses.fields(kind):
         hint = str(get_type_hints(kind)[item.name])
@@ -28,4 +28,4 @@ def sample(kind: type[Message]) -> Message:
             values[item.name] = 3
         else:
             values[item.name] = "text"
-    return kind(**{**values, "t_mono_ns": time.monotonic_ns()})
+    return kind(**{**values, "t_mono_ns": time.monotonic_ns(), **changes})

@@ -45,11 +45,16 @@ def test_a_design_is_a_configuration_that_builds(built: Path) -> None:
     assert bank.valid.any()
 
 
-def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path: Path) -> None:
+def step_frames() -> np.ndarray:
+    """Return the model's frames (8, 896) of steps of eight sizes."""
     mesh = load_geometry(OWN_FINGERTIP)
     forward = ForwardModel(mesh)
     cells = [conductivity(mesh, "step", k, 1.0) for k in np.linspace(1.2, 2.2, 8).tolist()]
-    frames = 0.01 * np.abs([forward.voltages(cell) - forward.homogeneous() for cell in cells])
+    return 0.01 * np.abs([forward.voltages(cell) - forward.homogeneous() for cell in cells])
+
+
+def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path: Path) -> None:
+    frames = step_frames()
     # A third of a frame's size: a coarse mesh and few cells, built in no time.
     frames += np.random.default_rng(0).normal(0.0, 8e-4, frames.shape)
     design = design_bank(
@@ -69,10 +74,7 @@ def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path: Pat
 def test_frames_that_no_model_explains_are_called_so_on_the_screen_and_in_the_configuration(
     noise_v: float, mixed_up: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    mesh = load_geometry(OWN_FINGERTIP)
-    forward = ForwardModel(mesh)
-    cells = [conductivity(mesh, "step", k, 1.0) for k in np.linspace(1.2, 2.2, 8).tolist()]
-    frames = 0.01 * np.abs([forward.voltages(cell) - forward.homogeneous() for cell in cells])
+    frames = step_frames()
     rng = np.random.default_rng(0)
     frames = frames[:, rng.permutation(N_CHANNELS)] if mixed_up else frames
     frames += rng.normal(0.0, noise_v, frames.shape)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from shearloop.drivers.calibration_files import load_calibration
 from shearloop.drivers.load_cell import LoadCalibration
 from shearloop.drivers.robotiq.width import WidthCalibration
-from shearloop.drivers.yaml_files import load_calibration
 
 SHEARLOOP = (sys.executable, "-m", "shearloop")
 COUNTS_PER_NM = 420e3 / (9.80665 * 0.035)

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from shearloop.bank.eit.channels import CHANNELS, LINE_SLOTS, ZERO_SLOTS, line_of_channels
 from shearloop.daemon.cli import EXIT_USAGE, main
 from shearloop.drivers.eit_kit import ADC_STEP_V, EitKit, Frame
+from tests.daemon.conftest import shearloop
+from tests.running import take
 
 # Guards against a test that hangs; none of them waits for so long.
 DEADLINE_S = 60
@@ -22,35 +24,10 @@ PERIOD_S = 0.5408
 @asynccontextmanager
 async def emulator(*arguments: str) -> AsyncIterator[tuple[asyncio.subprocess.Process, str]]:
     """Run `shearloop emulate eit-kit` as a process of its own and hand over the path that it prints."""
-    process = await asyncio.create_subprocess_exec(
-        sys.executable,
-        *("-m", "shearloop", "emulate", "eit-kit", *arguments),
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-    )
-    try:
-        async with asyncio.timeout(DEADLINE_S):
-            assert process.stdout is not None
-            path = (await process.stdout.readline()).decode().strip()
-            assert path, (await process.stderr.read()).decode() if process.stderr else ""
-            yield process, path
-    finally:
-        if process.returncode is None:
-            process.terminate()
-        await process.communicate()
-        # The transport closes its pipes one step later.
-        await asyncio.sleep(0)
-
-
-async def take(kit: EitKit, n_frames: int) -> list[Frame]:
-    frames: list[Frame] = []
-    async with aclosing(kit.frames()) as arriving:
-        async for frame in arriving:
-            frames.append(frame)
-            if len(frames) == n_frames:
-                break
-    return frames
+    async with shearloop("emulate", "eit-kit", *arguments, stdin=asyncio.subprocess.PIPE) as process:
+        path = (await process.stdout.readline()).decode().strip()
+        assert path, (await process.stderr.read()).decode()
+        yield process, path
 
 
 def recording(folder: Path, n_frames: int) -> tuple[Path, NDArray[np.float64]]:
@@ -71,7 +48,7 @@ async def test_a_recording_at_a_hundred_times_its_pace_arrives_whole_and_in_orde
     expected = loadmat(folder / "device1.mat")["Right_Data"][:, 1:]
     async with emulator("--recording", str(folder / "device1.mat"), "--speed", "100", "--once") as (_, path):
         kit = EitKit(zero_slots=ZERO_SLOTS, path=path)
-        frames = await take(kit, 832)
+        frames = await take(kit.readings(), 832)
     assert [frame.seq for frame in frames] == list(range(832))
     np.testing.assert_array_equal([frame.raw for frame in frames], expected)
     facts = kit.diagnostics()
@@ -91,7 +68,7 @@ async def test_a_recording_is_played_again_and_again_under_the_name_given(
     link = tmp_path / "eit"
     async with emulator("--recording", str(path), "--speed", "500", "--link", str(link)) as (process, port):
         assert port == str(link)
-        frames = await take(EitKit(zero_slots=ZERO_SLOTS, path=port), 7)
+        frames = await take(EitKit(zero_slots=ZERO_SLOTS, path=port).readings(), 7)
         process.send_signal(number)
         assert await process.wait() == 0
     np.testing.assert_array_equal([frame.raw for frame in frames], [lines[n % 3] for n in range(7)])
@@ -104,7 +81,7 @@ async def test_faults_are_switched_on_by_argument_and_by_standard_input(tmp_path
     async with emulator(*arguments, "--fault", "cut-line@1", "--fault", "unplug:0.1@3") as (process, port):
         kit = EitKit(zero_slots=ZERO_SLOTS, path=port)
         frames: list[Frame] = []
-        async with aclosing(kit.frames()) as arriving:
+        async with aclosing(kit.readings()) as arriving:
             async for frame in arriving:
                 frames.append(frame)
                 if len(frames) == 5:
@@ -137,7 +114,7 @@ async def test_twists_are_synthesised_from_a_bank(tmp_path: Path) -> None:
     path = tmp_path / "bank.shb"
     write_bank(path, definition, homogeneous, np.full((2, 2), 0.5), np.ones((2, 2), bool), signals)
     async with emulator("--bank", str(path), "--speed", "200") as (_, port):
-        frames = await take(EitKit(zero_slots=ZERO_SLOTS, path=port), 50)
+        frames = await take(EitKit(zero_slots=ZERO_SLOTS, path=port).readings(), 50)
     channels = np.array([frame.channels for frame in frames])
     # The programme begins with 15 s of nothing, then grips within 3 s: 28 and 34 frames.
     idle, gripped = channels[:25].mean(axis=0), channels[36:].mean(axis=0)
@@ -148,7 +125,7 @@ async def test_twists_are_synthesised_from_a_bank(tmp_path: Path) -> None:
 
 async def test_without_recording_and_bank_the_demos_fingertip_is_twisted() -> None:
     async with emulator("--speed", "200") as (_, port):
-        frames = await take(EitKit(zero_slots=ZERO_SLOTS, path=port), 90)
+        frames = await take(EitKit(zero_slots=ZERO_SLOTS, path=port).readings(), 90)
     channels = np.array([frame.channels for frame in frames])
     before, after, held, rest = (channels[n : n + 8].mean(axis=0) for n in (0, 8, 43, 61))
 

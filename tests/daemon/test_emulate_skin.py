@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator
-from contextlib import aclosing, asynccontextmanager
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from shearloop.drivers.connection import Link, SerialLink, TcpLink
 from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings, RigSkin
 from shearloop.drivers.shear_skin import AdcBoard, Daq, Keithley6430, ScpiScanner, ShearSkin, SkinFault, SkinSample
 from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.running import pass_on, running
 
 SPEED = 20
 
@@ -39,18 +40,8 @@ def tcp(address: str) -> Link:
 async def read(source: Link, daq: Daq) -> AsyncIterator["asyncio.Queue[SkinSample]"]:
     skin, queue = ShearSkin(Keithley6430(source, period_s=0.05), daq), asyncio.Queue[SkinSample]()
 
-    async def listen() -> None:
-        async with aclosing(skin.samples()) as samples:
-            async for sample in samples:
-                queue.put_nowait(sample)
-
-    tasks = [asyncio.create_task(skin.watch_source()), asyncio.create_task(listen())]
-    try:
+    async with running(skin.watch_source(), pass_on(skin.samples(), queue.put_nowait)):
         yield queue
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.wait(tasks)
 
 
 async def until(queue: "asyncio.Queue[SkinSample]", *faults: SkinFault, r1_ohm: float | None = None) -> SkinSample:

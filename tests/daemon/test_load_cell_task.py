@@ -8,6 +8,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoadTorque
 from shearloop.daemon.sensing.load_cell_task import ZERO_SAMPLES, ZERO_TIMEOUT_S, LoadCellTask
 from shearloop.drivers.load_cell import LoadSample
+from tests.running import running
 
 
 class Board:
@@ -19,7 +20,7 @@ class Board:
         # Later than all that a test asks for.
         self._seq = Clock().now_ns() + 10**9
 
-    async def samples(self) -> AsyncGenerator[LoadSample]:
+    async def readings(self) -> AsyncGenerator[LoadSample]:
         while True:
             yield await self.sent.get()
             self.sent.task_done()
@@ -60,12 +61,8 @@ async def reading(
 ) -> AsyncIterator[tuple[LoadCellTask, Board]]:
     board = Board()
     task = LoadCellTask(board, published or Published(), Clock(), lambda _: None, rate_hz)  # type: ignore[arg-type]
-    read = asyncio.create_task(task.read())
-    try:
+    async with running(task.read()):
         yield task, board
-    finally:
-        read.cancel()
-        await asyncio.gather(read, return_exceptions=True)
 
 
 async def asked(task: LoadCellTask) -> asyncio.Task[str]:

@@ -1,6 +1,6 @@
 import asyncio
-from collections.abc import AsyncIterator, Iterable
-from contextlib import aclosing, asynccontextmanager
+from collections.abc import Iterable
+from contextlib import aclosing
 from itertools import cycle, pairwise
 from pathlib import Path
 from typing import cast
@@ -14,10 +14,9 @@ from shearloop.drivers import eit_kit
 from shearloop.drivers.connection import LinkEvent
 from shearloop.drivers.eit_kit import ADC_STEP_V, EitKit, Frame, FrameErrorKind
 from shearloop.drivers.emulators.boards import BoardFault, BoardFaultKind, EitKitBoard, format_line
+from tests.running import DEADLINE_S, running, take
 
 PERIOD_S = 0.003
-# Guards against a test that hangs; none of them waits for so long.
-DEADLINE_S = 30
 
 
 def some_lines(n: int) -> list[NDArray[np.float64]]:
@@ -25,35 +24,14 @@ def some_lines(n: int) -> list[NDArray[np.float64]]:
     return [np.round(line_of_channels(row * ADC_STEP_V), 4) for row in steps]
 
 
-@asynccontextmanager
-async def running(board: EitKitBoard) -> AsyncIterator[EitKitBoard]:
-    task = asyncio.create_task(board.run())
-    await asyncio.sleep(0)
-    try:
-        yield board
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-
-
-async def take(kit: EitKit, n_frames: int) -> list[Frame]:
-    frames: list[Frame] = []
-    async with asyncio.timeout(DEADLINE_S), aclosing(kit.frames()) as arriving:
-        async for frame in arriving:
-            frames.append(frame)
-            if len(frames) == n_frames:
-                break
-    return frames
-
-
 async def play(
     lines: Iterable[NDArray[np.float64]], n_frames: int, tmp_path: Path, faults: dict[int, BoardFault] | None = None
 ) -> tuple[EitKit, list[Frame], list[LinkEvent]]:
     link = tmp_path / "eit"
     events: list[LinkEvent] = []
-    async with running(EitKitBoard(lines, period_s=PERIOD_S, link=link, fault_at=faults)):
+    async with running(EitKitBoard(lines, period_s=PERIOD_S, link=link, fault_at=faults).run()):
         kit = EitKit(zero_slots=ZERO_SLOTS, path=link, frame_period_s=PERIOD_S, on_event=events.append)
-        frames = await take(kit, n_frames)
+        frames = await take(kit.readings(), n_frames)
     return kit, frames, events
 
 
@@ -73,10 +51,10 @@ async def test_every_frame_arrives_once_and_in_order(tmp_path: Path) -> None:
 
 
 async def test_the_rate_is_told_once_it_is_measured(tmp_path: Path) -> None:
-    async with running(EitKitBoard(cycle(some_lines(4)), period_s=PERIOD_S, link=tmp_path / "eit")):
+    async with running(EitKitBoard(cycle(some_lines(4)), period_s=PERIOD_S, link=tmp_path / "eit").run()):
         kit = EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit", frame_period_s=PERIOD_S)
         assert kit.diagnostics()["measured_hz"] is None
-        async with asyncio.timeout(DEADLINE_S), aclosing(kit.frames()) as arriving:
+        async with asyncio.timeout(DEADLINE_S), aclosing(kit.readings()) as arriving:
             async for _ in arriving:
                 if kit.diagnostics()["measured_hz"] is not None:
                     break
@@ -85,10 +63,11 @@ async def test_the_rate_is_told_once_it_is_measured(tmp_path: Path) -> None:
 
 async def test_a_reader_that_stops_for_a_while_loses_nothing(tmp_path: Path) -> None:
     lines = some_lines(40)
-    async with running(EitKitBoard(lines, period_s=PERIOD_S, link=tmp_path / "eit")) as board:
+    board = EitKitBoard(lines, period_s=PERIOD_S, link=tmp_path / "eit")
+    async with running(board.run()):
         kit = EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit", frame_period_s=PERIOD_S)
         frames = []
-        async with asyncio.timeout(DEADLINE_S), aclosing(kit.frames()) as arriving:
+        async with asyncio.timeout(DEADLINE_S), aclosing(kit.readings()) as arriving:
             async for frame in arriving:
                 frames.append(frame)
                 if len(frames) == 5:
@@ -164,10 +143,10 @@ async def test_a_board_that_is_unplugged_is_found_again_and_started(tmp_path: Pa
 
 async def test_a_driver_that_begins_while_the_board_sends_takes_up_with_the_next_line(tmp_path: Path) -> None:
     lines = some_lines(30)
-    async with running(EitKitBoard(lines, period_s=PERIOD_S, link=tmp_path / "eit")):
-        first = await take(EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit"), 10)
+    async with running(EitKitBoard(lines, period_s=PERIOD_S, link=tmp_path / "eit").run()):
+        first = await take(EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit").readings(), 10)
         kit = EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit")
-        second = await take(kit, 10)
+        second = await take(kit.readings(), 10)
     assert_same(first, lines[:10])
     sent = [line.tolist() for line in lines]
     places = [sent.index(frame.raw.tolist()) for frame in second]
@@ -186,9 +165,9 @@ async def test_a_board_that_is_not_there_is_awaited_and_told_of_once(tmp_path: P
             missed_twice.set()
 
     kit = EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit", on_event=note)
-    taking = asyncio.create_task(take(kit, 1))
+    taking = asyncio.create_task(take(kit.readings(), 1))
     await missed_twice.wait()
-    async with running(EitKitBoard(some_lines(1), period_s=PERIOD_S, link=tmp_path / "eit")):
+    async with running(EitKitBoard(some_lines(1), period_s=PERIOD_S, link=tmp_path / "eit").run()):
         (frame,) = await taking
     assert frame.seq == 0
     assert [event.repeated for event in events if not event.up][:2] == [False, True]

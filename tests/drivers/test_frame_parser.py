@@ -7,22 +7,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import LINE_SLOTS, ZERO_SLOTS, channels_of_line, line_of_channels
-from shearloop.drivers.eit_kit import (
-    ADC_STEP_V,
-    FULL_SCALE_SINE_RMS_V,
-    LINE_BYTES,
-    MAX_LINE_BYTES,
-    NOMINAL_PERIOD_NS,
-    TRANSFER_NS,
-    Frame,
-    FrameError,
-    FrameErrorKind,
-    FrameParser,
-    read_line,
-)
+from shearloop.drivers import eit_kit
+from shearloop.drivers.eit_kit import ADC_STEP_V, FULL_SCALE_SINE_RMS_V, Frame, FrameErrorKind, FrameParser
 from shearloop.drivers.emulators.boards import format_line
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
-PERIOD_NS = NOMINAL_PERIOD_NS
+PERIOD_NS = eit_kit.NOMINAL_PERIOD_NS
 
 
 def some_line(seed: int) -> bytes:
@@ -82,7 +72,7 @@ def test_every_value_that_four_decimals_can_write_is_the_double_that_float_reads
     for start in range(0, len(every), 1024):
         texts = every[start : start + 1024]
         texts += [b"0.0001"] * (1024 - len(texts))
-        values = read_line(b", ".join(texts) + b", ", np.array([text == b"0.0000" for text in texts]))
+        values = eit_kit.read_line(b", ".join(texts) + b", ", np.array([text == b"0.0000" for text in texts]))
         assert isinstance(values, np.ndarray)
         assert values.tolist() == [float(text) for text in texts]
 
@@ -94,19 +84,19 @@ def test_a_cell_is_sound_with_digits_and_punctuation_in_their_places_alone() -> 
             line = bytearray(GOOD.rstrip())
             line += b" "
             line[8 * CHANNEL + place] = byte
-            found = read_line(bytes(line), ZERO_SLOTS)
+            found = eit_kit.read_line(bytes(line), ZERO_SLOTS)
             if byte in sound:
                 # A first digit above 2 V, or digits that are all 0, are refused for what they say.
-                assert not isinstance(found, FrameError) or found.kind in (
+                assert not isinstance(found, eit_kit.FrameError) or found.kind in (
                     FrameErrorKind.OUT_OF_RANGE, FrameErrorKind.ZERO_CHANNEL,
                 )  # fmt: skip
             else:
-                assert isinstance(found, FrameError)
+                assert isinstance(found, eit_kit.FrameError)
 
 
 @given(st.one_of(st.binary(max_size=9000), st.sampled_from([line.rstrip(b"\r\n") for _, line in BROKEN])))
 def test_no_bytes_make_the_reader_fail(line: bytes) -> None:
-    read_line(line, ZERO_SLOTS)
+    eit_kit.read_line(line, ZERO_SLOTS)
 
 
 def test_a_line_is_read_to_the_last_digit() -> None:
@@ -117,26 +107,20 @@ def test_a_line_is_read_to_the_last_digit() -> None:
     assert frame.line + b"\n" == GOOD
     assert (frame.seq, other.seq) == (0, 1)
     assert frame.t_arrival_ns == 5_000_000_000
-    assert frame.t_mid_ns == 5_000_000_000 - TRANSFER_NS - PERIOD_NS // 2
+    assert frame.t_mid_ns == 5_000_000_000 - eit_kit.TRANSFER_NS - PERIOD_NS // 2
     assert not frame.saturated.any()
     assert not frame.dead.any()
     with pytest.raises(ValueError, match="read-only"):
         frame.channels[0] = 1.0
 
 
-@given(st.lists(st.integers(0, 4 * LINE_BYTES + 4), max_size=40))
+@given(st.lists(st.integers(0, 4 * eit_kit.LINE_BYTES + 4), max_size=40))
 def test_any_slicing_gives_the_same_frames(cuts: list[int]) -> None:
     parser = FrameParser(ZERO_SLOTS)
     frames = feed_all(parser, slices(b"".join(LINES), cuts))
     assert [frame.line + b"\n" for frame in frames] == LINES
     assert not parser.errors
     assert parser.partial_lines == 0
-
-
-def test_one_byte_at_a_time_gives_the_same_frames() -> None:
-    stream = b"".join(LINES[:2])
-    frames = feed_all(FrameParser(ZERO_SLOTS), [stream[n : n + 1] for n in range(len(stream))])
-    assert [frame.line + b"\n" for frame in frames] == LINES[:2]
 
 
 def test_carriage_returns_are_taken_as_part_of_the_line_end() -> None:
@@ -156,8 +140,8 @@ def test_each_kind_of_broken_line_is_refused_and_named_and_the_next_is_unaffecte
 
 
 def test_a_refusal_says_which_value_it_was() -> None:
-    refusal = read_line(with_value(CHANNEL, b"-0.1234").rstrip(b"\n"), ZERO_SLOTS)
-    assert isinstance(refusal, FrameError)
+    refusal = eit_kit.read_line(with_value(CHANNEL, b"-0.1234").rstrip(b"\n"), ZERO_SLOTS)
+    assert isinstance(refusal, eit_kit.FrameError)
     assert refusal.position == CHANNEL
     assert f"read '-0.1234' at value {CHANNEL + 1}" in str(refusal)
 
@@ -169,7 +153,7 @@ def test_a_line_with_any_one_byte_changed_is_refused_or_reads_as_another_number(
     changed = GOOD[:position] + bytes([byte]) + GOOD[position + 1 :]
     parser = FrameParser(ZERO_SLOTS)
     frames = parser.feed(LINES[1] + changed + LINES[2], 0)
-    read_line(changed.rstrip(b"\n"), ZERO_SLOTS)
+    eit_kit.read_line(changed.rstrip(b"\n"), ZERO_SLOTS)
     is_digit = chr(byte).isdigit() and byte < 128 and chr(GOOD[position]).isdigit()
     assert len(frames) + parser.errors.total() == 3
     assert [frames[0].line + b"\n", frames[-1].line + b"\n"] == LINES[1:3]
@@ -193,7 +177,7 @@ def test_garbage_never_yields_a_frame_nor_grows_the_parser(garbage: bytes, times
     parser = FrameParser(ZERO_SLOTS)
     for _ in range(times):
         assert parser.feed(garbage, 0) == []
-        assert len(parser._lines.partial) <= MAX_LINE_BYTES
+        assert len(parser._lines.partial) <= eit_kit.MAX_LINE_BYTES
     parser.feed(b"\n", 0)
     assert [frame.line + b"\n" for frame in parser.feed(GOOD, 0)] == [GOOD]
 
@@ -207,7 +191,7 @@ def test_a_flood_without_newline_is_told_when_it_happens_and_only_once() -> None
     assert parser.errors.total() == 1
 
 
-@given(st.integers(1, LINE_BYTES))
+@given(st.integers(1, eit_kit.LINE_BYTES))
 def test_the_rest_of_a_line_that_was_under_way_is_no_error(start: int) -> None:
     parser = FrameParser(ZERO_SLOTS)
     assert len(parser.feed(GOOD[start:] + LINES[1], 0)) == 1
@@ -225,18 +209,18 @@ def test_a_whole_line_that_is_broken_is_refused_even_as_the_first() -> None:
 def test_another_port_drops_the_line_that_was_cut_off_and_counts_it_apart() -> None:
     parser = FrameParser(ZERO_SLOTS)
     parser.feed(GOOD + LINES[1][:3000], 0)
-    parser.port_opened()
+    parser.handle(RawEvent(InputKind.OPENED, 0))
     frames = parser.feed(LINES[2], 0)
     assert [(frame.line + b"\n", frame.seq) for frame in frames] == [(LINES[2], 1)]
     assert parser.unfinished == 1
     assert not parser.errors
 
 
-@given(st.integers(0, LINE_BYTES), st.booleans())
+@given(st.integers(0, eit_kit.LINE_BYTES), st.booleans())
 def test_a_board_that_is_started_again_may_go_on_or_begin_anew(begun: int, anew: bool) -> None:
     parser = FrameParser(ZERO_SLOTS)
     parser.feed(GOOD + LINES[1][:begun], 0)
-    parser.board_started()
+    parser.handle(RawEvent(InputKind.STARTED, 0))
     frames = parser.feed((LINES[2] if anew else LINES[1][begun:]) + LINES[3], 0)
     assert [frame.line + b"\n" for frame in frames] == [LINES[2] if anew else LINES[1], LINES[3]]
     assert parser.unfinished == (anew and begun > 0)
@@ -250,7 +234,7 @@ def test_frames_that_waited_together_are_stamped_a_period_apart() -> None:
     # The reader was away from frame 30 to shortly after frame 34.
     late = parser.feed(b"".join(LINES) + LINES[0], 34 * PERIOD_NS + 1_000_000)
     assert {frame.t_arrival_ns for frame in late} == {34 * PERIOD_NS + 1_000_000}
-    middles = [(frame.t_mid_ns + TRANSFER_NS) / PERIOD_NS for frame in late]
+    middles = [(frame.t_mid_ns + eit_kit.TRANSFER_NS) / PERIOD_NS for frame in late]
     assert middles == pytest.approx([29.5, 30.5, 31.5, 32.5, 33.5], abs=0.01)
 
 
@@ -265,8 +249,8 @@ def test_the_middles_of_frames_are_in_order_and_before_their_arrival(bursts: lis
     assert all(a < b for a, b in pairwise(middles))
 
 
-def flagged(lines: list[NDArray[np.float64]], **settings: int) -> list[Frame]:
-    parser = FrameParser(ZERO_SLOTS, **settings)
+def flagged(lines: list[NDArray[np.float64]]) -> list[Frame]:
+    parser = FrameParser(ZERO_SLOTS)
     return [frame for n, line in enumerate(lines) for frame in parser.feed(format_line(line), n * PERIOD_NS)]
 
 
@@ -283,19 +267,21 @@ def test_a_channel_above_the_largest_sine_the_adc_follows_is_saturated() -> None
     assert frame.unusable == 1
 
 
-def test_a_channel_that_has_not_changed_for_n_frames_is_dead_until_it_changes() -> None:
+def test_a_channel_that_has_not_changed_for_n_frames_is_dead_until_it_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(eit_kit, "DEAD_AFTER_FRAMES", 4)
     lines = noisy(8)
     for line in lines[:6]:
         line[LINE_SLOTS[10]] = 0.5
-    frames = flagged(lines, dead_after=4)
+    frames = flagged(lines)
     dead = [frame.dead[10] for frame in frames]
     assert [frame.unusable for frame in frames] == dead
     assert dead == [False, False, False, True, True, True, False, False]
 
 
-def test_a_repeated_line_is_flagged_and_makes_no_channel_dead() -> None:
+def test_a_repeated_line_is_flagged_and_makes_no_channel_dead(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(eit_kit, "DEAD_AFTER_FRAMES", 3)
     first, second = noisy(2)
-    frames = flagged([first, first, first, first, second], dead_after=3)
+    frames = flagged([first, first, first, first, second])
     assert [frame.repeated for frame in frames] == [False, True, True, True, False]
     assert not any(frame.dead.any() for frame in frames)
 

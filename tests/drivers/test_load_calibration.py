@@ -7,22 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shearloop.drivers import load_calibration
 from shearloop.drivers.errors import DeviceCalibrationError
-from shearloop.drivers.load_calibration import (
-    SAMPLES_PER_STEP,
-    SKIP_SAMPLES,
-    STANDARD_GRAVITY,
-    UNCALIBRATED,
-    LoadCalibrator,
-)
+from shearloop.drivers.load_calibration import STANDARD_GRAVITY, LoadCalibrator
 from shearloop.drivers.load_cell import COUNTS_MAX, LoadCalibration, LoadParser, LoadSample
 
-STEP = SKIP_SAMPLES + SAMPLES_PER_STEP
+STEP = load_calibration.SKIP_SAMPLES + load_calibration.SAMPLES_PER_STEP
 
 
 def samples(raws: Iterable[float]) -> list[LoadSample]:
     """Return what the parser makes of lines with these decimals, after the first line that may be torn."""
-    parser = LoadParser(UNCALIBRATED)
+    parser = LoadParser(load_calibration.UNCALIBRATED)
     return parser.feed(b"0\n" + b"".join(b"%.6f\n" % raw for raw in raws), 0)[1:]
 
 
@@ -128,7 +123,7 @@ def test_too_many_corrupted_values_are_refused_and_few_are_left_out() -> None:
     calibrator = LoadCalibrator([100.0])
     calibrator.start_step()
     assert any(calibrator.feed(sample) for sample in few)
-    assert calibrator.levels[0].n == SAMPLES_PER_STEP - 1
+    assert calibrator.levels[0].n == load_calibration.SAMPLES_PER_STEP - 1
     raws[20:25] = 9e12
     parser.restart()
     many = parser.feed(b"0\n" + b"".join(b"%.0f\n" % raw for raw in raws), 0)[1:]

@@ -7,23 +7,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shearloop.drivers import load_cell
+from shearloop.drivers.calibration_files import load_calibration, save_calibration
 from shearloop.drivers.errors import DeviceCalibrationError
 from shearloop.drivers.load_cell import (
     COUNTS_MAX,
     COUNTS_MIN,
-    MAX_LINE_BYTES,
     PERIOD_NS,
-    RATE_HZ,
-    SLEW_NM_PER_S,
     STUCK_AFTER,
     LoadCalibration,
     LoadParser,
-    LoadSample,
     SpikeFilter,
-    describe_errors,
 )
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
-from shearloop.drivers.yaml_files import load_calibration, save_calibration
 
 TORQUE_LINES = LoadCalibration.of_torque_lines()
 STREAMS = {
@@ -34,7 +30,7 @@ STREAMS = {
 }
 
 
-def feed_lines(parser: LoadParser, lines: list[str]) -> list[LoadSample]:
+def feed_lines(parser: LoadParser, lines: list[str]) -> list[load_cell.LoadSample]:
     samples = []
     for n, line in enumerate(lines):
         samples += parser.feed(f"{line}\r\n".encode(), n * PERIOD_NS)
@@ -87,7 +83,7 @@ def test_the_slices_in_which_bytes_come_change_nothing(pieces: list[bytes], widt
     ]
     assert sliced.errors == whole.errors
     # Every line is either a sample or a counted refusal; only an unfinished one is neither.
-    unfinished_but_refused = len(data) - data.rfind(b"\n") - 1 > MAX_LINE_BYTES
+    unfinished_but_refused = len(data) - data.rfind(b"\n") - 1 > load_cell.MAX_LINE_BYTES
     assert len(expected) + whole.errors.total() == data.count(b"\n") + unfinished_but_refused
 
 
@@ -101,7 +97,7 @@ def test_a_line_that_is_no_decimal_is_refused_by_kind_with_a_sentence(line: str,
     parser = LoadParser(TORQUE_LINES)
     assert feed_lines(parser, [line]) == []
     assert dict(parser.errors) == {kind: 1}
-    assert describe_errors(parser.errors).count("(1 times)") == 1
+    assert load_cell.describe_errors(parser.errors).count("(1 times)") == 1
 
 
 def test_a_line_that_breaks_off_is_counted_and_no_part_of_it_is_read() -> None:
@@ -151,7 +147,7 @@ def test_a_board_of_another_rate_is_stamped_and_found_stuck_by_its_own(rate_hz: 
     assert [s.t_arrival_ns for s in samples] == [8 * period_ns, 9 * period_ns, 10 * period_ns]
     assert samples[-1].t_arrival_ns - samples[-1].t_mid_ns == pytest.approx(period_ns / 2 + 0.35e6, abs=0.02e6)
     stuck = [s.stuck for s in feed_lines(LoadParser(TORQUE_LINES, rate_hz), ["0.01"] * 200)]
-    assert stuck.index(True) + 1 == max(STUCK_AFTER, round(STUCK_AFTER * rate_hz / RATE_HZ))
+    assert stuck.index(True) + 1 == max(STUCK_AFTER, round(STUCK_AFTER * rate_hz / load_cell.RATE_HZ))
 
 
 torques = st.floats(-1.7, 1.7)
@@ -186,7 +182,7 @@ def test_after_a_gap_the_rig_may_have_moved_further() -> None:
 
 @pytest.mark.parametrize("rate_hz", [1.0, 10.9, 80.0])
 def test_a_spike_is_what_the_rig_cannot_do_within_the_boards_own_period(rate_hz: float) -> None:
-    within_nm = SLEW_NM_PER_S / rate_hz
+    within_nm = load_cell.SLEW_NM_PER_S / rate_hz
     for share, spike in ((0.9, False), (1.1, True)):
         parser, torque_nm = LoadParser(TORQUE_LINES, rate_hz), min(share * within_nm, 1.74)
         lines = [f"{value:.4f}\n".encode() for value in (0.0, 0.0, torque_nm)]
@@ -216,8 +212,8 @@ def test_a_calibration_survives_its_file(tmp_path: Path) -> None:
         ("tare_counts: .nan\nscale_n_per_count: 2.0e-5\n", "tare_counts"),
         ("tare_counts: 1.0\nscale_n_per_count: 2.0e-5\nsign: 0\n", "sign"),
         ("tare_counts: 1.0\nscale_n_per_count: 2.0e-5\nlever_arm_m: -0.035\n", "lever_arm_m"),
-        ("[1, 2", "is not YAML"),
-        ("", "the file"),
+        ("[1, 2", "line 1, column 6: "),
+        ("", "the calibration is empty"),
     ],
 )
 def test_a_calibration_file_that_is_wrong_is_refused_by_name_and_key(tmp_path: Path, text: str, said: str) -> None:

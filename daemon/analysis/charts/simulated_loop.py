@@ -312,10 +312,8 @@ def settings_for(found: ToolModel, scenario: LoopScenario) -> ControllerSettings
 
 def started_controller(plant: Plant, found: ToolModel, settings: ControllerSettings) -> TwistController:
     """Return a twist controller that starts at the plant's present angle."""
-    controller = TwistController(settings)
     torque = found.torque_nm + found.stiffness_nm_per_rad * (plant.angle_rad - found.angle_rad)
-    controller.start(nanoseconds(plant.t_s), plant.angle_rad, torque, found.known_measurements)
-    return controller
+    return TwistController(settings, nanoseconds(plant.t_s), plant.angle_rad, torque, found.known_measurements)
 
 
 # The chart's loop panel: how closely the torque follows over how many frames are averaged.

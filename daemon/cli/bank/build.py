@@ -166,17 +166,14 @@ def overrides(args: argparse.Namespace) -> "tuple[str | None, GridConfig | None,
 
 
 def _grid(option: str, text: str | None) -> "GridConfig | None":
-    from pydantic import ValidationError
-
     from shearloop.daemon.bank_config import GridConfig
-    from shearloop.daemon.config_file import mistakes
+    from shearloop.yaml_files import validated
 
     if text is None:
         return None
     try:
         low, high, count = text.split(":")
-        return GridConfig(low=float(low), high=float(high), count=int(count))
-    except ValidationError as error:
-        raise UserError(f"{option} {text}: {mistakes(error, GridConfig)}") from error
+        grid = {"low": float(low), "high": float(high), "count": int(count)}
     except ValueError as error:
         raise UserError(f"{option} must be LO:HI:N such as 0.01:4.4:100, not {text!r}") from error
+    return validated(grid, GridConfig, f"{option} {text}", UserError)

@@ -45,12 +45,12 @@ def run(args: argparse.Namespace) -> int:
     """Grip each object and write the calibration."""
     from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
+    from shearloop.drivers.calibration_files import save_calibration
     from shearloop.drivers.robotiq.gripper import RobotiqGripper
     from shearloop.drivers.robotiq.messages import GripperClient
     from shearloop.drivers.robotiq.modbus_client import ModbusClient
     from shearloop.drivers.robotiq.socket_client import SocketClient
     from shearloop.drivers.robotiq.width import STROKE_MM, WidthCalibration
-    from shearloop.drivers.yaml_files import save_calibration
 
     if any(not 0 < diameter < STROKE_MM for diameter in args.diameter_mm) or len(set(args.diameter_mm)) < 2:
         raise UserError(f"give at least two different --diameter-mm between 0 and {STROKE_MM:g}")

@@ -52,10 +52,10 @@ def run(args: argparse.Namespace) -> int:
     """Measure each load and write the calibration."""
     from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
+    from shearloop.drivers.calibration_files import save_calibration
     from shearloop.drivers.connection import SerialPort, find_port
     from shearloop.drivers.load_calibration import LoadCalibrator
     from shearloop.drivers.load_cell import BAUD_RATE
-    from shearloop.drivers.yaml_files import save_calibration
 
     if not 0 < args.lever_arm_mm < 1000:
         raise UserError(f"--lever-arm-mm {args.lever_arm_mm:g} is no lever arm; give millimetres above 0")

@@ -7,7 +7,7 @@ from itertools import count, cycle
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.emulate.console import Device, add_link, check_positive, checked_link, play, print_port
+from shearloop.daemon.cli.emulate import console
 from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def _configure_eit_kit(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--speed", type=float, default=1.0, metavar="N", help="times the board's 1.85 frames per second"
     )
-    add_link(parser)
+    console.add_link(parser)
     parser.add_argument(
         "--fault",
         action="append",
@@ -69,8 +69,8 @@ def _run_eit_kit(args: argparse.Namespace) -> int:
     from shearloop.drivers.eit_kit import FRAME_PERIOD_S
     from shearloop.drivers.emulators.boards import EitKitBoard
 
-    check_positive(args, "speed")
-    link = checked_link(args.link)
+    console.check_positive(args, "speed")
+    link = console.checked_link(args.link)
     fault_at: dict[int, BoardFault] = {}
     for text in args.fault:
         name, _, frame = text.partition("@")
@@ -82,10 +82,10 @@ def _run_eit_kit(args: argparse.Namespace) -> int:
         period_s=FRAME_PERIOD_S / args.speed,
         link=link,
         fault_at=fault_at,
-        on_port=print_port,
+        on_port=console.print_port,
         seed=args.seed,
     )
-    play(board.run(), board.command)
+    console.play(board.run(), board.command)
     return 0
 
 
@@ -150,14 +150,14 @@ def _configure_hx711(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--paper-sketch", action="store_true", help="send N·m, as the paper's board did, not counts")
     parser.add_argument("--seed", type=int, default=0, help="of noise and garbage (default: %(default)s)")
     parser.add_argument("--speed", type=float, default=1.0, metavar="N", help="times the board's 10.9 lines per second")
-    add_link(parser)
+    console.add_link(parser)
     parser.add_argument("--fault", action="append", default=[], metavar="NAME[:AMOUNT]", help="a fault from the start")
 
 
 def _run_hx711(args: argparse.Namespace) -> int:
     from shearloop.drivers.emulators.boards import LOAD_PERIOD_S, PAPER_SKETCH, Hx711Board, Sketch
 
-    check_positive(args, "speed")
+    console.check_positive(args, "speed")
     if not (math.isfinite(args.torque_nm) and math.isfinite(args.sweep_nm)):
         raise UserError("--torque-nm and --sweep-nm must be finite")
     held_nm, lines = args.torque_nm, count()
@@ -169,8 +169,8 @@ def _run_hx711(args: argparse.Namespace) -> int:
         torque_nm,
         PAPER_SKETCH if args.paper_sketch else Sketch(),
         period_s=LOAD_PERIOD_S / args.speed,
-        link=checked_link(args.link),
-        on_port=print_port,
+        link=console.checked_link(args.link),
+        on_port=console.print_port,
         seed=args.seed,
     )
     for text in args.fault:
@@ -186,7 +186,7 @@ def _run_hx711(args: argparse.Namespace) -> int:
             case _:
                 board.command(line)
 
-    play(board.run(), on_command)
+    console.play(board.run(), on_command)
     return 0
 
 
@@ -198,6 +198,6 @@ def _finite(text: str) -> float:
 
 
 DEVICES = {
-    "eit-kit": Device("the EIT board of a fingertip, on a pseudo-terminal", _configure_eit_kit, _run_eit_kit),
-    "hx711": Device("the load cell's board, on a pseudo-terminal", _configure_hx711, _run_hx711),
+    "eit-kit": console.Device("the EIT board of a fingertip, on a pseudo-terminal", _configure_eit_kit, _run_eit_kit),
+    "hx711": console.Device("the load cell's board, on a pseudo-terminal", _configure_hx711, _run_hx711),
 }

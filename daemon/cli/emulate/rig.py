@@ -10,14 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-from shearloop.daemon.cli.emulate.console import (
-    Device,
-    check_positive,
-    checked_link,
-    play,
-    print_event,
-    report_busy_address,
-)
+from shearloop.daemon.cli.emulate import console
 from shearloop.daemon.cli.emulate.robots import add_robot, print_robot_event, robot_make
 from shearloop.daemon.errors import UserError
 
@@ -99,11 +92,11 @@ def _run(args: argparse.Namespace) -> int:
             on_truth=None if file is None else partial(_write_truth, file),
             on_ready=partial(_print_ready, settings),
         )
-        with report_busy_address(
+        with console.report_busy_address(
             f"the rig cannot be played on {args.host} and in {args.run_dir}",
             "choose another --host or --run-dir, or end what uses them",
         ):
-            play(rig.run(), partial(_obey, rig))
+            console.play(rig.run(), partial(_obey, rig))
     return 0
 
 
@@ -112,7 +105,7 @@ def _settings(args: argparse.Namespace) -> "RigSettings":
     from shearloop.drivers.emulators.rig import NOISE_NM, RigSettings
     from shearloop.drivers.emulators.scene import Joint, TwinSettings
 
-    check_positive(args, "speed", "arm_speed", "gel_stiffness")
+    console.check_positive(args, "speed", "arm_speed", "gel_stiffness")
     make = robot_make(args)
     if not 0 < args.diameter_mm <= 140:
         raise UserError(f"--diameter-mm {args.diameter_mm:g} does not fit between the fingers; give up to 140")
@@ -136,7 +129,7 @@ def _settings(args: argparse.Namespace) -> "RigSettings":
     except OSError as error:
         raise UserError(f"--run-dir {args.run_dir} cannot be made ({error.strerror}); choose another") from None
     for link in settings.ports.values():
-        checked_link(link)
+        console.checked_link(link)
     return settings
 
 
@@ -156,10 +149,10 @@ def _skin(args: argparse.Namespace) -> "RigSkin":
 
 def _obey(rig: "EmulatedRig", line: str) -> None:
     if line == "truth":
-        print_event("truth", **_fields(rig.scene.truth()))
+        console.print_event("truth", **_fields(rig.scene.truth()))
     else:
         rig.command(line)
-        print_event("obeyed", detail=line)
+        console.print_event("obeyed", detail=line)
 
 
 @contextmanager
@@ -189,4 +182,4 @@ def _fields(truth: "Truth") -> dict[str, object]:
     return {name: round(value, 9) if isinstance(value, float) else value for name, value in asdict(truth).items()}
 
 
-DEVICES = {"rig": Device("all devices of the rig, tied by one physics", _configure, _run)}
+DEVICES = {"rig": console.Device("all devices of the rig, tied by one physics", _configure, _run)}

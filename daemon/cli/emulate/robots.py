@@ -4,17 +4,7 @@ import argparse
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.emulate.console import (
-    Device,
-    add_link,
-    check_positive,
-    check_range,
-    checked_link,
-    play,
-    print_event,
-    print_port,
-    report_busy_address,
-)
+from shearloop.daemon.cli.emulate import console
 from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
@@ -49,14 +39,14 @@ def robot_make(args: argparse.Namespace, version: tuple[int, ...] | None = None)
     """Return the controller's make; UserError for a wrong rate."""
     from shearloop.drivers.emulators.ur.robot import ControllerSpec
 
-    check_range(args, "rate_hz", 50, 1000)
+    console.check_range(args, "rate_hz", 50, 1000)
     times = {name: getattr(args, name) for name in ("unlock_wait_s", "power_on_s", "tool_length_m")}
     return ControllerSpec(**times) if version is None else ControllerSpec(version=version, **times)
 
 
 def print_robot_event(event: "RobotEvent") -> None:
     """Print an event of the robot."""
-    print_event(
+    console.print_event(
         event.name,
         detail=event.detail,
         time_s=round(event.time_s, 6),
@@ -88,16 +78,16 @@ def _run_ur(args: argparse.Namespace) -> int:
 
     def on_command(line: str) -> None:
         apply_fault(controller, line)
-        print_event("obeyed", detail=line)
+        console.print_event("obeyed", detail=line)
 
-    with report_busy_address(f"the controller cannot listen on {args.host}", "choose another --host"):
-        play(_play_ur(controller, args.host), on_command)
+    with console.report_busy_address(f"the controller cannot listen on {args.host}", "choose another --host"):
+        console.play(_play_ur(controller, args.host), on_command)
     return 0
 
 
 async def _play_ur(controller: "Controller", host: str) -> None:
     async with controller:
-        print_event("listening", detail=host)
+        console.print_event("listening", detail=host)
         await controller.run()
 
 
@@ -121,7 +111,7 @@ def _configure_gripper_socket(parser: argparse.ArgumentParser) -> None:
 
 def _configure_gripper_modbus(parser: argparse.ArgumentParser) -> None:
     _configure_gripper(parser, "the port's path")
-    add_link(parser)
+    console.add_link(parser)
 
 
 def _run_gripper_socket(args: argparse.Namespace) -> int:
@@ -129,21 +119,21 @@ def _run_gripper_socket(args: argparse.Namespace) -> int:
 
     if not 0 <= args.port <= 65535:
         raise UserError(f"--port {args.port} is no port; give 0 to 65535")
-    return _play_gripper(args, lambda gripper: UrcapServer(gripper, args.bind, args.port, print_port))
+    return _play_gripper(args, lambda gripper: UrcapServer(gripper, args.bind, args.port, console.print_port))
 
 
 def _run_gripper_modbus(args: argparse.Namespace) -> int:
     from shearloop.drivers.emulators.robotiq.servers import ModbusServer
 
-    link = checked_link(args.link)
-    return _play_gripper(args, lambda gripper: ModbusServer(gripper, link, print_port))
+    link = console.checked_link(args.link)
+    return _play_gripper(args, lambda gripper: ModbusServer(gripper, link, console.print_port))
 
 
 def _play_gripper(args: argparse.Namespace, make_server: Callable[["Gripper"], "GripperServer"]) -> int:
     from shearloop.drivers.emulators.robotiq.gripper import Gripper
     from shearloop.drivers.emulators.robotiq.servers import GripperPlayer
 
-    check_positive(args, "speed")
+    console.check_positive(args, "speed")
     gripper = Gripper()
     player = GripperPlayer(gripper, make_server(gripper), args.speed)
     if args.object_mm is not None:
@@ -151,15 +141,17 @@ def _play_gripper(args: argparse.Namespace, make_server: Callable[["Gripper"], "
             player.command(f"object {args.object_mm}")
         except ValueError as error:
             raise UserError(f"--object-mm: {error}") from None
-    with report_busy_address("the gripper cannot be played", "choose another port or bind address"):
-        play(player.run(), player.command)
+    with console.report_busy_address("the gripper cannot be played", "choose another port or bind address"):
+        console.play(player.run(), player.command)
     return 0
 
 
 DEVICES = {
-    "ur": Device("a UR robot's controller, on an address of this machine", _configure_ur, _run_ur),
-    "gripper-socket": Device("a 2F-140 behind the URCap's socket", _configure_gripper_socket, _run_gripper_socket),
-    "gripper-modbus": Device(
+    "ur": console.Device("a UR robot's controller, on an address of this machine", _configure_ur, _run_ur),
+    "gripper-socket": console.Device(
+        "a 2F-140 behind the URCap's socket", _configure_gripper_socket, _run_gripper_socket
+    ),
+    "gripper-modbus": console.Device(
         "a 2F-140 on Modbus RTU, on a pseudo-terminal", _configure_gripper_modbus, _run_gripper_modbus
     ),
 }

@@ -7,16 +7,9 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.emulate.console import (
-    Device,
-    check_positive,
-    check_range,
-    checked_link,
-    play,
-    print_port,
-    report_busy_address,
-)
+from shearloop.daemon.cli.emulate import console
 from shearloop.daemon.errors import UserError
+from shearloop.drivers.emulators import number_between
 
 if TYPE_CHECKING:
     from shearloop.daemon.synthetic_skin import SyntheticSkin
@@ -92,13 +85,7 @@ class PushedSkin:
 
 
 def _newtons(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not abs(value) <= 20.0:
-        raise ValueError(f"{text!r} is no force of at most 20 N; write for instance 0.5")
-    return value
+    return number_between(text, -20.0, 20.0, "no force of at most 20 N; write for instance 0.5")
 
 
 def _add_address(parser: argparse.ArgumentParser, prefix: str, link_help: str, port_help: str) -> None:
@@ -117,7 +104,7 @@ def _address(args: argparse.Namespace, prefix: str) -> "Address | None":
     """Return the given address; None for an unnamed pseudo-terminal."""
     link, port = getattr(args, f"{prefix}link"), getattr(args, f"{prefix}port")
     if port is None:
-        return checked_link(link)
+        return console.checked_link(link)
     if not 0 <= port <= 65535:
         raise UserError(f"--{prefix.replace('_', '-')}port {port} is no port; give 0 to 65535")
     return args.bind, port
@@ -143,12 +130,12 @@ def _run_skin(args: argparse.Namespace) -> int:
     from shearloop.drivers.emulators.ur.robot import Robot
     from shearloop.drivers.emulators.ur.server import Controller, apply_fault
 
-    check_positive(args, "speed")
+    console.check_positive(args, "speed")
     if not abs(args.sweep_n) <= 5.0:
         raise UserError(f"--sweep-n {args.sweep_n:g} is beyond the 5 N that the skin is made for")
-    check_range(args, "normal_n", 0, 20, " N")
-    check_range(args, "radius_mm", 0.1, 200, " mm")
-    check_range(args, "rate_hz", 50, 1000)
+    console.check_range(args, "normal_n", 0, 20, " N")
+    console.check_range(args, "radius_mm", 0.1, 200, " mm")
+    console.check_range(args, "rate_hz", 50, 1000)
     if args.robot is not None and args.sweep_n:
         raise UserError("a skin that a robot turns is not swept: leave --sweep-n or --robot out")
     skin = SyntheticSkin(radius_mm=args.radius_mm, normal_n=args.normal_n, seed=args.seed)
@@ -173,8 +160,8 @@ def _run_skin(args: argparse.Namespace) -> int:
         elif not pushed.command(line):
             instruments.command(line)
 
-    with report_busy_address("the skin cannot be played", "choose another port or address"):
-        play(_play(instruments, controller), on_command)
+    with console.report_busy_address("the skin cannot be played", "choose another port or address"):
+        console.play(_play(instruments, controller), on_command)
     return 0
 
 
@@ -211,14 +198,14 @@ def _run_instrument(args: argparse.Namespace) -> int:
     from shearloop.daemon.synthetic_skin import SyntheticSkin
     from shearloop.drivers.emulators.skin import Circuit, play_daq, play_source
 
-    check_positive(args, "speed")
+    console.check_positive(args, "speed")
     address = _address(args, "")
     pushed = PushedSkin(SyntheticSkin(seed=args.seed))
     circuit = Circuit(pushed.resistances_ohm)
     if args.device == "skin-daq":
         circuit.level_a, circuit.compliance_v, circuit.output_on = 5e-3, 1.0, True
     play_instrument = play_daq if args.device == "skin-daq" else play_source
-    instrument = play_instrument(circuit, address, print_port, speed=args.speed, seed=args.seed)
+    instrument = play_instrument(circuit, address, console.print_port, speed=args.speed, seed=args.seed)
 
     def on_command(line: str) -> None:
         if pushed.command(line):
@@ -228,13 +215,15 @@ def _run_instrument(args: argparse.Namespace) -> int:
         except ValueError:
             instrument.command(line)
 
-    with report_busy_address("it cannot be played", CURE):
-        play(instrument.run(), on_command)
+    with console.report_busy_address("it cannot be played", CURE):
+        console.play(instrument.run(), on_command)
     return 0
 
 
 DEVICES = {
-    "skin": Device("the shear skin with source and DAQ, and the robot that turns it", _configure_skin, _run_skin),
-    "skin-source": Device("the Keithley 6430 that feeds the shear skin", _configure_source, _run_instrument),
-    "skin-daq": Device("the scanner or converter board of the shear skin", _configure_daq, _run_instrument),
+    "skin": console.Device(
+        "the shear skin with source and DAQ, and the robot that turns it", _configure_skin, _run_skin
+    ),
+    "skin-source": console.Device("the Keithley 6430 that feeds the shear skin", _configure_source, _run_instrument),
+    "skin-daq": console.Device("the scanner or converter board of the shear skin", _configure_daq, _run_instrument),
 }

@@ -1,8 +1,7 @@
 """The emulated 2F-140: spindle, fingers, registers, activation, faults. No I/O; `step` passes the time."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from enum import Enum, auto
+from dataclasses import dataclass, replace
 
 COUNTS_MAX = 255
 FIRST_MAJOR_FAULT = 10
@@ -36,19 +35,6 @@ class GripperMechanics:
         return (self.closed_counts - counts) * self.mm_per_count
 
 
-class _Activation(Enum):
-    RESET = auto()
-    OPENING = auto()
-    CLOSING = auto()
-    OPENING_AGAIN = auto()
-    ACTIVE = auto()
-
-
-def no_object(force_n: float) -> float | None:  # noqa: ARG001 - a callback's signature
-    """Return None: there is no object between the fingers."""
-    return None
-
-
 @dataclass(slots=True)
 class Command:
     """The command registers."""
@@ -73,69 +59,33 @@ class Gripper:
     def __init__(
         self,
         mechanics: GripperMechanics | None = None,
-        between: Callable[[float], float | None] = no_object,
-        around: Callable[[float], float | None] = no_object,
+        between: Callable[[float], float | None] = lambda _: None,
     ) -> None:
         """Start as after power-on: reset, half open."""
         self.mechanics = mechanics or GripperMechanics()
         self.between = between
-        self.around = around
+        self.around: Callable[[float], float | None] = lambda _: None
         self.command = Command()
+        # The commands that the last step has taken up.
+        self.taken = Command()
         # The time without a request after which the gripper reports a fault; None where its master is the controller.
         self.watchdog_s: float | None = None
+        # gOBJ: 0 moving, 1 contact opening, 2 contact closing, 3 at target; gFLT; gCU: motor current in 10 mA.
+        self.obj = self.flt = self.current = 0
         self._silent_s = 0.0
         self._position = float(COUNTS_MAX // 2)
-        self._activation = _Activation.RESET
-        self._fault = 0
-        self._taken = Command()
-        self._obj = 0
-        self._current = 0
-
-    @property
-    def act(self) -> bool:
-        """gACT."""
-        return self._taken.act
-
-    @property
-    def gto(self) -> bool:
-        """gGTO."""
-        return self._taken.gto
+        # The positions that an activation has still to reach; None before it begins.
+        self._to_reach: list[float] | None = None
 
     @property
     def sta(self) -> int:
         """gSTA: 0 reset, 1 activating, 3 active."""
-        match self._activation:
-            case _Activation.RESET:
-                return 0
-            case _Activation.ACTIVE:
-                return 3
-            case _:
-                return 1
-
-    @property
-    def obj(self) -> int:
-        """gOBJ: 0 moving, 1 contact opening, 2 contact closing, 3 at target."""
-        return self._obj
-
-    @property
-    def flt(self) -> int:
-        """gFLT."""
-        return self._fault
-
-    @property
-    def pre(self) -> int:
-        """gPR: the echo of the target."""
-        return self._taken.pos
+        return 0 if self._to_reach is None else 1 if self._to_reach else 3
 
     @property
     def pos(self) -> int:
         """gPO: the position, rounded to counts."""
         return min(max(round(self._position), 0), COUNTS_MAX)
-
-    @property
-    def current(self) -> int:
-        """gCU: motor current in 10 mA."""
-        return self._current
 
     @property
     def width_mm(self) -> float:
@@ -145,16 +95,16 @@ class Gripper:
     @property
     def grip_force_n(self) -> float:
         """The force on the object between the fingers, N; 0 without one."""
-        return self._force_n() if self._obj == 2 else 0.0
+        return self._force_n() if self.obj == 2 else 0.0
 
     def fail(self, code: int) -> None:
         """Report a fault and stop; from 10 on only a rising edge of ACT ends it."""
-        self._fault, self._current = code, 0
+        self.flt, self.current = code, 0
 
     def clear_minor(self) -> None:
         """End a fault below 10, as cooling down does."""
-        if self._fault < FIRST_MAJOR_FAULT:
-            self._fault = 0
+        if self.flt < FIRST_MAJOR_FAULT:
+            self.flt = 0
 
     def feed_watchdog(self) -> None:
         """Note a request."""
@@ -162,68 +112,59 @@ class Gripper:
 
     def status_was_read(self) -> None:
         """Note that the status was read, which clears the report of a silence."""
-        if self._fault == NO_COMMUNICATION:
-            self._fault = 0
+        if self.flt == NO_COMMUNICATION:
+            self.flt = 0
 
     def step(self, dt_s: float) -> None:
         """Take up the command registers, then move for dt_s."""
         self._watch(dt_s)
         self._take_up()
-        if self._fault >= FIRST_MAJOR_FAULT and self._fault != RELEASE_RUNNING:
-            self._current = 0
-            return
-        if self._fault == RELEASE_RUNNING:
+        if self.flt == RELEASE_RUNNING:
             self._release(dt_s)
-        elif self.sta == 1:
-            self._activate(dt_s)
-        elif self.sta == 3 and self._taken.gto and self._fault != 8:
-            self._go(dt_s)
+        elif self.flt >= FIRST_MAJOR_FAULT:
+            self.current = 0
+        elif self._to_reach:
+            self._activate(self._to_reach, dt_s)
+        elif self.sta == 3 and self.taken.gto and self.flt != 8:
+            low, high = SPEED_MM_S
+            self._approach(float(self.taken.pos), low + (high - low) * self.taken.spe / COUNTS_MAX, dt_s)
         else:
-            self._current = 0
+            self.current = 0
 
     def _watch(self, dt_s: float) -> None:
         self._silent_s += dt_s
-        if self.watchdog_s is not None and self._silent_s > self.watchdog_s and self._fault == 0:
-            self._fault = NO_COMMUNICATION
+        if self.watchdog_s is not None and self._silent_s > self.watchdog_s and self.flt == 0:
+            self.flt = NO_COMMUNICATION
 
     def _take_up(self) -> None:
-        wanted, before = self.command, self._taken
-        self._taken = Command(wanted.act, wanted.gto, wanted.atr, wanted.ard, wanted.pos, wanted.spe, wanted.force)
+        wanted, before = self.command, self.taken
+        self.taken = replace(wanted)
         if not wanted.act:
-            self._activation, self._obj, self._current = _Activation.RESET, 0, 0
+            self._to_reach, self.obj, self.current = None, 0, 0
             if before.act:
-                self._fault = 0
+                self.flt = 0
             if wanted.gto and not before.gto:
-                self._fault = NOT_ACTIVATED
+                self.flt = NOT_ACTIVATED
         elif not before.act:
-            self._activation, self._fault = _Activation.OPENING, ACTIVATION_NOT_FINISHED
+            opened, closed = self.mechanics.open_counts, self.mechanics.closed_counts
+            self._to_reach, self.flt = [opened, closed, opened], ACTIVATION_NOT_FINISHED
         if wanted.atr and not before.atr and wanted.act:
-            self._fault = RELEASE_RUNNING
+            self.flt = RELEASE_RUNNING
 
-    def _activate(self, dt_s: float) -> None:
-        match self._activation:
-            case _Activation.OPENING:
-                if self._approach(self.mechanics.open_counts, self.mechanics.activation_speed_mm_s, dt_s):
-                    self._activation = _Activation.CLOSING
-            case _Activation.CLOSING:
-                if self._approach(self.mechanics.closed_counts, self.mechanics.activation_speed_mm_s, dt_s):
-                    self._activation = _Activation.OPENING_AGAIN
-            case _:
-                if self._approach(self.mechanics.open_counts, self.mechanics.activation_speed_mm_s, dt_s):
-                    self._activation, self._fault, self._obj = _Activation.ACTIVE, 0, 3
+    def _activate(self, to_reach: list[float], dt_s: float) -> None:
+        if self._approach(to_reach[0], self.mechanics.activation_speed_mm_s, dt_s):
+            del to_reach[0]
+            if not to_reach:
+                self.flt, self.obj = 0, 3
 
     def _release(self, dt_s: float) -> None:
-        end = self.mechanics.open_counts if self._taken.ard else self.mechanics.closed_counts
+        end = self.mechanics.open_counts if self.taken.ard else self.mechanics.closed_counts
         if self._approach(end, self.mechanics.release_speed_mm_s, dt_s):
-            self._fault = RELEASE_DONE
-
-    def _go(self, dt_s: float) -> None:
-        low, high = SPEED_MM_S
-        self._approach(float(self._taken.pos), low + (high - low) * self._taken.spe / COUNTS_MAX, dt_s)
+            self.flt = RELEASE_DONE
 
     def _force_n(self) -> float:
         low, high = FORCE_N
-        return low + (high - low) * self._taken.force / COUNTS_MAX
+        return low + (high - low) * self.taken.force / COUNTS_MAX
 
     def _approach(self, target: float, speed_mm_s: float, dt_s: float) -> bool:
         """Move towards a position; return whether the fingers have stopped, there or at an object."""
@@ -231,23 +172,20 @@ class Gripper:
         closing = target > self._position
         # The fingers' own stops count as the target: a real gripper that closes on air reports no object.
         target = min(max(target, self.mechanics.open_counts), self.mechanics.closed_counts)
-        met = self._obstacle(closing=closing)
-        stop = target if met is None else (min if closing else max)(target, met)
+        width_mm = (self.between if closing else self.around)(self._force_n())
+        met = target if width_mm is None else self.mechanics.counts(width_mm)
+        stop = (min if closing else max)(target, met)
         if closing:
             # An object wider than the opening pushes the fingers apart.
             self._position = min(self._position + travel, stop)
         else:
             self._position = max(self._position - travel, stop)
         if self._position != stop:
-            self._obj, self._current = 0, 15
+            self.obj, self.current = 0, 15
             return False
         if stop == target:
-            self._obj, self._current = 3, 0
+            self.obj, self.current = 3, 0
         else:
-            self._obj = 2 if closing else 1
-            self._current = 5 + self._taken.force // 5
+            self.obj = 2 if closing else 1
+            self.current = 5 + self.taken.force // 5
         return True
-
-    def _obstacle(self, *, closing: bool) -> float | None:
-        width_mm = (self.between if closing else self.around)(self._force_n())
-        return None if width_mm is None else self.mechanics.counts(width_mm)

@@ -9,13 +9,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.ports import Outage, PtyServer, SocketServer
 from shearloop.drivers.emulators.robotiq.gripper import Gripper
 
 URCAP_PORT = 63352
 LONGEST_LINE = 256
-_FLAGS = {"ACT": "act", "GTO": "gto", "ATR": "atr", "ARD": "ard"}
-_VALUES = {"POS": "pos", "SPE": "spe", "FOR": "force"}
+_COMMANDS = {"ACT": "act", "GTO": "gto", "ATR": "atr", "ARD": "ard", "POS": "pos", "SPE": "spe", "FOR": "force"}
 
 DEVICE_ID = 9
 COMMAND_REGISTERS, STATUS_REGISTERS = range(0x03E8, 0x03EB), range(0x07D0, 0x07D3)
@@ -58,8 +58,8 @@ class UrcapSession:
         gripper = self.gripper
         gripper.feed_watchdog()
         values = {
-            "ACT": int(gripper.act),
-            "GTO": int(gripper.gto),
+            "ACT": int(gripper.taken.act),
+            "GTO": int(gripper.taken.gto),
             "ATR": int(gripper.command.atr),
             "ARD": int(gripper.command.ard),
             "SPE": gripper.command.spe,
@@ -67,7 +67,7 @@ class UrcapSession:
             "STA": gripper.sta,
             "OBJ": gripper.obj,
             "POS": gripper.pos,
-            "PRE": gripper.pre,
+            "PRE": gripper.taken.pos,
             "FLT": gripper.flt,
             "COU": gripper.current,
             "SID": DEVICE_ID,
@@ -82,16 +82,15 @@ class UrcapSession:
         return f"{variable} {text}\n".encode()
 
     def _set(self, pairs: dict[str, str]) -> bytes:
-        if not pairs.keys() <= _FLAGS.keys() | _VALUES.keys():
+        if not pairs.keys() <= _COMMANDS.keys():
             return b""
         if not all(text.isdigit() and int(text) <= 255 for text in pairs.values()):
             return b""
         self.gripper.feed_watchdog()
+        command = self.gripper.command
         for name, text in pairs.items():
-            if name in _FLAGS:
-                setattr(self.gripper.command, _FLAGS[name], bool(int(text)))
-            else:
-                setattr(self.gripper.command, _VALUES[name], int(text))
+            kind = type(getattr(command, _COMMANDS[name]))
+            setattr(command, _COMMANDS[name], kind(int(text)))
         return b"ack"
 
 
@@ -198,8 +197,8 @@ class ModbusSlave:
         if not count or wanted[0] not in STATUS_REGISTERS or wanted[-1] not in STATUS_REGISTERS:
             raise _ModbusError(ILLEGAL_ADDRESS)
         gripper = self._gripper
-        status = gripper.act | gripper.gto << 3 | gripper.sta << 4 | gripper.obj << 6
-        content = bytes([status, 0, gripper.flt, gripper.pre, gripper.pos, gripper.current])
+        status = gripper.taken.act | gripper.taken.gto << 3 | gripper.sta << 4 | gripper.obj << 6
+        content = bytes([status, 0, gripper.flt, gripper.taken.pos, gripper.pos, gripper.current])
         gripper.status_was_read()
         part = content[2 * (first - STATUS_REGISTERS[0]) :][: 2 * count]
         return bytes([function, len(part)]) + part
@@ -296,9 +295,9 @@ class GripperPlayer:
             case ["object", "none"]:
                 self._object_mm = None
             case ["object", width]:
-                self._object_mm = _number(width, 0.0, 140.0, "a width in mm")
+                self._object_mm = number_between(width, 0.0, 140.0, "not a width in mm from 0 to 140")
             case ["fault", code]:
-                self._gripper.fail(int(_number(code, 0, 15, "a fault code")))
+                self._gripper.fail(int(number_between(code, 0, 15, "not a fault code from 0 to 15")))
             case ["cool"]:
                 self._gripper.clear_minor()
             case ["lose", *seconds] if len(seconds) < 2:
@@ -331,14 +330,4 @@ class GripperPlayer:
 
 
 def _seconds(words: list[str]) -> float:
-    return _number(words[0], 0.0, 86400.0, "a time in seconds") if words else 0.0
-
-
-def _number(text: str, low: float, high: float, what: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not low <= value <= high:
-        raise ValueError(f"{text!r} is not {what} from {low:g} to {high:g}")
-    return value
+    return number_between(words[0], 0.0, 86400.0, "not a time in seconds from 0 to 86400") if words else 0.0

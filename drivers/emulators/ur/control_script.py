@@ -10,8 +10,9 @@ import re
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from shearloop.drivers.emulators.ur.motion import Halt, LinearMove, Motion, Speed, Vector, rotation_matrix
+from shearloop.drivers.emulators.ur.motion import Halt, LinearMove, Motion, Speed, Vector
 
 if TYPE_CHECKING:
     from shearloop.drivers.emulators.ur.robot import Robot
@@ -107,7 +108,7 @@ class ControlScript:
         if not self._may_move("move"):
             return
         goal = np.eye(4)
-        goal[:3, :3], goal[:3, 3] = rotation_matrix(target[3:]), target[:3]
+        goal[:3, :3], goal[:3, 3] = Rotation.from_rotvec(target[3:]).as_matrix(), target[:3]
         robot.motion = LinearMove(robot.frame(), goal, speed, acceleration, robot.spec.tool_length_m)
         if asynchronous:
             self._begin_async()

@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -46,49 +47,7 @@ def jacobian(frames: list[Matrix]) -> Matrix:
 
 def pose_of(frame: Matrix) -> Vector:
     """Return a frame as UR's pose (6,): x, y, z in m and the rotation vector in rad."""
-    return np.concatenate([frame[:3, 3], rotation_vector(frame[:3, :3])])
-
-
-def rotation_vector(rotation: Matrix) -> Vector:
-    """Return the rotation vector (3,) in rad of a rotation matrix, of magnitude at most pi.
-
-    By the quaternion's largest component, which is exact also for half turns: a tool that points down is one.
-    """
-    r = rotation
-    squares = np.array(
-        [
-            1 + r[0, 0] + r[1, 1] + r[2, 2],
-            1 + r[0, 0] - r[1, 1] - r[2, 2],
-            1 - r[0, 0] + r[1, 1] - r[2, 2],
-            1 - r[0, 0] - r[1, 1] + r[2, 2],
-        ]
-    )
-    largest = int(np.argmax(squares))
-    skew = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
-    if largest == 0:
-        quaternion = np.concatenate([[squares[0]], skew])
-    else:
-        k = largest - 1
-        column = r[:, k] + r[k, :]
-        column[k] = squares[largest]
-        quaternion = np.concatenate([[skew[k]], column])
-    quaternion /= np.linalg.norm(quaternion)
-    if quaternion[0] < 0:
-        quaternion = -quaternion
-    sine = float(np.linalg.norm(quaternion[1:]))
-    scale: float = 2.0 if sine < 1e-12 else 2 * math.atan2(sine, float(quaternion[0])) / sine
-    return np.asarray(quaternion[1:] * scale, dtype=np.float64)
-
-
-def rotation_matrix(vector: Vector) -> Matrix:
-    """Return the rotation matrix (3, 3) of a rotation vector in rad (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.eye(3)
-    x, y, z = vector / angle
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    rotation: Matrix = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k)
-    return rotation
+    return np.concatenate([frame[:3, 3], Rotation.from_matrix(frame[:3, :3]).as_rotvec()])
 
 
 class Advanced(NamedTuple):
@@ -149,7 +108,7 @@ class LinearMove:
     def __post_init__(self) -> None:
         """Compute the length; a move that only turns is measured in radians."""
         way_m = float(np.linalg.norm(self.target[:3, 3] - self.start[:3, 3]))
-        self._turn = rotation_vector(self.start[:3, :3].T @ self.target[:3, :3])
+        self._turn = Rotation.from_matrix(self.start[:3, :3].T @ self.target[:3, :3]).as_rotvec()
         self._length = way_m if way_m > 1e-6 else float(np.linalg.norm(self._turn))
         self._done = self._rate = 0.0
 
@@ -159,8 +118,8 @@ class LinearMove:
         frames = link_frames(q_rad, self.tool_length_m)
         here = frames[-1]
         where = self.start[:3, 3] + share * (self.target[:3, 3] - self.start[:3, 3])
-        turned = self.start[:3, :3] @ rotation_matrix(share * self._turn)
-        error = np.concatenate([where - here[:3, 3], rotation_vector(turned @ here[:3, :3].T)])
+        turned = self.start[:3, :3] @ Rotation.from_rotvec(share * self._turn).as_matrix()
+        error = np.concatenate([where - here[:3, 3], Rotation.from_matrix(turned @ here[:3, :3].T).as_rotvec()])
         try:
             step = np.linalg.solve(jacobian(frames), error)
         except np.linalg.LinAlgError as singular:

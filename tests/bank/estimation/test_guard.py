@@ -61,11 +61,11 @@ def lost_channels(side, frame, usable):
 
 
 def test_each_side_is_compared_with_its_own_fingertip_whatever_the_other_says(recorded):
-    """Side by side they are what each is by itself: why, which channels are lost, jumps and grips."""
+    """Side by side they are what each is by itself: why, which channels are lost, and jumps."""
     random = np.random.default_rng(3)
     sides = [guard_of(recorded, layer) for layer in (0, 1)]
     both, alone = FingertipSet(tuple(sides)), [FingertipSet((side,)) for side in sides]
-    before, idle = recorded.channels[100], np.array([side.idle for side in sides])
+    before = recorded.channels[100]
     said = set()
     for number, frame in enumerate(recorded.channels[::10].copy()):
         usable = random.random((2, 896)) > (0.0, 0.02, 0.1)[number % 3]
@@ -73,7 +73,7 @@ def test_each_side_is_compared_with_its_own_fingertip_whatever_the_other_says(re
         frame[1] = frame[1, ::-1] if number % 4 == 0 else frame[1]
         frame[:, :40] += 0.05 * random.random()
         why, lost = both.check(frame, usable)
-        jumps, grips = both.jumping_shares(frame, before, usable), both.grip_scores(frame, idle)
+        jumps = both.jumping_shares(frame, before, usable)
         for layer, (one, side) in enumerate(zip(alone, sides, strict=True)):
             own = slice(layer, layer + 1)
             own_why, own_lost = one.check(frame[own], usable[own])
@@ -81,7 +81,6 @@ def test_each_side_is_compared_with_its_own_fingertip_whatever_the_other_says(re
             np.testing.assert_array_equal(own_lost, lost[own])
             np.testing.assert_array_equal(lost[layer], lost_channels(side, frame[layer], usable[layer]))
             assert one.jumping_shares(frame[own], before[own], usable[own]) == jumps[own]
-            assert side.grip_score(frame[layer], side.idle) == grips[layer]
             moved = np.abs(frame[layer] - before[layer])[usable[layer]]
             limit = np.maximum(_JUMP_NOISES * np.sqrt(2.0) * side.noise, _JUMP_V)[usable[layer]]
             assert jumps[layer] == np.mean(moved > limit)

@@ -1,15 +1,16 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.stats import truncnorm
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
+from shearloop.bank.estimation.interval_regressor import best_strength, fit_interval_regressor
 from shearloop.bank.estimation.regressors import (
     InverseCalibration,
     Ridge,
     TobitRidge,
     _moments_below_zero,
-    best_strength,
     later_origins,
     later_splits,
     left_out_blocks,
@@ -161,7 +162,11 @@ def test_what_is_judged_comes_later_or_is_left_out(n):
 
 
 def test_of_equal_strengths_the_strongest():
-    assert best_strength((0.1, 1.0, 10.0), lambda s, *_: 5.0 if s == 10.0 else 1.0, list(later_splits(20))) == 1.0
+    def fit(_features, _values, strength):
+        return SimpleNamespace(predict=lambda rows: rows[:, 0] + (5.0 if strength == 10.0 else 1.0))
+
+    values = np.arange(20.0)
+    assert best_strength(values[:, None], values, fit, (0.1, 1.0, 10.0)) == (1.0, 1.0)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -190,7 +190,7 @@ def test_a_calibration_comes_back_from_its_file(calibration: SkinCalibration, tm
         ("linear_to_n: 1.2\n", "", "linear_to_n"),
         ("calibration 1", "calibration 2", "format"),
         ("- -1.2", "- 1.3", "tension_n must rise"),
-        ("rows: 100", "rows: [", "cannot be read"),
+        ("rows: 100", "rows: [", r"line \d+, column \d+: "),
     ],
 )
 def test_a_file_with_a_mistake_is_refused_by_name(old: str, new: str, named: str, tmp_path: Path) -> None:

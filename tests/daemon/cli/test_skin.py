@@ -1,10 +1,8 @@
-import io
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from shearloop.bank.skin.calibration import load_calibration
 from shearloop.bank.skin.characterisation import FigureOfMerit
@@ -14,15 +12,7 @@ from shearloop.daemon.cli import main
 from shearloop.daemon.cli.skin import _table
 
 
-@pytest.fixture(scope="session")
-def fonts_open() -> None:
-    """Draw once: matplotlib keeps the files of its fonts open for the life of the process."""
-    figure = Figure()
-    figure.text(0.5, 0.5, "±")
-    figure.savefig(io.BytesIO())
-
-
-@pytest.mark.usefixtures("fonts_open")
+@pytest.mark.usefixtures("fonts")
 def test_characterise_holds_the_models_against_the_paper_and_draws_its_figures(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -32,9 +32,8 @@ class Bench:
 
     def __init__(self, **changes: Any) -> None:
         self.settings = ControllerSettings(**(DEFAULTS | changes))
-        self.controller = TwistController(self.settings)
         self.t_ns, self.angle, self.speed = 10**12, 0.3, 0.0
-        self.controller.start(self.t_ns, self.angle, 0.0, 100.0)
+        self.controller = TwistController(self.settings, self.t_ns, self.angle, 0.0, 100.0)
 
     def advance(self, seconds: float) -> list[float]:
         speeds = []

@@ -1,5 +1,4 @@
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -77,8 +76,6 @@ def test_refused_measurements_change_nothing(batch: list[tuple[float | None, int
 
 def test_unusable_measurements_are_rejected_by_kind(bench: Bench) -> None:
     bench.advance(1.0)
-    fresh = TwistController(bench.settings)
-    assert fresh.measure(0.1, 0, 1) is ControllerRefusal.NOT_STARTED
     assert bench.measure(None) is ControllerRefusal.NOT_A_NUMBER
     assert bench.measure(math.nan) is ControllerRefusal.NOT_A_NUMBER
     assert bench.measure(0.0, -0.1) is ControllerRefusal.FROM_THE_FUTURE
@@ -136,9 +133,8 @@ def test_a_stale_torque_holds_and_a_fresh_one_lets_go() -> None:
     assert bench.speed > 0.0
 
 
-def test_without_angle_measurement_set_point_or_start_the_wrist_stays() -> None:
+def test_without_angle_measurement_or_set_point_the_wrist_stays() -> None:
     bench = Bench()
-    assert TwistController(bench.settings).command(0, 0.0).reasons == (ControllerReason.NOT_STARTED,)
     assert set(bench.controller.command(bench.t_ns + 1, math.nan).reasons) == {
         ControllerReason.NO_ANGLE,
         ControllerReason.NO_SET_POINT,
@@ -316,15 +312,13 @@ def test_settings_out_of_range_are_refused_by_name(name: str, value: float) -> N
         ControllerSettings(**(DEFAULTS | {name: value}))
 
 
-def test_a_set_point_beyond_the_limit_or_before_the_start_is_refused(bench: Bench) -> None:
+def test_a_set_point_beyond_the_limit_and_a_start_without_an_angle_are_refused(bench: Bench) -> None:
     with pytest.raises(UserError, match=r"0\.3 N·m is not within the limit of 0\.2"):
         bench.controller.set_point(0.3)
     with pytest.raises(UserError, match="not within"):
         bench.controller.set_point(math.nan)
-    with pytest.raises(UserError, match="after the start"):
-        TwistController(replace(bench.settings, kp=0.2)).set_point(0.1)
     with pytest.raises(UserError, match="numbers"):
-        bench.controller.start(0, math.nan, 0.0)
+        TwistController(bench.settings, 0, math.nan, 0.0)
 
 
 STEP_NS = 8_000_000

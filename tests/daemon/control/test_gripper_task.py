@@ -75,7 +75,7 @@ async def test_a_grip_that_is_broken_off_is_halted_and_keeps_the_connection(way:
                 await asyncio.sleep(0)
             # What is written is taken up at the model's next step.
             assert rig.model.width_mm == pytest.approx(halted_mm, abs=60.0 * STEP_S + 1e-6)
-            assert not rig.model.gto
+            assert not rig.model.taken.gto
             assert felt[-1].uncertain
             assert not felt[-1].holding
         assert rig.driver.diagnostics()["connections"] == 1
@@ -104,7 +104,7 @@ async def test_fingers_whose_connection_is_lost_in_the_middle_of_a_grip_are_stop
         rig.silence(False)
         assert await halt == ""
         rig.model.step(STEP_S)
-        assert not rig.model.gto
+        assert not rig.model.taken.gto
         assert rig.model.width_mm > 110.0
         read.cancel()
 

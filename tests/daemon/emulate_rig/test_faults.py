@@ -32,7 +32,7 @@ pytestmark = pytest.mark.real_time
 async def test_disturbances_reach_the_tool_and_robot_faults_the_robot(rig: RigProcess) -> None:
     async with AsyncExitStack() as stack:
         gripper = await stack.enter_async_context(open_gripper_at(rig))
-        load = await stack.enter_async_context(Reader(LoadCell(COUNTS, path=rig.run_dir / "load-cell").samples()))
+        load = await stack.enter_async_context(Reader(LoadCell(COUNTS, path=rig.run_dir / "load-cell").readings()))
         await grip(gripper)
         await rig.fault("kick 0.05")
         truth = await rig.truth(lambda truth: bool(truth["torque_nm"]))
@@ -99,9 +99,9 @@ async def test_boards_fall_silent_vanish_and_come_back(rig: RigProcess) -> None:
         losses: asyncio.Queue[LinkEvent] = asyncio.Queue()
         kit, other = kit_at(rig, "right", told.put_nowait), kit_at(rig, "left")
         cell = LoadCell(COUNTS, path=rig.run_dir / "load-cell", on_event=losses.put_nowait)
-        right = await stack.enter_async_context(Reader(kit.frames()))
-        left = await stack.enter_async_context(Reader(other.frames()))
-        load = await stack.enter_async_context(Reader(cell.samples()))
+        right = await stack.enter_async_context(Reader(kit.readings()))
+        left = await stack.enter_async_context(Reader(other.readings()))
+        load = await stack.enter_async_context(Reader(cell.readings()))
         for each in (right, left, load):
             await each.take(1)
         assert told.get_nowait().up

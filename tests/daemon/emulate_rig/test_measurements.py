@@ -40,9 +40,9 @@ async def test_a_twist_is_felt_by_load_cell_wrench_and_both_fingertips_and_is_go
     async with AsyncExitStack() as stack:
         arm = await stack.enter_async_context(arm_at(rig))
         gripper = await stack.enter_async_context(open_gripper_at(rig))
-        right = await stack.enter_async_context(Reader(kit_at(rig, "right").frames()))
-        left = await stack.enter_async_context(Reader(kit_at(rig, "left").frames()))
-        load = await stack.enter_async_context(Reader(LoadCell(COUNTS, path=rig.run_dir / "load-cell").samples()))
+        right = await stack.enter_async_context(Reader(kit_at(rig, "right").readings()))
+        left = await stack.enter_async_context(Reader(kit_at(rig, "left").readings()))
+        load = await stack.enter_async_context(Reader(LoadCell(COUNTS, path=rig.run_dir / "load-cell").readings()))
         free = [await mean_of(right), await mean_of(left)]
         held = await grip(gripper)
         assert held.object is ObjectStatus.CONTACT_CLOSING
@@ -100,8 +100,8 @@ async def test_the_modbus_gripper_the_papers_sketch_a_calibration_and_the_truth_
             )
             stack.push_async_callback(gripper.close)
             cell = LoadCell(LoadCalibration.of_torque_lines(), path=run_dir / "load-cell")
-            load = await stack.enter_async_context(Reader(cell.samples()))
-            right = await stack.enter_async_context(Reader(kit_at(rig, "right").frames()))
+            load = await stack.enter_async_context(Reader(cell.readings()))
+            right = await stack.enter_async_context(Reader(kit_at(rig, "right").readings()))
             await gripper.connect()
             await gripper.activate()
             free = await mean_of(right)

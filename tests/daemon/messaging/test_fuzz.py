@@ -16,14 +16,8 @@ import zmq.asyncio
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.health import resident_memory_mb
-from shearloop.daemon.messaging.command_server import (
-    CLIENT_BURST,
-    CLIENT_PER_S,
-    MAX_CONCURRENT,
-    TOTAL_BURST,
-    TOTAL_PER_S,
-    RateLimit,
-)
+from shearloop.daemon.messaging import command_server
+from shearloop.daemon.messaging.command_server import RateLimit
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import CommandReply
@@ -147,7 +141,7 @@ async def test_a_flood_of_malformed_frames_and_requests(
             assert not daemon.supervisor.dead
             assert all(record.restarts == 0 for record in daemon.supervisor.records.values())
             assert resident_memory_mb() - before_mb < MOST_GROWTH_MB
-            assert len(asyncio.all_tasks()) <= tasks + MAX_CONCURRENT
+            assert len(asyncio.all_tasks()) <= tasks + command_server.MAX_CONCURRENT
             status = await asyncio.to_thread(exchange, address, iter([[encode({"command": "stop"})]]))
             assert status == {True: 1}, "stop is heard in the middle of it all"
             await daemon.stopped()
@@ -182,8 +176,7 @@ def write_all(board: int, lines: Iterator[bytes]) -> None:
     for line in lines:
         batch += line
         if len(batch) > 4096:
-            while batch:
-                batch = batch[os.write(board, batch) :]
+            batch = batch[os.write(board, batch) :]
     while batch:
         batch = batch[os.write(board, batch) :]
 
@@ -191,13 +184,13 @@ def write_all(board: int, lines: Iterator[bytes]) -> None:
 def test_the_rate_limit_of_a_client_recovers() -> None:
     limit = RateLimit()
     allowed = [limit.allow(b"loud", 0) for _ in range(1000)]
-    assert sum(allowed) == CLIENT_BURST
+    assert sum(allowed) == command_server.CLIENT_BURST
     assert limit.allow(b"quiet", 0)
-    assert sum(limit.allow(b"loud", 10**9) for _ in range(1000)) == CLIENT_PER_S
+    assert sum(limit.allow(b"loud", 10**9) for _ in range(1000)) == command_server.CLIENT_PER_S
 
 
 def test_many_clients_share_the_total_limit() -> None:
     limit = RateLimit()
     allowed = sum(limit.allow(b"%d" % number, number * 1000) for number in range(100_000))
-    assert allowed <= TOTAL_BURST + 0.1 * TOTAL_PER_S + 1
+    assert allowed <= command_server.TOTAL_BURST + 0.1 * command_server.TOTAL_PER_S + 1
     assert len(limit._clients) <= 256

@@ -132,7 +132,7 @@ async def test_only_allowed_clients_connect_and_only_encrypted(
                 await asking.send(encode({"command": "status"}))
                 assert not await asking.poll(SILENCE_MS), who
                 assert not await hearing.poll(0), who
-            assert daemon._command_facts()["errors"]["key is not allowed"] >= 1
+            assert daemon._command_diagnostics()["errors"]["key is not allowed"] >= 1
             await _stop_without_a_key(daemon, connect)
         finally:
             daemon.stop()
@@ -151,11 +151,8 @@ async def _stop_without_a_key(daemon: Daemon, connect: Callable[..., Any]) -> No
 
 
 def test_the_local_stop_socket_is_named_by_the_port() -> None:
-    assert (
-        local_stop_address("tcp://0.0.0.0:7762")
-        == local_stop_address("tcp://127.0.0.1:7762")
-        == "ipc://@shearloop-stop-7762"
-    )
+    for address in ("tcp://0.0.0.0:7762", "tcp://127.0.0.1:7762"):
+        assert local_stop_address(address) == "ipc://@shearloop-stop-7762"
 
 
 def test_a_client_needs_keys_for_another_machine(
@@ -174,17 +171,17 @@ def test_keys_are_made_listed_and_revoked(keys: Path, capsys: pytest.CaptureFixt
     folder = keys / "keys"
     assert (folder / "server.key_secret").stat().st_mode & 0o777 == 0o600
     assert (folder / "clients/ada.key").stat().st_mode & 0o777 == 0o644
-    assert main(["keys", "server", "--dir", str(folder)]) == 2
-    assert "exists already" in capsys.readouterr().err
     assert main(["keys", "list", "--dir", str(folder), "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["clients"] == {"ada": load_public_key(keys / "ada/client.key").decode()}
-    assert main(["keys", "allow", str(keys / "ada/client.key"), "--name", "eve", "--dir", str(folder)]) == 2
-    assert "is allowed already, as ada" in capsys.readouterr().err
-    assert main(["keys", "allow", str(folder / "server.key"), "--name", "../eve", "--dir", str(folder)]) == 2
-    assert "is not a client's name" in capsys.readouterr().err
-    assert main(["keys", "revoke", "eve", "--dir", str(folder)]) == 2
-    assert "there is no client 'eve'; the allowed clients are ada" in capsys.readouterr().err
+    for arguments, why in (
+        (["server"], "exists already"),
+        (["allow", str(keys / "ada/client.key"), "--name", "eve"], "is allowed already, as ada"),
+        (["allow", str(folder / "server.key"), "--name", "../eve"], "is not a client's name"),
+        (["revoke", "eve"], "there is no client 'eve'; the allowed clients are ada"),
+    ):
+        assert main(["keys", *arguments, "--dir", str(folder)]) == 2
+        assert why in capsys.readouterr().err
     assert main(["keys", "revoke", "ada", "--dir", str(folder)]) == 0
     assert main(["keys", "list", "--dir", str(folder)]) == 0
     assert "no client may connect yet" in capsys.readouterr().out

@@ -6,25 +6,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from shearloop.daemon.messaging.messages import TOPICS, EitHeatmap, RobotStateMessage, decode, encode, wire_map
+from shearloop.daemon.messaging.messages import TOPICS, EitHeatmap, Message, RobotStateMessage, decode, encode, wire_map
 from tests.daemon.sample_messages import sample
 
 SCALARS = st.none() | st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False) | st.text()
 ARRAYS = hnp.arrays(np.float32, hnp.array_shapes(min_dims=1, max_dims=3, max_side=8))
 
 
-def heatmap(scores: np.ndarray) -> EitHeatmap:
-    return EitHeatmap(
-        source="right",
-        t_mono_ns=5,
-        scores=scores,
-        k_low=0.1,
-        k_high=4.4,
-        sigma_low=0.1,
-        sigma_high=4.4,
-        model="gaussian_derivative",
-        frame=7,
-    )
+def heatmap(scores: np.ndarray) -> Message:
+    return sample(EitHeatmap, source="right", t_mono_ns=5, scores=scores)
 
 
 @given(ARRAYS)
@@ -45,7 +35,7 @@ def test_an_array_is_bin_with_a_shape_key() -> None:
 def test_a_tuple_is_encoded_like_an_array(numbers: list[float]) -> None:
     with np.errstate(over="ignore"):
         array = np.array(numbers).astype("<f4")
-    content = wire_map(dataclasses.replace(sample(RobotStateMessage), joints_rad=tuple(numbers)), 0.0, 0)  # type: ignore[call-arg]
+    content = wire_map(sample(RobotStateMessage, joints_rad=tuple(numbers)), 0.0, 0)
     assert content["joints_rad_shape"] == [len(numbers)]
     np.testing.assert_array_equal(np.frombuffer(content["joints_rad"], "<f4"), array)
 
@@ -53,12 +43,6 @@ def test_a_tuple_is_encoded_like_an_array(numbers: list[float]) -> None:
 @given(st.dictionaries(st.text().filter(lambda key: not key.endswith("_shape")), SCALARS))
 def test_scalars_round_trip(content: dict[str, object]) -> None:
     assert decode(encode(content)) == content
-
-
-def test_a_failed_encoding_does_not_affect_the_next_message() -> None:
-    with pytest.raises(TypeError):
-        encode({"source": "left", "k": object()})
-    assert decode(encode({"source": "right"})) == {"source": "right"}
 
 
 @given(st.binary(max_size=300))

@@ -1,5 +1,5 @@
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -11,6 +11,9 @@ from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.messages import LoadTorque, decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
 from tests.daemon.conftest import DEADLINE_S
+from tests.daemon.sample_messages import sample
+
+Connect = Callable[..., "zmq.Socket[bytes]"]
 
 
 def until(is_so: Callable[[], bool]) -> None:
@@ -21,35 +24,41 @@ def until(is_so: Callable[[], bool]) -> None:
         time.sleep(0.001)
 
 
-def test_the_publisher_knows_the_subscribed_topics(tmp_path: Path) -> None:
-    address = f"ipc://{tmp_path}/publish"
+@pytest.fixture
+def publisher(tmp_path: Path) -> Iterator[Publisher]:
+    with zmq.Context() as context, closing(Publisher(context, f"ipc://{tmp_path}/publish", Clock())) as bound:
+        yield bound
+
+
+@pytest.fixture
+def connect(tmp_path: Path) -> Iterator[Connect]:
+    """Connects a socket to the publisher, with a subscription."""
     with zmq.Context() as context:
-        publisher = Publisher(context, address, Clock())
-        assert not publisher.has_subscriber("eit.heatmap")
-        with context.socket(zmq.SUB) as one, context.socket(zmq.SUB) as two:
-            one.connect(address)
-            two.connect(address)
-            one.subscribe("eit.")
-            two.subscribe("eit.heatmap")
-            until(lambda: publisher.has_subscriber("eit.heatmap") and publisher.has_subscriber("eit.frame"))
-            assert not publisher.has_subscriber("health")
-            one.unsubscribe("eit.")
-            until(lambda: not publisher.has_subscriber("eit.frame"))
-            assert publisher.has_subscriber("eit.heatmap")
-        until(lambda: not publisher.has_subscriber("eit.heatmap"))
-        publisher.close()
+
+        def connected(*topics: str, kind: int = zmq.SUB) -> "zmq.Socket[bytes]":
+            socket = context.socket(kind)
+            socket.setsockopt(zmq.RCVTIMEO, DEADLINE_S * 1000)
+            socket.connect(f"ipc://{tmp_path}/publish")
+            for topic in topics:
+                socket.subscribe(topic)
+            return socket
+
+        yield connected
 
 
-def test_an_unsendable_message_does_not_affect_the_next(tmp_path: Path) -> None:
-    address = f"ipc://{tmp_path}/publish"
-    with (
-        zmq.Context() as context,
-        closing(Publisher(context, address, Clock())) as publisher,
-        context.socket(zmq.SUB) as subscriber,
-    ):
-        subscriber.setsockopt(zmq.RCVTIMEO, 10_000)
-        subscriber.subscribe("health")
-        subscriber.connect(address)
+def test_the_publisher_knows_the_subscribed_topics(publisher: Publisher, connect: Connect) -> None:
+    assert not publisher.has_subscriber("eit.heatmap")
+    with connect("eit.") as one, connect("eit.heatmap"):
+        until(lambda: publisher.has_subscriber("eit.heatmap") and publisher.has_subscriber("eit.frame"))
+        assert not publisher.has_subscriber("health")
+        one.unsubscribe("eit.")
+        until(lambda: not publisher.has_subscriber("eit.frame"))
+        assert publisher.has_subscriber("eit.heatmap")
+    until(lambda: not publisher.has_subscriber("eit.heatmap"))
+
+
+def test_an_unsendable_message_does_not_affect_the_next(publisher: Publisher, connect: Connect) -> None:
+    with connect("health") as subscriber:
         until(lambda: publisher.has_subscriber("health"))
         with pytest.raises(TypeError):
             publisher.forward("health", {"what": object()})
@@ -58,56 +67,31 @@ def test_an_unsendable_message_does_not_affect_the_next(tmp_path: Path) -> None:
         assert (topic, list(map(decode, payload))) == (b"health", [{"number": 1}])
 
 
-def test_subscriptions_to_unknown_topics_are_not_kept(tmp_path: Path) -> None:
-    address = f"ipc://{tmp_path}/publish"
-    with zmq.Context() as context:
-        publisher = Publisher(context, address, Clock())
-        with context.socket(zmq.XSUB) as stranger:
-            stranger.connect(address)
-            for number in range(300):
-                stranger.send(b"\x01eit.%d" % number)
-            stranger.send(b"no subscription")
-            stranger.send(b"\x01health")
+def test_subscriptions_to_unknown_topics_are_not_kept(publisher: Publisher, connect: Connect) -> None:
+    with connect(kind=zmq.XSUB) as stranger:
+        for number in range(300):
+            stranger.send(b"\x01eit.%d" % number)
+        stranger.send(b"no subscription")
+        stranger.send(b"\x01health")
+        until(lambda: publisher.has_subscriber("health"))
+        assert publisher._prefixes == {b"health"}
+
+
+def test_subscribers_come_and_go_while_messages_are_sent(publisher: Publisher, connect: Connect) -> None:
+    for _ in range(100):
+        publisher.publish(sample(LoadTorque))
+    with connect("load.") as one:
+        until(lambda: publisher.has_subscriber("load.torque"))
+        assert not publisher.has_subscriber("health")
+        publisher.publish(sample(LoadTorque))
+        topic, payload = one.recv_multipart()
+        assert topic == b"load.torque"
+        assert decode(payload)["seq"] == 100, "messages without a subscriber are numbered too"
+        with connect("health"):
+            publisher.publish(sample(LoadTorque))
             until(lambda: publisher.has_subscriber("health"))
-            assert publisher._prefixes == {b"health"}
-        publisher.close()
-
-
-def reading(number: int) -> LoadTorque:
-    return LoadTorque(
-        source="load_cell",
-        t_mono_ns=number,
-        torque_nm=0.1,
-        raw=1.0,
-        saturated=False,
-        spike=False,
-        valid=True,
-        reason="",
-    )
-
-
-def test_subscribers_come_and_go_while_messages_are_sent(tmp_path: Path) -> None:
-    address = f"ipc://{tmp_path}/publish"
-    with zmq.Context() as context, closing(Publisher(context, address, Clock())) as publisher:
-        for number in range(100):
-            publisher.publish(reading(number))
-        with context.socket(zmq.SUB) as one:
-            one.setsockopt(zmq.RCVTIMEO, round(DEADLINE_S * 1000))
-            one.connect(address)
-            one.subscribe("load.")
-            until(lambda: publisher.has_subscriber("load.torque"))
-            assert not publisher.has_subscriber("health")
-            publisher.publish(reading(100))
-            topic, payload = one.recv_multipart()
-            assert topic == b"load.torque"
-            assert decode(payload)["seq"] == 100, "messages without a subscriber are numbered too"
-            with context.socket(zmq.SUB) as two:
-                two.connect(address)
-                two.subscribe("health")
-                publisher.publish(reading(101))
-                until(lambda: publisher.has_subscriber("health"))
-            until(lambda: not publisher.has_subscriber("health"))
-        until(lambda: not publisher.has_subscribers())
+        until(lambda: not publisher.has_subscriber("health"))
+    until(lambda: not publisher.has_subscribers())
 
 
 def test_a_subscriber_is_warned_once_and_receives_a_later_daemon(

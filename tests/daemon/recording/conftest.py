@@ -7,6 +7,7 @@ import pytest
 from scipy.io import savemat
 
 from shearloop.bank.eit.channels import line_of_channels
+from shearloop.daemon.recording.importing import import_mat
 
 PERIOD_S = 0.5408
 # 2024-12-03 16:09 as MATLAB counts days.
@@ -42,6 +43,13 @@ def mat_folder(tmp_path) -> Callable[..., Path]:
         return folder
 
     return write
+
+
+@pytest.fixture
+def imported(mat_folder: Callable[..., Path], tmp_path: Path) -> Path:
+    """The recording of two sides and a load, imported."""
+    import_mat([mat_folder()], tmp_path / "imported.mcap")
+    return tmp_path / "imported.mcap"
 
 
 @pytest.fixture

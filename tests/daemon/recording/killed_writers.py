@@ -16,6 +16,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import EitFrame, wire_map
 from shearloop.daemon.recording.identity import Identity, basic_identity
 from shearloop.daemon.recording.recorder import Recorder
+from tests.daemon.sample_messages import sample
 
 # Five boards of frames: a kill in the middle of a write is likely.
 PERIOD_S = 0.1
@@ -34,17 +35,8 @@ async def write(folder: Path) -> None:
     seq = 0
     while not task.done():
         now_ns = clock.now_ns()
-        frame = EitFrame(
-            source="right",
-            t_mono_ns=now_ns,
-            channels=generator.uniform(size=896),
-            line=generator.uniform(size=1024),
-            frame=seq,
-            age_s=0.0,
-            saturated=0,
-            dead=0,
-            repeated=False,
-        )
+        arrays = {"channels": generator.uniform(size=896), "line": generator.uniform(size=1024)}
+        frame = sample(EitFrame, source="right", t_mono_ns=now_ns, **arrays)
         recorder.record_message(frame.topic, wire_map(frame, clock.unix_s(now_ns), seq))
         times[8:] = struct.pack("<q", now_ns)
         seq += 1

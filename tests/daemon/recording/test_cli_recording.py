@@ -118,4 +118,4 @@ def test_mistakes_end_in_one_sentence(
     given = [one.format(folder=tmp_path, recording=recording) for one in arguments]
     assert main(["recording", *given]) == 2
     assert message in capsys.readouterr().err
-    assert not list(tmp_path.glob("*.repairing"))
+    assert not list(tmp_path.glob("*.tmp"))

@@ -63,9 +63,8 @@ def test_calibrate_says_where_loads_are_not_seen(misses_loads, slices_folder, tm
     assert main(calibrate) == 0
     told = capsys.readouterr().out
     assert ("It does not see the load: " in told) == misses_loads
-    assert (
-        "every interval spans all calibrated torques, 0.01 to 0.14 N·m, and the torque is useless" in told
-    ) == misses_loads
+    useless = "every interval spans all calibrated torques, 0.01 to 0.14 N·m, and the torque is useless"
+    assert (useless in told) == misses_loads
     cure = "Calibrate with --estimator motion_regression or on both fingertips, or record a grip in which the tool"
     assert (cure in told) == misses_loads
     assert main([*calibrate, "--json"]) == 0
@@ -152,10 +151,7 @@ def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, 
         (["calibrate", "{slices}", "--time-range", "0.9:0.5", "--out", "x"], "--time-range must rise"),
         (["calibrate", "{slices}", "--sides", "middle", "--out", "x"], "--sides must be right or left"),
         (["calibrate", "{slices}", "--estimator", "bank", "--out", "x"], "needs a bank"),
-        (
-            ["calibrate", "{slices}", "--tool-mm", "0", "--out", "x"],
-            "--tool-mm must be above 0 and below 140 mm, not 0",
-        ),
+        (["calibrate", "{slices}", "--tool-mm", "0", "--out", "x"], "--tool-mm must be above 0 and below 140 mm, not"),
         (["calibrate", "{slices}", "--load-cell-delay-s", "0", "--out", "x"], "--load-cell-delay-s is for recordings"),
         (["calibrate", "{slices}", "--tool-mm", "20", "--out", "x"], "--tool-mm is for recordings: a calibration of"),
         (["calibrate", "{slices}", "--sides", "left", "--out", "x"], "--sides is for recordings: slices do not name"),
@@ -208,10 +204,8 @@ def test_what_is_judged_twice_is_refused_as_what_is_fitted_twice_is(slices_folde
     copytree(slices, copy)
     capsys.readouterr()
     assert main(["evaluate", str(calibration), str(slices), str(slices)]) == 2
-    assert capsys.readouterr() == (
-        "",
-        f"shearloop evaluate: {slices} is given twice; name it once: a copy adds nothing\n",
-    )
+    told = f"shearloop evaluate: {slices} is given twice; name it once: a copy adds nothing\n"
+    assert capsys.readouterr() == ("", told)
     assert main(["evaluate", str(calibration), str(slices), str(copy), "--time-range", "0.6:1"]) == 2
     out, told = capsys.readouterr()
     assert out == ""
@@ -224,12 +218,15 @@ def test_the_load_cell_is_still_calibrated_by_its_name(capsys):
     assert "known masses" in capsys.readouterr().out
 
 
+def _torque(torque_nm: float, half_nm: float) -> Estimate:
+    return Estimate(
+        True, (), torque_nm=torque_nm, torque_low_nm=torque_nm - half_nm, torque_high_nm=torque_nm + half_nm
+    )
+
+
 def test_figures_are_what_their_names_say():
     truth = np.array([0.0, 0.1, 0.2, 0.3])
-    estimates = [
-        Estimate(True, (), torque_nm=value, torque_low_nm=value - 0.05, torque_high_nm=value + 0.05)
-        for value in (0.02, 0.1, 0.27)
-    ] + [Estimate(False, ("no grip",))]
+    estimates = [*(_torque(value, 0.05) for value in (0.02, 0.1, 0.27)), Estimate(False, ("no grip",))]
     t = np.arange(4.0)
     series = FrameSeries("difference", ("right",), t, np.zeros((4, 1, 896)), t, truth, np.full(4, np.nan))
     figures = figures_of([EstimateTrack(series, tuple(estimates), np.array([1.0, 2.0, 3.0, 4.0]))])
@@ -245,9 +242,7 @@ def test_figures_are_what_their_names_say():
 
 def test_a_coverage_is_told_with_the_median_width_of_its_intervals():
     t, halves = np.arange(4.0), (0.01, 0.02, 0.1)
-    torques = [
-        Estimate(True, (), torque_nm=0.1, torque_low_nm=0.1 - half, torque_high_nm=0.1 + half) for half in halves
-    ]
+    torques = [_torque(0.1, half) for half in halves]
     cylinders = [Estimate(True, (), diameter_mm=20.0, diameter_low_mm=15.0, diameter_high_mm=25.0 + n) for n in t]
     refused = [Estimate(False, ("no grip",))]
     told = FrameSeries("difference", ("right",), t, np.zeros((4, 1, 896)), t, np.full(4, 0.1), np.full(4, np.nan))

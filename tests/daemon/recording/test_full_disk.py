@@ -4,6 +4,7 @@ import asyncio
 import errno
 import io
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +25,19 @@ from tests.daemon.recording.test_recorder import IDENTITY, frame, topics, torque
 class SmallDisk(io.FileIO):
     """A file on a disk that has room for so many bytes, and takes what it can, as a file system does."""
 
-    def __init__(self, path: Path, room: int) -> None:
-        super().__init__(path, "xb")
-        self.room = room
+    room: int
+
+    @classmethod
+    def opener(cls, disks: "list[SmallDisk]", *rooms: int) -> Callable[[Path], McapFile]:
+        """Return what opens a recorder's files on disks with so much room, one after the other; it adds the disks."""
+
+        def open_file(path: Path) -> McapFile:
+            disk = cls(path.with_name(path.name + ".partial"), "xb")
+            disk.room = rooms[len(disks)]
+            disks.append(disk)
+            return McapFile(path, disk)
+
+        return open_file
 
     def write(self, data: Any, /) -> int:
         room = self.room - self.tell()
@@ -36,18 +47,11 @@ class SmallDisk(io.FileIO):
 
 
 def test_a_full_disk_keeps_all_flushed_data(tmp_path: Path) -> None:
-    clock = Clock()
     for n, room in enumerate(np.random.default_rng(3).integers(2_000, 40_000, 50)):
-        disks = []
-
-        def opener(path: Path, room: int = int(room), disks: list[SmallDisk] = disks) -> McapFile:
-            disks.append(SmallDisk(path.with_name(path.name + ".partial"), room))
-            return McapFile(path, disks[0])
-
-        recorder = Recorder(tmp_path / str(n), IDENTITY, clock, open_file=opener)
+        recorder = Recorder(tmp_path / str(n), IDENTITY, Clock(), open_file=SmallDisk.opener([], int(room)))
         safe = -1
         for number in range(12):
-            recorder.record_message("eit.frame", frame(clock, number))
+            recorder.record_message("eit.frame", frame(number))
             recorder.write()
             if not recorder.failure:
                 safe = number
@@ -63,17 +67,10 @@ def test_a_full_disk_keeps_all_flushed_data(tmp_path: Path) -> None:
 
 
 def test_no_data_is_missing_when_the_disk_has_room_again(tmp_path: Path) -> None:
-    clock = Clock()
     disks: list[SmallDisk] = []
-
-    def opener(path: Path) -> McapFile:
-        disks.append(SmallDisk(path.with_name(path.name + ".partial"), 20_000))
-        return McapFile(path, disks[-1])
-
-    told: list[str] = []
-    recorder = Recorder(tmp_path, IDENTITY, clock, open_file=opener, on_failure=told.append)
+    recorder = Recorder(tmp_path, IDENTITY, Clock(), open_file=SmallDisk.opener(disks, 20_000))
     for number in range(20):
-        recorder.record_message("eit.frame", frame(clock, number))
+        recorder.record_message("eit.frame", frame(number))
         recorder.write()
     assert "No space left on device" in recorder.failure
     facts = recorder.diagnostics()
@@ -92,92 +89,65 @@ def test_no_data_is_missing_when_the_disk_has_room_again(tmp_path: Path) -> None
 
 
 def test_a_file_that_cannot_be_started_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = Clock()
-    rooms = [0, 100_000, 0, 0, 0, 100_000]
-
-    def opener(path: Path) -> McapFile:
-        disk = SmallDisk(path.with_name(path.name + ".partial"), 0)
-        disk.room = rooms.pop(0)
-        return McapFile(path, disk)
-
+    opener = SmallDisk.opener([], 0, 100_000, 0, 0, 0, 100_000)
     with pytest.raises(UserError, match="cannot record there: No space left on device"):
-        Recorder(tmp_path, IDENTITY, clock, open_file=opener)
+        Recorder(tmp_path, IDENTITY, Clock(), open_file=opener)
     assert list(tmp_path.iterdir()) == []
-    recorder = Recorder(tmp_path, IDENTITY, clock, open_file=opener)
+    recorder = Recorder(tmp_path, IDENTITY, Clock(), open_file=opener)
     # Each item asks for another file, as all do after an hour; the disk has room for one at last.
     monkeypatch.setattr(recorder_module, "LONGEST_IDLE_FILE_S", -1.0)
     for number in range(3):
-        recorder.record_message("load.torque", torque(clock, number))
+        recorder.record_message("load.torque", torque(number))
     recorder.write()
     assert "No space left on device" in recorder.failure
     assert list(tmp_path.iterdir()) == [recorder.path]
-    recorder.record_message("load.torque", torque(clock, 3))
+    recorder.record_message("load.torque", torque(3))
     recorder.write()
     assert recorder.failure == ""
     recorder.close()
     assert [[one["seq"] for one in topics(path)["load.torque"]] for path in recorder.finished] == [[0, 1, 2], [3]]
 
 
-def test_the_queue_is_bounded_and_drops_are_counted(tmp_path: Path) -> None:
-    clock = Clock()
-    recorder = Recorder(tmp_path, IDENTITY, clock, max_waiting_bytes=100_000)
+def test_the_queue_is_bounded_and_drops_are_counted_in_their_own_file(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, IDENTITY, Clock(), max_waiting_bytes=100_000)
     for number in range(20):
-        recorder.record_message("eit.frame", frame(clock, number))
-    dropped = recorder.diagnostics()["errors"]["dropped"]
-    assert 0 < dropped < 20
-    recorder.close()
-    (path,) = recorder.finished
-    assert [one["frame"] for one in topics(path)["eit.frame.right"]] == list(range(20 - dropped))
-    assert summarise(path).dropped == dropped
-
-
-def test_drops_are_counted_in_their_own_file(tmp_path: Path) -> None:
-    clock = Clock()
-    recorder = Recorder(tmp_path, IDENTITY, clock, max_waiting_bytes=100_000)
-    for number in range(20):
-        recorder.record_message("eit.frame", frame(clock, number))
+        recorder.record_message("eit.frame", frame(number))
     dropped = recorder.diagnostics()["errors"]["dropped"]
     recorder.write()
     recorder.record_experiment("one")
-    recorder.record_message("load.torque", torque(clock, 0))
+    recorder.record_message("load.torque", torque(0))
     recorder.write()
     recorder.record_experiment("two")
     for number in range(20):
-        recorder.record_message("eit.frame", frame(clock, number))
+        recorder.record_message("eit.frame", frame(number))
     later = recorder.diagnostics()["errors"]["dropped"] - dropped
     recorder.write()
     recorder.record_experiment("three")
     recorder.close()
-    assert dropped > 0 < later
+    assert 0 < dropped < 20
+    assert later > 0
     assert [summarise(path).dropped for path in recorder.finished] == [dropped, later, 0]
+    kept = topics(recorder.finished[0])["eit.frame.right"]
+    assert [one["frame"] for one in kept] == list(range(20 - dropped))
 
 
 @pytest.mark.parametrize("small_disk", ["64k"], indirect=True)
 async def test_a_real_full_disk_is_reported_and_the_file_can_be_repaired(small_disk: Path, tmp_path: Path) -> None:
-    clock = Clock()
-    why: list[str] = []
-    flushed = asyncio.Event()
-
-    def on_failure(failure: str) -> None:
-        if failure:
-            why.append(failure)
-        flushed.set()
-
-    recorder = Recorder(small_disk, IDENTITY, clock, on_failure=on_failure)
+    flushed: asyncio.Queue[str] = asyncio.Queue()
+    recorder = Recorder(small_disk, IDENTITY, Clock(), on_failure=flushed.put_nowait)
     task = asyncio.create_task(recorder.run())
-    number = 0
-    async with deadline("the recorder did not tell of the full disk"):
+    why, number = "", 0
+    async with deadline("the recorder did not report the full disk"):
         while not why:
             assert number < 1000, "a disk of 64 kB took a thousand frames, and is not full"
             for _ in range(5):
-                recorder.record_message("eit.frame", frame(clock, number))
+                recorder.record_message("eit.frame", frame(number))
                 number += 1
-            flushed.clear()
-            await flushed.wait()
+            why = await flushed.get()
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
     await asyncio.to_thread(recorder.close)
-    assert "No space left on device" in why[0]
+    assert "No space left on device" in why
     repaired = repair(recorder.path, tmp_path / "saved.mcap")
     kept = [one["frame"] for one in topics(repaired.path)["eit.frame.right"]]
     assert kept == list(range(len(kept)))

@@ -178,12 +178,9 @@ def test_closing_writes_the_last_slice(tmp_path: Path) -> None:
 
 def test_a_hold_with_a_safety_interruption_is_one_slice(tmp_path: Path) -> None:
     sweep = Sweep(tmp_path)
-    sweep._loop(hold=1)
-    sweep.frames(0.1, 2.0)
-    sweep._loop(hold=1, phase="held")
-    sweep.frames(0.1, 1.0)
-    sweep._loop(hold=1)
-    sweep.frames(0.1, 2.0)
+    for phase, for_s in (("running", 2.0), ("held", 1.0), ("running", 2.0)):
+        sweep._loop(hold=1, phase=phase)
+        sweep.frames(0.1, for_s)
     sweep._loop()
     sweep.done()
     assert sweep.recorder.written["torque"] == 1

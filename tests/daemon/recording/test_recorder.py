@@ -5,6 +5,7 @@ import os
 import struct
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,39 +27,23 @@ from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.recording.repair import repair, summarise
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.conftest import deadline
+from tests.daemon.sample_messages import sample
 
 IDENTITY = Identity(basic_identity("a test"), (AttachedFile("configuration.json", "application/json", b"{}"),))
 
 
-def frame(clock: Clock, number: int) -> dict:
+def frame(number: int) -> dict:
     rng = np.random.default_rng(number)
     channels = np.round(rng.uniform(0.01, 0.5, len(LINE_SLOTS)), 4)
-    message = EitFrame(
-        source="right",
-        t_mono_ns=clock.now_ns() - 300_000_000,
-        channels=channels,
-        line=line_of_channels(channels),
-        frame=number,
-        age_s=0.3,
-        saturated=0,
-        dead=0,
-        repeated=False,
-    )
-    return wire_map(message, clock.unix_s(message.t_mono_ns), number)
+    arrays = {"channels": channels, "line": line_of_channels(channels)}
+    times = {"t_mono_ns": time.monotonic_ns() - 300_000_000, "age_s": 0.3}
+    message = sample(EitFrame, source="right", frame=number, repeated=False, **arrays, **times)
+    return wire_map(message, Clock().unix_s(message.t_mono_ns), number)
 
 
-def torque(clock: Clock, number: int, torque_nm: float = 0.1) -> dict:
-    message = LoadTorque(
-        source="load_cell",
-        t_mono_ns=clock.now_ns(),
-        torque_nm=torque_nm,
-        raw=1.0,
-        saturated=False,
-        spike=False,
-        valid=True,
-        reason="",
-    )
-    return wire_map(message, clock.unix_s(message.t_mono_ns), number)
+def torque(number: int, torque_nm: float = 0.1) -> dict:
+    message = sample(LoadTorque, source="load_cell", torque_nm=torque_nm)
+    return wire_map(message, Clock().unix_s(message.t_mono_ns), number)
 
 
 def topics(path: Path) -> dict[str, list[dict]]:
@@ -76,9 +61,9 @@ def test_messages_are_recorded_with_schema_and_time(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "new" / "folder", IDENTITY, clock)
     recorder.input_recorder("right")(RawEvent(InputKind.OPENED, 5))
     recorder.input_recorder("right")(RawEvent(InputKind.DATA, 7, bytes(range(256))))
-    one = frame(clock, 0)
+    one = frame(0)
     recorder.record_message("eit.frame", one)
-    recorder.record_message("load.torque", torque(clock, 0, float("nan")))
+    recorder.record_message("load.torque", torque(0, float("nan")))
     recorder.close()
     assert recorder.failure == ""
     (path,) = recorder.finished
@@ -101,13 +86,12 @@ def test_messages_are_recorded_with_schema_and_time(tmp_path: Path) -> None:
 
 
 def test_a_live_recording_is_read_like_an_import(tmp_path: Path) -> None:
-    clock = Clock()
-    recorder = Recorder(tmp_path, IDENTITY, clock)
-    frames = [frame(clock, n) for n in range(3)]
+    recorder = Recorder(tmp_path, IDENTITY, Clock())
+    frames = [frame(n) for n in range(3)]
     for n, one in enumerate(frames):
         recorder.record_message("eit.frame", one)
-        recorder.record_message("load.torque", torque(clock, n))
-    recorder.record_message("load.torque", {**torque(clock, 3, 9.0), "valid": False})
+        recorder.record_message("load.torque", torque(n))
+    recorder.record_message("load.torque", {**torque(3, 9.0), "valid": False})
     recorder.close()
     found = read_recording(recorder.finished[0])
     wanted = np.round(np.array([np.frombuffer(one["line"], "<f4") for one in frames], dtype=np.float64), 4)
@@ -119,7 +103,7 @@ def test_a_live_recording_is_read_like_an_import(tmp_path: Path) -> None:
 def test_a_repeated_frame_is_read_once(tmp_path: Path) -> None:
     clock = Clock()
     recorder = Recorder(tmp_path, IDENTITY, clock)
-    frames = [frame(clock, n) for n in range(2)]
+    frames = [frame(n) for n in range(2)]
     for one in (frames[0], frames[1], {**frames[1], "t_mono_ns": frames[1]["t_mono_ns"] + 10, "repeated": True}):
         recorder.record_message("eit.frame", one)
     recorder.close()
@@ -128,14 +112,13 @@ def test_a_repeated_frame_is_read_once(tmp_path: Path) -> None:
 
 
 def test_each_experiment_has_a_file_with_its_name(tmp_path: Path) -> None:
-    clock = Clock()
-    recorder = Recorder(tmp_path, IDENTITY, clock)
-    recorder.record_message("load.torque", torque(clock, 0))
+    recorder = Recorder(tmp_path, IDENTITY, Clock())
+    recorder.record_message("load.torque", torque(0))
     recorder.record_experiment("Hold 0.10 N·m", (AttachedFile("hold.yaml", "application/yaml", b"name: hold"),))
-    recorder.record_message("load.torque", torque(clock, 1))
+    recorder.record_message("load.torque", torque(1))
     recorder.write()
     recorder.record_experiment("again")
-    recorder.record_message("load.torque", torque(clock, 2))
+    recorder.record_message("load.torque", torque(2))
     recorder.close()
     first, second = recorder.finished
     assert first.name.endswith("_hold-0.10-n-m.mcap")
@@ -148,14 +131,13 @@ def test_each_experiment_has_a_file_with_its_name(tmp_path: Path) -> None:
 
 
 def test_a_new_file_begins_after_an_hour_without_experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = Clock()
     busy = True
-    recorder = Recorder(tmp_path, IDENTITY, clock, is_busy=lambda: busy)
+    recorder = Recorder(tmp_path, IDENTITY, Clock(), is_busy=lambda: busy)
     monkeypatch.setattr(recorder_module, "LONGEST_IDLE_FILE_S", -1.0)
-    recorder.record_message("load.torque", torque(clock, 0))
+    recorder.record_message("load.torque", torque(0))
     recorder.write()
     busy = False
-    recorder.record_message("load.torque", torque(clock, 1))
+    recorder.record_message("load.torque", torque(1))
     recorder.close()
     assert [topics(path)["load.torque"][0]["seq"] for path in recorder.finished] == [0, 1]
 
@@ -216,12 +198,11 @@ ENDLESS["itself"] = ENDLESS
     ids=["object", "no UTF-8", "500", "5000", "endless"],
 )
 def test_a_message_without_a_json_form_is_counted(raw: object, why: str, tmp_path: Path) -> None:
-    clock = Clock()
-    recorder = Recorder(tmp_path, IDENTITY, clock)
+    recorder = Recorder(tmp_path, IDENTITY, Clock())
     recorder.record_experiment("first")
-    recorder.record_message("load.torque", torque(clock, 0))
-    recorder.record_message("load.torque", {**torque(clock, 1), "raw": raw})
-    recorder.record_message("load.torque", torque(clock, 2))
+    recorder.record_message("load.torque", torque(0))
+    recorder.record_message("load.torque", {**torque(1), "raw": raw})
+    recorder.record_message("load.torque", torque(2))
     # In a thread, as it is live: its stack is what nesting takes up.
     asyncio.run(asyncio.to_thread(recorder.write))
     facts = recorder.diagnostics()
@@ -231,7 +212,7 @@ def test_a_message_without_a_json_form_is_counted(raw: object, why: str, tmp_pat
     assert facts["waiting_bytes"] == 0
     assert recorder.failure == "", "nothing is wrong with the disk"
     recorder.record_experiment("second")
-    recorder.record_message("load.torque", torque(clock, 3))
+    recorder.record_message("load.torque", torque(3))
     recorder.close()
     first, second = recorder.finished
     assert [one["seq"] for one in topics(first)["load.torque"]] == [0, 2]
@@ -239,9 +220,8 @@ def test_a_message_without_a_json_form_is_counted(raw: object, why: str, tmp_pat
 
 
 def test_a_hundred_levels_are_recorded(tmp_path: Path) -> None:
-    clock = Clock()
-    recorder = Recorder(tmp_path, IDENTITY, clock)
-    recorder.record_message("load.torque", {**torque(clock, 0), "raw": nested(100)})
+    recorder = Recorder(tmp_path, IDENTITY, Clock())
+    recorder.record_message("load.torque", {**torque(0), "raw": nested(100)})
     recorder.close()
     assert topics(recorder.finished[0])["load.torque"][0]["raw"] == nested(100)
 

@@ -4,7 +4,8 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,24 +20,30 @@ from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.importing import import_mat
-from shearloop.daemon.recording.replay import RecordedRun, Replay, ReplayClock, ReplayComparison, ReplayPipeline
+from shearloop.daemon.recording.replay import (
+    RecordedRun,
+    Replay,
+    ReplayClock,
+    ReplayComparison,
+    ReplayPipeline,
+    restored_wire_map,
+)
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.test_run import recording
 
 Write = Callable[..., Path]
+Messages = list[tuple[str, dict[str, Any]]]
 # Of the real recording's estimates with the tests' bank: what they were when it was last looked at with care.
 REFERENCE = Path(__file__).parents[2] / "data" / "replayed_stream.json"
 RELATIVE = 1e-9
 
 
-async def replayed(
-    path: Path, speed: float, address: str, config: DaemonConfig | None = None
-) -> tuple[list[tuple[str, dict[str, Any]]], ReplayComparison]:
+async def replayed(path: Path, speed: float, config: DaemonConfig | None = None) -> tuple[Messages, ReplayComparison]:
     """Return all that a replay publishes, and how it compares."""
     run, clock, seen = RecordedRun(path), ReplayClock(), []
     with contextlib.ExitStack() as opened:
         config = config or opened.enter_context(run.configuration())
-        publisher = Publisher(opened.enter_context(zmq.asyncio.Context()), address, clock)
+        publisher = Publisher(opened.enter_context(zmq.asyncio.Context()), "tcp://127.0.0.1:*", clock)
         opened.callback(publisher.close)
         publisher.add_listener(lambda topic, content: seen.append((topic, content)))
         replay = Replay(run, ReplayPipeline(config, run.replay_events(), publisher), publisher, clock)
@@ -44,58 +51,56 @@ async def replayed(
     return seen, replay.comparison
 
 
-def measured(messages: list[tuple[str, dict[str, Any]]]) -> list[tuple[str, dict[str, Any]]]:
+def measured(messages: Messages) -> Messages:
     """Return the messages without what says how long they took and how clocks were read."""
     return [(t, {k: v for k, v in c.items() if k not in ("latency_s", "timestamp")}) for t, c in messages]
 
 
-@pytest.fixture
-def recorded(config: Write, tmp_path: Path) -> Callable[..., Path]:
-    """Run a daemon on an emulated board, with faults, a tare on the way and recording on; return the recording."""
+@asynccontextmanager
+async def recording_daemon(
+    config: Path, *faults: str
+) -> AsyncIterator[tuple[Daemon, Messages, Callable[[int], Awaitable[None]]]]:
+    """Run a daemon on an emulated board of 60 frames; give it, what it published, and a wait for a frame."""
+    published: Messages = []
+    news = asyncio.Event()
 
-    async def record() -> list[dict[str, Any]]:
-        link, published = str(tmp_path / "eit-right"), []
-        faults = ["--fault", "wrong-count@5", "--fault", "unplug:0.3@12"]
-        with zmq.asyncio.Context() as context:
-            path = config(recording={"folder": "recordings"})
-            daemon = Daemon(load_daemon_config(path), context)
-            news = asyncio.Event()
+    def listen(topic: str, content: dict[str, Any]) -> None:
+        published.append((topic, content))
+        news.set()
 
-            def listen(topic: str, content: dict[str, Any]) -> None:
-                published.append((topic, content))
-                news.set()
+    async def until(frame: int) -> None:
+        while not any(t == "eit.estimate" and c["frame"] >= frame for t, c in published):
+            news.clear()
+            await news.wait()
 
-            async def until(frame: int) -> None:
-                while not any(t == "eit.estimate" and c["frame"] >= frame for t, c in published):
-                    news.clear()
-                    await news.wait()
+    folder = config.parent
+    play = ("--recording", recording(folder, 60), "--once", "--speed", "20", "--link", folder / "eit-right", *faults)
+    with zmq.asyncio.Context() as context:
+        daemon = Daemon(load_daemon_config(config), context)
+        daemon.publisher.add_listener(listen)
+        async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
+            group.create_task(daemon.run())
+            async with shearloop("emulate", "eit-kit", *map(str, play), stdin=asyncio.subprocess.PIPE):
+                yield daemon, published, until
+            daemon.stop()
 
-            daemon.publisher.add_listener(listen)
-            async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
-                group.create_task(daemon.run())
-                play = ("--recording", str(recording(tmp_path, 60)), "--once", "--speed", "20", "--link", link)
-                async with shearloop("emulate", "eit-kit", *play, *faults, stdin=asyncio.subprocess.PIPE):
-                    await until(25)
-                    reply = await asyncio.to_thread(
-                        send_command, f"ipc://{tmp_path}/commands", {"command": "tare"}, DEADLINE_S
-                    )
-                    assert reply["ok"]
-                    await until(50)
-                daemon.stop()
-        return published
 
-    def run() -> tuple[Path, list[tuple[str, dict[str, Any]]]]:
-        published = asyncio.run(record())
-        (path,) = (tmp_path / "recordings").iterdir()
-        return path, published
-
-    return run
+async def record(config: Path) -> Messages:
+    """Record a board with faults and a tare on the way; return what the daemon published."""
+    faults = ["--fault", "wrong-count@5", "--fault", "unplug:0.3@12"]
+    async with recording_daemon(config, *faults) as (_, published, until):
+        await until(25)
+        address = f"ipc://{config.parent}/commands"
+        assert (await asyncio.to_thread(send_command, address, {"command": "tare"}, DEADLINE_S))["ok"]
+        await until(50)
+    return published
 
 
 def test_a_replay_equals_the_recording_at_any_speed(
-    recorded: Callable[..., Any], tmp_path: Path, tiny_calibration: Path, capsys: pytest.CaptureFixture[str]
+    config: Write, tmp_path: Path, tiny_calibration: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path, live = recorded()
+    live = asyncio.run(record(config(recording={"folder": "recordings"})))
+    (path,) = (tmp_path / "recordings").iterdir()
     # The recording holds the calibration that was used, whatever becomes of it.
     kept = tiny_calibration.rename(tmp_path / "kept.yaml")
     try:
@@ -113,11 +118,11 @@ def test_a_replay_equals_the_recording_at_any_speed(
 
 def _same_at_any_speed(path: Path, live: list[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     address = f"ipc://{tmp_path}/replay"
-    fast, comparison = asyncio.run(replayed(path, math.inf, address))
+    fast, comparison = asyncio.run(replayed(path, math.inf))
     assert comparison.compared["eit.frame"] > 50
     assert comparison.compared["eit.estimate"] > 50
     assert comparison.different == Counter(), comparison.examples
-    slow, _ = asyncio.run(replayed(path, 5.0, address))
+    slow, _ = asyncio.run(replayed(path, 5.0))
     assert measured(slow) == measured(fast)
     assert [c["latency_s"] for t, c in slow if t == "eit.estimate"] == [0.0] * comparison.compared["eit.estimate"]
     # And the same as what subscribers saw, but for messages under way when the daemon was stopped.
@@ -140,7 +145,7 @@ def test_a_real_recording_gives_the_stored_estimates(shared: Path, config: Write
     configured = load_daemon_config(config())
     averaging = {"right": configured.fingertips["right"].model_copy(update={"average_frames": 5})}
     configured = configured.model_copy(update={"fingertips": averaging})
-    messages, _ = asyncio.run(replayed(path, math.inf, f"ipc://{tmp_path}/replay", configured))
+    messages, _ = asyncio.run(replayed(path, math.inf, configured))
     estimates = [content for topic, content in messages if topic == "eit.estimate"]
     assert [content["frame"] for content in estimates] == list(range(832))
     torques = [content for topic, content in messages if topic == "load.torque"]
@@ -176,16 +181,13 @@ def test_a_real_recording_gives_the_stored_estimates(shared: Path, config: Write
     ],
 )
 def test_mistakes_end_in_one_sentence(
-    arguments: list[str], message: str, mat_folder: Callable[..., Path], tmp_path: Path, capsys: Any
+    arguments: list[str], message: str, imported: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import_mat([mat_folder()], tmp_path / "imported.mcap")
-    assert main(["replay", *(one.format(imported=tmp_path / "imported.mcap") for one in arguments)]) == 2
+    assert main(["replay", *(one.format(imported=imported) for one in arguments)]) == 2
     assert message in capsys.readouterr().err
 
 
 def test_nan_is_restored() -> None:
-    from shearloop.daemon.recording.replay import restored_wire_map
-
     on_wire = restored_wire_map({"seq": 3, "joints_rad": [1.5, None, 2.5], "reason": ""})
     assert on_wire["joints_rad_shape"] == [3]
     np.testing.assert_array_equal(np.frombuffer(on_wire["joints_rad"], "<f4"), np.float32([1.5, np.nan, 2.5]))

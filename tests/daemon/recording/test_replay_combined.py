@@ -19,9 +19,8 @@ from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
 from shearloop.drivers.eit_kit import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
-from tests.daemon.recording.test_replay import measured, replayed
+from tests.daemon.recording.test_replay import Messages, measured, replayed
 
-Messages = list[tuple[str, dict[str, Any]]]
 N_FRAMES = 120
 GRIPPED = slice(25, 110)
 PERIOD_S = 0.5408
@@ -120,7 +119,7 @@ def test_combined_fingertips_are_replayed_at_any_speed(
     # Recorded at many times a board's pace: at speed 1 it takes as long as it took.
     replays = {}
     for speed in (1.0, 7.0, math.inf):
-        again, comparison = asyncio.run(replayed(recording, speed, f"ipc://{tmp_path}/replay"))
+        again, comparison = asyncio.run(replayed(recording, speed))
         assert comparison.different == {}, comparison.examples
         assert comparison.compared["eit.estimate"] >= 2 * (N_FRAMES - 12) + N_FRAMES // 3
         replays[speed] = measured([one for one in again if one[0] == "eit.estimate"])

@@ -7,74 +7,48 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import zmq.asyncio
 
 from shearloop.bank.estimation import Measured
-from shearloop.daemon.app import Daemon
-from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.recording.replay import RecordedRun
 from shearloop.daemon.sensing.estimators import LiveEstimator
-from tests.daemon.conftest import DEADLINE_S, shearloop
-from tests.daemon.recording.test_replay import replayed
-from tests.daemon.test_run import recording
+from tests.daemon.recording.test_replay import recording_daemon, replayed
 
 OTHER_TOOL = Measured(14.0, 0.5)
 # The frames after which another tool is held, a further experiment is begun, and a zero is taken.
 HELD, BEGUN, ZEROED, ENOUGH = 6, 12, 18, 40
 
 
-async def record(config: Path, stream: Path) -> list[dict[str, Any]]:
+async def record(config: Path) -> list[dict[str, Any]]:
     """Run a daemon through two experiments; return what was published as estimates."""
-    estimates: list[dict[str, Any]] = []
-    news = asyncio.Event()
-
-    def listen(topic: str, content: dict[str, Any]) -> None:
-        if topic == "eit.estimate":
-            estimates.append(content)
-            news.set()
-
-    async def until(number: int) -> None:
-        while not any(one["frame"] >= number for one in estimates):
-            news.clear()
-            await news.wait()
-
-    with zmq.asyncio.Context() as context:
-        daemon = Daemon(load_daemon_config(config), context)
+    async with recording_daemon(config) as (daemon, published, until):
         recorder, right = daemon._recorder, daemon._estimators["right"]
         assert recorder is not None
         right._held_tool = lambda _: OTHER_TOOL if right.count >= HELD else None
-        daemon.publisher.add_listener(listen)
-        async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
-            group.create_task(daemon.run())
-            play = ("--recording", str(stream), "--once", "--speed", "20", "--link", str(config.parent / "eit-right"))
-            async with shearloop("emulate", "eit-kit", *play, stdin=asyncio.subprocess.PIPE):
-                recorder.record_experiment("first")
-                await until(BEGUN)
-                recorder.record_experiment("second")
-                await until(ZEROED)
-                right.tare()
-                await until(ENOUGH)
-            daemon.stop()
-    return estimates
+        recorder.record_experiment("first")
+        await until(BEGUN)
+        recorder.record_experiment("second")
+        await until(ZEROED)
+        right.tare()
+        await until(ENOUGH)
+    return [content for topic, content in published if topic == "eit.estimate"]
 
 
 def test_a_later_file_replays_frame_numbers_tares_and_tools(
     config: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    live = asyncio.run(record(config(recording={"folder": "recordings"}), recording(tmp_path, 60)))
+    live = asyncio.run(record(config(recording={"folder": "recordings"})))
     (later,) = (path for path in (tmp_path / "recordings").iterdir() if "second" in path.name)
     ((zeroed,),) = RecordedRun(later).replay_events().tares.values()
     assert zeroed >= ZEROED
     held: list[object] = []
     monkeypatch.setattr(LiveEstimator, "set_tool", lambda _self, tool: held.append(tool))
-    again, _ = asyncio.run(replayed(later, math.inf, f"ipc://{tmp_path}/replay"))
+    again, _ = asyncio.run(replayed(later, math.inf))
     assert held == [OTHER_TOOL], "which was told before the file began"
     estimates = {content["frame"]: content for topic, content in again if topic == "eit.estimate"}
     assert min(estimates) >= BEGUN
     said = ("reason", "valid", "k", "sigma", "score", "torque_nm")
     after = [one for one in live if one["frame"] >= zeroed]
     assert len(after) > ENOUGH - ZEROED - 10
-    assert [[estimates[one["frame"]][key] for key in said] for one in after] == [
-        [one[key] for key in said] for one in after
-    ]
+    for one in after:
+        assert [estimates[one["frame"]][key] for key in said] == [one[key] for key in said]
     assert estimates[zeroed]["reason"].startswith("taking the homogeneous frame, 1 of")

@@ -33,6 +33,11 @@ HALF = 0.457
 LATER_SLICES = {29: (0.97, 0.0150, 0.9), 39: (0.975, 0.0135, 0.9)}
 
 
+def imported(out: Path, *sources: Path) -> FrameSeries:
+    import_mat(sources, out)
+    return series_of(read_recording(out))
+
+
 @pytest.fixture(scope="module")
 def twists_file(shared, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("recording") / "twists.mcap"
@@ -61,9 +66,7 @@ def earlier(slices) -> Callable[[Name, int], Calibration]:
 @pytest.fixture(scope="module")
 def cylinders(shared, tmp_path_factory) -> dict[int, FrameSeries]:
     folder, out = shared / "recordings/streams/cylinders", tmp_path_factory.mktemp("cylinders")
-    for mm in (10, 20, 30, 40):
-        import_mat(sorted(folder.glob(f"{mm}mm_1_*.mat")), out / f"{mm}.mcap")
-    return {mm: series_of(read_recording(out / f"{mm}.mcap")) for mm in (10, 20, 30, 40)}
+    return {mm: imported(out / f"{mm}.mcap", *folder.glob(f"{mm}mm_1_*.mat")) for mm in (10, 20, 30, 40)}
 
 
 @pytest.fixture(scope="module")
@@ -195,9 +198,8 @@ def test_torques_beyond_those_calibrated_on_lie_within_the_intervals(name, low_n
     # As where somebody has vouched that no other will come, which changes nothing else (test_later_torque_slices).
     reader = replace(calibration.torque.regressor, low_end=-np.inf, high_end=np.inf)
     vouched = replace(calibration, torque=replace(calibration.torque, regressor=reader))
-    assert figures_of([estimate_series(vouched, _some(slices, ~inside))])["coverage_95"] < 0.8, (
-        "or there was nothing to hold"
-    )
+    vouched_for = figures_of([estimate_series(vouched, _some(slices, ~inside))])
+    assert vouched_for["coverage_95"] < 0.8, "or there was nothing to hold"
 
 
 def _some(series: FrameSeries, chosen) -> FrameSeries:
@@ -231,9 +233,8 @@ def test_where_slices_tell_little_intervals_reach_to_what_may_be_hidden_in_them(
     foreign = later.channels.mean(axis=0)[:, mirrored]
     spoilt = replace(later, channels=0.9 * later.channels + 0.1 * foreign)
     assert figures_of([estimate_series(calibration, spoilt)])["coverage_95"] >= 0.9
-    assert figures_of([estimate_series(_believing(calibration), spoilt)])["coverage_95"] <= 0.7, (
-        "or there was nothing to hold"
-    )
+    believed = figures_of([estimate_series(_believing(calibration), spoilt)])
+    assert believed["coverage_95"] <= 0.7, "or there was nothing to hold"
 
 
 def _believing(calibration: Calibration) -> Calibration:
@@ -251,9 +252,8 @@ def test_a_fifth_of_a_recorded_cylinder_in_later_slices_lies_within_the_interval
         calibration, later = earlier(name, n), slices.between(n, 49)
         for diameter_mm in (10, 20, 30, 40):
             foreign = cylinders.channels[cylinders.diameter_mm == diameter_mm].mean(axis=0)
-            figures = figures_of(
-                [estimate_series(calibration, replace(later, channels=0.8 * later.channels + 0.2 * foreign))]
-            )
+            mixed = replace(later, channels=0.8 * later.channels + 0.2 * foreign)
+            figures = figures_of([estimate_series(calibration, mixed)])
             assert figures["valid_fraction"] == 1
             missed.append(1 - figures["coverage_95"])
     assert max(missed) <= 0.2, "else it breaks silently"
@@ -262,9 +262,8 @@ def test_a_fifth_of_a_recorded_cylinder_in_later_slices_lies_within_the_interval
 
 def test_later_slices_of_the_cylinders(shared):
     (series,) = read_series(shared / "recordings/diameter_slices")
-    figures = figures_of(
-        [estimate_series(fit("motion_regression", [part_of(series, 0, 0.62)], "earlier"), part_of(series, 0.62, 1))]
-    )
+    calibration = fit("motion_regression", [part_of(series, 0, 0.62)], "earlier")
+    figures = figures_of([estimate_series(calibration, part_of(series, 0.62, 1))])
     assert figures["diameter_rmse_mm"] <= 5
     assert figures["coverage_95"] >= 0.9
 
@@ -342,8 +341,7 @@ def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twis
 
 @pytest.mark.parametrize("name", ["20241202_153632", "glitch_20241202_173837"])
 def test_nothing_is_said_of_the_times_of_a_recording_that_does_not_show_them(shared, tmp_path, name):
-    import_mat([shared / "recordings/streams" / name], tmp_path / "other.mcap")
-    assert find_load_delay(series_of(read_recording(tmp_path / "other.mcap"))) is None
+    assert find_load_delay(imported(tmp_path / "other.mcap", shared / "recordings/streams" / name)) is None
 
 
 def test_a_load_that_seems_stamped_early_is_told_and_not_refused(shared, twists_file, tmp_path, capsys):
@@ -358,14 +356,9 @@ def test_a_load_that_seems_stamped_early_is_told_and_not_refused(shared, twists_
     assert re.findall(r"Warning: (\S+):", capsys.readouterr().err) == ["other.mcap"]
 
 
-def test_no_good_recording_is_doubted(shared, twists_file, tmp_path):
-    streams = shared / "recordings/streams"
-    cylinders = [[streams / "cylinders" / f"{mm}mm_1_{of}.mat" for of in ("right", "truth")] for mm in (10, 20, 30, 40)]
-    paths = [twists_file]
-    for n, sources in enumerate([[streams / "glitch_20241202_173837"], *cylinders]):
-        paths.append(tmp_path / f"{n}.mcap")
-        import_mat(sources, paths[-1])
-    assert [load_delay_warning(series_of(read_recording(path))) for path in paths] == [""] * 6
+def test_no_good_recording_is_doubted(shared, twists, cylinders, tmp_path):
+    glitch = imported(tmp_path / "glitch.mcap", shared / "recordings/streams/glitch_20241202_173837")
+    assert [load_delay_warning(series) for series in (twists, glitch, *cylinders.values())] == [""] * 6
 
 
 @pytest.mark.parametrize("n", [19, 24, 29, 34, 39, 44])

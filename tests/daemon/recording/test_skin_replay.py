@@ -46,8 +46,7 @@ def test_a_skin_replay_gives_equal_forces(tmp_path: Path, socket: bool, capsys: 
     live = asyncio.run(recorded(tmp_path, socket=socket))
     (path,) = (tmp_path / "recordings").iterdir()
     assert {"skin.shear", "input.skin", "input.skin.source", "input.skin.daq"} <= set(count_messages(path))
-    address = f"ipc://{tmp_path}/replay"
-    again, comparison = asyncio.run(replayed(path, math.inf, address))
+    again, comparison = asyncio.run(replayed(path, math.inf))
     assert comparison.different == Counter(), comparison.examples
     assert comparison.compared["skin.shear"] > 50
     then, now = (measured([one for one in run if one[0] == "skin.shear"]) for run in (live, again))
@@ -56,6 +55,6 @@ def test_a_skin_replay_gives_equal_forces(tmp_path: Path, socket: bool, capsys: 
     reasons = {content["reason"].split(",")[0] for _, content in now}
     assert {"", "taking the zero"} <= reasons
     assert any("gauge 1 is open" in why for why in reasons)
-    assert main(["replay", str(path), "--speed", "max", "--publish", address, "--check"]) == 0
+    assert main(["replay", str(path), "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check"]) == 0
     count = comparison.compared["skin.shear"]
     assert f"skin.shear: {count} of {count} equal the recorded ones" in capsys.readouterr().err

@@ -18,6 +18,7 @@ from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.recording.repair import summarise
 from shearloop.daemon.sensing.tool_diameter import tool_as_bytes
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from tests.daemon.sample_messages import sample
 
 PERIOD_NS = 540_000_000
 TEN, TWENTY = Measured(10.2, 1.2), Measured(20.1, 1.2)
@@ -42,21 +43,11 @@ def recorded(folder: Path, *held: tuple[int, Measured | None], named_mm: float |
         clock.t_ns += PERIOD_NS
         recorder.input_recorder("right")(RawEvent(InputKind.DATA, clock.t_ns, b'"kind":"tool", said the board'))
         if number in told:
-            recorder.input_recorder("right")(
-                RawEvent(InputKind.TOOL, clock.t_ns - PERIOD_NS // 2, tool_as_bytes(number, told[number]))
-            )
+            tool = tool_as_bytes(number, told[number])
+            recorder.input_recorder("right")(RawEvent(InputKind.TOOL, clock.t_ns - PERIOD_NS // 2, tool))
         line = np.random.default_rng(number).uniform(0.01, 0.5, 1024)
-        message = EitFrame(
-            source="right",
-            t_mono_ns=clock.t_ns - PERIOD_NS // 2,
-            channels=line[:896],
-            line=line,
-            frame=number,
-            age_s=0.3,
-            saturated=0,
-            dead=0,
-            repeated=False,
-        )
+        t_ns = clock.t_ns - PERIOD_NS // 2
+        message = sample(EitFrame, source="right", t_mono_ns=t_ns, line=line, frame=number, age_s=0.3)
         recorder.record_message("eit.frame", wire_map(message, 0.0, number))
     recorder.close()
     return recorder.finished[0]

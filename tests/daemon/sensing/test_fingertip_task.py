@@ -103,7 +103,7 @@ class Board:
     def __init__(self, combined: CombinedFingertipTask | None = None) -> None:
         self._combined = combined
 
-    async def frames(self) -> AsyncGenerator[Frame]:
+    async def readings(self) -> AsyncGenerator[Frame]:
         for number in range(4):
             if self._combined is not None:
                 self._combined.on_frame("left", frame(number))

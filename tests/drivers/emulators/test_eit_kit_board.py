@@ -9,6 +9,7 @@ from shearloop.bank.eit.channels import ZERO_SLOTS
 from shearloop.drivers.connection import SerialPort
 from shearloop.drivers.eit_kit import FrameError, read_line
 from shearloop.drivers.emulators.boards import BoardFault, BoardFaultKind, EitKitBoard, format_line, parse_fault
+from tests.running import running
 
 
 async def two_lines(port: SerialPort) -> bytes:
@@ -62,19 +63,16 @@ async def test_it_says_nothing_before_it_is_started_and_is_silent_after_its_last
     line = np.where(ZERO_SLOTS, 0, 0.25)
     ports: list[str] = []
     board = EitKitBoard([line, line], period_s=0.001, on_port=ports.append)
-    running = asyncio.create_task(board.run())
-    await asyncio.sleep(0)
-    with SerialPort(board.path) as port:
-        assert await port.read(0.05) is None
-        await port.write(b"n")
-        assert await port.read(0.05) is None
-        await port.write(b"y")
-        assert await two_lines(port) == 2 * format_line(line)
-        async with asyncio.timeout(20):
-            await board.finished.wait()
-        assert await port.read(0.05) is None
-    running.cancel()
-    await asyncio.gather(running, return_exceptions=True)
+    async with running(board.run()):
+        with SerialPort(board.path) as port:
+            assert await port.read(0.05) is None
+            await port.write(b"n")
+            assert await port.read(0.05) is None
+            await port.write(b"y")
+            assert await two_lines(port) == 2 * format_line(line)
+            async with asyncio.timeout(20):
+                await board.finished.wait()
+            assert await port.read(0.05) is None
     assert ports == [board.path]
     assert board.sent == 2
 
@@ -83,12 +81,9 @@ async def test_faults_can_be_switched_on_while_it_runs() -> None:
     line = np.where(ZERO_SLOTS, 0, 0.25)
     board = EitKitBoard([line, line], period_s=0.001)
     board.inject(BoardFault(BoardFaultKind.NAN))
-    running = asyncio.create_task(board.run())
-    await asyncio.sleep(0)
-    with SerialPort(board.path) as port:
-        await port.write(b"y")
-        broken, sound = (await two_lines(port)).splitlines(keepends=True)
-    running.cancel()
-    await asyncio.gather(running, return_exceptions=True)
+    async with running(board.run()):
+        with SerialPort(board.path) as port:
+            await port.write(b"y")
+            broken, sound = (await two_lines(port)).splitlines(keepends=True)
     assert broken.count(b"nan") == 1
     assert sound == format_line(line)

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
-from dataclasses import dataclass, field
 from itertools import repeat
 from pathlib import Path
 
@@ -12,32 +11,27 @@ import pytest
 from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
 from shearloop.drivers.emulators.boards import PAPER_SKETCH, BoardFault, BoardFaultKind, Hx711Board, Sketch, parse_fault
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell, LoadSample
+from tests.running import Changes, pass_on, running
 
 SKETCH = Sketch()
 CALIBRATION = LoadCalibration(tare_counts=SKETCH.tare_counts, scale_n_per_count=1 / (0.035 * SKETCH.counts_per_nm))
 
 
-@dataclass
-class Rig:
-    board: Hx711Board
-    cell: LoadCell = field(init=False)
-    samples: list[LoadSample] = field(default_factory=list)
-    events: list[LinkEvent] = field(default_factory=list)
-    changed: asyncio.Event = field(default_factory=asyncio.Event)
+class Rig(Changes):
+    def __init__(self, board: Hx711Board) -> None:
+        super().__init__()
+        self.board = board
+        self.cell: LoadCell
+        self.samples: list[LoadSample] = []
+        self.events: list[LinkEvent] = []
 
     def on_sample(self, sample: LoadSample) -> None:
         self.samples.append(sample)
-        self.changed.set()
+        self.note()
 
     def on_event(self, event: LinkEvent) -> None:
         self.events.append(event)
-        self.changed.set()
-
-    async def until(self, condition: Callable[[], object]) -> None:
-        async with asyncio.timeout(20):
-            while not condition():
-                self.changed.clear()
-                await self.changed.wait()
+        self.note()
 
 
 @contextlib.asynccontextmanager
@@ -51,25 +45,12 @@ async def a_rig(
     plugged = asyncio.Event()
     board = Hx711Board(torque_nm, sketch, period_s=0.002, link=link, on_port=lambda _: plugged.set())
     rig = Rig(board)
-    cell = rig.cell = LoadCell(calibration, path=link, policy=ReconnectPolicy(0.001, 0.002), on_event=rig.on_event)
+    rig.cell = cell = LoadCell(calibration, path=link, policy=ReconnectPolicy(0.001, 0.002), on_event=rig.on_event)
 
-    async def listen() -> None:
-        async with contextlib.aclosing(cell.samples()) as samples:
-            async for sample in samples:
-                rig.on_sample(sample)
-
-    tasks = [asyncio.create_task(board.run())]
-    await plugged.wait()
-    tasks.append(asyncio.create_task(listen()))
-    try:
-        yield rig
-    finally:
-        for task in tasks:
-            task.cancel()
-        done, _ = await asyncio.wait(tasks)
-        for task in done:
-            with contextlib.suppress(asyncio.CancelledError):
-                task.result()
+    async with running(board.run()):
+        await plugged.wait()
+        async with running(pass_on(cell.readings(), rig.on_sample)):
+            yield rig
 
 
 @pytest.mark.parametrize(

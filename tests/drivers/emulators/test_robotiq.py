@@ -75,7 +75,7 @@ def test_closing_on_air_ends_at_the_fingers_own_stop_without_an_object() -> None
     gripper = active_gripper()
     go(gripper, 255)
     steps(gripper, 1.0)
-    assert (gripper.obj, gripper.pos, gripper.pre) == (3, 230, 255)
+    assert (gripper.obj, gripper.pos, gripper.taken.pos) == (3, 230, 255)
     assert gripper.grip_force_n == 0
 
 

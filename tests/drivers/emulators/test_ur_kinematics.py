@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from shearloop.drivers.emulators.ur.motion import jacobian, link_frames, pose_of, rotation_matrix, rotation_vector
+from shearloop.drivers.emulators.ur.motion import jacobian, link_frames, pose_of
 
 angles = st.floats(-math.pi, math.pi)
 joints = st.tuples(*[angles] * 6).map(np.array)
@@ -39,12 +39,3 @@ def test_jacobian_is_the_derivative_of_the_pose(q: np.ndarray) -> None:
         linear = (moved[:3, 3] - frames[-1][:3, 3]) / step
         angular = Rotation.from_matrix(moved[:3, :3] @ frames[-1][:3, :3].T).as_rotvec() / step
         assert column == pytest.approx(np.concatenate([linear, angular]), abs=1e-5)
-
-
-@given(st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: math.hypot(*v) > 1e-3), st.floats(0, math.pi))
-def test_rotation_vectors_agree_with_scipy(direction: tuple[float, ...], angle: float) -> None:
-    vector = np.array(direction) / math.hypot(*direction) * angle
-    matrix = rotation_matrix(vector)
-    assert matrix == pytest.approx(Rotation.from_rotvec(vector).as_matrix(), abs=1e-12)
-    # A half turn has two vectors; both are the same rotation.
-    assert Rotation.from_rotvec(rotation_vector(matrix)).as_matrix() == pytest.approx(matrix, abs=1e-9)

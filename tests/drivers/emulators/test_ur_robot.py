@@ -6,15 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shearloop.drivers.emulators.ur.control_script import (
-    MOVE_L,
-    SET_WATCHDOG,
-    SPEED_J,
-    SPEED_STOP,
-    STOP_J,
-    ZERO_FT,
-    armed_hz,
-)
+from shearloop.drivers.emulators.ur import control_script
 from shearloop.drivers.emulators.ur.robot import MODE_POWER_OFF, MODE_RUNNING, PAUSED, STOPPED, ControllerSpec, Robot
 
 DT_S = 0.002
@@ -48,7 +40,7 @@ def do(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) 
 
 
 def turn(robot: Robot, speed: float, acceleration: float = 2.0) -> None:
-    send(robot, SPEED_J, 0, 0, 0, 0, 0, speed, acceleration, 0)
+    send(robot, control_script.SPEED_J, 0, 0, 0, 0, 0, speed, acceleration, 0)
 
 
 def down(robot: Robot, metres: float = 0.2) -> list[float]:
@@ -92,7 +84,7 @@ def test_without_a_watchdog_the_speed_outlives_its_client() -> None:
 
 def test_watchdog_ends_the_motion_of_a_client_that_died() -> None:
     robot = started()
-    do(robot, SET_WATCHDOG, 10.0)
+    do(robot, control_script.SET_WATCHDOG, 10.0)
     turn(robot, 0.4)
     wait(robot, 0.05)
     turn(robot, 0.4)
@@ -106,7 +98,7 @@ def test_watchdog_ends_the_motion_of_a_client_that_died() -> None:
 
 def test_watchdog_does_not_outlive_the_program_it_was_armed_in() -> None:
     robot = started()
-    do(robot, SET_WATCHDOG, 10.0)
+    do(robot, control_script.SET_WATCHDOG, 10.0)
     robot.upload()
     wait(robot, 1.0)
     assert robot.program_running
@@ -114,8 +106,8 @@ def test_watchdog_does_not_outlive_the_program_it_was_armed_in() -> None:
 
 def test_script_may_arm_its_watchdog_by_itself() -> None:
     text = b'  rtde_set_watchdog("input_int_register_0", watchdog_min_frequency, "stop")\n'
-    assert armed_hz(text) == 0.0
-    own_hz = armed_hz(text + b'rtde_set_watchdog("input_int_register_0", 12.5, "stop")\n')
+    assert control_script.armed_hz(text) == 0.0
+    own_hz = control_script.armed_hz(text + b'rtde_set_watchdog("input_int_register_0", 12.5, "stop")\n')
     assert own_hz == 12.5
     robot = started()
     robot.write("input_int_register_0", 0)
@@ -128,8 +120,8 @@ def test_script_may_arm_its_watchdog_by_itself() -> None:
 
 def test_watchdog_ends_the_program_under_a_blocking_move() -> None:
     robot = started()
-    do(robot, SET_WATCHDOG, 10.0)
-    send(robot, MOVE_L, *down(robot))
+    do(robot, control_script.SET_WATCHDOG, 10.0)
+    send(robot, control_script.MOVE_L, *down(robot))
     wait(robot, 0.2)
     assert not robot.program_running
 
@@ -152,7 +144,7 @@ def test_linear_move_arrives_at_the_pose_on_a_straight_line() -> None:
     target = begin.copy()
     target[:3] += (0.05, -0.03, -0.1)
     target[3:] = (Rotation.from_rotvec(begin[3:]) * Rotation.from_rotvec([0.2, 0, 0.3])).as_rotvec()
-    do(robot, MOVE_L, *target, 0.1, 0.5, asynchronous=True)
+    do(robot, control_script.MOVE_L, *target, 0.1, 0.5, asynchronous=True)
     assert moving_asynchronously(robot)
     way = target[:3] - begin[:3]
     while moving_asynchronously(robot):
@@ -168,7 +160,7 @@ def test_linear_move_arrives_at_the_pose_on_a_straight_line() -> None:
 
 def test_linear_move_out_of_reach_ends_in_a_protective_stop() -> None:
     robot = started()
-    send(robot, MOVE_L, 2.0, 0.0, 0.5, 0, math.pi, 0, 1.0, 1.0, asynchronous=True)
+    send(robot, control_script.MOVE_L, 2.0, 0.0, 0.5, 0, math.pi, 0, 1.0, 1.0, asynchronous=True)
     wait(robot, 4.0)
     assert happened(robot, "protective-stop")
     assert not robot.qd_rad_per_s.any()
@@ -177,9 +169,9 @@ def test_linear_move_out_of_reach_ends_in_a_protective_stop() -> None:
 def test_asynchronous_move_is_stopped_on_command() -> None:
     robot = started()
     z_m = robot.pose()[2]
-    do(robot, MOVE_L, *down(robot), asynchronous=True)
+    do(robot, control_script.MOVE_L, *down(robot), asynchronous=True)
     wait(robot, 0.3)
-    do(robot, STOP_J, 2.0, asynchronous=True)
+    do(robot, control_script.STOP_J, 2.0, asynchronous=True)
     assert moving_asynchronously(robot)
     wait(robot, 0.3)
     assert not moving_asynchronously(robot)
@@ -191,7 +183,7 @@ def test_two_threads_may_not_move_the_arm() -> None:
     robot = started()
     turn(robot, 0.4)
     wait(robot, 0.1)
-    send(robot, MOVE_L, *down(robot), asynchronous=True)
+    send(robot, control_script.MOVE_L, *down(robot), asynchronous=True)
     wait(robot, 0.1)
     assert not robot.program_running
     assert "another thread" in robot.events[-1].detail or "another thread" in robot.events[-2].detail
@@ -201,8 +193,8 @@ def test_after_speed_stop_a_move_is_possible() -> None:
     robot = started()
     turn(robot, 0.4)
     wait(robot, 0.3)
-    assert do(robot, SPEED_STOP, 2.0) == pytest.approx(0.2, abs=0.01)
-    do(robot, MOVE_L, *down(robot), asynchronous=True)
+    assert do(robot, control_script.SPEED_STOP, 2.0) == pytest.approx(0.2, abs=0.01)
+    do(robot, control_script.MOVE_L, *down(robot), asynchronous=True)
     wait(robot, 0.1)
     assert robot.program_running
 
@@ -252,8 +244,8 @@ def test_what_the_tool_feels_is_the_plants_torque_about_its_axis() -> None:
     # The tool points down: its axis is -z of the base.
     assert robot.wrench() == pytest.approx([0, 0, 0, 0, 0, -expected], abs=1e-9)
     robot.write("input_int_register_0", 0)
-    do(robot, SPEED_STOP, 10.0)
-    do(robot, ZERO_FT)
+    do(robot, control_script.SPEED_STOP, 10.0)
+    do(robot, control_script.ZERO_FT)
     assert robot.wrench() == pytest.approx(np.zeros(6), abs=1e-9)
 
 

@@ -5,14 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from shearloop.drivers.robotiq import messages
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
-from shearloop.drivers.robotiq.messages import (
-    ActivationStatus,
-    GripperCommand,
-    GripperFaultError,
-    GripperRefusedError,
-    ObjectStatus,
-)
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from tests.drivers.robotiq.gripper_rig import CALIBRATION, WAYS, a_rig
 
@@ -22,25 +16,25 @@ async def test_it_is_activated_moves_and_measures_what_it_grips(way: str, tmp_pa
     async with a_rig(way, tmp_path) as rig:
         driver = rig.driver
         first = await driver.connect()
-        assert first.activation is ActivationStatus.RESET
-        with pytest.raises(GripperFaultError, match="has to be activated"):
-            await driver.move(GripperCommand(50.0))
+        assert first.activation is messages.ActivationStatus.RESET
+        with pytest.raises(messages.GripperFaultError, match="has to be activated"):
+            await driver.move(messages.GripperCommand(50.0))
         active = await driver.activate()
-        assert active.activation is ActivationStatus.ACTIVE
+        assert active.activation is messages.ActivationStatus.ACTIVE
         assert active.fault.code == 0
         # The fingers opened and closed for it.
         assert active.width_mm == pytest.approx(140, abs=1)
 
-        sent = await driver.move(GripperCommand(60.0, speed_mm_s=250.0, force_n=20.0))
+        sent = await driver.move(messages.GripperCommand(60.0, speed_mm_s=250.0, force_n=20.0))
         assert sent.clipped == ()
         state = await driver.finish(sent)
-        assert state.object is ObjectStatus.AT_TARGET
+        assert state.object is messages.ObjectStatus.AT_TARGET
         assert state.diameter_mm is None
         assert abs(state.width_mm - 60.0) <= abs(CALIBRATION.mm_per_count) / 2 + 1e-9
 
         rig.object_mm = 31.7
-        state = await driver.finish(await driver.move(GripperCommand(0.0, force_n=40.0)))
-        assert state.object is ObjectStatus.CONTACT_CLOSING
+        state = await driver.finish(await driver.move(messages.GripperCommand(0.0, force_n=40.0)))
+        assert state.object is messages.ObjectStatus.CONTACT_CLOSING
         assert state.diameter_mm == pytest.approx(31.7, abs=abs(CALIBRATION.mm_per_count) / 2 + 1e-9)
         assert state.diameter_std_mm == CALIBRATION.width_std_mm
         assert state.current_ma is not None
@@ -52,7 +46,7 @@ async def test_it_is_activated_moves_and_measures_what_it_grips(way: str, tmp_pa
         while not closed.is_set():
             state = await driver.read()
             assert state.diameter_mm is None
-            if state.object is ObjectStatus.AT_TARGET:
+            if state.object is messages.ObjectStatus.AT_TARGET:
                 closed.set()
         assert state.width_mm == pytest.approx(0.0, abs=0.7)
 
@@ -63,15 +57,15 @@ async def test_until_a_command_is_taken_up_the_old_contact_is_not_believed(way: 
         await rig.driver.connect()
         await rig.driver.activate()
         rig.object_mm = 20.0
-        await rig.driver.finish(await rig.driver.move(GripperCommand(0.0)))
+        await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
         rig.stopped = True
-        sent = await rig.driver.move(GripperCommand(100.0))
+        sent = await rig.driver.move(messages.GripperCommand(100.0))
         # The registers still say "contact closing" of the motion before.
         assert rig.model.obj == 2
-        assert (await rig.driver.read()).object is ObjectStatus.MOVING
+        assert (await rig.driver.read()).object is messages.ObjectStatus.MOVING
         assert (await rig.driver.read()).diameter_mm is None
         rig.stopped = False
-        assert (await rig.driver.finish(sent)).object is ObjectStatus.AT_TARGET
+        assert (await rig.driver.finish(sent)).object is messages.ObjectStatus.AT_TARGET
 
 
 @WAYS
@@ -79,16 +73,16 @@ async def test_a_halted_gripper_claims_no_object(way: str, tmp_path: Path) -> No
     async with a_rig(way, tmp_path) as rig:
         await rig.driver.connect()
         await rig.driver.activate()
-        sent = await rig.driver.move(GripperCommand(0.0, speed_mm_s=30.0))
+        sent = await rig.driver.move(messages.GripperCommand(0.0, speed_mm_s=30.0))
         while (await rig.driver.read()).width_mm >= 140:
             pass
         rig.stopped = True
         await rig.driver.halt()
         rig.stopped = False
-        with pytest.raises(GripperRefusedError, match="took over"):
+        with pytest.raises(messages.GripperRefusedError, match="took over"):
             await rig.driver.finish(sent)
         state = await rig.driver.read()
-        assert state.object is ObjectStatus.UNKNOWN
+        assert state.object is messages.ObjectStatus.UNKNOWN
         assert 0 < state.width_mm < 140
 
 
@@ -98,18 +92,18 @@ async def test_a_major_fault_ends_only_by_the_operators_word(way: str, tmp_path:
         driver = rig.driver
         await driver.connect()
         await driver.activate()
-        sent = await driver.move(GripperCommand(0.0, speed_mm_s=30.0))
+        sent = await driver.move(messages.GripperCommand(0.0, speed_mm_s=30.0))
         rig.model.fail(14)
-        with pytest.raises(GripperFaultError, match="too much current"):
+        with pytest.raises(messages.GripperFaultError, match="too much current"):
             await driver.finish(sent)
         assert (await driver.read()).fault.name == "overcurrent"
-        for refused in (driver.activate(), driver.move(GripperCommand(50.0))):
-            with pytest.raises(GripperFaultError, match="too much current"):
+        for refused in (driver.activate(), driver.move(messages.GripperCommand(50.0))):
+            with pytest.raises(messages.GripperFaultError, match="too much current"):
                 await refused
         assert not rig.model.command.gto or rig.model.command.pos == sent.request.position
         state = await driver.activate(operator_confirmed=True)
         assert state.fault.code == 0
-        assert state.activation is ActivationStatus.ACTIVE
+        assert state.activation is messages.ActivationStatus.ACTIVE
 
 
 @WAYS
@@ -118,10 +112,10 @@ async def test_overheating_passes_without_activation(way: str, tmp_path: Path) -
         await rig.driver.connect()
         await rig.driver.activate()
         rig.model.fail(8)
-        with pytest.raises(GripperFaultError, match="too hot"):
-            await rig.driver.move(GripperCommand(50.0))
+        with pytest.raises(messages.GripperFaultError, match="too hot"):
+            await rig.driver.move(messages.GripperCommand(50.0))
         rig.model.clear_minor()
-        await rig.driver.finish(await rig.driver.move(GripperCommand(50.0)))
+        await rig.driver.finish(await rig.driver.move(messages.GripperCommand(50.0)))
 
 
 @WAYS
@@ -130,7 +124,7 @@ async def test_activating_an_active_gripper_moves_nothing(way: str, tmp_path: Pa
         await rig.driver.connect()
         await rig.driver.activate()
         rig.object_mm = 25.0
-        held = await rig.driver.finish(await rig.driver.move(GripperCommand(0.0)))
+        held = await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
         again = await rig.driver.activate()
         assert again.position_counts == held.position_counts
         assert again.diameter_mm == held.diameter_mm
@@ -139,14 +133,18 @@ async def test_activating_an_active_gripper_moves_nothing(way: str, tmp_path: Pa
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 async def test_a_command_that_is_no_number_is_refused(bad: float) -> None:
     driver = RobotiqGripper(SocketClient("127.0.0.1"), CALIBRATION)
-    for command in (GripperCommand(bad), GripperCommand(1.0, speed_mm_s=bad), GripperCommand(1.0, force_n=bad)):
-        with pytest.raises(GripperRefusedError, match="no command"):
+    for command in (
+        messages.GripperCommand(bad),
+        messages.GripperCommand(1.0, speed_mm_s=bad),
+        messages.GripperCommand(1.0, force_n=bad),
+    ):
+        with pytest.raises(messages.GripperRefusedError, match="no command"):
             driver.clip(command)
 
 
 async def test_what_is_clipped_is_said_and_what_is_sent_is_returned() -> None:
     driver = RobotiqGripper(SocketClient("127.0.0.1"), CALIBRATION)
-    sent = driver.clip(GripperCommand(500.0, speed_mm_s=1.0, force_n=1e9))
+    sent = driver.clip(messages.GripperCommand(500.0, speed_mm_s=1.0, force_n=1e9))
     assert (sent.request.position, sent.request.speed, sent.request.force) == (0, 0, 255)
     assert (sent.speed_mm_s, sent.force_n) == (30.0, 125.0)
     assert sent.width_mm == pytest.approx(CALIBRATION.width_mm(0))

@@ -8,17 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.errors import DeviceCalibrationError, DeviceLostError, ProtocolError
-from shearloop.drivers.robotiq import modbus_client
-from shearloop.drivers.robotiq.messages import (
-    Activate,
-    ActivationStatus,
-    GripperHalt,
-    GripperMove,
-    ObjectStatus,
-    Readout,
-    Reset,
-    fault_of,
-)
+from shearloop.drivers.robotiq import messages, modbus_client
 from shearloop.drivers.robotiq.socket_client import READ_ORDER, ReplyParser, readout_of, set_lines, value_of
 from shearloop.drivers.robotiq.width import WidthCalibration
 
@@ -27,21 +17,27 @@ byte = st.integers(0, 255)
 
 def test_requests_are_the_manuals_registers() -> None:
     # Instruction manual, "Modbus RTU": reset 0000 0000 0000, close at full speed and force 0900 00FF FFFF.
-    last = GripperMove(0, 0, 0)
-    assert modbus_client.command_registers(Reset(), last) == [0, 0, 0]
-    assert modbus_client.command_registers(Activate(), last) == [0x0100, 0, 0]
-    assert modbus_client.command_registers(GripperMove(255, 255, 255), last) == [0x0900, 0x00FF, 0xFFFF]
-    assert modbus_client.command_registers(GripperHalt(), GripperMove(255, 255, 128)) == [0x0100, 0x00FF, 0xFF80]
+    last = messages.GripperMove(0, 0, 0)
+    assert modbus_client.command_registers(messages.Reset(), last) == [0, 0, 0]
+    assert modbus_client.command_registers(messages.Activate(), last) == [0x0100, 0, 0]
+    assert modbus_client.command_registers(messages.GripperMove(255, 255, 255), last) == [0x0900, 0x00FF, 0xFFFF]
+    assert modbus_client.command_registers(messages.GripperHalt(), messages.GripperMove(255, 255, 128)) == [
+        0x0100,
+        0x00FF,
+        0xFF80,
+    ]
 
 
 def test_replies_are_read_as_the_manual_explains_them() -> None:
     # The manual's three examples: closing under way, object gripped, opened completely.
     moving = modbus_client.readout_of([0x3900, 0x0000, 0xBB10])
-    assert moving == Readout(True, True, ActivationStatus.ACTIVE, ObjectStatus.MOVING, 0, 0, 187, 16)
+    assert moving == messages.Readout(
+        True, True, messages.ActivationStatus.ACTIVE, messages.ObjectStatus.MOVING, 0, 0, 187, 16
+    )
     gripped = modbus_client.readout_of([0xB900, 0x00FF, 0xBD00])
-    assert (gripped.obj, gripped.pre, gripped.pos) == (ObjectStatus.CONTACT_CLOSING, 255, 189)
+    assert (gripped.obj, gripped.pre, gripped.pos) == (messages.ObjectStatus.CONTACT_CLOSING, 255, 189)
     opened = modbus_client.readout_of([0xF900, 0x0000, 0x0D00])
-    assert (opened.obj, opened.pos) == (ObjectStatus.AT_TARGET, 13)
+    assert (opened.obj, opened.pos) == (messages.ObjectStatus.AT_TARGET, 13)
     with pytest.raises(ProtocolError, match="2 registers"):
         modbus_client.readout_of([0, 0])
 
@@ -55,10 +51,10 @@ def test_every_status_is_either_read_whole_or_refused(content: bytes) -> None:
 
 
 def test_socket_lines_are_those_that_the_urcap_takes() -> None:
-    assert set_lines(GripperMove(100, 255, 50)) == [b"SET POS 100 SPE 255 FOR 50 GTO 1\n"]
-    assert set_lines(Reset()) == [b"SET ACT 0\n", b"SET ATR 0\n"]
-    assert set_lines(Activate()) == [b"SET ACT 1\n"]
-    assert set_lines(GripperHalt()) == [b"SET GTO 0\n"]
+    assert set_lines(messages.GripperMove(100, 255, 50)) == [b"SET POS 100 SPE 255 FOR 50 GTO 1\n"]
+    assert set_lines(messages.Reset()) == [b"SET ACT 0\n", b"SET ATR 0\n"]
+    assert set_lines(messages.Activate()) == [b"SET ACT 1\n"]
+    assert set_lines(messages.GripperHalt()) == [b"SET GTO 0\n"]
 
 
 @given(st.lists(st.one_of(st.just("ack"), st.tuples(st.sampled_from(READ_ORDER), byte)), max_size=8), st.data())
@@ -130,15 +126,15 @@ def test_missing_values_are_a_lost_gripper_except_for_the_current() -> None:
 
 def test_every_fault_code_has_a_name_a_sentence_and_its_cure() -> None:
     for code in range(1, 16):
-        fault = fault_of(code)
+        fault = messages.fault_of(code)
         assert fault.code == code
         assert fault.name
         assert fault.sentence.endswith(".")
         assert fault.needs_activation == (code >= 10)
         assert not fault.needs_activation or "activate" in fault.sentence
-    assert fault_of(14).name == "overcurrent"
-    assert fault_of(3).name == "unknown fault 3"
-    assert fault_of(0).sentence == ""
+    assert messages.fault_of(14).name == "overcurrent"
+    assert messages.fault_of(3).name == "unknown fault 3"
+    assert messages.fault_of(0).sentence == ""
 
 
 @given(st.floats(0, 20), st.floats(200, 255), st.floats(-20, 140))

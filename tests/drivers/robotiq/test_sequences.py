@@ -6,25 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shearloop.drivers.robotiq import messages
 from shearloop.drivers.robotiq.gripper import PAUSE_NS, RobotiqGripper, object_status
-from shearloop.drivers.robotiq.messages import (
-    Activate,
-    ActivationStatus,
-    GripperCommand,
-    GripperFaultError,
-    GripperMove,
-    ObjectStatus,
-    Readout,
-    Request,
-    Reset,
-)
 from tests.drivers.robotiq.gripper_rig import CALIBRATION
 
 S = 10**9
-RESET = Readout(False, False, ActivationStatus.RESET, ObjectStatus.MOVING, 0, 0, 3, 0)
-ACTIVATING = replace(RESET, act=True, sta=ActivationStatus.ACTIVATING, flt=5)
-ACTIVE = Readout(True, True, ActivationStatus.ACTIVE, ObjectStatus.AT_TARGET, 0, 50, 50, 0)
-GO = GripperMove(100, 255, 0)
+RESET = messages.Readout(False, False, messages.ActivationStatus.RESET, messages.ObjectStatus.MOVING, 0, 0, 3, 0)
+ACTIVATING = replace(RESET, act=True, sta=messages.ActivationStatus.ACTIVATING, flt=5)
+ACTIVE = messages.Readout(True, True, messages.ActivationStatus.ACTIVE, messages.ObjectStatus.AT_TARGET, 0, 50, 50, 0)
+GO = messages.GripperMove(100, 255, 0)
 
 
 class Client:
@@ -32,9 +22,9 @@ class Client:
 
     name = "here"
 
-    def __init__(self, *readouts: Readout) -> None:
+    def __init__(self, *readouts: messages.Readout) -> None:
         self.readouts = list(readouts)
-        self.requests: list[tuple[Request, int]] = []
+        self.requests: list[tuple[messages.Request, int]] = []
         self.now_ns = 0
 
     def clock_ns(self) -> int:
@@ -45,10 +35,10 @@ class Client:
 
     async def close(self) -> None: ...
 
-    async def read(self) -> Readout:
+    async def read(self) -> messages.Readout:
         return self.readouts.pop(0) if len(self.readouts) > 1 else self.readouts[0]
 
-    async def write(self, request: Request) -> None:
+    async def write(self, request: messages.Request) -> None:
         self.requests.append((request, self.now_ns))
 
     @property
@@ -60,9 +50,9 @@ async def test_activation_is_a_reset_a_pause_and_a_rising_edge() -> None:
     # Silent during the pause is no obstacle, and the old active state is not the new one.
     client = Client(ACTIVE, ACTIVE, *[RESET] * 6, replace(ACTIVATING, flt=9), ACTIVATING, ACTIVE)
     state = await client.gripper.activate(operator_confirmed=True)
-    assert state.activation is ActivationStatus.ACTIVE
+    assert state.activation is messages.ActivationStatus.ACTIVE
     (reset, reset_ns), (activate, activate_ns) = client.requests
-    assert (reset, activate) == (Reset(), Activate())
+    assert (reset, activate) == (messages.Reset(), messages.Activate())
     assert activate_ns - reset_ns >= PAUSE_NS
     assert client.readouts == [ACTIVE]
 
@@ -75,37 +65,39 @@ async def test_activation_is_a_reset_a_pause_and_a_rising_edge() -> None:
         ((ACTIVE, *[RESET] * 6, ACTIVATING), "does not end"),
     ],
 )
-async def test_activation_that_hangs_or_fails_is_reported(readouts: tuple[Readout, ...], failure: str) -> None:
-    with pytest.raises(GripperFaultError, match=failure):
+async def test_activation_that_hangs_or_fails_is_reported(readouts: tuple[messages.Readout, ...], failure: str) -> None:
+    with pytest.raises(messages.GripperFaultError, match=failure):
         await Client(*readouts).gripper.activate(operator_confirmed=True)
 
 
-@given(st.sampled_from([status for status in ObjectStatus if status >= 0]), st.integers(0, 255), st.booleans())
+@given(st.sampled_from([status for status in messages.ObjectStatus if status >= 0]), st.integers(0, 255), st.booleans())
 def test_what_the_fingers_met_is_believed_only_for_the_target_that_was_asked_for(
-    obj: ObjectStatus, pre: int, gto: bool
+    obj: messages.ObjectStatus, pre: int, gto: bool
 ) -> None:
     readout = replace(ACTIVE, obj=obj, pre=pre, gto=gto)
     believed = object_status(readout, GO)
-    assert believed is (obj if gto and pre == GO.position else ObjectStatus.MOVING)
-    assert object_status(readout, None) is (obj if gto else ObjectStatus.UNKNOWN)
+    assert believed is (obj if gto and pre == GO.position else messages.ObjectStatus.MOVING)
+    assert object_status(readout, None) is (obj if gto else messages.ObjectStatus.UNKNOWN)
 
 
-@pytest.mark.parametrize("sta", [one for one in ActivationStatus if one is not ActivationStatus.ACTIVE])
-def test_a_gripper_that_is_not_active_holds_nothing(sta: ActivationStatus) -> None:
+@pytest.mark.parametrize(
+    "sta", [one for one in messages.ActivationStatus if one is not messages.ActivationStatus.ACTIVE]
+)
+def test_a_gripper_that_is_not_active_holds_nothing(sta: messages.ActivationStatus) -> None:
     """As after its supply was away for a moment: the fingers stand where they stood, and press on nothing."""
-    held = replace(ACTIVE, obj=ObjectStatus.CONTACT_CLOSING, pre=GO.position, gto=True)
+    held = replace(ACTIVE, obj=messages.ObjectStatus.CONTACT_CLOSING, pre=GO.position, gto=True)
     for last in (GO, None):
-        assert object_status(held, last) is ObjectStatus.CONTACT_CLOSING
-        assert object_status(replace(held, sta=sta), last) is ObjectStatus.UNKNOWN
+        assert object_status(held, last) is messages.ObjectStatus.CONTACT_CLOSING
+        assert object_status(replace(held, sta=sta), last) is messages.ObjectStatus.UNKNOWN
 
 
-@pytest.mark.parametrize("obj", [ObjectStatus.CONTACT_CLOSING, ObjectStatus.AT_TARGET])
-async def test_a_motion_ends_at_its_target_or_on_an_object_and_not_before(obj: ObjectStatus) -> None:
+@pytest.mark.parametrize("obj", [messages.ObjectStatus.CONTACT_CLOSING, messages.ObjectStatus.AT_TARGET])
+async def test_a_motion_ends_at_its_target_or_on_an_object_and_not_before(obj: messages.ObjectStatus) -> None:
     client = Client(ACTIVE)
     gripper = client.gripper
-    sent = await gripper.move(GripperCommand(50.0))
+    sent = await gripper.move(messages.GripperCommand(50.0))
     taken_up = replace(ACTIVE, pre=sent.request.position)
-    client.readouts = [ACTIVE, replace(taken_up, obj=ObjectStatus.MOVING), replace(taken_up, obj=obj), RESET]
+    client.readouts = [ACTIVE, replace(taken_up, obj=messages.ObjectStatus.MOVING), replace(taken_up, obj=obj), RESET]
     assert (await gripper.finish(sent)).object is obj
     assert client.readouts == [RESET]
 
@@ -120,10 +112,10 @@ async def test_a_motion_ends_at_its_target_or_on_an_object_and_not_before(obj: O
         (ACTIVATING, "still activating"),
     ],
 )
-async def test_a_motion_that_will_never_end_is_reported(readout: Readout, failure: str) -> None:
+async def test_a_motion_that_will_never_end_is_reported(readout: messages.Readout, failure: str) -> None:
     client = Client(ACTIVE)
     gripper = client.gripper
-    sent = await gripper.move(GripperCommand(50.0))
+    sent = await gripper.move(messages.GripperCommand(50.0))
     client.readouts = [readout]
-    with pytest.raises(GripperFaultError, match=failure):
+    with pytest.raises(messages.GripperFaultError, match=failure):
         await gripper.finish(sent)

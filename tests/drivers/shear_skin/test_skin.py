@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
-from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,25 +14,31 @@ from shearloop.drivers.emulators.boards import EmulatedAdcBoard
 from shearloop.drivers.emulators.ports import PtyServer, SocketServer
 from shearloop.drivers.emulators.scpi import FaultyServer
 from shearloop.drivers.emulators.skin import NOISE_V, Circuit, EmulatedKeithley6430, EmulatedScanner
-from shearloop.drivers.shear_skin.instruments import OUTPUT, READ, SOURCE_BAUD, AdcBoard, Daq, Keithley6430, ScpiScanner
+from shearloop.drivers.shear_skin.instruments import OUTPUT, READ, SOURCE_BAUD, AdcBoard, Keithley6430, ScpiScanner
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
+from tests.running import DEADLINE_S, Changes, pass_on, running
 
 R1, R2 = 24.6, 25.3
 RATE_HZ = 500.0
-# Guards against a test that hangs; none waits for so long.
-DEADLINE_S = 30
 
 
-@dataclass
-class Bench:
-    circuit: Circuit
-    played: EmulatedKeithley6430
-    source: FaultyServer
-    reader: Callable[[str], None]
-    skin: ShearSkin
-    samples: list[SkinSample] = field(default_factory=list)
-    events: list[LinkEvent] = field(default_factory=list)
-    changed: asyncio.Event = field(default_factory=asyncio.Event)
+class Bench(Changes):
+    def __init__(
+        self, circuit: Circuit, played: EmulatedKeithley6430, source: FaultyServer, reader: Callable[[str], None]
+    ) -> None:
+        super().__init__()
+        self.circuit, self.played, self.source, self.reader = circuit, played, source, reader
+        self.skin: ShearSkin
+        self.samples: list[SkinSample] = []
+        self.events: list[LinkEvent] = []
+
+    def on_sample(self, sample: SkinSample) -> None:
+        self.samples.append(sample)
+        self.note()
+
+    def on_event(self, event: LinkEvent) -> None:
+        self.events.append(event)
+        self.note()
 
     @property
     def losses(self) -> int:
@@ -44,12 +49,6 @@ class Bench:
         errors = self.skin.source_diagnostics()["errors"]
         assert isinstance(errors, Mapping)
         return errors
-
-    async def until(self, condition: Callable[[], object]) -> None:
-        async with asyncio.timeout(DEADLINE_S):
-            while not condition():
-                self.changed.clear()
-                await self.changed.wait()
 
     async def next_says(self, *faults: SkinFault) -> None:
         """Wait for a sample with exactly these faults that was taken from here on."""
@@ -63,71 +62,43 @@ class Bench:
 @contextlib.asynccontextmanager
 async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: float = 2.0) -> AsyncIterator[Bench]:
     circuit = Circuit(lambda: (R1, R2))
-    policy, events = ReconnectPolicy(0.001, 0.005), []
-    changed, ready = asyncio.Event(), asyncio.Semaphore(0)
-
-    def on_event(event: LinkEvent) -> None:
-        events.append(event)
-        changed.set()
-
+    ready = asyncio.Semaphore(0)
     played = EmulatedKeithley6430(circuit)
-    way_in: PtyServer | SocketServer
-    if serial_source:
-        way_in = PtyServer(played.feed, folder / "source", lambda _: ready.release(), answer_s=0.0)
-    else:
-        way_in = SocketServer(lambda: played.feed, on_port=lambda _: ready.release(), answer_s=0.0)
-    outages = FaultyServer(way_in)
-    players = [outages.run]
-    scanner = SocketServer(lambda: EmulatedScanner(circuit).feed, on_port=lambda _: ready.release(), answer_s=0.0)
-    scanner_outages = FaultyServer(scanner)
-    board = EmulatedAdcBoard(
-        circuit.voltages, period_s=1 / RATE_HZ, noise_v=NOISE_V, link=folder / "adc", on_port=lambda _: ready.release()
-    )
-    players.append(board.run if adc else scanner_outages.run)
-    tasks = [asyncio.create_task(play()) for play in players]
-    for _ in players:
-        await ready.acquire()
 
-    source_link = (
-        SerialLink(path=str(folder / "source"), baud=SOURCE_BAUD, policy=policy, on_event=on_event)
-        if isinstance(way_in, PtyServer)
-        else TcpLink("127.0.0.1", way_in.port, policy=policy, on_event=on_event)
+    def on_port(_: str) -> None:
+        ready.release()
+
+    def answer(data: bytes) -> bytes:
+        return played.feed(data)  # replaced by some tests
+
+    way_in = (
+        PtyServer(answer, folder / "source", on_port)
+        if serial_source
+        else SocketServer(lambda: answer, on_port=on_port)
     )
-    source = Keithley6430(source_link, period_s=0.01, timeout_s=deadline_s)
-    daq: Daq
+    source_server = FaultyServer(way_in)
+    scanner = SocketServer(lambda: EmulatedScanner(circuit).feed, on_port=on_port)
+    reader = FaultyServer(scanner)
     if adc:
-        daq = AdcBoard(SerialLink(path=str(folder / "adc"), policy=policy, on_event=on_event), RATE_HZ)
-    else:
-        link = TcpLink("127.0.0.1", scanner.port, policy=policy, on_event=on_event)
-        daq = ScpiScanner(link, rate_hz=RATE_HZ, timeout_s=deadline_s)
-    skin = ShearSkin(source, daq)
-    bench = Bench(
-        circuit,
-        played,
-        outages,
-        board.command if adc else scanner_outages.command,
-        skin,
-        events=events,
-        changed=changed,
-    )
-
-    async def listen() -> None:
-        async with contextlib.aclosing(skin.samples()) as samples:
-            async for sample in samples:
-                bench.samples.append(sample)
-                changed.set()
-
-    drivers = [asyncio.create_task(skin.watch_source()), asyncio.create_task(listen())]
-    try:
-        yield bench
-    finally:
-        for group in (drivers, tasks):
-            for task in group:
-                task.cancel()
-            done, _ = await asyncio.wait(group)
-            for task in done:
-                with contextlib.suppress(asyncio.CancelledError):
-                    task.result()
+        reader = EmulatedAdcBoard(
+            circuit.voltages, period_s=1 / RATE_HZ, noise_v=NOISE_V, link=folder / "adc", on_port=on_port
+        )
+    bench = Bench(circuit, played, source_server, reader.command)
+    options = {"policy": ReconnectPolicy(0.001, 0.005), "on_event": bench.on_event}
+    async with running(source_server.run(), reader.run()):
+        await ready.acquire()
+        await ready.acquire()
+        if serial_source:
+            source_link = SerialLink(path=folder / "source", baud=SOURCE_BAUD, **options)
+        else:
+            source_link = TcpLink("127.0.0.1", way_in.port, **options)
+        if adc:
+            daq = AdcBoard(SerialLink(path=folder / "adc", **options), RATE_HZ)
+        else:
+            daq = ScpiScanner(TcpLink("127.0.0.1", scanner.port, **options), rate_hz=RATE_HZ, timeout_s=deadline_s)
+        bench.skin = ShearSkin(Keithley6430(source_link, period_s=0.01, timeout_s=deadline_s), daq)
+        async with running(bench.skin.watch_source(), pass_on(bench.skin.samples(), bench.on_sample)):
+            yield bench
 
 
 @pytest.mark.parametrize(("serial_source", "adc"), [(True, True), (True, False), (False, True), (False, False)])
@@ -223,16 +194,16 @@ async def test_a_source_that_is_switched_off_between_two_questions_stays_off_too
     async with a_bench(tmp_path, serial_source=False, adc=False, deadline_s=1.0) as bench:
         await bench.next_says()
         openings = bench.skin.source_diagnostics()["connections"]
-        sound = bench.played.interpreter.feed
+        sound = bench.played.feed
 
         def switched_off_after_it_said_that_it_is_on(data: bytes) -> bytes:
             reply = sound(data)
             if b"OUTP?" in data:
                 bench.circuit.output_on = False
-                bench.played.interpreter.feed = sound  # type: ignore[method-assign]
+                bench.played.feed = sound  # type: ignore[method-assign]
             return reply
 
-        bench.played.interpreter.feed = switched_off_after_it_said_that_it_is_on  # type: ignore[method-assign]
+        bench.played.feed = switched_off_after_it_said_that_it_is_on  # type: ignore[method-assign]
         await bench.next_says(SkinFault.SOURCE_OFF)
         assert not bench.circuit.output_on
         assert bench.skin.source_diagnostics()["connections"] == openings
@@ -241,11 +212,11 @@ async def test_a_source_that_is_switched_off_between_two_questions_stays_off_too
 async def test_a_source_that_says_nonsense_is_not_believed(tmp_path: Path) -> None:
     async with a_bench(tmp_path, serial_source=False, adc=False, deadline_s=0.1) as bench:
         await bench.next_says()
-        sound = bench.played.interpreter.feed
-        bench.played.interpreter.feed = lambda data: sound(data) and b"%%%\n"  # type: ignore[method-assign]  # a bad cable
+        sound = bench.played.feed
+        bench.played.feed = lambda data: sound(data) and b"%%%\n"  # type: ignore[method-assign]  # a bad cable
         await bench.until(lambda: bench.source_errors.get("not understood", 0) >= 3)
         await bench.next_says(SkinFault.SOURCE_LOST)
-        bench.played.interpreter.feed = sound  # type: ignore[method-assign]
+        bench.played.feed = sound  # type: ignore[method-assign]
         await bench.next_says()
 
 
@@ -269,15 +240,15 @@ async def test_a_source_that_breaks_off_in_the_middle_of_an_answer_is_named_coun
 ) -> None:
     async with a_bench(tmp_path, serial_source=serial_source, adc=True) as bench:
         await bench.next_says()
-        sound = bench.played.interpreter.feed
+        sound = bench.played.feed
 
         def broken_off_at_the_query(data: bytes) -> bytes:
             if query.encode() in data:
                 bench.source.command("break-off")
-                bench.played.interpreter.feed = sound  # type: ignore[method-assign]
+                bench.played.feed = sound  # type: ignore[method-assign]
             return sound(data)
 
-        bench.played.interpreter.feed = broken_off_at_the_query  # type: ignore[method-assign]
+        bench.played.feed = broken_off_at_the_query  # type: ignore[method-assign]
         await bench.until(lambda: bench.skin.source_diagnostics()["connections"] == 2)
         await bench.next_says()
         # On a busy machine the converter board may be late too, which is no news here.
@@ -338,13 +309,6 @@ async def test_an_instrument_that_is_no_source_is_refused_by_name() -> None:
         await scanner.restore()
         source = Keithley6430(TcpLink("127.0.0.1", scanner.port, on_event=on_event))
 
-        async def watch() -> None:
-            async with contextlib.aclosing(source.readings()) as readings:
-                async for _ in readings:
-                    pass
-
-        task = asyncio.create_task(watch())
-        assert "says it is 'Agilent Technologies,34972A" in await sentences.get()
-        task.cancel()
-        await asyncio.wait([task])
+        async with running(pass_on(source.readings(), lambda _: None)):
+            assert "says it is 'Agilent Technologies,34972A" in await sentences.get()
         await scanner.disconnect()

@@ -7,16 +7,8 @@ from collections.abc import Callable
 import pytest
 
 from shearloop.drivers.errors import DriverError
+from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.messages import (
-    Command,
-    CommandReply,
-    Enable,
-    MoveLinear,
-    RobotState,
-    RtdeSample,
-    WristSpeed,
-)
 from shearloop.drivers.ur.settings import UrSettings
 from tests.drivers.ur.test_limits import AT_REST, LIMITS
 
@@ -62,7 +54,7 @@ class FakeArm:
     def be(self, **changes: object) -> None:
         self.reading = dataclasses.replace(self.reading, **changes)  # type: ignore[arg-type]
 
-    def read(self) -> RtdeSample:
+    def read(self) -> messages.RtdeSample:
         return self.reading
 
     def end_program(self) -> None:
@@ -83,7 +75,7 @@ class FakeArm:
         self.calls.append(call)
         self._unheard_ns = 0
 
-    def wrist(self, command: WristSpeed) -> bool:
+    def wrist(self, command: messages.WristSpeed) -> bool:
         self.hear("wrist")
         if self.takes:
             self.target, self.acceleration = command.rad_per_s, command.acceleration_rad_per_s2
@@ -95,7 +87,7 @@ class FakeArm:
         self.target, self.acceleration = 0.0, deceleration_rad_per_s2
         return True
 
-    def move(self, _command: MoveLinear) -> bool:
+    def move(self, _command: messages.MoveLinear) -> bool:
         self.hear("move")
         self.be(moving_linearly=self.takes)
         return self.takes
@@ -163,7 +155,7 @@ class Flight:
         self.arm = FakeArm()
         self.now_ns = 10**12
         self.number = self.cycle = 0
-        self.decided: dict[int, CommandReply] = {}
+        self.decided: dict[int, messages.CommandReply] = {}
         self._settings = settings
         self.begin_anew(takes_over=takes_over)
 
@@ -177,7 +169,7 @@ class Flight:
         self.arm.cycle()
         self.now_ns += CYCLE_NS
 
-    def ask(self, command: Command) -> CommandReply:
+    def ask(self, command: messages.Command) -> messages.CommandReply:
         """Send a command and return its reply, letting cycles pass until it comes."""
         self.number += 1
         reply = self.handler.request(self.number, command, self.arm.reading, self.now_ns)
@@ -199,7 +191,7 @@ class Flight:
             self.now_ns += CYCLE_NS
             self.cycle += 1
 
-    def fly_until(self, condition: Callable[[RobotState], bool], cycles: int = 1000) -> RobotState:
+    def fly_until(self, condition: Callable[[messages.RobotState], bool], cycles: int = 1000) -> messages.RobotState:
         for _ in range(cycles):
             if condition(self.state):
                 return self.state
@@ -207,7 +199,7 @@ class Flight:
         raise AssertionError(f"never came about; now {self.state}")
 
     @property
-    def state(self) -> RobotState:
+    def state(self) -> messages.RobotState:
         return self.handler.state(self.arm.reading, self.cycle)
 
     @property
@@ -218,14 +210,14 @@ class Flight:
 def flying(settings: UrSettings = SETTINGS) -> Flight:
     flight = Flight(settings)
     flight.fly(5)
-    assert flight.ask(Enable()).accepted
+    assert flight.ask(messages.Enable()).accepted
     flight.arm.calls.clear()
     return flight
 
 
 def turning(speed: float = 0.5) -> Flight:
     flight = flying()
-    assert flight.ask(WristSpeed(speed, 4.0)).accepted
+    assert flight.ask(messages.WristSpeed(speed, 4.0)).accepted
     flight.fly(30)
     assert flight.wrist_speed == pytest.approx(speed)
     return flight

@@ -26,6 +26,7 @@ from typing import Any
 import yaml
 import zmq
 
+from benchmarks.daemon_speed import write_config
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import TOPICS, decode
 
@@ -89,21 +90,17 @@ class RunningRig:
         shipped = yaml.safe_load(Path("config/ur.yaml").read_text())
         (self.folder / "ur.yaml").write_text(yaml.safe_dump({**shipped, "host": args.host}))
         calibration = str((args.rig / "rig-right.cal").resolve())
-        content = {
-            "publish": f"ipc://{self.folder}/publish",
-            "commands": f"ipc://{self.folder}/commands",
-            "fingertips": {
+        return write_config(
+            self.folder,
+            fingertips={
                 "right": {"device": {"path": "eit-right"}, "estimator": "motion_regression", "calibration": calibration}
             },
-            "load_cell": {"device": {"path": "load-cell"}},
-            "robot": "ur.yaml",
-            "gripper": {"socket": {"host": args.host}},
+            load_cell={"device": {"path": "load-cell"}},
+            robot="ur.yaml",
+            gripper={"socket": {"host": args.host}},
             # Estimates that disagree are no fault here.
-            "loop": {"disagreement_nm": 1.0, "max_innovation_nm": 1.0},
-        }
-        path = self.folder / "config.yaml"
-        path.write_text(yaml.safe_dump(content))
-        return path
+            loop={"disagreement_nm": 1.0, "max_innovation_nm": 1.0},
+        )
 
     def tell_rig(self, command: str) -> int:
         """Send the rig a command; return the time in ns."""
@@ -134,9 +131,9 @@ class RunningRig:
                     return content
         raise RuntimeError(f"no such {topic}; daemon's status {self.daemon.poll()}, latest loop.state {loop}")
 
-    def wait_for_phase(self, *phases: str) -> dict[str, Any]:
-        """Return the first loop state in one of these phases."""
-        return self.wait_for("loop.state", lambda state: state["phase"] in phases)
+    def wait_for_phase(self, phase: str) -> dict[str, Any]:
+        """Return the first loop state in a phase."""
+        return self.wait_for("loop.state", lambda state: state["phase"] == phase)
 
     def wait_for_event(self, name: str, since_ns: int) -> dict[str, Any]:
         """Return the first event of the emulated robot with a name, since a moment."""

@@ -193,17 +193,18 @@ def select_rows(series: FrameSeries, rows: Rows) -> FrameSeries:
     )  # fmt: skip
 
 
-Outcome = tuple[FaultLevel, float | None] | str
+# The reason of a refusal, or none.
+Outcome = tuple[FaultLevel, float | None, str]
 
 
 def judge_others(shared: tuple[FrameSeries, str, Mesh | None], task: tuple[Name, CalibrationPart]) -> Outcome:
-    """Return the figures and the median width of a part's judged slices, or the reason of a refused calibration."""
+    """Return the figures and the median width of a part's judged slices, and the reason of a refused calibration."""
     (series, path, mesh), (name, part) = shared, task
     bank = Bank.open(path)
     try:
         calibration = fit(name, [select_rows(series, part.fitted)], "some torques", Physics(bank, mesh))
     except BankError as error:
-        return str(error)
+        return FaultLevel(part.limit_nm, None, None, 0.0, 0.0), None, str(error)
     others = select_rows(series, part.others)
     estimates = estimate_frames(EstimatorSession(calibration, bank), FaultyFrames(others))
     widths = [
@@ -211,25 +212,19 @@ def judge_others(shared: tuple[FrameSeries, str, Mesh | None], task: tuple[Name,
         for one in estimates
         if one.torque_low_nm is not None and one.torque_high_nm is not None
     ]
-    return judge_level(estimates, others.torque_nm, part.limit_nm), float(np.median(widths)) if widths else None
+    return judge_level(estimates, others.torque_nm, part.limit_nm), float(np.median(widths)) if widths else None, ""
 
 
 def _extrapolation(
     title: str, which: str, name: Name, steps: Sequence[tuple[CalibrationPart, Outcome]]
 ) -> Extrapolation:
-    levels: list[FaultLevel] = []
-    widths: list[float | None] = []
-    for part, outcome in steps:
-        if isinstance(outcome, str):
-            print(f"{title}: {name}, {which} ({part.limit_nm:.3f} N·m), is left out: {outcome}")
-            level, width = FaultLevel(part.limit_nm, None, None, 0.0, 0.0), None
-        else:
-            # The calibration on all earlier slices serves both directions.
-            level, width = replace(outcome[0], level=part.limit_nm), outcome[1]
-        levels.append(level)
-        widths.append(width)
-    slices = tuple(len(part.fitted) for part, _ in steps)
-    return Extrapolation(fault_curve(which, UNITS[which], name, levels), slices, tuple(widths))
+    for part, (_, _, refusal) in steps:
+        if refusal:
+            print(f"{title}: {name}, {which} ({part.limit_nm:.3f} N·m), is left out: {refusal}")
+    # The calibration on all earlier slices serves both directions.
+    levels = [replace(level, level=part.limit_nm) for part, (level, _, _) in steps]
+    slices, widths = zip(*((len(part.fitted), width) for part, (_, width, _) in steps), strict=True)
+    return Extrapolation(fault_curve(which, UNITS[which], name, levels), slices, widths)
 
 
 FOREIGN_SHARES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)

@@ -146,17 +146,15 @@ class TorqueResult:
 class DiameterResult:
     """The diameter slices' results: Pearson's correlation between diameter and the best match's k.
 
-    `single` is slice by slice. `accumulated` has one match per diameter (d,), of its mean heatmap (d, K, S); `fit` is
-    the line through `accumulated_k` (d,).
+    `single` is slice by slice. `accumulated` has one match per diameter (d,), of its mean heatmap; `fit` is the line
+    through its k.
     """
 
     slices: DiameterSlices
     single: Matches
     r_single: float | None
     diameters_mm: FloatArray
-    heatmaps: FloatArray
-    accumulated_k: FloatArray
-    accumulated: tuple[Match, ...]
+    accumulated: Matches
     r_accumulated: float | None
     fit: Polynomial | None
     notes: tuple[str, ...]
@@ -185,7 +183,10 @@ def match_slices(differences: FloatArray, bank: Bank, progress: Progress) -> Mat
     for start in range(0, len(differences), _BATCH):
         parts.append(matcher.heatmaps(differences[start : start + _BATCH]))
         progress(min(start + _BATCH, len(differences)))
-    heatmaps = np.concatenate(parts)
+    return _best_matches(np.concatenate(parts), bank)
+
+
+def _best_matches(heatmaps: FloatArray, bank: Bank) -> Matches:
     best = tuple(best_match(heatmap, bank.k_grid, bank.sigma_grid) for heatmap in heatmaps)
     return Matches(
         heatmaps=heatmaps,
@@ -200,8 +201,7 @@ def analyse_torque(slices: TorqueSlices, on_focused: Matches, on_wide: Matches) 
     """Relate sigma to torque, from the matches of at least three slices in both banks."""
     torque = slices.torque_nm
     sigma = on_focused.sigma
-    groups, grouping = _levels(torque)
-    parts, held_out = _held_out_parts(torque)
+    groups, grouping, parts, held_out = _groups(torque)
     group_sigma, group_torque = group_means(sigma, groups), group_means(torque, groups)
     r_clustered = correlation(group_sigma, group_torque)
     notes: list[str] = []
@@ -230,9 +230,8 @@ def analyse_diameter(slices: DiameterSlices, wide: Bank, progress: Progress) -> 
     single = match_slices(smoothed_along_channels(slices.differences), wide, progress)
     diameters = np.unique(slices.diameter_mm)
     heatmaps = np.array([single.heatmaps[slices.diameter_mm == each].mean(axis=0) for each in diameters])
-    accumulated = tuple(best_match(heatmap, wide.k_grid, wide.sigma_grid) for heatmap in heatmaps)
-    accumulated_k = np.array([match.k for match in accumulated])
-    r_accumulated = correlation(accumulated_k, diameters)
+    accumulated = _best_matches(heatmaps, wide)
+    r_accumulated = correlation(accumulated.k, diameters)
     notes: list[str] = []
     if r_accumulated is None:
         notes.append(f"{len(diameters)} diameters, or too few distinct k, do not make a correlation of k with diameter")
@@ -241,11 +240,9 @@ def analyse_diameter(slices: DiameterSlices, wide: Bank, progress: Progress) -> 
         single=single,
         r_single=correlation(single.k, slices.diameter_mm),
         diameters_mm=diameters,
-        heatmaps=heatmaps,
-        accumulated_k=accumulated_k,
         accumulated=accumulated,
         r_accumulated=r_accumulated,
-        fit=_fit_or_note(accumulated_k, diameters, DIAMETER_DEGREE, "diameter over k", notes),
+        fit=_fit_or_note(accumulated.k, diameters, DIAMETER_DEGREE, "diameter over k", notes),
         notes=tuple(notes),
     )
 
@@ -275,22 +272,23 @@ def correlation(x: FloatArray, y: FloatArray) -> float | None:
     return float(np.corrcoef(x, y)[0, 1])
 
 
-def _levels(torque: FloatArray) -> tuple[IntArray, str]:
+def _groups(torque: FloatArray) -> tuple[IntArray, str, IntArray, str]:
+    """Return each slice's level of torque and part of the recording, and how both were found.
+
+    Parts are stretches of time, as neighbours in time are not independent.
+    """
     series = place_in_series(torque)
     if series is not None:
-        return series.level, f"by place in {int(series.repeat.max()) + 1} repeated series"
-    count = min(_GROUPS, max(FEWEST_SLICES, len(torque) // 3), len(np.unique(torque)))
-    return kmeans_groups(torque[:, None], count), f"by k-means of the torques into {count} (no repeated series found)"
-
-
-def _held_out_parts(torque: FloatArray) -> tuple[IntArray, str]:
-    """Return each slice's part of the recording: neighbours in time are not independent."""
-    series = place_in_series(torque)
-    if series is not None:
-        return series.repeat, "one repeat of the series left out at a time"
-    count = min(_STRETCHES, len(torque))
-    stretches = (np.arange(len(torque)) * count // len(torque)).astype(np.int64)
-    return stretches, f"one of {count} stretches of time left out at a time"
+        repeats = f"by place in {int(series.repeat.max()) + 1} repeated series"
+        return series.level, repeats, series.repeat, "one repeat of the series left out at a time"
+    n_levels = min(_GROUPS, max(FEWEST_SLICES, len(torque) // 3), len(np.unique(torque)))
+    n_parts = min(_STRETCHES, len(torque))
+    return (
+        kmeans_groups(torque[:, None], n_levels),
+        f"by k-means of the torques into {n_levels} (no repeated series found)",
+        (np.arange(len(torque)) * n_parts // len(torque)).astype(np.int64),
+        f"one of {n_parts} stretches of time left out at a time",
+    )
 
 
 def _cross_validated_rmse(sigma: FloatArray, torque: FloatArray, parts: IntArray, notes: list[str]) -> float | None:

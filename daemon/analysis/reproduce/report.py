@@ -20,7 +20,7 @@ from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration
 from shearloop.daemon.analysis.charts.drawing import figure, lay_out
-from shearloop.daemon.analysis.reproduce.analysis import DiameterResult, ModelScores, TorqueResult
+from shearloop.daemon.analysis.reproduce.analysis import DiameterResult, Matches, ModelScores, TorqueResult
 
 PAPER = "Trehan, Hardman and Iida 2025, Sensors 25, 5159"
 # As published, without signs: sigma falls with rising torque, and k with rising diameter.
@@ -263,8 +263,7 @@ def torque_figure(torque: TorqueResult, bank: Bank) -> Figure:
     )
     scatter.legend(frameon=False, fontsize=8)
     titles = [f"{measured[index]:.3f} N·m, σ = {sigma[index]:.2f} cm" for index in shown]
-    matches = [torque.focused.best[index] for index in shown]
-    _heatmap_row(made, lower, torque.focused.heatmaps[shown], matches, titles, bank)
+    _heatmap_row(made, lower, torque.focused, shown, titles, bank)
     made.suptitle(f"Torque from σ (figure 8): {len(measured)} slices, {torque.grouping}, focused bank", fontsize=11)
     return made
 
@@ -272,7 +271,7 @@ def torque_figure(torque: TorqueResult, bank: Bank) -> Figure:
 def diameter_figure(diameter: DiameterResult, bank: Bank) -> Figure:
     """Draw k against diameter with the accumulated heatmaps, and the diameter predicted from k."""
     measured, k = diameter.slices.diameter_mm, diameter.single.k
-    diameters_mm, means_k = diameter.diameters_mm, diameter.accumulated_k
+    diameters_mm, means_k = diameter.diameters_mm, diameter.accumulated.k
     shown = _spread_over(diameters_mm)
     made, scatter, lower = _relation_figure(
         diameter.fit, (k, measured), (means_k, diameters_mm), "diameter (mm)",
@@ -288,8 +287,7 @@ def diameter_figure(diameter: DiameterResult, bank: Bank) -> Figure:
     )
     scatter.legend(frameon=False, fontsize=8)
     titles = [f"{diameters_mm[index]:g} mm, k = {means_k[index]:.2f} cm" for index in shown]
-    matches = [diameter.accumulated[index] for index in shown]
-    _heatmap_row(made, lower, diameter.heatmaps[shown], matches, titles, bank)
+    _heatmap_row(made, lower, diameter.accumulated, shown, titles, bank)
     made.suptitle(
         f"Diameter from k (figure 9): {len(measured)} slices of {len(diameters_mm)} diameters, wide bank", fontsize=11
     )
@@ -337,14 +335,15 @@ def _predictions(
 
 
 def _heatmap_row(
-    made: Figure, place: SubplotSpec, heatmaps: FloatArray, matches: list[Match], titles: list[str], bank: Bank
+    made: Figure, place: SubplotSpec, matches: Matches, shown: list[int], titles: list[str], bank: Bank
 ) -> None:
-    """Draw heatmaps (n, K, S) side by side, each relative to its own maximum."""
-    row = place.subgridspec(1, len(heatmaps)).subplots(sharey=True, squeeze=False)[0]
-    below = [heatmap - match.score for heatmap, match in zip(heatmaps, matches, strict=True)]
+    """Draw some heatmaps side by side, each relative to its own maximum."""
+    row = place.subgridspec(1, len(shown)).subplots(sharey=True, squeeze=False)[0]
+    best = [matches.best[index] for index in shown]
+    below = [matches.heatmaps[index] - matches.scores[index] for index in shown]
     # Skip the worst half of the cells, which would take most of the colours.
     lowest = float(np.median([np.nanmedian(heatmap) for heatmap in below]))
-    for axes, heatmap, match, title in zip(row, below, matches, titles, strict=True):
+    for axes, heatmap, match, title in zip(row, below, best, titles, strict=True):
         image = _heatmap(axes, heatmap, bank, match, (min(lowest, -1e-6), 0.0))
         axes.set_title(f"{title}, score {match.score:.3f}", fontsize=9)
         axes.label_outer()

@@ -89,7 +89,7 @@ def test_diameter_is_related_to_the_k_of_the_best_match(signals: NDArray, bank) 
     expected = [best_match(heatmap, bank.k_grid, bank.sigma_grid).k for heatmap in found.single.heatmaps]
     assert found.single.k.tolist() == expected
     np.testing.assert_allclose(found.single.heatmaps, ReferenceMatcher.from_bank(bank).heatmaps(smooth), atol=1e-14)
-    np.testing.assert_allclose(found.heatmaps[2], found.single.heatmaps[3:].mean(axis=0), atol=1e-14)
+    np.testing.assert_allclose(found.accumulated.heatmaps[2], found.single.heatmaps[3:].mean(axis=0), atol=1e-14)
     assert found.r_single is not None
     assert found.r_single < -0.9
     assert found.r_accumulated is not None

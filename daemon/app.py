@@ -26,10 +26,10 @@ from shearloop.daemon.messaging.keys import CurveAuthenticator, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
 from shearloop.daemon.recording.identity import AttachedFile, daemon_identity, experiment_notes
 from shearloop.daemon.recording.recorder import Recorder
-from shearloop.daemon.rig import Rig, check_experiment, make_load_cell
+from shearloop.daemon.rig import Rig, check_experiment, load_cell_calibration
 from shearloop.daemon.sensing.estimators import COMBINED, LiveEstimator, open_combined, open_estimator, torque_sources
 from shearloop.daemon.sensing.fingertip_task import CombinedFingertipTask, EstimatorTask, FingertipTask
-from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
+from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
 from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, SkinTask
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.service import notify
@@ -37,6 +37,7 @@ from shearloop.daemon.signals import ending_signals
 from shearloop.daemon.supervisor import Supervisor
 from shearloop.drivers.connection import LinkEvent
 from shearloop.drivers.eit_kit import EitKit
+from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.serial_sensor import OnRaw, ignore_raw
 
 
@@ -115,7 +116,7 @@ class Daemon:
         diameters = FingertipDiameters(COMBINED)
         if config.robot is not None:
             dead_tasks = self.supervisor.deaths
-            self._rig = Rig(config, publisher, clock, sources, self._tare, dead_tasks, self._on_raw, diameters.latest)
+            self._rig = Rig(config, publisher, clock, sources, self._tare, dead_tasks, diameters.latest)
         on_torque = self._rig.control_loop.on_torque if self._rig is not None else lambda _: None
 
         gripper = self._rig.gripper if self._rig is not None else None
@@ -170,13 +171,19 @@ class Daemon:
             self._skin = SkinTask(config.skin, publisher, clock, on_torque, self._on_raw)
             self._add(SKIN, self._skin.read, self._skin.diagnostics, self._skin.tare)
             self._add(SKIN_SOURCE, self._skin.watch_source, self._skin.source_diagnostics)
-        load_cell = self._rig.load_cell if self._rig is not None else None
-        if self._rig is None and config.load_cell is not None:
-            # Measured and recorded while another machine twists.
-            on_link, on_raw = self._on_link(LOAD_CELL), self._on_raw(LOAD_CELL)
-            load_cell = make_load_cell(config.load_cell, publisher, clock, on_torque, on_link, on_raw)
-        if load_cell is not None:
-            self._add(LOAD_CELL, load_cell.read, load_cell.diagnostics, load_cell.tare)
+        self._load_cell: LoadCellTask | None = None
+        if config.load_cell is not None:
+            port, rate_hz = config.load_cell.device, config.load_cell.rate_hz
+            board = LoadCell(
+                load_cell_calibration(config.load_cell),
+                serial_number=port.serial_number,
+                path=port.path,
+                rate_hz=rate_hz,
+                on_event=self._on_link(LOAD_CELL),
+                on_raw=self._on_raw(LOAD_CELL),
+            )
+            self._load_cell = LoadCellTask(board, publisher, clock, on_torque, rate_hz)
+            self._add(LOAD_CELL, self._load_cell.read, self._load_cell.diagnostics, self._load_cell.tare)
         if self._rig is not None:
             if self._rig.gripper is not None:
                 self._add("gripper", self._rig.gripper.read, self._rig.gripper.diagnostics)
@@ -314,10 +321,12 @@ class Daemon:
         return {"errors": dict(refused)}
 
     async def _tare(self) -> str:
-        """Zero fingertips and skin; return the errors, or an empty string."""
+        """Zero every torque sensor; return the errors, or an empty string."""
         tares = [task.tare_and_wait() for task in self._estimators.values()]
         if self._skin is not None:
             tares.append(self._skin.zero())
+        if self._load_cell is not None:
+            tares.append(self._load_cell.zero())
         return " ".join(filter(None, await asyncio.gather(*tares)))
 
 

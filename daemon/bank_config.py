@@ -160,20 +160,20 @@ class BankPlan(NamedTuple):
 
 
 def load_bank_plan(
-    path: Path, *, model: str | None = None, k: GridConfig | None = None, sigma: GridConfig | None = None
+    path: Path, model: str | None = None, k: GridConfig | None = None, sigma: GridConfig | None = None
 ) -> BankPlan:
     """Read a bank's configuration and its mesh; the other arguments override the file.
 
     Raises UserError and GeometryError with the file and the key to mend, also for a configuration of several banks.
     """
-    plans = load_bank_plans(path, model=model, k=k, sigma=sigma)
+    plans = load_bank_plans(path, model, k, sigma)
     if set(plans) != {""}:
         raise UserError(f"{path}: `over` makes {len(plans)} banks, and here one is wanted; leave it out")
     return plans[""]
 
 
 def load_bank_plans(
-    path: Path, *, model: str | None = None, k: GridConfig | None = None, sigma: GridConfig | None = None
+    path: Path, model: str | None = None, k: GridConfig | None = None, sigma: GridConfig | None = None
 ) -> dict[str, BankPlan]:
     """Read a configuration as `load_bank_plan` does, and return its banks by name.
 

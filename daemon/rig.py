@@ -1,6 +1,5 @@
-"""The rig: builds load cell, gripper, robot and control loop from the configuration, and checks its experiment."""
+"""The rig: builds gripper, robot and control loop from the configuration, and checks its experiment."""
 
-import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 
@@ -20,22 +19,20 @@ from shearloop.daemon.control.experiment_schema import (
     check_limits,
 )
 from shearloop.daemon.control.gripper_task import GripperTask
-from shearloop.daemon.control.loop_inputs import GripperStatus, TorqueSample, TorqueSource
+from shearloop.daemon.control.loop_inputs import GripperStatus, TorqueSource
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.logs import log_event, log_link
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.estimators import COMBINED
-from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
 from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.drivers.calibration_files import load_calibration
 from shearloop.drivers.connection import LinkEvent
-from shearloop.drivers.load_cell import LoadCalibration, LoadCell
+from shearloop.drivers.load_cell import LoadCalibration
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.robotiq.width import WidthCalibration
-from shearloop.drivers.serial_sensor import OnRaw, ignore_raw
 from shearloop.drivers.ur.client import UrLinkEvent, UrRobot
 from shearloop.drivers.ur.settings import read_settings
 
@@ -45,28 +42,6 @@ def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
     if config.calibration is None:
         return LoadCalibration.of_torque_lines()
     return load_calibration(config.calibration, LoadCalibration)
-
-
-def make_load_cell(
-    config: LoadCellConfig,
-    publisher: Publisher,
-    clock: Clock,
-    on_torque: Callable[[TorqueSample], None],
-    on_event: Callable[[LinkEvent], None],
-    tap: OnRaw = ignore_raw,
-) -> LoadCellTask:
-    """Return the load cell's task; raises DriverError if its calibration cannot be used."""
-    calibration = load_cell_calibration(config)
-    device = config.device
-    board = LoadCell(
-        calibration,
-        serial_number=device.serial_number,
-        path=device.path,
-        rate_hz=config.rate_hz,
-        on_event=on_event,
-        on_raw=tap,
-    )
-    return LoadCellTask(board, publisher, clock, on_torque, config.rate_hz)
 
 
 def make_gripper_client(config: GripperConfig) -> GripperClient:
@@ -90,7 +65,7 @@ def gripper_calibration(config: GripperConfig) -> WidthCalibration:
 
 
 class Rig:
-    """Robot, gripper, load cell and the control loop between them."""
+    """Robot, gripper and the control loop between them."""
 
     def __init__(
         self,
@@ -98,30 +73,21 @@ class Rig:
         publisher: Publisher,
         clock: Clock,
         sources: Mapping[str, TorqueSource],
-        tare_fingertips: Callable[[], Awaitable[str]],
+        tare: Callable[[], Awaitable[str]],
         dead_tasks: Callable[[], Mapping[str, str]],
-        tap: Callable[[str], OnRaw] = lambda _: ignore_raw,
         fingertip_diameter: Callable[[int], Measured | None] = lambda _: None,
     ) -> None:
         """Read the settings of every device; none is opened yet.
 
-        `sources` are fingertips and skin. `dead_tasks` returns the error of each dead task of the daemon, `tap` the
-        recorder's callback for a device's raw data.
+        `sources` are all torques but the robot's. `tare` zeroes every torque sensor and returns the errors,
+        `dead_tasks` returns the error of each dead task of the daemon.
         """
         if config.robot is None:
             raise ValueError("a rig needs a robot")
-        self._tare_fingertips = tare_fingertips
         # Counts the operator's stops, also while an experiment starts.
         self._stops = 0
-        sources = dict(sources)
-        self.load_cell: LoadCellTask | None = None
-        if config.load_cell is not None:
-            self.load_cell = make_load_cell(
-                config.load_cell, publisher, clock, self._on_torque, self.on_link(LOAD_CELL), tap(LOAD_CELL)
-            )
-            sources[self.load_cell.source.name] = self.load_cell.source
         robot = read_settings(config.robot)
-        sources[WRENCH] = wrench_source(robot.rate_hz)
+        sources = {**sources, WRENCH: wrench_source(robot.rate_hz)}
         required = ("robot", "gripper") if config.gripper is not None else ("robot",)
         gels = {
             name: Creep(fingertip.creep.share, fingertip.creep.time_s)
@@ -144,7 +110,7 @@ class Rig:
             self.control_loop,
             self.robot,
             self.gripper,
-            self.tare,
+            tare,
             publisher,
             clock,
             dead_tasks,
@@ -159,13 +125,6 @@ class Rig:
             self._set_link(device, event.up, event.sentence)
 
         return on_event
-
-    async def tare(self) -> str:
-        """Zero every torque sensor; return the errors, or an empty string."""
-        tares = [self._tare_fingertips()]
-        if self.load_cell is not None:
-            tares.append(self.load_cell.zero())
-        return " ".join(filter(None, await asyncio.gather(*tares)))
 
     async def start(self, path: Path) -> str | None:
         """Begin the experiment of a file; return None, or why not. Raises UserError for an invalid file."""
@@ -205,9 +164,6 @@ class Rig:
             self.control_loop.inputs.lost[device] = sentence
             self.runner.decide_now()
 
-    def _on_torque(self, torque: TorqueSample) -> None:
-        self.control_loop.on_torque(torque)
-
     def _on_gripper_state(self, state: GripperStatus) -> None:
         known = self.control_loop.inputs.gripper
         if known is None or state.t_ns >= known.t_ns:
@@ -225,14 +181,13 @@ def read_experiment(path: Path) -> ExperimentFile:
 def check_experiment(config: DaemonConfig, sources: Mapping[str, TorqueSource]) -> ExperimentFile | None:
     """Return the configured experiment, if any; raises UserError if the configured devices cannot run it.
 
-    `sources` are fingertips and skin.
+    `sources` are all torques but the robot's.
     """
     path = config.experiment
     if path is None:
         return None
     file = read_experiment(path)
-    measured = [name for name, source in sources.items() if source.measures_torque]
-    driving = [*measured, *([LOAD_CELL] if config.load_cell is not None else []), WRENCH]
+    driving = [*(name for name, source in sources.items() if source.measures_torque), WRENCH]
     if file.torque_source not in driving:
         reason = _why_not_driving(file.torque_source, config)
         raise UserError(f"{path}: `torque_source: {file.torque_source}` {reason}; there are {', '.join(driving)}")

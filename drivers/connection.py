@@ -11,7 +11,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, Self, TypeAlias
+from typing import NamedTuple, Self, TypeAlias
 
 import serial
 from serial.tools import list_ports
@@ -40,23 +40,6 @@ class Received:
 
     data: bytes
     t_arrival_ns: int
-
-
-class Port(Protocol):
-    """An open serial port or socket."""
-
-    @property
-    def path(self) -> str:
-        """Its name in messages."""
-
-    async def read(self, timeout_s: float) -> Received | None:
-        """Return arrived bytes, or None after `timeout_s`; DeviceLostError if the port is gone."""
-
-    async def write(self, data: bytes) -> None:
-        """Write all of `data`; DeviceLostError if the port is gone."""
-
-    def close(self) -> None:
-        """Close the port, also if it is gone already."""
 
 
 def find_port(*, serial_number: str | None = None, path: str | None = None) -> str:
@@ -246,6 +229,10 @@ class TcpPort:
 
     def _lost(self, error: OSError) -> DeviceLostError:
         return DeviceLostError(f"The connection to {self.path} broke ({error.strerror or error}).")
+
+
+# An open port; its `read` and `write` raise DeviceLostError if the device is gone.
+Port: TypeAlias = SerialPort | TcpPort
 
 
 class Retry(NamedTuple):

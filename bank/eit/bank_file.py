@@ -97,7 +97,7 @@ class Bank:
     """A bank of difference signals v(k, σ) − v_homogeneous; its arrays are read-only.
 
     signals (K, S, 896) float32, zeros in cells that are not valid; homogeneous (896,); k_grid (K,) and sigma_grid (S,)
-    in k_unit and sigma_unit; min_conductivity (K, S), the smallest of each cell's conductivities; valid (K, S), where
+    in the model's units; min_conductivity (K, S), the smallest of each cell's conductivities; valid (K, S), where
     that is positive and the signal's norm at least MIN_SIGNAL_NORM.
     """
 
@@ -129,16 +129,6 @@ class Bank:
     def sigma_grid(self) -> FloatArray:
         """The (S,) values of σ, ascending."""
         return self.definition.sigma_grid
-
-    @property
-    def k_unit(self) -> str:
-        """The unit of k."""
-        return MODELS[self.model].k_unit
-
-    @property
-    def sigma_unit(self) -> str:
-        """The unit of σ."""
-        return MODELS[self.model].sigma_unit
 
     @classmethod
     def open(cls, path: str | Path, verify: bool = False) -> "Bank":

@@ -28,7 +28,7 @@ from shearloop.bank.eit.channels import N_CHANNELS
 # Number of cells, spread over the bank, that the basis is fitted to: neighbouring cells are alike.
 _FITTED_CELLS = 1024
 # Cells in memory at a time.
-COMPRESSED_CELLS = 128
+_CHUNK_CELLS = 128
 # Numbers per cell: few to find the neighbourhood, more to separate its cells.
 COARSE_RANK = 24
 FINE_RANK = 96
@@ -63,7 +63,7 @@ class CompressedBank:
     basis (R, 896), most important directions first; fine (n, R + 2) and coarse (n, r + 2) rows of the n cells; levels
     of groups from few to many. overlaps (1792,) bound the norm of a signal's overlap with a frame at the lags from
     −896 up. Cell i belongs to group group_of[i] of the last level. members[j] are the cells of group j of SEED_LEVEL,
-    and centres[j] is the cell nearest to its centre. estimators (r, n) and left_out (n,) are the columns of coarse.
+    and centres[j] is the cell nearest to its centre.
     """
 
     basis: Float32Array
@@ -74,8 +74,6 @@ class CompressedBank:
     group_of: IntArray
     members: tuple[IntArray, ...]
     centres: IntArray
-    estimators: Float32Array
-    left_out: Float32Array
 
 
 def compress(unit_signals: Callable[[IntArray], FloatArray], cells: IntArray) -> CompressedBank:
@@ -121,8 +119,6 @@ def compress(unit_signals: Callable[[IntArray], FloatArray], cells: IntArray) ->
         group_of=group_of,
         members=members,
         centres=np.array([_central_cell(coarse, chosen) for chosen in members]),
-        estimators=np.ascontiguousarray(coarse[:, :-2].T),
-        left_out=np.ascontiguousarray(coarse[:, -1]),
     )
 
 
@@ -137,7 +133,7 @@ def columns(parts: NDArray[np.floating[Any]], squared_norms: FloatArray) -> Floa
 
 
 def _chunks(cells: IntArray) -> Iterable[IntArray]:
-    return (cells[start : start + COMPRESSED_CELLS] for start in range(0, len(cells), COMPRESSED_CELLS))
+    return (cells[start : start + _CHUNK_CELLS] for start in range(0, len(cells), _CHUNK_CELLS))
 
 
 def _cell_rows(numbers: FloatArray) -> Float32Array:

@@ -28,8 +28,6 @@ COUNTS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 150)
 RANKS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 CHANNEL_COUNTS = (8, 16, 32, 64, 112, 168, 224, 280, 336, 392, 448, 504, 560, 616, 672, 728, 784, 840, 896)
 _WITHOUT_SIGMA = tuple(name for name, model in MODELS.items() if model.sigma_unit == "not used")
-# Parameters of each model, without the amplitude.
-PARAMETERS = {name: 1 if name in _WITHOUT_SIGMA else 2 for name in MODELS}
 _FOLDS = 8
 # Errors of linear elements are proportional to the mesh size: two fine meshes extrapolate to the limit.
 _FINE_CM = (0.05, 0.035)
@@ -57,8 +55,8 @@ class MeasuredFrames:
             )
         # Sizes that overflow as a square, or vanish, give no number.
         with np.errstate(all="ignore"):
-            noise = self.noise_v / np.sqrt((self.differences**2).mean())
-        if not _MIN_NOISE <= noise < np.inf:
+            usable = _MIN_NOISE <= self.relative_noise < np.inf
+        if not usable:
             raise CalibrationError(
                 "the gripped frames have no noise to design for: they are all alike, multiples of a few, or not from a "
                 "board; record frames as they come"
@@ -67,7 +65,7 @@ class MeasuredFrames:
     @property
     def relative_noise(self) -> float:
         """The noise as a share of the differences, both as RMS."""
-        return self.noise_v / float(np.sqrt((self.differences**2).mean()))
+        return float(self.noise_v / np.sqrt((self.differences**2).mean()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,10 +108,10 @@ _ONE_SIGMA = DesignChoice("cells along sigma", "cells", (DesignStep(1, 0.0, "the
 
 @dataclass(frozen=True, slots=True)
 class ModelFit:
-    """A model against the data: error of held-out channels relative to the frame, its standard error, BIC per frame.
+    """A model against the data: error of held-out channels relative to the frame, and its standard error.
 
-    Held out are injections that k, σ and amplitude were not fitted to. `penalised` adds to the error the share of pure
-    noise that the model's parameters would explain.
+    Held out are injections that k, σ and amplitude were not fitted to. `penalised` is the error with the share of pure
+    noise that the model's parameters would explain; the amplitude is one of them.
     """
 
     model: str
@@ -121,7 +119,6 @@ class ModelFit:
     error: float
     standard_error: float
     penalised: float
-    bic: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,14 +191,10 @@ def _model_fit(measured: MeasuredFrames, model: str, signals: FloatArray) -> Mod
         predicted = amplitude[np.arange(len(frames)), best][:, None] * signals[best][:, out]
         left += ((frames[:, out] - predicted) ** 2).sum(axis=1)
     share = left / (frames**2).sum(axis=1)
-    whole = _fit(frames, signals)[1].min(axis=1)
-    p = PARAMETERS[model] + 1
-    bic = N_CHANNELS * np.log(whole / N_CHANNELS) + p * np.log(N_CHANNELS)
+    p = 2 if model in _WITHOUT_SIGMA else 3
     error = float(np.sqrt(share.mean()))
-    return ModelFit(
-        model, p, error, float(share.std() / np.sqrt(len(share)) / (2 * error)),
-        float(np.sqrt(share.mean() * (1 + p * np.log(N_CHANNELS) / N_CHANNELS))), float(bic.mean()),
-    )  # fmt: skip
+    penalised = float(np.sqrt(share.mean() * (1 + p * np.log(N_CHANNELS) / N_CHANNELS)))
+    return ModelFit(model, p, error, float(share.std() / np.sqrt(len(share)) / (2 * error)), penalised)
 
 
 def _ranges(

@@ -6,46 +6,31 @@ parent. The pattern decides all of this, so it is planned once; only arithmetic 
 (`vector_kernel`). Fronts reuse each other's memory and stay in the processor's caches.
 """
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.arrays import FloatArray, IntArray
+from shearloop.bank.eit.forward import Terms
 from shearloop.bank.eit.vector_kernel import LANES, TILE, Plan, schur_complements
 
 Records = NDArray[np.void]
 _CACHE_LINE_BYTES = 64
 
 
-class Pattern(NamedTuple):
-    """The terms of the matrices' entries: entry (rows, columns)[p] gets Σ values[p] · factors[source[p]].
-
-    All are (P,); terms of one place add up. Symmetric pairs are given twice or below the diagonal.
-    """
-
-    rows: IntArray
-    columns: IntArray
-    values: FloatArray
-    source: IntArray
-
-    def where(self, keep: BoolArray) -> "Pattern":
-        """Return some of the terms."""
-        return Pattern(self.rows[keep], self.columns[keep], self.values[keep], self.source[keep])
-
-
 class Elimination:
     """Eliminates all unknowns but the last `kept` of n; keeps no state between calls, and may run in several threads.
 
-    The order of the unknowns decides the fill.
+    The order of the unknowns decides the fill. Terms of symmetric pairs are given twice or below the diagonal.
     """
 
-    def __init__(self, pattern: Pattern, n: int, kept: int) -> None:
+    def __init__(self, terms: Terms, n: int, kept: int) -> None:
         """Plan the elimination."""
         self._kept = kept
-        self._last_factor = int(pattern.source.max())
-        self._plan, self._entries = plan_of(pattern, n, kept)
+        self._last_factor = int(terms.source.max())
+        self._plan, self._entries = plan_of(terms, n, kept)
 
     def schur_complements(self, factors: FloatArray) -> FloatArray:
         """Return the (n, kept, kept) Schur complements for the (n, F) factors of the entries; factor F is 1.
@@ -70,18 +55,18 @@ def _lanes(entries: int) -> FloatArray:
     return raw[first : first + entries * LANES].reshape(entries, LANES)
 
 
-def plan_of(pattern: Pattern, n: int, kept: int) -> tuple[Plan, int]:
+def plan_of(terms: Terms, n: int, kept: int) -> tuple[Plan, int]:
     """Return the plan for matrices of n unknowns, the last `kept` of them kept, and its number of entries."""
-    lower = pattern.where(pattern.rows >= pattern.columns)
+    lower = terms.where(terms.rows >= terms.columns)
     layout = _Layout(_in_order(_tree(_structures(lower, n, n - kept), n - kept, n)), n)
-    terms, term_starts = layout.terms(lower)
+    entry_terms, term_starts = layout.terms(lower)
     arrivals, arrival_starts, columns = layout.arrivals()
     fronts = _records(
         base=layout.base, first=layout.first, end=layout.end, size=layout.size,
         tile_row=np.searchsorted(layout.tile_rows, layout.apart),
     )  # fmt: skip
     tile_rows = _records(term=term_starts, arrival=arrival_starts)
-    return Plan(fronts, tile_rows, terms, arrivals, columns), layout.entries
+    return Plan(fronts, tile_rows, entry_terms, arrivals, columns), layout.entries
 
 
 def row_start(row: IntArray) -> IntArray:
@@ -91,13 +76,13 @@ def row_start(row: IntArray) -> IntArray:
     return found
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class _Front:
     """Pivots and the unknowns below them, by number, and the fronts that add their remainder to it."""
 
-    def __init__(self, pivots: list[int], below: IntArray, children: list["_Front"]) -> None:
-        self.pivots = pivots
-        self.below = below
-        self.children = children
+    pivots: list[int]
+    below: IntArray
+    children: list["_Front"]
 
     @property
     def end(self) -> int:
@@ -115,7 +100,7 @@ class _Front:
         return int(row_start(np.array(self.rows)))
 
 
-def _structures(lower: Pattern, n: int, eliminated: int) -> list[IntArray]:
+def _structures(lower: Terms, n: int, eliminated: int) -> list[IntArray]:
     """Return the rows below every unknown in its column when it is eliminated (George and Liu 1981, chapter 5)."""
     matrix = sp.csc_array((np.ones(len(lower.rows)), (lower.rows, lower.columns)), shape=(n, n))
     matrix.sum_duplicates()
@@ -197,7 +182,7 @@ class _Layout:
         found: IntArray = np.searchsorted(self._keys, front * len(self.number) + unknown) + self._shift[front]
         return found
 
-    def terms(self, lower: Pattern) -> tuple[Records, IntArray]:
+    def terms(self, lower: Terms) -> tuple[Records, IntArray]:
         """Return the terms of the matrices' own entries, and where each row of tiles begins in them."""
         upper, under = np.sort([self.number[lower.rows], self.number[lower.columns]], axis=0)
         front = self.owner[upper]

@@ -16,7 +16,7 @@ from skfem.helpers import dot, grad
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES, STIMULATION_CURRENT
-from shearloop.bank.eit.mesh import Mesh, require_fingertip
+from shearloop.bank.eit.mesh import Mesh, require_fingertip, rows_of_edges
 from shearloop.bank.errors import ConductivityError
 
 # The node of zero potential; only differences of potentials leave this module.
@@ -32,15 +32,14 @@ class CompleteElectrodeModel:
     def __init__(self, mesh: Mesh) -> None:
         """Assemble the parts that do not depend on conductivity."""
         self.mesh = mesh
-        terms, source, place = _placed_terms(mesh)
+        terms, place = _terms(mesh)
         n, n_triangles = len(mesh.nodes) + mesh.n_electrodes, len(mesh.triangles)
-        rows, columns = place[terms.rows], place[terms.columns]
-        kept: Any = (rows >= 0) & (columns >= 0)
-        keys, entry = np.unique(columns[kept] * n + rows[kept], return_inverse=True)
+        terms = terms.moved(place)
+        terms = terms.where((terms.rows >= 0) & (terms.columns >= 0))
+        keys, entry = np.unique(terms.columns * n + terms.rows, return_inverse=True)
         # Entry p of the grounded matrix, in compressed columns, is Σ_t shares[p, t] · (s, 1)_t.
-        self._shares = sp.csr_array(
-            (terms.values[kept], (entry, source[kept])), shape=(len(keys), n_triangles + 1), dtype=np.float64
-        )
+        entries: Any = terms.values, (entry, terms.source)
+        self._shares = sp.csr_array(entries, shape=(len(keys), n_triangles + 1), dtype=np.float64)
         column, row = np.divmod(keys, n)
         self._indices = row.astype(np.int32)
         self._indptr = np.searchsorted(column, np.arange(n)).astype(np.int32)
@@ -121,17 +120,16 @@ class BatchForwardModel:
     def __init__(self, mesh: Mesh) -> None:
         """Assemble, and plan the elimination (about a tenth of a second for 5000 triangles)."""
         # The daemon imports this module, and numba takes 60 MB.
-        from shearloop.bank.eit.elimination import Elimination, Pattern
+        from shearloop.bank.eit.elimination import Elimination
 
         self.mesh = mesh
         self.direct = ForwardModel(mesh)
-        terms, source, place = _placed_terms(mesh)
+        terms, place = _terms(mesh)
         # The node that the direct solve grounds is the last one here.
         n_nodes = len(mesh.nodes)
         place[n_nodes:] += 1
         place[place < 0] = n_nodes - 1
-        pattern = Pattern(place[terms.rows], place[terms.columns], terms.values, source)
-        self._elimination = Elimination(pattern, n_nodes + N_ELECTRODES, N_ELECTRODES)
+        self._elimination = Elimination(terms.moved(place), n_nodes + N_ELECTRODES, N_ELECTRODES)
 
     def voltages(self, conductivities: FloatArray) -> FloatArray:
         """Return the (n, 896) voltages of (n, T) conductivities of the mesh's triangles.
@@ -174,15 +172,23 @@ def require_positive(conductivity: FloatArray, n_triangles: int) -> None:
 
 
 class Terms(NamedTuple):
-    """Terms that add up to a matrix: (P,) row and column numbers and values."""
+    """Terms that add up to a matrix: entry (rows, columns)[p] gets Σ values[p] · factors[source[p]]; all are (P,).
+
+    A factor is the conductivity of a triangle or, numbered after them, the contacts' constant 1.
+    """
 
     rows: IntArray
     columns: IntArray
     values: FloatArray
+    source: IntArray
 
     def where(self, keep: BoolArray) -> "Terms":
         """Return some of the terms."""
-        return Terms(self.rows[keep], self.columns[keep], self.values[keep])
+        return Terms(self.rows[keep], self.columns[keep], self.values[keep], self.source[keep])
+
+    def moved(self, place: IntArray) -> "Terms":
+        """Return the terms with each unknown at its place."""
+        return self._replace(rows=place[self.rows], columns=place[self.columns])
 
 
 @BilinearForm
@@ -204,9 +210,12 @@ def assemble(mesh: Mesh) -> tuple[Terms, Terms]:
     """Return the terms ∫∇u·∇v of every triangle, and the contacts' terms, with the electrodes after the nodes."""
     domain = MeshTri(mesh.nodes.T.copy(), mesh.triangles.T.copy())
     inside = _stiffness.coo_data(Basis(domain, ElementTriP1(), intorder=0))
-    stiffness = Terms(inside.indices[0], inside.indices[1], inside.data)
+    n_triangles = len(mesh.triangles)
+    stiffness = Terms(inside.indices[0], inside.indices[1], inside.data, np.tile(np.arange(n_triangles), 9))
 
-    edges = FacetBasis(domain, ElementTriP1(), facets=_facets_of(domain, mesh.electrode_edges), intorder=2)
+    electrode_edges, facets = np.sort(mesh.electrode_edges, axis=1), domain.facets.T.astype(np.int64)
+    numbers = rows_of_edges(electrode_edges, facets, len(mesh.nodes))
+    edges = FacetBasis(domain, ElementTriP1(), facets=numbers, intorder=2)
     impedance = mesh.contact_impedance[mesh.electrode_of_edge]
     z = np.repeat(impedance[:, None], edges.dx.shape[1], axis=1)
     mass, load = _mass.coo_data(edges, z=z), _load.coo_data(edges, z=z)
@@ -217,6 +226,7 @@ def assemble(mesh: Mesh) -> tuple[Terms, Terms]:
         np.concatenate([mass.indices[1], electrode, node, electrode]),
         # An edge's functions add up to 1, so its loads add up to its length over z.
         np.concatenate([mass.data, -load.data, -load.data, load.data]),
+        np.full(len(mass.data) + 3 * len(load.data), n_triangles),
     )
     # The third node of the triangle behind an edge has a function that vanishes on the edge.
     return stiffness, contact.where(np.abs(contact.values) > 1e-12 * np.abs(contact.values).max())
@@ -235,21 +245,8 @@ def elimination_order(mesh: Mesh, stiffness: Terms) -> IntArray:
     return place
 
 
-def _placed_terms(mesh: Mesh) -> tuple[Terms, IntArray, IntArray]:
-    """Return all terms of a mesh, the factor of each, and each unknown's place.
-
-    A factor is the conductivity of a triangle or, numbered after them, the contacts' constant 1.
-    """
+def _terms(mesh: Mesh) -> tuple[Terms, IntArray]:
+    """Return all terms of a mesh, and each unknown's place."""
     stiffness, contact = assemble(mesh)
-    terms = Terms(*(np.concatenate(pair) for pair in zip(stiffness, contact, strict=True)))
-    source = np.full(len(terms.values), len(mesh.triangles))
-    source[: len(stiffness.values)] = np.tile(np.arange(len(mesh.triangles)), 9)
-    return terms, source, elimination_order(mesh, stiffness)
-
-
-def _facets_of(domain: MeshTri, edges: IntArray) -> IntArray:
-    wanted = np.sort(edges, axis=1) @ [domain.nvertices, 1]
-    numbers = np.sort(domain.facets, axis=0).T.astype(np.int64) @ [domain.nvertices, 1]
-    order = np.argsort(numbers)
-    found: IntArray = order[np.searchsorted(numbers, wanted, sorter=order)]
-    return found
+    terms: Any = (np.concatenate(pair) for pair in zip(stiffness, contact, strict=True))
+    return Terms(*terms), elimination_order(mesh, stiffness)

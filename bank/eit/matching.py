@@ -47,13 +47,6 @@ class Match:
     runner_up_cell: tuple[int, int] | None
 
 
-@dataclass(frozen=True, slots=True)
-class NoSignal:
-    """A difference that noise alone explains; do not match it."""
-
-    why: str
-
-
 class Matcher(ABC):
     """Scores differences against all valid cells of a bank; keeps no state between calls."""
 
@@ -105,10 +98,9 @@ class Matcher(ABC):
         """Return the maximum of one (896,) difference's heatmap and its runner-up. Errors as `heatmaps`."""
         return best_match(self.heatmap(difference), self.k_grid, self.sigma_grid)
 
-    def _chunks(self, size: int = CHUNK_CELLS) -> Iterator[IntArray]:
-        """Yield the numbers of all valid cells, `size` at a time."""
-        for start in range(0, len(self._cells), size):
-            yield self._cells[start : start + size]
+    def _chunks(self) -> Iterator[IntArray]:
+        for start in range(0, len(self._cells), CHUNK_CELLS):
+            yield self._cells[start : start + CHUNK_CELLS]
 
     def _unit_signals(self, cells: IntArray) -> FloatArray:
         magnitudes = self._magnitudes(cells)
@@ -168,8 +160,8 @@ def unit_magnitudes(differences: ArrayLike) -> FloatArray:
     return np.asarray(magnitudes / np.linalg.norm(magnitudes, axis=1, keepdims=True))
 
 
-def signal_above_noise(difference: ArrayLike, noise_std: ArrayLike) -> NoSignal | None:
-    """Return why an (896,) difference is no signal, or None where it exceeds the noise.
+def signal_above_noise(difference: ArrayLike, noise_std: ArrayLike) -> str | None:
+    """Return why an (896,) difference is no signal and must not be matched, or None where it exceeds the noise.
 
     noise_std is the difference's standard deviation from noise alone, (896,) or one number. For independent Gaussian
     noise Σ (difference/noise_std)² is χ² distributed with 896 degrees of freedom; a signal exceeds its quantile at
@@ -186,7 +178,7 @@ def signal_above_noise(difference: ArrayLike, noise_std: ArrayLike) -> NoSignal 
         energy = float(np.sum((values / noise) ** 2))
     if energy > _MIN_ENERGY:
         return None
-    return NoSignal(
+    return (
         f"no signal above the noise: the difference is {np.sqrt(energy / N_CHANNELS):.2f} times the noise, "
         f"and a signal needs {np.sqrt(_MIN_ENERGY / N_CHANNELS):.2f} times"
     )

@@ -83,7 +83,7 @@ class Mesh:
         (a, b, c), (ab, bc, ca) = self.triangles.T, n + of_side.T
         children = np.stack([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]).transpose(2, 0, 1)
         edges = np.sort(self.electrode_edges, axis=1)
-        halves = n + _rows_of(edges, pairs, n)
+        halves = n + rows_of_edges(edges, pairs, n)
         return Mesh(
             nodes=np.vstack([self.nodes, self.nodes[pairs].mean(axis=1)]),
             triangles=children.reshape(-1, 3),
@@ -261,7 +261,7 @@ def _check_electrodes(mesh: Mesh) -> None:
     if len(np.unique(edges, axis=0)) != len(edges):
         raise GeometryError("an edge belongs to two electrodes, or twice to one")
     boundary = boundary_edges(mesh.triangles)
-    inside = _rows_of(edges, boundary, len(mesh.nodes)) < 0
+    inside = rows_of_edges(edges, boundary, len(mesh.nodes)) < 0
     if inside.any():
         which = int(np.flatnonzero(inside)[0])
         raise GeometryError(
@@ -279,7 +279,7 @@ def _edges(triangles: IntArray) -> tuple[IntArray, IntArray]:
     return np.column_stack(np.divmod(keys, n)), of_side.reshape(-1, 3)
 
 
-def _rows_of(edges: IntArray, among: IntArray, n_nodes: int) -> IntArray:
+def rows_of_edges(edges: IntArray, among: IntArray, n_nodes: int) -> IntArray:
     """Return where each of (E, 2) sorted edges stands in a lexically sorted (B, 2) list, or −1."""
     keys, wanted = among @ [n_nodes, 1], edges @ [n_nodes, 1]
     at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)

@@ -19,7 +19,6 @@ from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.compression import (
     COARSE_RANK,
-    COMPRESSED_CELLS,
     ROUNDING,
     SEED_LEVEL,
     CompressedBank,
@@ -36,7 +35,6 @@ from shearloop.bank.eit.matching import (
     ZeroLagMatcher,
     unit_magnitudes,
 )
-from shearloop.bank.errors import MatchingError
 
 # Rounding of a sum of 896 products in float64; where a tie hangs on less, the reference decides. And in float32.
 _ROUNDING_64 = 1e-14
@@ -57,6 +55,7 @@ _SLACK = 0.01
 # More bounds than this (16 MB) are not computed: all cells and lags remain.
 _MAX_BOUNDS = 1 << 22
 
+# The conjugate transforms of the basis's first directions, (r, n // 2 + 1), by length n.
 Spectra = Mapping[int, NDArray[np.complex64]]
 
 
@@ -72,50 +71,26 @@ class Candidates(NamedTuple):
     frames: FloatArray
 
 
-class Neighbourhood:
-    """The cells at most `radius` away from one, in k and in σ; rows and columns (n,) are the places of all cells."""
-
-    def __init__(self, rows: IntArray, columns: IntArray, cell: int, radius: int) -> None:
-        self._rows, self._columns, self._cell, self._radius = rows, columns, cell, radius
-
-    def excludes(self, cells: IntArray) -> BoolArray:
-        """Return which of some cells lie outside."""
-        rows = np.abs(self._rows[cells] - self._rows[self._cell])
-        columns = np.abs(self._columns[cells] - self._columns[self._cell])
-        outside: BoolArray = np.maximum(rows, columns) > self._radius
-        return outside
-
-
 class ZeroLagBounds:
-    """A unit frame (896,), estimated and bounded at lag 0 for all cells; frames (1, 896) is that frame."""
+    """A unit frame (896,), bounded at lag 0 for all cells; frames (1, 896) is that frame."""
 
     def __init__(self, bank: CompressedBank, frame: FloatArray) -> None:
-        self._bank = bank
-        self.frames = frame[None]
-        parts = bank.basis @ frame.astype(np.float32)
-        one = np.ones(1)
-        self._fine = columns(parts[:, None], one)[:, 0]
-        t = columns(parts[:COARSE_RANK, None], one)[-1, 0]
-        n = len(bank.left_out)
-        # The last entry stands for grid places without a cell.
-        self._estimates = np.full(n + 1, -np.inf, dtype=np.float32)
-        self._bounds = self._estimates.copy()
-        np.dot(parts[:COARSE_RANK], bank.estimators, out=self._estimates[:n])
-        np.multiply(bank.left_out, t, out=self._bounds[:n])
-        self._bounds[:n] += self._estimates[:n]
+        self._bank, self.frames = bank, frame[None]
+        parts = (bank.basis @ frame.astype(np.float32))[:, None]
+        self._fine = columns(parts, np.ones(1))[:, 0]
+        self._bounds = bank.coarse @ columns(parts[:COARSE_RANK], np.ones(1))[:, 0]
 
-    def leave_out(self, cells: IntArray) -> None:
-        """Exclude these cells from now on."""
-        self._estimates[cells] = self._bounds[cells] = -np.inf
+    def leave_out(self, cells: BoolArray) -> None:
+        """Exclude some of all cells (n,) from now on."""
+        self._bounds[cells] = -np.inf
 
-    def seed(self) -> int | None:
-        """Return the cell of the highest estimate; None where all are excluded."""
-        cell = int(self._estimates.argmax())
-        return None if self._estimates[cell] == -np.inf else cell
+    def seed(self) -> int:
+        """Return the cell of the highest bound."""
+        return int(self._bounds.argmax())
 
     def candidates(self, score: float) -> Candidates:
         """Return the cells that may reach a score."""
-        (cells,) = (self._bounds >= score - ROUNDING).nonzero()
+        cells = np.flatnonzero(self._bounds >= score - ROUNDING)
         return Candidates(cells, self._bank.fine.take(cells, axis=0) @ self._fine, self.frames)
 
 
@@ -149,21 +124,21 @@ class AllLagsBounds:
         self._seeds = self._lags[likeliest], at_lags, at_lags.T @ self._centres.T
         self.reached = max(reached, self.seed() or reached, key=itemgetter(1))
 
-    def seed(self, around: Neighbourhood | None = None) -> tuple[int, float] | None:
-        """Return a promising cell outside a neighbourhood, and a score that it reaches.
+    def seed(self, outside: BoolArray | None = None) -> tuple[int, float] | None:
+        """Return a promising cell among those (n,) outside a neighbourhood, and a score that it reaches.
 
         It has the highest estimate in the group of the highest estimate, at the likeliest lags. None where none is
         found at once.
         """
         lags, at_lags, estimates = self._seeds
-        if around is not None:
-            estimates = np.where(around.excludes(self._bank.centres), estimates, -np.inf)
+        if outside is not None:
+            estimates = np.where(outside[self._bank.centres], estimates, -np.inf)
         lag, group = divmod(int(np.argmax(estimates)), estimates.shape[1])
         if estimates[lag, group] == -np.inf:
             return None
         cells = self._bank.members[group]
-        if around is not None:
-            cells = cells[around.excludes(cells)]
+        if outside is not None:
+            cells = cells[outside[cells]]
         cell = self._likeliest(cells, at_lags[:, lag])
         return cell, self._score(cell, self._frames(lags[lag, None]))
 
@@ -212,11 +187,6 @@ class AllLagsBounds:
         return self._padded.take(lags[:, None] + _CHANNELS)
 
 
-def spectra_of(bank: CompressedBank) -> Spectra:
-    """Return the conjugate transforms of the basis's first directions, (r, n // 2 + 1), by length n."""
-    return {length: np.conj(fft.rfft(bank.basis[:COARSE_RANK], length)) for length in _LENGTHS}
-
-
 class _PruningMatcher(Matcher):
     """The search, and the exact scores of the candidates that it leaves."""
 
@@ -230,8 +200,7 @@ class _PruningMatcher(Matcher):
         """
         super().__init__(signals, valid, k_grid, sigma_grid)
         self._bank = compress(self._unit_signals, self._cells)
-        chunks = self._chunks(COMPRESSED_CELLS)
-        self._norms = np.concatenate([np.linalg.norm(self._magnitudes(cells), axis=1) for cells in chunks])
+        self._norms = np.concatenate([np.linalg.norm(self._magnitudes(cells), axis=1) for cells in self._chunks()])
         self._row, self._column = np.divmod(self._cells, valid.shape[1])
 
     def match(self, difference: ArrayLike, *, runner_up: bool = True) -> Match:
@@ -303,35 +272,28 @@ class _PruningMatcher(Matcher):
     def _place(self, cell: int) -> tuple[int, int]:
         return int(self._row[cell]), int(self._column[cell])
 
+    def _outside(self, cell: int, radius: int) -> BoolArray:
+        """Return which cells (n,) are more than `radius` away from one, in k or in σ."""
+        row, column = self._place(cell)
+        away: BoolArray = np.maximum(np.abs(self._row - row), np.abs(self._column - column)) > radius
+        return away
+
 
 class PrunedZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
-    """Matches at lag 0 alone. All cells are estimated at once: one lag takes few operations per cell."""
-
-    def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
-        """Compress the bank; arguments and errors as `Matcher`."""
-        super().__init__(signals, valid, k_grid, sigma_grid)
-        # The number of the cell at every place of the grid; invalid places share one that no cell has.
-        self._numbers = np.full(valid.shape, len(self._cells))
-        self._numbers[valid] = np.arange(len(self._cells))
+    """Matches at lag 0 alone. All cells are bounded at once: one lag takes few operations per cell."""
 
     def _search(self, frame: FloatArray, runner_up: bool) -> Match:
         bounds = ZeroLagBounds(self._bank, frame)
         best = self._best(frame, bounds)
-        if best is None:
-            raise MatchingError("no cell of the bank is valid")
-        if not runner_up:
+        outside = self._outside(best[0], RUNNER_UP_RADIUS)
+        if not (runner_up and outside.any()):
             return self._match(best, None)
-        row, column = self._place(best[0])
-        rows = slice(max(row - RUNNER_UP_RADIUS, 0), row + RUNNER_UP_RADIUS + 1)
-        columns = slice(max(column - RUNNER_UP_RADIUS, 0), column + RUNNER_UP_RADIUS + 1)
-        bounds.leave_out(self._numbers[rows, columns])
+        bounds.leave_out(~outside)
         return self._match(best, self._best(frame, bounds))
 
-    def _best(self, frame: FloatArray, bounds: ZeroLagBounds) -> tuple[int, float] | None:
+    def _best(self, frame: FloatArray, bounds: ZeroLagBounds) -> tuple[int, float]:
         """Return the cell of the highest score among those not left out, and the score."""
         seed = bounds.seed()
-        if seed is None:
-            return None
         reached = self._score(seed, bounds.frames)
         return self._best_candidate(frame, bounds.candidates(reached), reached, seed)
 
@@ -344,7 +306,7 @@ class PrunedMatcher(_PruningMatcher, ReferenceMatcher):
     def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Compress the bank; arguments and errors as `Matcher`."""
         super().__init__(signals, valid, k_grid, sigma_grid)
-        self._spectra = spectra_of(self._bank)
+        self._spectra = {n: np.conj(fft.rfft(self._bank.basis[:COARSE_RANK], n)) for n in _LENGTHS}
 
     def _search(self, frame: FloatArray, runner_up: bool) -> Match:
         bounds = AllLagsBounds(self._bank, self._spectra, frame, self._score)
@@ -352,16 +314,13 @@ class PrunedMatcher(_PruningMatcher, ReferenceMatcher):
         if not runner_up:
             return self._match(self._best_candidate(frame, bounds.candidates(reached), reached), None)
         # A cell outside at twice the radius is outside the peak of every cell in this peak.
-        far, least = bounds.seed(self._around(near, 2 * RUNNER_UP_RADIUS)) or (-1, 0.0)
+        far, least = bounds.seed(self._outside(near, 2 * RUNNER_UP_RADIUS)) or (-1, 0.0)
         candidates = bounds.candidates(min(reached, least))
         best = self._best_candidate(frame, candidates, reached)
-        peak = self._around(best[0], RUNNER_UP_RADIUS)
-        if far >= 0 and not peak.excludes(np.array([far]))[0]:
-            _, least = bounds.seed(peak) or (-1, 0.0)
+        outside = self._outside(best[0], RUNNER_UP_RADIUS)
+        if far >= 0 and not outside[far]:
+            _, least = bounds.seed(outside) or (-1, 0.0)
             candidates = bounds.candidates(least)
-        outside = peak.excludes(candidates.cells)
-        rest = Candidates(candidates.cells[outside], candidates.bounds[outside], candidates.frames)
+        kept = outside[candidates.cells]
+        rest = Candidates(candidates.cells[kept], candidates.bounds[kept], candidates.frames)
         return self._match(best, self._best_candidate(frame, rest, least) if len(rest.cells) else None)
-
-    def _around(self, cell: int, radius: int) -> Neighbourhood:
-        return Neighbourhood(self._row, self._column, cell, radius)

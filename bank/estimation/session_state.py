@@ -450,8 +450,8 @@ class PaperState:
         difference = mean - self._homogeneous
         n = len(self._latest)
         noise = self._noise * math.sqrt(1.0 / n + 1.0 / self._baseline_frames)
-        if (silent := signal_above_noise(difference, noise)) is not None:
-            return ProcessedFrame.refused(frame.usable, silent.why)
+        if (reason := signal_above_noise(difference, noise)) is not None:
+            return ProcessedFrame.refused(frame.usable, reason)
         lag_s = frame.t_s - sum(t_s for t_s, _ in self._latest) / n
         return ProcessedFrame(difference[None], (), frame.usable, lag_s)
 

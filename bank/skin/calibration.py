@@ -9,6 +9,7 @@ imported only to fit.
 
 import csv
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -16,7 +17,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.special import stdtrit
 
-from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.skin.membrane import (
     PAPER_SECTION,
@@ -243,80 +244,88 @@ def fit_calibration(
     the response does not rise with the force.
     """
     response, loading = responses_of_table(table, unloaded_below_n)
-    rows = _LoadedRows(table, response, loading, math.radians(gauge_angle_deg))
+    loaded, gauge_angle_rad = loading > 0, math.radians(gauge_angle_deg)
+    columns = loading[loaded], table.shear_n[loaded], table.normal_n[loaded]
+    forces = list(zip(*(column.tolist() for column in columns), strict=True))
     start = PAPER_SECTION.friction if friction is None else friction
-    nominal = rows.tensions(start)
+    nominal = _tensions(forces, gauge_angle_rad, start)
     upper, lower = _knots(nominal, linear_to_n), _knots(-nominal, linear_to_n)
     kept = (len(upper) > 0) | (nominal <= linear_to_n)
     kept &= (len(lower) > 0) | (-nominal <= linear_to_n)
-    curve = _CurveFit(rows, kept, linear_to_n, upper, lower)
+    curve = _CurveFit(
+        lambda mu: _tensions(forces, gauge_angle_rad, mu)[kept], response[loaded][kept], linear_to_n, upper, lower
+    )
     if curve.rows < curve.pieces + 3:
         raise CalibrationError(
             f"{curve.rows} rows under load cannot carry {curve.pieces} pieces of curve and an interval; record more."
         )
-    if not curve.rises(start):
+    # The response must go with the tension, not against it.
+    if float(nominal[kept] @ curve.response) <= 0.0:
         raise CalibrationError(NOT_RISING)
     if friction is None:
         friction = _fit_friction(curve)
+    knots, responses, half_width = curve.fit(friction)
     idle = loading == 0
-    rest_ohm = float(table.r1_ohm[idle].mean()), float(table.r2_ohm[idle].mean())
-    return curve.calibration(friction, int((~kept).sum()), rest_ohm)
+    return SkinCalibration(
+        friction=friction,
+        gauge_angle_deg=math.degrees(gauge_angle_rad),
+        linear_to_n=linear_to_n,
+        tension_n=tuple(knots.tolist()),
+        response=tuple(responses.tolist()),
+        response_half_width=half_width,
+        rows=curve.rows,
+        rows_beyond=int((~kept).sum()),
+        rest_ohm=(float(table.r1_ohm[idle].mean()), float(table.r2_ohm[idle].mean())),
+    )
 
 
-class _LoadedRows:
-    """The rows under load, and the tension that the membrane gives each of them."""
+def _tensions(forces: Sequence[tuple[int, float, float]], gauge_angle_rad: float, friction: float) -> FloatArray:
+    """Return the net tension (rows,) at the gauges, in N, for rows of (loading, shear, normal force).
 
-    def __init__(
-        self, table: CalibrationTable, response: FloatArray, loading: IntArray, gauge_angle_rad: float
-    ) -> None:
-        used = loading > 0
-        self.response = response[used]
-        self.gauge_angle_rad = gauge_angle_rad
-        self._forces = list(
-            zip(loading[used].tolist(), table.shear_n[used].tolist(), table.normal_n[used].tolist(), strict=True)
-        )
-
-    def tensions(self, friction: float) -> FloatArray:
-        """Return the net tension (rows,) at the gauges, in N; each loading starts from the unstretched skin."""
-        membrane = Membrane(1.0, friction, self.gauge_angle_rad, 1.0)
-        state, current, found = UNSTRETCHED, 0, []
-        for loading, shear_n, normal_n in self._forces:
-            if loading != current:
-                state, current = UNSTRETCHED, loading
-            state = membrane.step(state, shear_n, normal_n)
-            found.append(state.gauge_tension_1_n - state.gauge_tension_2_n)
-        return np.array(found)
+    Each loading starts from the unstretched skin.
+    """
+    membrane = Membrane(1.0, friction, gauge_angle_rad, 1.0)
+    state, current, found = UNSTRETCHED, 0, []
+    for loading, shear_n, normal_n in forces:
+        if loading != current:
+            state, current = UNSTRETCHED, loading
+        state = membrane.step(state, shear_n, normal_n)
+        found.append(state.gauge_tension_1_n - state.gauge_tension_2_n)
+    return np.array(found)
 
 
 class _CurveFit:
-    """Response against tension in straight pieces: one through the origin, others beyond its ends."""
+    """Response against tension in straight pieces: one through the origin, others beyond its ends.
+
+    `tensions` returns the tension (rows,) for a friction.
+    """
 
     def __init__(
-        self, rows: _LoadedRows, kept: BoolArray, linear_to_n: float, upper: FloatArray, lower: FloatArray
+        self,
+        tensions: Callable[[float], FloatArray],
+        response: FloatArray,
+        linear_to_n: float,
+        upper: FloatArray,
+        lower: FloatArray,
     ) -> None:
-        self._rows, self._kept, self._response = rows, kept, rows.response[kept]
+        self._tensions, self.response = tensions, response
         self._linear_to_n, self._upper, self._lower = linear_to_n, upper, lower
-        self.rows = int(kept.sum())
+        self.rows = len(response)
         self.pieces = 1 + len(upper) + len(lower)
-        self.total_squares = float(self._response @ self._response)
 
     def squares(self, friction: float) -> float:
         """Return the sum of squared residuals with the best curve for this friction."""
         from scipy.optimize import nnls
 
-        return float(nnls(self._design(self._tensions(friction)), self._response)[1] ** 2)
+        return float(nnls(self._design(self._tensions(friction)), self.response)[1] ** 2)
 
-    def rises(self, friction: float) -> bool:
-        """Return whether the response goes with the tension, not against it."""
-        return float(self._tensions(friction) @ self._response) > 0.0
-
-    def calibration(self, friction: float, rows_beyond: int, rest_ohm: tuple[float, float]) -> SkinCalibration:
-        """Return the calibration with the best curve for this friction."""
+    def fit(self, friction: float) -> tuple[FloatArray, FloatArray, float]:
+        """Return the best curve's knots (N) and responses there, and the half width of its prediction interval."""
         from scipy.optimize import nnls
 
         tension = self._tensions(friction)
         design = self._design(tension)
-        slopes, distance = nnls(design, self._response)
+        slopes, distance = nnls(design, self.response)
         ends = min(float(tension.min()), 0.0), max(float(tension.max()), 0.0)
         knots = np.concatenate([[ends[0]], -self._lower[::-1], self._upper, [ends[1]]])
         if not (slopes > 0).all() or not (np.diff(knots) > 0).all():
@@ -324,20 +333,8 @@ class _CurveFit:
         leverage = (np.linalg.qr(design).Q ** 2).sum(axis=1).max()
         freedom = self.rows - self.pieces
         scatter = distance / math.sqrt(freedom)
-        return SkinCalibration(
-            friction=friction,
-            gauge_angle_deg=math.degrees(self._rows.gauge_angle_rad),
-            linear_to_n=self._linear_to_n,
-            tension_n=tuple(knots.tolist()),
-            response=tuple((self._design(knots) @ slopes).tolist()),
-            response_half_width=float(stdtrit(freedom, 0.975)) * scatter * math.sqrt(1 + leverage),
-            rows=self.rows,
-            rows_beyond=rows_beyond,
-            rest_ohm=rest_ohm,
-        )
-
-    def _tensions(self, friction: float) -> FloatArray:
-        return self._rows.tensions(friction)[self._kept]
+        half_width = float(stdtrit(freedom, 0.975)) * scatter * math.sqrt(1 + leverage)
+        return knots, self._design(knots) @ slopes, half_width
 
     def _design(self, tension: FloatArray) -> FloatArray:
         columns = [np.clip(tension, -self._linear_to_n, self._linear_to_n)]
@@ -372,7 +369,7 @@ def _fit_friction(curve: _CurveFit) -> float:
     least = curve.squares(friction)
     neighbours = [mu for mu in (friction - FRICTION_STD, friction + FRICTION_STD) if mu >= 0]
     worse = min(map(curve.squares, neighbours)) - least
-    if worse <= max(least / max(curve.rows - curve.pieces, 1), 1e-9 * curve.total_squares):
+    if worse <= max(least / max(curve.rows - curve.pieces, 1), 1e-9 * float(curve.response @ curve.response)):
         raise CalibrationError(
             "The table does not determine the friction of the skin; load it under more normal force, load and "
             "unload it, or give the coefficient (--friction)."

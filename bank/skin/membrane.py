@@ -20,6 +20,10 @@ EXCITATION_A = 5e-3
 EGAIN_RESISTIVITY_OHM_M = 29.4e-8
 # One gauge, 7 mm by 3 mm.
 SENSOR_AREA_M2 = 7e-3 * 3e-3
+# Usual for still air.
+CONVECTION_W_M2_K = 10.0
+# 1 + 2ν, the change of resistance per strain at small strain, of an incompressible elastomer.
+GAUGE_FACTOR = 2.0
 # The paper's own estimate of F/(EA); its E and width would make the skin 0.88 mm thick.
 PAPER_SENSITIVITY_PER_N = 0.088
 
@@ -90,7 +94,6 @@ class Gauge:
     channel_width_m: float = 50e-6
     channel_height_m: float = 50e-6
     resistivity_ohm_m: float = EGAIN_RESISTIVITY_OHM_M
-    sensor_area_m2: float = SENSOR_AREA_M2
 
     @property
     def resistance_ohm(self) -> float:
@@ -98,31 +101,21 @@ class Gauge:
         length_m = self.strips * self.strip_length_m
         return self.resistivity_ohm_m * length_m / (self.channel_width_m * self.channel_height_m)
 
-    def power_w(self, voltage_v: float) -> float:
-        """Return the heat V² w h / (ρ N L)."""
-        return voltage_v**2 / self.resistance_ohm
-
     def power_at_current_w(self, current_a: float = EXCITATION_A) -> float:
         """Return the heat where a current source feeds the gauge, 5 mA in the paper."""
-        return self.power_w(current_a * self.resistance_ohm)
+        return (current_a * self.resistance_ohm) ** 2 / self.resistance_ohm
 
     def joule_heating_k(self, current_a: float = EXCITATION_A) -> float:
         """Return the steady temperature rise of the gauge's area in still air."""
-        return joule_heating_k(self.power_at_current_w(current_a), self.sensor_area_m2)
+        return joule_heating_k(self.power_at_current_w(current_a))
 
 
-def joule_heating_k(power_w: float, area_m2: float = SENSOR_AREA_M2, convection_w_m2_k: float = 10.0) -> float:
-    """Return the steady temperature rise of an area in air, one side cooled: P / (h A).
+def joule_heating_k(power_w: float) -> float:
+    """Return the steady temperature rise of a gauge's area in still air, one side cooled: P / (h A).
 
-    10 W/(m² K) is usual for still air. Conduction into skin and core is neglected, so the true rise is smaller; the
-    paper gives at most 5 K.
+    Conduction into skin and core is neglected, so the true rise is smaller; the paper gives at most 5 K.
     """
-    return power_w / (convection_w_m2_k * area_m2)
-
-
-def gauge_factor(poisson_ratio: float = 0.5) -> float:
-    """Return 1 + 2ν, the change of resistance per strain at small strain; 2 for an incompressible elastomer."""
-    return 1 + 2 * poisson_ratio
+    return power_w / (CONVECTION_W_M2_K * SENSOR_AREA_M2)
 
 
 def measured_response(
@@ -141,9 +134,9 @@ def measured_response(
     return ratio
 
 
-def response_of_strains(strain_1: FloatArray, strain_2: FloatArray, factor: float = 2.0) -> FloatArray:
+def response_of_strains(strain_1: FloatArray, strain_2: FloatArray) -> FloatArray:
     """Return F (ε₁ − ε₂), the modelled side of equation (1)."""
-    modelled: FloatArray = factor * (strain_1 - strain_2)
+    modelled: FloatArray = GAUGE_FACTOR * (strain_1 - strain_2)
     return modelled
 
 
@@ -152,17 +145,14 @@ def response_of_strains(strain_1: FloatArray, strain_2: FloatArray, factor: floa
 # mid-thickness, turn N into strain. Friction takes e^(−μφ) on the way to the gauge and μ F_n R_in/R_out at the load.
 
 
-def sensitivity_per_n(section: Section, factor: float | None = None) -> float:
-    """Return S = F (1−ν²)/(E w t) · (1 + ν/(1−ν) · t/2R) · (R_out/R) · e^(−μφ), beyond the deadband, in 1/N.
-
-    F is 2, as of an incompressible elastomer, unless given.
-    """
+def sensitivity_per_n(section: Section) -> float:
+    """Return S = F (1−ν²)/(E w t) · (1 + ν/(1−ν) · t/2R) · (R_out/R) · e^(−μφ), beyond the deadband, in 1/N."""
     nu, radius, thickness = section.poisson_ratio, section.mid_radius_mm, section.thickness_mm
     flat = (1 - nu**2) / (section.young_mpa * section.width_mm * thickness)
     pressed = 1 + nu / (1 - nu) * thickness / (2 * radius)
     lever = section.outer_radius_mm / radius
     capstan = math.exp(-section.friction * section.gauge_angle_rad)
-    return (gauge_factor() if factor is None else factor) * flat * pressed * lever * capstan
+    return GAUGE_FACTOR * flat * pressed * lever * capstan
 
 
 def deadband_n(section: Section, normal_n: float) -> float:
@@ -224,7 +214,7 @@ class Membrane:
     axial_stiffness_n: float
     friction: float
     gauge_angle_rad: float
-    gauge_factor: float = gauge_factor()
+    gauge_factor: float = GAUGE_FACTOR
 
     def __post_init__(self) -> None:
         """Refuse values that no belt has."""
@@ -294,12 +284,12 @@ def direction_of(before: float, now: float, noise: float) -> Direction:
 
 def paper_membrane(section: Section = PAPER_SECTION) -> Membrane:
     """Return the membrane with the paper's own F/(EA) = 0.088 1/N."""
-    return Membrane(gauge_factor() / PAPER_SENSITIVITY_PER_N, section.friction, section.gauge_angle_rad)
+    return Membrane(GAUGE_FACTOR / PAPER_SENSITIVITY_PER_N, section.friction, section.gauge_angle_rad)
 
 
 def section_membrane(section: Section = PAPER_SECTION) -> Membrane:
     """Return the membrane with the stiffness that modulus and cross-section give in plane strain."""
-    stiffness = gauge_factor() / sensitivity_per_n(replace(section, friction=0.0))
+    stiffness = GAUGE_FACTOR / sensitivity_per_n(replace(section, friction=0.0))
     return Membrane(stiffness, section.friction, section.gauge_angle_rad)
 
 

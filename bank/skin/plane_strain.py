@@ -14,7 +14,7 @@ linear system of that guess, and goes along it as far as Φ falls.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -63,9 +63,7 @@ class MeshSize:
 
     def refined(self, times: int) -> "MeshSize":
         """Return the size with every element cut into times × times."""
-        return MeshSize(
-            times * self.bracket, times * self.gauge, times * self.flank, times * self.load, times * self.layers
-        )
+        return MeshSize(*(times * n for n in astuple(self)))
 
     @property
     def elements(self) -> int:

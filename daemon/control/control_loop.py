@@ -9,7 +9,13 @@ from types import MappingProxyType
 
 from shearloop.daemon.control.controller import TwistController
 from shearloop.daemon.control.creep import Creep
-from shearloop.daemon.control.experiment_schema import ExperimentFile, ExperimentLimits, first_turn_before_grip
+from shearloop.daemon.control.experiment_schema import (
+    ExperimentFile,
+    ExperimentLimits,
+    IdentifyStep,
+    TareStep,
+    first_turn_before_grip,
+)
 from shearloop.daemon.control.fault_detection import MonitorInputs, compared_for_s, detect_faults
 from shearloop.daemon.control.identification import ToolModel
 from shearloop.daemon.control.loop_inputs import GripperStatus, LoopInputs, TorqueSample, TorqueSource
@@ -22,16 +28,11 @@ from shearloop.daemon.control.step_runner import (
     ExperimentPhase,
     GripTo,
     Hold,
-    IdentifyStiffness,
     StepCommand,
     StepContext,
-    Tare,
     TrackTorque,
 )
 from shearloop.daemon.control.wrist_controller import WristController, WristVelocity
-
-# The limits while no experiment runs.
-NO_LIMITS = ExperimentLimits()
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +175,7 @@ class ControlLoop:
         self._action_state = ActionState.FAILED if error else ActionState.DONE
         self._action_error = error
         match self._command.action:
-            case Tare() if not error:
+            case TareStep() if not error:
                 # The tool was identified with another zero.
                 self._forget_tool()
             case GripTo() as grip if not error:
@@ -194,7 +195,7 @@ class ControlLoop:
     def tick(self, t_ns: int) -> ControlOutput:
         """Return the commands for now."""
         experiment, arm = self.experiment, self.inputs.arm
-        limits = experiment.limits if experiment is not None else NO_LIMITS
+        limits = experiment.limits if experiment is not None else ExperimentLimits()
         drive = experiment.file.torque_source if experiment is not None else next(iter(self._wrists))
         found = [*self._faults(limits, drive, t_ns), *self._refusals]
         self._refusals.clear()
@@ -266,7 +267,7 @@ class ControlLoop:
 
     @property
     def _turns(self) -> bool:
-        return not isinstance(self._command.wrist, Hold) or isinstance(self._command.action, IdentifyStiffness)
+        return not isinstance(self._command.wrist, Hold) or isinstance(self._command.action, IdentifyStep)
 
     def _begin(self, experiment: Experiment, t_ns: int, wrist_rad: float) -> Action | None:
         """Close the loop or start the identification of a new command; return its action for the devices."""
@@ -286,7 +287,7 @@ class ControlLoop:
         if command.step_index == self._begun:
             return None
         self._begun, self._action_state, self._action_error = command.step_index, ActionState.RUNNING, ""
-        if isinstance(command.action, IdentifyStiffness):
+        if isinstance(command.action, IdentifyStep):
             wrist.begin_identification(command.action, experiment.limits.torque_nm)
             return None
         return command.action
@@ -295,7 +296,7 @@ class ControlLoop:
         wrist = self._driving_wrist
         if still:
             return wrist.hold()
-        if isinstance(self._command.action, IdentifyStiffness) and self._action_state is ActionState.RUNNING:
+        if isinstance(self._command.action, IdentifyStep) and self._action_state is ActionState.RUNNING:
             velocity, ended = wrist.identify(t_ns, wrist_rad)
             if ended is not None:
                 self.on_action_ended(ended)

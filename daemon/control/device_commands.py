@@ -7,8 +7,9 @@ from collections.abc import Awaitable, Callable
 import structlog
 
 from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.experiment_schema import ApproachStep, TareStep
 from shearloop.daemon.control.gripper_task import GripperTask
-from shearloop.daemon.control.step_runner import Action, GripTo, MoveTo, Tare
+from shearloop.daemon.control.step_runner import Action, GripTo
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import (
     ARRIVED,
@@ -98,13 +99,13 @@ class ActionExecutor:
     async def run(self, action: Action) -> str:
         """Carry out an action; return an error, or an empty string."""
         match action:
-            case MoveTo():
+            case ApproachStep():
                 return await self._move(action)
             case GripTo():
                 if self._gripper is None:
                     return "no gripper is configured; add a `gripper` section to the configuration"
                 return await self._grip(self._gripper, action)
-            case Tare():
+            case TareStep():
                 return await self._zero()
             case _:
                 raise TypeError(f"{action} is not an action of the devices")
@@ -147,8 +148,8 @@ class ActionExecutor:
         reply = await self._robot.send(ZeroForceTorque())
         return reply.refusal if not reply.accepted else await self._tare()
 
-    async def _move(self, action: MoveTo) -> str:
-        pose = action.pose_m_rad
+    async def _move(self, action: ApproachStep) -> str:
+        pose: tuple[float, ...] | None = action.pose_m_rad
         while True:
             await self._may_move.wait()
             if error := await self._rest():
@@ -160,7 +161,7 @@ class ActionExecutor:
             if here is None:
                 return "the robot is not connected"
             # The goal is fixed at the first start, so that an interruption does not lengthen the move.
-            pose = pose or along_tool(here.tcp_pose, action.along_tool_m)
+            pose = pose or along_tool(here.tcp_pose, action.along_tool_m or 0.0)
             x, y, z, rx, ry, rz = pose
             command = MoveLinear((x, y, z, rx, ry, rz), action.speed_m_per_s, LINEAR_ACCELERATION_M_PER_S2)
             self._moving, self._interrupted = True, False

@@ -50,15 +50,6 @@ WristSetpoint: TypeAlias = Hold | MoveToAngle | ConstantVelocity | TrackTorque
 
 
 @dataclass(frozen=True, slots=True)
-class MoveTo:
-    """Move the tool centre in a straight line, to a pose or by a distance along the tool's axis."""
-
-    pose_m_rad: tuple[float, ...] | None
-    speed_m_per_s: float
-    along_tool_m: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
 class GripTo:
     """Close or open the gripper."""
 
@@ -68,19 +59,8 @@ class GripTo:
     expect_object: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Tare:
-    """Tare every torque sensor, with the wrist standing still."""
-
-
-@dataclass(frozen=True, slots=True)
-class IdentifyStiffness:
-    """Identify stiffness, delay and noise with small twists."""
-
-    amplitude_rad: float
-
-
-Action: TypeAlias = MoveTo | GripTo | Tare | IdentifyStiffness
+# An action of the devices or of the identification; a retreat is an approach as well.
+Action: TypeAlias = steps.ApproachStep | GripTo | steps.TareStep | steps.IdentifyStep
 
 
 class ActionState(Enum):
@@ -276,18 +256,17 @@ def expected_s(step: Step) -> float:
 def _program(step: Step, elapsed_s: Callable[[], float]) -> StepProgram:
     """Return the generator of one step; `elapsed_s()` is the experiment's time in seconds."""
     match step:
-        case steps.ApproachStep() | steps.RetreatStep():
-            move = MoveTo(step.pose_m_rad, step.speed_m_per_s, step.along_tool_m or 0.0)
-            return _act(move, "moving in a straight line")
+        case steps.ApproachStep():
+            return _act(step, "moving in a straight line")
         case steps.GripStep():
             grip = GripTo(step.width_mm, step.speed_mm_per_s, step.force_n, step.expect_object)
             return _act(grip, "closing the gripper")
         case steps.ReleaseStep():
             return _act(GripTo(step.width_mm, 60.0, 10.0, expect_object=False), "opening the gripper")
         case steps.TareStep():
-            return _act(Tare(), "taking the zero of every torque sensor")
+            return _act(step, "taking the zero of every torque sensor")
         case steps.IdentifyStep():
-            return _act(IdentifyStiffness(step.amplitude_rad), "measuring the tool's stiffness, delay and noise")
+            return _act(step, "measuring the tool's stiffness, delay and noise")
         case steps.TurnToStep():
             return _turn_to(step)
         case steps.TwistStep():

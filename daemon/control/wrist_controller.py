@@ -5,6 +5,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from shearloop.daemon.control.controller import TwistController
+from shearloop.daemon.control.experiment_schema import IdentifyStep
 from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
 from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
 from shearloop.daemon.control.margins import gain_for_noise, integral_gain, margin_refusal
@@ -12,7 +13,6 @@ from shearloop.daemon.control.settings import ControllerSettings, LoopConfig
 from shearloop.daemon.control.step_runner import (
     ConstantVelocity,
     Hold,
-    IdentifyStiffness,
     MoveToAngle,
     TrackTorque,
     WristSetpoint,
@@ -116,7 +116,7 @@ class WristController:
         self.controller.set_point(setpoint.torque_nm)
         self.tracked = setpoint
 
-    def begin_identification(self, action: IdentifyStiffness, torque_limit_nm: float) -> None:
+    def begin_identification(self, action: IdentifyStep, torque_limit_nm: float) -> None:
         """Begin the small twists that identify the tool."""
         self.reset()
         self._excitation = StiffnessExcitation(

@@ -18,6 +18,7 @@ from shearloop.daemon.config import CombinedConfig, DaemonConfig, FingertipConfi
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
+from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
 from shearloop.daemon.sensing.skin_task import skin_source
 from shearloop.drivers.eit_kit import Frame
 
@@ -171,8 +172,11 @@ def torque_sources(
         sources[COMBINED] = TorqueSource(
             name=COMBINED, period_s=period_s, window_s=period_s, measures_torque=combined.measures_torque
         )
-    skin = skin_source(config.skin) if config.skin is not None else None
-    return sources if skin is None else {**sources, skin.name: skin}
+    if config.skin is not None and (skin := skin_source(config.skin)) is not None:
+        sources[skin.name] = skin
+    if config.load_cell is not None:
+        sources[LOAD_CELL] = TorqueSource(name=LOAD_CELL, period_s=1.0 / config.load_cell.rate_hz)
+    return sources
 
 
 def _shared_matcher(bank: Bank, matching: str) -> PrunedMatcher | PrunedZeroLagMatcher:

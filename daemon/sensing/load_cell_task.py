@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 import structlog
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
+from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.waiters import Waiters
@@ -32,7 +32,7 @@ class LoadCellTask:
         on_torque: Callable[[TorqueSample], None],
         rate_hz: float,
     ) -> None:
-        self.source = TorqueSource(name=LOAD_CELL, period_s=1.0 / rate_hz)
+        self._period_s = 1.0 / rate_hz
         self._timeout_s = max(ZERO_TIMEOUT_S, 2.0 * (ZERO_SAMPLES + SETTLING_PERIODS) / rate_hz)
         self._board = board
         self._publisher = publisher
@@ -61,7 +61,7 @@ class LoadCellTask:
         self._zeroing, self._zero_error = [], ""
         now_ns = self._clock.now_ns()
         # The middle of the first settled reading.
-        self._zero_from_ns = now_ns + round((SETTLING_PERIODS - 0.5) * self.source.period_s * 1e9)
+        self._zero_from_ns = now_ns + round((SETTLING_PERIODS - 0.5) * self._period_s * 1e9)
         self._zero_until_ns = now_ns + round(self._timeout_s * 1e9)
 
     async def zero(self) -> str:
@@ -82,7 +82,7 @@ class LoadCellTask:
         """Return the board's values for `health`."""
         found = self._board.diagnostics()
         error = self._zero_error if found["connected"] else found["last_loss"]
-        return {**found, "expected_hz": 1.0 / self.source.period_s, "error": error}
+        return {**found, "expected_hz": 1.0 / self._period_s, "error": error}
 
     def _take_zero(self, sample: LoadSample) -> None:
         if self._zeroing is None:

@@ -91,7 +91,7 @@ class EmulatedBoard(ABC):
     """An emulated board on a pseudo-terminal.
 
     `on_port` receives the port's path whenever it appears. `inject` applies faults to the next lines, one each.
-    `sent` counts intact lines. Without a reader the terminal fills up and then the board waits.
+    `sent` counts intact lines. Without a reader the terminal fills up; then the board waits and `port.held_up` is set.
     """
 
     faults: Collection[BoardFaultKind]
@@ -107,20 +107,10 @@ class EmulatedBoard(ABC):
         self._period_s = period_s
         self._on_port = on_port
         self._random = Random(seed)
-        self._port = PtyPort(on_bytes, link)
+        self.port = PtyPort(on_bytes, link)
         self._injected: deque[BoardFault] = deque()
         self.sent = 0
         self.finished = asyncio.Event()
-
-    @property
-    def path(self) -> str:
-        """The port's path."""
-        return self._port.path
-
-    @property
-    def held_up(self) -> asyncio.Event:
-        """Set while the board waits for a reader."""
-        return self._port.held_up
 
     @abstractmethod
     async def run(self) -> None:
@@ -142,8 +132,8 @@ class EmulatedBoard(ABC):
             self.inject(parse_fault(text, self.faults))
 
     def _plug(self) -> None:
-        self._port.plug()
-        self._on_port(self.path)
+        self.port.plug()
+        self._on_port(self.port.path)
 
     def _garbage(self, count: int) -> bytes:
         return bytes(self._random.choices(range(128, 256), k=count))
@@ -193,8 +183,8 @@ class EitKitBoard(EmulatedBoard):
     async def run(self) -> None:
         """Play until cancelled; at the end of the frames the board stays plugged in and `finished` is set."""
         loop = asyncio.get_running_loop()
-        with self._port:
-            self._on_port(self.path)
+        with self.port:
+            self._on_port(self.port.path)
             due_s = 0.0
             frames = iter(self._frames)
             for number in itertools.count():
@@ -229,16 +219,16 @@ class EitKitBoard(EmulatedBoard):
                 await self._unplug(line, 1.0 if fault is None or fault.amount is None else fault.amount)
                 return
             case _K.GARBAGE:
-                await self._port.write(self._garbage(700) + b"\n")
+                await self.port.write(self._garbage(700) + b"\n")
             case _K.FLOOD:
-                await self._port.write(bytes(self._random.choices(b"0123456789., ", k=FLOOD_BYTES)) + b"\n")
+                await self.port.write(bytes(self._random.choices(b"0123456789., ", k=FLOOD_BYTES)) + b"\n")
             case _K.REPEAT:
-                await self._port.write(line)
+                await self.port.write(line)
                 self.sent += 1
             case kind:
-                await self._port.write(self._broken(line, kind))
+                await self.port.write(self._broken(line, kind))
                 return
-        await self._port.write(line)
+        await self.port.write(line)
         self.sent += 1
 
     def _broken(self, line: bytes, kind: BoardFaultKind) -> bytes:
@@ -267,8 +257,8 @@ class EitKitBoard(EmulatedBoard):
         self._waits_for_start = False
 
     async def _unplug(self, line: bytes, seconds: float) -> None:
-        await self._port.write(line[: len(line) // 2])
-        await self._port.break_off()
+        await self.port.write(line[: len(line) // 2])
+        await self.port.break_off()
         # Without power the board forgets its start.
         self._started.clear()
         await self._outage.wait(seconds)
@@ -304,8 +294,8 @@ class ConverterBoard(EmulatedBoard):
         """Play until cancelled; at the end of the data the board stays plugged in and `finished` is set."""
         loop = asyncio.get_running_loop()
         due_s = loop.time()
-        with self._port:
-            self._on_port(self.path)
+        with self.port:
+            self._on_port(self.port.path)
             while True:
                 due_s = max(due_s + self._period_s, loop.time() - CATCH_UP_S)
                 await asyncio.sleep(due_s - loop.time())
@@ -316,7 +306,7 @@ class ConverterBoard(EmulatedBoard):
                 line = self._with_faults(line, loop.time())
                 if line:
                     try:
-                        await self._port.write(line)
+                        await self.port.write(line)
                     except ConnectionError:  # unplugged while the line waited for a reader
                         continue
                     self.sent += 1
@@ -355,7 +345,7 @@ class ConverterBoard(EmulatedBoard):
                 self._lasting = kind
                 self._lasts_until_s = math.inf if fault.amount is None else now_s + fault.amount
                 if kind is _K.UNPLUG:
-                    self._port.unplug()
+                    self.port.unplug()
         return line
 
     def _end_lasting(self) -> None:

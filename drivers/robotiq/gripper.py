@@ -3,7 +3,8 @@
 import asyncio
 import math
 import time
-from collections.abc import AsyncGenerator, Callable, Coroutine, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Mapping
+from contextlib import asynccontextmanager
 from typing import TypeVar
 
 from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
@@ -22,8 +23,6 @@ ACTIVATION_DEADLINE_NS = 15_000_000_000
 # The full stroke at the slowest speed takes 4.7 s.
 MOTION_DEADLINE_NS = 10_000_000_000
 _OVER_TEMPERATURE, _NO_COMMUNICATION = 8, 9
-# Faults below this are normal during an activation, as is a silence before it.
-_LEAST_ACTIVATION_FAULT = 8
 
 
 class RobotiqGripper:
@@ -51,7 +50,7 @@ class RobotiqGripper:
         self._policy = policy or ReconnectPolicy()
         self._on_event = on_event
         self._clock_ns = clock_ns
-        self._exchange = asyncio.Lock()
+        self._lock = asyncio.Lock()
         self._seq = 0
         self._last_move: messages.GripperMove | None = None
         self._connections = 0
@@ -102,7 +101,7 @@ class RobotiqGripper:
                 raise messages.GripperFaultError(
                     f"{fault.sentence} An operator has to confirm that the fingers are clear."
                 )
-            if blocking_fault(readout) is None:
+            if not blocking_fault(readout):
                 return self._state(readout, t_ns)
         self._last_move = None
         await _uninterrupted(self._write(messages.Reset()))
@@ -127,8 +126,7 @@ class RobotiqGripper:
         """
         sent = self.clip(command)
         readout, _ = await _uninterrupted(self._read())
-        blocking = blocking_fault(readout)
-        if blocking is not None:
+        if blocking := blocking_fault(readout):
             raise messages.GripperFaultError(blocking)
         self._last_move = sent.request
         await _uninterrupted(self._write(sent.request))
@@ -142,8 +140,7 @@ class RobotiqGripper:
                 raise messages.GripperRefusedError(
                     "Another command took over before the gripper had finished its motion."
                 )
-            blocking = blocking_fault(readout)
-            if blocking is not None:
+            if blocking := blocking_fault(readout):
                 raise messages.GripperFaultError(blocking)
             return object_status(readout, sent.request) is not messages.ObjectStatus.MOVING
 
@@ -246,27 +243,25 @@ class RobotiqGripper:
         )
 
     async def _read(self) -> tuple[messages.Readout, int]:
-        async with self._exchange:
+        async with self._exchange():
             t_ns = self._clock_ns()
-            try:
-                return await self._client.read(), t_ns
-            except DriverError as error:
-                self._note_loss(error)
-                raise
+            return await self._client.read(), t_ns
 
     async def _write(self, request: messages.Request) -> None:
-        async with self._exchange:
-            try:
-                await self._client.write(request)
-            except DriverError as error:
-                self._note_loss(error)
-                raise
+        async with self._exchange():
+            await self._client.write(request)
 
-    def _note_loss(self, error: DriverError) -> None:
-        if self.connected:
-            # `states` reports the loss.
-            self._loss = error
-        self.connected, self.latest = False, None
+    @asynccontextmanager
+    async def _exchange(self) -> AsyncIterator[None]:
+        """Exclude other exchanges, and note a loss, which `states` reports."""
+        async with self._lock:
+            try:
+                yield
+            except DriverError as error:
+                if self.connected:
+                    self._loss = error
+                self.connected, self.latest = False, None
+                raise
 
     def _state(self, readout: messages.Readout, t_ns: int) -> messages.GripperState:
         state = messages.GripperState(
@@ -286,7 +281,8 @@ class RobotiqGripper:
 
 
 def _is_active(readout: messages.Readout) -> bool:
-    if readout.act and readout.flt >= _LEAST_ACTIVATION_FAULT and readout.flt != _NO_COMMUNICATION:
+    # Lower faults are normal during an activation, as is a silence before it.
+    if readout.act and readout.flt >= _OVER_TEMPERATURE and readout.flt != _NO_COMMUNICATION:
         raise messages.GripperFaultError(messages.fault_of(readout.flt).sentence)
     return readout.act and readout.sta is messages.ActivationStatus.ACTIVE
 
@@ -303,15 +299,16 @@ def object_status(readout: messages.Readout, last: messages.GripperMove | None) 
     return readout.obj if readout.gto else messages.ObjectStatus.UNKNOWN
 
 
-def blocking_fault(readout: messages.Readout) -> str | None:
-    """Return why the gripper would not move now, as a sentence, or None."""
-    if readout.flt >= messages.FIRST_MAJOR_CODE or readout.flt == _OVER_TEMPERATURE:
-        return messages.fault_of(readout.flt).sentence
+def blocking_fault(readout: messages.Readout) -> str:
+    """Return why the gripper would not move now, as a sentence, or an empty string."""
+    fault = messages.fault_of(readout.flt)
+    if fault.needs_activation or fault.code == _OVER_TEMPERATURE:
+        return fault.sentence
     if readout.sta is messages.ActivationStatus.ACTIVATING:
         return messages.fault_of(5).sentence
     if not readout.act or readout.sta is not messages.ActivationStatus.ACTIVE:
         return messages.fault_of(7).sentence
-    return None
+    return ""
 
 
 async def _uninterrupted(exchange: Coroutine[object, object, T]) -> T:

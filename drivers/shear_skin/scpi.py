@@ -28,11 +28,11 @@ _NUMBER = re.compile(r" *[+-]?[0-9]{1,12}(\.[0-9]{0,12})?([Ee][+-]?[0-9]{1,2})? 
 ReadingT = TypeVar("ReadingT")
 
 
-class ReplyLines:
+class ReplyLines(LineSplitter):
     """Splits bytes into replies, however they are sliced; instruments end them with CR, LF or both. No I/O."""
 
     def __init__(self) -> None:
-        self._lines = LineSplitter(MAX_REPLY_BYTES)
+        super().__init__(MAX_REPLY_BYTES)
         self._not_ascii = 0
         self.unasked = 0
 
@@ -41,26 +41,17 @@ class ReplyLines:
         """The number of rejected replies, by kind."""
         return +Counter(
             {
-                "too long": self._lines.too_long,
-                "unfinished": self._lines.unfinished,
+                "too long": self.too_long,
+                "unfinished": self.unfinished,
                 "unasked": self.unasked,
                 "not ASCII": self._not_ascii,
             }
         )
 
-    @property
-    def in_line(self) -> bool:
-        """Whether a reply has begun and not ended."""
-        return self._lines.in_line
-
-    def restart(self) -> None:
-        """Drop a half-received reply."""
-        self._lines.restart()
-
-    def feed(self, data: bytes) -> list[str]:
+    def replies(self, data: bytes) -> list[str]:
         """Return the replies that `data` completes, without line ends; empty lines are ignored."""
         replies = []
-        for line in self._lines.feed(data.replace(b"\r", b"\n")):
+        for line in self.feed(data.replace(b"\r", b"\n")):
             if line is None:
                 continue
             if not line.isascii():
@@ -196,7 +187,7 @@ class ScpiSession:
                     f"{self._instrument} at {self._port.path} has not answered {query!r} within {waited_s:.2g} s; "
                     "see that it is on, and that baud rate and line end are as configured."
                 )
-            self._waiting += [(text, received.t_arrival_ns) for text in self.lines.feed(received.data)]
+            self._waiting += [(text, received.t_arrival_ns) for text in self.lines.replies(received.data)]
         text, arrival_ns = self._waiting.pop(0)
         return Reply(text, asked_ns, arrival_ns)
 

@@ -32,10 +32,6 @@ _PR_SET_TIMERSLACK = 29
 _BEFORE_LOOP = "        keep_running = True\n"
 
 
-class DashboardRefusedError(DriverError):
-    """The dashboard server refused a request."""
-
-
 class UrArm:
     """A connection for samples, one for control, and the dashboard when needed."""
 
@@ -157,7 +153,7 @@ class UrArm:
         return done
 
     def unlock(self) -> None:
-        """Unlock a protective stop; `DashboardRefusedError` in its first 5 s."""
+        """Unlock a protective stop; `DriverError` in its first 5 s."""
         self._ask_dashboard("unlockProtectiveStop")
 
     def close_popups(self) -> None:
@@ -183,7 +179,7 @@ class UrArm:
             for request in requests:
                 getattr(dashboard, request)()
         except RuntimeError as error:
-            raise DashboardRefusedError(str(error)) from error
+            raise DriverError(str(error)) from error
         finally:
             dashboard.disconnect()
 

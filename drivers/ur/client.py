@@ -11,7 +11,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Any, Final, Literal, cast
 
@@ -153,7 +153,7 @@ class UrRobot:
             await asyncio.sleep(PAUSES_S[min(attempts, len(PAUSES_S)) - 1])
 
     async def _run_worker(self) -> None:
-        connection = WorkerConnection(self.settings, self.handle_messages, takes_over=self.takes_over)
+        connection = WorkerConnection(self.settings, self.handle_message, takes_over=self.takes_over)
         await asyncio.get_running_loop().subprocess_exec(
             lambda: connection, sys.executable, "-m", "shearloop.drivers.ur.worker"
         )
@@ -188,18 +188,17 @@ class UrRobot:
                 context = {"message": "a callback for a reply of the robot's process failed", "exception": error}
                 asyncio.get_running_loop().call_exception_handler(context)
 
-    def handle_messages(self, messages: Sequence[tuple[int, Message]]) -> None:
-        """Handle the messages of one read, in order."""
-        for number, message in messages:
-            match message:
-                case RobotState():
-                    self._handle_state(message)
-                case CommandReply():
-                    on_reply = self._replies.pop(number, None)
-                    if on_reply is not None:
-                        on_reply(message)
-                case Failed():
-                    raise LostError(message.kind, message.sentence)
+    def handle_message(self, number: int, message: Message) -> None:
+        """Handle a message of the worker."""
+        match message:
+            case RobotState():
+                self._handle_state(message)
+            case CommandReply():
+                on_reply = self._replies.pop(number, None)
+                if on_reply is not None:
+                    on_reply(message)
+            case Failed():
+                raise LostError(message.kind, message.sentence)
 
     def _handle_state(self, state: RobotState) -> None:
         before, self._state = self._state, state
@@ -225,13 +224,13 @@ class WorkerConnection(asyncio.SubprocessProtocol):
     def __init__(
         self,
         settings: UrSettings,
-        on_messages: Callable[[Sequence[tuple[int, Message]]], None],
+        on_message: Callable[[int, Message], None],
         *,
         takes_over: bool = False,
     ) -> None:
-        """Take the worker's configuration. `on_messages` receives all messages of one read, in order."""
+        """Take the worker's configuration. `on_message` receives each message with its number."""
         self._settings = settings
-        self._on_messages = on_messages
+        self._on_message = on_message
         self._takes_over = takes_over
         self._decoder = MessageDecoder()
         self._received_s = self._sent_s = time.monotonic()
@@ -270,13 +269,12 @@ class WorkerConnection(asyncio.SubprocessProtocol):
             return
         self._received_s = time.monotonic()
         try:
-            messages = self._decoder.feed(data)
-            for _, message in messages:
+            for number, message in self._decoder.feed(data):
                 if isinstance(message, WorkerPhase):
                     self._activity = message.activity
                 elif isinstance(message, RobotState):
                     self._state, self._activity = message, "controlling"
-            self._on_messages(messages)
+                self._on_message(number, message)
         except ProtocolError as error:
             self._kill()
             self._closed.set_result(LostError("garbled", str(error)))

@@ -37,7 +37,8 @@ class CommandHandler:
         self._limits = settings.limits
         self._arm = arm
         self._held_reason = error_messages.NOT_ENABLED
-        self._leaving = False
+        # Whether the daemon disconnects: only stops are taken from then on.
+        self.leaving = False
         self._owns_program = takes_over
         # When a program was being started last: an upload may take effect after its recovery was given up.
         self._starting_ns: int | None = None
@@ -92,7 +93,7 @@ class CommandHandler:
         self, number: int, command: messages.Command, sample: messages.RtdeSample, now_ns: int
     ) -> messages.CommandReply | None:
         """Return the reply to a command; None when `tick` returns it later (`Unlock`)."""
-        if self._leaving and not isinstance(command, messages.Stop | messages.Disconnect):
+        if self.leaving and not isinstance(command, messages.Stop | messages.Disconnect):
             return messages.CommandReply(refusal=error_messages.LEAVING)
         match command:
             case messages.Stop():
@@ -214,7 +215,7 @@ class CommandHandler:
         return self._reply(taken=not self._executor.disabled_reason)
 
     def _leave(self, sample: messages.RtdeSample, now_ns: int) -> messages.CommandReply:
-        self._leaving = True
+        self.leaving = True
         if self._recovery is not None:
             self._recovery.give_up(error_messages.LEAVING)
         self._executor.stop_now(sample, now_ns, "the daemon disconnects")
@@ -263,7 +264,7 @@ class CommandHandler:
 
     def _stop_paused_program(self, sample: messages.RtdeSample, now_ns: int, *, announced: bool) -> None:
         """Stop a paused program of ours, in the cycle after the one that has announced it."""
-        if self._leaving or not (self._owns_program and sample.program_paused and self._is_recent(sample)):
+        if self.leaving or not (self._owns_program and sample.program_paused and self._is_recent(sample)):
             return
         if self._paused_program.is_due(now_ns):
             if announced:

@@ -6,6 +6,7 @@ robot's watchdog then ends the motion. When stdin ends the daemon is gone: the w
 """
 
 import contextlib
+import math
 import os
 import select
 import signal
@@ -133,17 +134,17 @@ def _control(pipe: Pipe, configured: messages.Configure, arm: "UrArm") -> NoRetu
     settings = configured.settings
     handler = CommandHandler(settings, arm, time.monotonic_ns(), takes_over=configured.takes_over)
     period_s, due_s, cycle = 1.0 / settings.rate_hz, time.monotonic(), 0
-    leave_s = 0.0
+    leave_s = math.inf
     while True:
         _set_alarm(settings.hang_timeout_s)
         sample = arm.read()
         if not sample.connected or sample.age_ns > 3 * settings.state_timeout_s * 1e9:
             _fail(pipe, "lost", error_messages.why_unfit(sample, settings.host, settings.state_timeout_s))
-        if _handle_commands(pipe, handler, sample):
-            leave_s = time.monotonic() + FAREWELL_S
-        if not pipe.open and not leave_s:
+        _handle_commands(pipe, handler, sample)
+        if not pipe.open and not handler.leaving:
             handler.request(0, messages.Disconnect(), sample, time.monotonic_ns())
-            leave_s = time.monotonic() + FAREWELL_S
+        if handler.leaving:
+            leave_s = min(leave_s, time.monotonic() + FAREWELL_S)
         if handler.recovering:
             # Announce a cycle that may take long.
             pipe.send_latest(handler.state(sample, cycle))
@@ -153,17 +154,17 @@ def _control(pipe: Pipe, configured: messages.Configure, arm: "UrArm") -> NoRetu
             pipe.send(ended[1], ended[0])
         if not handler.take_command_rejected():
             pipe.send_latest(handler.state(sample, cycle))
-        if leave_s and (handler.at_rest or time.monotonic() > leave_s):
+        if (handler.leaving and handler.at_rest) or time.monotonic() > leave_s:
             _end_program(settings, handler, arm)
             _exit(EXIT_DONE)
         # A late cycle begins at once; missed ones are skipped.
         due_s, cycle = max(due_s + period_s, time.monotonic()), cycle + 1
         while (left_s := due_s - time.monotonic()) > 0:
-            if leave_s or not pipe.open:
+            if handler.leaving or not pipe.open:
                 time.sleep(left_s)
-            # Carry a command out on arrival: waiting for the next cycle would delay the loop.
-            elif pipe.wait(left_s) and _handle_commands(pipe, handler, arm.read()):
-                leave_s = time.monotonic() + FAREWELL_S
+            elif pipe.wait(left_s):
+                # Carry a command out on arrival: waiting for the next cycle would delay the loop.
+                _handle_commands(pipe, handler, arm.read())
 
 
 def _end_program(settings: UrSettings, handler: CommandHandler, arm: "UrArm") -> None:
@@ -178,15 +179,12 @@ def _end_program(settings: UrSettings, handler: CommandHandler, arm: "UrArm") ->
         arm.stop_program()
 
 
-def _handle_commands(pipe: Pipe, handler: CommandHandler, sample: messages.RtdeSample) -> bool:
-    """Carry out the daemon's commands; return whether it disconnects."""
-    disconnects = False
+def _handle_commands(pipe: Pipe, handler: CommandHandler, sample: messages.RtdeSample) -> None:
+    """Carry out the daemon's commands."""
     for number, command in _newest_commands(pipe, handler):
         reply = handler.request(number, command, sample, time.monotonic_ns())
         if reply is not None:
             pipe.send(reply, number)
-        disconnects = disconnects or isinstance(command, messages.Disconnect)
-    return disconnects
 
 
 def _newest_commands(pipe: Pipe, handler: CommandHandler) -> list[tuple[int, messages.Command]]:

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shearloop.bank.eit.elimination import Elimination, Pattern
-from shearloop.bank.eit.forward import MAX_LEAK, BatchForwardModel, rounding_leaks
+from shearloop.bank.eit.elimination import Elimination
+from shearloop.bank.eit.forward import MAX_LEAK, BatchForwardModel, Terms, rounding_leaks
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS, conductivity
 from shearloop.bank.eit.vector_kernel import LANES
@@ -27,7 +27,7 @@ def relative(found, expected):
     return np.linalg.norm(found - expected) / np.linalg.norm(expected)
 
 
-def chained(rng: np.random.Generator, n: int, far: int, factors: int) -> Pattern:
+def chained(rng: np.random.Generator, n: int, far: int, factors: int) -> Terms:
     """Return a Laplacian, each unknown linked to some that follow, each link with a factor; and 1 on the diagonal."""
     links = [(min(i + int(step), n - 1), i) for i in range(n - 1) for step in rng.integers(1, far + 1, 2)]
     rows, columns, values, source = [], [], [], []
@@ -36,7 +36,7 @@ def chained(rng: np.random.Generator, n: int, far: int, factors: int) -> Pattern
         columns += [i, j, j, i]
         values += [1.0, 1.0, -1.0, -1.0]
         source += [number % factors] * 4
-    return Pattern(
+    return Terms(
         np.array(rows + list(range(n))),
         np.array(columns + list(range(n))),
         np.array(values + [1.0] * n),

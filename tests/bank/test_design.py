@@ -10,13 +10,14 @@ from shearloop.bank.eit.channels import CHANNELS
 from shearloop.bank.eit.design import ALLOWED, DesignChoice, DesignStep, MeasuredFrames, _board_choices, design_bank
 from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.bank.eit.forward import BatchForwardModel, ForwardModel
+from shearloop.bank.eit.model_scores import Setting, simulated_signals
 from shearloop.bank.eit.models import conductivity
 from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.bank_config import FingertipGeometryConfig
 from shearloop.daemon.config_file import load_yaml_model
 
 FINGERTIP = Path(__file__).parents[2] / "config" / "fingertips" / "paper.yaml"
-PLACES = [(3.1 + 0.02 * i, 1.3 + 0.04 * i) for i in range(10)]
+PLACES = [Setting(3.1 + 0.02 * i, 1.3 + 0.04 * i) for i in range(10)]
 
 
 @pytest.fixture(scope="module")
@@ -26,11 +27,7 @@ def fingertip() -> Fingertip:
 
 @pytest.fixture(scope="module")
 def clean(fingertip: Fingertip) -> np.ndarray:
-    mesh = fingertip.mesh()
-    forward = ForwardModel(mesh)
-    homogeneous = forward.homogeneous()
-    cells = [conductivity(mesh, "gaussian_derivative", k, sigma) for k, sigma in PLACES]
-    return np.abs([forward.voltages(cell) - homogeneous for cell in cells]) * 0.01
+    return np.abs(simulated_signals(ForwardModel(fingertip.mesh()), "gaussian_derivative", PLACES)) * 0.01
 
 
 def scene(clean: np.ndarray, noise_v: float) -> MeasuredFrames:
@@ -162,11 +159,9 @@ def test_injections_cost_what_generalised_least_squares_loses_without_them() -> 
 
 
 def test_a_model_without_a_sigma_gets_one_cell_along_it(fingertip) -> None:
-    mesh = replace(fingertip, mesh_size_cm=0.2).mesh()
-    forward = ForwardModel(mesh)
-    cells = [conductivity(mesh, "step", k, 1.0) for k in np.linspace(1.2, 2.2, 10).tolist()]
-    frames = 0.01 * np.abs([forward.voltages(cell) - forward.homogeneous() for cell in cells])
-    design = design_bank(scene(frames, 4e-4), fingertip)
+    forward = ForwardModel(replace(fingertip, mesh_size_cm=0.2).mesh())
+    steps = [Setting(k, 1.0) for k in np.linspace(1.2, 2.2, 10).tolist()]
+    design = design_bank(scene(0.01 * np.abs(simulated_signals(forward, "step", steps)), 4e-4), fingertip)
     assert design.model == "step"
     assert design.sigma_count.chosen.setting == 1
     assert design.sigma_count.enough

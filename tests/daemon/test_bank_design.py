@@ -11,7 +11,7 @@ from shearloop.bank.eit.build import build_bank
 from shearloop.bank.eit.channels import N_CHANNELS, N_LINE_VALUES
 from shearloop.bank.eit.design import MeasuredFrames, design_bank
 from shearloop.bank.eit.forward import ForwardModel
-from shearloop.bank.eit.models import conductivity
+from shearloop.bank.eit.model_scores import Setting, simulated_signals
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import NOT_TURNED, RefinedMatcher
 from shearloop.bank.estimation.values import FrameSeries
@@ -48,9 +48,8 @@ def test_a_design_is_a_configuration_that_builds(built: Path) -> None:
 def step_frames() -> np.ndarray:
     """Return the model's frames (8, 896) of steps of eight sizes."""
     mesh = load_geometry(OWN_FINGERTIP)
-    forward = ForwardModel(mesh)
-    cells = [conductivity(mesh, "step", k, 1.0) for k in np.linspace(1.2, 2.2, 8).tolist()]
-    return 0.01 * np.abs([forward.voltages(cell) - forward.homogeneous() for cell in cells])
+    steps = [Setting(k, 1.0) for k in np.linspace(1.2, 2.2, 8).tolist()]
+    return 0.01 * np.abs(simulated_signals(ForwardModel(mesh), "step", steps))
 
 
 def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path: Path) -> None:

@@ -138,26 +138,36 @@ async def test_without_recording_and_bank_the_demos_fingertip_is_twisted() -> No
 
 
 @pytest.mark.parametrize(
-    ("arguments", "sentence"),
+    ("device", "arguments", "sentence"),
     [
         (
-            ("--recording", "a.mat", "--bank", "b.shb"),
+            "eit-kit",
+            "--recording a.mat --bank b.shb",
             "give either --recording FILE to play a recording or --bank FILE",
         ),
-        (("--sigma", "1.8", "nan"), "the sigma grid must be finite numbers"),
-        (("--recording", "absent.mat"), "absent.mat: the recording cannot be read"),
-        (("--bank", "absent.shb"), "absent.shb"),
-        (("--bank", "absent.shb", "--once"), "--once is for a recording"),
-        (("--recording", "absent.mat", "--speed", "0"), "--speed 0 is not above 0"),
-        (("--recording", "absent.mat", "--fault", "nan"), "--fault nan names no frame; write NAME@FRAME"),
-        (("--recording", "absent.mat", "--fault", "explode@3"), "there is no fault 'explode'"),
-        (("--recording", "absent.mat", "--link", "/dev/null/eit"), "--link /dev/null/eit cannot be made"),
+        ("eit-kit", "--sigma 1.8 nan", "the sigma grid must be finite numbers"),
+        ("eit-kit", "--recording absent.mat", "absent.mat: the recording cannot be read"),
+        ("eit-kit", "--bank absent.shb", "absent.shb"),
+        ("eit-kit", "--bank absent.shb --once", "--once is for a recording"),
+        ("eit-kit", "--recording absent.mat --speed 0", "--speed 0 is not above 0"),
+        ("eit-kit", "--recording absent.mat --fault nan", "--fault nan names no frame; write NAME@FRAME"),
+        ("eit-kit", "--recording absent.mat --fault explode@3", "there is no fault 'explode'"),
+        ("eit-kit", "--recording absent.mat --link /dev/null/eit", "--link /dev/null/eit cannot be made"),
+        ("ur", "--version five", "--version five is no version"),
+        ("ur", "--rate-hz 5", "--rate-hz 5 is outside 50 to 1000"),
+        # An address for documentation (RFC 5737), which no machine has.
+        ("ur", "--host 192.0.2.1", "cannot listen on 192.0.2.1"),
+        ("skin", "--sweep-n 9", "--sweep-n 9 is beyond the 5 N"),
+        ("skin", "--sweep-n 1 --robot 127.0.0.1", "leave --sweep-n or --robot out"),
+        ("skin", "--speed 0", "--speed 0 is not above 0"),
+        ("skin", "--source-port 70000", "--source-port 70000 is no port"),
+        ("skin-daq", "--link /dev/null/daq", "--link /dev/null/daq cannot be made"),
     ],
 )
 def test_a_mistake_is_one_sentence_and_status_two(
-    arguments: tuple[str, ...], sentence: str, capsys: pytest.CaptureFixture[str]
+    device: str, arguments: str, sentence: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["emulate", "eit-kit", *arguments]) == EXIT_USAGE
+    assert main(["emulate", device, *arguments.split()]) == EXIT_USAGE
     complaint = capsys.readouterr().err
     assert sentence in complaint
     assert complaint.count("\n") == 1

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shearloop.daemon.cli import main
 from shearloop.daemon.cli.emulate.skin import PushedSkin
 from shearloop.daemon.synthetic_skin import SyntheticSkin
 from shearloop.drivers.connection import Link, SerialLink, TcpLink
@@ -89,23 +88,6 @@ async def test_source_and_scanner_are_played_alone_too() -> None:
             await told(daq, "mend")
             await told(source, "leads 1000")
             await until(samples, SkinFault.COMPLIANCE)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["skin", "--sweep-n", "9"], "--sweep-n 9 is beyond the 5 N"),
-        (["skin", "--sweep-n", "1", "--robot", "127.0.0.1"], "leave --sweep-n or --robot out"),
-        (["skin", "--speed", "0"], "--speed 0 is not above 0"),
-        (["skin", "--source-port", "70000"], "--source-port 70000 is no port"),
-        (["skin-daq", "--link", "/dev/null/daq"], "--link /dev/null/daq cannot be made"),
-    ],
-)
-def test_mistakes_on_the_command_line_are_sentences(
-    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["emulate", *arguments]) == 2
-    assert said in capsys.readouterr().err
 
 
 def test_on_the_rig_the_robot_s_motion_shears_the_skin(tmp_path: Path) -> None:

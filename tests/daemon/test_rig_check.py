@@ -31,6 +31,7 @@ SOURCES = {
     name: TorqueSource(name=name, period_s=0.5, measures_torque=measures)
     for name, measures in (("right", True), ("left", False))
 }
+LOAD = {"load_cell": TorqueSource(name="load_cell", period_s=0.1)}
 
 
 def refusal(folder: Path, experiment: dict[str, Any], **more: Any) -> str:
@@ -42,7 +43,7 @@ def refusal(folder: Path, experiment: dict[str, Any], **more: Any) -> str:
 def test_a_torque_that_is_measured_may_drive(tmp_path: Path) -> None:
     for drive in ("right", "load_cell", "wrench"):
         file = check_experiment(
-            config(tmp_path, {"torque_source": drive}, load_cell={"device": {"path": "load"}}), SOURCES
+            config(tmp_path, {"torque_source": drive}, load_cell={"device": {"path": "load"}}), {**SOURCES, **LOAD}
         )
         assert file is not None
         assert file.torque_source == drive

@@ -11,10 +11,9 @@ from shearloop.drivers import connection
 from shearloop.drivers.connection import LinkEvent, ReconnectPolicy, SerialLink, SerialPort, find_port
 from shearloop.drivers.emulators.ports import PtyPort
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceUnavailableError
+from tests.running import DEADLINE_S, Changes
 
 SECOND_NS = 1_000_000_000
-# Guards against a test that hangs; none of them waits for so long.
-DEADLINE_S = 20
 
 
 class Peer(PtyPort):
@@ -22,12 +21,12 @@ class Peer(PtyPort):
 
     def __init__(self, link: Path | None = None) -> None:
         self.received = bytearray()
-        self.heard = asyncio.Event()
+        self.changes = Changes()
         super().__init__(self._hear, link)
 
     def _hear(self, data: bytes) -> None:
         self.received += data
-        self.heard.set()
+        self.changes.note()
 
 
 async def read_exactly(port: SerialPort, n_bytes: int) -> bytes:
@@ -40,13 +39,11 @@ async def read_exactly(port: SerialPort, n_bytes: int) -> bytes:
 
 
 def listed(monkeypatch: pytest.MonkeyPatch, *ports: tuple[str, str | None]) -> None:
-    entries = [SimpleNamespace(device=d, serial_number=n, description="USB Serial") for d, n in ports]
-
     class Entry(SimpleNamespace):
         def __lt__(self, other: "Entry") -> bool:
             return self.device < other.device
 
-    found = [Entry(**vars(entry)) for entry in entries]
+    found = [Entry(device=device, serial_number=number, description="USB Serial") for device, number in ports]
     monkeypatch.setattr(connection.list_ports, "comports", lambda: found)
 
 
@@ -83,9 +80,7 @@ async def test_bytes_pass_unchanged_in_both_directions() -> None:
             assert await read_exactly(port, len(data)) == data
             await sending
             await port.write(bytes(range(256)))
-            while len(peer.received) < 256:
-                peer.heard.clear()
-                await peer.heard.wait()
+            await peer.changes.until(lambda: len(peer.received) >= 256)
     assert bytes(peer.received) == bytes(range(256))
 
 
@@ -188,9 +183,7 @@ async def test_a_link_opens_a_device_that_comes_late_and_again_after_it_went(tmp
             peer.plug()
             port = await link.open()
             await port.write(b"again")
-            while peer.received != b"again":
-                peer.heard.clear()
-                await peer.heard.wait()
+            await peer.changes.until(lambda: peer.received == b"again")
     assert link.connections == 2
     assert "has gone" in link.last_error or "no serial port" in link.last_error
     assert [event.up for event in events if event.up or not event.repeated][-1]

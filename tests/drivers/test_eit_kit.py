@@ -71,7 +71,7 @@ async def test_a_reader_that_stops_for_a_while_loses_nothing(tmp_path: Path) -> 
             async for frame in arriving:
                 frames.append(frame)
                 if len(frames) == 5:
-                    await board.held_up.wait()
+                    await board.port.held_up.wait()
                 if len(frames) == 40:
                     break
     assert_same(frames, lines)

@@ -89,17 +89,17 @@ def test_a_saturated_signal_is_refused_and_the_step_asked_for_again() -> None:
     assert calibrator.finished
 
 
-def test_a_converter_that_repeats_itself_is_refused() -> None:
-    assert "never that still" in refused(LoadCalibrator([100.0]), samples([1234.0] * STEP))
-
-
-def test_a_mass_that_changes_nothing_is_refused() -> None:
-    assert "did not change with 100 g" in refused(after_empty([100.0]), noisy(8100.0, seed=1))
-
-
-def test_noise_is_refused_beyond_the_bound_and_beyond_a_share_of_the_change() -> None:
-    assert "more than 5000" in refused(LoadCalibrator([100.0]), noisy(8000.0, std=20_000.0))
-    assert "use a larger one" in refused(after_empty([100.0]), noisy(12_000.0, seed=1))
+@pytest.mark.parametrize(
+    ("after_rest", "signal", "reason"),
+    [
+        (False, samples([1234.0] * STEP), "never that still"),
+        (False, noisy(8000.0, std=20_000.0), "more than 5000"),
+        (True, noisy(8100.0, seed=1), "did not change with 100 g"),
+        (True, noisy(12_000.0, seed=1), "use a larger one"),
+    ],
+)
+def test_a_signal_that_is_not_fit_is_refused(after_rest: bool, signal: list[LoadSample], reason: str) -> None:
+    assert reason in refused(after_empty([100.0]) if after_rest else LoadCalibrator([100.0]), signal)
 
 
 def test_masses_off_the_line_or_in_the_wrong_order_are_refused() -> None:

@@ -20,10 +20,10 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.skin.calibration import SkinCalibration, load_calibration
 from shearloop.daemon.analysis.charts.drawing import figure, look, save
 from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
 from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
 from shearloop.daemon.control.settings import LoopConfig
-from shearloop.daemon.control.step_runner import ExperimentPhase, Tare
+from shearloop.daemon.control.step_runner import ExperimentPhase
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
 from shearloop.daemon.synthetic_skin import SyntheticSkin
@@ -133,7 +133,7 @@ class SkinLoop:
         speed = 0.0 if orders.stop else orders.wrist_rad_per_s
         self.brain.on_speed_sent(speed)
         self._speeds.append(speed)
-        if isinstance(orders.action, Tare):
+        if isinstance(orders.action, TareStep):
             self.estimator.tare()
             self._zero_begun = True
         controller = self.brain.controller

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from shearloop.daemon.cli.bank import build
-from shearloop.daemon.cli.bank.build import MODELS, add_overrides, overrides
+from shearloop.daemon.cli.bank.build import MODEL_NAMES, add_overrides, overrides
 from shearloop.daemon.cli.options import add_json, check_overwrite
 from shearloop.daemon.cli.output import print_result
 from shearloop.daemon.errors import UserError
@@ -52,7 +52,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     solve.add_argument(
         "--mesh", type=Path, required=True, metavar="FILE", help="a mesh (.npz, EIDORS .mat) or a fingertip (.yaml)"
     )
-    solve.add_argument("--model", required=True, metavar="M", help=f"basis model: {MODELS}")
+    solve.add_argument("--model", required=True, metavar="M", help=f"basis model: {MODEL_NAMES}")
     solve.add_argument("--k", type=float, required=True, metavar="K", help="the model's first parameter")
     solve.add_argument("--sigma", type=float, required=True, metavar="S", help="the model's second parameter")
     solve.add_argument("--out", type=Path, required=True, metavar="V.npy", help="file for the 896 float64 voltages")
@@ -92,9 +92,11 @@ def _info(args: argparse.Namespace) -> int:
 
     from shearloop.bank.eit.bank_file import FORMAT_VERSION, Bank
     from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH
+    from shearloop.bank.eit.models import MODELS
 
     bank = Bank.open(args.path, verify=True)
-    grids = ("k", bank.k_grid, bank.k_unit), ("sigma", bank.sigma_grid, bank.sigma_unit)
+    model = MODELS[bank.model]
+    grids = ("k", bank.k_grid, model.k_unit), ("sigma", bank.sigma_grid, model.sigma_unit)
     facts: dict[str, object] = {
         "path": str(args.path),
         "format_version": FORMAT_VERSION,
@@ -138,8 +140,8 @@ def _plot(args: argparse.Namespace) -> int:
     from shearloop.daemon.bank_config import load_bank_plan
 
     drawn = {}
-    model, k, sigma = overrides(args)
-    plan = load_bank_plan(args.config, model=model, k=k, sigma=sigma) if args.config is not None else None
+    replaced = overrides(args)
+    plan = load_bank_plan(args.config, *replaced) if args.config is not None else None
     if args.path is not None:
         drawn["bank_signals"] = figures.signal_figure(figures.grid_of_bank(Bank.open(args.path)))
     elif plan is not None:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from shearloop.daemon.bank_config import BankPlan, GridConfig
 
 # As text: `--help` imports no large library.
-MODELS = "step, linear, cut_linear, gaussian_derivative or modulated_gaussian"
+MODEL_NAMES = "step, linear, cut_linear, gaussian_derivative or modulated_gaussian"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def add_overrides(parser: argparse.ArgumentParser) -> None:
     """Add the options that replace values of the configuration."""
-    parser.add_argument("--model", metavar="M", help=f"basis model ({MODELS}), in place of the configured one")
+    parser.add_argument("--model", metavar="M", help=f"basis model ({MODEL_NAMES}), in place of the configured one")
     parser.add_argument(
         "--k",
         metavar="LO:HI:N",
@@ -72,8 +72,7 @@ def _build(args: argparse.Namespace) -> int:
     jobs = len(os.sched_getaffinity(0)) if args.jobs is None else args.jobs
     if jobs < 1:
         raise UserError(f"--jobs must be 1 or more, not {jobs}")
-    model, k, sigma = overrides(args)
-    plans = load_bank_plans(args.config, model=model, k=k, sigma=sigma)
+    plans = load_bank_plans(args.config, *overrides(args))
     paths = _paths(args.out, list(plans))
     # In a folder the names are the banks' own, and an unusable bank is built again.
     if paths == [args.out]:

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 
@@ -62,7 +61,7 @@ def signal_figure(grid: SignalGrid) -> Figure:
     """
     model = MODELS[grid.model]
     rows, columns = len(grid.sigma), len(grid.k)
-    figure = _figure(1.35 * columns + 1.2, 0.85 * rows + 1.4)
+    figure = Figure(figsize=(1.35 * columns + 1.2, 0.85 * rows + 1.4), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, gridspec_kw={"wspace": 0.08, "hspace": 0.12})
     for row, s in enumerate(reversed(range(rows))):
         for column in range(columns):
@@ -92,24 +91,6 @@ def signal_figure(grid: SignalGrid) -> Figure:
     return figure
 
 
-class _Example(NamedTuple):
-    name: str
-    k: float
-    sigma: float
-
-
-def _examples(height: float) -> list[_Example]:
-    """Return parameters that show each model with a positive conductivity, for any height."""
-    return [
-        _Example("step", height / 2, height),
-        _Example("linear", height / 2, 1.1 * height),
-        _Example("cut_linear", 0.65 * height, 0.7 * height),
-        # Its steepest fall, e^(-1/2)/σ with σ in cm, limits σ.
-        _Example("gaussian_derivative", height / 2, max(0.9, 0.2 * height)),
-        _Example("modulated_gaussian", 3.0, 0.25 * height),
-    ]
-
-
 def models_figure(mesh: Mesh) -> Figure:
     """Draw basis function, conductivity and signal of the five models, as figure 4 of Trehan et al. 2025 does."""
     forward = ForwardModel(mesh)
@@ -117,19 +98,28 @@ def models_figure(mesh: Mesh) -> Figure:
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     y = np.linspace(low[1], high[1], 400)
     centre = float(low[1] + high[1]) / 2
-    examples = _examples(mesh.height_cm)
-    figure = _figure(13.5, 2.25 * len(examples) + 0.9)
+    height = mesh.height_cm
+    # k and σ that show each model with a positive conductivity, for any height.
+    examples = {
+        "step": (height / 2, height),
+        "linear": (height / 2, 1.1 * height),
+        "cut_linear": (0.65 * height, 0.7 * height),
+        # Its steepest fall, e^(-1/2)/σ with σ in cm, limits σ.
+        "gaussian_derivative": (height / 2, max(0.9, 0.2 * height)),
+        "modulated_gaussian": (3.0, 0.25 * height),
+    }
+    figure = Figure(figsize=(13.5, 2.25 * len(examples) + 0.9), layout="constrained")
     axes = figure.subplots(len(examples), 3, gridspec_kw={"width_ratios": [1.1, 1.5, 3]})
     norm = TwoSlopeNorm(1.0, 0.0, 2.0)
-    for (curve, plane, signal), example in zip(axes, examples, strict=True):
-        basis = MODELS[example.name]
-        values = conductivity(mesh, example.name, example.k, example.sigma)
-        curve.plot(basis.function(y, example.k, example.sigma, centre), y, color=_BLUE)
+    for (curve, plane, signal), (name, (k, sigma)) in zip(axes, examples.items(), strict=True):
+        basis = MODELS[name]
+        values = conductivity(mesh, name, k, sigma)
+        curve.plot(basis.function(y, k, sigma, centre), y, color=_BLUE)
         curve.axvline(0, color=_GREY, linewidth=0.6)
         curve.set(xlim=(-1.1, 1.1), ylim=(low[1], high[1]), ylabel="y (cm)")
-        parameters = [f"k = {example.k:.3g} {basis.k_unit}"]
+        parameters = [f"k = {k:.3g} {basis.k_unit}"]
         if basis.sigma_unit != "not used":
-            parameters.append(f"σ = {example.sigma:.3g} {basis.sigma_unit}")
+            parameters.append(f"σ = {sigma:.3g} {basis.sigma_unit}")
         curve.set_title(f"{basis.title}: {', '.join(parameters)}", fontsize=9, loc="left")
         drawn = plane.tripcolor(
             *mesh.nodes.T, mesh.triangles, facecolors=values, cmap="RdBu_r", norm=norm, rasterized=True
@@ -156,10 +146,3 @@ def save_figure(figure: Figure, directory: Path, name: str) -> list[Path]:
     for path in paths:
         figure.savefig(path, dpi=150)
     return paths
-
-
-def _figure(width: float, height: float) -> Figure:
-    """Return an empty figure, sizes in inches, without a window."""
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure

@@ -3,8 +3,7 @@
 import argparse
 import json
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -83,7 +82,7 @@ def _run(args: argparse.Namespace) -> int:
 
     settings = _settings(args)
     frames = frame_maker(args.bank, args.seed, sigma=args.sigma, calibration=args.calibration)
-    with _truth_file(args.truth) as file:
+    with nullcontext() if args.truth is None else _open_truth(args.truth) as file:
         rig = EmulatedRig(
             settings,
             frames,
@@ -155,17 +154,11 @@ def _obey(rig: "EmulatedRig", line: str) -> None:
         console.print_event("obeyed", detail=line)
 
 
-@contextmanager
-def _truth_file(path: Path | None) -> Iterator[TextIO | None]:
-    if path is None:
-        yield None
-        return
+def _open_truth(path: Path) -> TextIO:
     try:
-        file = path.open("a", buffering=1, encoding="utf-8")
+        return path.open("a", buffering=1, encoding="utf-8")
     except OSError as error:
         raise UserError(f"--truth {path} cannot be written ({error.strerror}); choose another file") from None
-    with file:
-        yield file
 
 
 def _write_truth(file: TextIO, truth: "Truth") -> None:

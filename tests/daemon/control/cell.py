@@ -14,7 +14,7 @@ from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_so
 from shearloop.daemon.control.settings import LoopConfig
 from shearloop.daemon.control.step_runner import ExperimentPhase, GripTo
 from shearloop.drivers.ur.client import UrRobot
-from shearloop.drivers.ur.messages import Command, CommandReply, Message, MoveLinear, RobotState, WristSpeed
+from shearloop.drivers.ur.messages import Command, CommandReply, MoveLinear, RobotState, WristSpeed
 from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, Flight
 
 SPEED_M_PER_S = 0.1
@@ -33,7 +33,7 @@ class Robot(UrRobot):
         self.brakes_for = 0
         self.flight.fly(5)
         self._held: list[tuple[Callable[[CommandReply], None], CommandReply]] = []
-        self._unread: list[tuple[int, Message]] = []
+        self._unread: list[RobotState] = []
         # For how many cycles there is no process yet.
         self.gone_for = 0
 
@@ -86,13 +86,14 @@ class Robot(UrRobot):
             arm.be(tcp_pose=(*arm.reading.tcp_pose[:2], z, *arm.reading.tcp_pose[3:]), moving_linearly=z != self.end_m)
         arm.be(t_mono_ns=self.flight.now_ns)
         self.flight.fly(1)
-        self._unread.append((0, self.flight.state))
+        self._unread.append(self.flight.state)
         if not read:
             return
         held, self._held = self._held, []
         for answered, reply in held:
             answered(reply)
-        self.handle_messages(self._unread)
+        for state in self._unread:
+            self.handle_message(0, state)
         self._unread.clear()
 
     @property

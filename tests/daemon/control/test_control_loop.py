@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, TareStep
 from shearloop.daemon.control.safety import FaultCode, Response
-from shearloop.daemon.control.step_runner import ExperimentPhase, GripTo, MoveTo, Tare
+from shearloop.daemon.control.step_runner import ExperimentPhase, GripTo
 from tests.daemon.control.loop_rig import EIT, GRIP, TICK_S, Rig, new_loop, phase, started
 
 
@@ -27,7 +27,7 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive: str) -> Non
     rig.run(200)
     assert rig.control_loop.experiment is not None
     assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
-    assert [type(action) for action in rig.begun] == [MoveTo, GripTo, Tare, GripTo]
+    assert [type(action) for action in rig.begun] == [ApproachStep, GripTo, TareStep, GripTo]
     held = np.array(rig.true_nm)[-round(15 / TICK_S) - 110 : -110]
     assert held.mean() == pytest.approx(0.1, abs=0.008)
     assert held.std() < 0.006

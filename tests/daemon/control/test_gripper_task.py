@@ -31,9 +31,7 @@ def task_of(rig: Rig, *, measures_diameters: bool = True) -> GripperTask:
 
 
 @WAYS
-async def test_a_grip_that_is_broken_off_in_the_middle_of_an_exchange_is_opened_all_the_same(
-    way: str, tmp_path: Path
-) -> None:
+async def test_cancelled_grip_can_be_released(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
         rig.object_mm = 40.0
         task = task_of(rig)
@@ -52,7 +50,7 @@ async def test_a_grip_that_is_broken_off_in_the_middle_of_an_exchange_is_opened_
 
 
 @WAYS
-async def test_a_grip_that_is_broken_off_is_halted_and_keeps_the_connection(way: str, tmp_path: Path) -> None:
+async def test_cancelled_grip_is_halted_and_stays_connected(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
         felt: list[GripperStatus] = []
         publisher: Any = Silent()
@@ -83,9 +81,7 @@ async def test_a_grip_that_is_broken_off_is_halted_and_keeps_the_connection(way:
 
 
 @WAYS
-async def test_fingers_whose_connection_is_lost_in_the_middle_of_a_grip_are_stopped_when_it_is_back(
-    way: str, tmp_path: Path
-) -> None:
+async def test_halt_stops_the_fingers_after_a_reconnection(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
         task = task_of(rig)
         read = tasks.create_task(task.read())
@@ -110,7 +106,7 @@ async def test_fingers_whose_connection_is_lost_in_the_middle_of_a_grip_are_stop
 
 
 @WAYS
-async def test_an_activation_that_is_broken_off_moves_the_fingers_no_further(way: str, tmp_path: Path) -> None:
+async def test_cancelled_activation_stops_the_fingers(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S):
         task = task_of(rig)
         await rig.driver.connect()
@@ -150,7 +146,7 @@ async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way: str, tm
 
 
 @WAYS
-async def test_a_fault_that_came_since_the_last_state_is_unlocked_too(way: str, tmp_path: Path) -> None:
+async def test_unlock_handles_a_fault_newer_than_the_state(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S):
         await rig.driver.connect()
         await rig.driver.activate()
@@ -160,7 +156,7 @@ async def test_a_fault_that_came_since_the_last_state_is_unlocked_too(way: str, 
         assert not (await rig.driver.read()).fault.needs_activation
 
 
-async def test_the_held_tool_has_a_diameter_while_it_is_held_and_the_gripper_speaks(tmp_path: Path) -> None:
+async def test_held_tool_has_a_diameter_while_states_are_new(tmp_path: Path) -> None:
     async with a_rig("socket", tmp_path) as rig, asyncio.timeout(DEADLINE_S):
         rig.object_mm = 40.0
         task = task_of(rig)
@@ -178,7 +174,7 @@ async def test_the_held_tool_has_a_diameter_while_it_is_held_and_the_gripper_spe
         assert task.held_tool((await rig.driver.read()).t_ns) is None
 
 
-async def test_a_gripper_that_stays_away_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_absent_gripper_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gripper_task, "TRIED_FOR_S", 0.2)
     async with a_rig("socket", tmp_path) as rig:
         assert "There is no connection to the gripper" in await task_of(rig).release()

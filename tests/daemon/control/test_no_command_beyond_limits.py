@@ -8,10 +8,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from shearloop.daemon.control.device_commands import along_tool
-from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, TorqueSample
 from shearloop.daemon.control.safety import Response
-from shearloop.daemon.control.step_runner import Action, ExperimentPhase, GripTo, MoveTo
+from shearloop.daemon.control.step_runner import Action, ExperimentPhase, GripTo
 from shearloop.drivers.emulators.scene import Twin, TwinSettings
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed
@@ -183,8 +183,8 @@ class WholeRig:
 
     def _begin(self, action: Action) -> None:
         self.action = (self.number + 30, action)
-        if isinstance(action, MoveTo):
-            pose = action.pose_m_rad or along_tool(self.arm.reading.tcp_pose, action.along_tool_m)
+        if isinstance(action, ApproachStep):
+            pose = action.pose_m_rad or along_tool(self.arm.reading.tcp_pose, action.along_tool_m or 0.0)
             self._ask(MoveLinear(pose, action.speed_m_per_s, 0.3))  # type: ignore[arg-type]
 
     def _finish(self, action: Action) -> None:

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 from shearloop.bank.eit.bank_file import BankDefinition
 from shearloop.bank.eit.build import RowSolver
 from shearloop.bank.eit.channels import smoothed_along_channels
-from shearloop.bank.eit.grouping import group_means
 from shearloop.bank.eit.matching import ReferenceMatcher, best_match
 from shearloop.bank.eit.mesh import Mesh, load_mesh
 from shearloop.daemon.analysis.reproduce.analysis import (
@@ -19,6 +18,7 @@ from shearloop.daemon.analysis.reproduce.analysis import (
     score_models,
 )
 from shearloop.daemon.analysis.reproduce.banks import GRIDS, Grid, cached_bank, focused_grid
+from shearloop.daemon.analysis.reproduce.grouping import group_means
 from shearloop.daemon.recording.matlab import DiameterSlices, TorqueSlices, read_torque_slices
 
 

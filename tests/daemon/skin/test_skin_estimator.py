@@ -192,8 +192,6 @@ def test_a_zero_under_a_small_load_is_stated_in_the_interval(calibration: SkinCa
 
 def test_a_zero_under_load_that_nothing_gave_away_is_told_when_the_load_goes(calibration: SkinCalibration) -> None:
     """The calibration's rest is that of this very load, so that the zero itself cannot be refused."""
-    from dataclasses import replace
-
     stretched = REST_OHM[0] * (1 + 0.088 * 0.8), REST_OHM[1]
     bench = Bench(replace(calibration, rest_ohm=stretched))
     bench.skin.normal_n = 1.0

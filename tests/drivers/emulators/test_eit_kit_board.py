@@ -64,7 +64,7 @@ async def test_it_says_nothing_before_it_is_started_and_is_silent_after_its_last
     ports: list[str] = []
     board = EitKitBoard([line, line], period_s=0.001, on_port=ports.append)
     async with running(board.run()):
-        with SerialPort(board.path) as port:
+        with SerialPort(board.port.path) as port:
             assert await port.read(0.05) is None
             await port.write(b"n")
             assert await port.read(0.05) is None
@@ -73,7 +73,7 @@ async def test_it_says_nothing_before_it_is_started_and_is_silent_after_its_last
             async with asyncio.timeout(20):
                 await board.finished.wait()
             assert await port.read(0.05) is None
-    assert ports == [board.path]
+    assert ports == [board.port.path]
     assert board.sent == 2
 
 
@@ -82,7 +82,7 @@ async def test_faults_can_be_switched_on_while_it_runs() -> None:
     board = EitKitBoard([line, line], period_s=0.001)
     board.inject(BoardFault(BoardFaultKind.NAN))
     async with running(board.run()):
-        with SerialPort(board.path) as port:
+        with SerialPort(board.port.path) as port:
             await port.write(b"y")
             broken, sound = (await two_lines(port)).splitlines(keepends=True)
     assert broken.count(b"nan") == 1

@@ -32,7 +32,7 @@ def framed(request: bytes) -> bytes:
     return request + crc16(request)
 
 
-def test_activation_opens_closes_and_opens_and_takes_as_long_as_that() -> None:
+def test_activation_opens_closes_and_opens_at_its_speed() -> None:
     gripper = Gripper()
     gripper.command.act = True
     travelled, extremes, t_s = 0.0, set(), 0.0
@@ -49,7 +49,7 @@ def test_activation_opens_closes_and_opens_and_takes_as_long_as_that() -> None:
 
 
 @pytest.mark.parametrize(("speed", "mm_s"), [(0, 30.0), (255, 250.0), (51, 74.0)])
-def test_the_fingers_move_at_the_speed_that_is_asked_for(speed: int, mm_s: float) -> None:
+def test_fingers_move_at_the_commanded_speed(speed: int, mm_s: float) -> None:
     gripper = active_gripper()
     go(gripper, 230, speed)
     steps(gripper, 0.2)
@@ -58,7 +58,7 @@ def test_the_fingers_move_at_the_speed_that_is_asked_for(speed: int, mm_s: float
 
 
 @given(st.floats(1, 139), st.integers(0, 255), st.floats(0.001, 0.2))
-def test_an_object_is_never_passed_through_however_coarse_the_steps(width: float, force: int, dt_s: float) -> None:
+def test_fingers_never_pass_through_an_object(width: float, force: int, dt_s: float) -> None:
     gripper = active_gripper()
     gripper.between = lambda force_n: width - 0.002 * force_n
     go(gripper, 255, force=force)
@@ -79,7 +79,7 @@ def test_closing_on_air_ends_at_the_fingers_own_stop_without_an_object() -> None
     assert gripper.grip_force_n == 0
 
 
-def test_opening_inside_something_is_a_contact_of_its_own() -> None:
+def test_opening_inside_an_object_is_a_contact() -> None:
     gripper = active_gripper()
     go(gripper, 230)
     steps(gripper, 1.0)
@@ -108,7 +108,7 @@ def test_moving_before_activation_is_fault_7_and_a_major_fault_waits_for_an_edge
     assert (gripper.flt, gripper.sta) == (0, 3)
 
 
-def test_an_automatic_release_opens_slowly_and_leaves_its_fault() -> None:
+def test_automatic_release_opens_slowly_and_leaves_its_fault() -> None:
     gripper = active_gripper()
     go(gripper, 230)
     steps(gripper, 1.0)
@@ -169,12 +169,12 @@ def test_modbus_requests_come_in_any_slices(widths: list[int]) -> None:
         ("0903 07D0 0000", "0983 02"),
     ],
 )
-def test_what_the_gripper_does_not_have_is_refused_in_its_words(request_hex: str, reply_hex: str) -> None:
+def test_invalid_modbus_requests_get_error_codes(request_hex: str, reply_hex: str) -> None:
     assert ModbusSlave(Gripper()).feed(framed(bytes.fromhex(request_hex)), 0.0) == framed(bytes.fromhex(reply_hex))
 
 
 @given(st.binary(max_size=600), st.integers(1, 50))
-def test_noise_on_the_line_is_survived_and_bounded(noise: bytes, width: int) -> None:
+def test_noise_on_the_line_does_no_harm(noise: bytes, width: int) -> None:
     face = ModbusSlave(Gripper())
     for start in range(0, len(noise), width):
         face.feed(noise[start : start + width], 0.0)
@@ -196,7 +196,7 @@ def test_the_socket_answers_as_the_urcap_does() -> None:
 
 
 @given(st.binary(max_size=2000), st.integers(1, 100))
-def test_a_client_that_talks_nonsense_gets_nothing_and_moves_nothing(noise: bytes, width: int) -> None:
+def test_invalid_input_gets_no_reply_and_moves_nothing(noise: bytes, width: int) -> None:
     gripper = active_gripper()
     face = UrcapSession(gripper)
     for start in range(0, len(noise), width):
@@ -206,7 +206,7 @@ def test_a_client_that_talks_nonsense_gets_nothing_and_moves_nothing(noise: byte
 
 
 @pytest.mark.parametrize("line", [b"SET POS 256\n", b"SET POS -1\n", b"SET POS\n", b"SET XYZ 1\n", b"SET\n", b"\n"])
-def test_a_wrong_set_is_not_acknowledged(line: bytes) -> None:
+def test_invalid_set_is_not_acknowledged(line: bytes) -> None:
     assert UrcapSession(active_gripper()).feed(line) == b""
 
 

@@ -28,6 +28,6 @@ def test_faults_are_carried_out_and_ended() -> None:
     ("line", "said"),
     [("fire", "there are protective-stop, emergency-stop"), ("silence long", "long"), ("silence", "nothing")],
 )
-def test_what_is_no_fault_is_told(line: str, said: str) -> None:
+def test_unknown_fault_is_refused(line: str, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         apply_fault(Controller(Robot()), line)

@@ -14,7 +14,7 @@ angles = st.floats(-math.pi, math.pi)
 joints = st.tuples(*[angles] * 6).map(np.array)
 
 
-def test_stretched_arm_is_where_the_dimensions_put_it() -> None:
+def test_stretched_arm_pose_follows_the_dimensions() -> None:
     x, y, z = pose_of(link_frames(np.zeros(6), 0.0)[-1])[:3]
     assert x == pytest.approx(-0.425 - 0.3922)
     assert y == pytest.approx(-0.1333 - 0.0996)

@@ -82,7 +82,7 @@ def test_without_a_watchdog_the_speed_outlives_its_client() -> None:
     assert robot.qd_rad_per_s[5] == pytest.approx(0.4)
 
 
-def test_watchdog_ends_the_motion_of_a_client_that_died() -> None:
+def test_watchdog_ends_the_motion_of_a_dead_client() -> None:
     robot = started()
     do(robot, control_script.SET_WATCHDOG, 10.0)
     turn(robot, 0.4)
@@ -96,7 +96,7 @@ def test_watchdog_ends_the_motion_of_a_client_that_died() -> None:
     assert not robot.program_running
 
 
-def test_watchdog_does_not_outlive_the_program_it_was_armed_in() -> None:
+def test_watchdog_ends_with_its_program() -> None:
     robot = started()
     do(robot, control_script.SET_WATCHDOG, 10.0)
     robot.upload()
@@ -126,7 +126,7 @@ def test_watchdog_ends_the_program_under_a_blocking_move() -> None:
     assert not robot.program_running
 
 
-def test_registers_outlive_the_program_and_a_new_one_obeys_them() -> None:
+def test_new_program_obeys_old_registers() -> None:
     robot = started()
     turn(robot, 0.4)
     wait(robot, 0.1)
@@ -216,7 +216,7 @@ def test_protective_stop_pauses_and_is_not_unlocked_at_once() -> None:
     assert not robot.qd_rad_per_s.any(), "unlocking must not resume"
 
 
-def test_emergency_stop_takes_power_which_comes_back_in_two_steps() -> None:
+def test_emergency_stop_cuts_power_that_returns_in_two_steps() -> None:
     robot = started(power_on_s=0.5)
     robot.emergency_stop()
     robot.power_on()
@@ -234,7 +234,7 @@ def test_emergency_stop_takes_power_which_comes_back_in_two_steps() -> None:
     assert robot.program_running
 
 
-def test_what_the_tool_feels_is_the_plants_torque_about_its_axis() -> None:
+def test_wrench_is_the_plants_torque_about_the_tool_axis() -> None:
     stiffness_nm_per_rad, damping = 2.0, 0.1
     robot = Robot(plant=lambda angle, speed, _dt_s: -stiffness_nm_per_rad * angle - damping * speed)
     robot.upload()
@@ -249,7 +249,7 @@ def test_what_the_tool_feels_is_the_plants_torque_about_its_axis() -> None:
     assert robot.wrench() == pytest.approx(np.zeros(6), abs=1e-9)
 
 
-def test_an_arm_in_fast_motion_leaves_the_controllers_time_alone() -> None:
+def test_fast_arm_motion_keeps_the_controllers_time() -> None:
     seen: list[float] = []
     robots = [Robot(plant=lambda angle, _speed, dt_s: seen.append(dt_s) or angle, pace=pace) for pace in (1.0, 20.0)]
     for robot in robots:
@@ -267,7 +267,7 @@ def test_an_arm_in_fast_motion_leaves_the_controllers_time_alone() -> None:
     assert fast.program_running
 
 
-def test_command_that_is_not_played_ends_the_program_loudly() -> None:
+def test_unknown_command_ends_the_program() -> None:
     robot = started()
     send(robot, 45)
     wait(robot, DT_S)

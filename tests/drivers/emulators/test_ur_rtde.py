@@ -125,7 +125,7 @@ def test_impossible_lengths_end_the_connection(size: int) -> None:
         session().receive(struct.pack(">HB", size, ord("V")))
 
 
-async def test_clock_goes_on_where_the_emulator_was_away(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_clock_runs_on_while_the_emulator_is_paused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its samples are of now; its time, and with it the watchdog, has not gone through what it missed."""
     robot, now_s, pauses_s = Robot(), 50.0, iter([0.002, 0.3, 0.002])
 

@@ -12,7 +12,7 @@ from tests.drivers.robotiq.gripper_rig import CALIBRATION, WAYS, a_rig
 
 
 @WAYS
-async def test_it_is_activated_moves_and_measures_what_it_grips(way: str, tmp_path: Path) -> None:
+async def test_gripper_activates_moves_and_measures_an_object(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig:
         driver = rig.driver
         first = await driver.connect()
@@ -52,7 +52,7 @@ async def test_it_is_activated_moves_and_measures_what_it_grips(way: str, tmp_pa
 
 
 @WAYS
-async def test_until_a_command_is_taken_up_the_old_contact_is_not_believed(way: str, tmp_path: Path) -> None:
+async def test_old_contact_is_ignored_until_the_command_is_taken_up(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig:
         await rig.driver.connect()
         await rig.driver.activate()
@@ -69,7 +69,7 @@ async def test_until_a_command_is_taken_up_the_old_contact_is_not_believed(way: 
 
 
 @WAYS
-async def test_a_halted_gripper_claims_no_object(way: str, tmp_path: Path) -> None:
+async def test_halted_gripper_reports_no_object(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig:
         await rig.driver.connect()
         await rig.driver.activate()
@@ -87,7 +87,7 @@ async def test_a_halted_gripper_claims_no_object(way: str, tmp_path: Path) -> No
 
 
 @WAYS
-async def test_a_major_fault_ends_only_by_the_operators_word(way: str, tmp_path: Path) -> None:
+async def test_major_fault_needs_the_operators_confirmation(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig:
         driver = rig.driver
         await driver.connect()
@@ -131,7 +131,7 @@ async def test_activating_an_active_gripper_moves_nothing(way: str, tmp_path: Pa
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-async def test_a_command_that_is_no_number_is_refused(bad: float) -> None:
+async def test_command_that_is_not_finite_is_refused(bad: float) -> None:
     driver = RobotiqGripper(SocketClient("127.0.0.1"), CALIBRATION)
     for command in (
         messages.GripperCommand(bad),
@@ -142,7 +142,7 @@ async def test_a_command_that_is_no_number_is_refused(bad: float) -> None:
             driver.clip(command)
 
 
-async def test_what_is_clipped_is_said_and_what_is_sent_is_returned() -> None:
+async def test_clipping_is_reported_and_the_sent_command_returned() -> None:
     driver = RobotiqGripper(SocketClient("127.0.0.1"), CALIBRATION)
     sent = driver.clip(messages.GripperCommand(500.0, speed_mm_s=1.0, force_n=1e9))
     assert (sent.request.position, sent.request.speed, sent.request.force) == (0, 0, 255)

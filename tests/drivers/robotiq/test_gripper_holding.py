@@ -32,7 +32,7 @@ async def holding(way: str, tmp_path: Path) -> AsyncIterator[tuple[Rig, AsyncIte
 
 @WAYS
 @pytest.mark.parametrize("asked", [{"gto": False}, {"pos": 250}], ids=["halted", "sent further"])
-async def test_what_another_master_asks_of_a_gripper_that_stands_is_seen_at_the_next_poll(
+async def test_command_of_another_master_is_seen_at_the_next_poll(
     way: str, tmp_path: Path, asked: dict[str, Any]
 ) -> None:
     """It holds as before, which is what position and object tell; but whether it does is no longer what we asked."""

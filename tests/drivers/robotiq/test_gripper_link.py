@@ -16,7 +16,7 @@ from tests.drivers.robotiq.gripper_rig import WAYS, a_rig
 
 
 @WAYS
-async def test_silence_is_a_loss_and_nothing_old_is_given_as_new(way: str, tmp_path: Path) -> None:
+async def test_silence_is_a_loss_and_clears_the_state(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig:
         await rig.driver.connect()
         assert rig.driver.latest is not None
@@ -34,7 +34,7 @@ async def test_silence_is_a_loss_and_nothing_old_is_given_as_new(way: str, tmp_p
         assert (await rig.driver.connect()).seq > 0
 
 
-async def test_a_cancellation_that_comes_with_an_answer_is_not_lost(
+async def test_cancellation_that_arrives_with_an_answer_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The task that reads the gripper went on for ever, and a daemon that was to end waited for it."""
@@ -62,7 +62,7 @@ async def test_a_cancellation_that_comes_with_an_answer_is_not_lost(
 
 
 @WAYS
-async def test_it_comes_back_by_itself_and_says_so(way: str, tmp_path: Path) -> None:
+async def test_lost_gripper_reconnects_and_reports_it(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
         first = await anext(states)
         assert rig.driver.latest == first
@@ -88,7 +88,7 @@ async def test_it_comes_back_by_itself_and_says_so(way: str, tmp_path: Path) -> 
 
 
 @WAYS
-async def test_a_loss_that_a_command_meets_is_told_as_well(way: str, tmp_path: Path) -> None:
+async def test_loss_during_a_command_is_reported(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
         await anext(states)
         await rig.driver.activate()
@@ -119,7 +119,7 @@ async def test_states_are_polled_while_a_command_runs(way: str, tmp_path: Path) 
 
 
 @WAYS
-async def test_a_call_that_is_cancelled_does_not_leave_its_answer_to_the_next(way: str, tmp_path: Path) -> None:
+async def test_cancelled_call_leaves_no_stale_answer(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig:
         await rig.driver.connect()
         rig.silence(True)
@@ -135,14 +135,14 @@ async def test_a_call_that_is_cancelled_does_not_leave_its_answer_to_the_next(wa
 
 
 @WAYS
-async def test_nobody_there_is_said_in_a_sentence(way: str, tmp_path: Path) -> None:
+async def test_absent_gripper_is_explained(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig:
         await rig.server.disconnect()
         with pytest.raises(DeviceNotFoundError, match="There is no"):
             await rig.driver.connect()
 
 
-async def test_a_gripper_without_power_is_not_read_as_zero(tmp_path: Path) -> None:
+async def test_gripper_without_power_is_not_read_as_zero(tmp_path: Path) -> None:
     async with a_rig("socket", tmp_path) as rig:
         await rig.driver.connect()
         assert isinstance(rig.server, UrcapServer)
@@ -151,7 +151,7 @@ async def test_a_gripper_without_power_is_not_read_as_zero(tmp_path: Path) -> No
             await rig.driver.read()
 
 
-async def test_a_damaged_modbus_reply_is_not_believed(tmp_path: Path) -> None:
+async def test_damaged_modbus_reply_is_rejected(tmp_path: Path) -> None:
     async with a_rig("modbus", tmp_path) as rig:
         await rig.driver.connect()
         assert isinstance(rig.server, ModbusServer)
@@ -161,7 +161,7 @@ async def test_a_damaged_modbus_reply_is_not_believed(tmp_path: Path) -> None:
         await rig.driver.connect()
 
 
-async def test_the_gripper_notices_a_master_that_was_silent(tmp_path: Path) -> None:
+async def test_gripper_reports_a_silent_master(tmp_path: Path) -> None:
     async with a_rig("modbus", tmp_path) as rig:
         await rig.driver.connect()
         rig.stopped = True

@@ -77,7 +77,7 @@ def test_socket_replies_come_in_any_slices(replies: list[str | tuple[str, int]],
             assert value_of(reply[0], text) == reply[1]
 
 
-def test_a_line_end_after_an_acknowledgement_is_forgiven() -> None:
+def test_line_end_after_ack_is_ignored() -> None:
     parser = ReplyParser()
     parser.feed(b"ack\n")
     assert parser.take_ack()
@@ -87,7 +87,7 @@ def test_a_line_end_after_an_acknowledgement_is_forgiven() -> None:
 
 
 @given(st.binary(min_size=1, max_size=80))
-def test_whatever_a_stranger_answers_is_refused_or_waited_for(answer: bytes) -> None:
+def test_foreign_answer_is_refused_or_awaited(answer: bytes) -> None:
     for take in (ReplyParser.take_ack, lambda parser: parser.take_value("POS")):
         parser = ReplyParser()
         try:
@@ -98,7 +98,7 @@ def test_whatever_a_stranger_answers_is_refused_or_waited_for(answer: bytes) -> 
         assert taken in (False, None) or answer.lstrip().startswith((b"ack", b"POS "))
 
 
-def test_answers_to_another_question_are_refused() -> None:
+def test_answers_to_another_request_are_refused() -> None:
     parser = ReplyParser()
     parser.feed(b"OBJ 3\n")
     with pytest.raises(ProtocolError, match="asked for POS"):
@@ -109,7 +109,7 @@ def test_answers_to_another_question_are_refused() -> None:
 
 
 @pytest.mark.parametrize("text", ["256", "-1", "1.5", "", "²", "0x10"])
-def test_a_value_that_is_no_byte_is_refused(text: str) -> None:
+def test_value_that_is_not_a_byte_is_refused(text: str) -> None:
     with pytest.raises(ProtocolError, match="POS"):
         value_of("POS", text)
 
@@ -138,7 +138,7 @@ def test_every_fault_code_has_a_name_a_sentence_and_its_cure() -> None:
 
 
 @given(st.floats(0, 20), st.floats(200, 255), st.floats(-20, 140))
-def test_a_width_becomes_counts_and_comes_back_within_half_a_count(opened: float, closed: float, width: float) -> None:
+def test_width_round_trips_within_half_a_count(opened: float, closed: float, width: float) -> None:
     calibration = WidthCalibration(open_counts=opened, open_mm=140.0, closed_counts=closed, std_mm=0.5)
     counts = calibration.counts(width)
     step = abs(calibration.mm_per_count)
@@ -179,7 +179,7 @@ def test_gauges_that_make_no_line_are_refused(gauges: list[tuple[float, float]],
         WidthCalibration.of_gauges(gauges)
 
 
-def test_what_pymodbus_has_to_say_does_not_come_between_our_lines() -> None:
+def test_pymodbus_logs_nothing() -> None:
     said = "import shearloop.drivers.robotiq.modbus_client; from pymodbus.logging import Log; Log.error('received pdu')"
     # Where pytest listens to every logger, nobody would print it anyway.
     done = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, check=True)

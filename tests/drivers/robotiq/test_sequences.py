@@ -71,9 +71,7 @@ async def test_activation_that_hangs_or_fails_is_reported(readouts: tuple[messag
 
 
 @given(st.sampled_from([status for status in messages.ObjectStatus if status >= 0]), st.integers(0, 255), st.booleans())
-def test_what_the_fingers_met_is_believed_only_for_the_target_that_was_asked_for(
-    obj: messages.ObjectStatus, pre: int, gto: bool
-) -> None:
+def test_object_status_counts_only_for_the_last_target(obj: messages.ObjectStatus, pre: int, gto: bool) -> None:
     readout = replace(ACTIVE, obj=obj, pre=pre, gto=gto)
     believed = object_status(readout, GO)
     assert believed is (obj if gto and pre == GO.position else messages.ObjectStatus.MOVING)
@@ -83,7 +81,7 @@ def test_what_the_fingers_met_is_believed_only_for_the_target_that_was_asked_for
 @pytest.mark.parametrize(
     "sta", [one for one in messages.ActivationStatus if one is not messages.ActivationStatus.ACTIVE]
 )
-def test_a_gripper_that_is_not_active_holds_nothing(sta: messages.ActivationStatus) -> None:
+def test_inactive_gripper_holds_nothing(sta: messages.ActivationStatus) -> None:
     """As after its supply was away for a moment: the fingers stand where they stood, and press on nothing."""
     held = replace(ACTIVE, obj=messages.ObjectStatus.CONTACT_CLOSING, pre=GO.position, gto=True)
     for last in (GO, None):
@@ -92,7 +90,7 @@ def test_a_gripper_that_is_not_active_holds_nothing(sta: messages.ActivationStat
 
 
 @pytest.mark.parametrize("obj", [messages.ObjectStatus.CONTACT_CLOSING, messages.ObjectStatus.AT_TARGET])
-async def test_a_motion_ends_at_its_target_or_on_an_object_and_not_before(obj: messages.ObjectStatus) -> None:
+async def test_motion_ends_at_its_target_or_on_an_object(obj: messages.ObjectStatus) -> None:
     client = Client(ACTIVE)
     gripper = client.gripper
     sent = await gripper.move(messages.GripperCommand(50.0))
@@ -112,7 +110,7 @@ async def test_a_motion_ends_at_its_target_or_on_an_object_and_not_before(obj: m
         (ACTIVATING, "still activating"),
     ],
 )
-async def test_a_motion_that_will_never_end_is_reported(readout: messages.Readout, failure: str) -> None:
+async def test_motion_without_an_end_is_reported(readout: messages.Readout, failure: str) -> None:
     client = Client(ACTIVE)
     gripper = client.gripper
     sent = await gripper.move(messages.GripperCommand(50.0))

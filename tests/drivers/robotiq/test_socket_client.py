@@ -60,7 +60,7 @@ async def connected(peer: Peer, deadline_s: float = 20.0) -> AsyncIterator[Socke
             await asyncio.gather(*peer.serving)
 
 
-async def test_what_is_asked_is_answered_in_order() -> None:
+async def test_requests_are_answered_in_order() -> None:
     peer = Peer(usual)
     async with connected(peer) as client:
         assert (await client.read()).pos == 100
@@ -80,7 +80,7 @@ async def test_what_is_asked_is_answered_in_order() -> None:
         (lambda line: usual(line) * 2, ProtocolError, "without a request"),
     ],
 )
-async def test_an_answer_that_is_none_ends_the_connection(
+async def test_invalid_answer_ends_the_connection(
     answer: Callable[[str], bytes | None], error: type[Exception], says: str
 ) -> None:
     async with connected(Peer(answer)) as client:
@@ -91,7 +91,7 @@ async def test_an_answer_that_is_none_ends_the_connection(
         await client.connect()
 
 
-async def test_bytes_that_nobody_asked_for_are_no_answer_to_what_is_asked_next() -> None:
+async def test_unrequested_bytes_are_not_taken_as_an_answer() -> None:
     peer = Peer(usual)
     async with connected(peer) as client:
         peer.unasked = b"ack"
@@ -100,7 +100,7 @@ async def test_bytes_that_nobody_asked_for_are_no_answer_to_what_is_asked_next()
             await client.read()
 
 
-async def test_a_question_that_was_given_up_leaves_no_answer_behind() -> None:
+async def test_cancelled_request_leaves_no_answer_behind() -> None:
     async with connected(Peer(lambda _: b"")) as client:
         asking = asyncio.create_task(client.read())
         await asyncio.sleep(0)
@@ -111,13 +111,13 @@ async def test_a_question_that_was_given_up_leaves_no_answer_behind() -> None:
             await client.read()
 
 
-async def test_the_answer_that_is_late_is_named() -> None:
+async def test_late_answer_is_named() -> None:
     async with connected(Peer(lambda line: usual(line) if "ACT" in line else b""), deadline_s=0.05) as client:
         with pytest.raises(DeviceLostError, match=r"'GET STA' within 0\.05 s"):
             await client.read()
 
 
-async def test_an_answer_that_comes_with_the_deadline_is_an_answer() -> None:
+async def test_answer_at_the_deadline_counts() -> None:
     """After a pause of this process the answer and the timer are due together."""
     client, reader, now_s = SocketClient("127.0.0.1"), asyncio.StreamReader(), asyncio.get_running_loop().time()
     receiving = asyncio.create_task(client._receive(reader, b"GET ACT\n", now_s + 0.01))

@@ -78,7 +78,7 @@ def test_replies_come_through_whatever_ends_their_lines(replies: list[str], cuts
     for end in (b"\n", b"\r", b"\r\n", b"\n\r"):
         lines = ReplyLines()
         data = b"".join(reply.encode() + end for reply in replies)
-        assert [text for part in slices(data, cuts) for text in lines.feed(part)] == [r.strip() for r in replies]
+        assert [text for part in slices(data, cuts) for text in lines.replies(part)] == [r.strip() for r in replies]
         assert not lines.errors
 
 
@@ -86,16 +86,16 @@ def test_replies_come_through_whatever_ends_their_lines(replies: list[str], cuts
 def test_no_bytes_break_the_reply_lines(noise: bytes, cuts: list[int]) -> None:
     lines = ReplyLines()
     for part in slices(noise, cuts):
-        lines.feed(part)
-    lines.feed(b"\n")
-    assert lines.feed(b"1\n") == ["1"]
+        lines.replies(part)
+    lines.replies(b"\n")
+    assert lines.replies(b"1\n") == ["1"]
 
 
 def test_a_flood_without_an_end_is_counted_once_and_forgotten() -> None:
     lines = ReplyLines()
     for _ in range(10):
-        assert lines.feed(b"7" * 300) == []
-    assert lines.feed(b"\n\xff\n0\n") == ["0"]
+        assert lines.replies(b"7" * 300) == []
+    assert lines.replies(b"\n\xff\n0\n") == ["0"]
     assert lines.errors == {"too long": 1, "not ASCII": 1}
 
 

@@ -55,7 +55,7 @@ def arm(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     del sys.modules["shearloop.drivers.ur.arm"]
 
 
-def test_sample_that_has_waited_in_the_socket_is_read_as_old(arm: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sample_that_waited_in_the_socket_is_old(arm: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     reader, now_ns = arm.UrArm(SETTINGS, VERSION), 10**12
     monkeypatch.setattr(arm.time, "monotonic_ns", lambda: now_ns)
     monkeypatch.setattr(reader, "_control", SimpleNamespace(isConnected=lambda: True))
@@ -67,7 +67,7 @@ def test_sample_that_has_waited_in_the_socket_is_read_as_old(arm: ModuleType, mo
         assert reader.read().age_ns == pytest.approx(waited_ns, abs=3_000_000)
 
 
-def test_kernel_that_does_not_let_threads_be_woken_late_does_not_prevent_connecting(
+def test_refused_timer_slack_does_not_prevent_connecting(
     arm: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: SimpleNamespace(prctl=lambda *_: -1))
@@ -76,7 +76,7 @@ def test_kernel_that_does_not_let_threads_be_woken_late_does_not_prevent_connect
 
 
 @pytest.mark.parametrize(("watchdog_hz", "slack_ms"), [(2.0, 16), (10.0, 16), (40.0, 4)])
-def test_threads_of_the_client_are_woken_late_but_not_for_long_of_the_watchdogs_patience(
+def test_timer_slack_is_a_fraction_of_the_watchdog_time(
     arm: ModuleType, monkeypatch: pytest.MonkeyPatch, watchdog_hz: float, slack_ms: int
 ) -> None:
     asked: list[int] = []
@@ -110,9 +110,7 @@ class Controlled(Client):
         return SimpleNamespace(isAsyncOperationRunning=lambda: True)
 
 
-def test_a_straight_move_is_asked_after_from_its_beginning_until_the_wrist_is_turned(
-    arm: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_progress_is_queried_only_for_a_linear_move(arm: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Controlled)
     times_s = iter(range(1, 100))
     monkeypatch.setattr(
@@ -151,9 +149,7 @@ class Hanging(Client):
         return not self.knows_of_the_end
 
 
-def test_nothing_is_asked_of_the_client_for_which_it_would_wait_in_vain(
-    arm: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_call_blocks_when_no_program_runs(arm: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     """The robot's watchdog has ended the program after a command was done, before it was ready for another."""
     monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Hanging)
     one = arm.UrArm(SETTINGS, VERSION)
@@ -182,9 +178,7 @@ def test_register_is_cleared_once_the_client_knows_that_no_program_runs(
     assert one._control.calls == ["kickWatchdog"]
 
 
-def test_connection_that_the_client_has_made_anew_is_a_lost_one(
-    arm: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_silently_reopened_connection_is_lost(arm: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     """It says nothing of it; on the descriptor of the one before there is another."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = server.getsockname()
@@ -213,7 +207,7 @@ def test_connection_that_the_client_has_made_anew_is_a_lost_one(
             assert not one.read().connected
 
 
-def test_script_that_is_sent_arms_its_watchdog_by_itself(arm: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sent_script_arms_its_watchdog(arm: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     class Sending(Client):
         sent = ""
 
@@ -235,7 +229,7 @@ def test_script_that_is_sent_arms_its_watchdog_by_itself(arm: ModuleType, monkey
     assert other._control.sent == "its own"
 
 
-def test_connection_on_which_no_script_can_be_sent_is_a_lost_one(
+def test_connection_that_takes_no_script_is_lost(
     arm: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Only another process opens it again; the one that met it died of it, and told its traceback."""

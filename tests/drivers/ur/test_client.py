@@ -34,7 +34,7 @@ def stopped_after_s(event: dict[str, int], since_ns: int) -> float:
     return (event["t_mono_ns"] - since_ns) / 1e9
 
 
-async def test_states_arrive_and_commands_are_answered_with_what_is_sent(controller: ControllerProcess) -> None:
+async def test_states_arrive_and_replies_hold_the_sent_command(controller: ControllerProcess) -> None:
     async with running(settings_for(controller.host)) as robot:
         assert "not connected" in (await robot.send(Enable())).refusal
         await until(robot, lambda state: state.program_running and not state.recovering)
@@ -65,7 +65,7 @@ async def test_states_arrive_and_commands_are_answered_with_what_is_sent(control
         assert state.tcp_pose[2] == pytest.approx(z - 0.02, abs=1e-5)
 
 
-async def test_a_linear_move_is_stopped_and_another_goes_on_from_there(controller: ControllerProcess) -> None:
+async def test_linear_move_is_stopped_and_repeated(controller: ControllerProcess) -> None:
     async with running(settings_for(controller.host)) as robot:
         await enable(robot)
         x, y, z, *turned = (await robot.next_state()).tcp_pose
@@ -115,7 +115,7 @@ async def test_twist_stops_when_the_client_is_killed(controller: ControllerProce
         await turn(robot, controller)
 
 
-async def test_data_that_stall_for_a_moment_end_the_motion(controller: ControllerProcess) -> None:
+async def test_stalled_samples_end_the_motion(controller: ControllerProcess) -> None:
     """Longer than data are believed, and back before the robot's watchdog has noticed: the program must not turn on."""
     async with running(settings_for(controller.host)) as robot:
         await enable(robot)
@@ -132,7 +132,7 @@ async def test_data_that_stall_for_a_moment_end_the_motion(controller: Controlle
         await turn(robot, controller)
 
 
-async def test_protective_stop_is_told_and_unlocked_in_the_same_process(controller: ControllerProcess) -> None:
+async def test_protective_stop_is_reported_and_unlocked_by_the_same_worker(controller: ControllerProcess) -> None:
     async with running(settings_for(controller.host)) as robot:
         await enable(robot)
         await turn(robot, controller)
@@ -151,7 +151,7 @@ async def test_protective_stop_is_told_and_unlocked_in_the_same_process(controll
         assert robot.pid == pid
 
 
-async def test_emergency_stop_is_told_and_recovered_from(controller: ControllerProcess) -> None:
+async def test_emergency_stop_is_reported_and_recovered_from(controller: ControllerProcess) -> None:
     async with running(settings_for(controller.host)) as robot:
         await enable(robot)
         await turn(robot, controller)
@@ -166,7 +166,7 @@ async def test_emergency_stop_is_told_and_recovered_from(controller: ControllerP
         await turn(robot, controller)
 
 
-async def test_lost_rtde_ends_the_process_and_the_next_one_moves_nothing(controller: ControllerProcess) -> None:
+async def test_lost_rtde_ends_the_worker_and_the_next_moves_nothing(controller: ControllerProcess) -> None:
     link = Link()
     async with running(settings_for(controller.host), link) as robot:
         await enable(robot)
@@ -193,7 +193,7 @@ async def test_crash_of_the_client_is_named(controller: ControllerProcess) -> No
         assert "motion disabled" in loss.sentence
 
 
-async def test_process_that_hangs_is_ended_and_started_again(controller: ControllerProcess) -> None:
+async def test_hung_worker_is_replaced(controller: ControllerProcess) -> None:
     link = Link()
     async with running(settings_for(controller.host, hang_timeout_s=0.3), link) as robot:
         await enable(robot)
@@ -210,7 +210,7 @@ async def test_process_that_hangs_is_ended_and_started_again(controller: Control
         assert not controller.happened("motion-started", hung_ns)
 
 
-async def test_controller_that_falls_silent_is_told_and_the_robot_stops(controller: ControllerProcess) -> None:
+async def test_silent_controller_is_reported_and_the_robot_stops(controller: ControllerProcess) -> None:
     link = Link()
     async with running(settings_for(controller.host, connect_timeout_s=1.5), link) as robot:
         await enable(robot)
@@ -287,7 +287,7 @@ asyncio.run(main())
 """
 
 
-async def test_daemon_killed_in_the_middle_of_a_twist_leaves_a_robot_at_rest_and_no_process(
+async def test_killed_daemon_leaves_a_resting_robot_and_no_process(
     controller: ControllerProcess,
 ) -> None:
     daemon = await asyncio.create_subprocess_exec(

@@ -27,7 +27,7 @@ async def test_absent_controller_is_explained() -> None:
         assert "refused" in loss.sentence
 
 
-async def test_without_ur_rtde_the_user_is_told_which_python(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_missing_ur_rtde_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
     with pytest.raises(DriverError, match=r"none for 3\.13"):
         await UrRobot(settings_for("127.0.0.254")).run()
@@ -47,7 +47,7 @@ def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Non
     return write
 
 
-async def test_last_words_of_a_process_that_its_own_alarm_ended_are_told(play: Callable[[str], None]) -> None:
+async def test_error_output_of_a_worker_ended_by_its_alarm_is_quoted(play: Callable[[str], None]) -> None:
     play("echo 'waiting for the dashboard' >&2; kill -ALRM $$")
     link = Link()
     async with running(settings_for("127.0.0.254"), link):
@@ -56,7 +56,7 @@ async def test_last_words_of_a_process_that_its_own_alarm_ended_are_told(play: C
     assert loss.sentence.endswith("Its last words: waiting for the dashboard.")
 
 
-async def test_long_line_of_a_process_is_heard_and_told_in_short(play: Callable[[str], None]) -> None:
+async def test_long_error_output_is_shortened(play: Callable[[str], None]) -> None:
     play("head -c 300000 /dev/zero | tr '\\0' x >&2; echo >&2; echo 'no memory' >&2; exit 3")
     link = Link()
     async with running(settings_for("127.0.0.254"), link):
@@ -101,7 +101,7 @@ with open(sys.argv[1], "a") as told:
 """
 
 
-async def test_process_is_ended_in_good_order_though_who_waits_for_a_reply_dies_of_it(
+async def test_failing_reply_callback_does_not_prevent_disconnecting(
     play: Callable[[str], None], tmp_path: Path
 ) -> None:
     told = tmp_path / "told"
@@ -126,7 +126,7 @@ async def test_process_is_ended_in_good_order_though_who_waits_for_a_reply_dies_
 
 # In the first cycle the register is cleared, in the second the program is sent.
 @pytest.mark.parametrize(("cycles", "may_stop"), [(0, "False"), (1, "True"), (5, "True")])
-async def test_process_after_one_that_has_begun_a_program_may_stop_what_that_left_running(
+async def test_next_worker_may_stop_the_program_left_behind(
     play: Callable[[str], None], tmp_path: Path, cycles: int, may_stop: str
 ) -> None:
     told = tmp_path / "told"
@@ -147,7 +147,7 @@ def lost_after(*readings: dict[str, int], flight: Flight) -> UrRobot:
     for reading in readings:
         flight.arm.be(**reading)
         flight.fly(1)
-        robot.handle_messages([(0, flight.state)])
+        robot.handle_message(0, flight.state)
     robot._disconnect()
     return robot
 
@@ -155,14 +155,14 @@ def lost_after(*readings: dict[str, int], flight: Flight) -> UrRobot:
 @pytest.mark.parametrize("cycles", [1, 500], ids=["just connected", "for long"])
 @pytest.mark.parametrize("last", [{}, STALE, PAUSED], ids=["playing", "silent", "paused"])
 @pytest.mark.parametrize("first", [{"runtime_state": 2}, PAUSED], ids=["played", "was paused"])
-async def test_program_that_was_there_before_us_is_not_taken_for_one_left_behind(
+async def test_earlier_program_does_not_count_as_left_behind(
     first: dict[str, int], last: dict[str, int], cycles: int
 ) -> None:
     assert not lost_after(*[first] * cycles, last, flight=Flight()).takes_over
 
 
 @pytest.mark.parametrize("last", [{}, STALE, PAUSED], ids=["playing", "silent", "paused"])
-async def test_program_that_was_started_here_is_taken_for_one_left_behind(last: dict[str, int]) -> None:
+async def test_our_program_counts_as_left_behind(last: dict[str, int]) -> None:
     flight = flying()
     flight.arm.stoppable = False
     assert lost_after({}, *[last] * 5, flight=flight).takes_over
@@ -173,32 +173,32 @@ async def test_program_that_was_started_here_is_taken_for_one_left_behind(last: 
     assert lost_after(*[{}] * 5, flight=after).takes_over
 
 
-async def test_program_that_is_begun_after_ours_has_ended_is_not_taken_for_one_left_behind() -> None:
+async def test_program_started_after_ours_ended_is_foreign() -> None:
     flight = flying()
     flight.arm.end_program()
     assert not lost_after({}, PAUSED, flight=flight).takes_over
 
 
-async def test_stops_in_vain_are_counted_across_processes() -> None:
+async def test_failed_stops_are_counted_across_workers() -> None:
     robot = UrRobot(SETTINGS)
     for counts in ((0, 1, 1, 2), (0, 3)):
         for count in counts:
-            robot.handle_messages([(0, replace(Flight().state, failed_program_stops=count))])
+            robot.handle_message(0, replace(Flight().state, failed_program_stops=count))
         robot._disconnect()
     assert robot.failed_program_stops == 5
 
 
-async def test_loss_that_nobody_retrieves_is_no_complaint_of_asyncio() -> None:
+async def test_unretrieved_loss_causes_no_asyncio_complaint() -> None:
     complaints: list[dict[str, Any]] = []
     asyncio.get_running_loop().set_exception_handler(lambda _loop, context: complaints.append(context))
-    connection = WorkerConnection(SETTINGS, UrRobot(SETTINGS).handle_messages)
+    connection = WorkerConnection(SETTINGS, UrRobot(SETTINGS).handle_message)
     connection.pipe_data_received(1, encode(Failed("lost", "The connection is lost.")))
     del connection
     gc.collect()
     assert complaints == []
 
 
-async def test_process_that_ends_by_itself_as_the_daemon_stops_is_waited_for(
+async def test_worker_that_ends_during_shutdown_is_awaited(
     play: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     play("exit 1")
@@ -221,7 +221,7 @@ async def test_process_that_ends_by_itself_as_the_daemon_stops_is_waited_for(
     assert len(ended) == 1
 
 
-async def test_a_process_that_is_lost_while_the_daemon_ends_is_not_started_again(
+async def test_worker_lost_during_shutdown_is_not_restarted(
     play: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Task groups tell of the loss alone, and the daemon waited for ever for a robot that it had told to end."""

@@ -28,7 +28,7 @@ def test_nothing_moves_before_it_is_enabled() -> None:
     assert {"wrist", "move"}.isdisjoint(flight.arm.calls)
 
 
-def test_what_was_sent_after_clipping_is_returned_and_reported() -> None:
+def test_clipped_command_is_returned_and_reported() -> None:
     flight = flying()
     reply = flight.ask(WristSpeed(3.0, 2.0))
     assert reply.sent == WristSpeed(0.8, 2.0)
@@ -40,7 +40,7 @@ def test_what_was_sent_after_clipping_is_returned_and_reported() -> None:
 @pytest.mark.parametrize(
     "command", [WristSpeed(0.1, 0.0), MoveLinear(POSE, 0.0, 0.1), MoveLinear(POSE, 0.1, -1.0), Stop(0.0)]
 )
-def test_senseless_numbers_are_refused_in_a_sentence(command: Command) -> None:
+def test_invalid_numbers_are_refused(command: Command) -> None:
     flight = flying()
     assert "above 0" in flight.ask(command).refusal
     assert not flight.arm.calls
@@ -61,7 +61,7 @@ def test_no_zero_hides_a_force_beyond_its_limit() -> None:
     assert "zero_wrench" not in flight.arm.calls
 
 
-def test_reading_is_part_of_the_state() -> None:
+def test_sample_is_part_of_the_state() -> None:
     flight = flying()
     for field in dataclasses.fields(RtdeSample):
         assert getattr(flight.state, field.name) == getattr(flight.arm.reading, field.name)

@@ -7,7 +7,7 @@ from tests.drivers.ur.flight import POSE, SETTINGS, Flight, flying, turning
 
 
 @pytest.mark.parametrize("command", [WristSpeed(0.1, 1.0), Stop(4.0)])
-def test_robot_that_does_not_take_a_command_is_left_to_its_watchdog(command: WristSpeed | Stop) -> None:
+def test_robot_that_rejects_a_command_is_left_to_its_watchdog(command: WristSpeed | Stop) -> None:
     flight = turning()
     flight.arm.takes = False
     assert "does not answer" in flight.ask(command).refusal
@@ -32,7 +32,7 @@ def test_linear_move_that_does_not_stop_is_left_to_the_watchdog() -> None:
     assert not flight.arm.reading.program_running
 
 
-def test_linear_move_that_does_not_take_its_stop_is_left_to_the_watchdog() -> None:
+def test_linear_move_that_rejects_its_stop_is_left_to_the_watchdog() -> None:
     flight = flying()
     flight.ask(MoveLinear(POSE, 0.1, 0.5))
     flight.fly(3)
@@ -43,7 +43,7 @@ def test_linear_move_that_does_not_take_its_stop_is_left_to_the_watchdog() -> No
     assert "silent" in flight.state.end_reason
 
 
-def test_arm_that_moves_unasked_is_left_to_the_watchdog() -> None:
+def test_arm_that_moves_without_a_command_is_left_to_the_watchdog() -> None:
     flight = flying()
     flight.arm.target = 0.1
     flight.fly(20)
@@ -55,7 +55,7 @@ def test_arm_that_moves_unasked_is_left_to_the_watchdog() -> None:
     assert "unlock" in flight.ask(WristSpeed(0.1, 1.0)).refusal.lower()
 
 
-def test_program_that_someone_resumes_is_not_kept_going() -> None:
+def test_resumed_program_gets_no_heartbeats() -> None:
     flight = turning()
     # Resumed before it could be stopped.
     flight.arm.protective_stop()
@@ -72,7 +72,7 @@ def test_program_that_someone_resumes_is_not_kept_going() -> None:
     assert flight.ask(Unlock()).accepted
 
 
-def test_program_that_somebody_else_runs_is_not_stopped_before_the_operator_says_so() -> None:
+def test_foreign_program_is_stopped_only_on_unlock() -> None:
     flight = Flight()
     flight.arm.be(runtime_state=2)
     flight.fly(500)
@@ -83,7 +83,7 @@ def test_program_that_somebody_else_runs_is_not_stopped_before_the_operator_says
 
 
 @pytest.mark.parametrize("takes_over", [False, True], ids=["daemon", "process"])
-def test_program_of_who_died_before_us_is_outlived(takes_over: bool) -> None:
+def test_program_left_behind_ends_before_ours_starts(takes_over: bool) -> None:
     flight = Flight(takes_over=takes_over)
     flight.arm.be(runtime_state=2)
     flight.fly(60)
@@ -93,7 +93,7 @@ def test_program_of_who_died_before_us_is_outlived(takes_over: bool) -> None:
     assert flight.ask(Enable()).accepted
 
 
-def test_program_that_was_begun_after_the_loss_of_ours_is_not_stopped_before_the_operator_says_so() -> None:
+def test_program_started_after_a_loss_is_stopped_only_on_unlock() -> None:
     """Left behind by a process, ours would have ended by its watchdog before the next one was there."""
     flight = Flight(takes_over=True)
     flight.arm.be(runtime_state=2)
@@ -106,7 +106,7 @@ def test_program_that_was_begun_after_the_loss_of_ours_is_not_stopped_before_the
     assert flight.ask(Unlock()).accepted
 
 
-def test_program_that_was_not_started_here_is_sent_nothing() -> None:
+def test_foreign_program_gets_no_commands() -> None:
     flight = Flight()
     flight.arm.be(safety_mode=3)
     flight.fly(5)
@@ -118,7 +118,7 @@ def test_program_that_was_not_started_here_is_sent_nothing() -> None:
     assert flight.arm.calls[:4] == ["close_popups", "stop_program", "clear_command", "upload"]
 
 
-def test_program_that_plays_just_after_a_given_up_start_may_own_program(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_program_after_an_abandoned_start_may_be_ours(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its upload was sent, and takes only after the operator's stop; ours ends by its watchdog before long."""
     flight = Flight()
     monkeypatch.setattr(flight.arm, "upload", lambda: True)
@@ -134,7 +134,7 @@ def test_program_that_plays_just_after_a_given_up_start_may_own_program(monkeypa
     assert not flight.handler.may_own_program(flight.now_ns)
 
 
-def test_hard_limit_stops_and_holds_until_enabled_anew() -> None:
+def test_hard_limit_stops_until_enabled_again() -> None:
     flight = turning()
     flight.arm.be(wrench=(0.0, 0.0, 0.0, 0.0, 0.0, 6.5))
     flight.fly(1)
@@ -148,7 +148,7 @@ def test_hard_limit_stops_and_holds_until_enabled_anew() -> None:
     assert flight.ask(WristSpeed(0.1, 1.0)).accepted
 
 
-def test_protective_stop_ends_motion_and_is_cured_on_the_operators_word() -> None:
+def test_protective_stop_is_unlocked_only_by_the_operator() -> None:
     flight = turning()
     flight.arm.be(safety_mode=3, runtime_state=4)
     flight.arm.target = 0.0
@@ -170,7 +170,7 @@ def test_protective_stop_ends_motion_and_is_cured_on_the_operators_word() -> Non
     assert flight.ask(WristSpeed(0.1, 1.0)).accepted
 
 
-def test_emergency_stop_is_cured_after_the_button_is_released() -> None:
+def test_recovery_from_an_emergency_stop_needs_the_button_released() -> None:
     flight = turning()
     flight.arm.end_program()
     flight.arm.be(safety_mode=7, robot_mode=3)
@@ -196,7 +196,7 @@ def test_connecting_to_a_robot_in_a_protective_stop_waits_for_the_operator() -> 
     assert flight.ask(WristSpeed(0.1, 1.0)).accepted
 
 
-def test_program_that_ended_is_said_and_started_again_on_the_operators_word() -> None:
+def test_ended_program_is_reported_and_restarted_on_unlock() -> None:
     flight = turning()
     flight.arm.end_program()
     flight.fly(50)
@@ -205,7 +205,7 @@ def test_program_that_ended_is_said_and_started_again_on_the_operators_word() ->
     assert flight.ask(Unlock()).accepted
 
 
-def test_recovery_gives_up_in_time_and_says_where_it_stands() -> None:
+def test_recovery_times_out_and_reports_the_modes() -> None:
     flight = flying()
     flight.arm.end_program()
     flight.arm.upload = lambda: True  # type: ignore[method-assign]  # an upload that never takes
@@ -216,7 +216,7 @@ def test_recovery_gives_up_in_time_and_says_where_it_stands() -> None:
     assert flight.now_ns - begun_ns == pytest.approx(30e9, rel=0.01)
 
 
-def test_old_data_is_not_believed() -> None:
+def test_old_samples_block_motion() -> None:
     flight = turning()
     flight.arm.be(age_ns=300_000_000)
     flight.arm.calls.clear()
@@ -229,7 +229,7 @@ def test_old_data_is_not_believed() -> None:
     assert flight.wrist_speed == 0, "the program turned on, and was kept going"
 
 
-def test_old_data_of_an_arm_at_rest_needs_no_other_program() -> None:
+def test_old_samples_at_rest_need_only_an_enable() -> None:
     flight = flying()
     flight.arm.be(age_ns=300_000_000)
     flight.fly(10)
@@ -264,7 +264,7 @@ def test_starting_the_program_is_ended_by_disconnecting() -> None:
         assert "disconnects" in flight.ask(command).refusal
 
 
-def test_unlocking_a_controller_whose_states_stay_old_is_answered_in_time() -> None:
+def test_unlocking_with_old_samples_times_out() -> None:
     flight = turning()
     flight.arm.protective_stop()
     flight.fly(10)
@@ -279,7 +279,7 @@ def test_unlocking_a_controller_whose_states_stay_old_is_answered_in_time() -> N
     assert flight.arm.calls == [], "nothing is unlocked so long after the operator's word"
 
 
-def test_program_that_is_slow_to_begin_is_given_signs_of_life_until_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slowly_starting_program_gets_heartbeats(monkeypatch: pytest.MonkeyPatch) -> None:
     """It arms its watchdog by itself as it begins, whenever that is."""
     flight = Flight()
     upload = flight.arm.upload

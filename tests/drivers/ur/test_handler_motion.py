@@ -42,7 +42,7 @@ def test_something_is_sent_in_each_cycle_of_a_motion() -> None:
 
 
 @pytest.mark.parametrize("given_anew", [False, True])
-def test_speed_that_a_limit_changes_is_sent_in_the_cycle_that_reads_it(given_anew: bool) -> None:
+def test_speed_changed_by_a_limit_is_sent_in_the_same_cycle(given_anew: bool) -> None:
     """However long ago the one before was sent, and whether the daemon gives its own anew or not."""
     for cycles in range(1, 7):
         flight = flying()
@@ -64,7 +64,7 @@ def test_same_speed_with_another_acceleration_is_sent_at_once() -> None:
 
 @pytest.mark.parametrize("cycles", [3, 4, 5])
 @pytest.mark.parametrize("stopped", [False, True])
-def test_cycle_in_which_a_straight_move_comes_to_rest_gives_a_sign_of_life(cycles: int, stopped: bool) -> None:
+def test_last_cycle_of_a_linear_move_sends_a_heartbeat(cycles: int, stopped: bool) -> None:
     """However old the last one: the next cycle may be three away."""
     flight = flying()
     assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
@@ -79,7 +79,7 @@ def test_cycle_in_which_a_straight_move_comes_to_rest_gives_a_sign_of_life(cycle
     assert flight.arm.calls == ["send_heartbeat"]
 
 
-def test_speed_that_is_the_one_before_another_motion_is_sent_after_it() -> None:
+def test_same_speed_after_another_motion_is_sent() -> None:
     flight = flying()
     assert flight.ask(WristSpeed(0.0, 4.0)).accepted
     flight.fly(2)
@@ -92,7 +92,7 @@ def test_speed_that_is_the_one_before_another_motion_is_sent_after_it() -> None:
     assert flight.arm.calls[-1] == "wrist"
 
 
-def test_silence_of_the_daemon_ends_whatever_moves() -> None:
+def test_silent_daemon_ends_the_motion() -> None:
     flight = flying()
     assert flight.ask(MoveLinear(POSE, 0.05, 0.1)).accepted
     flight.fly(30, daemon_alive=False)
@@ -103,7 +103,7 @@ def test_silence_of_the_daemon_ends_whatever_moves() -> None:
     assert "stop_move" in flight.arm.calls
 
 
-def test_linear_move_is_kicked_along_and_its_arrival_told() -> None:
+def test_linear_move_gets_heartbeats_and_reports_its_arrival() -> None:
     flight = flying()
     reply = flight.ask(MoveLinear((-2.0, *POSE[1:]), 9.0, 0.1))
     assert reply.sent == MoveLinear((-0.78, *POSE[1:]), 0.1, 0.1)
@@ -131,7 +131,7 @@ def test_linear_move_has_a_deadline_and_inner_limits() -> None:
     assert flight.arm.calls.count("stop_move") == 2
 
 
-def test_stop_ends_turning_before_anything_else_may_begin() -> None:
+def test_stop_ends_before_another_motion_begins() -> None:
     flight = turning(0.5)
     reply = flight.ask(Stop(2.0))
     assert reply.sent == Stop(2.0)
@@ -161,7 +161,7 @@ def test_gentle_stop_becomes_a_hard_one_when_the_daemon_falls_silent() -> None:
     assert flight.arm.acceleration == LIMITS.wrist_acceleration_rad_per_s2.hard
 
 
-def test_of_two_stops_the_harder_one_counts() -> None:
+def test_harder_of_two_stops_counts() -> None:
     flight = turning(0.5)
     assert flight.ask(Stop(4.0)).sent == Stop(4.0)
     assert flight.ask(Stop(1.0)).sent == Stop(4.0)
@@ -169,7 +169,7 @@ def test_of_two_stops_the_harder_one_counts() -> None:
     assert flight.arm.acceleration == 6.0
 
 
-def test_however_gently_it_is_asked_a_stop_ends_within_a_second() -> None:
+def test_gentlest_stop_ends_within_a_second() -> None:
     flight = turning(0.5)
     assert flight.ask(Stop(1e-3)).sent == Stop(0.5)
     flight.fly(130)

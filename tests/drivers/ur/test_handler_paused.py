@@ -21,7 +21,7 @@ def asked_s(flight: Flight, seconds: float) -> list[float]:
     return times
 
 
-def test_program_that_a_process_before_owns_paused_program_is_stopped_before_anybody_resumes_it() -> None:
+def test_paused_program_of_the_last_worker_is_stopped() -> None:
     flight = Flight(takes_over=True)
     flight.arm.target = 0.5
     flight.arm.be(runtime_state=2)
@@ -34,7 +34,7 @@ def test_program_that_a_process_before_owns_paused_program_is_stopped_before_any
     assert flight.wrist_speed == 0.0
 
 
-def test_paused_program_that_cannot_be_stopped_keeps_nobody_from_unlocking() -> None:
+def test_failed_program_stop_does_not_prevent_unlocking() -> None:
     flight = Flight(takes_over=True)
     flight.arm.stoppable = False
     flight.arm.be(safety_mode=3, runtime_state=4)
@@ -45,7 +45,7 @@ def test_paused_program_that_cannot_be_stopped_keeps_nobody_from_unlocking() -> 
     assert flight.ask(Unlock()).accepted
 
 
-def test_paused_program_of_somebody_else_is_left_alone() -> None:
+def test_foreign_paused_program_is_left_alone() -> None:
     flight = Flight()
     flight.arm.be(safety_mode=3, runtime_state=4)
     flight.fly(300)
@@ -53,7 +53,7 @@ def test_paused_program_of_somebody_else_is_left_alone() -> None:
 
 
 @pytest.mark.parametrize("takes_over", [False, True], ids=["ours", "of the process before"])
-def test_dashboard_that_does_not_answer_is_asked_again_ever_less_often_and_not_for_ever(takes_over: bool) -> None:
+def test_silent_dashboard_is_retried_with_growing_pauses(takes_over: bool) -> None:
     flight = Flight(takes_over=True) if takes_over else turning()
     flight.arm.be(runtime_state=2)
     flight.arm.stoppable = False
@@ -67,7 +67,7 @@ def test_dashboard_that_does_not_answer_is_asked_again_ever_less_often_and_not_f
     assert flight.state.blocked.startswith("Protective stop")
 
 
-def test_dashboard_that_says_yes_and_does_nothing_is_asked_again_and_that_is_told() -> None:
+def test_ineffective_stop_is_retried_and_reported() -> None:
     flight = turning()
     stop_program = flight.arm.stop_program
     flight.arm.stop_program = lambda: None  # type: ignore[method-assign]
@@ -84,7 +84,7 @@ def test_dashboard_that_says_yes_and_does_nothing_is_asked_again_and_that_is_tol
     assert len(flight.state.blocked) > 0
 
 
-def test_daemon_learns_before_each_time_that_it_may_take_long() -> None:
+def test_long_cycles_are_announced() -> None:
     flight = turning()
     flight.arm.stoppable = False
     flight.arm.protective_stop()
@@ -94,7 +94,7 @@ def test_daemon_learns_before_each_time_that_it_may_take_long() -> None:
         assert announced == (flight.arm.calls.count(ASKED) > before)
 
 
-def test_another_pause_is_a_new_one() -> None:
+def test_each_pause_gets_new_requests() -> None:
     flight = turning()
     flight.arm.stoppable = False
     flight.arm.protective_stop()
@@ -109,7 +109,7 @@ def test_another_pause_is_a_new_one() -> None:
 
 
 @pytest.mark.parametrize(("runtime_state", "times"), [(0, 0), (1, 0), (3, 1), (4, 1), (5, 1)])
-def test_program_that_ends_by_itself_is_not_asked_to(runtime_state: int, times: int) -> None:
+def test_only_paused_programs_are_stopped(runtime_state: int, times: int) -> None:
     """Of the controller's states 0 is stopping, 1 stopped, 3 pausing, 4 paused and 5 resuming."""
     flight = turning()
     flight.arm.stoppable = False
@@ -117,7 +117,7 @@ def test_program_that_ends_by_itself_is_not_asked_to(runtime_state: int, times: 
     assert len(asked_s(flight, 0.5)) == times
 
 
-def test_what_is_read_late_is_not_acted_upon() -> None:
+def test_old_sample_causes_no_program_stop() -> None:
     """Whatever was paused then, somebody else's may be there by now."""
     flight = turning()
     flight.arm.protective_stop()
@@ -125,7 +125,7 @@ def test_what_is_read_late_is_not_acted_upon() -> None:
     assert asked_s(flight, 5.0) == []
 
 
-def test_program_that_is_begun_at_the_pendant_after_ours_has_ended_is_left_alone() -> None:
+def test_program_started_at_the_pendant_after_ours_is_left_alone() -> None:
     flight = flying()
     flight.arm.end_program()
     flight.fly(3)
@@ -136,7 +136,7 @@ def test_program_that_is_begun_at_the_pendant_after_ours_has_ended_is_left_alone
     assert not flight.handler.owns_paused_program(flight.arm.reading)
 
 
-def test_program_that_another_process_left_is_asked_for_once_more_when_this_one_leaves() -> None:
+def test_paused_program_left_behind_is_left_to_the_exit() -> None:
     flight = Flight(takes_over=True)
     flight.arm.stoppable = False
     flight.arm.be(safety_mode=3, runtime_state=4)
@@ -146,7 +146,7 @@ def test_program_that_another_process_left_is_asked_for_once_more_when_this_one_
     assert flight.handler.owns_paused_program(flight.arm.reading)
 
 
-def test_paused_program_that_is_stopped_is_started_by_the_operator_alone() -> None:
+def test_stopped_program_restarts_only_on_unlock() -> None:
     flight = turning()
     flight.arm.protective_stop()
     flight.fly(100)
@@ -159,7 +159,7 @@ def test_paused_program_that_is_stopped_is_started_by_the_operator_alone() -> No
     assert flight.ask(Unlock()).accepted
 
 
-def test_program_that_is_just_being_started_is_ours_though_the_operator_starts_anew() -> None:
+def test_program_being_started_is_ours_during_an_unlock() -> None:
     flight = Flight()
     flight.fly(2)
     assert flight.arm.calls == ["clear_command", "upload"]
@@ -168,7 +168,7 @@ def test_program_that_is_just_being_started_is_ours_though_the_operator_starts_a
 
 
 @pytest.mark.parametrize(("played_s", "times"), [(0.5, 1), (4.0, 0)])
-def test_program_that_took_the_place_of_ours_unseen_is_somebody_elses(played_s: float, times: int) -> None:
+def test_program_that_plays_without_heartbeats_is_foreign(played_s: float, times: int) -> None:
     """Its end may fall into the seconds that a dashboard hangs, in which nothing is read."""
     flight = turning()
     flight.arm.stoppable = False
@@ -182,14 +182,14 @@ def test_program_that_took_the_place_of_ours_unseen_is_somebody_elses(played_s: 
     assert len(asked_s(flight, 1.5)) == times
 
 
-def test_our_program_is_ours_for_however_long_it_plays() -> None:
+def test_our_program_stays_ours_while_it_plays() -> None:
     flight = flying()
     flight.fly(500)
     flight.arm.protective_stop()
     assert len(asked_s(flight, 0.5)) == 1
 
 
-def test_program_whose_states_are_old_is_not_taken_for_somebody_elses() -> None:
+def test_old_samples_do_not_make_a_program_foreign() -> None:
     flight = turning()
     # Its last state, which is repeated.
     flight.arm._watched = False
@@ -199,7 +199,7 @@ def test_program_whose_states_are_old_is_not_taken_for_somebody_elses() -> None:
     assert len(asked_s(flight, 0.5)) == 1
 
 
-def test_program_that_both_a_process_and_its_daemon_owns_paused_program_is_told_to_who_may_resume_it() -> None:
+def test_paused_program_of_unknown_owner_is_reported() -> None:
     """Once the protective stop is unlocked at the pendant, its button to play would turn the wrist."""
     flight = Flight()
     flight.arm.be(safety_mode=3, runtime_state=4)

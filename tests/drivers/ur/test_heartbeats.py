@@ -50,7 +50,7 @@ async def signs_s(monkeypatch: pytest.MonkeyPatch, commands_until_s: float, ends
     """Return when signs of life were given."""
     played: Any = Played(commands_until_s, ends_s)
     monkeypatch.setattr(client, "time", SimpleNamespace(monotonic=lambda: played.now_s))
-    played.connection = WorkerConnection(SETTINGS, lambda _: None)
+    played.connection = WorkerConnection(SETTINGS, lambda *_: None)
     played.connection.connection_made(played)
     with monkeypatch.context() as patched:
         patched.setattr(asyncio, "sleep", played.sleep)
@@ -59,11 +59,11 @@ async def signs_s(monkeypatch: pytest.MonkeyPatch, commands_until_s: float, ends
     return played.signs_s
 
 
-async def test_as_long_as_commands_come_no_other_sign_of_life_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_no_heartbeats_while_commands_come(monkeypatch: pytest.MonkeyPatch) -> None:
     assert await signs_s(monkeypatch, commands_until_s=10.0, ends_s=9.0) == []
 
 
-async def test_after_the_last_command_the_process_is_never_without_one_for_longer(
+async def test_heartbeats_start_after_the_last_command(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     signs = await signs_s(monkeypatch, commands_until_s=1.0, ends_s=3.0)

@@ -57,7 +57,7 @@ readings = st.builds(reading, st.floats(-2.5, 2.5), st.floats(-1.5, 1.5), st.flo
 
 
 @given(commands, readings)
-def test_wrist_command_is_within_the_limits_and_tells_what_was_clipped(asked: WristSpeed, now: RtdeSample) -> None:
+def test_wrist_command_is_within_the_limits_and_reports_clipping(asked: WristSpeed, now: RtdeSample) -> None:
     sent, reasons = clip_wrist(asked, now, LIMITS, REACTION_S)
     assert abs(sent.rad_per_s) <= min(LIMITS.wrist_speed_rad_per_s.inner, abs(asked.rad_per_s))
     assert sent.rad_per_s * asked.rad_per_s >= 0
@@ -97,7 +97,7 @@ def test_arm_that_follows_stays_within_its_inner_range(
 
 
 @given(above_0, st.floats(-1.9, 1.9), st.floats(-0.8, 0.8))
-def test_stop_brakes_within_the_range_however_gently_it_was_asked(asked: float, wrist_rad: float, speed: float) -> None:
+def test_stop_brakes_within_the_range(asked: float, wrist_rad: float, speed: float) -> None:
     room = 1.9 - abs(wrist_rad) if wrist_rad * speed > 0 else 1.9 + abs(wrist_rad)
     sent = clip_stop(Stop(asked), reading(wrist_rad, speed), LIMITS, REACTION_S).deceleration_rad_per_s2
     assert 0 < sent <= LIMITS.wrist_acceleration_rad_per_s2.hard
@@ -109,7 +109,7 @@ poses = st.tuples(*[anything] * 3, *[st.floats(-math.pi, math.pi)] * 3)
 
 
 @given(st.builds(MoveLinear, poses, above_0, above_0))
-def test_linear_move_ends_within_the_workspace_and_tells_what_was_clipped(asked: MoveLinear) -> None:
+def test_linear_move_ends_within_the_workspace_and_reports_clipping(asked: MoveLinear) -> None:
     sent, reasons = clip_linear(asked, LIMITS)
     box = LIMITS.workspace
     for value, low, high in zip(sent.pose[:3], box.lower_m, box.upper_m, strict=True):

@@ -78,7 +78,7 @@ def test_foreign_bytes_are_refused_or_waited_on(data: bytes) -> None:
 
 
 @pytest.mark.parametrize("fields", [(), ("0.1",), (math.nan,), (math.inf,), (0.1, 1.0), (None,), ((0.1, math.nan),)])
-def test_command_with_anything_missing_wrong_or_more_is_refused(fields: tuple[object, ...]) -> None:
+def test_malformed_command_is_refused(fields: tuple[object, ...]) -> None:
     stop = encode(Stop(0.1))
     code = msgpack.unpackb(stop)[1].code
     with pytest.raises(ProtocolError):
@@ -86,7 +86,7 @@ def test_command_with_anything_missing_wrong_or_more_is_refused(fields: tuple[ob
 
 
 @pytest.mark.parametrize("message", [7, (1, 2), (0, "stop"), (0, LIMITS), ("0", Stop(0.1)), (0, Stop(0.1), 0)])
-def test_anything_but_a_numbered_message_is_refused(message: object) -> None:
+def test_only_numbered_messages_are_accepted(message: object) -> None:
     with pytest.raises(ProtocolError, match="no message"):
         MessageDecoder().feed(msgpack.packb(message, default=wire._packed))
 
@@ -96,7 +96,7 @@ def test_message_of_an_unknown_type_is_refused() -> None:
         MessageDecoder().feed(msgpack.packb((0, msgpack.ExtType(100, msgpack.packb(())))))
 
 
-def test_states_carry_what_is_no_number() -> None:
+def test_states_carry_values_that_are_not_finite() -> None:
     state = RobotState(
         0.0, (float("nan"),) * 6, (0.0,) * 6, (0.0,) * 6, (float("inf"),) * 6, 7, 1, 2, 1.0, 0, 0, True, False,
         0.0, False, False, "", False, "idle", 0, "", None, (), 3, False, 0,

@@ -32,7 +32,7 @@ def test_half_a_turn_is_the_same_either_way(
 
 
 @given(vectors, vectors, st.floats(0.01, 3.0))
-def test_turns_are_as_far_apart_as_rotations_are(
+def test_angular_distance_agrees_with_scipy(
     one: tuple[float, float, float], other: tuple[float, float, float], within: float
 ) -> None:
     apart_rad = float((Rotation.from_rotvec(one).inv() * Rotation.from_rotvec(other)).magnitude())

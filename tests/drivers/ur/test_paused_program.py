@@ -37,7 +37,7 @@ async def kill(robot: UrRobot, link: Link) -> None:
     await robot.next_state()
 
 
-async def test_paused_program_of_somebody_else_outlives_the_loss_of_our_first_process(
+async def test_foreign_paused_program_outlives_a_lost_worker(
     controller: ControllerProcess,
 ) -> None:
     """It was paused before we came, and nothing that we see tells whose it is but that we did not start it."""
@@ -55,7 +55,7 @@ async def test_paused_program_of_somebody_else_outlives_the_loss_of_our_first_pr
     assert not controller.happened("program-ended", since_ns)
 
 
-async def test_program_that_somebody_begins_after_the_loss_of_our_process_is_left_alone(
+async def test_program_started_after_a_lost_worker_is_left_alone(
     controller: ControllerProcess,
 ) -> None:
     link = Link()
@@ -74,7 +74,7 @@ async def test_program_that_somebody_begins_after_the_loss_of_our_process_is_lef
     assert not controller.happened("program-ended", since_ns)
 
 
-async def test_our_paused_program_is_stopped_by_the_process_that_started_it(controller: ControllerProcess) -> None:
+async def test_our_paused_program_is_stopped_by_its_worker(controller: ControllerProcess) -> None:
     async with running(settings_for(controller.host)) as robot:
         await enable(robot)
         since_ns = await controller.fault("protective-stop")
@@ -84,7 +84,7 @@ async def test_our_paused_program_is_stopped_by_the_process_that_started_it(cont
 
 
 @pytest.mark.parametrize("hangs", [0, 1])
-async def test_our_paused_program_is_stopped_by_the_next_process(controller: ControllerProcess, hangs: int) -> None:
+async def test_our_paused_program_is_stopped_by_the_next_worker(controller: ControllerProcess, hangs: int) -> None:
     link = Link()
     async with running(settings_for(controller.host), link) as robot:
         await enable(robot)
@@ -98,7 +98,7 @@ async def test_our_paused_program_is_stopped_by_the_next_process(controller: Con
         assert robot.failed_program_stops == hangs
 
 
-async def test_dashboard_that_hangs_is_asked_again_and_the_operator_told_meanwhile(
+async def test_hanging_dashboard_is_retried_and_reported(
     controller: ControllerProcess,
 ) -> None:
     async with running(settings_for(controller.host)) as robot:

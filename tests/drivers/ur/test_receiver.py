@@ -65,7 +65,7 @@ def test_newest_sample_is_found_however_the_stream_is_cut(kinds: list[int | None
 
 
 @pytest.mark.parametrize("bad", [package(b"U", bytes(8)), b"\x00\x02U", data(1)[:-1] + b"\x00" + data(2)])
-def test_what_cannot_be_a_package_is_told(bad: bytes) -> None:
+def test_invalid_package_is_refused(bad: bytes) -> None:
     with pytest.raises(ProtocolError):
         SampleParser().feed(bad + bytes(300))
 
@@ -123,7 +123,7 @@ def arrived(receiver: RtdeReceiver, timestamp_s: float) -> bool:
     return receiver.latest().timestamp_s == timestamp_s
 
 
-def test_outputs_are_asked_for_at_the_rate_and_the_newest_is_kept(play: Callable[..., Controller]) -> None:
+def test_outputs_are_requested_at_the_rate_and_the_newest_kept(play: Callable[..., Controller]) -> None:
     controller = play()
     receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
     assert controller.asked[b"O"].startswith(struct.pack(">d", 125.0) + b"timestamp,actual_q,")
@@ -140,9 +140,7 @@ def test_outputs_are_asked_for_at_the_rate_and_the_newest_is_kept(play: Callable
 
 
 @pytest.mark.parametrize("last", [b"", package(b"U", bytes(8))])
-def test_connection_that_ends_or_carries_something_else_is_no_connection(
-    play: Callable[..., Controller], last: bytes
-) -> None:
+def test_closed_or_invalid_stream_is_a_lost_connection(play: Callable[..., Controller], last: bytes) -> None:
     controller = play()
     receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
     controller.send(data(2) + last)
@@ -155,9 +153,7 @@ def test_connection_that_ends_or_carries_something_else_is_no_connection(
 
 
 @pytest.mark.parametrize("number", [errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ECONNRESET])
-def test_connection_that_the_network_gives_up_is_lost_and_nothing_else(
-    play: Callable[..., Controller], number: int
-) -> None:
+def test_network_error_is_a_lost_connection(play: Callable[..., Controller], number: int) -> None:
     play()
     receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
     receiver.close()
@@ -173,7 +169,7 @@ def test_connection_that_the_network_gives_up_is_lost_and_nothing_else(
     ("answers", "told"),
     [((TYPES.replace(b"UINT32", b"NOT_FOUND"),), "NOT_FOUND"), ((TYPES, b"\x00"), "does not send its state")],
 )
-def test_controller_that_does_not_send_what_is_needed_is_refused(
+def test_controller_without_the_needed_outputs_is_refused(
     play: Callable[..., Controller], answers: tuple[bytes, ...], told: str
 ) -> None:
     play(*answers)

@@ -23,7 +23,7 @@ os._exit(0)
 """
 
 
-def test_of_ur_rtdes_own_script_one_line_is_new_and_comes_before_it_reads_a_register() -> None:
+def test_script_differs_by_one_line_before_its_loop() -> None:
     script_client = pytest.importorskip("script_client", reason="ur-rtde has wheels for CPython up to 3.12 only")
     text = script_client.ScriptClient("", 5, 17).getScript()
     program = arm_watchdog_in(text, 10.0)
@@ -38,18 +38,18 @@ def test_of_ur_rtdes_own_script_one_line_is_new_and_comes_before_it_reads_a_regi
     assert program.endswith("\nend\n")
 
 
-def test_script_of_another_form_is_not_touched() -> None:
+def test_unknown_script_is_not_changed() -> None:
     assert not arm_watchdog_in("def other():\n  sync()\nend\n", 10.0)
     assert not arm_watchdog_in("        keep_running = True\n" * 2, 10.0)
 
 
-def test_program_is_in_a_file_for_as_long_as_it_is_needed() -> None:
+def test_memory_file_holds_the_program() -> None:
     with _memory_file("a program\n") as path:
         assert [Path(path).read_text() for _ in range(2)] == ["a program\n"] * 2
 
 
 @pytest.mark.real_time
-async def test_program_of_a_process_that_dies_before_it_has_armed_the_watchdog_ends_by_it(
+async def test_program_of_a_worker_killed_before_arming_ends(
     controller: ControllerProcess,
 ) -> None:
     """Nothing moves, for the register is cleared before; and nothing stays that would do what is written there."""

@@ -31,13 +31,13 @@ class Samples:
         return seconds >= 0.008
 
 
-def test_where_no_command_was_done_nothing_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_wait_without_a_command(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = Samples(monkeypatch, (DONE, STOPPED))
     assert ScriptReadiness(samples, 0.1).wait()
     assert samples.taken == 0
 
 
-def test_only_a_sample_of_after_the_command_says_that_the_script_is_ready(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_a_later_sample_shows_readiness(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = Samples(monkeypatch, (READY, PLAYING), (DONE, PLAYING), (DONE, PLAYING), (READY, PLAYING))
     ready = ScriptReadiness(samples, 0.1)
     ready.command_sent()
@@ -48,9 +48,7 @@ def test_only_a_sample_of_after_the_command_says_that_the_script_is_ready(monkey
 
 
 @pytest.mark.parametrize("runtime_state", [STOPPED, PAUSED])
-def test_program_that_has_ended_or_pauses_is_not_waited_for(
-    monkeypatch: pytest.MonkeyPatch, runtime_state: int
-) -> None:
+def test_ended_or_paused_program_is_not_awaited(monkeypatch: pytest.MonkeyPatch, runtime_state: int) -> None:
     """The watchdog ends it in the middle of a command where the computer was away for long: ready it never becomes."""
     samples = Samples(monkeypatch, (DONE, PLAYING), (DONE, PLAYING), (DONE, runtime_state))
     ready = ScriptReadiness(samples, 0.1)
@@ -60,7 +58,7 @@ def test_program_that_has_ended_or_pauses_is_not_waited_for(
     assert not ready.wait()
 
 
-def test_script_that_stays_done_is_waited_for_no_longer_than_the_watchdog_is_patient(
+def test_wait_for_readiness_has_a_timeout(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     samples = Samples(monkeypatch, (DONE, PLAYING))
@@ -70,7 +68,7 @@ def test_script_that_stays_done_is_waited_for_no_longer_than_the_watchdog_is_pat
     assert samples.now_s == pytest.approx(5.1, abs=0.01)
 
 
-def test_connection_that_has_ended_says_nothing_of_the_script(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lost_connection_never_means_ready(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = Samples(monkeypatch, (READY, PLAYING))
     ready = ScriptReadiness(samples, 0.1)
     ready.command_sent()

@@ -18,7 +18,7 @@ def test_disconnecting_while_the_robot_is_made_ready_starts_nothing(daemon: Daem
     assert arm.calls == []
 
 
-def test_unlocking_that_a_disconnection_ends_is_answered(daemon: Daemon) -> None:
+def test_unlocking_ended_by_a_disconnection_is_answered(daemon: Daemon) -> None:
     arm = CyclingArm()
     arm.be(robot_mode=3)
     daemon.say(Unlock(), Disconnect())
@@ -29,7 +29,7 @@ def test_unlocking_that_a_disconnection_ends_is_answered(daemon: Daemon) -> None
     assert replies[2].accepted
 
 
-def test_nothing_that_comes_after_a_disconnection_is_carried_out(daemon: Daemon) -> None:
+def test_commands_after_a_disconnection_are_refused(daemon: Daemon) -> None:
     arm = CyclingArm()
     daemon.say(Disconnect(), Enable(), WristSpeed(0.5, 4.0), Unlock())
     fly(daemon, arm)
@@ -61,7 +61,7 @@ class Uploading(CyclingArm):
         return super().read()
 
 
-def test_program_that_a_late_upload_has_started_is_ended(daemon: Daemon) -> None:
+def test_program_started_by_a_late_upload_is_ended(daemon: Daemon) -> None:
     """What counts is what runs when the process leaves, not when its last cycle began."""
     # The next cycle's reading still shows none; that by which the process leaves shows it.
     arm = Uploading(daemon, Disconnect(), reads=2)
@@ -70,7 +70,7 @@ def test_program_that_a_late_upload_has_started_is_ended(daemon: Daemon) -> None
     assert not arm.reading.program_running
 
 
-def test_program_that_plays_and_was_started_here_is_ended(daemon: Daemon) -> None:
+def test_our_program_is_ended_on_exit(daemon: Daemon) -> None:
     class Ready(CyclingArm):
         def arm_watchdog(self) -> bool:
             daemon.say(Disconnect())
@@ -86,7 +86,7 @@ def test_program_that_plays_and_was_started_here_is_ended(daemon: Daemon) -> Non
     ]
 
 
-def test_program_of_somebody_else_plays_on_when_the_process_leaves(daemon: Daemon) -> None:
+def test_foreign_program_plays_on_after_exit(daemon: Daemon) -> None:
     """As of another daemon on the same robot."""
     arm = CyclingArm()
     arm.be(runtime_state=2)
@@ -96,7 +96,7 @@ def test_program_of_somebody_else_plays_on_when_the_process_leaves(daemon: Daemo
     assert arm.reading.program_running
 
 
-def test_program_that_is_paused_is_stopped_before_the_process_leaves(daemon: Daemon) -> None:
+def test_our_paused_program_is_stopped_on_exit(daemon: Daemon) -> None:
     """Resumed by somebody later, it would turn on where it was."""
 
     class Stopped(CyclingArm):
@@ -113,7 +113,7 @@ def test_program_that_is_paused_is_stopped_before_the_process_leaves(daemon: Dae
     assert arm.calls[:4] == ["clear_command", "upload", "arm_watchdog", "stop_program"]
 
 
-def test_program_of_somebody_else_is_not_stopped_by_a_process_that_leaves(daemon: Daemon) -> None:
+def test_foreign_paused_program_is_not_stopped_on_exit(daemon: Daemon) -> None:
     arm = CyclingArm()
     arm.be(runtime_state=4)
     daemon.say(Disconnect())
@@ -139,7 +139,7 @@ worker.main()
 """
 
 
-def test_exception_ends_the_process_at_once_and_is_told() -> None:
+def test_exception_ends_the_process_and_is_printed() -> None:
     command = [sys.executable, "-c", CRASHING]
     ended = subprocess.run(command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, timeout=30, check=False)
     assert ended.returncode == worker.EXIT_FAILED

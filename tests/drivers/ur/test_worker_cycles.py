@@ -19,7 +19,7 @@ def test_each_state_is_sent_and_the_robot_kept_awake_in_each_cycle(
     assert timed.arm.calls.count("send_heartbeat") == 49
 
 
-def test_a_late_cycle_begins_at_once_and_is_not_caught_up_with(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_late_cycle_starts_at_once_and_missed_ones_are_skipped(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
     class Slow(TimedArm):
         def read(self) -> RtdeSample:
             if len(self.read_s) == 10:
@@ -31,9 +31,7 @@ def test_a_late_cycle_begins_at_once_and_is_not_caught_up_with(daemon: Daemon, m
     assert [state.cycle for state in timed.states[12:16]] == [9, 10, 11, 12]
 
 
-def test_a_command_is_carried_out_when_it_comes_and_again_in_each_cycle(
-    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_command_is_sent_on_arrival_and_in_each_cycle(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
     sent_s: list[float] = []
 
     class Turned(TimedArm):
@@ -47,7 +45,7 @@ def test_a_command_is_carried_out_when_it_comes_and_again_in_each_cycle(
 
 
 @pytest.mark.parametrize("stopped_s", [0.2001, 0.2005, 0.2079])
-def test_a_stop_that_the_readings_tell_later_than_the_commands_is_told_as_what_it_is(
+def test_protective_stop_seen_late_is_reported_as_such(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch, stopped_s: float
 ) -> None:
     class Late(TimedArm):
@@ -67,9 +65,7 @@ def test_a_stop_that_the_readings_tell_later_than_the_commands_is_told_as_what_i
 
 
 @pytest.mark.parametrize("cycle", [31, 32, 34])
-def test_what_happens_is_told_in_the_cycle_that_sees_it(
-    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, cycle: int
-) -> None:
+def test_protective_stop_is_reported_in_its_cycle(daemon: Daemon, monkeypatch: pytest.MonkeyPatch, cycle: int) -> None:
     class Stopping(TimedArm):
         def read(self) -> RtdeSample:
             if worker.time.monotonic() > 1000.0 + 0.008 * cycle - 1e-6 and self.reading.safety_mode == 1:
@@ -81,9 +77,7 @@ def test_what_happens_is_told_in_the_cycle_that_sees_it(
     assert next(state.cycle for state in timed.states if state.protective_stop) == cycle
 
 
-def test_robot_that_is_made_ready_no_more_is_told_at_once_however_soon(
-    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_end_of_a_recovery_is_reported_at_once(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
     """Announced as being made ready, and given up in the same cycle: all is as before the announcement."""
     arm = TimedArm()
     arm.be(robot_mode=3)

@@ -6,7 +6,7 @@ from tests.drivers.ur.flight import Flight, flying
 from tests.drivers.ur.process import Daemon
 
 
-def test_state_that_finds_others_waiting_is_not_sent_and_says_so(daemon: Daemon) -> None:
+def test_state_is_dropped_while_others_are_unsent(daemon: Daemon) -> None:
     state = Flight().state
     while not daemon.pipe._unsent:
         daemon.pipe.send(state)
@@ -26,7 +26,7 @@ def test_each_command_is_answered_at_once(daemon: Daemon) -> None:
         assert [message.accepted for _, message in daemon.hear() if isinstance(message, CommandReply)] == [accepted]
 
 
-def test_what_is_unsent_to_a_daemon_that_reads_nothing_has_a_bound(daemon: Daemon) -> None:
+def test_unsent_output_is_bounded(daemon: Daemon) -> None:
     state = Flight().state
     for _ in range(10_000):
         daemon.pipe.send(state)

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from shearloop.bank.eit.grouping import group_means, kmeans_groups, place_in_series
 from shearloop.bank.errors import CalibrationError
+from shearloop.daemon.analysis.reproduce.grouping import group_means, kmeans_groups, place_in_series
 
 LEVELS = np.array([0.01, 0.03, 0.05, 0.06, 0.07, 0.08, 0.10, 0.11])
 

@@ -7,7 +7,7 @@ step from the homogeneous conductivity with the NOSER prior (Cheney et al. 1990)
 """
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -49,13 +49,6 @@ class BankMatch:
         return np.array([self.k, self.sigma, self.sigma**2, self.log_amplitude])
 
 
-class BankMatcher(Protocol):
-    """Finds a difference's position in the bank."""
-
-    def match(self, difference: FloatArray) -> BankMatch:
-        """Return the position of a (896,) difference. Its sign does not matter."""
-
-
 class PaperMatcher:
     """The paper's method: the heatmap's maximum, by default over all lags, found without the rest of the heatmap."""
 
@@ -64,7 +57,7 @@ class PaperMatcher:
         self._matcher = PrunedMatcher.from_bank(bank) if isinstance(bank, Bank) else bank
 
     def match(self, difference: FloatArray) -> BankMatch:
-        """Return the position of the heatmap's maximum."""
+        """Return the position of the heatmap's maximum for a (896,) difference of any sign."""
         found = self._matcher.match(difference)
         size = float(np.log(np.linalg.norm(difference)))
         return BankMatch(found.k, found.sigma, size, found.score, found.runner_up, ambiguous=False)
@@ -140,7 +133,7 @@ class RefinedMatcher:
         self._cells = np.flatnonzero(self._valid)
 
     def match(self, difference: FloatArray) -> BankMatch:
-        """Return the refined position of the best cell."""
+        """Return the refined position of the best cell for a (896,) difference of any sign."""
         (x,) = smoothed_along_channels(np.abs(difference)[None])
         norm = float(np.linalg.norm(x))
         scores = np.full(len(self._valid), -np.inf)
@@ -174,6 +167,9 @@ class RefinedMatcher:
         k = float(weights @ self._k_grid[row])
         sigma = float(np.exp(weights @ np.log(self._sigma_grid[column])))
         return k, sigma, float(weights @ np.log(norm * scores[near] / self._norms[near]))
+
+
+BankMatcher: TypeAlias = PaperMatcher | RefinedMatcher
 
 
 def image_matrix(mesh: "Mesh", smoothing: float = 0.05) -> FloatArray:

@@ -12,17 +12,11 @@ import numpy as np
 
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation import load_delay
 from shearloop.bank.estimation.bank_match import image_matrix
 from shearloop.bank.estimation.calibration import NEEDS_BANK, Calibration, Name
 from shearloop.bank.estimation.fitting_raw import Physics, fit_raw, tools_of
 from shearloop.bank.estimation.fitting_slices import fit_slices
-from shearloop.bank.estimation.load_delay import (
-    DelayFinder,
-    check_load_delay,
-    find_load_delay,
-    timing_references,
-    timing_uncertainty_s,
-)
 from shearloop.bank.estimation.values import FrameSeries
 
 
@@ -35,7 +29,7 @@ def fit(
     trust_times: bool = False,
     full_range: bool = False,
     timed_by: Sequence[FrameSeries] = (),
-    find_delay: DelayFinder | None = None,
+    find_delay: load_delay.DelayFinder | None = None,
 ) -> Calibration:
     """Calibrate an estimator on recordings of one kind, in time order; `source` describes them in words.
 
@@ -77,10 +71,10 @@ def fit(
         return replace(fitted, assumptions=("full range",)) if assumed else fitted
     if trust_times:
         return replace(fit_raw(blank, chosen, physics, 0.0), assumptions=("load timing",))
-    find_delay = find_delay or cache(find_load_delay)
-    references = timing_references(recordings, timed_by, find_delay)
-    check_load_delay(references, find_delay)
-    return fit_raw(blank, chosen, physics, timing_uncertainty_s(references, find_delay))
+    find_delay = find_delay or cache(load_delay.find_load_delay)
+    references = load_delay.timing_references(recordings, timed_by, find_delay)
+    load_delay.check_load_delay(references, find_delay)
+    return fit_raw(blank, chosen, physics, load_delay.timing_uncertainty_s(references, find_delay))
 
 
 def _check_values(recordings: Sequence[FrameSeries]) -> None:

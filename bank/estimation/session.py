@@ -1,7 +1,7 @@
 """A session with a calibration: frames in, estimates out, causally."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -161,10 +161,10 @@ class EstimatorSession:
         temporal = state.temporal_features if state is not None else None
         features, match = calibration.features(self._matcher, difference, temporal, t_s)
         if match is not None and match.ambiguous:
-            return _with_match(Estimate(valid=False, reasons=_AMBIGUOUS), match)
+            return _estimate({}, _AMBIGUOUS, match)
         mean_difference = state.mean_difference if state is not None else difference
         inputs = _Inputs(difference, temporal, usable, t_s, mean_difference, usable_share, errors, features, match)
-        values: dict[str, _Interval] = {}
+        values: dict[Quantity, _Interval] = {}
         for quantity, (model, novelty_result) in outputs.items():
             value, against = self._predict_quantity(quantity, model, novelty_result, inputs)
             reasons += [reason for reason in against if reason not in reasons]
@@ -174,7 +174,7 @@ class EstimatorSession:
         if calibration.kind == "raw" and (torque_missing or (calibration.has_curves_only and reasons)):
             # A frame beyond the calibrated torques is beyond the calibrated diameters too.
             values.clear()
-        return _with_match(_estimate(values, tuple(reasons)), match)
+        return _estimate(values, reasons, match)
 
     def _select_outputs(
         self, difference: FloatArray, usable: BoolArray
@@ -282,20 +282,12 @@ def _widened(value: _Interval, error: float) -> _Interval:
     return value[0], math.hypot(value[1], error), math.hypot(value[2], error)
 
 
-def _estimate(values: dict[str, _Interval], reasons: Sequence[str]) -> Estimate:
-    if not values:
-        return Estimate(valid=False, reasons=tuple(reasons))
-    estimate = Estimate(valid=True)
-    if "torque" in values:
-        value, below, above = values["torque"]
-        estimate = replace(estimate, torque_nm=value, torque_low_nm=value - below, torque_high_nm=value + above)
-    if "diameter" in values:
-        value, below, above = values["diameter"]
-        estimate = replace(estimate, diameter_mm=value, diameter_low_mm=value - below, diameter_high_mm=value + above)
-    return estimate
-
-
-def _with_match(estimate: Estimate, match: BankMatch | None) -> Estimate:
+def _estimate(values: Mapping[Quantity, _Interval], reasons: Sequence[str], match: BankMatch | None) -> Estimate:
+    torque, diameter = (
+        (value[0], value[0] - value[1], value[0] + value[2]) if (value := values.get(quantity)) else (None,) * 3
+        for quantity in _UNITS
+    )
+    estimate = Estimate(bool(values), () if values else tuple(reasons), *torque, *diameter)
     if match is None:
         return estimate
     return replace(estimate, k=match.k, sigma=match.sigma, score=match.score, runner_up=match.runner_up)

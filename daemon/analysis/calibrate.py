@@ -6,15 +6,8 @@ from functools import cache
 from math import isnan
 from pathlib import Path
 
-from shearloop.bank.estimation import Calibration, FrameSeries, Name, Physics, fit
+from shearloop.bank.estimation import Calibration, FrameSeries, Name, Physics, fit, load_delay
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor
-from shearloop.bank.estimation.load_delay import (
-    DelayFinder,
-    find_load_delay,
-    load_delay_warning,
-    timing_references,
-    timing_uncertainty_s,
-)
 from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, part_of, read_series, series_of
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.reader import read_recording
@@ -63,7 +56,7 @@ def calibrate(
     if delay_s:
         parts = [replace(one, torque_t_s=one.torque_t_s - delay_s) for one in parts]
     others = _other_sides(paths, options) if options.sides is not None and delay_s is None else []
-    find_delay = cache(find_load_delay)
+    find_delay = cache(load_delay.find_load_delay)
     calibration = fit(
         estimator,
         parts,
@@ -95,7 +88,8 @@ def calibrate(
     if calibration.kind == "raw":
         if delay_s is None:
             named = [*((path.name, one) for (path, _), one in zip(series, parts, strict=True)), *others]
-            _report_timing(report, named, timing_references(parts, [one for _, one in others], find_delay), find_delay)
+            references = load_delay.timing_references(parts, [one for _, one in others], find_delay)
+            _report_timing(report, named, references, find_delay)
         _report_tool(report)
     return report
 
@@ -181,17 +175,19 @@ def _report_timing(
     report: CalibrationReport,
     named: Sequence[tuple[str, FrameSeries]],
     references: Sequence[FrameSeries],
-    find_delay: DelayFinder,
+    find_delay: load_delay.DelayFinder,
 ) -> None:
     """Report the load cell's delay, doubts about it, and its effect on the intervals."""
     delays_s = [found and round(found.delay_s, 3) for found in map(find_delay, references)]
     known = ", ".join(f"{each:.2f}" for each in delays_s if each is not None)
-    uncertainty_s = round(timing_uncertainty_s(references, find_delay), 3)
+    uncertainty_s = round(load_delay.timing_uncertainty_s(references, find_delay), 3)
     if known:
         probably = "probably " if uncertainty_s else ""
         report.sentences.append(f"The load is {probably}stamped {known} s after the frames move.")
     doubts = [
-        f"{name}: {why}" for name, one in named if one in references and (why := load_delay_warning(one, find_delay))
+        f"{name}: {why}"
+        for name, one in named
+        if one in references and (why := load_delay.load_delay_warning(one, find_delay))
     ]
     report.sentences.extend(f"Warning: {doubt}." for doubt in doubts)
     report.result.update(load_cell_delay_s=delays_s, load_cell_warnings=doubts, timing_uncertainty_s=uncertainty_s)

@@ -5,8 +5,8 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
+from typing import Self
 
 import pytest
 
@@ -19,13 +19,19 @@ COUNTS_PER_NM = 420e3 / (9.80665 * 0.035)
 
 
 class Process:
-    """A command with pipes."""
+    """A command with pipes; the end of its input ends it."""
 
     def __init__(self, *arguments: str) -> None:
         self._child = subprocess.Popen(
             [*SHEARLOOP, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         self.said: list[str] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
 
     def tell(self, line: str) -> None:
         assert self._child.stdin is not None
@@ -56,22 +62,12 @@ class Process:
         return self._child.returncode, out, err
 
 
-@contextlib.contextmanager
-def process(*arguments: str) -> Iterator[Process]:
-    """Run a command; the end of its input ends it."""
-    running = Process(*arguments)
-    try:
-        yield running
-    finally:
-        running.end()
-
-
 def test_the_load_cell_is_calibrated_step_by_step_and_a_step_can_be_refused(tmp_path: Path) -> None:
     link, out = tmp_path / "load", tmp_path / "load.yaml"
-    with process("emulate", "hx711", "--link", str(link), "--speed", "20") as board:
+    with Process("emulate", "hx711", "--link", str(link), "--speed", "20") as board:
         board.hear(str(link))
         masses = ("--mass-g", "100", "--mass-g", "200")
-        with process("calibrate", "load", "--port", str(link), *masses, "--out", str(out)) as calibrate:
+        with Process("calibrate", "load", "--port", str(link), *masses, "--out", str(out)) as calibrate:
             calibrate.hear("Take every load off")
             calibrate.tell("")
             calibrate.hear("  0 g:")
@@ -98,9 +94,9 @@ def test_the_load_cell_is_calibrated_step_by_step_and_a_step_can_be_refused(tmp_
 
 def test_for_a_script_the_result_alone_is_on_stdout(tmp_path: Path) -> None:
     link, out = tmp_path / "load", tmp_path / "load.yaml"
-    with process("emulate", "hx711", "--link", str(link), "--speed", "20") as board:
+    with Process("emulate", "hx711", "--link", str(link), "--speed", "20") as board:
         board.hear(str(link))
-        with process(
+        with Process(
             "calibrate", "load", "--port", str(link), "--mass-g", "100", "--out", str(out), "--json"
         ) as script:
             script.hear("Take every load off", on_stderr=True)
@@ -120,14 +116,14 @@ def test_for_a_script_the_result_alone_is_on_stdout(tmp_path: Path) -> None:
 def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path: Path, way: str) -> None:
     out, link = tmp_path / "gripper.yaml", tmp_path / "gripper"
     arguments = ("--port", "0") if way == "socket" else ("--link", str(link))
-    with process("emulate", f"gripper-{way}", "--speed", "20", *arguments) as gripper:
+    with Process("emulate", f"gripper-{way}", "--speed", "20", *arguments) as gripper:
         where = gripper.hear("127.0.0.1:" if way == "socket" else str(link))
         host, _, port = where.partition(":")
         reach = ("--host", host, "--socket-port", port) if way == "socket" else ("--port", where)
         diameters = ("--diameter-mm", "10", "--diameter-mm", "40")
         # One of the two ways as a script would: what is asked of the operator is then on stderr.
         script = way == "modbus"
-        with process("calibrate", "gripper", *reach, *diameters, "--out", str(out), *["--json"] * script) as calibrate:
+        with Process("calibrate", "gripper", *reach, *diameters, "--out", str(out), *["--json"] * script) as calibrate:
             calibrate.hear("The fingers will open", on_stderr=script)
             calibrate.tell("")
             calibrate.hear("Hold the object of 10 mm", on_stderr=script)
@@ -154,22 +150,16 @@ def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path: Path, way:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("load", "--port", "/dev/none", "--mass-g", "100", "--out", "load.yaml"), "no serial port /dev/none"),
-        (("load", "--port", "/dev/none", "--mass-g", "-1", "--out", "load.yaml"), "mass in grams"),
-        (("load", "--port", "/dev/none", "--mass-g", "1", "--out", "no/load.yaml"), "does not exist"),
-        (
-            ("load", "--port", "/dev/none", "--mass-g", "1", "--lever-arm-mm", "0", "--out", "l.yaml"),
-            "--lever-arm-mm 0",
-        ),
-        (("gripper", "--port", "/dev/none", "--diameter-mm", "20", "--out", "g.yaml"), "two different"),
-        (
-            ("gripper", "--port", "/dev/none", "--diameter-mm", "2", "--diameter-mm", "4", "--out", "g.yaml"),
-            "/dev/none",
-        ),
+        ("load --port /dev/none --mass-g 100 --out load.yaml", "no serial port /dev/none"),
+        ("load --port /dev/none --mass-g -1 --out load.yaml", "mass in grams"),
+        ("load --port /dev/none --mass-g 1 --out no/load.yaml", "does not exist"),
+        ("load --port /dev/none --mass-g 1 --lever-arm-mm 0 --out l.yaml", "--lever-arm-mm 0"),
+        ("gripper --port /dev/none --diameter-mm 20 --out g.yaml", "two different"),
+        ("gripper --port /dev/none --diameter-mm 2 --diameter-mm 4 --out g.yaml", "/dev/none"),
     ],
 )
 def test_a_mistake_ends_in_one_sentence(
-    arguments: tuple[str, ...],
+    arguments: str,
     said: str,
     tmp_path: Path,
     capfd: pytest.CaptureFixture[str],
@@ -178,7 +168,7 @@ def test_a_mistake_ends_in_one_sentence(
     from shearloop.daemon.cli import main
 
     monkeypatch.chdir(tmp_path)
-    assert main(["calibrate", *arguments]) == 2
+    assert main(["calibrate", *arguments.split()]) == 2
     message = capfd.readouterr().err
     assert said in message
     assert message.startswith("shearloop calibrate: ")
@@ -187,24 +177,16 @@ def test_a_mistake_ends_in_one_sentence(
 
 def test_the_end_of_the_input_ends_the_calibration_with_a_sentence(tmp_path: Path) -> None:
     link = tmp_path / "load"
-    with process("emulate", "hx711", "--link", str(link), "--speed", "20") as board:
+    with Process("emulate", "hx711", "--link", str(link), "--speed", "20") as board:
         board.hear(str(link))
-        command = [
-            *SHEARLOOP,
-            "calibrate",
-            "load",
-            "--port",
-            str(link),
-            "--mass-g",
-            "100",
-            "--out",
-            tmp_path / "l.yaml",
-        ]
+        arguments = f"calibrate load --port {link} --mass-g 100 --out {tmp_path / 'l.yaml'}".split()
         # From a file, which no event loop can wait for.
         answers = tmp_path / "answers"
         answers.write_text("\n")
         with answers.open() as stdin:
-            done = subprocess.run(command, stdin=stdin, capture_output=True, text=True, timeout=30, check=False)
+            done = subprocess.run(
+                [*SHEARLOOP, *arguments], stdin=stdin, capture_output=True, text=True, timeout=30, check=False
+            )
     assert done.returncode == 2
     assert "the input ended before all was measured" in done.stderr
     assert not os.path.exists(tmp_path / "l.yaml")
@@ -213,28 +195,28 @@ def test_the_end_of_the_input_ends_the_calibration_with_a_sentence(tmp_path: Pat
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("hx711", "--speed", "0"), "--speed 0"),
-        (("hx711", "--fault", "spark"), "there is no fault 'spark'"),
-        (("hx711", "--torque-nm", "nan"), "finite"),
-        (("gripper-socket", "--port", "70000"), "no port"),
-        (("gripper-socket", "--object-mm", "900"), "width in mm"),
-        (("gripper-socket", "--bind", "192.0.2.1"), "cannot be played"),
-        (("gripper-modbus", "--link", "/nowhere/at/all"), "/nowhere/at/all cannot be made"),
+        ("hx711 --speed 0", "--speed 0"),
+        ("hx711 --fault spark", "there is no fault 'spark'"),
+        ("hx711 --torque-nm nan", "finite"),
+        ("gripper-socket --port 70000", "no port"),
+        ("gripper-socket --object-mm 900", "width in mm"),
+        ("gripper-socket --bind 192.0.2.1", "cannot be played"),
+        ("gripper-modbus --link /nowhere/at/all", "/nowhere/at/all cannot be made"),
     ],
 )
 def test_an_emulator_that_cannot_be_played_says_why(
-    arguments: tuple[str, ...], said: str, capfd: pytest.CaptureFixture[str]
+    arguments: str, said: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     from shearloop.daemon.cli import main
 
-    assert main(["emulate", *arguments]) == 2
+    assert main(["emulate", *arguments.split()]) == 2
     assert said in capfd.readouterr().err
 
 
 def test_a_gripper_socket_fails_on_request() -> None:
     import socket
 
-    with process("emulate", "gripper-socket", "--port", "0", "--speed", "10") as gripper:
+    with Process("emulate", "gripper-socket", "--port", "0", "--speed", "10") as gripper:
         host, _, port = gripper.hear("127.0.0.1:").partition(":")
         with socket.create_connection((host, int(port)), timeout=10) as client:
             client.sendall(b"GET FLT\n")

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from shearloop.bank.arrays import FloatArray
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.bank_file import Bank, BankDefinition, write_bank
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.estimation import Calibration, FrameSeries, fit
+from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, TactileFrame, fit
 
 PERIOD_S = 0.54
 IDLE_S, CYCLE_S = 20.0, 30.0
@@ -82,6 +82,16 @@ def slices(n_repeats: int = 5, seed: int = 0, noise_v: float = 0.0008) -> FrameS
     frames = np.abs(frames + rng.normal(0, noise_v, frames.shape))
     t = np.arange(len(torque), dtype=float)
     return FrameSeries("difference", ("right",), t, frames[:, None], t, torque, np.full(len(t), np.nan))
+
+
+def follow(
+    calibration: Calibration | EstimatorSession, played: FrameSeries, usable: BoolArray | bool = True
+) -> list[Estimate]:
+    """Return the estimates of a session; `usable` is of each (m, 896) frame, or of all (n, m, 896)."""
+    session = calibration if isinstance(calibration, EstimatorSession) else EstimatorSession(calibration)
+    masks = np.broadcast_to(usable, played.channels.shape)
+    frames = zip(played.t_s, played.channels, masks, strict=True)
+    return [session.estimate(TactileFrame.of(float(t), *each)) for t, *each in frames]
 
 
 @pytest.fixture(scope="session")

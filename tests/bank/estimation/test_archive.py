@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shearloop.bank.errors import BankError, CalibrationError
-from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFrame, fit
+from shearloop.bank.estimation import Calibration, fit
+from tests.bank.estimation.conftest import follow
 
 
 @pytest.fixture(scope="module")
@@ -24,10 +25,8 @@ def test_the_same_calibration_is_the_same_bytes(saved, tmp_path):
 
 
 def test_a_loaded_calibration_estimates_alike(motion_calibration, saved, recorded):
-    trackers = [EstimatorSession(motion_calibration), EstimatorSession(Calibration.load(saved))]
-    for t, x in zip(recorded.t_s[:120], recorded.channels, strict=False):
-        one, other = (tracker.estimate(TactileFrame.of(float(t), x)) for tracker in trackers)
-        assert one == other
+    part = recorded.between(0, 120)
+    assert follow(Calibration.load(saved), part) == follow(motion_calibration, part)
 
 
 @settings(max_examples=40, deadline=None)

@@ -1,15 +1,17 @@
 """Diameters from grips of a few cylinders, each with the noise of its own idle frame."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.estimation import EstimatorSession, TactileFrame, fit
+from shearloop.bank.estimation import EstimatorSession, fit
 from shearloop.bank.estimation.fitting_raw import CylinderGrip, fit_cylinders, fit_line
 from shearloop.bank.estimation.regressors import Ridge
+from tests.bank.estimation.conftest import follow
 
 KNOWN_MM = (10.0, 25.0, 40.0)
 N_FRAMES = 150
@@ -91,23 +93,23 @@ def test_one_recording_under_three_diameters_reads_none_of_them_apart(known, fra
     assert min(below, above) > 15.0
 
 
+def cylinder(twisting, tips, millimetre, mm, seed):
+    """Return a grip of a cylinder on the played rig; a millimetre moves channels by up to that many volts."""
+    whole = twisting(cycles=1, tips=tips, seed=seed)
+    gripped = (whole.t_s > 20.0) & (whole.t_s < 50.0)
+    moved = gripped[:, None, None] * (mm - 25) * millimetre * np.sin(np.arange(N_CHANNELS) / 9.0)
+    return replace(whole, channels=whole.channels + moved, diameter_mm=np.full(len(whole.t_s), mm))
+
+
 def test_a_diameter_is_of_this_grip_alone(twisting):
     """It is read from the mean place of a grip, and each grip has its own."""
-    recorded = twisting(cycles=1, tips=(1,))
-
-    def of(mm, seed):
-        whole = twisting(cycles=1, tips=(1,), seed=seed)
-        gripped = (whole.t_s > 20.0) & (whole.t_s < 50.0)
-        channels = whole.channels + gripped[:, None, None] * (mm - 25) * 2e-4 * np.sin(np.arange(N_CHANNELS) / 9.0)
-        return replace(whole, channels=channels, diameter_mm=np.full(len(whole.t_s), mm))
-
+    of = partial(cylinder, twisting, (1,), 2e-4)
     calibration = fit("motion_regression", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "rig", trust_times=True)
     tracker, read = EstimatorSession(calibration), []
     for number, mm in enumerate((12.0, 38.0)):
-        for t_s, channels in zip(recorded.t_s, of(mm, 10 + number).channels, strict=True):
-            estimate = tracker.estimate(TactileFrame.of(t_s + number * (recorded.t_s[-1] + 0.54), channels))
-            if estimate.diameter_mm is not None:
-                read.append((mm, estimate.diameter_mm))
+        later = of(mm, 10 + number)
+        later = replace(later, t_s=later.t_s + number * (later.t_s[-1] + 0.54))
+        read += [(mm, one.diameter_mm) for one in follow(tracker, later) if one.diameter_mm is not None]
     truth, found = np.array(read).T
     assert {12.0, 38.0} == set(truth)
     assert np.abs(found - truth).max() < 6.0
@@ -115,21 +117,12 @@ def test_a_diameter_is_of_this_grip_alone(twisting):
 
 def test_the_first_frames_of_a_grip_have_the_interval_of_a_mean_of_few(twisting):
     """Of one frame the interval was that of a mean of sixty: on the played rig it held 0.7 of the tools."""
-    recorded = twisting(cycles=1)
-
-    def of(mm, seed):
-        whole = twisting(cycles=1, seed=seed)
-        gripped = (whole.t_s > 20.0) & (whole.t_s < 50.0)
-        channels = whole.channels + gripped[:, None, None] * (mm - 25) * 2e-5 * np.sin(np.arange(N_CHANNELS) / 9.0)
-        return replace(whole, channels=channels, diameter_mm=np.full(len(whole.t_s), mm))
-
+    of = partial(cylinder, twisting, (1, 2), 2e-5)
     calibration = fit("motion_regression", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "rig", trust_times=True)
     inside, widths = [], []
     for seed in range(20, 40):
-        tracker, known_half_mm = EstimatorSession(calibration), calibration.diameter.regressor.intervals.half_widths[0]
-        frames = zip(recorded.t_s, of(15.0, seed).channels, strict=True)
-        told = [tracker.estimate(TactileFrame.of(*one)) for one in frames]
-        grip = [one for one in told if one.diameter_mm is not None]
+        known_half_mm = calibration.diameter.regressor.intervals.half_widths[0]
+        grip = [one for one in follow(calibration, of(15.0, seed)) if one.diameter_mm is not None]
         inside.append(grip[0].diameter_low_mm <= 15.0 <= grip[0].diameter_high_mm)
         widths.append([0.5 * (one.diameter_high_mm - one.diameter_low_mm) for one in (grip[0], grip[-1])])
     assert np.mean(inside) >= 0.9

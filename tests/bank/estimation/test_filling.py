@@ -31,10 +31,7 @@ def without(channels: np.ndarray, start: int, series: FrameSeries, tracker: Esti
     """Return the estimates of a session of which (896,) channels of the first side are dead from a frame on."""
     usable = np.ones(series.channels.shape, dtype=np.bool_)
     usable[start:, 0, channels] = False
-    frames = np.where(usable, series.channels, 0.0)
-    return [
-        tracker.estimate(TactileFrame.of(float(t), *each)) for t, *each in zip(series.t_s, frames, usable, strict=True)
-    ]
+    return conftest.follow(tracker, replace(series, channels=np.where(usable, series.channels, 0.0)), usable)
 
 
 def judged(found: list[Estimate], series: FrameSeries) -> tuple[int, float]:

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shearloop.bank.estimation import Calibration, EstimatorSession, FrameSeries, TactileFrame, fit
+from shearloop.bank.estimation import Calibration, FrameSeries, fit
 from shearloop.bank.estimation.fitting_slices import ContaminationTest, Mixtures
 from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
 from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.bank.estimation.regressors import Ridge
+from tests.bank.estimation.conftest import follow
 
 
 def shrinking(seed: int) -> FrameSeries:
@@ -34,9 +35,7 @@ def mixed_with_a_foreign_frame(series: FrameSeries, share: float) -> FrameSeries
 
 def judged(calibration: Calibration, series: FrameSeries) -> tuple[float, float, float]:
     """Return the share of valid and of false-valid estimates, and the median width of the intervals in N·m."""
-    tracker = EstimatorSession(calibration)
-    pairs = zip(series.t_s, series.channels, strict=True)
-    estimates = [tracker.estimate(TactileFrame.of(float(t), channels)) for t, channels in pairs]
+    estimates = follow(calibration, series)
     valid = [
         (one.torque_low_nm, truth, one.torque_high_nm)
         for one, truth in zip(estimates, series.torque_at_frames(), strict=True)

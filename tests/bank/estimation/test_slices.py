@@ -6,14 +6,8 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import EstimatorSession, FrameSeries, TactileFrame, fit
-
-
-def follow(calibration, series, usable=None):
-    tracker = EstimatorSession(calibration)
-    return [
-        tracker.estimate(TactileFrame.of(float(t), x, usable)) for t, x in zip(series.t_s, series.channels, strict=True)
-    ]
+from shearloop.bank.estimation import FrameSeries, fit
+from tests.bank.estimation.conftest import follow
 
 
 def errors(estimates, series):
@@ -43,10 +37,7 @@ def test_what_is_not_familiar_is_not_valid(sliced, sliced_calibration):
     idle = np.abs(rng.normal(0, 0.0008, later.channels.shape))
     foreign = later.channels[..., ::-1]
     for frames, why in ((noisy, "outside the calibration"), (idle, "no grip"), (foreign, "outside the")):
-        strange = FrameSeries(
-            later.kind, later.sides, later.t_s, frames, later.torque_t_s, later.torque_nm, later.diameter_mm
-        )
-        estimates = follow(calibration, strange)
+        estimates = follow(calibration, replace(later, channels=frames))
         assert not any(one.valid for one in estimates)
         assert all(why in one.reasons[0] and one.torque_nm is None for one in estimates)
 
@@ -95,10 +86,8 @@ def test_cylinders_give_a_diameter_and_no_torque(sliced):
     ],
 )
 def test_what_cannot_be_calibrated_says_why(sliced, name, change, message):
-    whole = sliced()
-    content = {key: getattr(whole, key) for key in FrameSeries.__slots__} | change
     with pytest.raises(CalibrationError, match=message):
-        fit(name, [FrameSeries(**content)], "x")
+        fit(name, [replace(sliced(), **change)], "x")
 
 
 @pytest.mark.parametrize(("name", "least"), [("motion_regression", 14), ("regression", 10)])

@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 
 from shearloop.bank.eit.channels import CHANNELS
-from shearloop.bank.estimation import EstimatorSession, FrameSeries, TactileFrame, fit
+from shearloop.bank.estimation import FrameSeries, fit
 from shearloop.bank.estimation.fingertip_validator import mask_saturated
 from shearloop.bank.estimation.novelty import NoveltyDetector
+from tests.bank.estimation.conftest import follow
 
 STEP_V = 0.00215
-
-
-def estimates(calibration, series: FrameSeries):
-    tracker = EstimatorSession(calibration)
-    return [
-        tracker.estimate(TactileFrame.of(float(t), frame)) for t, frame in zip(series.t_s, series.channels, strict=True)
-    ]
 
 
 def rms_error(found, series: FrameSeries) -> float:
@@ -36,14 +30,14 @@ def without_electrodes(series: FrameSeries, electrodes: tuple[int, ...], start: 
 def test_electrodes_that_are_lost_without_a_word_are_done_without(motion_calibration, twisting, electrodes):
     whole = twisting(seed=31)
     spoilt = without_electrodes(whole, electrodes, 90)
-    found = estimates(motion_calibration, spoilt)
-    before = estimates(motion_calibration, whole)
+    found = follow(motion_calibration, spoilt)
+    before = follow(motion_calibration, whole)
     assert sum(one.valid for one in found) > 0.9 * sum(one.valid for one in before)
     assert rms_error(found, spoilt) < 1.5 * rms_error(before, whole)
 
 
 def test_many_lost_electrodes_end_it(motion_calibration, twisting):
-    found = estimates(motion_calibration, without_electrodes(twisting(seed=32), (1, 4, 8, 12, 20, 25), 90))
+    found = follow(motion_calibration, without_electrodes(twisting(seed=32), (1, 4, 8, 12, 20, 25), 90))
     assert not any(one.valid for one in found[90:])
 
 
@@ -51,7 +45,7 @@ def test_channels_at_a_rail_are_found_and_done_without(motion_calibration, twist
     whole = twisting(seed=33)
     rail = np.quantile(whole.channels[5], 0.9)
     clipped = replace(whole, channels=np.minimum(whole.channels, rail))
-    found = estimates(motion_calibration, clipped)
+    found = follow(motion_calibration, clipped)
     assert rms_error(found, clipped) < 0.02 * 0.06
     # One side is clipped, the other is not.
     frame, usable = np.array([clipped.channels[100, 0], whole.channels[100, 0]]), np.ones((2, 896), dtype=np.bool_)
@@ -83,7 +77,7 @@ def test_a_drift_does_not_lead_a_regression_astray(twisting):
     calibration = fit("regression", [past], "rig")
     later = twisting(seed=36)
     moved = np.random.default_rng(0).normal(0.0, 0.05, 896) * later.channels[5]
-    found = estimates(
+    found = follow(
         calibration, replace(later, channels=later.channels + np.linspace(0, 1, len(later.t_s))[:, None, None] * moved)
     )
     assert not any(one.valid for one in found[-60:-40])

@@ -6,27 +6,8 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import (
-    Estimate,
-    EstimatorSession,
-    FrameSeries,
-    Measured,
-    TactileFrame,
-    fit,
-    fitting,
-    fitting_raw,
-)
-
-
-def changed(series, **content):
-    return FrameSeries(**{key: getattr(series, key) for key in FrameSeries.__slots__} | content)
-
-
-def follow(calibration, series, usable=None) -> list[Estimate]:
-    tracker = calibration if isinstance(calibration, EstimatorSession) else EstimatorSession(calibration)
-    return [
-        tracker.estimate(TactileFrame.of(float(t), x, usable)) for t, x in zip(series.t_s, series.channels, strict=True)
-    ]
+from shearloop.bank.estimation import EstimatorSession, Measured, TactileFrame, fit, fitting, fitting_raw
+from tests.bank.estimation.conftest import follow
 
 
 def judged(estimates, series):
@@ -51,7 +32,7 @@ def test_another_recording_is_read_with_honest_intervals(motion_calibration, twi
 def test_a_slow_drift_of_the_baseline_changes_little(motion_calibration, twisting):
     other = twisting(seed=6)
     drifting = other.channels * (1 + 0.03 * np.linspace(0, 1, len(other.t_s)))[:, None, None]
-    shifted = changed(other, channels=drifting)
+    shifted = replace(other, channels=drifting)
     assert (
         judged(follow(motion_calibration, shifted), shifted)[1]
         < 1.5 * judged(follow(motion_calibration, other), other)[1] + 0.001
@@ -68,7 +49,7 @@ def test_another_session_takes_its_own_baseline(motion_calibration, twisting, gr
     step = np.median(other.channels[gripped], axis=0) - np.median(other.channels[other.t_s < 19], axis=0)
     dried = 1 + shift * np.random.default_rng(20).normal(size=other.channels.shape[1:])
     channels = gain * dried * (other.channels + (grip - 1) * gripped[:, None, None] * step)
-    session = changed(other, channels=channels)
+    session = replace(other, channels=channels)
     estimates = follow(motion_calibration, session)
     valid = np.array([one.valid for one in estimates])
     assert not valid[(other.t_s < 19) | (other.t_s > 145)].any()
@@ -86,10 +67,7 @@ def test_three_idle_frames_are_a_baseline_for_an_outright_grip(motion_calibratio
     tracker = EstimatorSession(motion_calibration)
     if told:
         tracker.tare(3)
-    valid = [
-        tracker.estimate(TactileFrame.of(float(t), x)).valid
-        for t, x in zip(other.t_s[first:230], other.channels[first:230], strict=True)
-    ]
+    valid = [one.valid for one in follow(tracker, other.between(first, 230))]
     assert not any(valid[:3])
     assert np.mean(valid[25:]) > 0.95
 
@@ -120,7 +98,7 @@ def test_frames_with_a_quarter_of_noise_are_not_valid_and_the_others_are(motion_
     for i in np.flatnonzero(noisy):
         for layer in channels[i]:
             layer[rng.choice(896, 224, replace=False)] = np.abs(rng.normal(0, amplitude_v, 224))
-    spoiled = changed(other, channels=channels)
+    spoiled = replace(other, channels=channels)
     estimates = follow(motion_calibration, spoiled)
     assert not any(one.valid for one, spoilt in zip(estimates, noisy, strict=True) if spoilt)
     r, rmse, _ = judged(estimates, spoiled)
@@ -138,7 +116,7 @@ def test_another_fingertip_is_told_by_its_pattern(motion_calibration, twisting):
 def test_dead_channels_are_done_without_and_widen_the_interval(motion_calibration, twisting):
     other = twisting(seed=10)
     usable = np.random.default_rng(0).random((2, 896)) > 0.2
-    damaged = changed(other, channels=np.where(usable, other.channels, 0.0))
+    damaged = replace(other, channels=np.where(usable, other.channels, 0.0))
     whole, less = follow(motion_calibration, other), follow(motion_calibration, damaged, usable)
     assert judged(less, damaged)[1] < 1.5 * judged(whole, other)[1]
     pairs = [(a, b) for a, b in zip(whole, less, strict=True) if a.valid and b.valid and a.torque_nm == 0.0]
@@ -163,7 +141,7 @@ def test_the_future_changes_nothing(motion_calibration, twisting):
 def test_after_a_gap_the_memory_is_filled_anew(motion_calibration, twisting):
     other = twisting(seed=13)
     times = other.t_s + np.where(np.arange(len(other.t_s)) >= 150, 3.0, 0.0)
-    torn = changed(other, t_s=times)
+    torn = replace(other, t_s=times)
     estimates = follow(motion_calibration, torn)
     assert estimates[149].valid
     assert all("more frames are needed" in one.reasons[0] for one in estimates[151:162])
@@ -204,7 +182,7 @@ def test_squeezing_alone_is_no_torque(motion_calibration, twisting):
     frames = np.where(
         gripped[:, None, None], idle + squeeze[:, None, None] * (reference - idle), still.channels
     ) + np.random.default_rng(3).normal(0, 0.001, still.channels.shape)
-    squeezed = changed(other, channels=frames)
+    squeezed = replace(other, channels=frames)
     torques = [
         one.torque_nm
         for one, held in zip(follow(motion_calibration, squeezed), gripped, strict=True)
@@ -224,7 +202,7 @@ def test_a_session_that_begins_with_a_spoilt_frame_gets_over_it(motion_calibrati
     other = twisting(seed=16).between(60, 200)
     channels = other.channels.copy()
     channels[0, :, ::4] = 0.01
-    estimates = follow(motion_calibration, changed(other, channels=channels))
+    estimates = follow(motion_calibration, replace(other, channels=channels))
     assert all(one.valid for one in estimates[20:])
 
 
@@ -276,8 +254,7 @@ def test_another_tool_is_refused_for_as_long_as_it_is_held(motion_calibration, t
     assert all(same), "what it was told of tools changes nothing that it remembers"
     unknown = EstimatorSession(motion_calibration)
     unknown.set_tool(Measured(14.0, 0.1))
-    frames = [TactileFrame.of(float(t_s), x) for t_s, x in zip(twisted.t_s, twisted.channels, strict=True)]
-    assert any(unknown.estimate(frame).valid for frame in frames)
+    assert any(one.valid for one in follow(unknown, twisted))
 
 
 def test_single_lost_frames_cost_little_and_are_not_invented_in_numbers(motion_calibration, twisting):
@@ -286,7 +263,7 @@ def test_single_lost_frames_cost_little_and_are_not_invented_in_numbers(motion_c
 
     def without(lost):
         kept = ~lost
-        return changed(whole, t_s=whole.t_s[kept], channels=whole.channels[kept], diameter_mm=whole.diameter_mm[kept])
+        return replace(whole, t_s=whole.t_s[kept], channels=whole.channels[kept], diameter_mm=whole.diameter_mm[kept])
 
     _, rmse, _ = judged(follow(motion_calibration, whole), whole)
     some = without(number % 8 == 7)
@@ -306,7 +283,7 @@ def test_of_a_board_that_leaves_out_half_of_its_frames_no_torque_is_read(motion_
     whole = twisting(seed=5)
     every, left_out = lost
     kept = ~np.isin(np.arange(len(whole.t_s)) % every, list(left_out))
-    part = changed(whole, t_s=whole.t_s[kept], channels=whole.channels[kept], diameter_mm=whole.diameter_mm[kept])
+    part = replace(whole, t_s=whole.t_s[kept], channels=whole.channels[kept], diameter_mm=whole.diameter_mm[kept])
     period_s = float(whole.t_s[1] - whole.t_s[0])
     estimates = follow(EstimatorSession(motion_calibration, period_s=period_s), part)
     assert not any(one.valid for one in estimates)
@@ -315,7 +292,7 @@ def test_of_a_board_that_leaves_out_half_of_its_frames_no_torque_is_read(motion_
 
 def test_a_board_that_is_faster_than_configured_is_followed_all_the_same(motion_calibration, twisting):
     whole = twisting(seed=5)
-    fast = changed(whole, t_s=whole.t_s / 5, torque_t_s=whole.torque_t_s / 5)
+    fast = replace(whole, t_s=whole.t_s / 5, torque_t_s=whole.torque_t_s / 5)
     configured = follow(EstimatorSession(motion_calibration, period_s=0.54), fast)
     assert [one.torque_nm for one in configured] == [one.torque_nm for one in follow(motion_calibration, whole)]
 
@@ -330,7 +307,7 @@ def test_after_frames_that_were_left_out_the_interval_holds_a_load_that_rises_me
         series = twisting(seed=seed)
         garbled = (np.arange(len(series.t_s)) + seed) % 17 < spoilt
         noise = 1 + garbled[:, None, None] * rng.normal(0, 0.4, series.channels.shape)
-        estimates = follow(motion_calibration, changed(series, channels=series.channels * noise))
+        estimates = follow(motion_calibration, replace(series, channels=series.channels * noise))
         loaded = np.abs(series.torque_at_frames()) > 0.006
         for i in np.flatnonzero(loaded & ~garbled):
             if estimates[i].valid:
@@ -347,9 +324,9 @@ def test_a_frame_that_a_board_sends_again_is_no_new_one(motion_calibration, twis
     frozen, expected = whole.channels.copy(), follow(motion_calibration, whole)
     hung = np.flatnonzero([one.valid for one in expected])[10]
     frozen[hung : hung + 30, sides] = frozen[hung, sides]
-    told = follow(motion_calibration, changed(whole, channels=frozen))
+    told = follow(motion_calibration, replace(whole, channels=frozen))
     assert told[hung] == expected[hung]
     assert all(one.reasons == ("the board sent the same frame again",) for one in told[hung + 1 : hung + 30])
     times = np.delete(np.arange(len(whole.t_s)), np.arange(hung + 1, hung + 30))
-    without = changed(whole, t_s=whole.t_s[times], channels=whole.channels[times], diameter_mm=whole.diameter_mm[times])
+    without = replace(whole, t_s=whole.t_s[times], channels=whole.channels[times], diameter_mm=whole.diameter_mm[times])
     assert told[hung + 30 :] == follow(motion_calibration, without)[hung + 1 :]

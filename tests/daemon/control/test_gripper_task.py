@@ -1,4 +1,4 @@
-"""The gripper's task over the real driver and the played gripper, by both ways in."""
+"""The gripper's task over the real driver and the emulated gripper, on both connections."""
 
 import asyncio
 from pathlib import Path
@@ -19,7 +19,7 @@ GRIP = GripTo(0.0, 60.0, 40.0, expect_object=True)
 
 
 class Silent:
-    """A publisher to which nobody listens."""
+    """A publisher without subscribers."""
 
     def publish(self, _message: Any) -> None:
         """Send nothing."""
@@ -58,7 +58,7 @@ async def test_cancelled_grip_is_halted_and_stays_connected(way: str, tmp_path: 
         read = tasks.create_task(task.read())
         while rig.driver.latest is None:  # noqa: ASYNC110 - the driver is asked, as the loop is
             await asyncio.sleep(0)
-        assert felt[-1].uncertain, "one without power keeps hold of a tool, and does not tell"
+        assert felt[-1].uncertain, "a gripper without power may hold a tool"
         await rig.driver.activate()
         for turns in range(1, 40, 3):
             assert await task.release() == ""
@@ -93,7 +93,7 @@ async def test_halt_stops_the_fingers_after_a_reconnection(way: str, tmp_path: P
             await asyncio.sleep(0)
         rig.silence(True)
         rig.stopped = True
-        assert await grip, "why it went wrong"
+        assert await grip, "the error"
         halt = asyncio.create_task(task.halt())
         rig.lost.clear()
         await rig.lost.wait()

@@ -1,4 +1,4 @@
-"""The played gripper by itself: its timing, its faults, its bytes."""
+"""The emulated gripper: timing, faults, protocols."""
 
 import pytest
 from hypothesis import given

@@ -1,4 +1,4 @@
-"""Faults by lines of text: each known one is carried out, and what is not known is told."""
+"""Faults as lines of text."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The emulated controller without I/O: what its registers, watchdog and safety do, at its own time."""
+"""The emulated controller without I/O: registers, watchdog, safety."""
 
 import math
 
@@ -25,7 +25,7 @@ def send(robot: Robot, command: int, *numbers: float, asynchronous: bool = False
 
 
 def do(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) -> float:
-    """Carry a command out as the client does, and return how long it took."""
+    """Carry out a command as the client does; return its duration in s."""
     send(robot, command, *numbers, asynchronous=asynchronous)
     begun_s = robot.time_s
     while robot.number("output_int_register_0") != 2:
@@ -135,7 +135,7 @@ def test_new_program_obeys_old_registers() -> None:
     assert not robot.qd_rad_per_s.any()
     robot.upload()
     wait(robot, 0.1)
-    assert robot.qd_rad_per_s[5] > 0, "the hazard that a driver has to know of"
+    assert robot.qd_rad_per_s[5] > 0, "a driver has to clear the registers"
 
 
 def test_linear_move_arrives_at_the_pose_on_a_straight_line() -> None:
@@ -257,7 +257,7 @@ def test_fast_arm_motion_keeps_the_controllers_time() -> None:
         robot.upload()
         turn(robot, 0.1, 4.0)
         wait(robot, 0.5)
-        assert robot.qd_rad_per_s[5] == pytest.approx(0.1), "in its own time it turns as it is told"
+        assert robot.qd_rad_per_s[5] == pytest.approx(0.1), "in its own time it turns at the commanded speed"
         assert sum(seen) == pytest.approx(robot.time_s), "the plant's time is the controller's"
     slow, fast = robots
     assert slow.time_s == fast.time_s == pytest.approx(0.5, abs=2 * DT_S)

@@ -126,7 +126,7 @@ def test_impossible_lengths_end_the_connection(size: int) -> None:
 
 
 async def test_clock_runs_on_while_the_emulator_is_paused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its samples are of now; its time, and with it the watchdog, has not gone through what it missed."""
+    """Samples carry the present time; the robot's time, which the watchdog uses, stands still."""
     robot, now_s, pauses_s = Robot(), 50.0, iter([0.002, 0.3, 0.002])
 
     async def sleep(_seconds: float) -> None:

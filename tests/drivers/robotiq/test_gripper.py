@@ -1,6 +1,7 @@
-"""What the gripper does when it is asked, by both ways in, and what of it is refused."""
+"""Commands to the gripper on both connections."""
 
 import asyncio
+import contextlib
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from shearloop.drivers.robotiq import messages
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.socket_client import SocketClient
-from tests.drivers.robotiq.gripper_rig import CALIBRATION, WAYS, a_rig
+from tests.drivers.robotiq.gripper_rig import CALIBRATION, STEP_S, WAYS, a_rig
 
 
 @WAYS
@@ -149,3 +150,24 @@ async def test_clipping_is_reported_and_the_sent_command_returned() -> None:
     assert (sent.speed_mm_s, sent.force_n) == (30.0, 125.0)
     assert sent.width_mm == pytest.approx(CALIBRATION.width_mm(0))
     assert [sentence.split()[1] for sentence in sent.clipped] == ["width", "speed", "force"]
+
+
+@WAYS
+@pytest.mark.parametrize("command", [{"gto": False}, {"pos": 250}], ids=["halted", "sent further"])
+async def test_command_of_another_master_is_seen_at_the_next_poll(
+    way: str, tmp_path: Path, command: dict[str, int]
+) -> None:
+    """Position and object stay the same, but the target is no longer ours."""
+    async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
+        await anext(states)
+        await rig.driver.activate()
+        rig.object_mm = 20.0
+        await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
+        rig.stopped = True
+        while (await anext(states)).object is not messages.ObjectStatus.CONTACT_CLOSING:
+            pass
+        for name, value in command.items():
+            setattr(rig.model.command, name, value)
+        rig.model.step(STEP_S)
+        assert rig.model.obj == messages.ObjectStatus.CONTACT_CLOSING
+        assert (await anext(states)).diameter_mm is None

@@ -1,4 +1,4 @@
-"""A gripper that is lost, silent, garbled or not there, by both ways in: nothing old is given as new."""
+"""A lost, silent, garbled or absent gripper, on both connections."""
 
 import asyncio
 import contextlib
@@ -37,7 +37,7 @@ async def test_silence_is_a_loss_and_clears_the_state(way: str, tmp_path: Path) 
 async def test_cancellation_that_arrives_with_an_answer_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The task that reads the gripper went on for ever, and a daemon that was to end waited for it."""
+    """Otherwise the reading task never ends, and the daemon waits for it on exit."""
     answered = asyncio.Event()
     read = AsyncModbusSerialClient.read_holding_registers
 

@@ -1,4 +1,4 @@
-"""The gripper's two languages and its widths: the manual's examples, any slices, odd answers."""
+"""The gripper's two protocols and its widths."""
 
 import subprocess
 import sys

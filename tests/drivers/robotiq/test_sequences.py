@@ -1,4 +1,4 @@
-"""Activation and motion, step by step, with readouts and times that are made up."""
+"""Activation and motion with made-up readouts and times."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ GO = messages.GripperMove(100, 255, 0)
 
 
 class Client:
-    """Returns the readouts one by one, then the last one for ever; its clock advances at each look."""
+    """Returns the readouts in turn, then the last one for ever. Each look at its clock advances it."""
 
     name = "here"
 
@@ -82,7 +82,7 @@ def test_object_status_counts_only_for_the_last_target(obj: messages.ObjectStatu
     "sta", [one for one in messages.ActivationStatus if one is not messages.ActivationStatus.ACTIVE]
 )
 def test_inactive_gripper_holds_nothing(sta: messages.ActivationStatus) -> None:
-    """As after its supply was away for a moment: the fingers stand where they stood, and press on nothing."""
+    """After a power failure the fingers stay in place without force."""
     held = replace(ACTIVE, obj=messages.ObjectStatus.CONTACT_CLOSING, pre=GO.position, gto=True)
     for last in (GO, None):
         assert object_status(held, last) is messages.ObjectStatus.CONTACT_CLOSING

@@ -1,4 +1,4 @@
-"""The connection to the URCap, with a peer that answers as it likes, over a real socket."""
+"""The URCap's client against a scripted peer over a real socket."""
 
 import asyncio
 import time
@@ -15,7 +15,7 @@ VALUES = {"ACT": 1, "STA": 3, "GTO": 1, "PRE": 100, "OBJ": 3, "POS": 100, "FLT":
 
 
 class Peer:
-    """Answers each line as `answer` says: with bytes, or by closing where it says None."""
+    """Answers each line with `answer`; None closes the connection."""
 
     def __init__(self, answer: Callable[[str], bytes | None]) -> None:
         self.answer = answer
@@ -118,7 +118,7 @@ async def test_late_answer_is_named() -> None:
 
 
 async def test_answer_at_the_deadline_counts() -> None:
-    """After a pause of this process the answer and the timer are due together."""
+    """After a pause of this process both the answer and the timer are due."""
     client, reader, now_s = SocketClient("127.0.0.1"), asyncio.StreamReader(), asyncio.get_running_loop().time()
     receiving = asyncio.create_task(client._receive(reader, b"GET ACT\n", now_s + 0.01))
     await asyncio.sleep(0)

@@ -1,17 +1,18 @@
-"""A controller in a process of its own, shared by the tests of a module; the daemon's ends of pipes to our process."""
+"""An emulated controller in its own process, one for each module; the daemon's ends of a worker's pipes."""
 
 import asyncio
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import pytest
 
-from tests.drivers.ur.process import Daemon
+from tests.drivers.ur.process import Daemon, Timed
 from tests.emulator_process import EmulatorProcess as ControllerProcess
 
 
 @pytest.fixture(scope="module")
 def controller_process() -> Iterator[ControllerProcess]:
-    """A controller that unlocks after a second, not five."""
+    """A controller that unlocks after one second instead of five."""
     options = ("--rate-hz", "250", "--unlock-wait-s", "1.0", "--power-on-s", "0.1")
     process = ControllerProcess("ur", *options, module=1, ready="listening")
     yield process
@@ -27,7 +28,13 @@ def controller(controller_process: ControllerProcess) -> Iterator[ControllerProc
 
 @pytest.fixture
 def daemon(monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
-    """The daemon of a process that does not end, and sets no alarm."""
+    """The daemon of a worker that neither exits nor sets alarms."""
     daemon = Daemon(monkeypatch)
     yield daemon
     daemon.close()
+
+
+@pytest.fixture
+def timed(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Timed]:
+    """Run a worker in its own time."""
+    return partial(Timed, daemon, monkeypatch)

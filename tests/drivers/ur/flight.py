@@ -1,4 +1,4 @@
-"""A handler that flies an arm of a test's own, cycle by cycle."""
+"""A handler that drives a fake arm, cycle by cycle."""
 
 import dataclasses
 import math
@@ -18,9 +18,9 @@ POSE = (-0.5, -0.1, 0.45, 0.0, math.pi, 0.0)
 
 
 class FakeArm:
-    """A wrist that follows speeds, a controller with modes and a watchdog, and a list of everything that was called.
+    """A wrist that follows speeds, a controller with modes and a watchdog, and a list of all calls.
 
-    As the real program's, its speed thread goes on until it is ended, whatever else is sent, and after a pause too.
+    As in the real program, the speed thread runs until it is ended, also after a pause.
     """
 
     def __init__(self) -> None:
@@ -33,12 +33,12 @@ class FakeArm:
         self.stale_command = False
         self._resumed_target = 0.0
         self._watched = False
-        self._unheard_ns = 0
+        self._since_call_ns = 0
 
     def cycle(self) -> None:
         if self.reading.runtime_state == 2:
-            self._unheard_ns += CYCLE_NS
-            if self._watched and self._unheard_ns > WATCHDOG_NS:
+            self._since_call_ns += CYCLE_NS
+            if self._watched and self._since_call_ns > WATCHDOG_NS:
                 self.end_program()
         wrist, speed = self.reading.q_rad[5], self.reading.qd_rad_per_s[5]
         step = self.acceleration * CYCLE_NS / 1e9
@@ -71,35 +71,35 @@ class FakeArm:
         self.target = self._resumed_target
         self.be(safety_mode=1, runtime_state=2)
 
-    def hear(self, call: str) -> None:
+    def note(self, call: str) -> None:
         self.calls.append(call)
-        self._unheard_ns = 0
+        self._since_call_ns = 0
 
     def wrist(self, command: messages.WristSpeed) -> bool:
-        self.hear("wrist")
+        self.note("wrist")
         if self.takes:
             self.target, self.acceleration = command.rad_per_s, command.acceleration_rad_per_s2
             self.stale_command = True
         return self.takes
 
     def end_speed(self, deceleration_rad_per_s2: float) -> bool:
-        self.hear("end_speed")
+        self.note("end_speed")
         self.target, self.acceleration = 0.0, deceleration_rad_per_s2
         return True
 
     def move(self, _command: messages.MoveLinear) -> bool:
-        self.hear("move")
+        self.note("move")
         self.be(moving_linearly=self.takes)
         return self.takes
 
     def stop_move(self, _deceleration_rad_per_s2: float) -> bool:
-        self.hear("stop_move")
+        self.note("stop_move")
         if self.stops_moves:
             self.be(moving_linearly=False)
         return self.takes
 
     def send_heartbeat(self) -> bool:
-        self.hear("send_heartbeat")
+        self.note("send_heartbeat")
         return True
 
     def clear_command(self) -> bool:
@@ -108,7 +108,7 @@ class FakeArm:
         return True
 
     def zero_wrench(self) -> bool:
-        self.hear("zero_wrench")
+        self.note("zero_wrench")
         return True
 
     def unlock(self) -> None:
@@ -143,7 +143,7 @@ class FakeArm:
         return True
 
     def arm_watchdog(self) -> bool:
-        self.hear("arm_watchdog")
+        self.note("arm_watchdog")
         self._watched = True
         return True
 
@@ -160,17 +160,17 @@ class Flight:
         self.begin_anew(takes_over=takes_over)
 
     def begin_anew(self, *, takes_over: bool) -> None:
-        """Put another handler in the place of the one before."""
+        """Replace the handler."""
         self.cycle = 0
         self.handler = CommandHandler(self._settings, self.arm, self.now_ns, takes_over=takes_over)
 
     def be_alone(self) -> None:
-        """Let a cycle pass without a handler; what is done then is the program's own."""
+        """Run a cycle of the program without a handler."""
         self.arm.cycle()
         self.now_ns += CYCLE_NS
 
     def ask(self, command: messages.Command) -> messages.CommandReply:
-        """Send a command and return its reply, letting cycles pass until it comes."""
+        """Send a command, run cycles until its reply comes, and return it."""
         self.number += 1
         reply = self.handler.request(self.number, command, self.arm.reading, self.now_ns)
         for _ in range(6000):

@@ -1,4 +1,4 @@
-"""The robot's own process in the test's own process: the daemon's ends of its pipes, arms for it, and its time."""
+"""The worker inside the test's process: the daemon's ends of its pipes, fake arms, a fake clock."""
 
 import os
 from typing import NoReturn
@@ -10,8 +10,8 @@ from shearloop.drivers.ur.messages import Configure, Message, MessageDecoder, Ro
 from tests.drivers.ur.flight import SETTINGS, FakeArm
 
 
-class LeftError(Exception):
-    """The process would have ended here."""
+class ExitedError(Exception):
+    """The worker would exit here."""
 
 
 class Daemon:
@@ -24,17 +24,17 @@ class Daemon:
         self._all = [its_stdin, self._stdin, self._stdout, its_stdout]
         self.pipe = worker.Pipe(its_stdin, its_stdout)
         monkeypatch.setattr(worker, "_set_alarm", lambda _seconds: None)
-        monkeypatch.setattr(worker, "_exit", self._left)
+        monkeypatch.setattr(worker, "_exit", self._exited)
 
     @staticmethod
-    def _left(_status: int) -> NoReturn:
-        raise LeftError
+    def _exited(_status: int) -> NoReturn:
+        raise ExitedError
 
-    def say(self, *messages: Message) -> None:
+    def send(self, *messages: Message) -> None:
         for number, message in enumerate(messages, 1):
             os.write(self._stdin, encode(message, number))
 
-    def hear(self) -> list[tuple[int, Message]]:
+    def receive(self) -> list[tuple[int, Message]]:
         return MessageDecoder().feed(os.read(self._stdout, 1 << 20))
 
     def close(self) -> None:
@@ -43,7 +43,7 @@ class Daemon:
 
 
 class CyclingArm(FakeArm):
-    """An arm that goes through a cycle whenever it is read."""
+    """An arm that runs a cycle at each read."""
 
     def read(self) -> RtdeSample:
         self.cycle()
@@ -55,12 +55,12 @@ class CyclingArm(FakeArm):
 
 
 def fly(daemon: Daemon, arm: CyclingArm) -> None:
-    with pytest.raises(LeftError):
+    with pytest.raises(ExitedError):
         worker._control(daemon.pipe, Configure(SETTINGS), arm)  # type: ignore[arg-type]  # an arm in all that counts
 
 
 class Time:
-    """A clock that only waiting moves on."""
+    """A clock that only waiting advances."""
 
     def __init__(self) -> None:
         self.now_s = 1000.0
@@ -76,7 +76,7 @@ class Time:
 
 
 class TimedArm(CyclingArm):
-    """An arm that is read in the process's own time; `read_s` keeps when."""
+    """An arm in the worker's time; `read_s` holds the times of its reads."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -90,7 +90,7 @@ class TimedArm(CyclingArm):
 
 
 class Timed:
-    """A flight in a time of its own: at some times the daemon says something; what was done when is kept."""
+    """A worker in its own time; the daemon sends the script's messages at their times."""
 
     def __init__(
         self,
@@ -106,13 +106,13 @@ class Timed:
         monkeypatch.setattr(worker, "time", self.time)
         monkeypatch.setattr(daemon.pipe, "wait", self._wait)
         fly(daemon, self.arm)
-        self.states = [message for _, message in daemon.hear() if isinstance(message, RobotState)]
+        self.states = [message for _, message in daemon.receive() if isinstance(message, RobotState)]
 
     def _wait(self, timeout_s: float) -> bool:
         if self._script and self._script[0][0] <= self.time.now_s + timeout_s:
             at_s, message = self._script.pop(0)
             self.time.now_s = max(self.time.now_s, at_s)
-            self._daemon.say(message)
+            self._daemon.send(message)
             return True
         self.time.now_s += timeout_s
         return False

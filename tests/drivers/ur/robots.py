@@ -1,4 +1,4 @@
-"""A robot as the daemon has it, with the settings that are delivered."""
+"""A robot as in the daemon, with the delivered settings."""
 
 import asyncio
 import contextlib
@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[3]
 
 
 class Link:
-    """A robot's link events, to be waited for."""
+    """A robot's link events."""
 
     def __init__(self) -> None:
         self.events: list[UrLinkEvent] = []
@@ -25,7 +25,7 @@ class Link:
         self._changed.set()
 
     async def down(self, number: int = 1, within_s: float = 15.0) -> UrLinkEvent:
-        """Return the loss of this number."""
+        """Wait for the loss of this number and return it."""
         async with asyncio.timeout(within_s):
             while len(losses := [event for event in self.events if event.status == "down"]) < number:
                 self._changed.clear()

@@ -1,4 +1,4 @@
-"""Connecting, with a client of the test's own in place of ur-rtde."""
+"""`UrArm` over fake ur-rtde clients."""
 
 import ctypes
 import dataclasses
@@ -31,13 +31,13 @@ class Client:
         return "        keep_running = True\n"
 
     def latest(self) -> ReceivedSample:
-        """Be a controller whose program has ended while a command was done, and not ready again."""
+        """Return a sample of a program that ended during a command."""
         return ReceivedSample(1.0, SIX, SIX, SIX, SIX, 7, 1, 1, 1.0, 2)
 
 
 @pytest.fixture
 def arm(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
-    """The module `shearloop.drivers.ur.arm` over such clients."""
+    """The module `shearloop.drivers.ur.arm` over fake clients."""
     for name, kinds in (
         ("rtde_control", ["RTDEControlInterface"]),
         ("dashboard_client", ["DashboardClient"]),
@@ -92,7 +92,7 @@ def test_timer_slack_is_a_fraction_of_the_watchdog_time(
 
 
 class Controlled(Client):
-    """Takes every command, and says that a straight move is under way; `asked` counts who asked."""
+    """Takes every command and reports a linear move; `asked` counts the queries."""
 
     asked = 0
 
@@ -130,7 +130,7 @@ def test_progress_is_queried_only_for_a_linear_move(arm: ModuleType, monkeypatch
 
 
 class Hanging(Client):
-    """Waits for ever, in each call but the first, for a program that has ended to be ready; `calls` names them."""
+    """Hangs in each call but the first; `calls` names them."""
 
     def __init__(self, *_: object) -> None:
         super().__init__()
@@ -150,7 +150,7 @@ class Hanging(Client):
 
 
 def test_no_call_blocks_when_no_program_runs(arm: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The robot's watchdog has ended the program after a command was done, before it was ready for another."""
+    """The watchdog has ended the program before it was ready for the next command."""
     monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Hanging)
     one = arm.UrArm(SETTINGS, VERSION)
     assert one.zero_wrench()
@@ -168,7 +168,7 @@ def test_no_call_blocks_when_no_program_runs(arm: ModuleType, monkeypatch: pytes
 def test_register_is_cleared_once_the_client_knows_that_no_program_runs(
     arm: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before, it would wait for that program to be ready."""
+    """Before that, the client would wait for the program."""
     monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Hanging)
     one = arm.UrArm(SETTINGS, VERSION)
     assert not one.clear_command()
@@ -179,14 +179,14 @@ def test_register_is_cleared_once_the_client_knows_that_no_program_runs(
 
 
 def test_silently_reopened_connection_is_lost(arm: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It says nothing of it; on the descriptor of the one before there is another."""
+    """ur-rtde reopens it silently, on the same descriptor."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = server.getsockname()
         monkeypatch.setattr(arm, "RTDE_PORT", address[1])
         with socket.create_connection(address):
 
             class Reconnecting(Controlled):
-                """Has a connection to the controller, and has another after `reconnect`."""
+                """Has a connection to the controller, and a new one after `reconnect`."""
 
                 def __init__(self, *_: object) -> None:
                     super().__init__()
@@ -232,7 +232,7 @@ def test_sent_script_arms_its_watchdog(arm: ModuleType, monkeypatch: pytest.Monk
 def test_connection_that_takes_no_script_is_lost(
     arm: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Only another process opens it again; the one that met it died of it, and told its traceback."""
+    """Only a new worker opens the connection again."""
 
     class Closed(Controlled):
         def setCustomScriptFile(self, _path: str) -> None:  # noqa: N802 - ur-rtde's name

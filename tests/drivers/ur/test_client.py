@@ -1,10 +1,12 @@
-"""The whole driver over real TCP: the real ur-rtde in its process, an emulated controller in another."""
+"""The whole driver over TCP: ur-rtde in the worker, an emulated controller in another process."""
 
 import asyncio
+import contextlib
 import os
 import signal
 import sys
 import time
+from collections.abc import AsyncIterator
 
 import pytest
 
@@ -22,12 +24,21 @@ STOPPED_WITHIN_S = 0.2
 
 
 async def turn(robot: UrRobot, controller: ControllerProcess, speed: float = 0.5) -> None:
-    """Turn the wrist, and return when it is up to speed."""
+    """Turn the wrist and return when it has reached its speed."""
     since_ns = time.monotonic_ns()
     reply = await robot.send(WristSpeed(speed, 4.0))
     assert reply.accepted, reply.refusal
     await controller.event("motion-started", since_ns)
     await until(robot, lambda state: abs(state.qd_rad_per_s[5]) > 0.9 * abs(speed))
+
+
+@contextlib.asynccontextmanager
+async def turning(controller: ControllerProcess, link: Link | None = None, **changes: float) -> AsyncIterator[UrRobot]:
+    """Return a robot with a turning wrist."""
+    async with running(settings_for(controller.host, **changes), link) as robot:
+        await enable(robot)
+        await turn(robot, controller)
+        yield robot
 
 
 def stopped_after_s(event: dict[str, int], since_ns: int) -> float:
@@ -94,9 +105,7 @@ async def test_state_comes_125_times_a_second_with_the_controllers_own_time(cont
 
 async def test_twist_stops_when_the_client_is_killed(controller: ControllerProcess) -> None:
     link = Link()
-    async with running(settings_for(controller.host), link) as robot:
-        await enable(robot)
-        await turn(robot, controller)
+    async with turning(controller, link) as robot:
         assert robot.pid is not None
         killed_ns = time.monotonic_ns()
         os.kill(robot.pid, signal.SIGKILL)
@@ -116,10 +125,8 @@ async def test_twist_stops_when_the_client_is_killed(controller: ControllerProce
 
 
 async def test_stalled_samples_end_the_motion(controller: ControllerProcess) -> None:
-    """Longer than data are believed, and back before the robot's watchdog has noticed: the program must not turn on."""
-    async with running(settings_for(controller.host)) as robot:
-        await enable(robot)
-        await turn(robot, controller)
+    """Longer than `state_timeout_s`, shorter than the watchdog's time: the wrist must not turn on."""
+    async with turning(controller) as robot:
         stalled_ns = await controller.fault(f"silence {robot.settings.state_timeout_s + 0.04}")
         # Wanted until the data are no longer believed.
         assert (await robot.send(WristSpeed(0.5, 4.0))).accepted
@@ -133,9 +140,7 @@ async def test_stalled_samples_end_the_motion(controller: ControllerProcess) -> 
 
 
 async def test_protective_stop_is_reported_and_unlocked_by_the_same_worker(controller: ControllerProcess) -> None:
-    async with running(settings_for(controller.host)) as robot:
-        await enable(robot)
-        await turn(robot, controller)
+    async with turning(controller) as robot:
         pid = robot.pid
         asked_ns = await controller.fault("protective-stop")
         state = await until(robot, lambda state: state.protective_stop)
@@ -152,9 +157,7 @@ async def test_protective_stop_is_reported_and_unlocked_by_the_same_worker(contr
 
 
 async def test_emergency_stop_is_reported_and_recovered_from(controller: ControllerProcess) -> None:
-    async with running(settings_for(controller.host)) as robot:
-        await enable(robot)
-        await turn(robot, controller)
+    async with turning(controller) as robot:
         asked_ns = await controller.fault("emergency-stop")
         state = await until(robot, lambda state: state.emergency_stop)
         assert "Emergency stop" in state.blocked
@@ -168,9 +171,7 @@ async def test_emergency_stop_is_reported_and_recovered_from(controller: Control
 
 async def test_lost_rtde_ends_the_worker_and_the_next_moves_nothing(controller: ControllerProcess) -> None:
     link = Link()
-    async with running(settings_for(controller.host), link) as robot:
-        await enable(robot)
-        await turn(robot, controller)
+    async with turning(controller, link) as robot:
         dropped_ns = await controller.fault("drop-rtde")
         stopped = await controller.event("motion-stopped", dropped_ns)
         assert stopped_after_s(stopped, dropped_ns) <= STOPPED_WITHIN_S
@@ -195,9 +196,7 @@ async def test_crash_of_the_client_is_named(controller: ControllerProcess) -> No
 
 async def test_hung_worker_is_replaced(controller: ControllerProcess) -> None:
     link = Link()
-    async with running(settings_for(controller.host, hang_timeout_s=0.3), link) as robot:
-        await enable(robot)
-        await turn(robot, controller)
+    async with turning(controller, link, hang_timeout_s=0.3) as robot:
         assert robot.pid is not None
         hung_ns = time.monotonic_ns()
         os.kill(robot.pid, signal.SIGSTOP)
@@ -212,9 +211,7 @@ async def test_hung_worker_is_replaced(controller: ControllerProcess) -> None:
 
 async def test_silent_controller_is_reported_and_the_robot_stops(controller: ControllerProcess) -> None:
     link = Link()
-    async with running(settings_for(controller.host, connect_timeout_s=1.5), link) as robot:
-        await enable(robot)
-        await turn(robot, controller)
+    async with turning(controller, link, connect_timeout_s=1.5) as robot:
         silent_ns = await controller.fault("silence 3600")
         stopped = await controller.event("motion-stopped", silent_ns)
         # Data is believed for state_timeout_s, then the watchdog is no longer kicked.
@@ -252,10 +249,8 @@ async def test_connection_that_is_refused_is_explained(
 async def test_leaving_stops_the_arm_and_ends_the_program(
     told: signal.Signals | None, controller: ControllerProcess
 ) -> None:
-    """Also where a terminal, or a service manager, tells every process of the daemon to end."""
-    async with running(settings_for(controller.host)) as robot:
-        await enable(robot)
-        await turn(robot, controller)
+    """Also when a terminal or service manager signals every process."""
+    async with turning(controller) as robot:
         left_ns = time.monotonic_ns()
         if told is not None:
             assert robot.pid is not None

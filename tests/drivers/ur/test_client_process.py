@@ -1,4 +1,4 @@
-"""The daemon's end of the robot where there is no controller: what is said of a process that ends."""
+"""`UrRobot` without a controller: the worker's end, and the message about it."""
 
 import asyncio
 import gc
@@ -35,7 +35,7 @@ async def test_missing_ur_rtde_is_explained(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.fixture
 def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Have shell commands run instead of the robot's process."""
+    """Run shell commands instead of the worker."""
 
     def write(commands: str) -> None:
         script = tmp_path / "process"
@@ -84,7 +84,7 @@ os.write(1, encode(flight.state))
 """
 
 
-LEAVES_IN_GOOD_ORDER = """
+DISCONNECTS = """
 import os, sys
 from shearloop.drivers.ur.messages import Disconnect
 from shearloop.drivers.ur.command_handler import CommandHandler
@@ -105,7 +105,7 @@ async def test_failing_reply_callback_does_not_prevent_disconnecting(
     play: Callable[[str], None], tmp_path: Path
 ) -> None:
     told = tmp_path / "told"
-    play(f"cd '{ROOT}' && exec '{sys.executable}' -c '{LEAVES_IN_GOOD_ORDER}' '{told}'")
+    play(f"cd '{ROOT}' && exec '{sys.executable}' -c '{DISCONNECTS}' '{told}'")
     unheard: list[dict[str, Any]] = []
     asyncio.get_running_loop().set_exception_handler(lambda _, context: unheard.append(context))
     replies: list[CommandReply] = []
@@ -119,7 +119,7 @@ async def test_failing_reply_callback_does_not_prevent_disconnecting(
             robot.send_nowait(Stop(1.0), dies)
             robot.send_nowait(Stop(1.0), replies.append)
     assert robot.pid is None
-    assert told.read_text() == "True\n", "it was told to go, and went by itself"
+    assert told.read_text() == "True\n", "it exits on Disconnect"
     assert ["ended before it answered" in reply.refusal for reply in replies] == [True]
     assert [repr(context["exception"]) for context in unheard] == ["ZeroDivisionError('nothing to divide')"]
 
@@ -142,7 +142,7 @@ STALE, PAUSED = {"age_ns": 400_000_000}, {"safety_mode": 3, "runtime_state": 4}
 
 
 def lost_after(*readings: dict[str, int], flight: Flight) -> UrRobot:
-    """Return a robot that was lost after a flight in which these were read."""
+    """Return a robot that was lost after these samples."""
     robot = UrRobot(SETTINGS)
     for reading in readings:
         flight.arm.be(**reading)
@@ -224,7 +224,7 @@ async def test_worker_that_ends_during_shutdown_is_awaited(
 async def test_worker_lost_during_shutdown_is_not_restarted(
     play: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Task groups tell of the loss alone, and the daemon waited for ever for a robot that it had told to end."""
+    """A task group raises the loss alone; the cancellation must not get lost."""
     play("exec cat")
     listened: list[WorkerConnection] = []
     kept_alive = asyncio.Event()

@@ -1,4 +1,4 @@
-"""Whatever happens in whatever order, no motion begins by itself or goes on by itself."""
+"""In any order of events, no motion begins or continues by itself."""
 
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -10,7 +10,7 @@ from tests.drivers.ur.test_limits import LIMITS
 
 
 class AnyFlight(RuleBasedStateMachine):
-    """Whatever happens in whatever order: commands within the limits, and no motion that was not asked for just now."""
+    """Any order of events: commands stay within the limits, and only a recent command moves the arm."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -58,14 +58,14 @@ class AnyFlight(RuleBasedStateMachine):
 
     @precondition(lambda self: self.flight.arm.reading.runtime_state == 4)
     @rule()
-    def someone_resumes_the_program(self) -> None:
+    def program_is_resumed(self) -> None:
         self.flight.arm.be_resumed_at_the_pendant()
         # What the program did before it was paused it may do until its watchdog ends it.
         self.allowed_until_ns = self.flight.now_ns + 500_000_000
         self.fly(100)
 
     @rule(cycles=st.integers(1, 10))
-    def hear_nothing_new(self, cycles: int) -> None:
+    def samples_get_old(self, cycles: int) -> None:
         self.flight.arm.be(age_ns=300_000_000)
         self.fly(cycles)
         self.flight.arm.be(age_ns=0)
@@ -90,7 +90,7 @@ class AnyFlight(RuleBasedStateMachine):
         assert abs(arm.target) <= LIMITS.wrist_speed_rad_per_s.inner
         assert abs(arm.reading.wrist_rad) <= 1.9 + 1e-6
         if self.flight.now_ns > self.allowed_until_ns:
-            assert arm.reading.qd_rad_per_s[5] == 0, "it moves, and nobody asked"
+            assert arm.reading.qd_rad_per_s[5] == 0, "it moves without a command"
 
 
 AnyFlight.TestCase.settings = hypothesis_settings(max_examples=60, stateful_step_count=25, deadline=None)

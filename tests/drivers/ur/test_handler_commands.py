@@ -1,4 +1,4 @@
-"""What the handler sends and refuses: nothing moves before it is enabled, and what is sent is told."""
+"""Commands that the handler sends and refuses."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Stops, faults and a robot that does not follow, and the recovery on the operator's request."""
+"""Stops, faults, a robot that does not follow, and recovery."""
 
 import pytest
 
@@ -94,7 +94,7 @@ def test_program_left_behind_ends_before_ours_starts(takes_over: bool) -> None:
 
 
 def test_program_started_after_a_loss_is_stopped_only_on_unlock() -> None:
-    """Left behind by a process, ours would have ended by its watchdog before the next one was there."""
+    """A program of the lost worker would have ended by its watchdog."""
     flight = Flight(takes_over=True)
     flight.arm.be(runtime_state=2)
     flight.fly(500)
@@ -119,13 +119,13 @@ def test_foreign_program_gets_no_commands() -> None:
 
 
 def test_program_after_an_abandoned_start_may_be_ours(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its upload was sent, and takes only after the operator's stop; ours ends by its watchdog before long."""
+    """The upload may take effect after the recovery was given up."""
     flight = Flight()
     monkeypatch.setattr(flight.arm, "upload", lambda: True)
     flight.fly(5)
     recovery = flight.handler._recovery
     assert recovery is not None
-    recovery.give_up("Nobody waits for it.")
+    recovery.give_up("The recovery is given up.")
     flight.fly(5)
     assert not flight.state.recovering
     assert not flight.state.owns_program
@@ -156,7 +156,7 @@ def test_protective_stop_is_unlocked_only_by_the_operator() -> None:
     flight.fly(100)
     assert flight.state.protective_stop
     assert flight.state.blocked.startswith("Protective stop")
-    assert flight.arm.calls == ["stop_program"], "above all nothing is unlocked"
+    assert flight.arm.calls == ["stop_program"], "nothing is unlocked"
     assert "Protective stop" in flight.ask(Enable()).refusal
 
     flight.arm.unlockable = False
@@ -225,8 +225,8 @@ def test_old_samples_block_motion() -> None:
     assert "is 0.30 s old" in flight.ask(WristSpeed(0.1, 1.0)).refusal
     flight.arm.be(age_ns=0)
     flight.fly(40)
-    assert flight.state.blocked, "what came back is not trusted by itself"
-    assert flight.wrist_speed == 0, "the program turned on, and was kept going"
+    assert flight.state.blocked, "motion stays blocked after the samples return"
+    assert flight.wrist_speed == 0, "the program must not be kept going"
 
 
 def test_old_samples_at_rest_need_only_an_enable() -> None:
@@ -280,7 +280,7 @@ def test_unlocking_with_old_samples_times_out() -> None:
 
 
 def test_slowly_starting_program_gets_heartbeats(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It arms its watchdog by itself as it begins, whenever that is."""
+    """The program arms its watchdog when it starts."""
     flight = Flight()
     upload = flight.arm.upload
     monkeypatch.setattr(flight.arm, "upload", lambda: flight.arm.calls.append("upload"))

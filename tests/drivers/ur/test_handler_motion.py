@@ -1,4 +1,4 @@
-"""How motions go on and end: turning, linear moves, stops."""
+"""Motions and their ends: turning, linear moves, stops."""
 
 import pytest
 
@@ -7,8 +7,8 @@ from tests.drivers.ur.flight import POSE, Flight, flying, turning
 from tests.drivers.ur.test_limits import LIMITS
 
 
-def said_in(flight: Flight, cycles: int) -> list[int]:
-    """Go through so many cycles, and return in which of them the robot was told anything."""
+def cycles_with_calls(flight: Flight, cycles: int) -> list[int]:
+    """Run cycles and return the numbers of those in which something was sent."""
     said = []
     for number in range(cycles):
         before = len(flight.arm.calls)
@@ -32,24 +32,24 @@ def test_wrist_speed_ends_when_it_is_not_renewed() -> None:
 def test_something_is_sent_in_each_cycle_of_a_motion() -> None:
     flight = flying()
     assert flight.ask(WristSpeed(0.1, 4.0)).accepted
-    assert said_in(flight, 30) == [*range(30)]
+    assert cycles_with_calls(flight, 30) == [*range(30)]
     assert flight.arm.calls[-1] == "wrist"
     assert flight.ask(Stop(4.0)).accepted
     flight.fly_until(lambda state: state.motion == "idle")
     assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
-    assert said_in(flight, 30) == [*range(30)]
+    assert cycles_with_calls(flight, 30) == [*range(30)]
     assert flight.arm.calls[-1] == "send_heartbeat"
 
 
-@pytest.mark.parametrize("given_anew", [False, True])
-def test_speed_changed_by_a_limit_is_sent_in_the_same_cycle(given_anew: bool) -> None:
-    """However long ago the one before was sent, and whether the daemon gives its own anew or not."""
+@pytest.mark.parametrize("repeated", [False, True])
+def test_speed_changed_by_a_limit_is_sent_in_the_same_cycle(repeated: bool) -> None:
+    """In any cycle after the last command, repeated or not."""
     for cycles in range(1, 7):
         flight = flying()
         assert flight.ask(WristSpeed(0.5, 4.0)).accepted
         flight.fly(cycles)
         flight.arm.be(wrench=(0.0, 0.0, 50.0, 0.0, 0.0, 0.0))
-        if given_anew:
+        if repeated:
             assert flight.ask(WristSpeed(0.5, 4.0)).accepted
         flight.fly(1)
         assert flight.arm.target == pytest.approx(0.4), "half of the fastest, half way to the hard limit"
@@ -65,7 +65,7 @@ def test_same_speed_with_another_acceleration_is_sent_at_once() -> None:
 @pytest.mark.parametrize("cycles", [3, 4, 5])
 @pytest.mark.parametrize("stopped", [False, True])
 def test_last_cycle_of_a_linear_move_sends_a_heartbeat(cycles: int, stopped: bool) -> None:
-    """However old the last one: the next cycle may be three away."""
+    """Independent of the age of the last one."""
     flight = flying()
     assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
     flight.fly(cycles)
@@ -113,7 +113,7 @@ def test_linear_move_gets_heartbeats_and_reports_its_arrival() -> None:
     assert "linear move is under way" in flight.ask(WristSpeed(0.1, 1.0)).refusal
     flight.arm.be(moving_linearly=False, qd_rad_per_s=(0.1, 0.0, 0.0, 0.0, 0.0, 0.0))
     flight.handler.tick(flight.arm.reading, flight.now_ns)
-    assert flight.state.motion == "linear", "its joints are still said to move"
+    assert flight.state.motion == "linear", "its joints still move"
     flight.fly(2)
     assert (flight.state.motion, flight.state.end_reason) == ("idle", "arrived")
 

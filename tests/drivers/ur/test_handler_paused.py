@@ -1,4 +1,4 @@
-"""A program that is paused, in the handler's own time: its owner, and the requests to stop it."""
+"""Paused programs: their owner, and the requests to stop them."""
 
 from itertools import pairwise
 
@@ -8,16 +8,16 @@ from shearloop.drivers.ur.messages import Disconnect, Enable, Unlock
 from shearloop.drivers.ur.recovery import STOP_RETRIES_S
 from tests.drivers.ur.flight import CYCLE_NS, Flight, flying, turning
 
-ASKED = "stop_program"
+STOP_REQUEST = "stop_program"
 
 
-def asked_s(flight: Flight, seconds: float) -> list[float]:
-    """Let time pass, and return when a program was asked to stop."""
+def stop_requests_s(flight: Flight, seconds: float) -> list[float]:
+    """Let time pass and return the times of the requests to stop a program."""
     since_ns, times = flight.now_ns, []
     for _ in range(round(seconds * 1e9 / CYCLE_NS)):
-        before = flight.arm.calls.count(ASKED)
+        before = flight.arm.calls.count(STOP_REQUEST)
         flight.fly(1)
-        times += [(flight.now_ns - CYCLE_NS - since_ns) / 1e9] * (flight.arm.calls.count(ASKED) - before)
+        times += [(flight.now_ns - CYCLE_NS - since_ns) / 1e9] * (flight.arm.calls.count(STOP_REQUEST) - before)
     return times
 
 
@@ -58,7 +58,7 @@ def test_silent_dashboard_is_retried_with_growing_pauses(takes_over: bool) -> No
     flight.arm.be(runtime_state=2)
     flight.arm.stoppable = False
     flight.arm.protective_stop()
-    times = asked_s(flight, 200.0)
+    times = stop_requests_s(flight, 200.0)
     pauses = [later - sooner for sooner, later in pairwise(times)]
     assert times[0] < 0.05
     assert pauses == pytest.approx(STOP_RETRIES_S, abs=0.02)
@@ -89,9 +89,9 @@ def test_long_cycles_are_announced() -> None:
     flight.arm.stoppable = False
     flight.arm.protective_stop()
     for _ in range(400):
-        announced, before = flight.state.recovering, flight.arm.calls.count(ASKED)
+        announced, before = flight.state.recovering, flight.arm.calls.count(STOP_REQUEST)
         flight.fly(1)
-        assert announced == (flight.arm.calls.count(ASKED) > before)
+        assert announced == (flight.arm.calls.count(STOP_REQUEST) > before)
 
 
 def test_each_pause_gets_new_requests() -> None:
@@ -105,24 +105,24 @@ def test_each_pause_gets_new_requests() -> None:
     flight.arm.calls.clear()
     flight.arm.protective_stop()
     flight.fly(3)
-    assert flight.arm.calls == [ASKED]
+    assert flight.arm.calls == [STOP_REQUEST]
 
 
 @pytest.mark.parametrize(("runtime_state", "times"), [(0, 0), (1, 0), (3, 1), (4, 1), (5, 1)])
 def test_only_paused_programs_are_stopped(runtime_state: int, times: int) -> None:
-    """Of the controller's states 0 is stopping, 1 stopped, 3 pausing, 4 paused and 5 resuming."""
+    """Runtime states: 0 stopping, 1 stopped, 3 pausing, 4 paused, 5 resuming."""
     flight = turning()
     flight.arm.stoppable = False
     flight.arm.be(runtime_state=runtime_state)
-    assert len(asked_s(flight, 0.5)) == times
+    assert len(stop_requests_s(flight, 0.5)) == times
 
 
 def test_old_sample_causes_no_program_stop() -> None:
-    """Whatever was paused then, somebody else's may be there by now."""
+    """Another client's program may be there by now."""
     flight = turning()
     flight.arm.protective_stop()
     flight.arm.be(age_ns=300_000_000)
-    assert asked_s(flight, 5.0) == []
+    assert stop_requests_s(flight, 5.0) == []
 
 
 def test_program_started_at_the_pendant_after_ours_is_left_alone() -> None:
@@ -132,7 +132,7 @@ def test_program_started_at_the_pendant_after_ours_is_left_alone() -> None:
     flight.arm.be(runtime_state=2)
     flight.fly(3)
     flight.arm.protective_stop()
-    assert asked_s(flight, 5.0) == []
+    assert stop_requests_s(flight, 5.0) == []
     assert not flight.handler.owns_paused_program(flight.arm.reading)
 
 
@@ -142,7 +142,7 @@ def test_paused_program_left_behind_is_left_to_the_exit() -> None:
     flight.arm.be(safety_mode=3, runtime_state=4)
     flight.fly(10)
     assert flight.ask(Disconnect()).accepted
-    assert asked_s(flight, 5.0) == [], "while it leaves, by who leaves"
+    assert stop_requests_s(flight, 5.0) == [], "the exit stops it"
     assert flight.handler.owns_paused_program(flight.arm.reading)
 
 
@@ -169,24 +169,24 @@ def test_program_being_started_is_ours_during_an_unlock() -> None:
 
 @pytest.mark.parametrize(("played_s", "times"), [(0.5, 1), (4.0, 0)])
 def test_program_that_plays_without_heartbeats_is_foreign(played_s: float, times: int) -> None:
-    """Its end may fall into the seconds that a dashboard hangs, in which nothing is read."""
+    """Our program may end while the dashboard hangs and no sample is read."""
     flight = turning()
     flight.arm.stoppable = False
     flight.arm.protective_stop()
     flight.fly(3)
     flight.arm._watched = False
     flight.arm.be(safety_mode=1, runtime_state=2)
-    assert asked_s(flight, played_s) == []
+    assert stop_requests_s(flight, played_s) == []
     flight.arm.be(runtime_state=4)
     # Ours may have been resumed just now, and is paused again.
-    assert len(asked_s(flight, 1.5)) == times
+    assert len(stop_requests_s(flight, 1.5)) == times
 
 
 def test_our_program_stays_ours_while_it_plays() -> None:
     flight = flying()
     flight.fly(500)
     flight.arm.protective_stop()
-    assert len(asked_s(flight, 0.5)) == 1
+    assert len(stop_requests_s(flight, 0.5)) == 1
 
 
 def test_old_samples_do_not_make_a_program_foreign() -> None:
@@ -196,11 +196,11 @@ def test_old_samples_do_not_make_a_program_foreign() -> None:
     flight.arm.be(age_ns=300_000_000)
     flight.fly(500)
     flight.arm.be(age_ns=0, runtime_state=4)
-    assert len(asked_s(flight, 0.5)) == 1
+    assert len(stop_requests_s(flight, 0.5)) == 1
 
 
 def test_paused_program_of_unknown_owner_is_reported() -> None:
-    """Once the protective stop is unlocked at the pendant, its button to play would turn the wrist."""
+    """If resumed at the pendant, it would turn the wrist."""
     flight = Flight()
     flight.arm.be(safety_mode=3, runtime_state=4)
     flight.fly(5)

@@ -1,4 +1,4 @@
-"""Signs of life to the robot's process: as often as it needs them, and none where commands are some."""
+"""Heartbeats to the worker: as often as needed, none while commands come."""
 
 import asyncio
 from itertools import pairwise
@@ -16,12 +16,12 @@ LONGEST_S = SETTINGS.silence_timeout_s / 4
 
 
 class Played:
-    """A robot that is told a command each 8 ms until `commands_until_s`, and a clock that only sleeping moves on."""
+    """A worker that gets a command each 8 ms until `commands_until_s`, and a clock that only sleeping advances."""
 
     def __init__(self, commands_until_s: float, ends_s: float) -> None:
         self.now_s = 0.0
         self.connection: Any = None
-        self.signs_s: list[float] = []
+        self.heartbeats_s: list[float] = []
         self._commands_until_s, self._ends_s = commands_until_s, ends_s
 
     def get_pipe_transport(self, _fd: int) -> Any:
@@ -31,12 +31,12 @@ class Played:
         return 0
 
     def write(self, data: bytes) -> None:
-        """Take what the process is told."""
+        """Note a heartbeat."""
         if data == encode(Heartbeat()):
-            self.signs_s.append(self.now_s)
+            self.heartbeats_s.append(self.now_s)
 
     async def sleep(self, seconds: float) -> None:
-        """Let so much time pass."""
+        """Let time pass."""
         assert seconds > 0
         # No sleep is as short as what rounding leaves.
         self.now_s += max(seconds, 1e-6)
@@ -46,8 +46,8 @@ class Played:
             raise asyncio.CancelledError
 
 
-async def signs_s(monkeypatch: pytest.MonkeyPatch, commands_until_s: float, ends_s: float) -> list[float]:
-    """Return when signs of life were given."""
+async def heartbeats_s(monkeypatch: pytest.MonkeyPatch, commands_until_s: float, ends_s: float) -> list[float]:
+    """Return the times of the heartbeats."""
     played: Any = Played(commands_until_s, ends_s)
     monkeypatch.setattr(client, "time", SimpleNamespace(monotonic=lambda: played.now_s))
     played.connection = WorkerConnection(SETTINGS, lambda *_: None)
@@ -56,17 +56,17 @@ async def signs_s(monkeypatch: pytest.MonkeyPatch, commands_until_s: float, ends
         patched.setattr(asyncio, "sleep", played.sleep)
         with pytest.raises(asyncio.CancelledError):
             await played.connection.keep_alive()
-    return played.signs_s
+    return played.heartbeats_s
 
 
 async def test_no_heartbeats_while_commands_come(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert await signs_s(monkeypatch, commands_until_s=10.0, ends_s=9.0) == []
+    assert await heartbeats_s(monkeypatch, commands_until_s=10.0, ends_s=9.0) == []
 
 
 async def test_heartbeats_start_after_the_last_command(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    signs = await signs_s(monkeypatch, commands_until_s=1.0, ends_s=3.0)
+    signs = await heartbeats_s(monkeypatch, commands_until_s=1.0, ends_s=3.0)
     last_command_s = 1.0 - 0.008
     assert len(signs) > 1.5 / LONGEST_S
     assert signs[0] - last_command_s <= LONGEST_S + 0.008

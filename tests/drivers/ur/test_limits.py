@@ -1,4 +1,4 @@
-"""Limits: whatever is asked, what is sent stays within, and an arm that follows it stays within its range."""
+"""Limits: commands stay within them, and an arm that follows stays within its range."""
 
 import dataclasses
 import math
@@ -81,7 +81,7 @@ def test_wrist_command_is_within_the_limits_and_reports_clipping(asked: WristSpe
 def test_arm_that_follows_stays_within_its_inner_range(
     asked: list[tuple[WristSpeed, int]], begin_rad: float, cycles_late: int
 ) -> None:
-    """The arm as speedJ moves it: towards the speed with the acceleration, commands taking hold some cycles late."""
+    """The arm follows as with speedJ; commands take effect some cycles late."""
     wrist_rad, speed = begin_rad, 0.0
     under_way = [WristSpeed(0.0, 4.0)] * cycles_late
     for command, cycles in asked:

@@ -1,4 +1,4 @@
-"""The pipe: everything arrives as it was sent, in any pieces, and nothing else is taken."""
+"""The pipe: messages arrive as sent, in any pieces; anything else is refused."""
 
 import contextlib
 import math

@@ -1,4 +1,4 @@
-"""Whether two poses are the same place, against scipy's rotations."""
+"""Distances of poses, against scipy's rotations."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""A program that is paused on an emulated controller: ours is stopped by the real ur-rtde, another's is left alone."""
+"""Paused programs on the emulated controller: ours is stopped, a foreign one is left alone."""
 
 import asyncio
 import os
@@ -20,7 +20,7 @@ STOPPED = "stopped from the dashboard"
 PAUSED = 4
 
 
-async def begin_somebody_elses_program(controller: ControllerProcess) -> None:
+async def begin_foreign_program(controller: ControllerProcess) -> None:
     since_ns = time.monotonic_ns()
     _, writer = await asyncio.open_connection(controller.host, SCRIPT_PORT)
     writer.write(b"def theirs():\n  sync()\nend\n")
@@ -30,7 +30,7 @@ async def begin_somebody_elses_program(controller: ControllerProcess) -> None:
 
 
 async def kill(robot: UrRobot, link: Link) -> None:
-    """Kill the robot's process, and return when the next one has its first states."""
+    """Kill the worker and wait for the next one's first state."""
     assert robot.pid is not None
     os.kill(robot.pid, signal.SIGKILL)
     await link.down()
@@ -40,8 +40,8 @@ async def kill(robot: UrRobot, link: Link) -> None:
 async def test_foreign_paused_program_outlives_a_lost_worker(
     controller: ControllerProcess,
 ) -> None:
-    """It was paused before we came, and nothing that we see tells whose it is but that we did not start it."""
-    await begin_somebody_elses_program(controller)
+    """It was paused before we connected."""
+    await begin_foreign_program(controller)
     since_ns = await controller.fault("protective-stop")
     link = Link()
     async with running(settings_for(controller.host), link) as robot:
@@ -65,7 +65,7 @@ async def test_program_started_after_a_lost_worker_is_left_alone(
         since_ns = time.monotonic_ns()
         os.kill(robot.pid, signal.SIGKILL)
         await controller.event("program-ended", since_ns)
-        await begin_somebody_elses_program(controller)
+        await begin_foreign_program(controller)
         since_ns = time.monotonic_ns()
         await link.down()
         state = await until(robot, lambda state: not state.recovering)

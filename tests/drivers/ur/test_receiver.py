@@ -1,4 +1,4 @@
-"""Samples of the controller, from bytes as UR's RTDE guide has them, and on a connection."""
+"""RTDE samples from bytes and on a connection."""
 
 import errno
 import socket
@@ -23,7 +23,7 @@ def package(kind: bytes, payload: bytes) -> bytes:
 
 
 def data(number: int) -> bytes:
-    """Return the package of the sample that has this number for a timestamp."""
+    """Return the package of a sample with this timestamp."""
     values = [number + 0.01 * index for index in range(24)]
     return package(b"U", b"\x01" + struct.pack(">d24diiIdi", number, *values, 7, -1, 2, 0.5, 1))
 
@@ -50,7 +50,7 @@ def test_sample_has_the_values_in_their_order() -> None:
 
 @given(st.lists(st.one_of(st.none(), st.integers(0, 40)), max_size=8), st.lists(st.integers(1, 300), max_size=20))
 def test_newest_sample_is_found_however_the_stream_is_cut(kinds: list[int | None], cuts: list[int]) -> None:
-    """None is a sample, a number the length of a text message between them."""
+    """None is a sample, a number the length of a text message."""
     packages = [data(index) if kind is None else text(kind) for index, kind in enumerate(kinds)]
     ends = [sum(map(len, packages[: index + 1])) for index in range(len(packages))]
     stream = b"".join(packages)
@@ -71,7 +71,7 @@ def test_invalid_package_is_refused(bad: bytes) -> None:
 
 
 class Controller:
-    """A controller's port at an address of the test's own, which answers as it is told."""
+    """A controller's port with scripted answers."""
 
     def __init__(self, types: bytes = TYPES, started: bytes = b"\x01") -> None:
         self._listening = socket.create_server(("127.0.0.1", 0))
@@ -117,7 +117,7 @@ def play(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Controller]]
 
 
 def arrived(receiver: RtdeReceiver, timestamp_s: float) -> bool:
-    """Look until the sample is there, or the connection's end."""
+    """Wait for the sample or the end of the connection."""
     while receiver.latest().timestamp_s != timestamp_s and receiver.connected:
         pass
     return receiver.latest().timestamp_s == timestamp_s

@@ -13,7 +13,7 @@ STARTED_NS = 7 * 10**12
 
 
 def ages_s(waits_s: list[float], *, drift: float = 0.0) -> list[float]:
-    """Return the ages of samples of which each waited for so long, by a clock that is `drift` slower than ours."""
+    """Return the ages of samples with these waits, by a clock that is `drift` slower than ours."""
     age, ages = SampleAge(), []
     for number, wait_s in enumerate(waits_s):
         made_ns = number * PERIOD_NS

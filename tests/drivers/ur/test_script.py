@@ -1,4 +1,4 @@
-"""The control script as it is sent: ur-rtde's own, with its watchdog armed before it reads a register."""
+"""The control script as sent: ur-rtde's own, with its watchdog armed before its loop."""
 
 import asyncio
 import sys
@@ -52,7 +52,7 @@ def test_memory_file_holds_the_program() -> None:
 async def test_program_of_a_worker_killed_before_arming_ends(
     controller: ControllerProcess,
 ) -> None:
-    """Nothing moves, for the register is cleared before; and nothing stays that would do what is written there."""
+    """Nothing moves: the register was cleared before."""
     pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-c", DIES_TOO_SOON, controller.host, cwd=ROOT, stdout=asyncio.subprocess.DEVNULL

@@ -1,4 +1,4 @@
-"""When the control script is ready for what is sent next, from samples of the test's own and in a time of its own."""
+"""The control script's readiness, from scripted samples in their own time."""
 
 from types import SimpleNamespace
 
@@ -13,7 +13,7 @@ PLAYING, STOPPED, PAUSED = 2, 1, 4
 
 
 class Samples:
-    """Samples every 8 ms, which say how the script is and whether its program plays; the last one says so for ever."""
+    """Samples every 8 ms with the script's and the program's state; the last one repeats."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *said: tuple[int, int]) -> None:
         self._said = list(said)
@@ -49,7 +49,7 @@ def test_only_a_later_sample_shows_readiness(monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.parametrize("runtime_state", [STOPPED, PAUSED])
 def test_ended_or_paused_program_is_not_awaited(monkeypatch: pytest.MonkeyPatch, runtime_state: int) -> None:
-    """The watchdog ends it in the middle of a command where the computer was away for long: ready it never becomes."""
+    """After a long pause of the computer the watchdog ends the program during a command."""
     samples = Samples(monkeypatch, (DONE, PLAYING), (DONE, PLAYING), (DONE, runtime_state))
     ready = ScriptReadiness(samples, 0.1)
     ready.command_sent()

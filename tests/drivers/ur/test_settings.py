@@ -1,4 +1,4 @@
-"""The robot's YAML: the one that is delivered is right, and mistakes are told together, with path and range."""
+"""The robot's YAML: the delivered file, and mistakes."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The robot's own process without a robot: how it leaves, and what it does to an arm before."""
+"""The worker over a fake arm: its exit and what it does before."""
 
 import subprocess
 import sys
@@ -6,6 +6,7 @@ from pathlib import Path
 
 from shearloop.drivers.ur import worker
 from shearloop.drivers.ur.messages import CommandReply, Disconnect, Enable, Message, RtdeSample, Unlock, WristSpeed
+from tests.drivers.ur.flight import Flight, flying
 from tests.drivers.ur.process import CyclingArm, Daemon, fly
 
 ROOT = Path(__file__).parents[3]
@@ -13,7 +14,7 @@ ROOT = Path(__file__).parents[3]
 
 def test_disconnecting_while_the_robot_is_made_ready_starts_nothing(daemon: Daemon) -> None:
     arm = CyclingArm()
-    daemon.say(Disconnect())
+    daemon.send(Disconnect())
     fly(daemon, arm)
     assert arm.calls == []
 
@@ -21,25 +22,25 @@ def test_disconnecting_while_the_robot_is_made_ready_starts_nothing(daemon: Daem
 def test_unlocking_ended_by_a_disconnection_is_answered(daemon: Daemon) -> None:
     arm = CyclingArm()
     arm.be(robot_mode=3)
-    daemon.say(Unlock(), Disconnect())
+    daemon.send(Unlock(), Disconnect())
     fly(daemon, arm)
     assert arm.calls == []
-    replies = {number: message for number, message in daemon.hear() if isinstance(message, CommandReply)}
+    replies = {number: message for number, message in daemon.receive() if isinstance(message, CommandReply)}
     assert "disconnects" in replies[1].refusal
     assert replies[2].accepted
 
 
 def test_commands_after_a_disconnection_are_refused(daemon: Daemon) -> None:
     arm = CyclingArm()
-    daemon.say(Disconnect(), Enable(), WristSpeed(0.5, 4.0), Unlock())
+    daemon.send(Disconnect(), Enable(), WristSpeed(0.5, 4.0), Unlock())
     fly(daemon, arm)
     assert arm.calls == []
-    replies = [message for _, message in daemon.hear() if isinstance(message, CommandReply)]
+    replies = [message for _, message in daemon.receive() if isinstance(message, CommandReply)]
     assert [reply.accepted for reply in replies] == [True, False, False, False]
 
 
 class Uploading(CyclingArm):
-    """Its upload takes only when it is read so many times more; when it is sent, the daemon says something."""
+    """Its upload takes effect after `reads` more reads; at the upload the daemon sends messages."""
 
     def __init__(self, daemon: Daemon, *said: Message, reads: int) -> None:
         super().__init__()
@@ -49,7 +50,7 @@ class Uploading(CyclingArm):
     def upload(self) -> bool:
         if self._left is None:
             self.calls.append("upload")
-            self._daemon.say(*self._said)
+            self._daemon.send(*self._said)
             self._left = self._reads
         return True
 
@@ -62,7 +63,7 @@ class Uploading(CyclingArm):
 
 
 def test_program_started_by_a_late_upload_is_ended(daemon: Daemon) -> None:
-    """What counts is what runs when the process leaves, not when its last cycle began."""
+    """The state at the exit counts, not the one at the last cycle's start."""
     # The next cycle's reading still shows none; that by which the process leaves shows it.
     arm = Uploading(daemon, Disconnect(), reads=2)
     fly(daemon, arm)
@@ -73,7 +74,7 @@ def test_program_started_by_a_late_upload_is_ended(daemon: Daemon) -> None:
 def test_our_program_is_ended_on_exit(daemon: Daemon) -> None:
     class Ready(CyclingArm):
         def arm_watchdog(self) -> bool:
-            daemon.say(Disconnect())
+            daemon.send(Disconnect())
             return super().arm_watchdog()
 
     arm = Ready()
@@ -87,25 +88,25 @@ def test_our_program_is_ended_on_exit(daemon: Daemon) -> None:
 
 
 def test_foreign_program_plays_on_after_exit(daemon: Daemon) -> None:
-    """As of another daemon on the same robot."""
+    """For example the program of another daemon."""
     arm = CyclingArm()
     arm.be(runtime_state=2)
-    daemon.say(Disconnect())
+    daemon.send(Disconnect())
     fly(daemon, arm)
     assert arm.calls == []
     assert arm.reading.program_running
 
 
 def test_our_paused_program_is_stopped_on_exit(daemon: Daemon) -> None:
-    """Resumed by somebody later, it would turn on where it was."""
+    """If resumed later, it would turn the wrist on."""
 
     class Stopped(CyclingArm):
-        """In a protective stop as soon as its program is ready."""
+        """Has a protective stop as soon as its program is ready."""
 
         def arm_watchdog(self) -> bool:
             super().arm_watchdog()
             self.protective_stop()
-            daemon.say(Disconnect())
+            daemon.send(Disconnect())
             return True
 
     arm = Stopped()
@@ -116,7 +117,7 @@ def test_our_paused_program_is_stopped_on_exit(daemon: Daemon) -> None:
 def test_foreign_paused_program_is_not_stopped_on_exit(daemon: Daemon) -> None:
     arm = CyclingArm()
     arm.be(runtime_state=4)
-    daemon.say(Disconnect())
+    daemon.send(Disconnect())
     fly(daemon, arm)
     assert arm.calls == []
 
@@ -129,7 +130,7 @@ from tests.drivers.ur.flight import SETTINGS, FakeArm
 
 class Arm(FakeArm):
     def read(self):
-        raise ValueError("what nobody thought of")
+        raise ValueError("an unforeseen error")
 
 # As the client's threads may, this one keeps the interpreter from ending.
 threading.Thread(target=threading.Event().wait).start()
@@ -143,4 +144,33 @@ def test_exception_ends_the_process_and_is_printed() -> None:
     command = [sys.executable, "-c", CRASHING]
     ended = subprocess.run(command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, timeout=30, check=False)
     assert ended.returncode == worker.EXIT_FAILED
-    assert b"ValueError: what nobody thought of" in ended.stderr
+    assert b"ValueError: an unforeseen error" in ended.stderr
+
+
+def test_state_is_dropped_while_others_are_unsent(daemon: Daemon) -> None:
+    state = Flight().state
+    while not daemon.pipe._unsent:
+        daemon.pipe.send(state)
+    unsent = daemon.pipe._unsent
+    daemon.pipe.send_latest(state)
+    assert daemon.pipe._unsent == unsent
+    daemon.receive()
+    daemon.pipe.send_latest(state)
+    assert not daemon.pipe._unsent
+
+
+def test_each_command_is_answered_at_once(daemon: Daemon) -> None:
+    flight = flying()
+    for acceleration, accepted in ((4.0, True), (-4.0, False)):
+        daemon.send(WristSpeed(0.1, acceleration))
+        worker._handle_commands(daemon.pipe, flight.handler, flight.state)
+        assert [message.accepted for _, message in daemon.receive() if isinstance(message, CommandReply)] == [accepted]
+
+
+def test_unsent_output_is_bounded(daemon: Daemon) -> None:
+    state = Flight().state
+    for _ in range(10_000):
+        daemon.pipe.send(state)
+        if not daemon.pipe.open:
+            return
+    raise AssertionError("it grows and grows")

@@ -1,5 +1,6 @@
-"""What the robot's own process does and sends in each cycle, in a time of its own."""
+"""The worker's cycles in their own time."""
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
@@ -7,31 +8,29 @@ import pytest
 from shearloop.drivers.ur import worker
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.messages import CommandReply, Disconnect, Enable, RtdeSample, Unlock, WristSpeed
-from tests.drivers.ur.process import Daemon, Timed, TimedArm
+from tests.drivers.ur.process import Timed, TimedArm
 
 
-def test_each_state_is_sent_and_the_robot_kept_awake_in_each_cycle(
-    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    timed = Timed(daemon, monkeypatch, (0.405, Disconnect()))
-    assert [state.cycle for state in timed.states] == [0, 0, 1, 1, 2, 2, *range(3, 52)]
-    assert timed.arm.read_s[:51] == pytest.approx([0.008 * cycle for cycle in range(51)])
-    assert timed.arm.calls.count("send_heartbeat") == 49
+def test_each_state_is_sent_and_the_robot_kept_awake_in_each_cycle(timed: Callable[..., Timed]) -> None:
+    run = timed((0.405, Disconnect()))
+    assert [state.cycle for state in run.states] == [0, 0, 1, 1, 2, 2, *range(3, 52)]
+    assert run.arm.read_s[:51] == pytest.approx([0.008 * cycle for cycle in range(51)])
+    assert run.arm.calls.count("send_heartbeat") == 49
 
 
-def test_late_cycle_starts_at_once_and_missed_ones_are_skipped(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_late_cycle_starts_at_once_and_missed_ones_are_skipped(timed: Callable[..., Timed]) -> None:
     class Slow(TimedArm):
         def read(self) -> RtdeSample:
             if len(self.read_s) == 10:
                 worker.time.sleep(0.0441)
             return super().read()
 
-    timed = Timed(daemon, monkeypatch, (0.3, Disconnect()), arm=Slow())
-    assert timed.arm.read_s[9:13] == pytest.approx([0.072, 0.1241, 0.1241, 0.1321])
-    assert [state.cycle for state in timed.states[12:16]] == [9, 10, 11, 12]
+    run = timed((0.3, Disconnect()), arm=Slow())
+    assert run.arm.read_s[9:13] == pytest.approx([0.072, 0.1241, 0.1241, 0.1321])
+    assert [state.cycle for state in run.states[12:16]] == [9, 10, 11, 12]
 
 
-def test_command_is_sent_on_arrival_and_in_each_cycle(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_command_is_sent_on_arrival_and_in_each_cycle(timed: Callable[..., Timed]) -> None:
     sent_s: list[float] = []
 
     class Turned(TimedArm):
@@ -39,15 +38,13 @@ def test_command_is_sent_on_arrival_and_in_each_cycle(daemon: Daemon, monkeypatc
             sent_s.append(worker.time.monotonic() - 1000.0)
             return super().wrist(command)
 
-    Timed(daemon, monkeypatch, (0.1, Enable()), (0.203, WristSpeed(0.1, 4.0)), (0.3, Disconnect()), arm=Turned())
+    timed((0.1, Enable()), (0.203, WristSpeed(0.1, 4.0)), (0.3, Disconnect()), arm=Turned())
     assert sent_s[:4] == pytest.approx([0.203, 0.208, 0.216, 0.224])
     assert max(later - earlier for earlier, later in pairwise(sent_s)) < 0.0081
 
 
 @pytest.mark.parametrize("stopped_s", [0.2001, 0.2005, 0.2079])
-def test_protective_stop_seen_late_is_reported_as_such(
-    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, stopped_s: float
-) -> None:
+def test_protective_stop_seen_late_is_reported_as_such(timed: Callable[..., Timed], stopped_s: float) -> None:
     class Late(TimedArm):
         def wrist(self, command: WristSpeed) -> bool:
             self.takes = worker.time.monotonic() < 1000.0 + stopped_s
@@ -59,13 +56,13 @@ def test_protective_stop_seen_late_is_reported_as_such(
             return super().read()
 
     speeds = [(0.1005 + 0.008 * number, WristSpeed(0.1, 4.0)) for number in range(20)]
-    timed = Timed(daemon, monkeypatch, (0.1, Enable()), *speeds, (0.3, Disconnect()), arm=Late())
-    assert {state.blocked[:15] for state in timed.states if state.cycle > 15} == {"", "Protective stop"}
-    assert {state.motion for state in timed.states if state.blocked} == {"idle"}
+    run = timed((0.1, Enable()), *speeds, (0.3, Disconnect()), arm=Late())
+    assert {state.blocked[:15] for state in run.states if state.cycle > 15} == {"", "Protective stop"}
+    assert {state.motion for state in run.states if state.blocked} == {"idle"}
 
 
 @pytest.mark.parametrize("cycle", [31, 32, 34])
-def test_protective_stop_is_reported_in_its_cycle(daemon: Daemon, monkeypatch: pytest.MonkeyPatch, cycle: int) -> None:
+def test_protective_stop_is_reported_in_its_cycle(timed: Callable[..., Timed], cycle: int) -> None:
     class Stopping(TimedArm):
         def read(self) -> RtdeSample:
             if worker.time.monotonic() > 1000.0 + 0.008 * cycle - 1e-6 and self.reading.safety_mode == 1:
@@ -73,24 +70,24 @@ def test_protective_stop_is_reported_in_its_cycle(daemon: Daemon, monkeypatch: p
             return super().read()
 
     said = (0.1, Enable()), (0.2, WristSpeed(0.01, 4.0)), (0.3, Disconnect())
-    timed = Timed(daemon, monkeypatch, *said, arm=Stopping())
-    assert next(state.cycle for state in timed.states if state.protective_stop) == cycle
+    run = timed(*said, arm=Stopping())
+    assert next(state.cycle for state in run.states if state.protective_stop) == cycle
 
 
-def test_end_of_a_recovery_is_reported_at_once(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Announced as being made ready, and given up in the same cycle: all is as before the announcement."""
+def test_end_of_a_recovery_is_reported_at_once(timed: Callable[..., Timed], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The recovery is announced and given up in the same cycle."""
     arm = TimedArm()
     arm.be(robot_mode=3)
     given_up = CommandHandler.tick
 
     def tick(handler: CommandHandler, reading: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
         if now_ns > 1000.1e9 and handler._recovery is not None:
-            handler._recovery.give_up("Nobody waits for it.")
+            handler._recovery.give_up("The recovery is given up.")
         return given_up(handler, reading, now_ns)
 
     monkeypatch.setattr("shearloop.drivers.ur.command_handler.CommandHandler.tick", tick)
-    timed = Timed(daemon, monkeypatch, (0.201, Unlock()), (0.4, Disconnect()), arm=arm)
-    ready = [state for state in timed.states if 1000.195 < state.t_mono_ns / 1e9 < 1000.3]
+    run = timed((0.201, Unlock()), (0.4, Disconnect()), arm=arm)
+    ready = [state for state in run.states if 1000.195 < state.t_mono_ns / 1e9 < 1000.3]
     announced = next(number for number, state in enumerate(ready) if state.recovering)
     assert not ready[announced + 1].recovering
     assert ready[announced + 1].cycle == ready[announced].cycle

@@ -20,6 +20,7 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -42,10 +43,8 @@ FLOOD_HZ = 500.0
 USB_PACKET_BYTES = 512
 # Before processor time counts: until everything is connected.
 SETTLING_S = 10.0
-RIG_RECORDING, RIG_BANK = "rig-25mm.mcap", "demo.bank"
 # Idle frames to skip, and the number of frames until the default estimator is valid in the grip.
 FIRST_FRAME, FIRST_VALID_FRAME = 12, 28
-_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 class PlayedBoard:
@@ -63,7 +62,6 @@ class PlayedBoard:
 
     def send(self, line: bytes) -> int:
         """Write bytes; return the time in ns just before the last of them was written."""
-        sent_ns = time.monotonic_ns()
         while line:
             sent_ns = time.monotonic_ns()
             line = line[os.write(self._master, line) :]
@@ -157,21 +155,18 @@ def process_tree(pid: int) -> list[int]:
 def cpu_s(pid: int) -> float:
     """Return the processor time of a process."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def resident_mb(pid: int) -> float:
     """Return the resident memory of a process."""
-    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-        if line.startswith("VmRSS:"):
-            return int(line.split()[1]) / 1024
-    raise RuntimeError(f"process {pid} has ended")
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def recorded_lines(rig: Path, side: str, n: int) -> list[bytes]:
     """Return n lines of one board from the emulated rig's recording: idle ones, then a gripped tool being twisted."""
-    lines = [line_text(one) for one in read_recording(rig / RIG_RECORDING).sides[side].lines[FIRST_FRAME:]]
-    return [lines[number % len(lines)] for number in range(n)]
+    lines = [line_text(one) for one in read_recording(rig / "rig-25mm.mcap").sides[side].lines[FIRST_FRAME:]]
+    return list(islice(cycle(lines), n))
 
 
 def by_bank(args: argparse.Namespace, matching: str) -> dict[str, Any]:
@@ -240,13 +235,12 @@ def latency(config: dict[str, Any], rig: Path, n_frames: int, period_s: float) -
                         if number >= FIRST_VALID_FRAME and (estimate["valid"] or estimate["k"] is not None):
                             taken[source].append((arrived_ns - sent_ns) / 1e6)
     return {
-        source: {**_percentiles(found), "missed": missed[source], "ready_s": ready_s} for source, found in taken.items()
-    }
-
-
-def _percentiles(taken_ms: Sequence[float]) -> dict[str, float]:
-    p50, p99 = np.percentile(taken_ms, [50, 99])
-    return {"p50_ms": float(p50), "p99_ms": float(p99), "n": len(taken_ms)}
+        source: {
+            **dict(zip(("p50_ms", "p99_ms"), np.percentile(found, [50, 99]).tolist(), strict=True)),
+            "n": len(found), "missed": missed[source], "ready_s": ready_s,
+        }
+        for source, found in taken.items()
+    }  # fmt: skip
 
 
 def flood(args: argparse.Namespace, n_frames: int) -> dict[str, Any]:
@@ -362,7 +356,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     if "flood" in args.only:
         found["flood"] = flood(args, 10 * args.frames)
     if "rated" in args.only:
-        found["rated"] = rated(args.bank, args.rig / RIG_BANK, args.rated_s)
+        found["rated"] = rated(args.bank, args.rig / "demo.bank", args.rated_s)
     return found
 
 

@@ -14,14 +14,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import FrameSeries, Name, Physics, fit
-from shearloop.bank.estimation.interval_regressor import STRENGTHS, best_strength
-from shearloop.bank.estimation.regressors import Ridge, ranked_channels
 from shearloop.daemon.analysis.evaluate import EstimateTrack, draw_tracks, estimate_series, figures_of
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.cli.demo_calibration import calibrate, record
@@ -38,7 +34,6 @@ CYLINDER_SHARE = 0.62
 TWIST_SHARE = 0.457
 # Frames before the judged part that fill an estimator's memory.
 _WARM_UP = 0.015
-CHANNEL_COUNTS = (8, 16, 32, 64, 128, 272, 512, 896)
 STREAMS = {"3 December": "2024-12-03_16-09", "2 December": "20241202_153632"}
 FINGERTIPS: tuple[tuple[str, ...], ...] = (("right",), ("left",), ("right", "left"))
 # Sets of cylinders to calibrate on, and the tools to judge.
@@ -135,20 +130,6 @@ def other_tools(bank: Path, seed: int, repeats: int) -> Iterator[tuple[int, tupl
             yield len(cylinders_mm), sides, figures_of(tracks)
 
 
-def over_channels(torque: FrameSeries) -> dict[int, float]:
-    """Return r on the later slices by number of channels, ranked on the earlier ones (the paper's figure 3b)."""
-    past, future = part_of(torque, 0, SLICE_SHARES[0]), part_of(torque, SLICE_SHARES[0], 1)
-    frames, values = past.channels[:, 0], past.torque_at_frames()
-    order = ranked_channels(frames, values)
-    found = {}
-    for count in CHANNEL_COUNTS:
-        best = frames[:, order[:count]]
-        ridge = Ridge.fit(best, values, best_strength(best, values, Ridge.fit, STRENGTHS)[0])
-        predicted = ridge.predict(future.channels[:, 0][:, order[:count]])
-        found[count] = float(np.corrcoef(predicted, future.torque_at_frames())[0, 1])
-    return found
-
-
 def table_row(*cells: str | float | None) -> str:
     """Return a Markdown row; numbers get four digits."""
     return f"| {' | '.join('–' if c is None else c if isinstance(c, str) else f'{c:.4g}' for c in cells)} |"
@@ -186,10 +167,6 @@ def main() -> None:
             continue
         found[f"{title}, other day"] = {DEFAULT: result}
         print(table_row(title, *(result[key] for key in ("r", "rmse_nm", "coverage_95", "valid_fraction"))))
-    (torque,) = read_series(args.recordings / "torque_slices")
-    print("\n| best channels | r on later slices |\n|---|---|")
-    for count, r in over_channels(torque).items():
-        print(table_row(count, r))
     if args.rig:
         print("\n| cylinders | fingertips | diameter RMSE, mm | coverage |\n|---|---|---|---|")
         for count, sides, figures in other_tools(args.bank, 5000, 4):

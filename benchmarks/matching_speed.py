@@ -12,10 +12,11 @@ import argparse
 import json
 import os
 import statistics
-import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
+from timeit import timeit
 from typing import Any
 
 import numpy as np
@@ -123,22 +124,20 @@ def match_methods(bank: Bank, frames: FloatArray) -> dict[str, tuple[Run, int]]:
     return methods
 
 
-def recorded_slices(recordings: Path) -> FloatArray:
-    """Return N_FRAMES of the recorded slices."""
-    found = np.array([loadmat(file)["data_diff"].ravel() for file in sorted(recordings.glob("*_slices/*_*.mat"))])
-    return np.asarray(found[np.linspace(0, len(found) - 1, N_FRAMES).astype(int)])
+def recorded_slices(folder: Path) -> FloatArray:
+    """Return the differences (n, 896) of all recorded slices."""
+    return np.array([loadmat(path)["data_diff"].ravel() for path in sorted(folder.glob("*_slices/*_*.mat"))])
 
 
 def recorded_frames(folder: Path, every: int) -> Iterator[FloatArray]:
     """Yield (n, 896) differences of all slices, and of every n-th stream frame to the mean of its first ten."""
-    slices = [loadmat(path)["data_diff"].ravel() for path in sorted(folder.glob("*_slices/*_*.mat"))]
     streams = [
         channels_of_line(values[:, 1:])
         for path in sorted(folder.glob("streams/*/*.mat"))
         for values in loadmat(path).values()
         if getattr(values, "shape", (0, 0))[-1] == N_LINE_VALUES + 1
     ]
-    for frames in (np.array(slices), *(each[10::every] - each[:10].mean(axis=0) for each in streams)):
+    for frames in (recorded_slices(folder), *(each[10::every] - each[:10].mean(axis=0) for each in streams)):
         for start in range(0, len(frames), 32):
             part = frames[start : start + 32]
             yield part[part.any(axis=1)]
@@ -168,9 +167,7 @@ def take_turns(methods: Mapping[str, tuple[Run, int]], turns: int) -> dict[str, 
     found: dict[str, list[float]] = {name: [] for name in methods}
     for _ in range(turns):
         for name, (run, n) in methods.items():
-            begun = time.perf_counter()
-            run()
-            found[name].append((time.perf_counter() - begun) / n)
+            found[name].append(timeit(run, number=1) / n)
     return found
 
 
@@ -184,9 +181,7 @@ def cold_seconds(bank: Bank, frames: FloatArray, turns: int) -> dict[str, list[f
             taken = []
             for frame in frames:
                 memory += 1.0
-                begun = time.perf_counter()
-                matcher.match(frame)
-                taken.append(time.perf_counter() - begun)
+                taken.append(timeit(partial(matcher.match, frame), number=1))
             found[f"{name}, cold, with runner-up"].append(statistics.median(taken))
     return found
 
@@ -217,7 +212,8 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=0, metavar="N", help="check every N-th frame (default: none)")
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
-    bank, frames = Bank.open(args.bank), recorded_slices(args.recordings)
+    bank, slices = Bank.open(args.bank), recorded_slices(args.recordings)
+    frames = slices[np.linspace(0, len(slices) - 1, N_FRAMES).astype(int)]
     cells, error = cell_methods(load_geometry(args.mesh))
     seconds = take_turns({**cells, **match_methods(bank, frames)}, args.turns)
     seconds |= cold_seconds(bank, frames, args.turns)

@@ -12,7 +12,6 @@ folder of `shearloop.daemon.cli.demo_calibration`, with demo.bank and rig-right.
 import argparse
 import json
 import os
-import select
 import signal
 import subprocess
 import sys
@@ -27,6 +26,7 @@ from typing import Any
 import yaml
 import zmq
 
+from benchmarks.daemon_speed import write_config
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import TOPICS, decode
 
@@ -76,8 +76,8 @@ class RunningRig:
                 stdin=subprocess.PIPE,
             )
         )
-        self._unread = b""
-        self._events: list[dict[str, Any]] = []
+        if self._rig.stdout is None or not self._rig.stdout.readline().startswith(b"rig ready"):
+            raise RuntimeError("the rig did not start")
         self.daemon = stack.enter_context(_process("run", str(self._write_config(args))))
         context = stack.enter_context(zmq.Context())
         self._socket: zmq.Socket[bytes] = stack.enter_context(context.socket(zmq.SUB))
@@ -90,21 +90,17 @@ class RunningRig:
         shipped = yaml.safe_load(Path("config/ur.yaml").read_text())
         (self.folder / "ur.yaml").write_text(yaml.safe_dump({**shipped, "host": args.host}))
         calibration = str((args.rig / "rig-right.cal").resolve())
-        content = {
-            "publish": f"ipc://{self.folder}/publish",
-            "commands": f"ipc://{self.folder}/commands",
-            "fingertips": {
+        return write_config(
+            self.folder,
+            fingertips={
                 "right": {"device": {"path": "eit-right"}, "estimator": "motion_regression", "calibration": calibration}
             },
-            "load_cell": {"device": {"path": "load-cell"}},
-            "robot": "ur.yaml",
-            "gripper": {"socket": {"host": args.host}},
+            load_cell={"device": {"path": "load-cell"}},
+            robot="ur.yaml",
+            gripper={"socket": {"host": args.host}},
             # Estimates that disagree are no fault here.
-            "loop": {"disagreement_nm": 1.0, "max_innovation_nm": 1.0},
-        }
-        path = self.folder / "config.yaml"
-        path.write_text(yaml.safe_dump(content))
-        return path
+            loop={"disagreement_nm": 1.0, "max_innovation_nm": 1.0},
+        )
 
     def tell_rig(self, command: str) -> int:
         """Send the rig a command; return the time in ns."""
@@ -135,23 +131,17 @@ class RunningRig:
                     return content
         raise RuntimeError(f"no such {topic}; daemon's status {self.daemon.poll()}, latest loop.state {loop}")
 
-    def wait_for_phase(self, *phases: str) -> dict[str, Any]:
-        """Return the first loop state in one of these phases."""
-        return self.wait_for("loop.state", lambda state: state["phase"] in phases)
+    def wait_for_phase(self, phase: str) -> dict[str, Any]:
+        """Return the first loop state in a phase."""
+        return self.wait_for("loop.state", lambda state: state["phase"] == phase)
 
     def wait_for_event(self, name: str, since_ns: int) -> dict[str, Any]:
         """Return the first event of the emulated robot with a name, since a moment."""
-        out = self._rig.stdout
-        if out is None:
-            raise RuntimeError("the rig has no output")
-        while True:
-            for event in self._events:
-                if event["event"] == name and event["t_mono_ns"] >= since_ns:
-                    return event
-            if not select.select([out], [], [], 5.0)[0]:
-                raise RuntimeError(f"no event {name} from the robot")
-            *lines, self._unread = (self._unread + os.read(out.fileno(), 1 << 16)).split(b"\n")
-            self._events += [json.loads(line) for line in lines if line.startswith(b"{")]
+        for line in self._rig.stdout or ():
+            event: dict[str, Any] = json.loads(line) if line.startswith(b"{") else {}
+            if event.get("event") == name and event["t_mono_ns"] >= since_ns:
+                return event
+        raise RuntimeError(f"the rig ended without an event {name} from the robot")
 
     def start(self, path: Path) -> None:
         """Start an experiment as soon as possible, unlocking as the operator does."""
@@ -168,10 +158,6 @@ def _process(*arguments: str, **options: Any) -> Iterator["subprocess.Popen[byte
     command = [sys.executable, "-m", "shearloop", *arguments]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, **options) as process:
         try:
-            if arguments[0] == "emulate" and (
-                process.stdout is None or not process.stdout.readline().startswith(b"rig ready")
-            ):
-                raise RuntimeError("the rig did not start")
             yield process
         finally:
             process.terminate()

@@ -7,7 +7,7 @@ difference of response, relative to the largest response. Times are the best of 
 reference is converged to 2e-5.
 """
 
-import time
+import timeit
 from collections.abc import Callable
 from functools import partial
 
@@ -55,16 +55,6 @@ def models() -> dict[str, Model]:
     }
 
 
-def seconds(action: Callable[[], object], repeats: int = 5) -> float:
-    """Return the shortest time of several runs."""
-    times = []
-    for _ in range(repeats):
-        begun = time.perf_counter()
-        action()
-        times.append(time.perf_counter() - begun)
-    return min(times)
-
-
 def main() -> None:
     """Measure and print a table."""
     up, there_and_back = loading(AMPLITUDE_N), loop(AMPLITUDE_N)
@@ -73,7 +63,7 @@ def main() -> None:
     scale = abs(true_loop).max()
     print("| model | µs per step | loading | whole loop |\n|---|---|---|---|")
     for name, model in models().items():
-        step_us = 1e6 * seconds(partial(model, there_and_back)) / len(there_and_back)
+        step_us = 1e6 * min(timeit.repeat(partial(model, there_and_back), number=1)) / len(there_and_back)
         errors = abs(model(up) - true_up).max() / scale, abs(model(there_and_back) - true_loop).max() / scale
         print(f"| {name} | {step_us:.1f} | {errors[0]:.3%} | {errors[1]:.3%} |", flush=True)
 

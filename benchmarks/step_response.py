@@ -76,11 +76,6 @@ class TwinPlant(Plant):
     sees_gel: bool = True
     creep: Creep | None = None
 
-    @property
-    def stiffness_nm_per_rad(self) -> float:
-        """The stiffness of gel and joint in series, on a fresh gel."""
-        return _stiffness(self.twin)
-
     def collect(self) -> list[PlantSample]:
         """Return the measurements that have become known, each once."""
         known = Plant.collect(self)
@@ -124,11 +119,6 @@ class RigPlant(Plant):
         self._rest(SETTLE_S)
         self.not_valid = self.estimated = self.outside_interval = 0
 
-    @property
-    def stiffness_nm_per_rad(self) -> float:
-        """The stiffness of gel and joint in series, on a fresh gel."""
-        return _stiffness(self.scene.twin)
-
     def _rest(self, seconds: float) -> None:
         for _ in range(round(seconds / self.period_s)):
             self.step(0.0)
@@ -152,10 +142,6 @@ class RigPlant(Plant):
         self.estimated += 1
         self.outside_interval += not estimate.torque_low_nm <= true_nm <= estimate.torque_high_nm
         self._samples.append(PlantSample(estimate.torque_nm, t_mid_s, self.t_s + self.sensor.transfer_s))
-
-
-def _stiffness(twin: Twin) -> float:
-    return 1.0 / (1.0 / twin.settings.gel_stiffness_nm_per_rad + 1.0 / twin.settings.joint_stiffness_nm_per_rad)
 
 
 def step(plant: Plant, scenario: LoopScenario) -> tuple[FloatArray, bool]:
@@ -239,7 +225,9 @@ def tightened(seed: int) -> tuple[float, float]:
     # The robot still carries out the speeds sent before the stop.
     for _ in range(round(1.0 / PERIOD_S)):
         plant.step(0.0)
-    return -plant.torque_nm - TIGHTEN_NM, plant.stiffness_nm_per_rad * TIGHTEN_RAD_PER_S * LOAD_CELL.period_s
+    # A fresh gel and the joint, in series.
+    stiffness = 1.0 / (1.0 / settings.gel_stiffness_nm_per_rad + 1.0 / settings.joint_stiffness_nm_per_rad)
+    return -plant.torque_nm - TIGHTEN_NM, stiffness * TIGHTEN_RAD_PER_S * LOAD_CELL.period_s
 
 
 def measure(seeds: int) -> dict[str, Any]:
@@ -279,7 +267,7 @@ def estimator_in_the_loop(bank: Path, calibration: Calibration, seeds: Sequence[
 
 
 def main() -> None:
-    """Measure, write the numbers, draw the chart."""
+    """Measure and write the numbers."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON file to write")
     parser.add_argument("--seeds", type=int, default=200)

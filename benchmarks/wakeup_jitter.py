@@ -13,7 +13,7 @@ import json
 import multiprocessing
 import os
 from collections.abc import Callable
-from multiprocessing.connection import Connection
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -62,10 +62,10 @@ def compute_endlessly(cores: set[int]) -> None:
         np.sort(values)
 
 
-def measure(option: str, seconds: float, answer: Connection) -> None:
-    """Send the lateness of every wake-up in s."""
+def measure(option: str, seconds: float) -> list[float]:
+    """Return the lateness of every wake-up in s."""
     OPTIONS[option]()
-    answer.send(asyncio.run(_wake_ups(seconds)))
+    return asyncio.run(_wake_ups(seconds))
 
 
 async def _wake_ups(seconds: float) -> list[float]:
@@ -89,18 +89,15 @@ def lateness(option: str, seconds: float) -> list[float]:
     busy = cores - {max(cores)} if option == OWN_CORE and len(cores) > 1 else cores
     context = multiprocessing.get_context("spawn")
     burners = [context.Process(target=compute_endlessly, args=(busy,), daemon=True) for _ in range(2 * len(cores))]
-    here, there = context.Pipe()
-    loop = context.Process(target=measure, args=(option, seconds, there))
-    for process in (*burners, loop):
-        process.start()
-    there.close()
+    for burner in burners:
+        burner.start()
     try:
-        found: list[float] = here.recv()
+        with ProcessPoolExecutor(1, context) as loop:
+            return loop.submit(measure, option, seconds).result()
     finally:
-        for process in (*burners, loop):
-            process.kill()
-            process.join()
-    return found
+        for burner in burners:
+            burner.kill()
+            burner.join()
 
 
 def main() -> None:

@@ -4,6 +4,7 @@ import asyncio
 import os
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 
 from shearloop.daemon.clock import Clock
@@ -31,14 +32,7 @@ class HealthReporter:
 
     def tasks(self) -> dict[str, TaskFacts]:
         """Return the present state of each task."""
-        gathered: dict[str, TaskFacts] = {}
-        for name, record in self._supervisor.records.items():
-            gathered[name] = {
-                "alive": record.alive,
-                "done": record.done,
-                "restarts": record.restarts,
-                "last_error": record.last_error,
-            }
+        gathered: dict[str, TaskFacts] = {name: asdict(record) for name, record in self._supervisor.records.items()}
         for name, facts in self._facts.items():
             gathered[name] = {**gathered.get(name, {}), **facts()}
         return gathered

@@ -25,7 +25,6 @@ def restart_pause_s(deaths_in_a_row: int) -> float:
 class TaskRecord:
     """The state of one task, for health."""
 
-    name: str
     alive: bool = False
     # Returned normally, as an experiment does.
     done: bool = False
@@ -50,7 +49,7 @@ class Supervisor:
 
     async def keep_running(self, name: str, run: Callable[[], Awaitable[None]]) -> None:
         """Run `run()` until it returns; if it raises, log the error and restart it."""
-        record = self.records.setdefault(name, TaskRecord(name))
+        record = self.records.setdefault(name, TaskRecord())
         log = structlog.get_logger().bind(task=name)
         loop = asyncio.get_running_loop()
         deaths = 0

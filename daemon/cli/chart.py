@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from shearloop.daemon.cli.options import add_cluster
+from shearloop.daemon.errors import UserError
 
 NAMES = {
     "speed-accuracy": "latency against torque error of every estimator, forward methods, and the loop's window",
@@ -37,8 +38,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw one chart and print its paths."""
-    from shearloop.daemon.errors import UserError
-
     _check_arguments(args)
     try:
         import matplotlib as _  # noqa: F401 - its absence is reported before anything is measured
@@ -76,8 +75,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_arguments(args: argparse.Namespace) -> None:
-    from shearloop.daemon.errors import UserError
-
     if not 0.1 <= args.split <= 0.9:
         raise UserError(f"--split must be a share from 0.1 to 0.9, not {args.split:g}")
     if args.rounds < 1:

@@ -3,8 +3,6 @@
 import argparse
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -45,11 +43,13 @@ def run(args: argparse.Namespace) -> int:
         from shearloop.daemon.analysis.reproduce.report import draw_all
     except ModuleNotFoundError as error:
         raise UserError(f"the figures need {error.name}; install it with `pip install 'shearloop[plot]'`") from error
-    from shearloop.daemon.analysis.reproduce.report import json_text, save_calibrations, table, write_json
+    from shearloop.daemon.analysis.reproduce.report import json_text, save_calibrations, table
 
     found, banks = _reproduce(args, jobs)
+    numbers = args.out / "reproduce.json"
     try:
-        written = [write_json(found, args.out), *draw_all(found, banks, args.out)]
+        numbers.write_text(json_text(found) + "\n", encoding="utf-8")
+        written = [numbers, *draw_all(found, banks, args.out)]
     except OSError as error:
         raise UserError(f"{args.out}: the results cannot be written: {error.strerror}") from error
     written += save_calibrations(found, banks, args.recordings, args.out)
@@ -64,56 +64,40 @@ def run(args: argparse.Namespace) -> int:
 def _reproduce(args: argparse.Namespace, jobs: int) -> "tuple[Reproduction, dict[str, Bank]]":
     from scipy import fft
 
-    from shearloop.daemon.analysis.reproduce.analysis import (
-        analyse_diameter,
-        analyse_torque,
-        match_slices,
-        read_inputs,
-        score_models,
-    )
+    from shearloop.daemon.analysis.reproduce import analysis
     from shearloop.daemon.analysis.reproduce.banks import GRIDS, cached_bank, choose_mesh, focused_grid
-    from shearloop.daemon.analysis.reproduce.report import Reproduction, moved_focus
+    from shearloop.daemon.analysis.reproduce.report import Reproduction
 
-    inputs = read_inputs(args.recordings)
-    chosen = choose_mesh(args.recordings, args.mesh, args.bank_config)
-    print(f"mesh: {chosen.origin}", file=sys.stderr)
+    inputs = analysis.read_inputs(args.recordings)
+    mesh, origin = choose_mesh(args.recordings, args.mesh, args.bank_config)
+    print(f"mesh: {origin}", file=sys.stderr)
     notes = list(inputs.notes)
 
     def build(name: str, grid: "Grid") -> "Bank":
         with progress_bar(name, grid.k.size, "row") as show:
-            return cached_bank(name, grid, chosen.mesh, args.out / "banks", jobs, lambda _, done, __: show(done))
+            return cached_bank(name, grid, mesh, args.out / "banks", jobs, lambda done, _: show(done))
 
     with fft.set_workers(jobs):
         banks = {"wide": build("wide", GRIDS["wide"])}
         torque = diameter = models = None
         if inputs.torque is not None:
             slices = inputs.torque.differences
-            with _matching(len(slices)) as advance:
-                on_wide = match_slices(slices, banks["wide"], advance)
+            with progress_bar("matching", len(slices), "slice") as show:
+                on_wide = analysis.match_slices(slices, banks["wide"], show)
             focus = focused_grid(on_wide.k, on_wide.sigma)
             if focus is not GRIDS["focused"]:
-                notes.append(moved_focus(focus))
+                (k_low, *_, k_high), (sigma_low, *_, sigma_high) = focus.k, focus.sigma
+                notes.append(
+                    "Most slices match best outside of the paper's focused bank: this one lies around them, "
+                    f"k {k_low:.2f} to {k_high:.2f} cm, sigma {sigma_low:.2f} to {sigma_high:.2f} cm."
+                )
             banks["focused"] = build("focused", focus)
-            with _matching(len(slices)) as advance:
-                on_focused = match_slices(slices, banks["focused"], advance)
-            torque = analyse_torque(inputs.torque, on_focused, on_wide)
-            models = score_models(inputs.torque, inputs.raw_difference, chosen.mesh)
+            with progress_bar("matching", len(slices), "slice") as show:
+                on_focused = analysis.match_slices(slices, banks["focused"], show)
+            torque = analysis.analyse_torque(inputs.torque, on_focused, on_wide)
+            models = analysis.score_models(inputs.torque, inputs.raw_difference, mesh)
         if inputs.diameter is not None:
-            with _matching(len(inputs.diameter.differences)) as advance:
-                diameter = analyse_diameter(inputs.diameter, banks["wide"], advance)
+            with progress_bar("matching", len(inputs.diameter.differences), "slice") as show:
+                diameter = analysis.analyse_diameter(inputs.diameter, banks["wide"], show)
     valid_cells = int(banks["wide"].valid.sum())
-    return Reproduction(chosen.origin, valid_cells, torque, diameter, models, tuple(notes)), banks
-
-
-@contextmanager
-def _matching(total: int) -> Iterator[Callable[[int], None]]:
-    """Show a bar of matched slices; the yielded function takes how many more are done."""
-    with progress_bar("matching", total, "slice") as show:
-        done = 0
-
-        def advance(count: int) -> None:
-            nonlocal done
-            done += count
-            show(done)
-
-        yield advance
+    return Reproduction(origin, valid_cells, torque, diameter, models, tuple(notes)), banks

@@ -42,9 +42,8 @@ def look(number: int) -> dict[str, Any]:
 
 def frontier(costs: Sequence[float], errors: Sequence[float]) -> list[int]:
     """Return the indices of the points that no other beats in both cost and error, by rising cost."""
-    order = sorted(range(len(costs)), key=lambda i: (costs[i], errors[i]))
     found: list[int] = []
-    for i in order:
+    for i in sorted(range(len(costs)), key=lambda i: (costs[i], errors[i])):
         if not found or errors[i] < errors[found[-1]]:
             found.append(i)
     return found
@@ -137,14 +136,11 @@ def _area(box: Bbox) -> float:
 def plain_log(axes: Axes) -> None:
     """Make both axes logarithmic, with ticks at 1, 2 and 5 of each decade."""
     axes.set(xscale="log", yscale="log")
+    axis: Axis
     for axis in (axes.xaxis, axes.yaxis):
-        _plain_ticks(axis)
-
-
-def _plain_ticks(axis: Axis) -> None:
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())
 
 
 def slug(title: str) -> str:

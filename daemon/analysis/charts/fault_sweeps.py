@@ -58,14 +58,15 @@ class FrameFault:
     apply: Callable[[FaultScene, float, np.random.Generator], FaultyFrames]
 
 
-def _with_channels(scene: FaultScene, channels: FloatArray) -> FrameSeries:
+def _faulty(scene: FaultScene, channels: FloatArray, usable: Mask | None = None) -> FaultyFrames:
     """Return the frames with other channels; differences are magnitudes."""
-    return replace(scene.series, channels=np.abs(channels) if scene.series.kind == "difference" else channels)
+    magnitudes = np.abs(channels) if scene.series.kind == "difference" else channels
+    return FaultyFrames(replace(scene.series, channels=magnitudes), usable)
 
 
 def _noise(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
     channels = scene.series.channels
-    return FaultyFrames(_with_channels(scene, channels + rng.normal(0.0, 1.0, channels.shape) * level * scene.noise_v))
+    return _faulty(scene, channels + rng.normal(0.0, 1.0, channels.shape) * level * scene.noise_v)
 
 
 def lost_channels(electrodes: NDArray[np.int64]) -> Mask:
@@ -73,22 +74,17 @@ def lost_channels(electrodes: NDArray[np.int64]) -> Mask:
     return np.asarray(np.isin(CHANNELS, electrodes).any(axis=1))
 
 
-def _lose_electrodes(scene: FaultScene, level: float, rng: np.random.Generator) -> tuple[FrameSeries, Mask]:
-    """Return frames with electrodes that read one ADC step, and the mask (896,) of their channels."""
+def _lost_reported(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
+    """Let electrodes read one ADC step, and mark their channels."""
     lost = lost_channels(rng.choice(N_ELECTRODES, int(level), replace=False))
     channels = scene.series.channels.copy()
     dead = ADC_STEP_V - scene.idle[:, lost] if scene.series.kind == "difference" else ADC_STEP_V
     channels[:, :, lost] = dead
-    return _with_channels(scene, channels), lost
+    return _faulty(scene, channels, np.broadcast_to(~lost, channels.shape))
 
 
 def _lost_unreported(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
-    return FaultyFrames(_lose_electrodes(scene, level, rng)[0])
-
-
-def _lost_reported(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
-    series, lost = _lose_electrodes(scene, level, rng)
-    return FaultyFrames(series, np.broadcast_to(~lost, series.channels.shape))
+    return replace(_lost_reported(scene, level, rng), usable=None)
 
 
 def _saturated(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFrames:
@@ -98,33 +94,32 @@ def _saturated(scene: FaultScene, level: float, _: np.random.Generator) -> Fault
         return FaultyFrames(scene.series)
     rail = np.quantile(scene.idle, 1.0 - level)
     if scene.series.kind == "raw":
-        return FaultyFrames(_with_channels(scene, np.minimum(channels, rail)))
+        return _faulty(scene, np.minimum(channels, rail))
     # Differences have lost their sign: let half of the channels rise.
     signs = np.where(np.arange(N_CHANNELS) % 2, -1.0, 1.0)
     read = np.minimum(scene.idle + signs * channels, rail)
-    return FaultyFrames(_with_channels(scene, read - np.minimum(scene.idle, rail)))
+    return _faulty(scene, read - np.minimum(scene.idle, rail))
 
 
 def _drift(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
     """Move the baseline over the recording by a random pattern of RMS `level` of the idle frame."""
     channels = scene.series.channels
     pattern = rng.normal(0.0, 1.0, channels.shape[1:]) * scene.idle * level
-    share = np.linspace(0.5, 1.0, len(channels))[:, None, None]
-    if scene.series.kind == "difference":
-        return FaultyFrames(_with_channels(scene, channels + pattern))
-    return FaultyFrames(_with_channels(scene, channels + share * pattern))
+    if scene.series.kind == "raw":
+        pattern = np.linspace(0.5, 1.0, len(channels))[:, None, None] * pattern
+    return _faulty(scene, channels + pattern)
 
 
 def _gain(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFrames:
     """Raise all channels by this share, as when the gel dries or the current source drifts."""
     channels = scene.series.channels
     moved = level * scene.idle if scene.series.kind == "difference" else level * channels
-    return FaultyFrames(_with_channels(scene, channels + moved))
+    return _faulty(scene, channels + moved)
 
 
 def _turned(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFrames:
     order = ElectrodeNumbering(int(level), reflected=False, score=1.0, runner_up=0.0).model_channels()
-    return FaultyFrames(_with_channels(scene, scene.series.channels[:, :, order]))
+    return _faulty(scene, scene.series.channels[:, :, order])
 
 
 def _swapped(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
@@ -136,11 +131,11 @@ def _swapped(scene: FaultScene, level: float, rng: np.random.Generator) -> Fault
     order = np.array(
         [place.get((wires[sink], wires[positive]), i) for i, (sink, _, positive, _) in enumerate(CHANNELS.tolist())]
     )
-    return FaultyFrames(_with_channels(scene, scene.series.channels[:, :, order]))
+    return _faulty(scene, scene.series.channels[:, :, order])
 
 
 def _foreign(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFrames:
-    return FaultyFrames(_with_channels(scene, (1.0 - level) * scene.series.channels + level * scene.foreign))
+    return _faulty(scene, (1.0 - level) * scene.series.channels + level * scene.foreign)
 
 
 FAULTS = (
@@ -158,14 +153,6 @@ FAULTS = (
     FrameFault("pairs of electrodes exchanged", "pairs", (0, 1, 2, 4, 8, 16), _swapped),
     FrameFault("a foreign frame mixed in", "share of the foreign frame", (0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0), _foreign),
 )
-
-
-def scene_of(series: FrameSeries, idle: FloatArray, noise_v: float, seed: int = 7) -> FaultScene:
-    """Return a scene; its foreign frame has the mean frame's voltages at shuffled channels."""
-    rng = np.random.default_rng(seed)
-    mean = series.channels.mean(axis=0)
-    foreign = np.array([layer[rng.permutation(N_CHANNELS)] for layer in mean])
-    return FaultScene(series, idle, noise_v, foreign)
 
 
 # An estimator breaks silently where more frames than this are false-valid; one in twenty is the promise.
@@ -208,13 +195,14 @@ def fault_curve(fault: str, unit: str, estimator: str, levels: Iterable[FaultLev
     found = tuple(levels)
     broken = [one.level for one in found if one.false_valid > BROKEN_SHARE]
     # Levels go from mild to grave, or through 0 for a fault with two directions.
-    mildest = min(broken, key=abs, default=None) if any(one.level < 0 for one in found) else next(iter(broken), None)
+    if any(one.level < 0 for one in found):
+        broken.sort(key=abs)
+    mildest = broken[0] if broken else None
     return FaultCurve(fault, unit, estimator, found, mildest)
 
 
 def judge_level(estimates: Sequence[Estimate], truth_nm: FloatArray, level: float) -> FaultLevel:
     """Return the figures of estimates against (n,) truths; NaN truths do not count."""
-    known = np.isfinite(truth_nm)
     rows = [
         (one.torque_nm - truth, one.torque_low_nm <= truth <= one.torque_high_nm)
         for one, truth in zip(estimates, truth_nm, strict=True)
@@ -225,7 +213,7 @@ def judge_level(estimates: Sequence[Estimate], truth_nm: FloatArray, level: floa
     if not rows:
         return FaultLevel(level, None, None, 0.0, 0.0)
     error, inside = np.array(rows, dtype=np.float64).T
-    n = int(known.sum())
+    n = int(np.isfinite(truth_nm).sum())
     return FaultLevel(level, float(error.mean()), float(error.std()), len(rows) / n, float((inside == 0).sum()) / n)
 
 
@@ -287,18 +275,16 @@ def misaligned(split: Split, names: Sequence[Name], physics: Physics, shifts_s: 
     A refused calibration gives no valid estimate.
     """
     levels: dict[str, list[FaultLevel]] = {name: [] for name in names}
+    judged = shortened(split.future)
     for shift in shifts_s:
-        past = split.past
-        late = replace(past, torque_t_s=past.torque_t_s + shift)
+        late = replace(split.past, torque_t_s=split.past.torque_t_s + shift)
         calibrated = {one.estimator: one for one in fitted(replace(split, past=late), names, physics)}
         for name, found in levels.items():
-            estimates: list[Estimate] = []
             if name in calibrated:
-                estimates = estimate_frames(
-                    EstimatorSession(calibrated[name], physics.bank), FaultyFrames(shortened(split.future))
-                )
-            truth = true_torques(shortened(split.future)) if estimates else np.zeros(0)
-            found.append(judge_level(estimates, truth, shift))
+                estimates = estimate_frames(EstimatorSession(calibrated[name], physics.bank), FaultyFrames(judged))
+                found.append(judge_level(estimates, true_torques(judged), shift))
+            else:
+                found.append(FaultLevel(shift, None, None, 0.0, 0.0))
     return [fault_curve("calibrated on misaligned times", "s", name, found) for name, found in levels.items()]
 
 
@@ -311,14 +297,17 @@ def scene_for(split: Split, bank: Bank) -> FaultScene:
     """Return the later frames with idle frame and noise of the earlier ones.
 
     Slices have no idle frame: the bank's homogeneous voltages take its place, scaled to the board's mean voltage.
+    The foreign frame has the mean frame's voltages at shuffled channels.
     """
     series = shortened(split.future)
+    rng = np.random.default_rng(7)
+    foreign = np.array([layer[rng.permutation(N_CHANNELS)] for layer in series.channels.mean(axis=0)])
     if series.kind == "difference":
         idle = np.abs(bank.homogeneous) * (_MEAN_V / float(np.abs(bank.homogeneous).mean()))
         noise = residual_noise(split.past.channels[:, 0])
-        return scene_of(series, np.tile(idle, (len(series.sides), 1)), noise)
+        return FaultScene(series, np.tile(idle, (len(series.sides), 1)), noise, foreign)
     idle = np.median(split.past.channels[:5], axis=0)
-    return scene_of(series, idle, float(np.median(channel_noise(split.past.channels[:, 0]))))
+    return FaultScene(series, idle, float(np.median(channel_noise(split.past.channels[:, 0]))), foreign)
 
 
 def sweeps(split: Split, names: Sequence[Name], physics: Physics, bank: Bank, executor: Executor) -> list[FaultCurve]:

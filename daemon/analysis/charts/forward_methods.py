@@ -53,11 +53,8 @@ class _Solver:
     solve: Callable[[], object]
     # None where another model is solved.
     truth: FloatArray | None
-
-    @property
-    def times(self) -> int:
-        """The number of times that one call solves all cells."""
-        return BATCHES if self.family.startswith(BATCH) else 1
+    # How often one call solves all cells.
+    repeats: int = 1
 
 
 def forward_methods(
@@ -77,12 +74,12 @@ def forward_methods(
     for size in sizes_cm:
         own = own_fingertip(size).mesh()
         solvers.append(_Solver(f"direct, {size:g} cm", "direct", own, direct(own), truth))
-        solvers.append(_Solver(f"batch, {size:g} cm", BATCH, own, batch(own), truth))
+        solvers.append(_Solver(f"batch, {size:g} cm", BATCH, own, batch(own), truth, BATCHES))
     if mesh is not None:
         once = mesh.refined()
         given = converged(once, once.refined(), 2.0)
         solvers.append(_Solver("direct, --mesh", "direct, the given mesh", mesh, direct(mesh), given))
-        solvers.append(_Solver("batch, --mesh", f"{BATCH}, the given mesh", mesh, batch(mesh), given))
+        solvers.append(_Solver("batch, --mesh", f"{BATCH}, the given mesh", mesh, batch(mesh), given, BATCHES))
     alike = min((one.mesh for one in solvers), key=lambda mesh: abs(len(mesh.triangles) - PAPER_TRIANGLES))
     solve = pyeit(alike)
     if solve is not None:
@@ -93,7 +90,7 @@ def forward_methods(
         for one in solvers:
             begun = time.perf_counter()
             signals = one.solve()
-            times[one.name].append(1e3 * (time.perf_counter() - begun) / (len(CELLS) * one.times))
+            times[one.name].append(1e3 * (time.perf_counter() - begun) / (len(CELLS) * one.repeats))
             if turn == rounds - 1:
                 own_ms = times[one.name]
                 found.append(
@@ -140,11 +137,7 @@ def pyeit_solver(mesh: Mesh) -> Callable[[FloatArray], object] | None:
         injections[:, 0, [1, 0]].copy(), injections[:, :, 2:].copy(), np.ones(N_CHANNELS, dtype=bool)
     )
     solver = EITForward(body, protocol)
-
-    def solve(conductivity: FloatArray) -> object:
-        return solver.solve_eit(perm=conductivity)
-
-    return solve
+    return lambda conductivity: solver.solve_eit(perm=conductivity)
 
 
 def batch(mesh: Mesh) -> Callable[[], FloatArray]:

@@ -97,11 +97,6 @@ class Plant:
         self._next_end_s = self.sensor.window_s + self.rng.uniform(0.0, self.sensor.period_s)
         self._speeds = [0.0] * (int(self.tool.actuation_s / self.period_s) + 1)
 
-    @property
-    def stiffness_nm_per_rad(self) -> float:
-        """The true stiffness between wrist and base."""
-        return self.tool.stiffness_nm_per_rad
-
     def step(self, speed_rad_per_s: float) -> None:
         """Send a wrist speed and let one command period pass."""
         part = self.tool.actuation_s / self.period_s % 1.0
@@ -114,8 +109,7 @@ class Plant:
     def collect(self) -> list[PlantSample]:
         """Return the measurements that have become known, each once."""
         known = [sample for sample in self._samples if sample.t_s <= self.t_s]
-        if known:
-            self._samples = [sample for sample in self._samples if sample.t_s > self.t_s]
+        self._samples = [sample for sample in self._samples if sample.t_s > self.t_s]
         return known
 
     def _update_torque(self) -> None:
@@ -187,12 +181,16 @@ class UncompensatedController:
     wrist_bandwidth_per_s: float = 5.0
     ramp_nm_per_s: float = float("inf")
     speed_limit_rad_per_s: float = float("inf")
-    set_point_nm: float = 0.0
+    _set_point_nm: float = 0.0
     _ramp_nm: float = 0.0
     _offset_nm: float = 0.0
     _creep_nm: float = 0.0
     _origin_rad: float | None = None
     _t_ns: int = 0
+
+    def set_point(self, torque_nm: float) -> None:
+        """Set the torque to reach."""
+        self._set_point_nm = torque_nm
 
     def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> None:  # noqa: ARG002 - the controller's
         """Correct the offset by the difference from the present ramp."""
@@ -208,7 +206,7 @@ class UncompensatedController:
             self._origin_rad, self._t_ns = wrist_angle_rad, t_ns
         most = self.ramp_nm_per_s * (t_ns - self._t_ns) / 1e9 if t_ns > self._t_ns else 0.0
         self._t_ns = t_ns
-        self._ramp_nm += max(-most, min(most, self.set_point_nm - self._ramp_nm))
+        self._ramp_nm += max(-most, min(most, self._set_point_nm - self._ramp_nm))
         goal = self._origin_rad + (self._ramp_nm - self._offset_nm) / self.stiffness_nm_per_rad
         speed = self.wrist_bandwidth_per_s * (goal - wrist_angle_rad)
         return WristCommand(max(-self.speed_limit_rad_per_s, min(self.speed_limit_rad_per_s, speed)))
@@ -347,7 +345,7 @@ class TrackingError:
 class _AveragedLoop:
     """A controller fed with the mean of the latest frames, stamped with the mean of their times."""
 
-    controller: LoopController
+    controller: TwistController | UncompensatedController
     latest: deque[tuple[float, int]]
 
     def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> None:
@@ -424,10 +422,7 @@ def _rms_error(plant: Plant, loop: _AveragedLoop) -> float:
         t_s = plant.t_s - begun
         wanted = _TARGET_NM + _SWING_NM * float(np.sin(2 * np.pi * t_s / _SWING_PERIOD_S))
         plant.disturbance_nm = _LOAD_NM * float(np.sin(2 * np.pi * t_s / _LOAD_PERIOD_S))
-        if isinstance(loop.controller, TwistController):
-            loop.controller.set_point(wanted)
-        elif isinstance(loop.controller, UncompensatedController):
-            loop.controller.set_point_nm = wanted
+        loop.controller.set_point(wanted)
         torque = run(plant, loop, _CHUNK_S).torque_nm
         if t_s >= _SETTLING_S:
             squares, n = squares + float(((torque - wanted) ** 2).sum()), n + len(torque)

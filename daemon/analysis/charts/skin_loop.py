@@ -23,7 +23,7 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
 from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
 from shearloop.daemon.control.settings import LoopConfig
-from shearloop.daemon.control.step_runner import Action, ExperimentPhase
+from shearloop.daemon.control.step_runner import ExperimentPhase
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
 from shearloop.daemon.synthetic_skin import SyntheticSkin
@@ -83,18 +83,11 @@ class SkinLoop:
             calibration = replace(calibration, friction=0.0)
         self.estimator = SkinEstimator(calibration, normal_n=configured_n)
         # The chart looks for the boundary, so every margin is allowed.
-        config = LoopConfig.model_validate(
-            {
-                **{
-                    "kp": case.kp,
-                    "deadband_nm": case.deadband_nm,
-                    "max_innovation_nm": 0.006,
-                    "max_offset_drift_nm": 0.006,
-                },
-                **{"gain_margin": 1.0, "phase_margin_deg": 0.0},
-            }
-        )
-        self._band, self._hold_s, self._age_s = case.band, case.hold_s, case.age_s
+        config = LoopConfig(
+            kp=case.kp, deadband_nm=case.deadband_nm, max_innovation_nm=0.006, max_offset_drift_nm=0.006,
+            gain_margin=1.0, phase_margin_deg=0.0,
+        )  # fmt: skip
+        self._case = case
         self.brain = ControlLoop(config, {SKIN: replace(SOURCE, has_friction_band=case.band)}, ())
         self._speeds = deque([0.0] * ACTUATION_TICKS)
         self._angle_rad = 0.0
@@ -114,19 +107,14 @@ class SkinLoop:
         """Run the experiment to its end; return how it ended."""
         for _ in range(50):
             self._step()
-        why = self.brain.start(_experiment(self._hold_s), self.t_ns)
-        if why:
-            raise RuntimeError(why)
+        why = self.brain.start(_experiment(self._case.hold_s), self.t_ns)
         experiment = self.brain.experiment
-        while experiment is not None and experiment.running and self._tick * TICK_S < most_s:
-            self._step()
         if experiment is None:
-            raise RuntimeError("no experiment was begun")
-        return (
-            experiment.phase.value
-            if experiment.phase is ExperimentPhase.DONE
-            else f"{experiment.phase.value}: {experiment.stop_reason}"
-        )
+            raise RuntimeError(why)
+        while experiment.running and self._tick * TICK_S < most_s:
+            self._step()
+        phase = experiment.phase
+        return phase.value if phase is ExperimentPhase.DONE else f"{phase.value}: {experiment.stop_reason}"
 
     def _step(self) -> None:
         self._tick += 1
@@ -136,8 +124,7 @@ class SkinLoop:
             self._samples += 1
             self._measure()
         while self._due and self._due[0][0] <= self.t_ns:
-            torque = self._due.pop(0)[1]
-            self.brain.on_torque(torque)
+            self.brain.on_torque(self._due.pop(0)[1])
             if self._zero_begun and self.estimator.zero is not None:
                 self._zero_begun = False
                 self.brain.on_action_ended()
@@ -146,30 +133,26 @@ class SkinLoop:
         speed = 0.0 if orders.stop else orders.wrist_rad_per_s
         self.brain.on_speed_sent(speed)
         self._speeds.append(speed)
-        self._begin(orders.action)
+        if isinstance(orders.action, TareStep):
+            self.estimator.tare()
+            self._zero_begun = True
         controller = self.brain.controller
         wanted_nm = controller.state.set_point_nm if controller is not None else None
         self.truth_n.append(self.skin.shear_n)
         self.set_point_n.append(math.nan if wanted_nm is None else wanted_nm / RADIUS_MM * 1e3)
 
-    def _begin(self, action: Action | None) -> None:
-        if isinstance(action, TareStep):
-            self.estimator.tare()
-            self._zero_begun = True
-
     def _measure(self) -> None:
         self.skin.rest(SOURCE.period_s)
         noise = self._random.normal(0.0, RELATIVE_NOISE, 2)
         r1, r2 = (ohm * (1.0 + error) for ohm, error in zip(self.skin.resistances_ohm(), noise, strict=True))
-        now_ns, known_ns = self.t_ns, self.t_ns + round(self._age_s * 1e9)
+        now_ns, known_ns = self.t_ns, self.t_ns + round(self._case.age_s * 1e9)
         reading = self.estimator.update(SkinSample(r1, r2, 0.0, 0.0, 5e-3, now_ns, known_ns, self._samples))
         torque = skin_torque(reading, RADIUS_MM * 1e-3, now_ns, known_ns)
-        if not self._band:
+        if not self._case.band:
             torque = replace(torque, low_nm=None, high_nm=None)
         self._due.append((known_ns, torque))
-        self.estimate_n += [math.nan if reading.shear_n is None else reading.shear_n] * round(
-            self._tick - len(self.estimate_n)
-        )
+        shear_n = math.nan if reading.shear_n is None else reading.shear_n
+        self.estimate_n += [shear_n] * (self._tick - len(self.estimate_n))
 
 
 def _experiment(hold_s: float) -> ExperimentFile:
@@ -185,8 +168,7 @@ def _experiment(hold_s: float) -> ExperimentFile:
 
 def holds_of(loop: SkinLoop, settled_s: float) -> list[FloatArray]:
     """Return the true force over the settled end of each hold, in order."""
-    set_points, truth = np.array(loop.set_point_n), np.array(loop.truth_n)
-    set_points = np.round(set_points, 6)
+    set_points, truth = np.round(loop.set_point_n, 6), np.array(loop.truth_n)
     changes = np.flatnonzero(np.diff(np.nan_to_num(set_points, nan=-1.0))) + 1
     ends = [*changes.tolist(), len(truth)]
     settled = round(settled_s / TICK_S)
@@ -226,11 +208,9 @@ def over_gains() -> list[SkinLoopCase]:
 
 def over_delays() -> list[SkinLoopCase]:
     """Return loops with and without the band, at the usual and the highest gain, with ever older readings."""
-    with_band = SkinLoopCase(name="with the band")
-    without_band = SkinLoopCase(name="without the band", band=False)
     return [
-        replace(kind, name=f"{kind.name}, kp = {kp:g}", kp=kp, age_s=age_s)
-        for kind in (with_band, without_band)
+        SkinLoopCase(name=f"{'with' if band else 'without'} the band, kp = {kp:g}", band=band, kp=kp, age_s=age_s)
+        for band in (True, False)
         for kp in (0.5, 1.0)
         for age_s in AGES_S
     ]
@@ -239,11 +219,9 @@ def over_delays() -> list[SkinLoopCase]:
 def worst(calibration: SkinCalibration, case: SkinLoopCase) -> SkinHold:
     """Return the widest oscillation and the largest offset over several noises, or the run that broke off."""
     found = [judge(replace(case, seed=case.seed + seed), calibration)[0] for seed in range(SEEDS)]
-    broken = next((held for held in found if math.isnan(held.width_n)), None)
-    if broken is not None:
-        return broken
+    broken = [held for held in found if math.isnan(held.width_n)]
     width_n, offset_n = max(held.width_n for held in found), max(held.offset_n for held in found)
-    return replace(found[0], width_n=width_n, offset_n=offset_n)
+    return broken[0] if broken else replace(found[0], width_n=width_n, offset_n=offset_n)
 
 
 def chart(out: Path, executor: Executor) -> list[Path]:
@@ -264,15 +242,15 @@ def limit_cycle_figure(gains: Sequence[SkinHold], delays: Sequence[SkinHold], lo
     width, offset, delay = (made.add_subplot(grid[1, i]) for i in range(3))
     _draw_run(over, loop)
     bound = "2 μFn"
-    _draw_curves(width, gains, lambda case: case.kp, lambda held: held.width_n / held.bound_n)
+    _draw_curves(width, gains, lambda case: case.kp, lambda held: held.width_n)
     width.set(title="Limit cycle over the gain", xlabel="gain kp", ylabel=f"peak to peak / {bound}")
-    _draw_curves(offset, gains, lambda case: case.kp, lambda held: held.offset_n / held.bound_n)
+    _draw_curves(offset, gains, lambda case: case.kp, lambda held: held.offset_n)
     offset.set(title="Accuracy over the gain", xlabel="gain kp", ylabel=f"mean distance from the set point / {bound}")
     for axes in (width, offset):
         axes.set_xscale("log")
         axes.set_xticks(GAINS, [f"{kp:g}" for kp in GAINS])
         axes.minorticks_off()
-    _draw_curves(delay, delays, lambda case: case.age_s, lambda held: held.width_n / held.bound_n)
+    _draw_curves(delay, delays, lambda case: case.age_s, lambda held: held.width_n)
     delay.set_xticks(AGES_S, [f"{age_s:g}" for age_s in AGES_S])
     delay.set(title="Limit cycle over the delay", xlabel="age of a reading, s", ylabel=f"peak to peak / {bound}")
     for axes in (width, delay, offset):
@@ -291,9 +269,8 @@ def limit_cycle_figure(gains: Sequence[SkinHold], delays: Sequence[SkinHold], lo
 
 def _draw_run(axes: Axes, loop: SkinLoop) -> None:
     time_s = np.arange(len(loop.truth_n)) * TICK_S
-    estimate = np.array(loop.estimate_n[: len(time_s)])
     axes.plot(time_s, loop.truth_n, color="#1f4e79", lw=1.2, label="true shear force")
-    axes.plot(time_s[: len(estimate)], estimate, color="#c44e52", lw=0.9, label="estimate")
+    axes.plot(time_s[: len(loop.estimate_n)], loop.estimate_n, color="#c44e52", lw=0.9, label="estimate")
     axes.plot(time_s, loop.set_point_n, color="#888888", lw=1, ls="--", label="set point")
     axes.set(
         title="Zero, identification, and three holds (Fn = 1 N, kp = 0.5)", xlabel="time, s", ylabel="shear force, N"
@@ -307,4 +284,5 @@ def _draw_curves(
     for number, name in enumerate(dict.fromkeys(held.case.name for held in found)):
         mine = [held for held in found if held.case.name == name]
         style = look(number) | {"markersize": 5, "linewidth": 1.2}
-        axes.plot([over(held.case) for held in mine], [value(held) for held in mine], label=name, **style)
+        shares = [value(held) / held.bound_n for held in mine]
+        axes.plot([over(held.case) for held in mine], shares, label=name, **style)

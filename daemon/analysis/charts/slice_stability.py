@@ -1,6 +1,6 @@
 """Stability checks of slices: continuity, torques beyond the calibrated ones, foreign frames, the rim of the bank."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -15,14 +15,17 @@ from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import conductivity
 from shearloop.bank.errors import BankError
-from shearloop.bank.estimation import Calibration, EstimatorSession, FrameSeries, Name, Physics, TactileFrame, fit
-from shearloop.bank.estimation.bank_match import (
-    NOT_TURNED,
-    BankMatcher,
-    ElectrodeNumbering,
-    PaperMatcher,
-    RefinedMatcher,
+from shearloop.bank.estimation import (
+    Calibration,
+    EstimatorSession,
+    FrameSeries,
+    Name,
+    Physics,
+    TactileFrame,
+    bank_match,
+    fit,
 )
+from shearloop.bank.estimation.bank_match import NOT_TURNED
 from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
 from shearloop.bank.estimation.novelty import NoveltyDetector, ReciprocityCheck
 from shearloop.bank.estimation.regressors import Ridge
@@ -60,8 +63,7 @@ class ContinuityWalk:
     @property
     def largest_hop_nm(self) -> float:
         """The largest change within one step, 0 where nothing was valid."""
-        hops = np.abs(np.diff(self.torque_nm))
-        return float(np.nanmax(hops)) if np.isfinite(hops).any() else 0.0
+        return float(np.nan_to_num(np.abs(np.diff(self.torque_nm))).max(initial=0.0))
 
     @property
     def hops(self) -> int:
@@ -82,31 +84,28 @@ def path_through(split: Split) -> tuple[FloatArray, float]:
 def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[ContinuityWalk]:
     """Return the torques of each estimator along the path; the first three differ only in the cell they choose."""
     path, share = path_through(split)
-    locators: dict[str, BankMatcher] = {
-        "paper: the maximum of all lags": PaperMatcher(bank),
-        "zero lag: the maximum, refined": RefinedMatcher(bank, NOT_TURNED, mean_of_alike=False),
-        "zero lag: mean of the cells alike (the fix)": RefinedMatcher(bank, NOT_TURNED),
+    locators: dict[str, bank_match.BankMatcher] = {
+        "paper: the maximum of all lags": bank_match.PaperMatcher(bank),
+        "zero lag: the maximum, refined": bank_match.RefinedMatcher(bank, NOT_TURNED, mean_of_alike=False),
+        "zero lag: mean of the cells alike (the fix)": bank_match.RefinedMatcher(bank, NOT_TURNED),
     }
     found = [ContinuityWalk(name, _read(split, locator, path), share) for name, locator in locators.items()]
     for calibration in calibrations:
         if calibration.estimator in ("regression", "motion_regression"):
             tracker = EstimatorSession(calibration, bank)
             torque = [tracker.estimate(TactileFrame.of(0.0, one[None])).torque_nm for one in path]
-            found.append(
-                ContinuityWalk(calibration.estimator, np.array([np.nan if t is None else t for t in torque]), share)
-            )
+            found.append(ContinuityWalk(calibration.estimator, np.array(torque, dtype=float), share))
     return found
 
 
-def _read(split: Split, locator: BankMatcher, path: FloatArray) -> FloatArray:
+def _read(split: Split, locator: bank_match.BankMatcher, path: FloatArray) -> FloatArray:
     def features(frames: FloatArray) -> FloatArray:
         sigma = np.array([locator.match(one).sigma for one in frames])
         return np.column_stack([sigma, sigma**2])
 
     past = features(np.abs(split.past.channels[:, 0]))
     reader = fit_interval_regressor(past, split.past.torque_at_frames(), Ridge.fit_scaled, strengths=(1e-9,))
-    read: Callable[[FloatArray], float] = lambda one: reader.predict(one)[0]  # noqa: E731
-    return np.array([read(one) for one in features(path)])
+    return np.array([reader.predict(one)[0] for one in features(path)])
 
 
 Rows = NDArray[np.int64]
@@ -194,17 +193,18 @@ def select_rows(series: FrameSeries, rows: Rows) -> FrameSeries:
     )  # fmt: skip
 
 
-Outcome = tuple[FaultLevel, float | None] | str
+# The reason of a refusal, or none.
+Outcome = tuple[FaultLevel, float | None, str]
 
 
 def judge_others(shared: tuple[FrameSeries, str, Mesh | None], task: tuple[Name, CalibrationPart]) -> Outcome:
-    """Return the figures and the median width of a part's judged slices, or the reason of a refused calibration."""
+    """Return the figures and the median width of a part's judged slices, and the reason of a refused calibration."""
     (series, path, mesh), (name, part) = shared, task
     bank = Bank.open(path)
     try:
         calibration = fit(name, [select_rows(series, part.fitted)], "some torques", Physics(bank, mesh))
     except BankError as error:
-        return str(error)
+        return FaultLevel(part.limit_nm, None, None, 0.0, 0.0), None, str(error)
     others = select_rows(series, part.others)
     estimates = estimate_frames(EstimatorSession(calibration, bank), FaultyFrames(others))
     widths = [
@@ -212,25 +212,19 @@ def judge_others(shared: tuple[FrameSeries, str, Mesh | None], task: tuple[Name,
         for one in estimates
         if one.torque_low_nm is not None and one.torque_high_nm is not None
     ]
-    return judge_level(estimates, others.torque_nm, part.limit_nm), float(np.median(widths)) if widths else None
+    return judge_level(estimates, others.torque_nm, part.limit_nm), float(np.median(widths)) if widths else None, ""
 
 
 def _extrapolation(
     title: str, which: str, name: Name, steps: Sequence[tuple[CalibrationPart, Outcome]]
 ) -> Extrapolation:
-    levels: list[FaultLevel] = []
-    widths: list[float | None] = []
-    for part, outcome in steps:
-        if isinstance(outcome, str):
-            print(f"{title}: {name}, {which} ({part.limit_nm:.3f} N·m), is left out: {outcome}")
-            level, width = FaultLevel(part.limit_nm, None, None, 0.0, 0.0), None
-        else:
-            # The calibration on all earlier slices serves both directions.
-            level, width = replace(outcome[0], level=part.limit_nm), outcome[1]
-        levels.append(level)
-        widths.append(width)
-    slices = tuple(len(part.fitted) for part, _ in steps)
-    return Extrapolation(fault_curve(which, UNITS[which], name, levels), slices, tuple(widths))
+    for part, (_, _, refusal) in steps:
+        if refusal:
+            print(f"{title}: {name}, {which} ({part.limit_nm:.3f} N·m), is left out: {refusal}")
+    # The calibration on all earlier slices serves both directions.
+    levels = [replace(level, level=part.limit_nm) for part, (level, _, _) in steps]
+    slices, widths = zip(*((len(part.fitted), width) for part, (_, width, _) in steps), strict=True)
+    return Extrapolation(fault_curve(which, UNITS[which], name, levels), slices, widths)
 
 
 FOREIGN_SHARES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
@@ -262,7 +256,7 @@ def detect_mixtures(series: FrameSeries, origins: Sequence[float] = ORIGINS, see
     """
     frames = np.abs(series.channels[:, 0])
     usable = np.ones(N_CHANNELS, dtype=np.bool_)
-    turned = ElectrodeNumbering(_TURNED_ELECTRODES, reflected=False, score=1.0, runner_up=0.0).model_channels()
+    turned = bank_match.ElectrodeNumbering(_TURNED_ELECTRODES, reflected=False, score=1.0, runner_up=0.0)
     found = []
     for origin in origins:
         n = round(origin * len(frames))
@@ -270,7 +264,7 @@ def detect_mixtures(series: FrameSeries, origins: Sequence[float] = ORIGINS, see
         mean = later.mean(axis=0)
         foreign = {
             "another fingertip": mean[np.random.default_rng(seed).permutation(N_CHANNELS)],
-            f"turned by {_TURNED_ELECTRODES} electrodes": mean[turned],
+            f"turned by {_TURNED_ELECTRODES} electrodes": mean[turned.model_channels()],
         }
         twins = ReciprocityCheck.fit(frames[:n])
         good = _misfits(twins, later)

@@ -55,7 +55,7 @@ def mesh_of(path: Path | None) -> Mesh:
 
 def bank_of(path: Path | None, mesh: Mesh, scratch: Path, grid: Grid = GRID) -> Bank:
     """Return the bank of a file, or a small one of this mesh, kept in the scratch folder."""
-    return Bank.open(path) if path is not None else cached_bank("chart", grid, mesh, scratch, 1, lambda *_: None)
+    return Bank.open(path) if path is not None else cached_bank("chart", grid, mesh, scratch)
 
 
 def splits(paths: Sequence[Path], share: float, scratch: Path) -> list[Split]:
@@ -63,19 +63,14 @@ def splits(paths: Sequence[Path], share: float, scratch: Path) -> list[Split]:
     named = [(path.name or str(path), series) for path in paths for series in read_series(path)]
     if not named:
         named = [("synthetic slices", synthetic_slices(scratch)), ("synthetic stream", synthetic_stream(scratch))]
-    return [
-        Split(f"{name}, {KINDS[series.kind]}, first {share:.0%}", *_parted(series, share), series)
-        for name, series in named
-        if series.torque_t_s.size and not np.isfinite(series.diameter_mm).any()
-    ]
-
-
-KINDS = {"raw": "stream", "difference": "slices"}
-
-
-def _parted(series: FrameSeries, share: float) -> tuple[FrameSeries, FrameSeries]:
-    start = round(share * len(series.t_s)) - (WARM_UP_FRAMES if series.kind == "raw" else 0)
-    return part_of(series, 0, share), series.between(max(start, 0), len(series.t_s))
+    found = []
+    for name, series in named:
+        if series.torque_t_s.size and not np.isfinite(series.diameter_mm).any():
+            kind, warm_up = ("stream", WARM_UP_FRAMES) if series.kind == "raw" else ("slices", 0)
+            start = max(round(share * len(series.t_s)) - warm_up, 0)
+            future = series.between(start, len(series.t_s))
+            found.append(Split(f"{name}, {kind}, first {share:.0%}", part_of(series, 0, share), future, series))
+    return found
 
 
 def sigma_of(torque_nm: float) -> float:
@@ -90,8 +85,7 @@ def torque_of(sigma: float) -> float:
 
 def played_bank(scratch: Path) -> Bank:
     """Return the bank of the synthetic frames."""
-    mesh = own_fingertip(PLAYED_MESH_SIZE_CM).mesh()
-    return cached_bank("played", _PLAYED_GRID, mesh, scratch, 1, lambda *_: None)
+    return cached_bank("played", _PLAYED_GRID, own_fingertip(PLAYED_MESH_SIZE_CM).mesh(), scratch)
 
 
 def mean_frame(synthesiser: Synthesiser, k: float, sigma: float, grip: float) -> FloatArray:

@@ -22,23 +22,15 @@ from shearloop.bank.estimation import Calibration, FrameSeries, Name, Physics, f
 from shearloop.bank.estimation.bank_match import NOT_TURNED, RefinedMatcher
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor, fit_interval_regressor
 from shearloop.bank.estimation.regressors import Ridge, ranked_channels
-from shearloop.daemon.analysis.charts.drawing import (
-    LINES,
-    MARKS,
-    SHADES,
-    draw_frontier,
-    figure,
-    lay_out,
-    plain_log,
-    save,
-    write_names,
-)
+from shearloop.daemon.analysis.charts import drawing
+from shearloop.daemon.analysis.charts.drawing import LINES, MARKS, SHADES
 from shearloop.daemon.analysis.charts.forward_methods import CELLS, SolvedForward, forward_methods
 from shearloop.daemon.analysis.charts.simulated_loop import GAIN, LOOPS, TrackingError, tracking_errors
 from shearloop.daemon.analysis.charts.sources import Split
 from shearloop.daemon.analysis.evaluate import estimate_series
 
 Single = NDArray[np.float32]
+_ESTIMATORS: tuple[Name, ...] = ("bank", "regression", "reconstruction", "motion_regression")
 RANKS = (4, 8, 16, 32, 64, 128)
 CHANNEL_COUNTS = (8, 16, 32, 64, 128, 272, 512)
 # The paper's polynomial needs no regularisation.
@@ -98,13 +90,11 @@ def measure(methods: list[TorqueMethod], truth_nm: FloatArray, rounds: int) -> l
     return found
 
 
-def estimators(
-    split: Split, physics: Physics, names: tuple[Name, ...], sides: tuple[str, ...]
-) -> Iterator[TorqueMethod]:
+def estimators(split: Split, physics: Physics, sides: tuple[str, ...]) -> Iterator[TorqueMethod]:
     """Yield the package's estimators on these sides as they run live; print why one cannot be fitted."""
     past, future = split.past.select_sides(sides), split.future.select_sides(sides)
     count = f", {sides[0] if len(sides) == 1 else 'both'}" if past.kind == "raw" else ""
-    for name in names:
+    for name in _ESTIMATORS:
         try:
             calibration = fit(name, [past], split.title, physics, timed_by=[split.past])
         except BankError as error:
@@ -117,8 +107,8 @@ def estimators(
 
 def _run_estimator(calibration: Calibration, future: FrameSeries, bank: Bank | None) -> tuple[FloatArray, FloatArray]:
     track = estimate_series(calibration, future, bank)
-    torque = [np.nan if one.torque_nm is None else one.torque_nm for one in track.estimates]
-    return np.array(torque), track.latency_ms
+    # None becomes NaN.
+    return np.array([one.torque_nm for one in track.estimates], dtype=float), track.latency_ms
 
 
 def matchers(split: Split, bank: Bank) -> Iterator[TorqueMethod]:
@@ -173,11 +163,8 @@ def fewer_channels(split: Split) -> Iterator[TorqueMethod]:
     for count in CHANNEL_COUNTS:
         best = order[:count]
         reader = fit_interval_regressor(differences[:, best], torque, Ridge.fit)
-        yield TorqueMethod(
-            f"{count} channels",
-            "regression on the best n channels",
-            _timed(split, partial(_read_some, reader, best)),
-        )
+        run = _timed(split, partial(_read_some, reader, best))
+        yield TorqueMethod(f"{count} channels", "regression on the best n channels", run)
 
 
 def _read_some(reader: IntervalRegressor, channels: NDArray[np.int64], difference: FloatArray) -> float:
@@ -208,14 +195,12 @@ def _timed(split: Split, read: Callable[[FloatArray], float]) -> Callable[[], tu
     return run
 
 
-Fill = Literal["none", "left", "full"]
 # The largest noise that the loop's identification tolerates.
 _LARGEST_LOOP_NOISE_NM = 0.02
-_SLICE_ESTIMATORS: tuple[Name, ...] = ("bank", "regression", "reconstruction", "motion_regression")
 # Errors count valid frames only. A method below this share of the most valid one stays off the frontier.
 _OFTEN_VALID = 0.9
 # Fill of a single window's mark, from the smallest noise to the largest.
-_FILLS: tuple[Fill, ...] = ("none", "left", "full")
+_FILLS: tuple[Literal["none", "left", "full"], ...] = ("none", "left", "full")
 # Families with one varying setting are joined by a line.
 _JOINED = {"zero lag, bank of rank r": "rank", "regression on the best n channels": "channels"}
 
@@ -232,15 +217,10 @@ def compare_methods(split: Split, bank: Bank, mesh: Mesh, rounds: int) -> Method
     """Return every method's time and error on a split."""
     physics, sides = Physics(bank, mesh), split.past.sides
     if split.past.kind == "difference":
-        methods = [
-            *matchers(split, bank), *fewer_channels(split), *estimators(split, physics, _SLICE_ESTIMATORS, sides[:1]),
-        ]  # fmt: skip
+        methods = [*matchers(split, bank), *fewer_channels(split), *estimators(split, physics, sides[:1])]
     else:
-        methods = [
-            method
-            for some in dict.fromkeys((sides[:1], sides))
-            for method in estimators(split, physics, _SLICE_ESTIMATORS, some)
-        ]
+        chosen = dict.fromkeys((sides[:1], sides))
+        methods = [method for some in chosen for method in estimators(split, physics, some)]
     return MethodComparison(split, measure(methods, split.future.torque_at_frames(), rounds))
 
 
@@ -270,7 +250,7 @@ def write(
     }
     panels = len(compared) + 2
     rows = (panels + 1) // 2
-    made = figure(15, 6.3 * rows)
+    made = drawing.figure(15, 6.3 * rows)
     axes = made.subplots(rows, 2, squeeze=False).ravel()
     for one, panel in zip(compared, axes, strict=False):
         _draw_methods(panel, one)
@@ -279,15 +259,15 @@ def write(
     for panel in axes[panels:]:
         panel.set_axis_off()
     made.suptitle("Speed against accuracy: below and to the left is better", fontsize=14)
-    lay_out(made)
+    drawing.lay_out(made)
     for one, panel in zip(compared, axes, strict=False):
         often = often_valid(one.methods)
         names = [_short(method, i in often) for i, method in enumerate(one.methods)]
         points = zip(one.methods, names, strict=True)
-        write_names(panel, [(method.latency_ms, method.rmse_nm, name) for method, name in points])
+        drawing.write_names(panel, [(method.latency_ms, method.rmse_nm, name) for method, name in points])
     named = [(one.cell_ms, one.error, f"{one.name}\n{one.triangles} triangles") for one in solved if one.error]
-    write_names(axes[len(compared)], named)
-    return save(made, content, out, "speed-accuracy")
+    drawing.write_names(axes[len(compared)], named)
+    return drawing.save(made, content, out, "speed-accuracy")
 
 
 def _rows(methods: Sequence[MeasuredMethod]) -> list[dict[str, Any]]:
@@ -298,10 +278,10 @@ def _rows(methods: Sequence[MeasuredMethod]) -> list[dict[str, Any]]:
 
 def _draw_methods(axes: Axes, compared: MethodComparison) -> None:
     methods = compared.methods
-    plain_log(axes)
+    drawing.plain_log(axes)
     often = often_valid(methods)
     costs, errors = ([getattr(methods[i], name) for i in often] for name in ("latency_ms", "rmse_nm"))
-    best = [often[i] for i in draw_frontier(axes, costs, errors, max(one.latency_ms for one in methods))]
+    best = [often[i] for i in drawing.draw_frontier(axes, costs, errors, max(one.latency_ms for one in methods))]
     families = list(dict.fromkeys(one.family for one in methods))
     for number, family in enumerate(families):
         shade, mark = SHADES[number % len(SHADES)], MARKS[number % len(MARKS)]
@@ -346,10 +326,10 @@ def _short(one: MeasuredMethod, is_often_valid: bool) -> str:
 
 
 def _draw_forward(axes: Axes, solved: Sequence[SolvedForward]) -> None:
-    plain_log(axes)
+    drawing.plain_log(axes)
     known = [(one.cell_ms, one.error) for one in solved if one.error is not None]
     costs = [cost for cost, _ in known]
-    draw_frontier(axes, costs, [error for _, error in known], max(costs))
+    drawing.draw_frontier(axes, costs, [error for _, error in known], max(costs))
     families = list(dict.fromkeys(one.family for one in solved))
     axes.margins(x=0.12, y=0.12)
     for number, family in enumerate(families):
@@ -364,12 +344,8 @@ def _draw_forward(axes: Axes, solved: Sequence[SolvedForward]) -> None:
             )  # fmt: skip
         for one in members:
             if one.error is None:
-                axes.axvline(
-                    one.cell_ms,
-                    color=shade,
-                    linestyle=LINES[number % len(LINES)],
-                    label=f"{one.name}, {one.triangles} triangles",
-                )
+                label = f"{one.name}, {one.triangles} triangles"
+                axes.axvline(one.cell_ms, color=shade, linestyle=LINES[number % len(LINES)], label=label)
     axes.set(
         title=f"Forward methods, {len(CELLS)} cells of the Gaussian derivative",
         xlabel="time per cell, ms (one thread; cited ones from elsewhere)",

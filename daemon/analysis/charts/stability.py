@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -12,20 +13,10 @@ from numpy.typing import NDArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.estimation import Name, Physics
-from shearloop.daemon.analysis.charts import skin_loop
+from shearloop.daemon.analysis.charts import skin_loop, slice_stability
 from shearloop.daemon.analysis.charts.drawing import SHADES, figure, look, save, slug
 from shearloop.daemon.analysis.charts.fault_sweeps import BROKEN_SHARE, FaultCurve, fitted, misaligned, sweeps
-from shearloop.daemon.analysis.charts.slice_stability import (
-    FOREIGN_SHARES,
-    STEPS,
-    ContinuityWalk,
-    Extrapolation,
-    ForeignMixture,
-    detect_mixtures,
-    extrapolate,
-    sweep_rims,
-    walks,
-)
+from shearloop.daemon.analysis.charts.slice_stability import FOREIGN_SHARES, STEPS
 from shearloop.daemon.analysis.charts.sources import Split, splits
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.workers import Executor
@@ -51,7 +42,7 @@ def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Pa
         if split.past.kind == "difference":
             written += _of_slices(split, bank, mesh, out, executor)
     synthetic = next(one for one in splits([], 0.6, scratch) if one.past.kind == "difference")
-    curves = list(sweep_rims(fitted(synthetic, SLICE_NAMES, physics), bank, scratch))
+    curves = list(slice_stability.sweep_rims(fitted(synthetic, SLICE_NAMES, physics), bank, scratch))
     written += _written("stability-rims", "the rim of the bank, on synthetic slices", curves, out)
     return written + skin_loop.chart(out, executor)
 
@@ -59,17 +50,17 @@ def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Pa
 def _of_slices(split: Split, bank: Bank, mesh: Mesh, out: Path, executor: Executor) -> list[Path]:
     """Write the charts of slices: continuity, torques beyond the calibrated ones, foreign frames."""
     name, physics = slug(split.title), Physics(bank, mesh)
-    found = walks(split, bank, fitted(split, ("regression", "motion_regression"), physics))
+    found = slice_stability.walks(split, bank, fitted(split, ("regression", "motion_regression"), physics))
     rows = [asdict(one) | {"largest_hop_nm": one.largest_hop_nm, "hops": one.hops} for one in found]
     written = save(continuity_figure(split.title, found), {"steps": STEPS, "walks": rows}, out, f"continuity-{name}")
-    beyond = extrapolate(split, SLICE_NAMES, bank, mesh, executor)
+    beyond = slice_stability.extrapolate(split, SLICE_NAMES, bank, mesh, executor)
     content = {
         "broken_share": BROKEN_SHARE,
         "title": split.title,
         "extrapolations": [asdict(one) | {"times_good": one.times_good} for one in beyond],
     }
     written += save(extrapolation_figure(split.title, beyond), content, out, f"extrapolation-{name}")
-    seen = detect_mixtures(split.whole)
+    seen = slice_stability.detect_mixtures(split.whole)
     return written + save(
         detectability_figure(split.title.split(",", maxsplit=1)[0], seen),
         {"mixtures": [asdict(one) for one in seen]}, out, f"detectability-{name}",
@@ -128,9 +119,9 @@ def _draw_curve(row: Sequence[Axes], one: FaultCurve, number: int, count: int) -
     style = look(number) | {"linewidth": 1.3, "markersize": 5}
     labels = [f"{level.level:g}" for level in one.levels]
     x = _offset_places(len(labels), number, count)
-    bias = np.array([np.nan if level.bias_nm is None else 1e3 * level.bias_nm for level in one.levels])
-    spread = np.array([np.nan if level.spread_nm is None else 1e3 * level.spread_nm for level in one.levels])
-    row[0].errorbar(x, bias, yerr=spread, elinewidth=0.8, **style)
+    # None becomes NaN.
+    bias_nm, spread_nm = np.array([(level.bias_nm, level.spread_nm) for level in one.levels], dtype=float).T
+    row[0].errorbar(x, 1e3 * bias_nm, yerr=1e3 * spread_nm, elinewidth=0.8, **style)
     row[1].plot(x, [level.valid for level in one.levels], **style)
     false = [level.false_valid for level in one.levels]
     row[2].plot(x, false, label=one.estimator, **style)
@@ -142,7 +133,7 @@ def _draw_curve(row: Sequence[Axes], one: FaultCurve, number: int, count: int) -
         panel.set_xlim(-0.6, len(labels) - 0.4)
 
 
-def extrapolation_figure(title: str, found: Sequence[Extrapolation]) -> Figure:
+def extrapolation_figure(title: str, found: Sequence[slice_stability.Extrapolation]) -> Figure:
     """Draw the estimators beyond the torques they were calibrated on, and the width of their intervals."""
     faults = list(dict.fromkeys((one.curve.fault, one.curve.unit) for one in found))
     made = figure(19, 4.2 * len(faults) + 1.0)
@@ -153,10 +144,9 @@ def extrapolation_figure(title: str, found: Sequence[Extrapolation]) -> Figure:
         _label(row[3], unit, "median width, times that of good later slices")
         row[3].axhline(1.0, color="#999999", linewidth=0.8)
         for number, one in enumerate(here):
-            times = [np.nan if width is None else width for width in one.times_good]
-            row[3].plot(
-                _offset_places(len(times), number, len(here)), times, linewidth=1.3, markersize=5, **look(number)
-            )
+            times = np.array(one.times_good, dtype=float)
+            x = _offset_places(len(times), number, len(here))
+            row[3].plot(x, times, linewidth=1.3, markersize=5, **look(number))
         row[3].set_ylim(bottom=0.0)
         labels = [f"{level.level:.3f}\n{n}" for level, n in zip(here[0].curve.levels, here[0].slices, strict=True)]
         for panel in row:
@@ -173,7 +163,7 @@ def extrapolation_figure(title: str, found: Sequence[Extrapolation]) -> Figure:
     return made
 
 
-def continuity_figure(title: str, walks: Sequence[ContinuityWalk]) -> Figure:
+def continuity_figure(title: str, walks: Sequence[slice_stability.ContinuityWalk]) -> Figure:
     """Draw the estimates along a path through the frames, and the largest change of each within one small step."""
     made = figure(15, 6.2)
     way, bars = made.subplots(1, 2, gridspec_kw={"width_ratios": [2.3, 1]})
@@ -181,20 +171,9 @@ def continuity_figure(title: str, walks: Sequence[ContinuityWalk]) -> Figure:
         style = look(number) | {"linewidth": 1.4, "markersize": 4}
         at = np.arange(len(walk.torque_nm)) / STEPS
         way.plot(at, walk.torque_nm, markevery=(2 * number, 40), label=walk.name, **style)
-        bars.barh(
-            number,
-            1e3 * walk.largest_hop_nm,
-            color="#d9d9d9",
-            edgecolor="black",
-            hatch=("/", "\\", "x", ".", "o")[number % 5],
-        )
-        bars.text(
-            1e3 * walk.largest_hop_nm,
-            number,
-            f"  {1e3 * walk.largest_hop_nm:.2f} ({walk.hops} hops)",
-            va="center",
-            fontsize=9,
-        )
+        hop_mnm = 1e3 * walk.largest_hop_nm
+        bars.barh(number, hop_mnm, color="#d9d9d9", edgecolor="black", hatch="/\\x.o"[number % 5])
+        bars.text(hop_mnm, number, f"  {hop_mnm:.2f} ({walk.hops} hops)", va="center", fontsize=9)
     bars.set_yticks(range(len(walks)), [walk.name.replace(": ", ":\n") for walk in walks], fontsize=8.5)
     bars.invert_yaxis()
     bars.margins(x=0.45)
@@ -213,7 +192,7 @@ def continuity_figure(title: str, walks: Sequence[ContinuityWalk]) -> Figure:
     return made
 
 
-def detectability_figure(title: str, found: Sequence[ForeignMixture]) -> Figure:
+def detectability_figure(title: str, found: Sequence[slice_stability.ForeignMixture]) -> Figure:
     """Draw the misfits of one origin, and the share that passes at all origins."""
     made = figure(15, 6)
     clouds, passing = made.subplots(1, 2, gridspec_kw={"width_ratios": [1, 1.15]})
@@ -224,25 +203,20 @@ def detectability_figure(title: str, found: Sequence[ForeignMixture]) -> Figure:
         if one.origin == shown and one.kind == kinds[0]:
             x = np.full(len(one.misfits), one.share) + np.linspace(-0.008, 0.008, len(one.misfits))
             clouds.plot(x, one.misfits, "o", color=SHADES[1], markersize=4, alpha=0.7)
-    good = next(one for one in found if one.origin == shown and one.share == 0)
+    best = max(next(one.misfits for one in found if one.origin == shown and one.share == 0))
     clouds.axhline(1.0, color="black", linewidth=1.4, label="limit of the validity check, from earlier slices")
-    clouds.axhline(
-        max(good.misfits), color="black", linestyle=":", linewidth=1.4, label="best limit: the worst good slice"
-    )
+    clouds.axhline(best, color="black", linestyle=":", linewidth=1.4, label="best limit: the worst good slice")
     clouds.set(
         xlabel=f"share of a foreign frame ({kinds[0]})", ylabel="misfit of each later slice's reciprocal channels",
         title=f"calibrated on the first {shown:.0%}", yscale="log",
     )  # fmt: skip
     clouds.legend(fontsize=8.5, loc="upper left")
-    for number, (kind, name, label) in enumerate(
-        [(kind, name, label) for kind in kinds
-         for name, label in (("passing", "validity check"), ("passing_best", "best possible limit"))]
-    ):  # fmt: skip
-        rows = [
-            [getattr(one, name) for one in found if one.kind == kind and one.share == share] for share in FOREIGN_SHARES
-        ]
-        mean = [float(np.mean(row)) for row in rows]
-        bars = np.array([[m - min(row), max(row) - m] for m, row in zip(mean, rows, strict=True)]).T
+    labels = (("passing", "validity check"), ("passing_best", "best possible limit"))
+    for number, (kind, (name, label)) in enumerate(product(kinds, labels)):
+        of_kind = [one for one in found if one.kind == kind]
+        rows = np.array([[getattr(one, name) for one in of_kind if one.share == share] for share in FOREIGN_SHARES])
+        mean = rows.mean(axis=1)
+        bars = mean - rows.min(axis=1), rows.max(axis=1) - mean
         x = np.array(FOREIGN_SHARES) + 0.003 * (number - 1.5)
         passing.errorbar(x, mean, yerr=bars, linewidth=1.4, elinewidth=0.8, label=f"{kind}: {label}", **look(number))
     passing.set(

@@ -1,11 +1,11 @@
 """The analysis of Trehan et al. 2025 (Sensors 25, 5159): torque and diameter from best matches of recorded slices."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
@@ -44,7 +44,7 @@ class Inputs:
 
     torque: TorqueSlices | None
     diameter: DiameterSlices | None
-    raw_difference: NDArray[np.float64] | None
+    raw_difference: FloatArray | None
     notes: tuple[str, ...]
 
 
@@ -78,7 +78,7 @@ def read_inputs(recordings: Path) -> Inputs:
     return Inputs(torque, diameter, raw, tuple(notes))
 
 
-def _raw_difference(folder: Path, notes: list[str]) -> NDArray[np.float64] | None:
+def _raw_difference(folder: Path, notes: list[str]) -> FloatArray | None:
     frame, homogeneous = folder / RAW_FRAME, folder / RAW_HOMOGENEOUS
     absent = [path.name for path in (frame, homogeneous) if not path.exists()]
     if absent:
@@ -87,7 +87,7 @@ def _raw_difference(folder: Path, notes: list[str]) -> NDArray[np.float64] | Non
     return np.abs(channels_of_line(read_line(frame)) - channels_of_line(read_line(homogeneous)))
 
 
-# Called with the number of slices matched since the last call.
+# Called with the number of slices matched so far.
 Progress = Callable[[int], object]
 
 FEWEST_SLICES = 3
@@ -146,17 +146,15 @@ class TorqueResult:
 class DiameterResult:
     """The diameter slices' results: Pearson's correlation between diameter and the best match's k.
 
-    `single` is slice by slice. `accumulated` has one match per diameter (d,), of its mean heatmap (d, K, S); `fit` is
-    the line through `accumulated_k` (d,).
+    `single` is slice by slice. `accumulated` has one match per diameter (d,), of its mean heatmap; `fit` is the line
+    through its k.
     """
 
     slices: DiameterSlices
     single: Matches
     r_single: float | None
     diameters_mm: FloatArray
-    heatmaps: FloatArray
-    accumulated_k: FloatArray
-    accumulated: tuple[Match, ...]
+    accumulated: Matches
     r_accumulated: float | None
     fit: Polynomial | None
     notes: tuple[str, ...]
@@ -184,8 +182,11 @@ def match_slices(differences: FloatArray, bank: Bank, progress: Progress) -> Mat
     parts = []
     for start in range(0, len(differences), _BATCH):
         parts.append(matcher.heatmaps(differences[start : start + _BATCH]))
-        progress(len(parts[-1]))
-    heatmaps = np.concatenate(parts)
+        progress(min(start + _BATCH, len(differences)))
+    return _best_matches(np.concatenate(parts), bank)
+
+
+def _best_matches(heatmaps: FloatArray, bank: Bank) -> Matches:
     best = tuple(best_match(heatmap, bank.k_grid, bank.sigma_grid) for heatmap in heatmaps)
     return Matches(
         heatmaps=heatmaps,
@@ -200,8 +201,7 @@ def analyse_torque(slices: TorqueSlices, on_focused: Matches, on_wide: Matches) 
     """Relate sigma to torque, from the matches of at least three slices in both banks."""
     torque = slices.torque_nm
     sigma = on_focused.sigma
-    groups, grouping = _levels(torque)
-    parts, held_out = _held_out_parts(torque)
+    groups, grouping, parts, held_out = _groups(torque)
     group_sigma, group_torque = group_means(sigma, groups), group_means(torque, groups)
     r_clustered = correlation(group_sigma, group_torque)
     notes: list[str] = []
@@ -230,9 +230,8 @@ def analyse_diameter(slices: DiameterSlices, wide: Bank, progress: Progress) -> 
     single = match_slices(smoothed_along_channels(slices.differences), wide, progress)
     diameters = np.unique(slices.diameter_mm)
     heatmaps = np.array([single.heatmaps[slices.diameter_mm == each].mean(axis=0) for each in diameters])
-    accumulated = tuple(best_match(heatmap, wide.k_grid, wide.sigma_grid) for heatmap in heatmaps)
-    accumulated_k = np.array([match.k for match in accumulated])
-    r_accumulated = correlation(accumulated_k, diameters)
+    accumulated = _best_matches(heatmaps, wide)
+    r_accumulated = correlation(accumulated.k, diameters)
     notes: list[str] = []
     if r_accumulated is None:
         notes.append(f"{len(diameters)} diameters, or too few distinct k, do not make a correlation of k with diameter")
@@ -241,11 +240,9 @@ def analyse_diameter(slices: DiameterSlices, wide: Bank, progress: Progress) -> 
         single=single,
         r_single=correlation(single.k, slices.diameter_mm),
         diameters_mm=diameters,
-        heatmaps=heatmaps,
-        accumulated_k=accumulated_k,
         accumulated=accumulated,
         r_accumulated=r_accumulated,
-        fit=_fit_or_note(accumulated_k, diameters, DIAMETER_DEGREE, "diameter over k", notes),
+        fit=_fit_or_note(accumulated.k, diameters, DIAMETER_DEGREE, "diameter over k", notes),
         notes=tuple(notes),
     )
 
@@ -261,7 +258,10 @@ def score_models(slices: TorqueSlices, raw_difference: FloatArray | None, mesh: 
         matching[model] = float(matching_scores(slices.differences, searched).mean()) if len(searched) else None
         if raw_difference is not None:
             centred = simulated_signals(forward, model, centred_settings(model, middle))
-            envelope[model] = _envelope_score_or_none(raw_difference, centred)
+            envelope[model] = None
+            # A signal without peaks has no score.
+            with suppress(MatchingError):
+                envelope[model] = mean_envelope_score(raw_difference, centred) if len(centred) else None
     return ModelScores(envelope or None, matching)
 
 
@@ -272,22 +272,23 @@ def correlation(x: FloatArray, y: FloatArray) -> float | None:
     return float(np.corrcoef(x, y)[0, 1])
 
 
-def _levels(torque: FloatArray) -> tuple[IntArray, str]:
+def _groups(torque: FloatArray) -> tuple[IntArray, str, IntArray, str]:
+    """Return each slice's level of torque and part of the recording, and how both were found.
+
+    Parts are stretches of time, as neighbours in time are not independent.
+    """
     series = place_in_series(torque)
     if series is not None:
-        return series.level, f"by place in {int(series.repeat.max()) + 1} repeated series"
-    count = min(_GROUPS, max(FEWEST_SLICES, len(torque) // 3), len(np.unique(torque)))
-    return kmeans_groups(torque[:, None], count), f"by k-means of the torques into {count} (no repeated series found)"
-
-
-def _held_out_parts(torque: FloatArray) -> tuple[IntArray, str]:
-    """Return each slice's part of the recording: neighbours in time are not independent."""
-    series = place_in_series(torque)
-    if series is not None:
-        return series.repeat, "one repeat of the series left out at a time"
-    count = min(_STRETCHES, len(torque))
-    stretches = (np.arange(len(torque)) * count // len(torque)).astype(np.int64)
-    return stretches, f"one of {count} stretches of time left out at a time"
+        repeats = f"by place in {int(series.repeat.max()) + 1} repeated series"
+        return series.level, repeats, series.repeat, "one repeat of the series left out at a time"
+    n_levels = min(_GROUPS, max(FEWEST_SLICES, len(torque) // 3), len(np.unique(torque)))
+    n_parts = min(_STRETCHES, len(torque))
+    return (
+        kmeans_groups(torque[:, None], n_levels),
+        f"by k-means of the torques into {n_levels} (no repeated series found)",
+        (np.arange(len(torque)) * n_parts // len(torque)).astype(np.int64),
+        f"one of {n_parts} stretches of time left out at a time",
+    )
 
 
 def _cross_validated_rmse(sigma: FloatArray, torque: FloatArray, parts: IntArray, notes: list[str]) -> float | None:
@@ -307,15 +308,3 @@ def _fit_or_note(x: FloatArray, y: FloatArray, degree: int, what: str, notes: li
     except CalibrationError as error:
         notes.append(f"no fit of {what}: {error}")
         return None
-
-
-def _envelope_score_or_none(raw_difference: FloatArray, signals: FloatArray) -> float | None:
-    try:
-        return mean_envelope_score(raw_difference, signals) if len(signals) else None
-    except MatchingError:  # a signal without peaks: nothing to compare
-        return None
-
-
-def all_notes(results: Iterable[TorqueResult | DiameterResult | None]) -> list[str]:
-    """Return the notes of the existing results."""
-    return [note for result in results if result is not None for note in result.notes]

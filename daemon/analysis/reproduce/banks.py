@@ -7,8 +7,8 @@ from importlib import resources
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank, BankDefinition
 from shearloop.bank.eit.build import build_bank
 from shearloop.bank.eit.mesh import Mesh
@@ -22,15 +22,13 @@ PAPER_MESH = Path("reference") / "fingertip_mesh.npz"
 
 OWN_FINGERTIP = Path(str(resources.files("shearloop"))) / "config" / "fingertips" / "paper.yaml"
 
-RowProgress = Callable[[str, int, int], None]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
     """The cells of a bank: k (K,) and sigma (S,) in cm."""
 
-    k: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    k: FloatArray
+    sigma: FloatArray
 
 
 # The whole fingertip as in the paper's figure 6, and finer where screwdrivers match.
@@ -46,59 +44,47 @@ FEWEST_INSIDE = 0.9
 _ENDS, _STEPS_AROUND = (0.02, 0.98), 2
 
 
-def focused_grid(k: NDArray[np.float64], sigma: NDArray[np.float64]) -> Grid:
+def focused_grid(k: FloatArray, sigma: FloatArray) -> Grid:
     """Return the focused grid for the best matches k (n,) and sigma (n,) in the wide bank, in cm.
 
     It is the paper's where that covers the matches; else an equally large or larger one around the matches.
     """
     paper, wide = GRIDS["focused"], GRIDS["wide"]
-    inside = _within(k, paper.k) & _within(sigma, paper.sigma)
+    pairs = ((k, paper.k), (sigma, paper.sigma))
+    inside = np.all([(found >= grid[0]) & (found <= grid[-1]) for found, grid in pairs], axis=0)
     if inside.mean() >= FEWEST_INSIDE:
         return paper
     return Grid(_around(k, paper.k, wide.k), _around(sigma, paper.sigma, wide.sigma))
 
 
-def _within(found: NDArray[np.float64], grid: NDArray[np.float64]) -> NDArray[np.bool_]:
-    inside: NDArray[np.bool_] = (found >= grid[0]) & (found <= grid[-1])
-    return inside
-
-
-def _around(found: NDArray[np.float64], paper: NDArray[np.float64], wide: NDArray[np.float64]) -> NDArray[np.float64]:
+def _around(found: FloatArray, paper: FloatArray, wide: FloatArray) -> FloatArray:
     low, high = np.quantile(found, _ENDS)
     half = max(high - low + 2 * _STEPS_AROUND * (wide[1] - wide[0]), paper[-1] - paper[0]) / 2
     middle = (low + high) / 2
     return np.linspace(max(middle - half, wide[0]), min(middle + half, wide[-1]), len(paper))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ChosenMesh:
-    """A mesh and its origin, for the report."""
-
-    mesh: Mesh
-    origin: str
-
-
-def choose_mesh(recordings: Path, mesh: Path | None, bank_config: Path | None) -> ChosenMesh:
+def choose_mesh(recordings: Path, mesh: Path | None, bank_config: Path | None) -> tuple[Mesh, str]:
     """Return the mesh of a file or of a bank's configuration, else the paper's next to the recordings, else our own.
 
-    Raises UserError and GeometryError for unusable files.
+    The second value is its origin, for the report. Raises UserError and GeometryError for unusable files.
     """
     if mesh is not None:
-        return ChosenMesh(load_geometry(mesh), str(mesh))
+        return load_geometry(mesh), str(mesh)
     if bank_config is not None:
-        return ChosenMesh(load_bank_plan(bank_config).mesh, f"the geometry of {bank_config}")
+        return load_bank_plan(bank_config).mesh, f"the geometry of {bank_config}"
     beside = recordings.resolve().parent / PAPER_MESH
     if beside.is_file():
-        return ChosenMesh(load_geometry(beside), f"{beside} (the paper's)")
-    if OWN_FINGERTIP.is_file():
-        return ChosenMesh(load_geometry(OWN_FINGERTIP), f"our own grid for {OWN_FINGERTIP}")
-    raise UserError(f"there is neither {beside} nor {OWN_FINGERTIP}; name a mesh with --mesh")
+        return load_geometry(beside), f"{beside} (the paper's)"
+    return load_geometry(OWN_FINGERTIP), f"our own grid for {OWN_FINGERTIP}"
 
 
-def cached_bank(name: str, grid: Grid, mesh: Mesh, folder: Path, jobs: int, on_row: RowProgress) -> Bank:
+def cached_bank(
+    name: str, grid: Grid, mesh: Mesh, folder: Path, jobs: int = 1, on_row: Callable[[int, int], None] = lambda *_: None
+) -> Bank:
     """Return the bank of this grid and mesh from a folder; build it where it is missing or damaged.
 
-    `on_row(name, done, total)` is called during the build. Raises BankFileError where it cannot be written.
+    `on_row(done, total)` is called during the build. Raises BankFileError where it cannot be written.
     """
     definition = BankDefinition(mesh.digest, MODEL, grid.k, grid.sigma)
     identity = definition.identity
@@ -115,11 +101,6 @@ def cached_bank(name: str, grid: Grid, mesh: Mesh, folder: Path, jobs: int, on_r
     except OSError as error:
         raise UserError(f"{folder}: the folder for banks cannot be made: {error.strerror}") from error
     build_bank(
-        mesh,
-        definition,
-        path,
-        jobs=jobs,
-        on_row=lambda done, total: on_row(name, done, total),
-        on_notice=lambda sentence: print(sentence, file=sys.stderr),
+        mesh, definition, path, jobs=jobs, on_row=on_row, on_notice=lambda sentence: print(sentence, file=sys.stderr)
     )
     return Bank.open(path)

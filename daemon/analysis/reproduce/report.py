@@ -19,8 +19,8 @@ from shearloop.bank.eit.models import MODELS
 from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration
-from shearloop.daemon.analysis.reproduce.analysis import DiameterResult, ModelScores, TorqueResult, all_notes
-from shearloop.daemon.analysis.reproduce.banks import Grid
+from shearloop.daemon.analysis.charts.drawing import figure, lay_out
+from shearloop.daemon.analysis.reproduce.analysis import DiameterResult, Matches, ModelScores, TorqueResult
 
 PAPER = "Trehan, Hardman and Iida 2025, Sensors 25, 5159"
 # As published, without signs: sigma falls with rising torque, and k with rising diameter.
@@ -45,14 +45,6 @@ class Reproduction:
     diameter: DiameterResult | None
     models: ModelScores | None
     notes: tuple[str, ...]
-
-
-def moved_focus(grid: Grid) -> str:
-    """Return the note about a focused bank elsewhere than the paper's."""
-    return (
-        "Most slices match best outside of the paper's focused bank: this one lies around them, "
-        f"k {grid.k[0]:.2f} to {grid.k[-1]:.2f} cm, sigma {grid.sigma[0]:.2f} to {grid.sigma[-1]:.2f} cm."
-    )
 
 
 def as_json(found: Reproduction) -> dict[str, Any]:
@@ -81,9 +73,9 @@ def table(found: Reproduction) -> str:
     if found.torque:
         torque = found.torque
         rows += [
-            ("torque and sigma, r, single slices, focused bank", _bare(PAPER_TORQUE_R), _number(torque.r_focused)),
+            ("torque and sigma, r, single slices, focused bank", f"{PAPER_TORQUE_R:.4f}", _number(torque.r_focused)),
             ("torque and sigma, r, single slices, wide bank", "", _number(torque.r_wide)),
-            ("torque and sigma, r, groups of slices", _bare(PAPER_TORQUE_CLUSTERED_R), _number(torque.r_clustered)),
+            ("torque and sigma, r, groups of slices", f"{PAPER_TORQUE_CLUSTERED_R:.4f}", _number(torque.r_clustered)),
             ("torque of a single slice, RMSE cross-validated, N·m", "", _number(torque.rmse_nm)),
             ("   beside the torques' standard deviation, N·m", "", _number(float(torque.slices.torque_nm.std()))),
         ]
@@ -91,12 +83,12 @@ def table(found: Reproduction) -> str:
         diameter = found.diameter
         rows += [
             ("diameter and k, r, single slices", "", _number(diameter.r_single)),
-            ("diameter and k, r, heatmaps accumulated", _bare(PAPER_DIAMETER_R), _number(diameter.r_accumulated)),
+            ("diameter and k, r, heatmaps accumulated", f"{PAPER_DIAMETER_R:.4f}", _number(diameter.r_accumulated)),
         ]
     if found.models:
         what = "matching" if found.models.envelope is None else "envelope"
         rows += [
-            (f"{MODELS[name].title}: {what} score", _bare(PAPER_MODEL_SCORES[name]), _number(score))
+            (f"{MODELS[name].title}: {what} score", f"{PAPER_MODEL_SCORES[name]:.4f}", _number(score))
             for name, score in found.models.chosen.items()
         ]
         if found.models.envelope is not None:
@@ -123,7 +115,8 @@ def explanations(found: Reproduction) -> list[str]:
         sentences.append(f"Diameter: {n_slices} slices of {n_diameters} diameters, smoothed along the channels.")
     if found.models:
         sentences += model_explanations(found.models)
-    return sentences + list(found.notes) + all_notes([found.torque, found.diameter])
+    results = (found.torque, found.diameter)
+    return [*sentences, *found.notes, *(note for result in results if result for note in result.notes)]
 
 
 def model_explanations(models: ModelScores) -> list[str]:
@@ -141,13 +134,6 @@ def model_explanations(models: ModelScores) -> list[str]:
         f"{_first(models.envelope)}, and the largest difference from the paper's is {max(gaps, default=0.0):.3f}.",
         matching,
     ]
-
-
-def write_json(found: Reproduction, folder: Path) -> Path:
-    """Write the JSON into a folder and return its path; raises OSError."""
-    path = folder / "reproduce.json"
-    path.write_text(json_text(found) + "\n", encoding="utf-8")
-    return path
 
 
 def save_calibrations(found: Reproduction, banks: dict[str, Bank], recordings: Path, folder: Path) -> list[Path]:
@@ -178,12 +164,8 @@ def _first(scores: dict[str, float | None]) -> str:
     return MODELS[max(known, key=lambda name: known[name])].title if known else "none"
 
 
-def _bare(value: float) -> str:
-    return f"{value:.4f}"
-
-
-def _number(value: float | None) -> str:
-    return "none" if value is None else f"{value:.5f}"
+def _number(value: float | None, digits: int = 5) -> str:
+    return "none" if value is None else f"{value:.{digits}f}"
 
 
 _GREY, _BLACK, _PINK, _BLUE, _TEAL, _ORANGE = "#8c8c8c", "#222222", "#d6338a", "#1f5f99", "#2a9d8f", "#d9822b"
@@ -202,13 +184,11 @@ def draw_all(found: Reproduction, banks: dict[str, Bank], folder: Path) -> list[
     if found.diameter:
         figures["figure_9_diameter"] = diameter_figure(found.diameter, banks["wide"])
     written = []
-    for name, figure in figures.items():
-        # The layout takes longer than drawing: compute it once for both files.
-        figure.draw_without_rendering()
-        figure.set_layout_engine("none")
+    for name, made in figures.items():
+        lay_out(made)
         for path in (folder / f"{name}.png", folder / f"{name}.svg"):
             # Without a date, the same numbers make the same file.
-            figure.savefig(path, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
+            made.savefig(path, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
             written.append(path)
     return written
 
@@ -220,11 +200,11 @@ def model_figure(models: ModelScores) -> Figure:
     if models.envelope is not None:
         bars.append(("envelope score, one raw frame (the paper's measure)", _BLUE, models.envelope))
     bars.append(("matching score, mean over the torque slices", _TEAL, models.matching))
-    figure = _figure(9, 4.6)
-    axes = figure.subplots()
+    made = figure(9, 4.6)
+    axes = made.subplots()
     width = 0.8 / len(bars)
     for place, (label, colour, scores) in enumerate(bars):
-        heights = [np.nan if scores[name] is None else float(scores[name] or 0.0) for name in names]
+        heights = np.array([scores[name] for name in names], dtype=float)
         at = np.arange(len(names)) + (place - (len(bars) - 1) / 2) * width
         drawn = axes.bar(at, heights, 0.92 * width, color=colour, label=label)
         axes.bar_label(drawn, fmt="%.3f", fontsize=7, padding=2)
@@ -234,15 +214,15 @@ def model_figure(models: ModelScores) -> Figure:
     axes.legend(frameon=False, ncols=len(bars), fontsize=8, loc="upper center")
     axes.set_title("Likeness of the five basis models to measured differences (figure 5)", loc="left", fontsize=11)
     _plain(axes)
-    return figure
+    return made
 
 
 def heatmap_figure(torque: TorqueResult, bank: Bank) -> Figure:
     """Draw one slice's match: its difference, the bank's best signal, and the heatmap over the wide bank."""
     index = int(np.argmax(torque.wide.scores))
     match, number = torque.wide.best[index], int(torque.slices.numbers[index])
-    figure = _figure(12, 5)
-    halves = figure.add_gridspec(1, 2, width_ratios=[1.25, 1])
+    made = figure(12, 5)
+    halves = made.add_gridspec(1, 2, width_ratios=[1.25, 1])
     measured, simulated = halves[0].subgridspec(2, 1).subplots(sharex=True, squeeze=False)[:, 0]
     measured.plot(torque.slices.differences[index] * 1e3, color=_BLACK, linewidth=0.6)
     measured.set(ylabel="|difference| (mV)", xlim=(0, N_CHANNELS))
@@ -256,80 +236,82 @@ def heatmap_figure(torque: TorqueResult, bank: Bank) -> Figure:
     )
     for axes in (measured, simulated):
         _plain(axes)
-    axes = figure.add_subplot(halves[1])
+    axes = made.add_subplot(halves[1])
     image = _heatmap(axes, torque.wide.heatmaps[index], bank, match)
     axes.set_title("Heatmap: largest cross-correlation over all lags", loc="left", fontsize=10)
-    figure.colorbar(image, ax=axes, label="score", shrink=0.9)
-    figure.suptitle("From a measured difference to k and σ (figure 7); hatched cells are not valid", fontsize=11)
-    return figure
+    made.colorbar(image, ax=axes, label="score", shrink=0.9)
+    made.suptitle("From a measured difference to k and σ (figure 7); hatched cells are not valid", fontsize=11)
+    return made
 
 
 def torque_figure(torque: TorqueResult, bank: Bank) -> Figure:
     """Draw sigma against torque with four heatmaps, and the torque predicted from sigma."""
     measured, sigma = torque.slices.torque_nm, torque.focused.sigma
     shown = _spread_over(measured)
-    figure = _figure(13, 8.2)
-    halves = figure.add_gridspec(2, 1, height_ratios=[1.25, 1])
-    scatter, predicted = halves[0].subgridspec(1, 2).subplots(squeeze=False)[0]
+    made, scatter, lower = _relation_figure(
+        torque.fit, (sigma, measured), (torque.group_sigma, torque.group_torque_nm), "torque (N·m)",
+        "b  second-order polynomial of σ, fitted to the group means",
+    )  # fmt: skip
     scatter.plot(measured, sigma, "o", color=_GREY, alpha=0.6, markeredgewidth=0, label="slices")
     scatter.plot(measured[shown], sigma[shown], "o", color=_PINK, label="heatmaps below")
     scatter.plot(torque.group_torque_nm, torque.group_sigma, "x", color=_BLACK, markersize=9, label="group means")
     scatter.set(xlabel="torque (N·m)", ylabel="σ of the best match (cm)")
     scatter.set_title(
-        f"a  r = {_r(torque.r_focused)} for slices, {_r(torque.r_clustered)} for groups", loc="left", fontsize=10
+        f"a  r = {_number(torque.r_focused, 3)} for slices, {_number(torque.r_clustered, 3)} for groups",
+        loc="left",
+        fontsize=10,
     )
-    _predictions(predicted, torque.fit, (sigma, measured), (torque.group_sigma, torque.group_torque_nm))
-    predicted.set(xlabel="measured torque (N·m)", ylabel="predicted torque (N·m)")
-    predicted.set_title("b  second-order polynomial of σ, fitted to the group means", loc="left", fontsize=10)
-    for axes in (scatter, predicted):
-        axes.legend(frameon=False, fontsize=8)
-        _plain(axes)
-    _heatmap_row(
-        figure,
-        halves[1],
-        [torque.focused.heatmaps[index] for index in shown],
-        [torque.focused.best[index] for index in shown],
-        [f"{measured[index]:.3f} N·m, σ = {sigma[index]:.2f} cm" for index in shown],
-        bank,
-    )
-    figure.suptitle(f"Torque from σ (figure 8): {len(measured)} slices, {torque.grouping}, focused bank", fontsize=11)
-    return figure
+    scatter.legend(frameon=False, fontsize=8)
+    titles = [f"{measured[index]:.3f} N·m, σ = {sigma[index]:.2f} cm" for index in shown]
+    _heatmap_row(made, lower, torque.focused, shown, titles, bank)
+    made.suptitle(f"Torque from σ (figure 8): {len(measured)} slices, {torque.grouping}, focused bank", fontsize=11)
+    return made
 
 
 def diameter_figure(diameter: DiameterResult, bank: Bank) -> Figure:
     """Draw k against diameter with the accumulated heatmaps, and the diameter predicted from k."""
     measured, k = diameter.slices.diameter_mm, diameter.single.k
-    figure = _figure(13, 8.2)
-    halves = figure.add_gridspec(2, 1, height_ratios=[1.25, 1])
-    scatter, predicted = halves[0].subgridspec(1, 2).subplots(squeeze=False)[0]
+    diameters_mm, means_k = diameter.diameters_mm, diameter.accumulated.k
+    shown = _spread_over(diameters_mm)
+    made, scatter, lower = _relation_figure(
+        diameter.fit, (k, measured), (means_k, diameters_mm), "diameter (mm)",
+        "b  first-order polynomial of k, fitted to the accumulated matches",
+    )  # fmt: skip
     scatter.plot(k, measured, "o", color=_GREY, alpha=0.6, markeredgewidth=0, label="slices")
-    scatter.plot(
-        diameter.accumulated_k, diameter.diameters_mm, "x", color=_BLACK, markersize=9, label="heatmaps accumulated"
-    )
+    scatter.plot(means_k, diameters_mm, "x", color=_BLACK, markersize=9, label="heatmaps accumulated")
     scatter.set(xlabel="k of the best match (cm)", ylabel="diameter (mm)")
     scatter.set_title(
-        f"a  r = {_r(diameter.r_single)} for slices, {_r(diameter.r_accumulated)} accumulated", loc="left", fontsize=10
+        f"a  r = {_number(diameter.r_single, 3)} for slices, {_number(diameter.r_accumulated, 3)} accumulated",
+        loc="left",
+        fontsize=10,
     )
-    _predictions(predicted, diameter.fit, (k, measured), (diameter.accumulated_k, diameter.diameters_mm))
-    predicted.set(xlabel="measured diameter (mm)", ylabel="predicted diameter (mm)")
-    predicted.set_title("b  first-order polynomial of k, fitted to the accumulated matches", loc="left", fontsize=10)
+    scatter.legend(frameon=False, fontsize=8)
+    titles = [f"{diameters_mm[index]:g} mm, k = {means_k[index]:.2f} cm" for index in shown]
+    _heatmap_row(made, lower, diameter.accumulated, shown, titles, bank)
+    made.suptitle(
+        f"Diameter from k (figure 9): {len(measured)} slices of {len(diameters_mm)} diameters, wide bank", fontsize=11
+    )
+    return made
+
+
+def _relation_figure(
+    fit: Polynomial | None,
+    slices: tuple[FloatArray, FloatArray],
+    means: tuple[FloatArray, FloatArray],
+    quantity: str,
+    title: str,
+) -> tuple[Figure, Axes, SubplotSpec]:
+    """Return a figure with drawn predictions, its empty axes for a scatter, and its lower half for heatmaps."""
+    made = figure(13, 8.2)
+    grid = made.add_gridspec(2, 1, height_ratios=[1.25, 1])
+    scatter, predicted = grid[0].subgridspec(1, 2).subplots(squeeze=False)[0]
+    _predictions(predicted, fit, slices, means)
+    predicted.set(xlabel=f"measured {quantity}", ylabel=f"predicted {quantity}")
+    predicted.set_title(title, loc="left", fontsize=10)
+    predicted.legend(frameon=False, fontsize=8)
     for axes in (scatter, predicted):
-        axes.legend(frameon=False, fontsize=8)
         _plain(axes)
-    few = _spread_over(diameter.diameters_mm)
-    _heatmap_row(
-        figure,
-        halves[1],
-        [diameter.heatmaps[index] for index in few],
-        [diameter.accumulated[index] for index in few],
-        [f"{diameter.diameters_mm[index]:g} mm, k = {diameter.accumulated_k[index]:.2f} cm" for index in few],
-        bank,
-    )
-    figure.suptitle(
-        f"Diameter from k (figure 9): {len(measured)} slices of {len(diameter.diameters_mm)} diameters, wide bank",
-        fontsize=11,
-    )
-    return figure
+    return made, scatter, grid[1]
 
 
 def _predictions(
@@ -353,23 +335,19 @@ def _predictions(
 
 
 def _heatmap_row(
-    figure: Figure,
-    place: SubplotSpec,
-    heatmaps: list[FloatArray],
-    matches: list[Match],
-    titles: list[str],
-    bank: Bank,
+    made: Figure, place: SubplotSpec, matches: Matches, shown: list[int], titles: list[str], bank: Bank
 ) -> None:
-    """Draw heatmaps side by side, each relative to its own maximum."""
-    row = place.subgridspec(1, len(heatmaps)).subplots(sharey=True, squeeze=False)[0]
-    below = [heatmap - match.score for heatmap, match in zip(heatmaps, matches, strict=True)]
+    """Draw some heatmaps side by side, each relative to its own maximum."""
+    row = place.subgridspec(1, len(shown)).subplots(sharey=True, squeeze=False)[0]
+    best = [matches.best[index] for index in shown]
+    below = [matches.heatmaps[index] - matches.scores[index] for index in shown]
     # Skip the worst half of the cells, which would take most of the colours.
     lowest = float(np.median([np.nanmedian(heatmap) for heatmap in below]))
-    for axes, heatmap, match, title in zip(row, below, matches, titles, strict=True):
+    for axes, heatmap, match, title in zip(row, below, best, titles, strict=True):
         image = _heatmap(axes, heatmap, bank, match, (min(lowest, -1e-6), 0.0))
         axes.set_title(f"{title}, score {match.score:.3f}", fontsize=9)
         axes.label_outer()
-    figure.colorbar(image, ax=list(row), label="score − the map's maximum", extend="min")
+    made.colorbar(image, ax=list(row), label="score − the map's maximum", extend="min")
 
 
 def _heatmap(
@@ -393,14 +371,5 @@ def _spread_over(values: FloatArray) -> list[int]:
     return [int(order[place]) for place in places]
 
 
-def _r(value: float | None) -> str:
-    return "none" if value is None else f"{value:.3f}"
-
-
 def _plain(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def _figure(width: float, height: float) -> Figure:
-    """Return an empty figure in inches, without a window or global state."""
-    return Figure(figsize=(width, height), layout="constrained")

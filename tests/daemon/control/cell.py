@@ -6,6 +6,8 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from typing import Any
 
+import pytest
+
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment_schema import ExperimentFile
@@ -18,6 +20,10 @@ from shearloop.drivers.ur.messages import Command, CommandReply, MoveLinear, Rob
 from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, Flight
 
 SPEED_M_PER_S = 0.1
+# Steps of experiments.
+MOVE = {"do": "approach", "along_tool_m": 0.1, "speed_m_per_s": SPEED_M_PER_S}
+GRIP = {"do": "grip", "width_mm": 10.0}
+TWIST = {"do": "twist", "angles_rad": [1.0], "speed_rad_per_s": 0.3}
 
 
 class Robot(UrRobot):
@@ -184,6 +190,12 @@ class Cell:
 
     def drive(self) -> None:
         self.task = asyncio.create_task(self.runner.run())
+
+    async def loop_died(self) -> None:
+        """Wait for the loop's end, which `no_tick` brings about."""
+        assert self.task is not None
+        with pytest.raises(ZeroDivisionError):
+            await self.task
 
     async def cycles(self, count: int) -> None:
         for _ in range(count):

@@ -14,12 +14,9 @@ from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.control.runner import WRENCH
 from shearloop.daemon.control.safety import Response
 from shearloop.daemon.control.step_runner import ExperimentPhase
-from tests.daemon.control.cell import SPEED_M_PER_S, Cell, driven
+from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, driven
 
 TURN = {"do": "turn_to", "angle_rad": 0.5}
-TWIST = {"do": "twist", "angles_rad": [1.0], "speed_rad_per_s": 0.3}
-MOVE = {"do": "approach", "along_tool_m": 0.1, "speed_m_per_s": SPEED_M_PER_S}
-GRIP = {"do": "grip", "width_mm": 10.0}
 # A stop, and what a program that is resumed at the pendant does until its watchdog ends it, takes less, in cycles.
 STANDS_AFTER, EXCUSED_FOR = 60, 60
 # Its supervisor's first pause is half a second.

@@ -6,10 +6,8 @@ import pytest
 
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.control.step_runner import ExperimentPhase
-from tests.daemon.control.cell import driven
+from tests.daemon.control.cell import TWIST, driven
 from tests.drivers.ur.flight import CYCLE_NS
-
-TWIST = {"do": "twist", "angles_rad": [1.0], "speed_rad_per_s": 0.3}
 
 
 async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch: pytest.MonkeyPatch) -> None:

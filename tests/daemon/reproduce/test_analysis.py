@@ -25,7 +25,7 @@ from shearloop.daemon.recording.matlab import DiameterSlices, TorqueSlices, read
 @pytest.fixture(scope="module")
 def bank(coarse_mesh: Mesh, tmp_path_factory: pytest.TempPathFactory):
     grid = Grid(np.linspace(2.6, 3.6, 7), np.linspace(1.0, 2.0, 8))
-    return cached_bank("small", grid, coarse_mesh, tmp_path_factory.mktemp("banks"), 1, lambda *_: None)
+    return cached_bank("small", grid, coarse_mesh, tmp_path_factory.mktemp("banks"))
 
 
 def slices_of(signals: NDArray, columns: list[int], torque: list[float]) -> TorqueSlices:
@@ -89,7 +89,7 @@ def test_diameter_is_related_to_the_k_of_the_best_match(signals: NDArray, bank) 
     expected = [best_match(heatmap, bank.k_grid, bank.sigma_grid).k for heatmap in found.single.heatmaps]
     assert found.single.k.tolist() == expected
     np.testing.assert_allclose(found.single.heatmaps, ReferenceMatcher.from_bank(bank).heatmaps(smooth), atol=1e-14)
-    np.testing.assert_allclose(found.heatmaps[2], found.single.heatmaps[3:].mean(axis=0), atol=1e-14)
+    np.testing.assert_allclose(found.accumulated.heatmaps[2], found.single.heatmaps[3:].mean(axis=0), atol=1e-14)
     assert found.r_single is not None
     assert found.r_single < -0.9
     assert found.r_accumulated is not None

@@ -104,17 +104,17 @@ def test_the_papers_mesh_is_taken_where_it_is_beside_the_recordings(
     make_recordings: MakeRecordings, tmp_path: Path, shared: Path
 ) -> None:
     recordings = make_recordings(diameter=False)
-    assert banks.choose_mesh(recordings, None, None).origin == f"our own grid for {banks.OWN_FINGERTIP}"
+    assert banks.choose_mesh(recordings, None, None)[1] == f"our own grid for {banks.OWN_FINGERTIP}"
     beside = recordings.parent / "reference" / "fingertip_mesh.npz"
     beside.parent.mkdir()
     shutil.copy(shared / "reference" / "fingertip_mesh.npz", beside)
-    chosen = banks.choose_mesh(recordings, None, None)
-    assert chosen.origin == f"{beside} (the paper's)"
-    assert len(chosen.mesh.triangles) == 4882
+    mesh, origin = banks.choose_mesh(recordings, None, None)
+    assert origin == f"{beside} (the paper's)"
+    assert len(mesh.triangles) == 4882
     config = tmp_path / "bank.yaml"
     grid = "{low: 1, high: 2, count: 2}"
     config.write_text(f"mesh: {{file: {beside}}}\nmodel: step\nk: {grid}\nsigma: {grid}\n")
-    assert banks.choose_mesh(recordings, None, config).mesh.digest == chosen.mesh.digest
+    assert banks.choose_mesh(recordings, None, config)[0].digest == mesh.digest
 
 
 def test_mistakes_end_in_one_sentence(

@@ -73,9 +73,7 @@ async def test_the_watchdog_is_fed_only_while_all_tasks_are_alive(
     manager: socket.socket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(health, "HEALTH_PERIOD_S", 0.0)
-    supervisor = Supervisor(
-        {"right": TaskRecord("right", alive=True), "experiment": TaskRecord("experiment", done=True)}
-    )
+    supervisor = Supervisor({"right": TaskRecord(alive=True), "experiment": TaskRecord(done=True)})
     with zmq.Context() as context:
         publisher = Publisher(context, f"ipc://{tmp_path}/publish", Clock())
         reporter = health.HealthReporter(publisher, supervisor, Clock())
@@ -100,7 +98,7 @@ async def test_a_finished_task_is_not_dead() -> None:
 
     await supervisor.keep_running("experiment", ends)
     assert supervisor.dead == ()
-    supervisor.records["other"] = TaskRecord("other")
+    supervisor.records["other"] = TaskRecord()
     assert supervisor.dead == ("other",)
 
 

@@ -22,7 +22,7 @@ from shearloop.bank.eit.models import MODELS
 from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import COMMANDS, main
-from shearloop.daemon.cli.bank.build import MODELS as MODELS_IN_HELP
+from shearloop.daemon.cli.bank.build import MODEL_NAMES
 from shearloop.daemon.cli.completion import full_parser
 from shearloop.daemon.cli.output import message_json, message_line
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
@@ -274,7 +274,7 @@ def test_every_argument_has_a_help_text() -> None:
 
 
 def test_help_names_all_basis_models() -> None:
-    assert MODELS_IN_HELP.replace(" or ", ", ").split(", ") == list(MODELS)
+    assert MODEL_NAMES.replace(" or ", ", ").split(", ") == list(MODELS)
 
 
 def test_an_unknown_command_lists_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:

@@ -56,7 +56,7 @@ def program_texts() -> list[str]:
 
     return [
         text(node)
-        for folder in ("bank", "drivers", "daemon")
+        for folder in ("bank", "drivers", "daemon", "src")
         for path in (ROOT / folder).rglob("*.py")
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str))

@@ -36,7 +36,7 @@ class TorqueSeries:
 
 
 @dataclass(slots=True)
-class _Step:
+class _StepSummary:
     number: int
     name: str
     from_ns: int
@@ -56,7 +56,7 @@ class _Run:
     steps_planned: int
     from_ns: int
     tool_mm: float | None
-    steps: list[_Step] = field(default_factory=list)
+    steps: list[_StepSummary] = field(default_factory=list)
     identified: tuple[float, float, float] | None = None
     held_s: float = 0.0
     hold_reasons: Counter[str] = field(default_factory=Counter)
@@ -132,7 +132,7 @@ def _update(run: _Run, content: Mapping[str, Any]) -> None:
     if not run.steps or run.steps[-1].number != content["step"]:
         if run.steps:
             run.steps[-1].to_ns = now_ns
-        run.steps.append(_Step(content["step"], content["step_name"], now_ns, now_ns))
+        run.steps.append(_StepSummary(content["step"], content["step_name"], now_ns, now_ns))
     step = run.steps[-1]
     step.to_ns, step.holds = now_ns, max(step.holds, content["hold"])
     if content["set_point_nm"] is not None and content["step_name"] == "hold_torque":
@@ -160,7 +160,7 @@ def _lines(run: _Run, phase: str, truth: TorqueSeries | None, disturbances: Sequ
     yield from _counted(run)
 
 
-def _details(step: _Step, run: _Run) -> str:
+def _details(step: _StepSummary, run: _Run) -> str:
     if step.name == "identify" and run.identified is not None:
         stiffness, delay_s, noise_nm = run.identified
         return f"   stiffness {stiffness:.3f} N·m/rad, delay {delay_s:.2f} s, noise of one torque {noise_nm:.4f} N·m"
@@ -169,7 +169,7 @@ def _details(step: _Step, run: _Run) -> str:
     return ""
 
 
-def _turned(step: _Step, run: _Run, truth: TorqueSeries | None) -> Iterator[str]:
+def _turned(step: _StepSummary, run: _Run, truth: TorqueSeries | None) -> Iterator[str]:
     if step.wrist_from_rad is not None and step.wrist_to_rad is not None:
         yield f"    turned by {step.wrist_to_rad - step.wrist_from_rad:+.3f} rad; torque source: {run.driving}"
     for name, series in _all_torques(run, truth).items():
@@ -185,7 +185,12 @@ def _all_torques(run: _Run, truth: TorqueSeries | None) -> dict[str, TorqueSerie
 
 
 def _held(
-    step: _Step, set_nm: float, from_ns: int, run: _Run, truth: TorqueSeries | None, disturbances: list[tuple[int, str]]
+    step: _StepSummary,
+    set_nm: float,
+    from_ns: int,
+    run: _Run,
+    truth: TorqueSeries | None,
+    disturbances: list[tuple[int, str]],
 ) -> Iterator[str]:
     held_s = (step.to_ns - from_ns) / 1e9
     yield f"    set point {set_nm:+.3f} N·m, held for {held_s:.0f} s; torque source: {run.driving}"

@@ -1,6 +1,6 @@
 """An emulated Robotiq 2F-140 behind the URCap's socket or Modbus RTU."""
 
-from shearloop.drivers.emulators.robotiq.gripper import Command, Gripper, GripperMechanics
+from shearloop.drivers.emulators.robotiq.gripper import Gripper, GripperMechanics, GripperRegisters
 from shearloop.drivers.emulators.robotiq.servers import (
     URCAP_PORT,
     GripperPlayer,
@@ -11,10 +11,10 @@ from shearloop.drivers.emulators.robotiq.servers import (
 
 __all__ = [
     "URCAP_PORT",
-    "Command",
     "Gripper",
     "GripperMechanics",
     "GripperPlayer",
+    "GripperRegisters",
     "GripperServer",
     "ModbusServer",
     "UrcapServer",

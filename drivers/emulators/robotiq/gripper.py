@@ -36,7 +36,7 @@ class GripperMechanics:
 
 
 @dataclass(slots=True)
-class Command:
+class GripperRegisters:
     """The command registers."""
 
     act: bool = False
@@ -65,9 +65,9 @@ class Gripper:
         self.mechanics = mechanics or GripperMechanics()
         self.between = between
         self.around: Callable[[float], float | None] = lambda _: None
-        self.command = Command()
+        self.command = GripperRegisters()
         # The commands that the last step has taken up.
-        self.taken = Command()
+        self.taken = GripperRegisters()
         # The time without a request after which the gripper reports a fault; None where its master is the controller.
         self.watchdog_s: float | None = None
         # gOBJ: 0 moving, 1 contact opening, 2 contact closing, 3 at target; gFLT; gCU: motor current in 10 mA.

@@ -353,8 +353,8 @@ async def run_daemon(
         daemon = Daemon(config, context)
         for listener in listeners:
             daemon.publisher.add_listener(listener)
-        for name, told in facts.items():
-            daemon.health.add(name, told)
+        for name, diagnostics in facts.items():
+            daemon.health.add(name, diagnostics)
         ending = ending_signals()
         for number in ending:
             loop.add_signal_handler(number, daemon.stop if number == signal.SIGINT else terminate)

@@ -32,9 +32,7 @@ class Creep:
     def __post_init__(self) -> None:
         """Raise UserError for parameters that no gel has."""
         if not (0.0 <= self.share < 1.0 and 0.0 < self.time_s < math.inf):
-            raise UserError(
-                f"creep: share {self.share:g} and time_s {self.time_s:g} are out of range; see docs/estimators.md"
-            )
+            raise UserError(f"creep: share {self.share:g} and time_s {self.time_s:g} are out of range; see docs/rig.md")
 
     def torque_nm(self, shear_nm: float, t_ns: int) -> float:
         """Return the torque of a reading at t_ns (monotonic clock)."""

@@ -25,7 +25,7 @@ from shearloop.daemon.synthetic import frame_maker
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 from shearloop.drivers.emulators.boards import LOAD_PERIOD_S
 from shearloop.drivers.emulators.rig import NOISE_NM, SIDES, FrameOf
-from shearloop.drivers.emulators.robotiq.gripper import Command, Gripper
+from shearloop.drivers.emulators.robotiq.gripper import Gripper, GripperRegisters
 from shearloop.drivers.emulators.scene import Scene
 
 # Three diameters are enough to interpolate; five halve the interval.
@@ -37,7 +37,7 @@ N_TWISTS = 12
 # Ranges of the wrist's angles, speeds and holds in a grip.
 ANGLES_RAD, SPEEDS_RAD_PER_S, HOLDS_S = (-0.12, 0.25), (0.05, 0.5), (1.0, 15.0)
 # Gripper commands: activate, grip a tool with about 60 N, open.
-ACTIVATE, GRIP = Command(act=True), Command(act=True, gto=True, pos=255, spe=128, force=110)
+ACTIVATE, GRIP = GripperRegisters(act=True), GripperRegisters(act=True, gto=True, pos=255, spe=128, force=110)
 _OPEN = replace(GRIP, pos=0)
 
 Sides = tuple[str, ...]

@@ -1,7 +1,6 @@
 """Commands to robot and gripper: wrist velocities and stops, and a step's moves, grips and tares."""
 
 import asyncio
-import math
 from collections.abc import Awaitable, Callable
 
 import structlog
@@ -19,6 +18,7 @@ from shearloop.drivers.ur.messages import (
     Stop,
     WristSpeed,
     ZeroForceTorque,
+    tool_axis,
 )
 
 LINEAR_ACCELERATION_M_PER_S2 = 0.3
@@ -191,9 +191,5 @@ class ActionExecutor:
 def along_tool(pose: tuple[float, ...], distance_m: float) -> tuple[float, ...]:
     """Return the pose (x, y, z in m, rotation vector in rad) at a distance along the tool's axis."""
     x, y, z, *turned = pose
-    # Rodrigues' formula for (0, 0, 1); importing scipy's rotations would take a tenth of a second.
-    angle_rad = math.hypot(*turned)
-    u, v, w = (part / angle_rad for part in turned) if angle_rad > 0 else (0.0, 0.0, 1.0)
-    sine, rest = math.sin(angle_rad), 1.0 - math.cos(angle_rad)
-    dx, dy, dz = v * sine + u * w * rest, -u * sine + v * w * rest, 1.0 - (u * u + v * v) * rest
+    dx, dy, dz = tool_axis(pose)
     return (x + dx * distance_m, y + dy * distance_m, z + dz * distance_m, *turned)

@@ -21,7 +21,7 @@ import script_client
 
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.controller import RTDE_PORT, RtdeReceiver, SampleAge, ScriptReadiness
-from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Sample, WristSpeed
+from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, WristSpeed
 from shearloop.drivers.ur.settings import UrSettings
 
 # A thread of ur-rtde polls its socket every 0.1 ms, which takes 5 % of a core. With this timer slack it wakes once per
@@ -64,7 +64,7 @@ class UrArm:
         sample = self._receiver.latest()
         now_ns = time.monotonic_ns()
         return RtdeSample(
-            **{name: getattr(sample, name) for name in Sample.__slots__},
+            *sample[:-1],
             t_mono_ns=now_ns,
             age_ns=self._age.age_ns(sample.timestamp_s, now_ns),
             connected=self._connected,

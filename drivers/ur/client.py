@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal, cast
 
 from shearloop.drivers.errors import DeviceLostError, DriverError, ProtocolError, is_cancelled
-from shearloop.drivers.ur import error_messages, messages
+from shearloop.drivers.ur import messages
+from shearloop.drivers.ur.controller import silent_sentence
 from shearloop.drivers.ur.settings import UrSettings
 
 LinkStatus = Literal["starting", "up", "down"]
@@ -28,11 +29,11 @@ STEADY_S = 30.0
 # A program found this soon after a loss counts as left behind by the lost worker.
 TAKES_OVER_S = 10.0
 # A disconnecting worker stops the arm (1 s) and ends the program; after this time it is killed.
-FAREWELL_S = 3.0
+EXIT_S = 3.0
 # The worker's own alarms end it at a known place; the daemon kills it this much later.
 GRACE_S = 1.0
-# The bound on bytes that a stuck worker leaves unread: some hundred commands.
-MOST_UNSENT = 1 << 15
+# The worker's activity once it sends states.
+CONTROLLING = "controlling"
 # The end of the worker's error output that a message quotes.
 LAST_WORDS_BYTES, LAST_WORDS_LINES = 1024, 8
 
@@ -64,7 +65,6 @@ class UrRobot:
         self.settings = settings
         self.link = UrLinkEvent(time.monotonic_ns(), "starting", "The robot's process has not been started.")
         self.losses: Counter[str] = Counter()
-        self.pid: int | None = None
         # How many states have come, and how many times our program was paused and did not stop on request.
         self.states = 0
         self.failed_program_stops = 0
@@ -75,6 +75,11 @@ class UrRobot:
         self._number = 0
         self._lost_s = -math.inf
         self._next: asyncio.Future[messages.RobotState] | None = None
+
+    @property
+    def pid(self) -> int | None:
+        """The worker's process id, or None while there is none."""
+        return self._connection.pid if self._connection is not None else None
 
     @property
     def takes_over(self) -> bool:
@@ -123,26 +128,29 @@ class UrRobot:
             DriverError: ur-rtde is not installed.
         """
         if importlib.util.find_spec("rtde_control") is None:
-            raise DriverError(error_messages.NOT_INSTALLED)
+            raise DriverError(
+                "The robot needs the package ur-rtde, which is not installed here. It has wheels for CPython up to "
+                "3.12 on x86-64 Linux and none for 3.13 or later: run shearloop with Python 3.11 or 3.12, then "
+                "`pip install 'ur-rtde>=1.6'`."
+            )
         attempts = 0
         while True:
             started_s = time.monotonic()
             try:
                 await self._run_worker()
             except LostError as loss:
-                if loss.kind == "not-installed":
-                    raise DriverError(str(loss)) from loss
                 attempts = 1 if time.monotonic() - started_s > STEADY_S else attempts + 1
                 self.losses[loss.kind] += 1
                 self._notify_link("down", str(loss), loss.kind)
             await asyncio.sleep(PAUSES_S[min(attempts, len(PAUSES_S)) - 1])
 
     async def _run_worker(self) -> None:
-        connection = WorkerConnection(self.settings, self.handle_message, takes_over=self.takes_over)
+        connection = WorkerConnection(self.settings, self.handle_message)
         await asyncio.get_running_loop().subprocess_exec(
             lambda: connection, sys.executable, "-m", "shearloop.drivers.ur.worker"
         )
-        self._connection, self.pid = connection, connection.pid
+        connection.send(messages.Configure(self.settings, self.takes_over))
+        self._connection = connection
         loss: BaseException | None = None
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -153,7 +161,6 @@ class UrRobot:
         finally:
             self._disconnect()
             await _finish(connection.end())
-            self.pid = None
         if loss is not None:
             if is_cancelled():
                 raise asyncio.CancelledError
@@ -166,41 +173,34 @@ class UrRobot:
             self._lost_s = time.monotonic() if self._state.owns_program else -math.inf
         self._state = None
         replies, self._replies = self._replies, {}
+        unanswered = messages.CommandReply(
+            refusal="The robot's process ended before it answered; nothing is sent again."
+        )
         for on_reply in replies.values():
-            try:
-                on_reply(
-                    messages.CommandReply(
-                        refusal="The robot's process ended before it answered; nothing is sent again."
-                    )
-                )
-            except Exception as error:  # noqa: BLE001 - the others get their replies, and the worker ends, all the same
-                context = {"message": "a callback for a reply of the robot's process failed", "exception": error}
-                asyncio.get_running_loop().call_exception_handler(context)
+            asyncio.get_running_loop().call_soon(on_reply, unanswered)
 
     def handle_message(self, number: int, message: messages.Message) -> None:
         """Handle a message of the worker."""
         match message:
             case messages.RobotState():
-                self._handle_state(message)
+                before, self._state = self._state, message
+                self.states += 1
+                # Each worker counts from zero.
+                counted = before.failed_program_stops if before is not None else 0
+                self.failed_program_stops += message.failed_program_stops - counted
+                if before is None:
+                    self._notify_link(
+                        "up", f"The robot at {self.settings.host} is connected. {message.blocked}".strip()
+                    )
+                if self._next is not None:
+                    self._next.set_result(message)
+                    self._next = None
             case messages.CommandReply():
                 on_reply = self._replies.pop(number, None)
                 if on_reply is not None:
                     on_reply(message)
             case messages.Failed():
                 raise LostError(message.kind, message.sentence)
-
-    def _handle_state(self, state: messages.RobotState) -> None:
-        before, self._state = self._state, state
-        # Each worker counts from zero.
-        self.failed_program_stops += state.failed_program_stops
-        if before is None:
-            self._notify_link("up", f"The robot at {self.settings.host} is connected. {state.blocked}".strip())
-        else:
-            self.failed_program_stops -= before.failed_program_stops
-        self.states += 1
-        if self._next is not None:
-            self._next.set_result(state)
-            self._next = None
 
     def _notify_link(self, status: LinkStatus, sentence: str, kind: LossKind | None = None) -> None:
         self.link = UrLinkEvent(time.monotonic_ns(), status, sentence, kind, self.losses.total())
@@ -210,17 +210,10 @@ class UrRobot:
 class WorkerConnection(asyncio.SubprocessProtocol):
     """The pipes to one worker process, its end, and the reason for that."""
 
-    def __init__(
-        self,
-        settings: UrSettings,
-        on_message: Callable[[int, messages.Message], None],
-        *,
-        takes_over: bool = False,
-    ) -> None:
-        """Take the worker's configuration. `on_message` receives each message with its number."""
+    def __init__(self, settings: UrSettings, on_message: Callable[[int, messages.Message], None]) -> None:
+        """`on_message` receives each message with its number."""
         self._settings = settings
         self._on_message = on_message
-        self._takes_over = takes_over
         self._decoder = messages.MessageDecoder()
         self._received_s = self._sent_s = time.monotonic()
         # Done when the worker has ended and all of its output was read.
@@ -230,13 +223,13 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         self._closed: asyncio.Future[Exception | None] = asyncio.get_running_loop().create_future()
         self._stderr_tail = b""
         self._activity = "starting"
-        self._state: messages.RobotState | None = None
+        # A worker that is silent for longer hangs.
+        self._timeout_s = settings.connect_timeout_s + GRACE_S
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Configure the worker."""
+        """Keep the process and its input."""
         self._process = cast(asyncio.SubprocessTransport, transport)
         self._stdin = cast(asyncio.WriteTransport, self._process.get_pipe_transport(0))
-        self.send(messages.Configure(self._settings, self._takes_over))
 
     @property
     def pid(self) -> int | None:
@@ -262,7 +255,9 @@ class WorkerConnection(asyncio.SubprocessProtocol):
                 if isinstance(message, messages.WorkerPhase):
                     self._activity = message.activity
                 elif isinstance(message, messages.RobotState):
-                    self._state, self._activity = message, "controlling"
+                    self._activity = CONTROLLING
+                    longest_s = messages.RECOVERY_HANG_S if message.recovering else self._settings.hang_timeout_s
+                    self._timeout_s = longest_s + GRACE_S
                 self._on_message(number, message)
         except ProtocolError as error:
             self._kill()
@@ -283,12 +278,11 @@ class WorkerConnection(asyncio.SubprocessProtocol):
             LostError: always, in the end.
         """
         while not self._closed.done():
-            timeout_s = self._timeout_s()
-            silent_s = time.monotonic() - self._received_s
-            if silent_s >= timeout_s:
+            left_s = self._received_s + self._timeout_s - time.monotonic()
+            if left_s <= 0:
                 self._kill()
-                raise LostError("hung", self._hung_sentence(timeout_s))
-            await asyncio.wait([self._closed], timeout=min(timeout_s - silent_s, self._settings.hang_timeout_s))
+                raise LostError("hung", self._hung_sentence(self._timeout_s))
+            await asyncio.wait([self._closed], timeout=min(left_s, self._settings.hang_timeout_s))
         error = self._closed.result()
         raise error if error is not None else self._died()
 
@@ -301,17 +295,14 @@ class WorkerConnection(asyncio.SubprocessProtocol):
                 self.send(messages.Heartbeat())
                 left_s = longest_s
             await asyncio.sleep(left_s)
-            if self._stdin.get_write_buffer_size() > MOST_UNSENT:
-                self._kill()
-                raise LostError("hung", self._hung_sentence(self._settings.silence_timeout_s))
 
     async def end(self) -> None:
-        """Disconnect the worker, and kill it after `FAREWELL_S`."""
+        """Disconnect the worker, and kill it after `EXIT_S`."""
         if self._process.get_returncode() is None:
             self.send(messages.Disconnect())
         # The end of its input disconnects the worker too.
         self._stdin.close()
-        await asyncio.wait([self._ended], timeout=FAREWELL_S)
+        await asyncio.wait([self._ended], timeout=EXIT_S)
         if not self._ended.done():
             self._kill()
             await self._ended
@@ -320,11 +311,6 @@ class WorkerConnection(asyncio.SubprocessProtocol):
     def _kill(self) -> None:
         with contextlib.suppress(ProcessLookupError):
             self._process.kill()
-
-    def _timeout_s(self) -> float:
-        if self._state is None:
-            return self._settings.connect_timeout_s + GRACE_S
-        return (messages.RECOVERY_HANG_S if self._state.recovering else self._settings.hang_timeout_s) + GRACE_S
 
     def _died(self) -> LostError:
         status = self._process.get_returncode() or 0
@@ -340,10 +326,8 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         )
 
     def _hung_sentence(self, seconds: float) -> str:
-        if self._state is None:
-            sentence = error_messages.SILENT.format(
-                host=self._settings.host, seconds=self._settings.connect_timeout_s, activity=self._activity
-            )
+        if self._activity != CONTROLLING:
+            sentence = silent_sentence(self._settings.host, self._settings.connect_timeout_s, self._activity)
         else:
             sentence = (
                 f"The robot's process did not answer for {seconds:.1f} s and was ended. The robot's watchdog ends the "

@@ -4,25 +4,32 @@ No clock, no pipe, no ur-rtde: the arm and the time are arguments. `tick` runs o
 between cycles. After a motion has ended, only a new command begins one.
 """
 
-from dataclasses import fields
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
-from shearloop.drivers.ur import error_messages, messages
-from shearloop.drivers.ur.limits import violation
-from shearloop.drivers.ur.motion_executor import MotionExecutor, tool_axis_torque
-from shearloop.drivers.ur.recovery import (
-    ENDS_ITSELF_S,
-    ForeignProgramDetector,
-    Outcome,
-    PausedProgramStopper,
-    Recovery,
+from shearloop.drivers.ur.limits import is_recent, violation, why_unfit
+from shearloop.drivers.ur.messages import (
+    Command,
+    CommandReply,
+    Disconnect,
+    Enable,
+    MoveLinear,
+    RobotState,
+    RtdeSample,
+    Stop,
+    Unlock,
+    WristSpeed,
+    ZeroForceTorque,
 )
+from shearloop.drivers.ur.motion_executor import MotionExecutor
+from shearloop.drivers.ur.recovery import Outcome, ProgramOwner, Recovery
 from shearloop.drivers.ur.settings import UrSettings
 
 if TYPE_CHECKING:
     from shearloop.drivers.ur.arm import UrArm
 
-_SAMPLE_FIELDS: Final = tuple(field.name for field in fields(messages.RtdeSample))
+NOT_ENABLED = "Motion has not been enabled since the robot's process was started: enable it when the arm may move."
+BEING_MADE_READY = "The robot is being made ready (safety, power, control program): ask again in a second."
+LEAVING = "The daemon disconnects from the robot: start it again to go on."
 
 
 class CommandHandler:
@@ -34,24 +41,17 @@ class CommandHandler:
         `takes_over`: a paused program on the robot was left behind by the worker before this one.
         """
         self._settings = settings
-        self._limits = settings.limits
         self._arm = arm
-        self._held_reason = error_messages.NOT_ENABLED
-        # Whether the daemon disconnects: only stops are taken from then on.
-        self.leaving = False
-        self._owns_program = takes_over
-        # When a program was being started last: an upload may take effect after its recovery was given up.
-        self._starting_ns: int | None = None
-        self._paused_program = PausedProgramStopper(arm)
-        self._foreign_program = ForeignProgramDetector()
-        # The next cycle stops a paused program; the state before it announces that the cycle may take long.
-        self._stops_paused = False
         self._executor = MotionExecutor(settings, arm, now_ns)
-        self._daemon_alive_ns = now_ns
+        self._program = ProgramOwner(arm, ours=takes_over)
         self._recovery: Recovery | None = Recovery(
             arm, now_ns, settings.recover_timeout_s, operator_asked=False, takes_over=takes_over
         )
         self._unlock_number: int | None = None
+        self._held_reason = NOT_ENABLED
+        self._daemon_alive_ns = now_ns
+        # Whether the daemon disconnects: only stops are taken from then on.
+        self.leaving = False
 
     @property
     def at_rest(self) -> bool:
@@ -61,72 +61,73 @@ class CommandHandler:
     @property
     def recovering(self) -> bool:
         """Whether calls may take seconds: to the dashboard, or the first one to a new program."""
-        return self._recovery is not None or self._stops_paused
-
-    @property
-    def owns_program(self) -> bool:
-        """Whether a program on the robot was started by this worker or the one before it."""
-        return self._owns_program or (self._recovery is not None and self._recovery.starts_program)
+        return self._recovery is not None or self._program.stop_announced
 
     def may_own_program(self, now_ns: int) -> bool:
         """Return whether a program that plays is ours or may be, because one was just being started."""
-        just_now = self._starting_ns is not None and now_ns - self._starting_ns <= ENDS_ITSELF_S * 1e9
-        return self.owns_program or just_now
+        return self._program.may_be_ours(now_ns)
 
-    def owns_paused_program(self, sample: messages.RtdeSample) -> bool:
+    def owns_paused_program(self, sample: RtdeSample) -> bool:
         """Return whether a program of ours is paused and could be resumed at the pendant."""
-        return self.owns_program and sample.program_paused
+        return self._program.ours and sample.program_paused
 
-    def take_command_rejected(self) -> bool:
+    def take_rejection(self) -> bool:
         """Return, once, whether the robot rejected a command.
 
         The control connection may see the end of the program before the sample does. The next sample may say why.
         """
-        rejected, self._executor.command_rejected = self._executor.command_rejected, False
-        return rejected
+        return self._executor.take_rejection()
 
     def note_daemon_alive(self, now_ns: int) -> None:
         """Note that the daemon sent something."""
         self._daemon_alive_ns = now_ns
 
-    def request(
-        self, number: int, command: messages.Command, sample: messages.RtdeSample, now_ns: int
-    ) -> messages.CommandReply | None:
+    def request(self, number: int, command: Command, sample: RtdeSample, now_ns: int) -> CommandReply | None:
         """Return the reply to a command; None when `tick` returns it later (`Unlock`)."""
-        if self.leaving and not isinstance(command, messages.Stop | messages.Disconnect):
-            return messages.CommandReply(refusal=error_messages.LEAVING)
+        if isinstance(command, Stop) and self._recovery is not None and self._unlock_number is not None:
+            self._recovery.give_up("Unlocking was ended by a stop.")
+        refusal = self._why_refused(command, sample)
+        if refusal:
+            return CommandReply(refusal=refusal)
         match command:
-            case messages.Stop():
-                return self._stop(number, command, sample, now_ns)
-            case messages.Enable():
-                return self._enable(sample)
-            case messages.Unlock():
-                return self._unlock(number, sample, now_ns)
-            case messages.ZeroForceTorque():
-                return self._zero_wrench(sample)
-            case messages.WristSpeed():
-                return self._turn(number, command, sample, now_ns)
-            case messages.MoveLinear():
-                return self._move(number, command, sample, now_ns)
-            case messages.Disconnect():
-                return self._leave(sample, now_ns)
+            case WristSpeed():
+                self._executor.turn(number, command, sample, now_ns)
+            case MoveLinear():
+                self._executor.move(number, command, sample, now_ns)
+            case Stop():
+                self._executor.stop_on_command(number, command, sample, now_ns)
+            case Unlock() if self._why_unfit(sample):
+                self._begin_unlocking(number, sample, now_ns)
+                return None
+            case Enable() | Unlock():
+                self._held_reason = ""
+                return CommandReply()
+            case ZeroForceTorque():
+                zeroed = self._arm.zero_wrench()
+                return CommandReply(refusal="" if zeroed else "The robot did not zero its force-torque sensor.")
+            case Disconnect():
+                self._leave(sample, now_ns)
+                return CommandReply()
+        if self._executor.disabled_reason:
+            return CommandReply(refusal=self._executor.disabled_reason)
+        return CommandReply(sent=self._executor.sent, clipped=self._executor.clipped)
 
-    def tick(self, sample: messages.RtdeSample, now_ns: int) -> tuple[int, messages.CommandReply] | None:
+    def tick(self, sample: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
         """Run one cycle: check the sample and send what is due; return the reply to an `Unlock` that has ended."""
         self._executor.watch(sample, now_ns)
-        announced, self._stops_paused = self._stops_paused, False
-        if self._recovery is not None and self._recovery.starts_program:
-            self._starting_ns = now_ns
+        recent = is_recent(sample, self._settings)
         without_us = self._recovery is not None or bool(self._executor.disabled_reason)
-        foreign = self._foreign_program.update(
-            now_ns, plays_without_us=without_us and sample.program_running and self._is_recent(sample)
+        self._program.update(
+            sample,
+            now_ns,
+            starting=self._recovery is not None and self._recovery.starts_program,
+            plays_without_us=without_us and sample.program_running and recent,
         )
-        if sample.runtime_state == messages.RUNTIME_STOPPED or foreign:
-            # The next program may be anyone's, and ours may have ended between two samples.
-            self._owns_program = False
-            self._paused_program.reset()
         if self._recovery is not None:
-            return self._recover(self._recovery, sample, now_ns)
+            # Samples may stay old for minutes without counting as lost; the operator gets an answer all the same.
+            if recent or self._recovery.has_ended(now_ns):
+                return self._recover(self._recovery, sample, now_ns)
+            return None
         unfit = self._why_unfit(sample)
         if unfit:
             # Nothing can be sent. The arm stops by itself, or by its watchdog, which is not fed now.
@@ -135,10 +136,11 @@ class CommandHandler:
                 # The program may turn the wrist on, also when it is resumed.
                 self._executor.leave_to_watchdog(unfit)
             if not sample.program_running:
-                self._executor.disabled_reason = error_messages.NOT_OURS
-                self._stop_paused_program(sample, now_ns, announced=announced)
+                self._executor.disable(unfit)
+                if recent and self.owns_paused_program(sample) and not self.leaving:
+                    self._program.stop_paused(now_ns)
             return None
-        beyond = violation(sample, self._limits)
+        beyond = violation(sample, self._settings.limits)
         if beyond:
             self._held_reason = beyond
             self._executor.stop(sample, now_ns, beyond)
@@ -148,14 +150,11 @@ class CommandHandler:
         self._executor.keep(sample, now_ns)
         return None
 
-    def state(self, sample: messages.RtdeSample, cycle: int) -> messages.RobotState:
+    def state(self, sample: RtdeSample, cycle: int) -> RobotState:
         """Return the sample with the state of the driver."""
         executor = self._executor
-        return messages.RobotState(
-            **{name: getattr(sample, name) for name in _SAMPLE_FIELDS},
-            wrist_torque_nm=tool_axis_torque(sample),
-            protective_stop=sample.safety_mode == messages.SAFETY_PROTECTIVE_STOP,
-            emergency_stop=sample.safety_mode in messages.SAFETY_EMERGENCY_STOPS,
+        return RobotState(
+            **sample.__dict__,
             blocked=self._why_blocked(sample),
             recovering=self.recovering,
             motion=executor.motion,
@@ -164,132 +163,74 @@ class CommandHandler:
             sent=executor.sent,
             clipped=executor.clipped,
             cycle=cycle,
-            owns_program=self.owns_program,
-            failed_program_stops=self._paused_program.failed_stops,
+            owns_program=self._program.ours,
+            failed_program_stops=self._program.failed_stops,
         )
 
-    def _turn(
-        self, number: int, asked: messages.WristSpeed, sample: messages.RtdeSample, now_ns: int
-    ) -> messages.CommandReply:
-        refusal = self._why_blocked(sample)
-        if not refusal and asked.acceleration_rad_per_s2 <= 0:
-            refusal = f"An acceleration of {asked.acceleration_rad_per_s2:g} rad/s² is not above 0."
-        if not refusal and self._executor.motion == "stopping":
-            refusal = "The arm is still stopping."
-        if not refusal and self._executor.motion == "linear":
-            refusal = "A linear move is under way: stop it."
-        if refusal:
-            return messages.CommandReply(refusal=refusal)
-        return self._reply(taken=self._executor.turn(number, asked, sample, now_ns))
-
-    def _move(
-        self, number: int, asked: messages.MoveLinear, sample: messages.RtdeSample, now_ns: int
-    ) -> messages.CommandReply:
-        refusal = self._why_blocked(sample)
-        if not refusal and min(asked.speed_m_per_s, asked.acceleration_m_per_s2) <= 0:
-            refusal = "A linear move needs a speed and an acceleration above 0."
-        if not refusal and not (self._executor.motion in ("idle", "wrist") and sample.rests):
-            refusal = "The arm moves: stop it before a linear move."
-        if refusal:
-            return messages.CommandReply(refusal=refusal)
-        return self._reply(taken=self._executor.move(number, asked, sample, now_ns))
-
-    def _reply(self, *, taken: bool) -> messages.CommandReply:
-        if not taken:
-            return messages.CommandReply(refusal=self._executor.disabled_reason)
-        return messages.CommandReply(sent=self._executor.sent, clipped=self._executor.clipped)
-
-    def _stop(
-        self, number: int, asked: messages.Stop, sample: messages.RtdeSample, now_ns: int
-    ) -> messages.CommandReply:
-        if asked.deceleration_rad_per_s2 <= 0:
-            return messages.CommandReply(
-                refusal=f"A deceleration of {asked.deceleration_rad_per_s2:g} rad/s² is not above 0."
-            )
-        if self._recovery is not None and self._unlock_number is not None:
-            self._recovery.give_up("Unlocking was ended by a stop.")
+    def _why_refused(self, command: Command, sample: RtdeSample) -> str:
+        """Return why a command is not carried out, or the empty string."""
+        if self.leaving and not isinstance(command, Stop | Disconnect):
+            return LEAVING
         unfit = self._why_unfit(sample)
-        if unfit:
-            return messages.CommandReply(refusal=f"Nothing can be sent, and the arm stops by itself. {unfit}")
-        self._executor.stop_on_command(number, asked, sample, now_ns)
-        return self._reply(taken=not self._executor.disabled_reason)
+        match command:
+            case WristSpeed() | MoveLinear():
+                return self._why_blocked(sample) or self._executor.why_refused(command, sample)
+            case Stop(deceleration) if deceleration <= 0:
+                return f"A deceleration of {deceleration:g} rad/s² is not above 0."
+            case Stop() if unfit:
+                return f"Nothing can be sent, and the arm stops by itself. {unfit}"
+            case Unlock() if self._unlock_number is not None:
+                return "Unlocking is under way."
+            case Unlock() if unfit:
+                return ""
+            case Enable() | Unlock() if self._recovery is not None:
+                return BEING_MADE_READY
+            case Enable() | Unlock():
+                return unfit or violation(sample, self._settings.limits)
+            case ZeroForceTorque():
+                rests = self.at_rest and sample.rests
+                moving = "" if rests else "The wrench is zeroed only at rest: stop the arm first."
+                # A new zero would only hide a value beyond its limit.
+                return unfit or violation(sample, self._settings.limits) or moving
+        return ""
 
-    def _leave(self, sample: messages.RtdeSample, now_ns: int) -> messages.CommandReply:
-        self.leaving = True
-        if self._recovery is not None:
-            self._recovery.give_up(error_messages.LEAVING)
-        self._executor.stop_now(sample, now_ns, "the daemon disconnects")
-        return messages.CommandReply()
-
-    def _enable(self, sample: messages.RtdeSample) -> messages.CommandReply:
-        refusal = self._why_unfit(sample) or violation(sample, self._limits)
-        if self._recovery is not None:
-            refusal = error_messages.BEING_MADE_READY
-        if not refusal:
-            self._held_reason = ""
-        return messages.CommandReply(refusal=refusal)
-
-    def _unlock(self, number: int, sample: messages.RtdeSample, now_ns: int) -> messages.CommandReply | None:
-        if self._unlock_number is not None:
-            return messages.CommandReply(refusal="Unlocking is under way.")
-        unfit = self._why_unfit(sample)
-        if not unfit:
-            return self._enable(sample)
-        self._executor.disable(unfit, self._executor.disabled_reason or error_messages.NOT_OURS)
-        self._unlock_number = number
-        self._owns_program = self.owns_program
-        self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, operator_asked=True)
-        return None
-
-    def _zero_wrench(self, sample: messages.RtdeSample) -> messages.CommandReply:
-        # A new zero would only hide a value beyond its limit.
-        refusal = self._why_unfit(sample) or violation(sample, self._limits)
-        if not refusal and not (self.at_rest and sample.rests):
-            refusal = "The wrench is zeroed only at rest: stop the arm first."
-        if not refusal and not self._arm.zero_wrench():
-            refusal = "The robot did not zero its force-torque sensor."
-        return messages.CommandReply(refusal=refusal)
-
-    def _why_unfit(self, sample: messages.RtdeSample) -> str:
+    def _why_unfit(self, sample: RtdeSample) -> str:
         """Return why nothing can be sent to the robot, or the empty string."""
-        unfit = error_messages.why_unfit(sample, self._settings.host, self._settings.state_timeout_s)
-        return unfit or self._executor.disabled_reason
+        return why_unfit(sample, self._settings) or self._executor.disabled_reason
 
-    def _why_blocked(self, sample: messages.RtdeSample) -> str:
+    def _why_blocked(self, sample: RtdeSample) -> str:
         """Return why motion is refused, or the empty string."""
         if self._recovery is not None:
-            return error_messages.BEING_MADE_READY
-        reason = self._why_unfit(sample) or violation(sample, self._limits) or self._held_reason
-        return f"{reason} {self._paused_program.failure}" if self._paused_program.failure else reason
+            return BEING_MADE_READY
+        reason = self._why_unfit(sample) or violation(sample, self._settings.limits) or self._held_reason
+        return f"{reason} {self._program.failure}" if self._program.failure else reason
 
-    def _stop_paused_program(self, sample: messages.RtdeSample, now_ns: int, *, announced: bool) -> None:
-        """Stop a paused program of ours, in the cycle after the one that has announced it."""
-        if self.leaving or not (self._owns_program and sample.program_paused and self._is_recent(sample)):
-            return
-        if self._paused_program.is_due(now_ns):
-            if announced:
-                self._paused_program.stop(now_ns)
-            self._stops_paused = not announced
+    def _leave(self, sample: RtdeSample, now_ns: int) -> None:
+        self.leaving = True
+        if self._recovery is not None:
+            self._recovery.give_up(LEAVING)
+        self._executor.stop_now(sample, now_ns, "the daemon disconnects")
 
-    def _is_recent(self, sample: messages.RtdeSample) -> bool:
-        return sample.connected and sample.age_ns <= self._settings.state_timeout_s * 1e9
+    def _begin_unlocking(self, number: int, sample: RtdeSample, now_ns: int) -> None:
+        unfit = self._why_unfit(sample)
+        if not self._executor.disabled_reason:
+            self._executor.disable(unfit)
+        self._unlock_number = number
+        self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, operator_asked=True)
 
-    def _recover(
-        self, recovery: Recovery, sample: messages.RtdeSample, now_ns: int
-    ) -> tuple[int, messages.CommandReply] | None:
-        # Samples may stay old for minutes without counting as lost; the operator gets an answer all the same.
-        if not self._is_recent(sample) and not recovery.has_ended(now_ns):
-            return None
+    def _recover(self, recovery: Recovery, sample: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
         outcome = recovery.advance(sample, now_ns)
+        if recovery.starts_program:
+            self._program.note_start(now_ns)
         if outcome is Outcome.UNDER_WAY:
             return None
-        self._owns_program, self._recovery = self.owns_program, None
+        self._recovery = None
         if outcome is Outcome.DONE:
-            self._executor.disabled_reason = ""
+            self._executor.enable()
         number, self._unlock_number = self._unlock_number, None
         if number is None:
             self._held_reason = recovery.refusal or self._held_reason
             return None
         if outcome is Outcome.DONE:
             self._held_reason = ""
-        return number, messages.CommandReply(refusal=recovery.refusal)
+        return number, CommandReply(refusal=recovery.refusal)

@@ -12,11 +12,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from shearloop.drivers.errors import DriverError, ProtocolError
-from shearloop.drivers.ur import error_messages
-from shearloop.drivers.ur.messages import RUNTIME_PLAYING, FailureKind, Sample
+from shearloop.drivers.ur.messages import RUNTIME_PLAYING, FailureKind
+from shearloop.drivers.ur.settings import Six
 
 RTDE_PORT, DASHBOARD_PORT = 30004, 29999
 SCRIPT_READY: Final = 1
@@ -68,10 +68,19 @@ class ControllerInfo:
     registers_free: bool
 
 
-@dataclass(frozen=True, slots=True)
-class ReceivedSample(Sample):
-    """A sample with the state of ur-rtde's control script: 1 when ready, 2 when done with a command."""
+class ReceivedSample(NamedTuple):
+    """The outputs in one package, the first nine as in `RtdeSample`."""
 
+    timestamp_s: float
+    q_rad: Six
+    qd_rad_per_s: Six
+    tcp_pose: Six
+    wrench: Six
+    robot_mode: int
+    safety_mode: int
+    runtime_state: int
+    speed_scaling: float
+    # Of ur-rtde's control script: 1 when ready, 2 when done with a command.
     script_state: int
 
 
@@ -89,7 +98,11 @@ def probe_controller(host: str, timeout_s: float) -> str:
         version = ".".join(str(number) for number in struct.unpack(">4I", answer[:16]))
         accepted = _agree_on_protocol(connection)
     if not accepted:
-        raise ProbeError("version", error_messages.VERSION_REFUSED.format(host=host, version=version))
+        raise ProbeError(
+            "version",
+            f"The UR controller at {host} ({version}) refuses protocol 2 of RTDE: it needs PolyScope 3.10 or 5.4, or "
+            "newer.",
+        )
     return version
 
 
@@ -135,11 +148,22 @@ def explain_failure(host: str, timeout_s: float, activity: str) -> Iterator[None
     try:
         yield
     except TimeoutError as error:
-        sentence = error_messages.SILENT.format(host=host, seconds=timeout_s, activity=activity)
-        raise ProbeError("silent", sentence) from error
+        raise ProbeError("silent", silent_sentence(host, timeout_s, activity)) from error
     except (OSError, struct.error) as error:
         reason = str(error) or type(error).__name__
-        raise ProbeError("unreachable", error_messages.UNREACHABLE.format(host=host, reason=reason)) from error
+        raise ProbeError(
+            "unreachable",
+            f"No UR controller at {host}: {reason}. Check that it is switched on and that this computer is in its "
+            "network (Settings → System → Network at the teach pendant).",
+        ) from error
+
+
+def silent_sentence(host: str, seconds: float, activity: str) -> str:
+    """Return the message about a controller that did not answer."""
+    return (
+        f"The UR controller at {host} said nothing for {seconds:.1f} s while {activity}: it is starting, hangs, or "
+        "something else listens on its ports. Look at the teach pendant."
+    )
 
 
 def _agree_on_protocol(connection: socket.socket) -> bool:

@@ -2,8 +2,16 @@
 
 import math
 
-from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
-from shearloop.drivers.ur.settings import Bound, UrLimits
+from shearloop.drivers.ur.messages import (
+    ROBOT_MODE_RUNNING,
+    SAFETY_NORMAL,
+    SAFETY_REDUCED,
+    MoveLinear,
+    RtdeSample,
+    Stop,
+    WristSpeed,
+)
+from shearloop.drivers.ur.settings import Bound, UrLimits, UrSettings
 
 WRIST = 5
 # The longest stop, however gentle the command.
@@ -77,6 +85,49 @@ def clip_linear(asked: MoveLinear, limits: UrLimits) -> tuple[MoveLinear, tuple[
     reasons += reason
     x, y, z = position
     return MoveLinear((x, y, z, *asked.pose[3:]), speed, acceleration), tuple(reasons)
+
+
+def is_recent(sample: RtdeSample, settings: UrSettings) -> bool:
+    """Return whether the connection is up and the sample is young enough to act on."""
+    return sample.connected and sample.age_ns <= settings.state_timeout_s * 1e9
+
+
+def why_unfit(sample: RtdeSample, settings: UrSettings) -> str:
+    """Return why the controller cannot take motion commands, or the empty string."""
+    if not sample.connected:
+        return f"The connection to the robot at {settings.host} is lost."
+    if not is_recent(sample, settings):
+        return (
+            f"The latest state from the controller at {settings.host} is {sample.age_ns / 1e9:.2f} s old: check its "
+            "cable, other traffic on the network, and with a simulator whether its clock is slower than real time."
+        )
+    if sample.protective_stop:
+        return "Protective stop: look for its cause, clear the workspace, then unlock (not in the first 5 s)."
+    if sample.emergency_stop:
+        return "Emergency stop: make the cell safe, release the button, then unlock."
+    if sample.safety_mode not in (SAFETY_NORMAL, SAFETY_REDUCED):
+        return _SAFETY.get(sample.safety_mode, f"The robot's safety system is in mode {sample.safety_mode}.")
+    if sample.robot_mode != ROBOT_MODE_RUNNING:
+        return f"The arm is not powered and released (robot mode {sample.robot_mode}): unlock to power it."
+    if sample.program_paused:
+        return (
+            "A program on the robot is paused, and goes on with what it did when it is resumed: stop it at the teach "
+            "pendant, or unlock, which stops it and starts the control program."
+        )
+    if not sample.program_running:
+        return (
+            "The control program on the robot does not run: it was stopped at the pendant, or by the watchdog when "
+            "commands came late. Unlock to start it again."
+        )
+    return ""
+
+
+_SAFETY = {
+    4: "The robot is in recovery mode: move it back within its safety limits at the teach pendant.",
+    5: "A safeguard stop holds the robot: close the safeguard, then unlock.",
+    8: "The robot's safety system reports a violation: restart it at the teach pendant.",
+    9: "The robot's safety system reports a fault: restart the controller.",
+}
 
 
 def violation(sample: RtdeSample, limits: UrLimits) -> str:

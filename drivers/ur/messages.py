@@ -4,16 +4,17 @@ On the pipe each message is `[number, message]`. A dataclass is an extension typ
 """
 
 import math
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 import msgpack
 
 from shearloop.drivers.errors import ProtocolError
-from shearloop.drivers.ur.settings import Bound, JointRange, Six, UrLimits, UrSettings, Workspace
+from shearloop.drivers.ur.settings import Bound, JointRange, Six, Three, UrLimits, UrSettings, Workspace
 
 MotionKind = Literal["idle", "wrist", "linear", "stopping"]
-FailureKind = Literal["not-installed", "unreachable", "silent", "version", "registers-in-use", "local-control", "lost"]
+FailureKind = Literal["unreachable", "silent", "version", "registers-in-use", "local-control", "lost"]
 
 # `RobotState.end_reason` of a motion that ended as commanded; any other reason is a sentence.
 ARRIVED: Final = "arrived"
@@ -98,9 +99,9 @@ class CommandReply:
         return not self.refusal
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """The state that the controller reports: SI units, base frame, joints from base to wrist 3."""
+@dataclass(frozen=True)
+class RtdeSample:
+    """The controller's latest sample (SI units, base frame, joints from base to wrist 3) and its connection's state."""
 
     # By the controller's clock.
     timestamp_s: float
@@ -112,12 +113,6 @@ class Sample:
     safety_mode: int
     runtime_state: int
     speed_scaling: float
-
-
-@dataclass(frozen=True, slots=True)
-class RtdeSample(Sample):
-    """The controller's latest sample, its age, and the state of the connection."""
-
     t_mono_ns: int
     # Time since the controller made the sample, by its own clock.
     age_ns: int
@@ -135,6 +130,16 @@ class RtdeSample(Sample):
         return self.runtime_state not in (RUNTIME_STOPPING, RUNTIME_STOPPED, RUNTIME_PLAYING)
 
     @property
+    def protective_stop(self) -> bool:
+        """Whether a protective stop holds the arm."""
+        return self.safety_mode == SAFETY_PROTECTIVE_STOP
+
+    @property
+    def emergency_stop(self) -> bool:
+        """Whether an emergency stop holds the arm."""
+        return self.safety_mode in SAFETY_EMERGENCY_STOPS
+
+    @property
     def rests(self) -> bool:
         """Whether every joint is at rest."""
         return self.fastest_rad_per_s < REST_RAD_PER_S
@@ -149,15 +154,29 @@ class RtdeSample(Sample):
         """The angle of wrist 3, about which the tool twists."""
         return self.q_rad[5]
 
+    @property
+    def wrist_torque_nm(self) -> float:
+        """The torque about the tool's own axis, from wrench and pose."""
+        x, y, z = tool_axis(self.tcp_pose)
+        _, _, _, torque_x, torque_y, torque_z = self.wrench
+        return x * torque_x + y * torque_y + z * torque_z
 
-@dataclass(frozen=True, slots=True)
+
+def tool_axis(pose: Sequence[float]) -> Three:
+    """Return the direction of the tool's z axis: the third column of the pose's rotation, by Rodrigues' formula."""
+    x, y, z = pose[3:]
+    angle_rad = math.hypot(x, y, z)
+    if angle_rad == 0.0:
+        return 0.0, 0.0, 1.0
+    x, y, z = x / angle_rad, y / angle_rad, z / angle_rad
+    sine, versine = math.sin(angle_rad), 1.0 - math.cos(angle_rad)
+    return x * z * versine + y * sine, y * z * versine - x * sine, 1.0 - (x * x + y * y) * versine
+
+
+@dataclass(frozen=True)
 class RobotState(RtdeSample):
     """A sample and the state of the driver; published as `robot.state`."""
 
-    # Torque about the tool's own axis, from wrench and pose.
-    wrist_torque_nm: float
-    protective_stop: bool
-    emergency_stop: bool
     # Why motion is refused at present; empty when it is enabled.
     blocked: str
     # Whether the robot is being unlocked, powered or started.
@@ -217,7 +236,6 @@ _TYPES: Final[tuple[Any, ...]] = (
     Failed, UrSettings, UrLimits, Bound, JointRange, Workspace,
 )  # fmt: skip
 _CODES: Final = {kind: code for code, kind in enumerate(_TYPES)}
-_NAMES: Final = {kind: [field.name for field in fields(kind)] for kind in _TYPES}
 
 
 def encode(message: Message, number: int = 0) -> bytes:
@@ -227,9 +245,8 @@ def encode(message: Message, number: int = 0) -> bytes:
 
 
 def _packed(value: Any) -> msgpack.ExtType:
-    kind = type(value)
-    content = [getattr(value, name) for name in _NAMES[kind]]
-    return msgpack.ExtType(_CODES[kind], msgpack.packb(content, default=_packed, buf_size=4096))
+    content = [getattr(value, name) for name in value.__dataclass_fields__]
+    return msgpack.ExtType(_CODES[type(value)], msgpack.packb(content, default=_packed, buf_size=4096))
 
 
 def _unpacked(code: int, data: bytes) -> Any:

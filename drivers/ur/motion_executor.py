@@ -5,10 +5,19 @@ robot's watchdog: nothing more is sent to the program, and only a new program ma
 """
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from shearloop.drivers.ur import error_messages, messages
 from shearloop.drivers.ur.limits import clip_linear, clip_stop, clip_wrist, line_violation
+from shearloop.drivers.ur.messages import (
+    ARRIVED,
+    STOPPED_ON_COMMAND,
+    MotionKind,
+    MoveLinear,
+    RtdeSample,
+    Stop,
+    WristSpeed,
+)
 from shearloop.drivers.ur.settings import Six, UrSettings
 
 if TYPE_CHECKING:
@@ -18,11 +27,46 @@ if TYPE_CHECKING:
 CLOSE, ARRIVED_AFTER_S = 2e-3, 0.2
 # An idle arm may tremble, but not move this fast for this long.
 ASTRAY_RAD_PER_S, ASTRAY_S = 0.02, 0.2
-# The time allowed for a linear move, and for a stop: nominal time × factor + constant.
-MOVE_SLACK, MOVE_SLACK_S = 1.5, 2.0
-STOP_SLACK, STOP_SLACK_S = 1.5, 1.0
+# The time allowed for a motion to end: nominal time × factor + constant.
+MOVE_SLACK_S, STOP_SLACK_S, SLACK = 2.0, 1.0, 1.5
 # The pendant's speed slider slows everything; below this a motion would have no end.
 SLOWEST_SCALING = 0.05
+
+NOT_OURS = (
+    "A program runs on the robot that someone else started or resumed: unlock to start the control program instead."
+)
+LEFT_TO_WATCHDOG = (
+    "{reason} The control program was left to the robot's watchdog, which ends it: unlock to start it again."
+)
+NOT_TAKEN = "The robot did not take the {command}: its control program does not answer."
+NOT_STOPPING = "The arm did not come to rest in time after a stop: keep clear of it, look at the teach pendant."
+ASTRAY = "The arm moved without a command: check whether a person or another program moves it."
+
+
+@dataclass(slots=True)
+class _Turn:
+    """The wrist turns at the speed last asked for."""
+
+    asked: WristSpeed
+    asked_ns: int
+
+
+@dataclass(slots=True)
+class _Move:
+    """A linear move is under way."""
+
+    end: Six
+    begun_ns: int
+    deadline_ns: int
+    seen: bool = False
+
+
+@dataclass(slots=True)
+class _Braking:
+    """The arm is being stopped."""
+
+    asked: Stop
+    deadline_ns: int
 
 
 class MotionExecutor:
@@ -33,196 +77,204 @@ class MotionExecutor:
 
     def __init__(self, settings: UrSettings, arm: "UrArm", now_ns: int) -> None:
         self._settings = settings
-        self._limits = settings.limits
         self._arm = arm
-        self.motion: messages.MotionKind = "idle"
         # The number of the motion's command, why the motion ended, and the command last sent.
         self.motion_id = 0
         self.end_reason = ""
-        self.sent: messages.WristSpeed | messages.MoveLinear | messages.Stop | None = None
+        self.sent: WristSpeed | MoveLinear | Stop | None = None
         self.clipped: tuple[str, ...] = ()
-        self.disabled_reason = error_messages.NOT_OURS
-        # Whether the robot rejected a command; the caller clears it.
-        self.command_rejected = False
-        self._asked, self._braking = messages.WristSpeed(0.0, 0.0), messages.Stop(0.0)
+        self.disabled_reason = NOT_OURS
+        self._motion: _Turn | _Move | _Braking | None = None
+        self._rejected = False
+        # The script's thread for speeds runs; it has to be ended before a linear move.
         self._speed_thread = False
-        self._asked_ns = self._rested_ns = now_ns
-        self._deadline_ns = self._move_ns = 0
-        self._move_seen = False
-        self._move_end: Six = (0.0,) * 6
+        self._rested_ns = now_ns
 
-    def turn(self, motion_id: int, asked: messages.WristSpeed, sample: messages.RtdeSample, now_ns: int) -> bool:
-        """Turn the wrist at this speed from now on; return whether the robot took it."""
-        self.motion, self.motion_id, self.end_reason = "wrist", motion_id, ""
-        self._asked, self._asked_ns = asked, now_ns
-        return self._send_clipped_speed(sample)
+    @property
+    def motion(self) -> MotionKind:
+        """What the arm does on command."""
+        match self._motion:
+            case _Turn():
+                return "wrist"
+            case _Move():
+                return "linear"
+            case _Braking():
+                return "stopping"
+        return "idle"
 
-    def move(self, motion_id: int, asked: messages.MoveLinear, sample: messages.RtdeSample, now_ns: int) -> bool:
-        """Begin a linear move of an arm at rest; return whether the robot took it."""
+    def take_rejection(self) -> bool:
+        """Return, once, whether the robot rejected a command."""
+        rejected, self._rejected = self._rejected, False
+        return rejected
+
+    def why_refused(self, command: WristSpeed | MoveLinear, sample: RtdeSample) -> str:
+        """Return why a motion cannot begin now, or the empty string."""
+        match command, self._motion:
+            case WristSpeed(_, acceleration), _ if acceleration <= 0:
+                return f"An acceleration of {acceleration:g} rad/s² is not above 0."
+            case WristSpeed(), _Braking():
+                return "The arm is still stopping."
+            case WristSpeed(), _Move():
+                return "A linear move is under way: stop it."
+            case MoveLinear(_, speed, acceleration), _ if min(speed, acceleration) <= 0:
+                return "A linear move needs a speed and an acceleration above 0."
+            case MoveLinear(), motion if isinstance(motion, _Move | _Braking) or not sample.rests:
+                return "The arm moves: stop it before a linear move."
+        return ""
+
+    def turn(self, motion_id: int, asked: WristSpeed, sample: RtdeSample, now_ns: int) -> None:
+        """Turn the wrist at this speed from now on."""
+        self._motion, self.motion_id, self.end_reason = _Turn(asked, now_ns), motion_id, ""
+        self._send_clipped_speed(asked, sample)
+
+    def move(self, motion_id: int, asked: MoveLinear, sample: RtdeSample, now_ns: int) -> None:
+        """Begin a linear move of an arm at rest."""
         self._end_speed_thread()
-        sent, clipped = clip_linear(asked, self._limits)
-        self.motion, self.motion_id, self.end_reason = "linear", motion_id, ""
-        self.sent, self.clipped = sent, clipped
-        self._deadline_ns = now_ns + int(1e9 * _longest_move_s(sent, sample))
-        self._move_seen = False
-        self._move_ns, self._move_end = now_ns, sent.pose
-        taken = self._arm.move(sent)
-        if not taken:
+        sent, self.clipped = clip_linear(asked, self._settings.limits)
+        self.sent, self.motion_id, self.end_reason = sent, motion_id, ""
+        self._motion = _Move(
+            sent.pose, now_ns, _deadline_ns(now_ns, _nominal_move_s(sent, sample), MOVE_SLACK_S, sample)
+        )
+        if not self._arm.move(sent):
             self._reject("linear move")
-        return taken
 
-    def stop_on_command(self, motion_id: int, asked: messages.Stop, sample: messages.RtdeSample, now_ns: int) -> None:
+    def stop_on_command(self, motion_id: int, asked: Stop, sample: RtdeSample, now_ns: int) -> None:
         """Stop at once, as hard as commanded within the needed and the allowed deceleration."""
-        sent = clip_stop(asked, sample, self._limits, self._settings.reaction_s)
-        if self.motion == "stopping":
-            sent = _harder(sent, self._braking)
-        self.motion_id = motion_id
-        self.sent, self.clipped = sent, ()
-        self.stop_now(sample, now_ns, messages.STOPPED_ON_COMMAND, sent)
+        sent = clip_stop(asked, sample, self._settings.limits, self._settings.reaction_s)
+        if isinstance(self._motion, _Braking):
+            sent = _harder(sent, self._motion.asked)
+        self.motion_id, self.sent, self.clipped = motion_id, sent, ()
+        self.stop_now(sample, now_ns, STOPPED_ON_COMMAND, sent)
 
-    def stop_now(
-        self, sample: messages.RtdeSample, now_ns: int, reason: str, stop: messages.Stop | None = None
-    ) -> None:
+    def stop_now(self, sample: RtdeSample, now_ns: int, reason: str, stop: Stop | None = None) -> None:
         """Begin to stop and send it at once, without waiting for the next cycle."""
         self.stop(sample, now_ns, reason, stop)
-        if self.motion == "stopping" and self._speed_thread:
-            self._keep_stopping(sample, now_ns)
+        if isinstance(self._motion, _Braking) and self._speed_thread:
+            self._keep_stopping(self._motion, sample, now_ns)
 
-    def stop(self, sample: messages.RtdeSample, now_ns: int, reason: str, stop: messages.Stop | None = None) -> None:
+    def stop(self, sample: RtdeSample, now_ns: int, reason: str, stop: Stop | None = None) -> None:
         """Begin to stop, by default as hard as allowed; the harder of two stops counts."""
-        asked = stop or messages.Stop(self._limits.wrist_acceleration_rad_per_s2.hard)
-        if self.motion == "idle" or (self.motion == "stopping" and _harder(self._braking, asked) is self._braking):
+        asked = stop or Stop(self._settings.limits.wrist_acceleration_rad_per_s2.hard)
+        if self._motion is None:
             return
-        if self.motion != "stopping":
+        if not isinstance(self._motion, _Braking):
             self.end_reason = reason
-        self.motion = "stopping"
-        self._braking = asked
-        self._deadline_ns = now_ns + int(1e9 * _longest_stop_s(asked, sample))
+        elif _harder(self._motion.asked, asked) is self._motion.asked:
+            return
+        nominal_s = sample.fastest_rad_per_s / asked.deceleration_rad_per_s2
+        self._motion = _Braking(asked, _deadline_ns(now_ns, nominal_s, STOP_SLACK_S, sample))
         if not self._speed_thread and not self._arm.stop_move(asked.deceleration_rad_per_s2):
             self._reject("stop")
 
+    def enable(self) -> None:
+        """Send commands from now on: our program runs."""
+        self.disabled_reason = ""
+
     def leave_to_watchdog(self, reason: str) -> None:
         """Send nothing more to this program, so that the robot's watchdog ends it."""
-        self.disable(reason, error_messages.LEFT_TO_WATCHDOG.format(reason=reason))
+        self.disable(reason, LEFT_TO_WATCHDOG.format(reason=reason))
 
-    def disable(self, end_reason: str, disabled_reason: str) -> None:
+    def disable(self, end_reason: str, disabled_reason: str = NOT_OURS) -> None:
         """End the present motion on paper, and send nothing to the program on the robot."""
-        if self.motion not in ("idle", "stopping"):
+        if isinstance(self._motion, _Turn | _Move):
             self.end_reason = end_reason
-        self.motion = "idle"
-        self._speed_thread = False
+        self._motion, self._speed_thread = None, False
         self.disabled_reason = disabled_reason
 
-    def watch(self, sample: messages.RtdeSample, now_ns: int) -> None:
+    def watch(self, sample: RtdeSample, now_ns: int) -> None:
         """Note whether an idle arm rests; call this in every cycle."""
-        if self.motion != "idle" or sample.fastest_rad_per_s < ASTRAY_RAD_PER_S:
+        if self._motion is not None or sample.fastest_rad_per_s < ASTRAY_RAD_PER_S:
             self._rested_ns = now_ns
 
-    def keep(self, sample: messages.RtdeSample, now_ns: int) -> None:
+    def keep(self, sample: RtdeSample, now_ns: int) -> None:
         """Send what this cycle needs."""
         if self.disabled_reason:
             return
-        match self.motion:
-            case "wrist":
-                self._keep_turning(sample, now_ns)
-            case "linear":
-                self._keep_moving(sample, now_ns)
-            case "stopping":
-                self._keep_stopping(sample, now_ns)
-            case "idle" if now_ns - self._rested_ns > ASTRAY_S * 1e9:
+        match self._motion:
+            case _Turn() as turn:
+                self._keep_turning(turn, sample, now_ns)
+            case _Move() as move:
+                self._keep_moving(move, sample, now_ns)
+            case _Braking() as braking:
+                self._keep_stopping(braking, sample, now_ns)
+            case None if now_ns - self._rested_ns > ASTRAY_S * 1e9:
                 self.end_reason = "it moved without a command"
-                self.leave_to_watchdog(error_messages.ASTRAY)
-            case "idle":
+                self.leave_to_watchdog(ASTRAY)
+            case None:
                 self._arm.send_heartbeat()
 
-    def _keep_turning(self, sample: messages.RtdeSample, now_ns: int) -> None:
-        if now_ns - self._asked_ns > self._settings.command_timeout_s * 1e9:
+    def _keep_turning(self, turn: _Turn, sample: RtdeSample, now_ns: int) -> None:
+        if now_ns - turn.asked_ns > self._settings.command_timeout_s * 1e9:
             late = f"the wrist speed was not renewed within {self._settings.command_timeout_s:g} s"
-            self.stop_now(sample, now_ns, late, messages.Stop(self._limits.wrist_acceleration_rad_per_s2.inner))
+            self.stop_now(sample, now_ns, late, Stop(self._settings.limits.wrist_acceleration_rad_per_s2.inner))
         else:
-            self._send_clipped_speed(sample)
+            self._send_clipped_speed(turn.asked, sample)
 
-    def _keep_moving(self, sample: messages.RtdeSample, now_ns: int) -> None:
-        self._move_seen = self._move_seen or sample.moving_linearly
-        reason = line_violation(sample, self._limits)
-        if now_ns > self._deadline_ns:
+    def _keep_moving(self, move: _Move, sample: RtdeSample, now_ns: int) -> None:
+        move.seen = move.seen or sample.moving_linearly
+        reason = line_violation(sample, self._settings.limits)
+        if now_ns > move.deadline_ns:
             reason = "the linear move did not end within its time"
         # The end of the move and the joint speeds come over two connections, and one may lag.
-        if not sample.moving_linearly and sample.rests and (self._move_seen or self._is_at_end(sample, now_ns)):
-            self.motion, self.end_reason = "idle", messages.ARRIVED
+        waited = now_ns - move.begun_ns > ARRIVED_AFTER_S * 1e9
+        ended = move.seen or (waited and is_close(sample.tcp_pose, move.end, CLOSE))
+        if ended and not sample.moving_linearly and sample.rests:
+            self._motion, self.end_reason = None, ARRIVED
         elif reason:
             self.stop(sample, now_ns, reason)
             return
         self._arm.send_heartbeat()
 
-    def _is_at_end(self, sample: messages.RtdeSample, now_ns: int) -> bool:
-        waited = now_ns - self._move_ns > ARRIVED_AFTER_S * 1e9
-        return waited and is_close(sample.tcp_pose, self._move_end, CLOSE)
-
-    def _keep_stopping(self, sample: messages.RtdeSample, now_ns: int) -> None:
-        if now_ns > self._deadline_ns:
-            self.leave_to_watchdog(error_messages.NOT_STOPPING)
+    def _keep_stopping(self, braking: _Braking, sample: RtdeSample, now_ns: int) -> None:
+        if now_ns > braking.deadline_ns:
+            self.leave_to_watchdog(NOT_STOPPING)
         elif self._speed_thread:
-            braking = clip_stop(self._braking, sample, self._limits, self._settings.reaction_s)
-            if self._send_speed(messages.WristSpeed(0.0, braking.deceleration_rad_per_s2)) and sample.rests:
+            stop = clip_stop(braking.asked, sample, self._settings.limits, self._settings.reaction_s)
+            if self._send_speed(WristSpeed(0.0, stop.deceleration_rad_per_s2)) and sample.rests:
                 self._end_speed_thread()
-                self.motion = "idle"
+                self._motion = None
         else:
             if not sample.moving_linearly and sample.rests:
-                self.motion = "idle"
+                self._motion = None
             self._arm.send_heartbeat()
 
-    def _send_clipped_speed(self, sample: messages.RtdeSample) -> bool:
-        self.sent, self.clipped = clip_wrist(self._asked, sample, self._limits, self._settings.reaction_s)
-        return self._send_speed(self.sent)
+    def _send_clipped_speed(self, asked: WristSpeed, sample: RtdeSample) -> None:
+        """Send the speed within the limits of this moment: the one check of all speeds that turn the wrist."""
+        self.sent, self.clipped = clip_wrist(asked, sample, self._settings.limits, self._settings.reaction_s)
+        self._send_speed(self.sent)
 
-    def _send_speed(self, command: messages.WristSpeed) -> bool:
+    def _send_speed(self, command: WristSpeed) -> bool:
         self._speed_thread = True
-        taken = self._arm.wrist(command)
-        if not taken:
+        accepted = self._arm.wrist(command)
+        if not accepted:
             # An earlier speed may still hold.
             self._reject("wrist speed")
-        return taken
+        return accepted
 
     def _reject(self, command: str) -> None:
-        self.command_rejected = True
-        self.leave_to_watchdog(error_messages.NOT_TAKEN.format(command=command))
+        self._rejected = True
+        self.leave_to_watchdog(NOT_TAKEN.format(command=command))
 
     def _end_speed_thread(self) -> None:
         if self._speed_thread:
-            self._arm.end_speed(self._limits.wrist_acceleration_rad_per_s2.inner)
+            self._arm.end_speed(self._settings.limits.wrist_acceleration_rad_per_s2.inner)
             self._speed_thread = False
 
 
-def _harder(one: messages.Stop, other: messages.Stop) -> messages.Stop:
+def _harder(one: Stop, other: Stop) -> Stop:
     return one if one.deceleration_rad_per_s2 >= other.deceleration_rad_per_s2 else other
 
 
-def _longest_move_s(move: messages.MoveLinear, sample: messages.RtdeSample) -> float:
+def _nominal_move_s(move: MoveLinear, sample: RtdeSample) -> float:
     distance_m = math.dist(move.pose[:3], sample.tcp_pose[:3])
     # At most half a turn; a move that only turns takes its speed as rad/s.
     way = max(distance_m, math.pi if distance_m < 1e-3 else 0.0)
-    nominal_s = way / move.speed_m_per_s + move.speed_m_per_s / move.acceleration_m_per_s2
-    return MOVE_SLACK * nominal_s / max(SLOWEST_SCALING, sample.speed_scaling) + MOVE_SLACK_S
+    return way / move.speed_m_per_s + move.speed_m_per_s / move.acceleration_m_per_s2
 
 
-def _longest_stop_s(stop: messages.Stop, sample: messages.RtdeSample) -> float:
-    nominal_s = sample.fastest_rad_per_s / stop.deceleration_rad_per_s2
-    if not math.isfinite(nominal_s):
-        return STOP_SLACK_S
-    return STOP_SLACK * nominal_s / max(SLOWEST_SCALING, sample.speed_scaling) + STOP_SLACK_S
-
-
-def tool_axis_torque(sample: messages.RtdeSample) -> float:
-    """Return the torque about the tool's z axis: the third column of the pose's rotation, times the torque."""
-    x, y, z = sample.tcp_pose[3:]
-    angle = math.hypot(x, y, z)
-    if angle < 1e-12:
-        return sample.wrench[5]
-    x, y, z = x / angle, y / angle, z / angle
-    sine, versine = math.sin(angle), 1 - math.cos(angle)
-    _, _, _, tx, ty, tz = sample.wrench
-    return (x * z * versine + y * sine) * tx + (y * z * versine - x * sine) * ty + (1 - (x * x + y * y) * versine) * tz
+def _deadline_ns(now_ns: int, nominal_s: float, slack_s: float, sample: RtdeSample) -> int:
+    longest_s = SLACK * nominal_s / max(SLOWEST_SCALING, sample.speed_scaling)
+    return now_ns + int(1e9 * (slack_s + (longest_s if math.isfinite(longest_s) else 0.0)))
 
 
 def is_close(pose: Six, other: Six, within: float) -> bool:

@@ -1,4 +1,4 @@
-"""Makes a robot ready to move, stops a paused program of ours, and recognises a program of another client.
+"""Makes a robot ready to move, knows whose program runs on it, and stops a paused program of ours.
 
 All of it runs one step a cycle and never waits, so that states keep coming while the arm powers up. A protective stop
 is unlocked only on the operator's request (UR's own rule). Without one, only the control program is started.
@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.ur import error_messages, messages
+from shearloop.drivers.ur import messages
 
 if TYPE_CHECKING:
     from shearloop.drivers.ur.arm import UrArm
@@ -20,6 +20,8 @@ _RETRY_S = 1.0
 ENDS_ITSELF_S = 2.0
 # The pauses between requests to stop a paused program; each may hang for another 2.5 s.
 STOP_RETRIES_S = (1.0, 2.0, 5.0, 10.0, 10.0)
+
+STILL_PAUSED = "The paused program could not be stopped ({reason}): stop it at the teach pendant, do not resume it."
 
 
 class Outcome(enum.Enum):
@@ -138,28 +140,55 @@ class Recovery:
         return Outcome.REFUSED
 
 
-class PausedProgramStopper:
-    """Stops our program while it is paused: resumed at the pendant, it would go on with its last motion.
+class ProgramOwner:
+    """Knows whether the program on the robot is ours, and stops ours while it is paused.
 
-    Requests repeat less and less often, a limited number of times. `failure` is the message for the operator.
+    Resumed at the pendant, a paused program would go on with its last motion. Requests to stop it repeat less and less
+    often, a limited number of times; `failure` is the message for the operator. A program is another client's when it
+    plays on without our heartbeats: ours would end.
     """
 
-    def __init__(self, arm: "UrArm") -> None:
+    def __init__(self, arm: "UrArm", *, ours: bool) -> None:
         self._arm = arm
-        self._requests, self._next_ns = 0, 0
+        self.ours = ours
+        # Whether the next cycle stops a paused program; the state before it announces that it may take long.
+        self.stop_announced = self._was_announced = False
         self.failure = ""
         self.failed_stops = 0
+        self._requests, self._next_ns = 0, 0
+        # When a program was being started last: an upload may take effect after its recovery was given up.
+        self._starting_ns: int | None = None
+        self._plays_without_us_ns: int | None = None
 
-    def reset(self) -> None:
-        """Note that no program is there."""
-        self._requests, self._next_ns, self.failure = 0, 0, ""
+    def may_be_ours(self, now_ns: int) -> bool:
+        """Return whether a program that plays is ours or may be, because one was just being started."""
+        return self.ours or (self._starting_ns is not None and now_ns - self._starting_ns <= ENDS_ITSELF_S * 1e9)
 
-    def is_due(self, now_ns: int) -> bool:
-        """Return whether to request a stop now."""
-        return now_ns >= self._next_ns and self._requests <= len(STOP_RETRIES_S)
+    def note_start(self, now_ns: int) -> None:
+        """Note that a program of ours is being started."""
+        self.ours, self._starting_ns = True, now_ns
 
-    def stop(self, now_ns: int) -> None:
-        """Request a stop, which may take seconds."""
+    def update(self, sample: messages.RtdeSample, now_ns: int, *, starting: bool, plays_without_us: bool) -> None:
+        """Take in a cycle's sample; `starting`: a program of ours is being started."""
+        self._was_announced, self.stop_announced = self.stop_announced, False
+        if not plays_without_us:
+            self._plays_without_us_ns = None
+        elif self._plays_without_us_ns is None:
+            self._plays_without_us_ns = now_ns
+        since_ns = self._plays_without_us_ns
+        foreign = since_ns is not None and now_ns - since_ns > ENDS_ITSELF_S * 1e9
+        if sample.runtime_state == messages.RUNTIME_STOPPED or foreign:
+            # The next program may be anyone's, and ours may have ended between two samples.
+            self.ours = starting
+            self._requests, self._next_ns, self.failure = 0, 0, ""
+
+    def stop_paused(self, now_ns: int) -> None:
+        """Request a stop when it is due, in the cycle after the one that has announced it: it may take seconds."""
+        if now_ns < self._next_ns or self._requests > len(STOP_RETRIES_S):
+            return
+        if not self._was_announced:
+            self.stop_announced = True
+            return
         if self._requests and not self.failure:
             self._fail("the dashboard said that it is stopped, and it is not")
         self._next_ns = now_ns + int(1e9 * STOP_RETRIES_S[min(self._requests, len(STOP_RETRIES_S) - 1)])
@@ -171,19 +200,4 @@ class PausedProgramStopper:
 
     def _fail(self, reason: str) -> None:
         self.failed_stops += 1
-        self.failure = error_messages.STILL_PAUSED.format(reason=reason.strip().removesuffix("."))
-
-
-class ForeignProgramDetector:
-    """Recognises another client's program: it plays on without our heartbeats, and ours would end."""
-
-    def __init__(self) -> None:
-        self._since_ns: int | None = None
-
-    def update(self, now_ns: int, *, plays_without_us: bool) -> bool:
-        """Return whether a foreign program plays; call this in every cycle."""
-        if not plays_without_us:
-            self._since_ns = None
-        elif self._since_ns is None:
-            self._since_ns = now_ns
-        return self._since_ns is not None and now_ns - self._since_ns > ENDS_ITSELF_S * 1e9
+        self.failure = STILL_PAUSED.format(reason=reason.strip().removesuffix("."))

@@ -15,9 +15,10 @@ import time
 import traceback
 from typing import TYPE_CHECKING, NoReturn
 
-from shearloop.drivers.ur import error_messages, messages
+from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.controller import ProbeError, probe_controller
+from shearloop.drivers.ur.limits import why_unfit
 from shearloop.drivers.ur.settings import UrSettings
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 EXIT_DONE, EXIT_FAILED = 0, 3
 # On exit, the time to brake a motion; the robot's watchdog ends what remains.
-FAREWELL_S = 1.0
+BRAKE_S = 1.0
 # The bound on unsent replies. States that a slow daemon does not read are dropped.
 MOST_UNSENT = 1 << 16
 
@@ -110,13 +111,12 @@ def _receive_configuration(pipe: Pipe) -> messages.Configure | None:
 def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
     _set_alarm(settings.connect_timeout_s)
     pipe.send(messages.WorkerPhase("loading ur-rtde"))
-    try:
-        from shearloop.drivers.ur.arm import UrArm
-    except ImportError:
-        _fail(pipe, "not-installed", error_messages.NOT_INSTALLED)
+    from shearloop.drivers.ur.arm import UrArm
+
+    host = settings.host
     try:
         pipe.send(messages.WorkerPhase("greeting the controller"))
-        version = probe_controller(settings.host, settings.connect_timeout_s / 3)
+        version = probe_controller(host, settings.connect_timeout_s / 3)
         pipe.send(messages.WorkerPhase("connecting"))
         return UrArm(settings, version)
     except ProbeError as error:
@@ -124,10 +124,20 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
     except RuntimeError as error:
         text = str(error)
         if "already in use" in text:
-            _fail(pipe, "registers-in-use", error_messages.REGISTERS_IN_USE.format(host=settings.host))
+            _fail(
+                pipe,
+                "registers-in-use",
+                f"The input registers of the robot at {host} are already in use by another RTDE client, EtherNet/IP or "
+                "PROFINET: end the other program, or disable the adapter under Installation → Fieldbus.",
+            )
         if "remote control" in text:
-            _fail(pipe, "local-control", error_messages.LOCAL_CONTROL.format(host=settings.host))
-        _fail(pipe, "unreachable", error_messages.REFUSED_BY_CLIENT.format(host=settings.host, text=text.strip()))
+            _fail(
+                pipe,
+                "local-control",
+                f"The robot at {host} is in local control: switch it to remote control, top right on the teach "
+                "pendant.",
+            )
+        _fail(pipe, "unreachable", f"The connection to the robot at {host} failed: ur-rtde says “{text.strip()}”.")
 
 
 def _control(pipe: Pipe, configured: messages.Configure, arm: "UrArm") -> NoReturn:
@@ -139,12 +149,12 @@ def _control(pipe: Pipe, configured: messages.Configure, arm: "UrArm") -> NoRetu
         _set_alarm(settings.hang_timeout_s)
         sample = arm.read()
         if not sample.connected or sample.age_ns > 3 * settings.state_timeout_s * 1e9:
-            _fail(pipe, "lost", error_messages.why_unfit(sample, settings.host, settings.state_timeout_s))
+            _fail(pipe, "lost", why_unfit(sample, settings))
         _handle_commands(pipe, handler, sample)
         if not pipe.open and not handler.leaving:
             handler.request(0, messages.Disconnect(), sample, time.monotonic_ns())
         if handler.leaving:
-            leave_s = min(leave_s, time.monotonic() + FAREWELL_S)
+            leave_s = min(leave_s, time.monotonic() + BRAKE_S)
         if handler.recovering:
             # Announce a cycle that may take long.
             pipe.send_latest(handler.state(sample, cycle))
@@ -152,7 +162,7 @@ def _control(pipe: Pipe, configured: messages.Configure, arm: "UrArm") -> NoRetu
         ended = handler.tick(sample, time.monotonic_ns())
         if ended is not None:
             pipe.send(ended[1], ended[0])
-        if not handler.take_command_rejected():
+        if not handler.take_rejection():
             pipe.send_latest(handler.state(sample, cycle))
         if (handler.leaving and handler.at_rest) or time.monotonic() > leave_s:
             _end_program(settings, handler, arm)
@@ -175,39 +185,18 @@ def _end_program(settings: UrSettings, handler: CommandHandler, arm: "UrArm") ->
         if handler.may_own_program(time.monotonic_ns()):
             arm.end_program()
     elif handler.owns_paused_program(sample):
-        _set_alarm(FAREWELL_S + settings.hang_timeout_s)
+        _set_alarm(BRAKE_S + settings.hang_timeout_s)
         arm.stop_program()
 
 
 def _handle_commands(pipe: Pipe, handler: CommandHandler, sample: messages.RtdeSample) -> None:
     """Carry out the daemon's commands."""
-    for number, command in _newest_commands(pipe, handler):
-        reply = handler.request(number, command, sample, time.monotonic_ns())
-        if reply is not None:
-            pipe.send(reply, number)
-
-
-def _newest_commands(pipe: Pipe, handler: CommandHandler) -> list[tuple[int, messages.Command]]:
-    """Return the commands to carry out; of several motions only the latest, the others are refused as overtaken."""
-    commands: list[tuple[int, messages.Command]] = []
     for number, message in pipe.receive():
         handler.note_daemon_alive(time.monotonic_ns())
         if isinstance(message, messages.Command):
-            commands.append((number, message))
-        elif not isinstance(message, messages.Heartbeat):
-            raise TypeError(f"the daemon sent a {type(message).__name__}, which is no command")
-    motions = [
-        n
-        for n, (_, command) in enumerate(commands)
-        if isinstance(command, messages.WristSpeed | messages.MoveLinear | messages.Stop)
-    ]
-    # A stop is never overtaken: a later motion finds the arm stopping.
-    overtaken = [n for n in motions[:-1] if not isinstance(commands[n][1], messages.Stop)]
-    for index in overtaken:
-        pipe.send(
-            messages.CommandReply(refusal="A newer command came before this one could be sent."), commands[index][0]
-        )
-    return [entry for index, entry in enumerate(commands) if index not in overtaken]
+            reply = handler.request(number, message, sample, time.monotonic_ns())
+            if reply is not None:
+                pipe.send(reply, number)
 
 
 def _set_alarm(seconds: float) -> None:

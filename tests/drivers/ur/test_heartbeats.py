@@ -27,9 +27,6 @@ class Played:
     def get_pipe_transport(self, _fd: int) -> Any:
         return self
 
-    def get_write_buffer_size(self) -> int:
-        return 0
-
     def write(self, data: bytes) -> None:
         """Note a heartbeat."""
         if data == encode(Heartbeat()):

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from shearloop.drivers.ur.limits import clip_linear, clip_stop, clip_wrist, line_violation, violation
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
-from shearloop.drivers.ur.motion_executor import tool_axis_torque
 from shearloop.drivers.ur.settings import Bound, JointRange, UrLimits, Workspace
 
 CYCLE_S, REACTION_S = 0.008, 0.04
@@ -152,4 +151,4 @@ def test_torque_about_the_tool_axis_agrees_with_scipy(
     vector = np.array(direction) / length * angle
     now = dataclasses.replace(AT_REST, tcp_pose=(0.0, 0.0, 0.0, *vector.tolist()), wrench=(0.0, 0.0, 0.0, *torque))
     axis = Rotation.from_rotvec(vector).as_matrix()[:, 2]
-    assert math.isclose(tool_axis_torque(now), float(axis @ np.array(torque)), abs_tol=1e-9)
+    assert math.isclose(now.wrist_torque_nm, float(axis @ np.array(torque)), abs_tol=1e-9)

@@ -48,7 +48,7 @@ states = st.builds(
     motion_id=st.integers(0, 2**32 - 1), cycle=st.integers(0, 2**64 - 1),
     failed_program_stops=st.integers(0, 2**32 - 1),
     q_rad=six, qd_rad_per_s=six, tcp_pose=six, wrench=six, sent=sent, clipped=reasons,
-    timestamp_s=finite, speed_scaling=finite, wrist_torque_nm=finite,
+    timestamp_s=finite, speed_scaling=finite,
     motion=st.sampled_from(["idle", "wrist", "linear", "stopping"]),
 )  # fmt: skip
 messages = st.one_of(
@@ -99,7 +99,7 @@ def test_message_of_an_unknown_type_is_refused() -> None:
 def test_states_carry_values_that_are_not_finite() -> None:
     state = RobotState(
         0.0, (float("nan"),) * 6, (0.0,) * 6, (0.0,) * 6, (float("inf"),) * 6, 7, 1, 2, 1.0, 0, 0, True, False,
-        0.0, False, False, "", False, "idle", 0, "", None, (), 3, False, 0,
+        "", False, "idle", 0, "", None, (), 3, False, 0,
     )  # fmt: skip
     ((_, got),) = MessageDecoder().feed(encode(state))
     assert isinstance(got, RobotState)

@@ -1,0 +1,268 @@
+"""The functions that one frame passes from the port to a subscriber, and one estimate to a sent speed.
+
+    python -m benchmarks.frame_path [--json]
+
+A daemon runs in this process on a board that the benchmark plays, with the default estimator. One frame is traced in
+all tasks and threads, from its first byte to the subscriber's receipt of the estimate. Then a daemon runs an experiment
+on the emulated rig. One estimate is traced from the control loop's inputs to the speed that goes to the robot's
+process; the decisions that lie between are traced from their beginning. Of several frames and estimates the shortest
+way counts: messages that a task publishes once a second do not belong to it.
+"""
+
+import argparse
+import asyncio
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import AsyncIterator, Sequence
+from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any
+
+import msgpack
+import numpy as np
+import yaml
+import zmq
+import zmq.asyncio
+from numpy.typing import NDArray
+
+import shearloop
+from benchmarks.daemon_speed import FIRST_FRAME, FIRST_VALID_FRAME, PAUSE_S, PlayedBoard, line_text, write_config
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.cli.demo_calibration import calibrate, record
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.runner import ControlLoopRunner
+from shearloop.drivers.emulators.rig import SIDES
+from shearloop.drivers.ur.client import WorkerConnection
+
+PACKAGE = str(Path(shearloop.__file__).parent) + os.sep
+SIDE = "right"
+SEED = 7
+DIAMETERS_MM = (17.5, 20.0, 25.0)
+TRACED = 5
+RECEIVE_MS = 60_000
+EXPERIMENT = {
+    "name": "hold 0.05 N·m",
+    "torque_source": SIDE,
+    "limits": {"torque_nm": 0.25, "angle_rad": 1.5},
+    "steps": [
+        {"do": "release", "timeout_s": 15},
+        {"do": "tare", "timeout_s": 30},
+        {"do": "grip", "width_mm": 5, "force_n": 60, "timeout_s": 15},
+        {"do": "wait", "wait_s": 8},
+        {"do": "identify", "amplitude_rad": 0.15, "timeout_s": 180},
+        {"do": "hold_torque", "torque_nm": 0.05, "ramp_nm_per_s": 0.02, "hold_s": 60, "timeout_s": 60},
+    ],
+}
+
+
+class Trace:
+    """Records the package's function calls in the threads that it is installed in, while `recording`."""
+
+    def __init__(self) -> None:
+        self.recording = False
+        self.calls: list[CodeType] = []
+
+    def install(self) -> None:
+        """Watch this thread and all that begin later."""
+        threading.setprofile(self._on_event)
+        sys.setprofile(self._on_event)
+
+    def remove(self) -> None:
+        """Watch nothing."""
+        threading.setprofile(None)
+        sys.setprofile(None)
+
+    def _on_event(self, frame: FrameType, event: str, _argument: object) -> None:
+        if self.recording and event == "call" and frame.f_code.co_filename.startswith(PACKAGE):
+            self.calls.append(frame.f_code)
+
+
+class CommandTrace(Trace):
+    """Records the calls within the taking of a torque and within decisions, until a speed is sent; then a new way."""
+
+    _TORQUE = ControlLoop.on_torque.__code__
+    _DECISION = ControlLoopRunner._decide.__code__
+    _SENT = WorkerConnection.send.__code__
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ways: list[list[CodeType]] = []
+        self._root: FrameType | None = None
+
+    def _on_event(self, frame: FrameType, event: str, _argument: object) -> None:
+        if not self.recording:
+            return
+        code = frame.f_code
+        if event == "call" and self._root is None:
+            if code is self._TORQUE and frame.f_locals["torque"].source == SIDE:
+                self.calls, self._root = [], frame
+            elif code is self._DECISION and self.calls:
+                self._root = frame
+        if self._root is None:
+            return
+        if event == "call" and code.co_filename.startswith(PACKAGE):
+            self.calls.append(code)
+        elif event == "return" and code is self._SENT and code in self.calls:
+            self.ways.append(self.calls)
+            self.calls, self._root = [], None
+        elif event == "return" and frame is self._root:
+            self._root = None
+
+
+def make_rig(folder: Path) -> list[NDArray[np.float64]]:
+    """Build the demo's bank and calibrate the default estimator on the emulated rig; return frames of one board."""
+    build = ("bank", "build", "--config", "config/banks/demo.yaml", "--out", str(folder / "demo.bank"))
+    subprocess.run([sys.executable, "-m", "shearloop", *build], check=True, stdout=subprocess.DEVNULL)
+    recorded = list(record(folder / "demo.bank", SEED, DIAMETERS_MM))
+    calibrate([one.series(diameter_mm) for diameter_mm, one in recorded], (SIDE,)).save(folder / "right.cal")
+    index = list(SIDES).index(SIDE)
+    return [pair[index] for pair in recorded[-1][1].lines]
+
+
+def fingertip(folder: Path, port: str, period_s: float | None = None) -> dict[str, Any]:
+    """Return the configuration of the fingertip with the default estimator."""
+    device = {"device": {"path": str(folder / port)}, "calibration": str(folder / "right.cal")}
+    return {"fingertips": {SIDE: {**device, **({"frame_period_s": period_s} if period_s is not None else {})}}}
+
+
+@contextlib.asynccontextmanager
+async def running(config: Path, *topics: str) -> AsyncIterator["zmq.asyncio.Socket"]:
+    """Run a daemon in this process; yield a socket that has subscribed to topics."""
+    loaded = load_daemon_config(config)
+    with zmq.asyncio.Context() as context:
+        daemon = Daemon(loaded, context)
+        ready = asyncio.Event()
+        task = asyncio.create_task(daemon.run(ready.set))
+        await ready.wait()
+        with context.socket(zmq.SUB) as subscriber:
+            subscriber.setsockopt(zmq.RCVHWM, 0)
+            subscriber.setsockopt(zmq.RCVTIMEO, RECEIVE_MS)
+            for topic in topics:
+                subscriber.setsockopt(zmq.SUBSCRIBE, topic.encode())
+            subscriber.connect(loaded.publish)
+            yield subscriber
+        daemon.stop()
+        await task
+
+
+async def trace_frame(folder: Path, lines: Sequence[NDArray[np.float64]]) -> list[CodeType]:
+    """Return the calls of one frame, in order."""
+    ways = []
+    with contextlib.closing(PlayedBoard(folder / "board")) as board:
+        trace = Trace()
+        trace.install()
+        try:
+            config = write_config(folder, **fingertip(folder, "board", PAUSE_S))
+            async with running(config, "eit.estimate", "eit.frame") as subscriber:
+                await asyncio.to_thread(board.wait_for_start)
+                for number, line in enumerate(lines[FIRST_FRAME : FIRST_FRAME + FIRST_VALID_FRAME + TRACED]):
+                    await asyncio.sleep(PAUSE_S)
+                    trace.calls, trace.recording = [], number >= FIRST_VALID_FRAME
+                    await asyncio.to_thread(board.send, line_text(line))
+                    received: dict[str, Any] = {}
+                    while len(received) < 2:
+                        topic, payload = await subscriber.recv_multipart()
+                        received[topic.decode()] = payload
+                    trace.recording = False
+                    if trace.calls and msgpack.unpackb(received["eit.estimate"])["valid"]:
+                        ways.append(trace.calls)
+        finally:
+            trace.remove()
+    return shortest(ways)
+
+
+def write_experiment(folder: Path, host: str) -> Path:
+    """Write the configuration of the emulated rig's experiment, and return its path."""
+    robot = yaml.safe_load(Path("config/demo_ur.yaml").read_text())
+    (folder / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": host}))
+    (folder / "hold.yaml").write_text(yaml.safe_dump(EXPERIMENT, allow_unicode=True))
+    devices = {"robot": "ur.yaml", "gripper": {"socket": {"host": host}}, "experiment": "hold.yaml"}
+    return write_config(folder, **fingertip(folder, "eit-right"), **devices)
+
+
+async def trace_command(folder: Path) -> list[CodeType]:
+    """Return the calls from an estimate to a sent speed, in order."""
+    # Every process has an address of its own, so that several can run at once.
+    host = f"127.{os.getpid() >> 14 & 63 | 192}.{os.getpid() >> 7 & 127}.{1 + os.getpid() % 128}"
+    config = write_experiment(folder, host)
+    rig = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "shearloop", "emulate", "rig", "--bank", str(folder / "demo.bank")),
+        *("--run-dir", str(folder), "--host", host),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    trace = CommandTrace()
+    try:
+        if rig.stdout is not None:
+            await rig.stdout.readline()
+        async with running(config, "loop.state") as subscriber:
+            trace.install()
+            while len(trace.ways) < TRACED:
+                state = msgpack.unpackb((await subscriber.recv_multipart())[1])
+                trace.recording = state["step_name"] == "hold_torque" and state["phase"] == "running"
+                if state["phase"] in ("stopped", "finished"):
+                    raise RuntimeError(f"the experiment ended before it was traced: {state['activity']}")
+            trace.remove()
+    finally:
+        trace.remove()
+        with contextlib.suppress(ProcessLookupError):
+            rig.terminate()
+        await rig.wait()
+    return shortest(trace.ways)
+
+
+def shortest(ways: Sequence[list[CodeType]]) -> list[CodeType]:
+    """Return the calls with the fewest distinct functions."""
+    return min(ways, key=lambda calls: len(set(calls)))
+
+
+def module_of(code: CodeType) -> str:
+    """Return a function's module, as a path in the package."""
+    return code.co_filename.removeprefix(PACKAGE)
+
+
+def diagram(calls: Sequence[CodeType]) -> str:
+    """Return the modules in the order of their first call, each with its functions in that order."""
+    functions: dict[str, dict[str, None]] = {}
+    for code in calls:
+        functions.setdefault(module_of(code), {})[code.co_qualname] = None
+    width = max(map(len, functions))
+    return "\n".join(f"{module:<{width}}  {' · '.join(names)}" for module, names in functions.items())
+
+
+def main() -> None:
+    """Trace both ways and print them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="print the counts as JSON")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        lines = make_rig(folder)
+        frame = asyncio.run(trace_frame(folder, lines))
+        command = asyncio.run(trace_command(folder))
+    counts = {
+        "functions": len(set(frame)),
+        "modules": len({module_of(code) for code in frame}),
+        "calls": len(frame),
+        "command_functions": len(set(command)),
+        "command_modules": len({module_of(code) for code in command}),
+    }
+    if args.json:
+        print(json.dumps(counts))
+        return
+    print("One frame: {functions} functions in {modules} modules, {calls} calls\n".format(**counts))
+    print(diagram(frame))
+    print(
+        "\nAn estimate to a sent speed: {command_functions} functions in {command_modules} modules\n".format(**counts)
+    )
+    print(diagram(command))
+
+
+if __name__ == "__main__":
+    main()

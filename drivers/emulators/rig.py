@@ -24,7 +24,7 @@ from shearloop.drivers.emulators.robotiq.gripper import (
 from shearloop.drivers.emulators.scene import FloatArray, Joint, Scene, Truth, TwinSettings
 from shearloop.drivers.emulators.skin import Gauges, SkinInstruments
 from shearloop.drivers.emulators.ur.robot import ControllerSpec, Robot, RobotEvent
-from shearloop.drivers.emulators.ur.server import FAULTS, Controller, apply_fault
+from shearloop.drivers.emulators.ur.server import FAULTS, Controller
 
 # Returns a frame (1024,) in volts from each injection's grip (0…1) and shear torque in N·m, (32,) each, and the tool's
 # diameter in mm.
@@ -112,7 +112,8 @@ class EmulatedRig:
         if settings.diameter_mm is not None:
             self.player.command(f"object {settings.diameter_mm}")
         robot = Robot(settings.make, lambda wrist_rad, _, dt_s: self._step(dt_s, wrist_rad), settings.arm_speed)
-        self.controller = Controller(robot, host=settings.host, rate_hz=settings.rate_hz, on_event=on_event)
+        self.controller = Controller(robot, host=settings.host, rate_hz=settings.rate_hz)
+        self._on_event = on_event
         self.eit = {side: self._eit_board(side, number) for number, side in enumerate(SIDES)}
         self.load = Hx711Board(
             lambda: self.scene.conversion_nm(LOAD_PERIOD_S),
@@ -128,7 +129,7 @@ class EmulatedRig:
     async def run(self) -> None:
         """Play until cancelled; OSError, alone or in a group, if an address or port is not available."""
         async with self.controller, asyncio.TaskGroup() as group:
-            group.create_task(self.controller.run())
+            group.create_task(self._play_robot())
             group.create_task(self.player.serve())
             group.create_task(self.load.run())
             for board in self.eit.values():
@@ -137,6 +138,11 @@ class EmulatedRig:
                 group.create_task(self.skin.run())
             if self._on_truth is not None:
                 group.create_task(self._report_truth(self._on_truth))
+
+    async def _play_robot(self) -> None:
+        async for event in self.controller.run():
+            if self._on_event is not None:
+                self._on_event(event)
 
     def command(self, text: str) -> None:
         """Execute a command; ValueError, with a sentence, for an unknown one."""
@@ -163,7 +169,7 @@ class EmulatedRig:
             case [device, *words] if device in self._devices and words:
                 self._command_device(device, " ".join(words))
             case [name, *_] if name in FAULTS:
-                apply_fault(self.controller, text)
+                self.controller.apply_fault(text)
             case _:
                 raise ValueError(f"{text!r} is no command; there are {COMMANDS}")
 
@@ -176,7 +182,7 @@ class EmulatedRig:
             raise ValueError(f"there is no device {device!r}; there are {', '.join(self._devices)}")
         kind = text.split(maxsplit=1)[0]
         if device == "robot":
-            apply_fault(self.controller, text)
+            self.controller.apply_fault(text)
         elif device == "gripper":
             self.player.command({"drop": "object none", "unplug": text.replace("unplug", "lose")}.get(kind, text))
         elif device == "load":

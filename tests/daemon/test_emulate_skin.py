@@ -108,7 +108,7 @@ def test_on_the_rig_the_robot_s_motion_shears_the_skin(tmp_path: Path) -> None:
     gripper.write(GripperRegisters(act=True, gto=True, pos=255, spe=255, force=67))
     pass_s(1.0)
     assert rig.scene.twin.state.gripped
-    robot.q_rad[5] += 0.03
+    robot.arm.q_rad[5] += 0.03
     pass_s(0.1)
     torque_nm = rig.scene.twin.state.torque_nm
     assert pushed.skin.shear_n == pytest.approx(torque_nm / 0.02)

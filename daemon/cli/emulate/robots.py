@@ -66,17 +66,17 @@ def _configure_ur(parser: argparse.ArgumentParser) -> None:
 
 def _run_ur(args: argparse.Namespace) -> int:
     from shearloop.drivers.emulators.ur.robot import Robot
-    from shearloop.drivers.emulators.ur.server import Controller, apply_fault
+    from shearloop.drivers.emulators.ur.server import Controller
 
     try:
         version = tuple(int(part) for part in args.version.split("."))
     except ValueError:
         raise UserError(f"--version {args.version} is no version; write for instance 5.17.3.0") from None
     robot = Robot(robot_make(args, version))
-    controller = Controller(robot, host=args.host, rate_hz=args.rate_hz, on_event=print_robot_event)
+    controller = Controller(robot, host=args.host, rate_hz=args.rate_hz)
 
     def on_command(line: str) -> None:
-        apply_fault(controller, line)
+        controller.apply_fault(line)
         console.print_event("obeyed", detail=line)
 
     with console.report_busy_address(f"the controller cannot listen on {args.host}", "choose another --host"):
@@ -87,7 +87,8 @@ def _run_ur(args: argparse.Namespace) -> int:
 async def _play_ur(controller: "Controller", host: str) -> None:
     async with controller:
         console.print_event("listening", detail=host)
-        await controller.run()
+        async for event in controller.run():
+            print_robot_event(event)
 
 
 def _configure_gripper(parser: argparse.ArgumentParser, printed: str) -> None:

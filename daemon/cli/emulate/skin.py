@@ -128,7 +128,7 @@ def _run_skin(args: argparse.Namespace) -> int:
     from shearloop.daemon.synthetic_skin import SyntheticSkin
     from shearloop.drivers.emulators.skin import SkinInstruments
     from shearloop.drivers.emulators.ur.robot import Robot
-    from shearloop.drivers.emulators.ur.server import Controller, apply_fault
+    from shearloop.drivers.emulators.ur.server import Controller
 
     console.check_positive(args, "speed")
     if not abs(args.sweep_n) <= 5.0:
@@ -156,7 +156,7 @@ def _run_skin(args: argparse.Namespace) -> int:
     def on_command(line: str) -> None:
         name, _, fault = line.partition(" ")
         if name == "robot" and controller is not None:
-            apply_fault(controller, fault)
+            controller.apply_fault(fault)
         elif not pushed.command(line):
             instruments.command(line)
 
@@ -170,8 +170,9 @@ async def _play(instruments: "SkinInstruments", controller: "Controller | None")
         await instruments.run()
         return
     async with controller, asyncio.TaskGroup() as group:
-        group.create_task(controller.run())
         group.create_task(instruments.run())
+        async for _ in controller.run():
+            pass
 
 
 def _configure_source(parser: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""Kinematics of a UR5e, and the emulated arm's motions, one control cycle at a time.
+"""Kinematics of a UR5e, and the emulated arm with its motions, one control cycle at a time.
 
 The Denavit-Hartenberg table is Universal Robots' own ("DH Parameters for calculations of kinematics and dynamics").
 Poses are UR's: position and rotation vector. The tool is a point on the flange's z axis, so that wrist 3 turns the tool
@@ -43,11 +43,6 @@ def jacobian(frames: list[Matrix]) -> Matrix:
     axes = np.array([frame[:3, 2] for frame in frames[:-1]])
     arms = frames[-1][:3, 3] - np.array([frame[:3, 3] for frame in frames[:-1]])
     return np.hstack([np.cross(axes, arms), axes]).T
-
-
-def pose_of(frame: Matrix) -> Vector:
-    """Return a frame as UR's pose (6,): x, y, z in m and the rotation vector in rad."""
-    return np.concatenate([frame[:3, 3], Rotation.from_matrix(frame[:3, :3]).as_rotvec()])
 
 
 class Advanced(NamedTuple):
@@ -139,3 +134,60 @@ class LinearMove:
         else:
             self._done += self._rate * dt_s
         return 1.0 if self._length <= 0 else self._done / self._length
+
+
+class Arm:
+    """The arm's joints, what moves them, and the wrench at the tool (6,) in base coordinates."""
+
+    def __init__(self, start_rad: tuple[float, ...], tool_length_m: float) -> None:
+        self.q_rad: Vector = np.array(start_rad)
+        self.qd_rad_per_s: Vector = np.zeros(6)
+        self.motion: Motion | None = None
+        self._tool_length_m = tool_length_m
+        self._frame = link_frames(self.q_rad, tool_length_m)[-1]
+        self._wrench = np.zeros(6)
+        self._wrench_zero = np.zeros(6)
+
+    @property
+    def moving(self) -> bool:
+        """Whether a joint turns."""
+        return bool(self.qd_rad_per_s.any())
+
+    @property
+    def pose(self) -> Vector:
+        """The tool's pose (6,)."""
+        return np.concatenate([self._frame[:3, 3], Rotation.from_matrix(self._frame[:3, :3]).as_rotvec()])
+
+    @property
+    def wrench(self) -> Vector:
+        """Force and torque at the tool, relative to the zero."""
+        return self._wrench - self._wrench_zero
+
+    def turn(self, target_rad_per_s: Vector, acceleration: float) -> None:
+        """Turn towards these joint speeds from now on."""
+        self.motion = Speed(target_rad_per_s, acceleration)
+
+    def move_to(self, pose: Vector, speed: float, acceleration: float) -> None:
+        """Begin a linear move."""
+        goal = np.eye(4)
+        goal[:3, :3], goal[:3, 3] = Rotation.from_rotvec(pose[3:]).as_matrix(), pose[:3]
+        self.motion = LinearMove(self._frame, goal, speed, acceleration, self._tool_length_m)
+
+    def halt(self, deceleration: float) -> None:
+        """Slow every joint down to rest."""
+        self.motion = Halt(deceleration) if self.moving else None
+
+    def advance(self, dt_s: float) -> None:
+        """Move for one cycle; `PathError` where the motion leads nowhere."""
+        if self.motion is not None:
+            self.q_rad, self.qd_rad_per_s, finished = self.motion.advance(self.q_rad, self.qd_rad_per_s, dt_s)
+            self.motion = None if finished else self.motion
+            self._frame = link_frames(self.q_rad, self._tool_length_m)[-1]
+
+    def load(self, torque_nm: float) -> None:
+        """Take a torque about the tool's axis."""
+        self._wrench = np.concatenate([np.zeros(3), torque_nm * self._frame[:3, 2]])
+
+    def zero_wrench(self) -> None:
+        """Make the present wrench zero."""
+        self._wrench_zero = self._wrench.copy()

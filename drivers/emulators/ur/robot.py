@@ -1,32 +1,41 @@
-"""The emulated controller and arm without I/O: commands, faults and time in; state and events out.
+"""The emulated controller without I/O: commands, faults and time in; state and events out.
 
 Nothing here reads a clock. A process that plays more of the rig gives the robot a `WristPlant` and steps it.
+
+`ControlScript` is ur-rtde's, played cycle by cycle after the command table in its source. Input register 0 carries a
+command; output register 0 is 1 for ready and 2 for done. `speedJ` runs in every cycle without an answer. Other commands
+run once, report 2, and wait for command 0. While one of them blocks, nothing reads the registers, so that a watchdog
+ends the program under a blocking move. A motion that starts while another thread of the script moves the arm ends the
+program, as in URScript. Commands that the driver never sends end the program.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from shearloop.drivers.emulators.ur.control_script import ControlScript
-from shearloop.drivers.emulators.ur.motion import Halt, Matrix, Motion, PathError, Vector, link_frames, pose_of
+from shearloop.drivers.emulators.ur.motion import Arm, Motion, PathError, Vector
 
 # Torque in N·m on the tool about its own axis, from the wrist's angle in rad, its speed in rad/s and the step in s.
 WristPlant = Callable[[float, float, float], float]
-Value = int | float | Sequence[float]
+# An event's name and detail.
+Event = tuple[str, str]
 
 STOPPED, PLAYING, PAUSED = 1, 2, 4
 MODE_POWER_OFF, MODE_IDLE, MODE_RUNNING = 3, 5, 7
 SAFETY_NORMAL, SAFETY_PROTECTIVE_STOP, SAFETY_EMERGENCY_STOP = 1, 3, 7
-_SAFETY_BITS = {
-    SAFETY_NORMAL: 1 << 0,
-    SAFETY_PROTECTIVE_STOP: 1 << 2 | 1 << 10,
-    SAFETY_EMERGENCY_STOP: 1 << 6 | 1 << 7 | 1 << 10,
-}
 PROGRAM_END_DECELERATION, SAFETY_DECELERATION = 10.0, 20.0
 # The longest step of the arm's motion in its own time.
 LONGEST_MOVE_S = 0.008
+
+READY, DONE = 1, 2
+MOVE_L, ZERO_FT, SPEED_J, SPEED_STOP, STOP_J, SET_WATCHDOG, END = 3, 8, 9, 15, 34, 35, 255
+ASYNC_RUNNING = 1 << 15
+COMMAND = "input_int_register_0"
+# With a number for the frequency: the script's text also has the call for its command, with a variable.
+_ARMED = re.compile(rb'rtde_set_watchdog\("input_int_register_0", ([0-9.]+), "stop"\)')
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,11 +43,9 @@ class ControllerSpec:
     """The kind of controller."""
 
     version: tuple[int, ...] = (5, 17, 3, 0)
-    serial_number: str = "20235500001"
     unlock_wait_s: float = 5.0
     power_on_s: float = 1.0
     tool_length_m: float = 0.0
-    remote_control: bool = True
     # Elbow up, the tool pointing straight down.
     start_rad: tuple[float, ...] = (0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0)
 
@@ -49,9 +56,205 @@ class RobotEvent:
 
     time_s: float
     name: str
-    detail: str = ""
-    since_command_s: float = math.nan
-    q_rad: tuple[float, ...] = field(default=())
+    detail: str
+    since_command_s: float
+    q_rad: tuple[float, ...]
+
+
+def armed_hz(text: bytes | bytearray) -> float:
+    """Return the watchdog frequency of a script that arms it before its loop, or 0."""
+    found = _ARMED.search(text)
+    return float(found[1]) if found is not None else 0.0
+
+
+class Registers:
+    """The RTDE registers by name; they outlive programs and clients."""
+
+    def __init__(self) -> None:
+        self._values: dict[str, float] = {}
+        # The last write of the command register, which is the heartbeat too.
+        self.commanded_s = 0.0
+
+    def write(self, name: str, value: float, now_s: float) -> None:
+        """Set an input register, as a client does over RTDE."""
+        self._values[name] = value
+        if name == COMMAND:
+            self.commanded_s = now_s
+
+    def put(self, name: str, value: float) -> None:
+        """Set an output register."""
+        self._values[name] = value
+
+    def number(self, name: str) -> float:
+        """Return a register."""
+        return self._values.get(name, 0)
+
+    def double(self, number: int) -> float:
+        """Return an input register of the type double."""
+        return self.number(f"input_double_register_{number}")
+
+    def vector(self) -> Vector:
+        """Return the first six input registers of the type double."""
+        return np.array([self.double(number) for number in range(6)])
+
+
+class ProgramEndedError(Exception):
+    """The script ends by itself; the message says why."""
+
+
+class ControlScript:
+    """One run of the control script, from its upload to its end."""
+
+    def __init__(self, registers: Registers, arm: Arm, watchdog_hz: float) -> None:
+        """Set the registers as the script does in its first cycle; `watchdog_hz` is 0 for one that arms none."""
+        self._registers = registers
+        self._arm = arm
+        # Heartbeats from before the program count: the manual does not say that the time begins here.
+        self._watchdog_s = 1.0 / watchdog_hz if watchdog_hz else math.inf
+        self._watched_since_s = -math.inf
+        self._executing = False
+        self._blocked_on: Motion | None = None
+        # The thread that moves the arm: "speed", "move" or none.
+        self._thread = ""
+        self._writes = self._operations = 0
+        self._report_async(running=False)
+        registers.put("output_int_register_0", READY)
+
+    def cycle(self, now_s: float) -> Event | None:
+        """Run the main loop once and return what happened; ProgramEndedError where the program ends."""
+        registers = self._registers
+        if now_s - max(registers.commanded_s, self._watched_since_s) > self._watchdog_s:
+            raise ProgramEndedError("the RTDE watchdog was not fed")
+        if self._thread == "move" and self._arm.motion is None:
+            self._end_move()
+        if self._blocked_on is not None:
+            if self._arm.motion is self._blocked_on:
+                return None
+            self._blocked_on = None
+            registers.put("output_int_register_0", DONE)
+        command = int(registers.number(COMMAND))
+        event = None
+        if command == SPEED_J:
+            self._claim_arm("speed")
+            self._arm.turn(registers.vector(), registers.double(6))
+            registers.put("output_int_register_0", READY)
+        elif command == 0:
+            self._executing = False
+            registers.put("output_int_register_0", READY)
+        elif not self._executing:
+            self._executing = True
+            event = self._run_once(command, now_s)
+            if self._blocked_on is None:
+                registers.put("output_int_register_0", DONE)
+        return event
+
+    def _run_once(self, command: int, now_s: float) -> Event | None:
+        registers = self._registers
+        asynchronous = registers.number("input_int_register_1") == 1
+        if command == MOVE_L:
+            self._end_move()
+            self._claim_arm("move")
+            self._arm.move_to(registers.vector(), registers.double(6), registers.double(7))
+            self._begin(asynchronous=asynchronous)
+        elif command == SPEED_STOP:
+            self._arm.halt(registers.double(0))
+            self._begin(asynchronous=False)
+        elif command == STOP_J:
+            self._end_move()
+            self._claim_arm("move")
+            self._arm.halt(registers.double(0))
+            self._begin(asynchronous=asynchronous)
+        elif command == ZERO_FT:
+            self._arm.zero_wrench()
+            return "wrench-zeroed", ""
+        elif command == SET_WATCHDOG:
+            self._watchdog_s, self._watched_since_s = 1.0 / registers.double(0), now_s
+            return "watchdog-armed", f"{registers.double(0):g} Hz"
+        elif command == END:
+            raise ProgramEndedError("the client ended it")
+        else:
+            raise ProgramEndedError(f"the emulated controller does not play command {command}")
+        return None
+
+    def _begin(self, *, asynchronous: bool) -> None:
+        """Go on beside the motion just begun, or wait for its end."""
+        if asynchronous:
+            self._thread = "move"
+            self._operations = (self._operations + 1) % 128
+            self._report_async(running=True)
+        else:
+            self._thread, self._blocked_on = "", self._arm.motion
+
+    def _end_move(self) -> None:
+        if self._thread == "move":
+            self._thread = ""
+            self._report_async(running=False)
+
+    def _claim_arm(self, thread: str) -> None:
+        if self._thread not in ("", thread):
+            raise ProgramEndedError("another thread is already controlling the robot")
+        self._thread = thread
+
+    def _report_async(self, *, running: bool) -> None:
+        self._writes = (self._writes + 1) % 128
+        status = (self._writes << 16) | (self._operations << 24) | (ASYNC_RUNNING if running else 0)
+        self._registers.put("output_int_register_2", status)
+
+
+class SafetyController:
+    """Safety mode, emergency stop button, power and brakes."""
+
+    def __init__(self, spec: ControllerSpec) -> None:
+        """Be switched on and safe."""
+        self._spec = spec
+        self.robot_mode, self.safety_mode = MODE_RUNNING, SAFETY_NORMAL
+        self._button_pressed = False
+        self._stopped_s = 0.0
+        self._power_step_s = math.inf
+
+    @property
+    def allows_motion(self) -> bool:
+        """Whether a program may run."""
+        return self.safety_mode == SAFETY_NORMAL and self.robot_mode == MODE_RUNNING
+
+    def pass_time(self, now_s: float) -> None:
+        """End a step of powering that has taken its time."""
+        if now_s >= self._power_step_s:
+            self._power_step_s = math.inf
+            self.robot_mode = MODE_IDLE if self.robot_mode == MODE_POWER_OFF else MODE_RUNNING
+
+    def stop(self, clock_s: float) -> None:
+        """Begin a protective stop."""
+        self.safety_mode, self._stopped_s = SAFETY_PROTECTIVE_STOP, clock_s
+
+    def unlock(self, clock_s: float) -> bool:
+        """End a protective stop; False within `unlock_wait_s` of its beginning."""
+        if self.safety_mode == SAFETY_PROTECTIVE_STOP:
+            if clock_s - self._stopped_s < self._spec.unlock_wait_s:
+                return False
+            self.safety_mode = SAFETY_NORMAL
+        return True
+
+    def press_button(self) -> None:
+        """Press the emergency stop button: the power goes off."""
+        self._button_pressed = True
+        self.safety_mode, self.robot_mode = SAFETY_EMERGENCY_STOP, MODE_POWER_OFF
+
+    def release_button(self) -> None:
+        """Release the button; the power stays off."""
+        self._button_pressed = False
+        if self.safety_mode == SAFETY_EMERGENCY_STOP:
+            self.safety_mode = SAFETY_NORMAL
+
+    def power_on(self, now_s: float) -> None:
+        """Begin to power the arm."""
+        if self.robot_mode == MODE_POWER_OFF and not self._button_pressed:
+            self._power_step_s = min(self._power_step_s, now_s + self._spec.power_on_s)
+
+    def brake_release(self, now_s: float) -> None:
+        """Begin to release the brakes of a powered arm."""
+        if self.robot_mode == MODE_IDLE:
+            self._power_step_s = min(self._power_step_s, now_s + self._spec.power_on_s)
 
 
 class Robot:
@@ -64,227 +267,118 @@ class Robot:
     def __init__(self, spec: ControllerSpec | None = None, plant: WristPlant | None = None, pace: float = 1.0) -> None:
         """Be switched on, at rest, without a program."""
         self.spec = spec or ControllerSpec()
-        self._pace = pace
-        self.plant: WristPlant = plant or (lambda _angle_rad, _speed_rad_per_s, _dt_s: 0.0)
-        self.time_s = 0.0
-        # How long its time has stood still while its clock went on.
-        self.stood_still_s = 0.0
-        self.q_rad: Vector = np.array(self.spec.start_rad)
-        self.qd_rad_per_s: Vector = np.zeros(6)
-        self.motion: Motion | None = None
-        self.events: list[RobotEvent] = []
-        self.robot_mode = MODE_RUNNING
-        self.safety_mode = SAFETY_NORMAL
+        self.arm = Arm(self.spec.start_rad, self.spec.tool_length_m)
+        self.safety = SafetyController(self.spec)
+        self.registers = Registers()
         self.runtime_state = STOPPED
-        self.remote_control = self.spec.remote_control
-        self.registers_taken = False
+        self.time_s = 0.0
+        # The controller's clock, which never stands still.
+        self.clock_s = 0.0
+        self._events: list[RobotEvent] = []
+        self._pace = pace
+        self._plant = plant
         self._script: ControlScript | None = None
-        self._registers: dict[str, float] = {}
-        self._watchdog_s = math.inf
-        self._heartbeat_s = self._commanded_s = self._safety_since_s = 0.0
-        self._power_step_s = math.inf
-        self._button_pressed = False
-        self._frames = link_frames(self.q_rad, self.spec.tool_length_m)
-        self._wrench = np.zeros(6)
-        self._wrench_zero = np.zeros(6)
-
-    @property
-    def clock_s(self) -> float:
-        """The controller's clock, which never stands still."""
-        return self.time_s + self.stood_still_s
 
     def step(self, dt_s: float) -> None:
         """Run one control cycle."""
         self.time_s += dt_s
-        if self.time_s >= self._power_step_s:
-            self._power_step_s = math.inf
-            self.robot_mode = MODE_IDLE if self.robot_mode == MODE_POWER_OFF else MODE_RUNNING
+        self.clock_s += dt_s
+        self.safety.pass_time(self.time_s)
         if self._script is not None and self.runtime_state == PLAYING:
-            if self.time_s - self._heartbeat_s > self._watchdog_s:
-                self.end_program("the RTDE watchdog was not fed")
+            try:
+                event = self._script.cycle(self.time_s)
+            except ProgramEndedError as ended:
+                self.end_program(str(ended))
             else:
-                self._script.cycle()
+                if event is not None:
+                    self._note(*event)
         parts = max(1, math.ceil(dt_s * self._pace / LONGEST_MOVE_S - 1e-9))
         for _ in range(parts):
             self._move(dt_s * self._pace / parts)
-            torque_nm = self.plant(float(self.q_rad[5]), float(self.qd_rad_per_s[5]), dt_s / parts)
-        self._wrench = np.concatenate([np.zeros(3), torque_nm * self._frames[-1][:3, 2]])
+            if self._plant is not None:
+                self.arm.load(self._plant(float(self.arm.q_rad[5]), float(self.arm.qd_rad_per_s[5]), dt_s / parts))
+
+    def stand_still(self, seconds: float) -> None:
+        """Let only the clock go on."""
+        self.clock_s += seconds
+
+    def take_events(self) -> list[RobotEvent]:
+        """Return what has happened since the last call."""
+        events, self._events = self._events, []
+        return events
 
     def _move(self, dt_s: float) -> None:
-        if self.motion is None:
-            return
-        moving = bool(self.qd_rad_per_s.any())
+        moving = self.arm.moving
         try:
-            self.q_rad, self.qd_rad_per_s, finished = self.motion.advance(self.q_rad, self.qd_rad_per_s, dt_s)
+            self.arm.advance(dt_s)
         except PathError as error:
             self.protective_stop(str(error))
-            return
-        if finished:
-            self.motion = None
-        self._frames = link_frames(self.q_rad, self.spec.tool_length_m)
-        if moving != bool(self.qd_rad_per_s.any()):
+        if moving != self.arm.moving:
             self._note("motion-stopped" if moving else "motion-started")
-
-    def upload(self, watchdog_hz: float = 0.0) -> None:
-        """Run a control script that arms its watchdog at `watchdog_hz` by itself; 0 for one that does not."""
-        if self.safety_mode != SAFETY_NORMAL or self.robot_mode != MODE_RUNNING:
-            self._note("script-refused", f"robot mode {self.robot_mode}, safety mode {self.safety_mode}")
-            return
-        if self._script is not None:
-            self.end_program("a new script arrived")
-        self._script = ControlScript(self)
-        self._watchdog_s = math.inf
-        self.runtime_state = PLAYING
-        self._note("program-started")
-        if watchdog_hz:
-            # Heartbeats from before the program count: the manual does not say that the time begins here.
-            self._watchdog_s = 1.0 / watchdog_hz
-            self._note("script-armed-watchdog", f"{watchdog_hz:g} Hz")
-
-    def end_program(self, cause: str) -> None:
-        """End the program; the arm slows down by itself."""
-        if self._script is None:
-            return
-        self._script = None
-        self._watchdog_s = math.inf
-        self.runtime_state = STOPPED
-        self._halt(PROGRAM_END_DECELERATION)
-        self._note("program-ended", cause)
-
-    def arm_watchdog(self, minimum_hz: float) -> None:
-        """End the program when input register 0 is written less often than this."""
-        self._watchdog_s = 1.0 / minimum_hz
-        self._heartbeat_s = self.time_s
-        self._note("watchdog-armed", f"{minimum_hz:g} Hz")
 
     @property
     def program_running(self) -> bool:
         """Whether a program is loaded and has not ended; a paused one counts."""
         return self._script is not None
 
+    def upload(self, watchdog_hz: float = 0.0) -> None:
+        """Run a control script that arms its watchdog at `watchdog_hz` by itself; 0 for one that does not."""
+        if not self.safety.allows_motion:
+            modes = f"robot mode {self.safety.robot_mode}, safety mode {self.safety.safety_mode}"
+            self._note("script-refused", modes)
+            return
+        self.end_program("a new script arrived")
+        self._script = ControlScript(self.registers, self.arm, watchdog_hz)
+        self.runtime_state = PLAYING
+        self._note("program-started")
+        if watchdog_hz:
+            self._note("script-armed-watchdog", f"{watchdog_hz:g} Hz")
+
+    def end_program(self, cause: str) -> None:
+        """End the program; the arm slows down by itself."""
+        if self._script is not None:
+            self._script = None
+            self.runtime_state = STOPPED
+            self.arm.halt(PROGRAM_END_DECELERATION)
+            self._note("program-ended", cause)
+
     def protective_stop(self, cause: str) -> None:
         """Stop for safety and pause the program."""
-        if self.safety_mode == SAFETY_NORMAL:
-            self._stop_for_safety(SAFETY_PROTECTIVE_STOP, "protective-stop", cause)
+        if self.safety.safety_mode == SAFETY_NORMAL:
+            self.safety.stop(self.clock_s)
+            self.arm.halt(SAFETY_DECELERATION)
+            self._note("protective-stop", cause)
             if self._script is not None:
                 self.runtime_state = PAUSED
 
     def emergency_stop(self) -> None:
         """Press the emergency stop button: the program ends and the power goes off."""
-        self._button_pressed = True
-        if self.safety_mode != SAFETY_EMERGENCY_STOP:
-            self._stop_for_safety(SAFETY_EMERGENCY_STOP, "emergency-stop", "the button is pressed")
+        if self.safety.safety_mode != SAFETY_EMERGENCY_STOP:
+            self.arm.halt(SAFETY_DECELERATION)
+            self._note("emergency-stop", "the button is pressed")
             self.end_program("emergency stop")
-            self.robot_mode = MODE_POWER_OFF
+        self.safety.press_button()
 
     def release(self) -> None:
-        """Release the button; the power stays off."""
-        self._button_pressed = False
-        if self.safety_mode == SAFETY_EMERGENCY_STOP:
-            self.safety_mode = SAFETY_NORMAL
+        """Release the emergency stop button."""
+        if self.safety.safety_mode == SAFETY_EMERGENCY_STOP:
             self._note("emergency-stop-released")
+        self.safety.release_button()
 
     def unlock(self) -> bool:
         """End a protective stop; False within `unlock_wait_s` of its beginning."""
-        if self.safety_mode != SAFETY_PROTECTIVE_STOP:
-            return True
-        if self.clock_s - self._safety_since_s < self.spec.unlock_wait_s:
-            return False
-        self.safety_mode = SAFETY_NORMAL
-        self._note("protective-stop-unlocked")
-        return True
-
-    def power_on(self) -> None:
-        """Begin to power the arm."""
-        if self.robot_mode == MODE_POWER_OFF and not self._button_pressed:
-            self._begin_power_step()
-
-    def brake_release(self) -> None:
-        """Begin to release the brakes of a powered arm."""
-        if self.robot_mode == MODE_IDLE:
-            self._begin_power_step()
+        stopped = self.safety.safety_mode == SAFETY_PROTECTIVE_STOP
+        unlocked = self.safety.unlock(self.clock_s)
+        if stopped and unlocked:
+            self._note("protective-stop-unlocked")
+        return unlocked
 
     def clear_faults(self) -> None:
-        """Be safe, powered and in remote control, without a program."""
+        """Be safe and powered, without a program."""
         self.end_program("the faults are cleared")
-        self._button_pressed = False
-        self.safety_mode, self.robot_mode = SAFETY_NORMAL, MODE_RUNNING
-        self._power_step_s = math.inf
-        self.remote_control, self.registers_taken = self.spec.remote_control, False
+        self.safety = SafetyController(self.spec)
         self._note("faults-cleared")
 
-    def write(self, name: str, value: float) -> None:
-        """Set an input register, as a client does over RTDE; registers outlive their client."""
-        self._registers[name] = value
-        if name == "input_int_register_0":
-            self._heartbeat_s = self._commanded_s = self.time_s
-
-    def number(self, name: str) -> float:
-        """Return a register."""
-        return self._registers.get(name, 0)
-
-    def put(self, name: str, value: float) -> None:
-        """Set an output register."""
-        self._registers[name] = value
-
-    def variable(self, name: str) -> Value | None:
-        """Return the value of a register or an RTDE variable, or None where it is not simulated."""
-        if "_register_" in name:
-            value = self.number(name)
-            return int(value) if "_int_" in name else value
-        compute = _VARIABLES.get(name)
-        return compute(self) if compute is not None else None
-
-    def frame(self) -> Matrix:
-        """Return the tool's frame (4, 4)."""
-        return self._frames[-1]
-
-    def pose(self) -> Vector:
-        """Return the tool's pose (6,)."""
-        return pose_of(self._frames[-1])
-
-    def wrench(self) -> Vector:
-        """Return force and torque at the tool (6,) in base coordinates, relative to the zero."""
-        return self._wrench - self._wrench_zero
-
-    def zero_wrench(self) -> None:
-        """Make the present wrench zero."""
-        self._wrench_zero = self._wrench.copy()
-        self._note("wrench-zeroed")
-
-    def _stop_for_safety(self, mode: int, name: str, cause: str) -> None:
-        self.safety_mode = mode
-        self._safety_since_s = self.clock_s
-        self._halt(SAFETY_DECELERATION)
-        self._note(name, cause)
-
-    def _begin_power_step(self) -> None:
-        if math.isinf(self._power_step_s):
-            self._power_step_s = self.time_s + self.spec.power_on_s
-
-    def _halt(self, deceleration: float) -> None:
-        self.motion = Halt(deceleration) if self.qd_rad_per_s.any() else None
-
     def _note(self, name: str, detail: str = "") -> None:
-        q_rad = tuple(float(angle) for angle in self.q_rad)
-        self.events.append(RobotEvent(self.time_s, name, detail, self.time_s - self._commanded_s, q_rad))
-
-
-_VARIABLES: dict[str, Callable[[Robot], Value]] = {
-    "timestamp": lambda r: r.clock_s,
-    "actual_q": lambda r: [*r.q_rad],
-    "target_q": lambda r: [*r.q_rad],
-    "actual_qd": lambda r: [*r.qd_rad_per_s],
-    "target_qd": lambda r: [*r.qd_rad_per_s],
-    "actual_TCP_pose": lambda r: [*r.pose()],
-    "target_TCP_pose": lambda r: [*r.pose()],
-    "actual_TCP_force": lambda r: [*r.wrench()],
-    "robot_mode": lambda r: r.robot_mode,
-    "safety_mode": lambda r: r.safety_mode,
-    "safety_status_bits": lambda r: _SAFETY_BITS[r.safety_mode],
-    "runtime_state": lambda r: r.runtime_state,
-    "robot_status_bits": lambda r: int(r.robot_mode == MODE_RUNNING) | r.program_running << 1,
-    "speed_scaling": lambda _: 1.0,
-    "target_speed_fraction": lambda _: 1.0,
-    "speed_scaling_combined": lambda _: 1.0,
-}
+        q_rad = tuple(float(angle) for angle in self.arm.q_rad)
+        self._events.append(RobotEvent(self.time_s, name, detail, self.time_s - self.registers.commanded_s, q_rad))

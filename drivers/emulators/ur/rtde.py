@@ -1,73 +1,82 @@
 """The controller's side of RTDE without I/O: bytes of one connection in, packages out (UR's RTDE guide, protocol 2)."""
 
 import math
+import re
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from shearloop.drivers.emulators.ur.robot import Robot, Value
+from shearloop.drivers.emulators.ur.motion import Vector
+from shearloop.drivers.emulators.ur.robot import (
+    COMMAND,
+    MODE_RUNNING,
+    SAFETY_EMERGENCY_STOP,
+    SAFETY_NORMAL,
+    SAFETY_PROTECTIVE_STOP,
+    Robot,
+)
 
-VERSION, URCONTROL_VERSION, TEXT = b"VvM"
-DATA, OUTPUTS, INPUTS, START, PAUSE = b"UOISP"
+Value = int | float | Sequence[float] | Vector
+
+VERSION, URCONTROL_VERSION, DATA, OUTPUTS, INPUTS, START, PAUSE = b"VvUOISP"
 _HEADER = struct.Struct(">HB")
 # The largest input recipe has 25 registers; a longer package than this is no RTDE.
 LARGEST_PACKAGE = 4096
 
-FORMATS = {
-    "UINT32": "I",
-    "UINT64": "Q",
-    "INT32": "i",
-    "DOUBLE": "d",
-    "VECTOR3D": "3d",
-    "VECTOR6D": "6d",
-    "VECTOR6INT32": "6i",
-}
+FORMATS = {"UINT32": "I", "INT32": "i", "DOUBLE": "d", "VECTOR6D": "6d"}
 _REGISTERS = 48
-_BY_TYPE = {
-    "DOUBLE": "timestamp actual_execution_time speed_scaling target_speed_fraction speed_scaling_combined "
-    "actual_momentum actual_main_voltage actual_robot_voltage actual_robot_current payload "
-    "standard_analog_input0 standard_analog_input1 standard_analog_output0 standard_analog_output1 "
-    "standard_analog_input_0 standard_analog_input_1 standard_analog_output_0 standard_analog_output_1 "
-    "speed_slider_fraction",
-    "VECTOR6D": "target_q target_qd target_qdd target_current target_moment actual_q actual_qd actual_current "
-    "joint_control_output actual_TCP_pose actual_TCP_speed actual_TCP_force target_TCP_pose target_TCP_speed "
-    "joint_temperatures actual_joint_voltage ft_raw_wrench payload_inertia actual_current_as_torque "
-    "external_force_torque",
-    "VECTOR3D": "actual_tool_accelerometer payload_cog",
-    "VECTOR6INT32": "joint_mode",
-    "UINT64": "actual_digital_input_bits actual_digital_output_bits",
-    "UINT32": "robot_status_bits safety_status_bits runtime_state speed_slider_mask",
-    "INT32": "robot_mode safety_mode safety_status",
+_REGISTER = re.compile(r"(input|output)_(int|double)_register_(\d+)")
+_SAFETY_BITS = {
+    SAFETY_NORMAL: 1 << 0,
+    SAFETY_PROTECTIVE_STOP: 1 << 2 | 1 << 10,
+    SAFETY_EMERGENCY_STOP: 1 << 6 | 1 << 7 | 1 << 10,
 }
-TYPES = {name: kind for kind, names in _BY_TYPE.items() for name in names.split()}
-for _direction in ("input", "output"):
-    for _number in range(_REGISTERS):
-        TYPES[f"{_direction}_int_register_{_number}"] = "INT32"
-        TYPES[f"{_direction}_double_register_{_number}"] = "DOUBLE"
-
+# What the driver and ur-rtde ask for: the type, and the value where it is an output.
+_VARIABLES: dict[str, tuple[str, Callable[[Robot], Value]]] = {
+    "timestamp": ("DOUBLE", lambda robot: robot.clock_s),
+    "actual_q": ("VECTOR6D", lambda robot: robot.arm.q_rad),
+    "actual_qd": ("VECTOR6D", lambda robot: robot.arm.qd_rad_per_s),
+    "actual_TCP_pose": ("VECTOR6D", lambda robot: robot.arm.pose),
+    "actual_TCP_force": ("VECTOR6D", lambda robot: robot.arm.wrench),
+    "robot_mode": ("INT32", lambda robot: robot.safety.robot_mode),
+    "safety_mode": ("INT32", lambda robot: robot.safety.safety_mode),
+    "safety_status_bits": ("UINT32", lambda robot: _SAFETY_BITS[robot.safety.safety_mode]),
+    "runtime_state": ("UINT32", lambda robot: robot.runtime_state),
+    "robot_status_bits": (
+        "UINT32",
+        lambda robot: int(robot.safety.robot_mode == MODE_RUNNING) | robot.program_running << 1,
+    ),
+    "speed_scaling": ("DOUBLE", lambda _: 1.0),
+    "external_force_torque": ("VECTOR6D", lambda _: (0.0,) * 6),
+}
 # The version that introduced a variable; an older controller answers NOT_FOUND.
-SINCE = {"ft_raw_wrench": (5, 9), "actual_current_as_torque": (5, 23), "external_force_torque": (5, 4)}
+SINCE = {"external_force_torque": (5, 4)}
 
 
 def known_type(name: str, version: tuple[int, ...]) -> str | None:
     """Return the RTDE type of a variable, or None where a controller of this version does not have it."""
-    if version[:2] < SINCE.get(name, (0, 0)):
+    register = _REGISTER.fullmatch(name)
+    if register is not None and int(register[3]) < _REGISTERS:
+        return "INT32" if register[2] == "int" else "DOUBLE"
+    if name not in _VARIABLES or version[:2] < SINCE.get(name, (0, 0)):
         return None
-    return TYPES.get(name)
+    return _VARIABLES[name][0]
 
 
-def pack(kinds: Iterable[str], values: Iterable[Value | None]) -> bytes:
-    """Return values one after the other, big-endian and without padding; None becomes zero."""
-    packed = b""
-    for kind, value in zip(kinds, values, strict=True):
-        layout = ">" + FORMATS[kind]
-        if value is None:
-            packed += bytes(struct.calcsize(layout))
-        elif isinstance(value, int | float):
-            packed += struct.pack(layout, value)
-        else:
-            packed += struct.pack(layout, *value)
-    return packed
+def variable(robot: Robot, name: str) -> Value:
+    """Return the present value of a known register or variable."""
+    if name in _VARIABLES:
+        return _VARIABLES[name][1](robot)
+    value = robot.registers.number(name)
+    return int(value) if "_int_" in name else value
+
+
+def pack(kinds: Iterable[str], values: Iterable[Value]) -> bytes:
+    """Return values one after the other, big-endian and without padding."""
+    return b"".join(
+        struct.pack(">" + FORMATS[kind], *([value] if isinstance(value, int | float) else value))
+        for kind, value in zip(kinds, values, strict=True)
+    )
 
 
 def unpack(kinds: Iterable[str], data: bytes) -> list[float] | None:
@@ -76,6 +85,17 @@ def unpack(kinds: Iterable[str], data: bytes) -> list[float] | None:
     if struct.calcsize(layout) != len(data):
         return None
     return list(struct.unpack(layout, data))
+
+
+@dataclass(frozen=True, slots=True)
+class ConnectionFaults:
+    """What a controller refuses or ignores."""
+
+    refuse_protocol: bool = False
+    registers_in_use: bool = False
+    local_control: bool = False
+    # How many of the next requests to stop the dashboard ignores.
+    stop_hangs: int = 0
 
 
 class NotRtdeError(Exception):
@@ -88,7 +108,7 @@ class RtdeSession:
 
     robot: Robot
     rate_hz: float
-    protocol_refused: bool = False
+    faults: ConnectionFaults
     _buffer: bytearray = field(default_factory=bytearray)
     _inputs: list[list[str]] = field(default_factory=list)
     _outputs: list[str] = field(default_factory=list)
@@ -120,14 +140,14 @@ class RtdeSession:
         if not self._started or self.robot.time_s < self._due_s - 1e-9:
             return b""
         self._due_s = max(self._due_s + self._period_s, self.robot.time_s)
-        return package(DATA, b"\x01" + pack(self._kinds, [self.robot.variable(name) for name in self._outputs]))
+        return package(DATA, b"\x01" + pack(self._kinds, [variable(self.robot, name) for name in self._outputs]))
 
     def _answer(self, kind: int, payload: bytes) -> bytes:
         if kind == DATA:
             self._write(payload)
             return b""
         if kind == VERSION:
-            return package(VERSION, bytes([payload == b"\x00\x02" and not self.protocol_refused]))
+            return package(VERSION, bytes([payload == b"\x00\x02" and not self.faults.refuse_protocol]))
         if kind == URCONTROL_VERSION:
             return package(URCONTROL_VERSION, struct.pack(">4I", *(*self.robot.spec.version, 0, 0, 0)[:4]))
         if kind == OUTPUTS:
@@ -135,8 +155,7 @@ class RtdeSession:
         if kind == INPUTS:
             return self._set_inputs(payload)
         if kind in (START, PAUSE):
-            self._started = kind == START
-            self._due_s = self.robot.time_s
+            self._started, self._due_s = kind == START, self.robot.time_s
             return package(kind, b"\x01")
         raise NotRtdeError(f"package type {kind}")
 
@@ -156,7 +175,7 @@ class RtdeSession:
     def _set_inputs(self, payload: bytes) -> bytes:
         names = _names(payload)
         kinds = [known_type(name, self.robot.spec.version) or "NOT_FOUND" for name in names]
-        if self.robot.registers_taken:
+        if self.faults.registers_in_use:
             kinds = ["IN_USE" if "_register_" in name else kind for name, kind in zip(names, kinds, strict=True)]
         if {"IN_USE", "NOT_FOUND"} & set(kinds):
             return package(INPUTS, b"\x00" + ",".join(kinds).encode())
@@ -173,8 +192,8 @@ class RtdeSession:
             return
         # Register 0 last: its command needs the arguments.
         pairs = list(zip(names, values, strict=False))
-        for name, value in sorted(pairs, key=lambda pair: pair[0] == "input_int_register_0"):
-            self.robot.write(name, value)
+        for name, value in sorted(pairs, key=lambda pair: pair[0] == COMMAND):
+            self.robot.registers.write(name, value, self.robot.time_s)
 
 
 def package(kind: int, payload: bytes) -> bytes:

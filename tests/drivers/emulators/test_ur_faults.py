@@ -3,7 +3,8 @@
 import pytest
 
 from shearloop.drivers.emulators.ur.robot import Robot
-from shearloop.drivers.emulators.ur.server import Controller, apply_fault
+from shearloop.drivers.emulators.ur.rtde import ConnectionFaults
+from shearloop.drivers.emulators.ur.server import Controller
 
 
 def test_faults_are_carried_out_and_ended() -> None:
@@ -13,15 +14,13 @@ def test_faults_are_carried_out_and_ended() -> None:
         "registers-in-use", "local-control", "refuse-protocol on", "stop-hangs 2", "protective-stop",
         "emergency-stop",
     ):  # fmt: skip
-        apply_fault(controller, line)
-    assert controller.stop_hangs == 2
-    assert (robot.registers_taken, robot.remote_control, controller.protocol_refused) == (True, False, True)
-    assert robot.safety_mode == 7
-    apply_fault(controller, "registers-in-use off")
-    assert not robot.registers_taken
-    apply_fault(controller, "normal")
-    assert (robot.remote_control, controller.protocol_refused, robot.safety_mode) == (True, False, 1)
-    assert controller.stop_hangs == 0
+        controller.apply_fault(line)
+    assert controller.faults == ConnectionFaults(True, True, True, 2)
+    assert robot.safety.safety_mode == 7
+    controller.apply_fault("registers-in-use off")
+    assert not controller.faults.registers_in_use
+    controller.apply_fault("normal")
+    assert (controller.faults, robot.safety.safety_mode) == (ConnectionFaults(), 1)
 
 
 @pytest.mark.parametrize(
@@ -30,4 +29,4 @@ def test_faults_are_carried_out_and_ended() -> None:
 )
 def test_unknown_fault_is_refused(line: str, said: str) -> None:
     with pytest.raises(ValueError, match=said):
-        apply_fault(Controller(Robot()), line)
+        Controller(Robot()).apply_fault(line)

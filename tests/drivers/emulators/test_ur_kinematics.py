@@ -8,14 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from shearloop.drivers.emulators.ur.motion import jacobian, link_frames, pose_of
+from shearloop.drivers.emulators.ur.motion import jacobian, link_frames
 
 angles = st.floats(-math.pi, math.pi)
 joints = st.tuples(*[angles] * 6).map(np.array)
 
 
 def test_stretched_arm_pose_follows_the_dimensions() -> None:
-    x, y, z = pose_of(link_frames(np.zeros(6), 0.0)[-1])[:3]
+    x, y, z = link_frames(np.zeros(6), 0.0)[-1][:3, 3]
     assert x == pytest.approx(-0.425 - 0.3922)
     assert y == pytest.approx(-0.1333 - 0.0996)
     assert z == pytest.approx(0.1625 - 0.0997)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shearloop.drivers.emulators.ur import control_script
+from shearloop.drivers.emulators.ur import robot as control_script
 from shearloop.drivers.emulators.ur.robot import MODE_POWER_OFF, MODE_RUNNING, PAUSED, STOPPED, ControllerSpec, Robot
 
 DT_S = 0.002
@@ -19,23 +19,23 @@ def wait(robot: Robot, seconds: float) -> None:
 
 def send(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) -> None:
     for index, number in enumerate(numbers):
-        robot.write(f"input_double_register_{index}", number)
-    robot.write("input_int_register_1", int(asynchronous))
-    robot.write("input_int_register_0", command)
+        robot.registers.write(f"input_double_register_{index}", number, robot.time_s)
+    robot.registers.write("input_int_register_1", int(asynchronous), robot.time_s)
+    robot.registers.write("input_int_register_0", command, robot.time_s)
 
 
 def do(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) -> float:
     """Carry out a command as the client does; return its duration in s."""
     send(robot, command, *numbers, asynchronous=asynchronous)
     begun_s = robot.time_s
-    while robot.number("output_int_register_0") != 2:
+    while robot.registers.number("output_int_register_0") != 2:
         robot.step(DT_S)
-        assert robot.program_running, robot.events[-1]
+        assert robot.program_running, robot._events[-1]
         assert robot.time_s < begun_s + 20
     took_s = robot.time_s - begun_s
-    robot.write("input_int_register_0", 0)
+    robot.registers.write("input_int_register_0", 0, robot.time_s)
     wait(robot, DT_S)
-    assert robot.number("output_int_register_0") == 1
+    assert robot.registers.number("output_int_register_0") == 1
     return took_s
 
 
@@ -45,7 +45,7 @@ def turn(robot: Robot, speed: float, acceleration: float = 2.0) -> None:
 
 def down(robot: Robot, metres: float = 0.2) -> list[float]:
     """Return the arguments of a linear move downwards: pose, speed, acceleration."""
-    x, y, z, *turn = robot.pose()
+    x, y, z, *turn = robot.arm.pose
     return [x, y, z - metres, *turn, 0.1, 0.5]
 
 
@@ -57,29 +57,29 @@ def started(**spec: float) -> Robot:
 
 
 def happened(robot: Robot, name: str) -> list[float]:
-    return [event.time_s for event in robot.events if event.name == name]
+    return [event.time_s for event in robot._events if event.name == name]
 
 
 def moving_asynchronously(robot: Robot) -> bool:
-    return bool(int(robot.number("output_int_register_2")) & 1 << 15)
+    return bool(int(robot.registers.number("output_int_register_2")) & 1 << 15)
 
 
 def test_speed_is_reached_with_the_acceleration_and_held() -> None:
     robot = started()
     turn(robot, 0.4)
     wait(robot, 0.1)
-    assert robot.qd_rad_per_s[5] == pytest.approx(0.2)
+    assert robot.arm.qd_rad_per_s[5] == pytest.approx(0.2)
     wait(robot, 0.9)
     # 0.4²/2·2 to get up to speed, then 0.8 s at 0.4 rad/s.
-    assert robot.q_rad[5] == pytest.approx(0.04 + 0.8 * 0.4)
-    assert not robot.qd_rad_per_s[:5].any()
+    assert robot.arm.q_rad[5] == pytest.approx(0.04 + 0.8 * 0.4)
+    assert not robot.arm.qd_rad_per_s[:5].any()
 
 
 def test_without_a_watchdog_the_speed_outlives_its_client() -> None:
     robot = started()
     turn(robot, 0.4)
     wait(robot, 3.0)
-    assert robot.qd_rad_per_s[5] == pytest.approx(0.4)
+    assert robot.arm.qd_rad_per_s[5] == pytest.approx(0.4)
 
 
 def test_watchdog_ends_the_motion_of_a_dead_client() -> None:
@@ -110,7 +110,7 @@ def test_script_may_arm_its_watchdog_by_itself() -> None:
     own_hz = control_script.armed_hz(text + b'rtde_set_watchdog("input_int_register_0", 12.5, "stop")\n')
     assert own_hz == 12.5
     robot = started()
-    robot.write("input_int_register_0", 0)
+    robot.registers.write("input_int_register_0", 0, robot.time_s)
     robot.upload(own_hz)
     wait(robot, 0.06)
     assert robot.program_running
@@ -132,15 +132,15 @@ def test_new_program_obeys_old_registers() -> None:
     wait(robot, 0.1)
     robot.end_program("test")
     wait(robot, 0.2)
-    assert not robot.qd_rad_per_s.any()
+    assert not robot.arm.qd_rad_per_s.any()
     robot.upload()
     wait(robot, 0.1)
-    assert robot.qd_rad_per_s[5] > 0, "a driver has to clear the registers"
+    assert robot.arm.qd_rad_per_s[5] > 0, "a driver has to clear the registers"
 
 
 def test_linear_move_arrives_at_the_pose_on_a_straight_line() -> None:
     robot = started(tool_length_m=0.2)
-    begin = robot.pose()
+    begin = robot.arm.pose
     target = begin.copy()
     target[:3] += (0.05, -0.03, -0.1)
     target[3:] = (Rotation.from_rotvec(begin[3:]) * Rotation.from_rotvec([0.2, 0, 0.3])).as_rotvec()
@@ -149,10 +149,10 @@ def test_linear_move_arrives_at_the_pose_on_a_straight_line() -> None:
     way = target[:3] - begin[:3]
     while moving_asynchronously(robot):
         wait(robot, 0.02)
-        off = np.cross(robot.pose()[:3] - begin[:3], way / np.linalg.norm(way))
+        off = np.cross(robot.arm.pose[:3] - begin[:3], way / np.linalg.norm(way))
         assert np.linalg.norm(off) < 1e-5
-    assert robot.pose()[:3] == pytest.approx(target[:3], abs=1e-6)
-    error = Rotation.from_rotvec(robot.pose()[3:]).inv() * Rotation.from_rotvec(target[3:])
+    assert robot.arm.pose[:3] == pytest.approx(target[:3], abs=1e-6)
+    error = Rotation.from_rotvec(robot.arm.pose[3:]).inv() * Rotation.from_rotvec(target[3:])
     assert error.magnitude() < 1e-5
     # A trapezoid: the way at 0.1 m/s and once its ramp of 0.2 s.
     assert happened(robot, "motion-stopped")[0] == pytest.approx(np.linalg.norm(way) / 0.1 + 0.2, abs=0.03)
@@ -163,20 +163,20 @@ def test_linear_move_out_of_reach_ends_in_a_protective_stop() -> None:
     send(robot, control_script.MOVE_L, 2.0, 0.0, 0.5, 0, math.pi, 0, 1.0, 1.0, asynchronous=True)
     wait(robot, 4.0)
     assert happened(robot, "protective-stop")
-    assert not robot.qd_rad_per_s.any()
+    assert not robot.arm.qd_rad_per_s.any()
 
 
 def test_asynchronous_move_is_stopped_on_command() -> None:
     robot = started()
-    z_m = robot.pose()[2]
+    z_m = robot.arm.pose[2]
     do(robot, control_script.MOVE_L, *down(robot), asynchronous=True)
     wait(robot, 0.3)
     do(robot, control_script.STOP_J, 2.0, asynchronous=True)
     assert moving_asynchronously(robot)
     wait(robot, 0.3)
     assert not moving_asynchronously(robot)
-    assert not robot.qd_rad_per_s.any()
-    assert robot.pose()[2] > z_m - 0.1
+    assert not robot.arm.qd_rad_per_s.any()
+    assert robot.arm.pose[2] > z_m - 0.1
 
 
 def test_two_threads_may_not_move_the_arm() -> None:
@@ -186,7 +186,7 @@ def test_two_threads_may_not_move_the_arm() -> None:
     send(robot, control_script.MOVE_L, *down(robot), asynchronous=True)
     wait(robot, 0.1)
     assert not robot.program_running
-    assert "another thread" in robot.events[-1].detail or "another thread" in robot.events[-2].detail
+    assert "another thread" in robot._events[-1].detail or "another thread" in robot._events[-2].detail
 
 
 def test_after_speed_stop_a_move_is_possible() -> None:
@@ -206,30 +206,30 @@ def test_protective_stop_pauses_and_is_not_unlocked_at_once() -> None:
     robot.protective_stop("test")
     wait(robot, 0.1)
     assert robot.runtime_state == PAUSED
-    assert robot.variable("safety_mode") == 3
-    assert not robot.qd_rad_per_s.any()
+    assert robot.safety.safety_mode == 3
+    assert not robot.arm.qd_rad_per_s.any()
     wait(robot, 4.8)
     assert not robot.unlock()
     wait(robot, 0.2)
     assert robot.unlock()
     wait(robot, 1.0)
-    assert not robot.qd_rad_per_s.any(), "unlocking must not resume"
+    assert not robot.arm.qd_rad_per_s.any(), "unlocking must not resume"
 
 
 def test_emergency_stop_cuts_power_that_returns_in_two_steps() -> None:
     robot = started(power_on_s=0.5)
     robot.emergency_stop()
-    robot.power_on()
+    robot.safety.power_on(robot.time_s)
     wait(robot, 1.0)
-    assert robot.robot_mode == MODE_POWER_OFF, "the button is still pressed"
+    assert robot.safety.robot_mode == MODE_POWER_OFF, "the button is still pressed"
     robot.release()
-    robot.power_on()
+    robot.safety.power_on(robot.time_s)
     wait(robot, 0.6)
     robot.upload()
     assert not robot.program_running, "the brakes are on"
-    robot.brake_release()
+    robot.safety.brake_release(robot.time_s)
     wait(robot, 0.6)
-    assert robot.robot_mode == MODE_RUNNING
+    assert robot.safety.robot_mode == MODE_RUNNING
     robot.upload()
     assert robot.program_running
 
@@ -240,13 +240,13 @@ def test_wrench_is_the_plants_torque_about_the_tool_axis() -> None:
     robot.upload()
     turn(robot, 0.5, 10.0)
     wait(robot, 1.0)
-    expected = -stiffness_nm_per_rad * robot.q_rad[5] - damping * 0.5
+    expected = -stiffness_nm_per_rad * robot.arm.q_rad[5] - damping * 0.5
     # The tool points down: its axis is -z of the base.
-    assert robot.wrench() == pytest.approx([0, 0, 0, 0, 0, -expected], abs=1e-9)
-    robot.write("input_int_register_0", 0)
+    assert robot.arm.wrench == pytest.approx([0, 0, 0, 0, 0, -expected], abs=1e-9)
+    robot.registers.write("input_int_register_0", 0, robot.time_s)
     do(robot, control_script.SPEED_STOP, 10.0)
     do(robot, control_script.ZERO_FT)
-    assert robot.wrench() == pytest.approx(np.zeros(6), abs=1e-9)
+    assert robot.arm.wrench == pytest.approx(np.zeros(6), abs=1e-9)
 
 
 def test_fast_arm_motion_keeps_the_controllers_time() -> None:
@@ -257,13 +257,13 @@ def test_fast_arm_motion_keeps_the_controllers_time() -> None:
         robot.upload()
         turn(robot, 0.1, 4.0)
         wait(robot, 0.5)
-        assert robot.qd_rad_per_s[5] == pytest.approx(0.1), "in its own time it turns at the commanded speed"
+        assert robot.arm.qd_rad_per_s[5] == pytest.approx(0.1), "in its own time it turns at the commanded speed"
         assert sum(seen) == pytest.approx(robot.time_s), "the plant's time is the controller's"
     slow, fast = robots
     assert slow.time_s == fast.time_s == pytest.approx(0.5, abs=2 * DT_S)
     lost_rad = 0.5 * 0.1**2 / 4.0  # while getting up to speed
-    assert slow.q_rad[5] == pytest.approx(0.1 * 0.5 - lost_rad, abs=0.1 * 2 * DT_S)
-    assert fast.q_rad[5] == pytest.approx(0.1 * 10.0 - lost_rad, abs=0.1 * 40 * DT_S)
+    assert slow.arm.q_rad[5] == pytest.approx(0.1 * 0.5 - lost_rad, abs=0.1 * 2 * DT_S)
+    assert fast.arm.q_rad[5] == pytest.approx(0.1 * 10.0 - lost_rad, abs=0.1 * 40 * DT_S)
     assert fast.program_running
 
 
@@ -272,4 +272,4 @@ def test_unknown_command_ends_the_program() -> None:
     send(robot, 45)
     wait(robot, DT_S)
     assert not robot.program_running
-    assert "45" in robot.events[-1].detail
+    assert "45" in robot._events[-1].detail

@@ -11,7 +11,15 @@ from hypothesis import strategies as st
 
 from shearloop.drivers.emulators.ur import server
 from shearloop.drivers.emulators.ur.robot import ControllerSpec, Robot
-from shearloop.drivers.emulators.ur.rtde import NotRtdeError, RtdeSession, pack, package, unpack
+from shearloop.drivers.emulators.ur.rtde import (
+    ConnectionFaults,
+    NotRtdeError,
+    RtdeSession,
+    pack,
+    package,
+    unpack,
+    variable,
+)
 
 GREETING = package(ord("V"), b"\x00\x02") + package(ord("v"), b"")
 COMMAND = b"input_int_register_0,input_double_register_0,"
@@ -25,7 +33,7 @@ CONVERSATION = (
 
 
 def session(**make: object) -> RtdeSession:
-    return RtdeSession(Robot(ControllerSpec(**make)), 500.0)  # type: ignore[arg-type]
+    return RtdeSession(Robot(ControllerSpec(**make)), 500.0, ConnectionFaults())  # type: ignore[arg-type]
 
 
 def replies(data: bytes) -> list[tuple[int, bytes]]:
@@ -46,8 +54,8 @@ def test_conversation_of_a_client() -> None:
         (ord("I"), b"\x01INT32,DOUBLE"),
         (ord("S"), b"\x01"),
     ]
-    assert rtde.robot.number("input_int_register_0") == 9
-    assert rtde.robot.number("input_double_register_0") == 0.25
+    assert rtde.robot.registers.number("input_int_register_0") == 9
+    assert rtde.robot.registers.number("input_double_register_0") == 0.25
     ((kind, data),) = replies(rtde.data())
     assert kind == ord("U")
     assert data[:1] == b"\x01"
@@ -62,7 +70,7 @@ def test_bytes_may_arrive_in_any_pieces(cuts: list[int]) -> None:
     edges = [0, *sorted(cuts), len(CONVERSATION)]
     got = b"".join(pieces.receive(CONVERSATION[a:b]) for a, b in pairwise(edges))
     assert got == answer
-    assert pieces.robot.number("input_double_register_0") == 0.25
+    assert pieces.robot.registers.number("input_double_register_0") == 0.25
 
 
 any_packages = st.tuples(st.sampled_from(b"VvOISPUM"), st.binary(max_size=60)).map(lambda parts: package(*parts))
@@ -96,8 +104,7 @@ def test_data_comes_at_the_rate_asked_for_and_not_before_the_start() -> None:
 
 
 def test_registers_in_use_and_unknown_variables_are_refused_by_name() -> None:
-    rtde = session(version=(5, 5, 1, 0))
-    rtde.robot.registers_taken = True
+    rtde = RtdeSession(Robot(ControllerSpec(version=(5, 5, 1, 0))), 500.0, ConnectionFaults(registers_in_use=True))
     ((_, answer),) = replies(rtde.receive(package(ord("I"), COMMAND)))
     assert answer == b"\x00IN_USE,IN_USE"
     ((_, answer),) = replies(rtde.receive(package(ord("O"), struct.pack(">d", 125.0) + b"timestamp,ft_raw_wrench")))
@@ -108,7 +115,7 @@ def test_short_vector_is_dropped() -> None:
     rtde = session()
     rtde.receive(CONVERSATION)
     rtde.receive(package(ord("U"), struct.pack(">Bi", 1, 11)))
-    assert rtde.robot.number("input_int_register_0") == 9
+    assert rtde.robot.registers.number("input_int_register_0") == 9
 
 
 @given(st.lists(st.floats(allow_nan=False), min_size=7, max_size=7), st.integers(-(2**31), 2**31 - 1))
@@ -140,6 +147,7 @@ async def test_clock_runs_on_while_the_emulator_is_paused(monkeypatch: pytest.Mo
     controller = server.Controller(robot, rate_hz=500.0)
     monkeypatch.setattr(server, "asyncio", SimpleNamespace(sleep=sleep))
     with pytest.raises(asyncio.CancelledError):
-        await controller.run()
-    assert robot.variable("timestamp") == pytest.approx(0.304, abs=0.004)
+        async for _ in controller.run():
+            pass
+    assert variable(robot, "timestamp") == pytest.approx(0.304, abs=0.004)
     assert robot.time_s == pytest.approx(0.024, abs=0.004)

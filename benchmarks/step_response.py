@@ -109,13 +109,13 @@ class RigPlant(Plant):
     def __post_init__(self) -> None:
         """Activate the gripper, stay idle, grip, and let the gel settle."""
         Plant.__post_init__(self)
-        gripper = Gripper(between=lambda _: DIAMETER_MM)
+        gripper = Gripper(object_mm=DIAMETER_MM)
         self.scene = Scene(gripper)
-        gripper.command = ACTIVATE
+        gripper.write(ACTIVATE)
         while gripper.sta != 3:
             self.step(0.0)
         self._rest(IDLE_S)
-        gripper.command = GRIP
+        gripper.write(GRIP)
         self._rest(SETTLE_S)
         self.not_valid = self.estimated = self.outside_interval = 0
 

@@ -90,25 +90,25 @@ class TwistPlayer:
         self.recorded = RecordedTwists()
         self._random = np.random.default_rng(seed)
         self._frame_of = frame_of
-        self._gripper = Gripper(between=lambda _: diameter_mm)
+        self._gripper = Gripper(object_mm=diameter_mm)
         self._scene = Scene(self._gripper)
         self._wrist_rad = 0.0
         self._due_frame_s, self._due_torque_s = FRAME_PERIOD_S, LOAD_PERIOD_S
 
     def run(self) -> None:
         """Idle, grip, twist, release."""
-        self._gripper.command = ACTIVATE
+        self._gripper.write(ACTIVATE)
         while self._gripper.sta != 3:
             self._step()
         self._hold_still(IDLE_S)
-        self._gripper.command = GRIP
+        self._gripper.write(GRIP)
         self._hold_still(SETTLE_S)
         for angle_rad in self._angles():
             self._turn_to(angle_rad, self._random.uniform(*SPEEDS_RAD_PER_S))
             self._hold_still(self._random.uniform(*HOLDS_S))
         self._turn_to(0.0, 0.2)
         self._hold_still(SETTLE_S)
-        self._gripper.command = _OPEN
+        self._gripper.write(_OPEN)
         self._hold_still(IDLE_S)
 
     def _angles(self) -> Iterator[float]:

@@ -13,8 +13,14 @@ from typing import Literal
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.boards import LOAD_PERIOD_S, EitKitBoard, Hx711Board, Sketch
-from shearloop.drivers.emulators.robotiq.gripper import Gripper
-from shearloop.drivers.emulators.robotiq.servers import URCAP_PORT, GripperPlayer, ModbusServer, UrcapServer
+from shearloop.drivers.emulators.ports import PtyServer, SocketServer
+from shearloop.drivers.emulators.robotiq.gripper import (
+    URCAP_PORT,
+    Gripper,
+    GripperPlayer,
+    modbus_server,
+    urcap_server,
+)
 from shearloop.drivers.emulators.scene import FloatArray, Joint, Scene, Truth, TwinSettings
 from shearloop.drivers.emulators.skin import Gauges, SkinInstruments
 from shearloop.drivers.emulators.ur.robot import ControllerSpec, Robot, RobotEvent
@@ -206,11 +212,11 @@ class EmulatedRig:
             seed=settings.seed,
         )
 
-    def _gripper_server(self, gripper: Gripper) -> UrcapServer | ModbusServer:
+    def _gripper_server(self, gripper: Gripper) -> SocketServer | PtyServer:
         settings = self._settings
         if settings.gripper == "modbus":
-            return ModbusServer(gripper, settings.ports["gripper"], lambda _: self._appeared("gripper"))
-        return UrcapServer(gripper, settings.host, settings.gripper_port, lambda _: self._appeared("gripper"))
+            return modbus_server(gripper, settings.ports["gripper"], lambda _: self._appeared("gripper"))
+        return urcap_server(gripper, settings.host, settings.gripper_port, lambda _: self._appeared("gripper"))
 
     def _eit_board(self, side: str, number: int) -> EitKitBoard:
         settings = self._settings

@@ -239,7 +239,7 @@ class Scene:
             wrist_rad=self._wrist_rad,
             grip_force_n=self.gripper.grip_force_n,
             width_mm=self.gripper.width_mm,
-            diameter_mm=self.gripper.between(0.0),
+            diameter_mm=self.gripper.object_mm,
             joint=self.twin.settings.joint.value,
         )
 

@@ -12,6 +12,7 @@ from shearloop.daemon.cli.emulate.skin import PushedSkin
 from shearloop.daemon.synthetic_skin import SyntheticSkin
 from shearloop.drivers.connection import Link, SerialLink, TcpLink
 from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings, RigSkin
+from shearloop.drivers.emulators.robotiq.gripper import GripperRegisters
 from shearloop.drivers.shear_skin import AdcBoard, Daq, Keithley6430, ScpiScanner, ShearSkin, SkinFault, SkinSample
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.running import pass_on, running
@@ -102,9 +103,9 @@ def test_on_the_rig_the_robot_s_motion_shears_the_skin(tmp_path: Path) -> None:
 
     pass_s(0.1)
     r1, r2 = pushed.resistances_ohm()
-    gripper.command.act = True
+    gripper.write(GripperRegisters(act=True))
     pass_s(8.0)
-    gripper.command.gto, gripper.command.pos, gripper.command.spe, gripper.command.force = True, 255, 255, 67
+    gripper.write(GripperRegisters(act=True, gto=True, pos=255, spe=255, force=67))
     pass_s(1.0)
     assert rig.scene.twin.state.gripped
     robot.q_rad[5] += 0.03

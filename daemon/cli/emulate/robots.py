@@ -1,15 +1,14 @@
 """`shearloop emulate ur`, `gripper-socket` and `gripper-modbus`: robot controller and gripper."""
 
 import argparse
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.emulate import console
 from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
+    from shearloop.drivers.emulators.ports import PtyServer, SocketServer
     from shearloop.drivers.emulators.robotiq.gripper import Gripper
-    from shearloop.drivers.emulators.robotiq.servers import GripperServer
     from shearloop.drivers.emulators.ur.robot import ControllerSpec, RobotEvent
     from shearloop.drivers.emulators.ur.server import Controller
 
@@ -115,27 +114,26 @@ def _configure_gripper_modbus(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_gripper_socket(args: argparse.Namespace) -> int:
-    from shearloop.drivers.emulators.robotiq.servers import UrcapServer
+    from shearloop.drivers.emulators.robotiq.gripper import Gripper, urcap_server
 
     if not 0 <= args.port <= 65535:
         raise UserError(f"--port {args.port} is no port; give 0 to 65535")
-    return _play_gripper(args, lambda gripper: UrcapServer(gripper, args.bind, args.port, console.print_port))
+    gripper = Gripper()
+    return _play_gripper(args, gripper, urcap_server(gripper, args.bind, args.port, console.print_port))
 
 
 def _run_gripper_modbus(args: argparse.Namespace) -> int:
-    from shearloop.drivers.emulators.robotiq.servers import ModbusServer
+    from shearloop.drivers.emulators.robotiq.gripper import Gripper, modbus_server
 
-    link = console.checked_link(args.link)
-    return _play_gripper(args, lambda gripper: ModbusServer(gripper, link, console.print_port))
+    gripper = Gripper()
+    return _play_gripper(args, gripper, modbus_server(gripper, console.checked_link(args.link), console.print_port))
 
 
-def _play_gripper(args: argparse.Namespace, make_server: Callable[["Gripper"], "GripperServer"]) -> int:
-    from shearloop.drivers.emulators.robotiq.gripper import Gripper
-    from shearloop.drivers.emulators.robotiq.servers import GripperPlayer
+def _play_gripper(args: argparse.Namespace, gripper: "Gripper", server: "SocketServer | PtyServer") -> int:
+    from shearloop.drivers.emulators.robotiq.gripper import GripperPlayer
 
     console.check_positive(args, "speed")
-    gripper = Gripper()
-    player = GripperPlayer(gripper, make_server(gripper), args.speed)
+    player = GripperPlayer(gripper, server, args.speed)
     if args.object_mm is not None:
         try:
             player.command(f"object {args.object_mm}")

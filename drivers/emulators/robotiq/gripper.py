@@ -1,25 +1,51 @@
-"""The emulated 2F-140: spindle, fingers, registers, activation, faults. No I/O; `step` passes the time."""
+"""An emulated Robotiq 2F-140: its mechanics, the URCap's socket and Modbus RTU, and a player that moves it in time.
 
+Modbus: application protocol 1.1b3 and serial line 1.02; registers: the gripper's manual, chapter 4. `Gripper`,
+`UrcapSession` and `ModbusSlave` have no I/O; `step` passes the time.
+"""
+
+import asyncio
+import struct
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from shearloop.drivers.emulators import number_between
+from shearloop.drivers.emulators.ports import Outage, PtyServer, SocketServer
 
 COUNTS_MAX = 255
 FIRST_MAJOR_FAULT = 10
-ACTIVATION_NOT_FINISHED, NOT_ACTIVATED, NO_COMMUNICATION = 5, 7, 9
-RELEASE_RUNNING, RELEASE_DONE = 11, 15
-SPEED_MM_S = (30.0, 250.0)
-FORCE_N = (10.0, 125.0)
+ACTIVATION_NOT_FINISHED, NOT_ACTIVATED, OVER_TEMPERATURE, NO_COMMUNICATION = 5, 7, 8, 9
+SPEED_MM_S, FORCE_N = (30.0, 250.0), (10.0, 125.0)
+ACTIVATION_SPEED_MM_S = 150.0
+
+URCAP_PORT = 63352
+LONGEST_LINE = 256
+_COMMANDS = {"ACT": "act", "GTO": "gto", "ATR": "atr", "POS": "pos", "SPE": "spe", "FOR": "force"}
+
+DEVICE_ID = 9
+COMMAND_REGISTERS, STATUS_REGISTERS = struct.pack(">HH", 0x03E8, 3), struct.pack(">HH", 0x07D0, 3)
+READ, WRITE = 3, 16
+ILLEGAL_FUNCTION, ILLEGAL_ADDRESS = 1, 2
+# A frame is at most 256 bytes. A pause ends it: 1.75 ms on the wire, longer on a busy host.
+LONGEST_FRAME, PAUSE_S = 256, 0.1
+
+STEP_S = 0.008
+COMMANDS = (
+    "object MM puts something of that width between the fingers, object none takes it away; "
+    "fault CODE makes the gripper report a fault, cool ends one below 10; "
+    "lose [SECONDS] breaks the connection, silence [SECONDS] leaves requests without an answer"
+)
 
 
 @dataclass(frozen=True, slots=True)
 class GripperMechanics:
-    """The ends of the fingers' range, and the speeds of activation and release."""
+    """The ends of the fingers' range."""
 
     open_counts: float = 3.0
     open_mm: float = 140.0
     closed_counts: float = 230.0
-    activation_speed_mm_s: float = 150.0
-    release_speed_mm_s: float = 30.0
 
     @property
     def mm_per_count(self) -> float:
@@ -35,44 +61,34 @@ class GripperMechanics:
         return (self.closed_counts - counts) * self.mm_per_count
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class GripperRegisters:
     """The command registers."""
 
     act: bool = False
     gto: bool = False
     atr: bool = False
-    ard: bool = False
     pos: int = 0
     spe: int = 0
     force: int = 0
 
 
 class Gripper:
-    """One gripper. Servers write `command` and read the status; `step` moves the fingers.
+    """One gripper: `write` sets the command registers, `step` moves the fingers. Closing, they stop at `object_mm`.
 
-    `between` returns the width in mm of an object that stops closing fingers with a given force in N, or None; `around`
-    does so for opening fingers. The next step takes up commands: until then the status belongs to the motion before, as
-    on the real gripper.
+    The next step takes up commands: until then the status belongs to the motion before, as on the real gripper.
     """
 
-    def __init__(
-        self,
-        mechanics: GripperMechanics | None = None,
-        between: Callable[[float], float | None] = lambda _: None,
-    ) -> None:
+    def __init__(self, mechanics: GripperMechanics | None = None, object_mm: float | None = None) -> None:
         """Start as after power-on: reset, half open."""
         self.mechanics = mechanics or GripperMechanics()
-        self.between = between
-        self.around: Callable[[float], float | None] = lambda _: None
+        self.object_mm = object_mm
+        self.powered = True
         self.command = GripperRegisters()
         # The commands that the last step has taken up.
         self.taken = GripperRegisters()
-        # The time without a request after which the gripper reports a fault; None where its master is the controller.
-        self.watchdog_s: float | None = None
-        # gOBJ: 0 moving, 1 contact opening, 2 contact closing, 3 at target; gFLT; gCU: motor current in 10 mA.
+        # gOBJ: 0 moving, 2 contact closing, 3 at target; gFLT; gCU: motor current in 10 mA.
         self.obj = self.flt = self.current = 0
-        self._silent_s = 0.0
         self._position = float(COUNTS_MAX // 2)
         # The positions that an activation has still to reach; None before it begins.
         self._to_reach: list[float] | None = None
@@ -95,7 +111,20 @@ class Gripper:
     @property
     def grip_force_n(self) -> float:
         """The force on the object between the fingers, N; 0 without one."""
-        return self._force_n() if self.obj == 2 else 0.0
+        low, high = FORCE_N
+        return low + (high - low) * self.taken.force / COUNTS_MAX if self.obj == 2 else 0.0
+
+    def write(self, registers: GripperRegisters) -> None:
+        """Set the command registers."""
+        self.command = registers
+
+    def put_between(self, object_mm: float | None) -> None:
+        """Put something of a width between the fingers, or take it away."""
+        self.object_mm = object_mm
+
+    def cut_power(self) -> None:
+        """Answer nothing more; the URCap then has no values."""
+        self.powered = False
 
     def fail(self, code: int) -> None:
         """Report a fault and stop; from 10 on only a rising edge of ACT ends it."""
@@ -106,10 +135,6 @@ class Gripper:
         if self.flt < FIRST_MAJOR_FAULT:
             self.flt = 0
 
-    def feed_watchdog(self) -> None:
-        """Note a request."""
-        self._silent_s = 0.0
-
     def status_was_read(self) -> None:
         """Note that the status was read, which clears the report of a silence."""
         if self.flt == NO_COMMUNICATION:
@@ -117,28 +142,21 @@ class Gripper:
 
     def step(self, dt_s: float) -> None:
         """Take up the command registers, then move for dt_s."""
-        self._watch(dt_s)
         self._take_up()
-        if self.flt == RELEASE_RUNNING:
-            self._release(dt_s)
-        elif self.flt >= FIRST_MAJOR_FAULT:
+        if self.flt >= FIRST_MAJOR_FAULT:
             self.current = 0
         elif self._to_reach:
-            self._activate(self._to_reach, dt_s)
-        elif self.sta == 3 and self.taken.gto and self.flt != 8:
+            if self._approach(self._to_reach[0], ACTIVATION_SPEED_MM_S, dt_s):
+                del self._to_reach[0]
+                if not self._to_reach:
+                    self.flt, self.obj = 0, 3
+        elif self.sta == 3 and self.taken.gto and self.flt != OVER_TEMPERATURE:
             low, high = SPEED_MM_S
             self._approach(float(self.taken.pos), low + (high - low) * self.taken.spe / COUNTS_MAX, dt_s)
-        else:
-            self.current = 0
-
-    def _watch(self, dt_s: float) -> None:
-        self._silent_s += dt_s
-        if self.watchdog_s is not None and self._silent_s > self.watchdog_s and self.flt == 0:
-            self.flt = NO_COMMUNICATION
 
     def _take_up(self) -> None:
         wanted, before = self.command, self.taken
-        self.taken = replace(wanted)
+        self.taken = wanted
         if not wanted.act:
             self._to_reach, self.obj, self.current = None, 0, 0
             if before.act:
@@ -148,34 +166,16 @@ class Gripper:
         elif not before.act:
             opened, closed = self.mechanics.open_counts, self.mechanics.closed_counts
             self._to_reach, self.flt = [opened, closed, opened], ACTIVATION_NOT_FINISHED
-        if wanted.atr and not before.atr and wanted.act:
-            self.flt = RELEASE_RUNNING
-
-    def _activate(self, to_reach: list[float], dt_s: float) -> None:
-        if self._approach(to_reach[0], self.mechanics.activation_speed_mm_s, dt_s):
-            del to_reach[0]
-            if not to_reach:
-                self.flt, self.obj = 0, 3
-
-    def _release(self, dt_s: float) -> None:
-        end = self.mechanics.open_counts if self.taken.ard else self.mechanics.closed_counts
-        if self._approach(end, self.mechanics.release_speed_mm_s, dt_s):
-            self.flt = RELEASE_DONE
-
-    def _force_n(self) -> float:
-        low, high = FORCE_N
-        return low + (high - low) * self.taken.force / COUNTS_MAX
 
     def _approach(self, target: float, speed_mm_s: float, dt_s: float) -> bool:
         """Move towards a position; return whether the fingers have stopped, there or at an object."""
         travel = speed_mm_s * dt_s / self.mechanics.mm_per_count
         closing = target > self._position
         # The fingers' own stops count as the target: a real gripper that closes on air reports no object.
-        target = min(max(target, self.mechanics.open_counts), self.mechanics.closed_counts)
-        width_mm = (self.between if closing else self.around)(self._force_n())
-        met = target if width_mm is None else self.mechanics.counts(width_mm)
-        stop = (min if closing else max)(target, met)
+        stop = target = min(max(target, self.mechanics.open_counts), self.mechanics.closed_counts)
         if closing:
+            if self.object_mm is not None:
+                stop = min(target, self.mechanics.counts(self.object_mm))
             # An object wider than the opening pushes the fingers apart.
             self._position = min(self._position + travel, stop)
         else:
@@ -183,9 +183,211 @@ class Gripper:
         if self._position != stop:
             self.obj, self.current = 0, 15
             return False
-        if stop == target:
-            self.obj, self.current = 3, 0
-        else:
-            self.obj = 2 if closing else 1
-            self.current = 5 + self.taken.force // 5
+        self.obj, self.current = (3, 0) if stop == target else (2, 5 + self.taken.force // 5)
         return True
+
+
+@dataclass(slots=True)
+class UrcapSession:
+    """One connection to the URCap. An invalid line gets no reply."""
+
+    gripper: Gripper
+    _buffer: bytes = field(default=b"", init=False)
+
+    def feed(self, data: bytes) -> bytes:
+        """Return the replies to the lines that `data` completes."""
+        *lines, self._buffer = (self._buffer + data).split(b"\n")
+        self._buffer = self._buffer[-LONGEST_LINE:]
+        return b"".join(self._reply(line.decode("ascii", "replace").split()) for line in lines)
+
+    def _reply(self, words: list[str]) -> bytes:
+        match words:
+            case ["GET", variable]:
+                return f"{variable} {self._get(variable)}\n".encode()
+            case ["SET", *pairs] if pairs and len(pairs) % 2 == 0:
+                return self._set(dict(zip(pairs[::2], pairs[1::2], strict=True)))
+        return b""
+
+    def _get(self, variable: str) -> str:
+        gripper = self.gripper
+        values = {
+            "ACT": int(gripper.taken.act),
+            "GTO": int(gripper.taken.gto),
+            "STA": gripper.sta,
+            "OBJ": gripper.obj,
+            "POS": gripper.pos,
+            "PRE": gripper.taken.pos,
+            "FLT": gripper.flt,
+            "COU": gripper.current,
+        }
+        if not gripper.powered or variable not in values:
+            return "?"
+        if variable == "FLT":
+            gripper.status_was_read()
+            return f"{values[variable]:02}"
+        return str(values[variable])
+
+    def _set(self, pairs: dict[str, str]) -> bytes:
+        if not pairs.keys() <= _COMMANDS.keys():
+            return b""
+        if not all(text.isdigit() and int(text) <= 255 for text in pairs.values()):
+            return b""
+        flags = ("ACT", "GTO", "ATR")
+        values = {name: bool(int(text)) if name in flags else int(text) for name, text in pairs.items()}
+        changed: dict[str, Any] = {_COMMANDS[name]: value for name, value in values.items()}
+        self.gripper.write(replace(self.gripper.command, **changed))
+        return b"ack"
+
+
+def urcap_server(
+    gripper: Gripper,
+    host: str = "127.0.0.1",
+    port: int = URCAP_PORT,
+    on_port: Callable[[str], None] = lambda _: None,
+) -> SocketServer:
+    """Return a server of the gripper's socket; `on_port` receives its address whenever it appears."""
+    return SocketServer(lambda: UrcapSession(gripper).feed, host, port, on_port)
+
+
+def crc16(data: bytes) -> bytes:
+    """Return the frame check, low byte first: CRC-16 with the polynomial 0xA001, reflected, from 0xFFFF."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+    return crc.to_bytes(2, "little")
+
+
+class ModbusSlave:
+    """The gripper's end of the serial line: its status and its command are read and written as a whole. No I/O."""
+
+    def __init__(self, gripper: Gripper) -> None:
+        self._gripper = gripper
+        self._buffer = b""
+        self._last_s = 0.0
+
+    def feed(self, data: bytes, t_s: float) -> bytes:
+        """Return the reply frames to the bytes at `t_s`; damaged requests and those to other devices get none."""
+        if t_s - self._last_s > PAUSE_S:
+            self._buffer = b""
+        self._last_s = t_s
+        self._buffer += data
+        replies = b""
+        while (length := _request_length(self._buffer)) is not None and len(self._buffer) >= length:
+            frame, self._buffer = self._buffer[:length], self._buffer[length:]
+            if crc16(frame[:-2]) != frame[-2:]:
+                # The start of the next frame is unknown.
+                self._buffer = b""
+            elif frame[0] == DEVICE_ID and self._gripper.powered:
+                answer = bytes([DEVICE_ID]) + self._answer(frame[1:-2])
+                replies += answer + crc16(answer)
+        if len(self._buffer) > LONGEST_FRAME:
+            self._buffer = b""
+        return replies
+
+    def _answer(self, request: bytes) -> bytes:
+        function, registers = request[0], request[1:5]
+        if function not in (READ, WRITE):
+            return bytes([function | 0x80, ILLEGAL_FUNCTION])
+        gripper = self._gripper
+        if function == READ and registers == STATUS_REGISTERS:
+            status = gripper.taken.act | gripper.taken.gto << 3 | gripper.sta << 4 | gripper.obj << 6
+            answer = bytes([READ, 6, status, 0, gripper.flt, gripper.taken.pos, gripper.pos, gripper.current])
+            gripper.status_was_read()
+            return answer
+        if function == WRITE and registers == COMMAND_REGISTERS and len(request) == 12:
+            action, _, _, pos, spe, force = request[6:]
+            act, gto, atr = (bool(action & 1 << bit) for bit in (0, 3, 4))
+            gripper.write(GripperRegisters(act, gto, atr, pos, spe, force))
+            return request[:5]
+        return bytes([function | 0x80, ILLEGAL_ADDRESS])
+
+
+def _request_length(buffer: bytes) -> int | None:
+    """Return the length of the request at the buffer's start, with its check, or None when too little has come."""
+    if len(buffer) < 2:
+        return None
+    if buffer[1] == WRITE:
+        return 9 + buffer[6] if len(buffer) > 6 else None
+    return 8
+
+
+def modbus_server(
+    gripper: Gripper, link: Path | None = None, on_port: Callable[[str], None] = lambda _: None
+) -> PtyServer:
+    """Return a server of the serial line on a pseudo-terminal; `on_port` receives its path whenever it appears."""
+    slave = ModbusSlave(gripper)
+    return PtyServer(lambda data: slave.feed(data, asyncio.get_running_loop().time()), link, on_port)
+
+
+class GripperPlayer:
+    """One gripper with one server, moved in real time or a multiple, with faults by commands."""
+
+    def __init__(self, gripper: Gripper, server: SocketServer | PtyServer, speed: float = 1.0) -> None:
+        self._gripper = gripper
+        self._server = server
+        self._speed = speed
+        self._outages: asyncio.Queue[float] = asyncio.Queue()
+        self._outage = Outage()
+
+    async def run(self) -> None:
+        """Play until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self.serve())
+            group.create_task(self._move())
+
+    async def serve(self) -> None:
+        """Serve until cancelled; the caller moves the gripper by its `step`."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._server.run())
+            group.create_task(self._break())
+
+    def recover(self) -> None:
+        """End outages, and a fault below 10; the client has to end one from 10 on."""
+        self._outage.end()
+        self._end_silence()
+        self._gripper.clear_minor()
+
+    def command(self, text: str) -> None:
+        """Carry out a line; ValueError, with a sentence, for an invalid one."""
+        match text.split():
+            case ["object", "none"]:
+                self._gripper.put_between(None)
+            case ["object", width]:
+                self._gripper.put_between(number_between(width, 0.0, 140.0, "not a width in mm from 0 to 140"))
+            case ["fault", code]:
+                self._gripper.fail(int(number_between(code, 0, 15, "not a fault code from 0 to 15")))
+            case ["cool"]:
+                self._gripper.clear_minor()
+            case ["lose", *seconds] if len(seconds) < 2:
+                self._outages.put_nowait(_seconds(seconds))
+            case ["silence", *seconds] if len(seconds) < 2:
+                self._server.silent = True
+                if seconds:
+                    asyncio.get_running_loop().call_later(_seconds(seconds), self._end_silence)
+            case _:
+                raise ValueError(f"{text!r} is no command; {COMMANDS}")
+
+    def _end_silence(self) -> None:
+        self._server.silent = False
+
+    async def _move(self) -> None:
+        loop = asyncio.get_running_loop()
+        last_s = loop.time()
+        while True:
+            await asyncio.sleep(STEP_S)
+            now_s = loop.time()
+            self._gripper.step((now_s - last_s) * self._speed)
+            last_s = now_s
+
+    async def _break(self) -> None:
+        while True:
+            seconds = await self._outages.get()
+            await self._server.disconnect()
+            await self._outage.wait(seconds)
+            await self._server.restore()
+
+
+def _seconds(words: list[str]) -> float:
+    return number_between(words[0], 0.0, 86400.0, "not a time in seconds from 0 to 86400") if words else 0.0

@@ -33,7 +33,7 @@ def task_of(rig: Rig, *, measures_diameters: bool = True) -> GripperTask:
 @WAYS
 async def test_cancelled_grip_can_be_released(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
-        rig.object_mm = 40.0
+        rig.model.put_between(40.0)
         task = task_of(rig)
         read = tasks.create_task(task.read())
         while rig.driver.latest is None:  # noqa: ASYNC110 - the driver is asked, as the loop is
@@ -129,7 +129,7 @@ async def test_cancelled_activation_stops_the_fingers(way: str, tmp_path: Path) 
 @WAYS
 async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S):
-        rig.object_mm = 40.0
+        rig.model.put_between(40.0)
         task = task_of(rig)
         await rig.driver.connect()
         assert await task.grip(GRIP) == ""
@@ -158,7 +158,7 @@ async def test_unlock_handles_a_fault_newer_than_the_state(way: str, tmp_path: P
 
 async def test_held_tool_has_a_diameter_while_states_are_new(tmp_path: Path) -> None:
     async with a_rig("socket", tmp_path) as rig, asyncio.timeout(DEADLINE_S):
-        rig.object_mm = 40.0
+        rig.model.put_between(40.0)
         task = task_of(rig)
         assert task.held_tool(0) is None, "nothing was read yet"
         await rig.driver.connect()

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from shearloop.drivers.emulators.robotiq.gripper import Gripper
+from shearloop.drivers.emulators.robotiq.gripper import Gripper, GripperRegisters
 from shearloop.drivers.emulators.scene import Joint, Scene, Truth, TwinSettings
 
 DT_S = 0.002
@@ -14,12 +14,11 @@ class Hands:
     """A scene and what is done with it."""
 
     def __init__(self, settings: TwinSettings = ELASTIC, speed: float = 1.0) -> None:
-        self.gripper = Gripper()
-        self.gripper.between = lambda _: 20.0
+        self.gripper = Gripper(object_mm=20.0)
         self.scene = Scene(self.gripper, settings, speed)
         self.wrist_rad = 0.0
         self.flange_nm = 0.0
-        self.gripper.command.act = True
+        self.gripper.write(GripperRegisters(act=True))
         self.wait(8.0 / speed)
 
     def wait(self, duration_s: float) -> Truth:
@@ -28,8 +27,7 @@ class Hands:
         return self.scene.truth()
 
     def go(self, position: int) -> Truth:
-        command = self.gripper.command
-        command.gto, command.pos, command.spe, command.force = True, position, 255, 67
+        self.gripper.write(GripperRegisters(act=True, gto=True, pos=position, spe=255, force=67))
         return self.wait(1.0)
 
     def twist(self, by_rad: float, duration_s: float) -> Truth:
@@ -118,7 +116,7 @@ def test_a_tool_that_falls_takes_the_torque_with_it() -> None:
     hands = Hands()
     hands.go(255)
     hands.twist(0.1, 0.1)
-    hands.gripper.between = lambda _: None
+    hands.gripper.put_between(None)
     truth = hands.wait(1.0)
     assert (truth.gripped, truth.torque_nm, truth.diameter_mm) == (False, 0.0, None)
     assert truth.width_mm == pytest.approx(0.0)

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
-from shearloop.drivers.emulators.robotiq.gripper import Gripper, GripperMechanics
-from shearloop.drivers.emulators.robotiq.servers import ModbusServer, UrcapServer
+from shearloop.drivers.emulators.ports import PtyServer, SocketServer
+from shearloop.drivers.emulators.robotiq.gripper import Gripper, GripperMechanics, modbus_server, urcap_server
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.modbus_client import ModbusClient
@@ -32,10 +32,9 @@ WAYS = pytest.mark.parametrize("way", ["socket", "modbus"])
 @dataclass
 class Rig:
     model: Gripper
-    server: UrcapServer | ModbusServer
+    server: SocketServer | PtyServer
     t_s: float = 0.0
     steps_left: int = MOST_STEPS
-    object_mm: float | None = None
     stopped: bool = False
     driver: RobotiqGripper = field(init=False)
     events: list[LinkEvent] = field(default_factory=list)
@@ -57,15 +56,15 @@ class Rig:
 @contextlib.asynccontextmanager
 async def a_rig(way: str, tmp_path: Path) -> AsyncIterator[Rig]:
     model = Gripper(MECHANICS)
-    server: UrcapServer | ModbusServer
+    server: SocketServer | PtyServer
     client: GripperClient
     if way == "socket":
-        server = UrcapServer(model, port=0)
-        await server.restore()
-        client = SocketClient("127.0.0.1", server.port, reply_deadline_s=0.2)
+        socket = server = urcap_server(model, port=0)
+        await socket.restore()
+        client = SocketClient("127.0.0.1", socket.port, reply_deadline_s=0.2)
     else:
         link = tmp_path / "gripper"
-        server = ModbusServer(model, link)
+        server = modbus_server(model, link)
         await server.restore()
         client = ModbusClient(path=str(link), reply_deadline_s=0.2)
     rig = Rig(model, server)
@@ -77,7 +76,6 @@ async def a_rig(way: str, tmp_path: Path) -> AsyncIterator[Rig]:
         on_event=rig.on_event,
         clock_ns=rig.clock_ns,
     )
-    model.between = lambda _: rig.object_mm
 
     async def pass_time() -> None:
         while True:

@@ -2,7 +2,9 @@
 
 import asyncio
 import contextlib
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -33,7 +35,7 @@ async def test_gripper_activates_moves_and_measures_an_object(way: str, tmp_path
         assert state.diameter_mm is None
         assert abs(state.width_mm - 60.0) <= abs(CALIBRATION.mm_per_count) / 2 + 1e-9
 
-        rig.object_mm = 31.7
+        rig.model.put_between(31.7)
         state = await driver.finish(await driver.move(messages.GripperCommand(0.0, force_n=40.0)))
         assert state.object is messages.ObjectStatus.CONTACT_CLOSING
         assert state.diameter_mm == pytest.approx(31.7, abs=abs(CALIBRATION.mm_per_count) / 2 + 1e-9)
@@ -42,7 +44,7 @@ async def test_gripper_activates_moves_and_measures_an_object(way: str, tmp_path
         assert state.current_ma > 0
         assert rig.model.grip_force_n == pytest.approx(40.0, abs=0.5)
         # Without the object the fingers go on to their target: what they held is no longer claimed.
-        rig.object_mm = None
+        rig.model.put_between(None)
         closed = asyncio.Event()
         while not closed.is_set():
             state = await driver.read()
@@ -57,7 +59,7 @@ async def test_old_contact_is_ignored_until_the_command_is_taken_up(way: str, tm
     async with a_rig(way, tmp_path) as rig:
         await rig.driver.connect()
         await rig.driver.activate()
-        rig.object_mm = 20.0
+        rig.model.put_between(20.0)
         await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
         rig.stopped = True
         sent = await rig.driver.move(messages.GripperCommand(100.0))
@@ -124,7 +126,7 @@ async def test_activating_an_active_gripper_moves_nothing(way: str, tmp_path: Pa
     async with a_rig(way, tmp_path) as rig:
         await rig.driver.connect()
         await rig.driver.activate()
-        rig.object_mm = 25.0
+        rig.model.put_between(25.0)
         held = await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
         again = await rig.driver.activate()
         assert again.position_counts == held.position_counts
@@ -155,19 +157,18 @@ async def test_clipping_is_reported_and_the_sent_command_returned() -> None:
 @WAYS
 @pytest.mark.parametrize("command", [{"gto": False}, {"pos": 250}], ids=["halted", "sent further"])
 async def test_command_of_another_master_is_seen_at_the_next_poll(
-    way: str, tmp_path: Path, command: dict[str, int]
+    way: str, tmp_path: Path, command: dict[str, Any]
 ) -> None:
     """Position and object stay the same, but the target is no longer ours."""
     async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
         await anext(states)
         await rig.driver.activate()
-        rig.object_mm = 20.0
+        rig.model.put_between(20.0)
         await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
         rig.stopped = True
         while (await anext(states)).object is not messages.ObjectStatus.CONTACT_CLOSING:
             pass
-        for name, value in command.items():
-            setattr(rig.model.command, name, value)
+        rig.model.write(replace(rig.model.command, **command))
         rig.model.step(STEP_S)
         assert rig.model.obj == messages.ObjectStatus.CONTACT_CLOSING
         assert (await anext(states)).diameter_mm is None

@@ -9,7 +9,7 @@ import pytest
 from pymodbus.client import AsyncModbusSerialClient
 from pymodbus.pdu import ModbusPDU
 
-from shearloop.drivers.emulators.robotiq.servers import ModbusServer, UrcapServer
+from shearloop.drivers.emulators.robotiq.gripper import ModbusSlave
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DriverError
 from shearloop.drivers.robotiq.messages import ActivationStatus, GripperCommand
 from tests.drivers.robotiq.gripper_rig import WAYS, a_rig
@@ -145,19 +145,24 @@ async def test_absent_gripper_is_explained(way: str, tmp_path: Path) -> None:
 async def test_gripper_without_power_is_not_read_as_zero(tmp_path: Path) -> None:
     async with a_rig("socket", tmp_path) as rig:
         await rig.driver.connect()
-        assert isinstance(rig.server, UrcapServer)
-        rig.server.no_data = True
+        rig.model.cut_power()
         with pytest.raises(DeviceLostError, match="no data of the gripper"):
             await rig.driver.read()
 
 
-async def test_damaged_modbus_reply_is_rejected(tmp_path: Path) -> None:
+async def test_damaged_modbus_reply_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    feed = ModbusSlave.feed
+
+    def damaged(slave: ModbusSlave, data: bytes, t_s: float) -> bytes:
+        *reply, last = feed(slave, data, t_s)
+        return bytes([*reply, last ^ 0xFF])
+
     async with a_rig("modbus", tmp_path) as rig:
         await rig.driver.connect()
-        assert isinstance(rig.server, ModbusServer)
-        rig.server.damage_next = True
-        with pytest.raises(DeviceLostError):
-            await rig.driver.read()
+        with monkeypatch.context() as patched:
+            patched.setattr(ModbusSlave, "feed", damaged)
+            with pytest.raises(DeviceLostError):
+                await rig.driver.read()
         await rig.driver.connect()
 
 
@@ -165,7 +170,6 @@ async def test_gripper_reports_a_silent_master(tmp_path: Path) -> None:
     async with a_rig("modbus", tmp_path) as rig:
         await rig.driver.connect()
         rig.stopped = True
-        rig.model.watchdog_s = 1.0
-        rig.model.step(1.1)
+        rig.model.fail(9)
         assert (await rig.driver.read()).fault.name == "no communication"
         assert (await rig.driver.read()).fault.code == 0

@@ -3,6 +3,7 @@
 Each caller names the exception to raise. Its message names the file and every mistake, with the key and allowed range.
 """
 
+import re
 from collections.abc import Hashable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -17,10 +18,43 @@ from shearloop.files import replace_file
 Model = TypeVar("Model")
 
 _LONGEST_VALUE = 60
+# Bounds on what a file may cost: its bytes, and its values with every alias written out.
+_MOST_BYTES, _MOST_VALUES = 1 << 17, 20_000
 
 
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """A SafeLoader that refuses duplicate keys, where YAML would silently keep the last."""
+class _Loader(yaml.SafeLoader):
+    """A SafeLoader that refuses duplicate keys and type tags, bounds aliases, and knows neither dates nor base 60.
+
+    Of two equal keys YAML would silently keep the last.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        # How many values each node holds, its aliases written out.
+        self._sizes: dict[yaml.Node, int] = {}
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        event: yaml.NodeEvent = self.peek_event()  # type: ignore[no-untyped-call]
+        tag = getattr(event, "tag", None)
+        if tag not in (None, "!"):
+            raise self._refusal(f"the type tag {tag} is not supported", event)
+        node = super().compose_node(parent, index)
+        if node is None:
+            return None
+        if node not in self._sizes:
+            if isinstance(event, yaml.AliasEvent):
+                raise self._refusal("an alias stands within its anchor", event)
+            pairs = node.value if isinstance(node, yaml.MappingNode) else [node.value]
+            inside = [] if isinstance(node, yaml.ScalarNode) else [each for pair in pairs for each in pair]
+            self._sizes[node] = 1 + sum(self._sizes[each] for each in inside)
+        if self._sizes[node] > _MOST_VALUES:
+            raise self._refusal(f"more than {_MOST_VALUES} values, with every alias written out", event)
+        return node
+
+    @staticmethod
+    def _refusal(problem: str, event: yaml.NodeEvent) -> yaml.MarkedYAMLError:
+        mark: Any = event.start_mark  # typed as C's marks too
+        return yaml.composer.ComposerError(None, None, problem, mark)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen: set[Hashable] = set()
@@ -34,10 +68,27 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+_INT, _FLOAT, _DATE = (f"tag:yaml.org,2002:{kind}" for kind in ("int", "float", "timestamp"))
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag not in (_INT, _FLOAT, _DATE)]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver(_INT, re.compile(r"[-+]?(0|[1-9][0-9]{0,30})$"), list("-+0123456789"))
+_Loader.add_implicit_resolver(
+    _FLOAT,
+    re.compile(
+        r"(?=.{1,40}$)[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$"
+    ),
+    list("-+.0123456789"),
+)
+
+
 def read_yaml(path: Path, raises: type[Exception], what: str = "configuration", cure: str = "") -> Any:
     """Return the content of a YAML file that is neither missing nor empty; `cure` ends the message of a missing one."""
     try:
-        content = yaml.load(path.read_text(encoding="utf-8"), _UniqueKeyLoader)  # noqa: S506 - it is a SafeLoader
+        if path.stat().st_size > _MOST_BYTES:
+            raise raises(f"{path}: the {what} is larger than {_MOST_BYTES >> 10} kB; is it another file?")
+        content = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # noqa: S506 - it is a SafeLoader
     except OSError as error:
         raise raises(f"{path}: the {what} cannot be read: {error.strerror}{cure}") from error
     except UnicodeDecodeError as error:

@@ -1,6 +1,7 @@
 """Configuration files: every mistake is reported, at once, by file, key and allowed range."""
 
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -69,6 +70,10 @@ def test_all_mistakes_are_reported_together_with_key_and_range(tmp_path):
         assert part in sentence
 
 
+# Each list holds nine of the one before it: 3 GB, if all were written out.
+ALIAS_BOMB = "a: &a [x]\n" + "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in pairwise("abcdefghij"))
+
+
 @pytest.mark.parametrize(
     ("text", "part"),
     [
@@ -82,7 +87,14 @@ def test_all_mistakes_are_reported_together_with_key_and_range(tmp_path):
             "line 3, column 1: the key `torque_limit_nm` is given",
         ),
         ("spare: {hold_s: 1, hold_s: 2}\n", "line 1, column 20: the key `hold_s` is given twice"),
-        ("mode: !!python/object/apply:os.system [ls]\n", "line 1, column 7: could not determine a constructor"),
+        ("mode: !!python/object/apply:os.system [ls]\n", "line 1, column 7: the type tag tag:yaml.org,2002:python/"),
+        ("torque_limit_nm: !!int 1:1\n", "line 1, column 18: the type tag tag:yaml.org,2002:int is not supported"),
+        ("torque_limit_nm: 2024-13-45\n", "should be a valid number, unable to parse string as a number"),
+        (f"torque_limit_nm: {'9' * 100_000}\n", "should be"),
+        (f"torque_limit_nm: {':'.join(['59'] * 40_000)}\n", "should be a valid number"),
+        ("mode: &a [*a]\n", "line 1, column 11: an alias stands within its anchor"),
+        (ALIAS_BOMB, "column 4: more than 20000 values, with every alias written out"),
+        ("#" * 131_073, "is larger than 128 kB"),
         ("? [1, 2]\n: 3\n", "line 1, column 3: found unhashable key"),
         ("mode: *other\n", "line 1, column 7: found undefined alias 'other'"),
         ("mode: \x00\n", "not a YAML file: unacceptable character"),

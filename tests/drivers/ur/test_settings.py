@@ -63,7 +63,7 @@ def test_all_mistakes_are_reported_together(tmp_path: Path) -> None:
         ),
         ("margin_rad: 0.1", "margin_rad: -1", "`limits.joints` the margin must be above 0, not -1"),
         ("limits:", "limits", "ur.yaml: line 5, column 9: could not find expected ':'"),
-        ("host: 192.168.1.10", "host: &itself [*itself]", "ur.yaml: `host` should be a valid string"),
+        ("host: 192.168.1.10", "host: &itself [*itself]", "an alias stands within its anchor"),
         ("host: 192.168.1.10", "? [1, 2]\n: 3", "column 3: found unhashable key"),
     ],
 )

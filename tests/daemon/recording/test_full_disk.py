@@ -101,8 +101,6 @@ def test_no_data_is_missing_when_the_disk_has_room_again(tmp_path: Path, disks: 
 def test_a_file_that_cannot_be_started_is_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disks: Disks
 ) -> None:
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disks: Disks
-) -> None:
     disks(0, 100_000, 0, 0, 0, 100_000)
     with pytest.raises(UserError, match="cannot record there: No space left on device"):
         Recorder(tmp_path, IDENTITY, Clock())

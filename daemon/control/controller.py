@@ -21,9 +21,11 @@ turn, and i stands still while less was sent than was wanted.
 
 import math
 from bisect import bisect_right
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 
+from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.control.settings import ControllerSettings
 from shearloop.daemon.errors import UserError
 
@@ -209,14 +211,20 @@ class TwistController:
         self._first_offset_nm = self._offset_nm
         self._rest()
 
-    def command(self, t_ns: int, wrist_angle_rad: float) -> WristCommand:
-        """Return the wrist speed for now, from the angle that the robot reports (NaN: unknown).
+    def command(self, t_ns: int, wrist_angle_rad: float, torques: Iterable[TorqueSample] = ()) -> WristCommand:
+        """Return the wrist speed for now, from the angle that the robot reports (NaN: unknown) and new torques.
 
-        The speed is 0 while anything forbids motion, and never exceeds the limit. It counts as sent until `sent`
-        corrects it.
+        The torques come after the angle, which their windows need, and before the decision. The speed is 0 while
+        anything forbids motion, and never exceeds the limit. It counts as sent until `sent` corrects it.
         """
         elapsed_ns = min(max(t_ns - self._t_ns, 0), _LONGEST_STEP_NS)
         self._t_ns = max(t_ns, self._t_ns)
+        if math.isfinite(wrist_angle_rad):
+            self._angle_rad = wrist_angle_rad
+            self._history.add(t_ns, wrist_angle_rad)
+        for torque in torques:
+            torque_nm = torque.nearest_to(self._expected_nm(self._angle_rad))
+            self.measure(torque_nm, torque.t_mid_ns, torque.t_ns)
         reasons = self._against_motion(t_ns, wrist_angle_rad)
         if reasons or self._set_point_nm is None:
             self._rest()
@@ -273,13 +281,10 @@ class TwistController:
         return jumped
 
     def _against_motion(self, t_ns: int, wrist_angle_rad: float) -> tuple[ControllerReason, ...]:
-        """Store the angle, and return everything that forbids motion now."""
+        """Return everything that forbids motion now."""
         stale_ns = self.settings.stale_periods * self.settings.sample_period_s * 1e9
         reasons = []
-        if math.isfinite(wrist_angle_rad):
-            self._angle_rad = wrist_angle_rad
-            self._history.add(t_ns, wrist_angle_rad)
-        else:
+        if not math.isfinite(wrist_angle_rad):
             reasons.append(ControllerReason.NO_ANGLE)
         if self._held:
             reasons.append(ControllerReason.HELD)

@@ -49,7 +49,7 @@ class WristController:
         self.tracked: TrackTorque | None = None
         self._config = config
         self._held = False
-        # A torque newer than the latest angle waits for the next angle.
+        # Torques wait for the next angle.
         self._pending: deque[TorqueSample] = deque(maxlen=MOST_PENDING)
         self._excitation: StiffnessExcitation | None = None
         # Speeds sent in the last `actuation_s`: time, speed, duration.
@@ -156,10 +156,7 @@ class WristController:
     def _follow(self, setpoint: TrackTorque, t_ns: int, wrist_rad: float) -> WristVelocity:
         if self.controller is None or self.tracked != setpoint:
             return WristVelocity(reasons=("the loop has not been closed",))
-        command = self.controller.command(t_ns, wrist_rad)
-        for torque in self._pending:
-            torque_nm = torque.nearest_to(self.controller.state.torque_nm)
-            self.controller.measure(torque_nm, torque.t_mid_ns, torque.t_ns)
+        command = self.controller.command(t_ns, wrist_rad, self._pending)
         self._pending.clear()
         return WristVelocity(self._bounded(command.speed_rad_per_s).speed_rad_per_s, tuple(map(str, command.reasons)))
 

@@ -1,3 +1,4 @@
+import copy
 import math
 from typing import Any
 
@@ -8,6 +9,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from shearloop.daemon.control.controller import AngleHistory, ControllerReason, ControllerRefusal, TwistController
+from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.control.settings import ControllerSettings
 from shearloop.daemon.errors import UserError
 
@@ -367,3 +369,14 @@ def test_memory_is_bounded_and_the_span_is_kept() -> None:
     newest_ns = 19_999 * STEP_NS
     assert history.mean(newest_ns - 1_000_000_000, newest_ns) == pytest.approx(0.001 * (19_999 - 62.5))
     assert history.mean(0, STEP_NS) is None
+
+
+def test_a_measurement_acts_on_the_command_of_the_same_tick() -> None:
+    """A lighter torque, whose window ends with the tick, turns the wrist faster at once."""
+    bench = running()
+    bench.measured_for(3.0)
+    now_ns, angle = bench.t_ns + 8_000_000, bench.angle + bench.speed * 0.008
+    twin = copy.deepcopy(bench.controller)
+    lighter = TorqueSample("right", 0.25 * (angle - 0.3) - 0.03, "", now_ns - 250_000_000, now_ns)
+    without = twin.command(now_ns, angle).speed_rad_per_s
+    assert bench.controller.command(now_ns, angle, [lighter]).speed_rad_per_s > without

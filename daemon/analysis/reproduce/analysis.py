@@ -27,23 +27,23 @@ from shearloop.bank.estimation.calibration import DIAMETER_DEGREE, TORQUE_DEGREE
 from shearloop.daemon.analysis.reproduce.grouping import group_means, kmeans_groups, place_in_series
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.matlab import (
-    DiameterSlices,
-    TorqueSlices,
+    DIAMETER_FOLDER,
+    RAW_FRAME,
+    RAW_HOMOGENEOUS,
+    TORQUE_FOLDER,
+    Slices,
     read_diameter_slices,
     read_line,
     read_torque_slices,
 )
-
-TORQUE_FOLDER, DIAMETER_FOLDER = "torque_slices", "diameter_slices"
-RAW_FRAME, RAW_HOMOGENEOUS = "TorqueSlice.mat", "TorqueSliceHom.mat"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inputs:
     """The slices of a folder; `raw_difference` (896,) is of one raw frame, `notes` name missing files."""
 
-    torque: TorqueSlices | None
-    diameter: DiameterSlices | None
+    torque: Slices | None
+    diameter: Slices | None
     raw_difference: FloatArray | None
     notes: tuple[str, ...]
 
@@ -118,7 +118,7 @@ class TorqueResult:
     `held_out` describe the groups and the parts.
     """
 
-    slices: TorqueSlices
+    slices: Slices
     focused: Matches
     wide: Matches
     r_focused: float | None
@@ -150,7 +150,7 @@ class DiameterResult:
     through its k.
     """
 
-    slices: DiameterSlices
+    slices: Slices
     single: Matches
     r_single: float | None
     diameters_mm: FloatArray
@@ -197,7 +197,7 @@ def _best_matches(heatmaps: FloatArray, bank: Bank) -> Matches:
     )
 
 
-def analyse_torque(slices: TorqueSlices, on_focused: Matches, on_wide: Matches) -> TorqueResult:
+def analyse_torque(slices: Slices, on_focused: Matches, on_wide: Matches) -> TorqueResult:
     """Relate sigma to torque, from the matches of at least three slices in both banks."""
     torque = slices.torque_nm
     sigma = on_focused.sigma
@@ -225,7 +225,7 @@ def analyse_torque(slices: TorqueSlices, on_focused: Matches, on_wide: Matches) 
     )
 
 
-def analyse_diameter(slices: DiameterSlices, wide: Bank, progress: Progress) -> DiameterResult:
+def analyse_diameter(slices: Slices, wide: Bank, progress: Progress) -> DiameterResult:
     """Match diameter slices, smoothed along the channels, in the wide bank and relate k to diameter."""
     single = match_slices(smoothed_along_channels(slices.differences), wide, progress)
     diameters = np.unique(slices.diameter_mm)
@@ -247,7 +247,7 @@ def analyse_diameter(slices: DiameterSlices, wide: Bank, progress: Progress) -> 
     )
 
 
-def score_models(slices: TorqueSlices, raw_difference: FloatArray | None, mesh: Mesh) -> ModelScores:
+def score_models(slices: Slices, raw_difference: FloatArray | None, mesh: Mesh) -> ModelScores:
     """Score the five basis models on a mesh against the slices and, if given, a raw (896,) difference."""
     forward = ForwardModel(mesh)
     middle = float(mesh.nodes[:, 1].min() + mesh.nodes[:, 1].max()) / 2

@@ -5,11 +5,12 @@ compiles the arithmetic, which treats a few matrices side by side.
 """
 
 from collections.abc import Callable
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 import scipy.sparse as sp
 from numba import config, njit
+from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.forward import Terms
@@ -17,6 +18,20 @@ from shearloop.bank.eit.forward import Terms
 # Matrices that are factorised together, each in its lane of a vector register.
 LANES: Final = 4
 _F = TypeVar("_F", bound=Callable[..., Any])
+
+
+class _Plan(NamedTuple):
+    """The factor's entries, column by column from the diagonal down: their rows, and where each column starts.
+
+    by_row are those of eliminated columns below the diagonal, row by row; each row starts at row_starts, and the column
+    of each ends at ends.
+    """
+
+    rows: NDArray[np.uint32]
+    starts: NDArray[np.uint32]
+    by_row: NDArray[np.uint32]
+    row_starts: NDArray[np.uint32]
+    ends: NDArray[np.uint32]
 
 
 class Elimination:
@@ -36,13 +51,12 @@ class Elimination:
         place = np.searchsorted(columns * n + rows, lower.columns * n + lower.rows)
         entries: Any = lower.values, (place, lower.source)
         self._shares = sp.csr_array(entries, shape=(len(rows), int(terms.source.max()) + 1))
-        # The entries of eliminated columns below the diagonal, row by row, and where their columns end.
         starts = np.append(0, np.cumsum(sizes))
         by_row = np.argsort(rows, kind="stable")
         by_row = by_row[(columns[by_row] < n - kept) & (columns[by_row] < rows[by_row])]
         row_starts = np.searchsorted(rows[by_row], np.arange(n + 1))
         plan = rows, starts, by_row, row_starts, starts[columns[by_row] + 1]
-        self._plan = tuple(each.astype(np.uint32) for each in plan)
+        self._plan = _Plan(*(each.astype(np.uint32) for each in plan))
 
     def schur_complements(self, factors: FloatArray) -> FloatArray:
         """Return the (n, kept, kept) Schur complements for the (n, F) factors of the entries; factor F is 1.
@@ -57,7 +71,7 @@ class Elimination:
             lanes = np.ones((some.shape[1] + 1, LANES))
             lanes[:-1, : len(some)] = some.T
             work = self._shares @ lanes
-            _factorise(*self._plan, work, self._kept)
+            _factorise(self._plan, work, self._kept)
             last = work[-len(row) :, : len(some)].T
             left[begin : begin + LANES, row, column] = left[begin : begin + LANES, column, row] = last
         return left
@@ -93,19 +107,12 @@ def _compiled(function: _F) -> _F:
 
 
 @_compiled
-def _factorise(
-    rows: IntArray,
-    starts: IntArray,
-    by_row: IntArray,
-    row_starts: IntArray,
-    ends: IntArray,
-    work: FloatArray,
-    kept: int,
-) -> None:
+def _factorise(plan: _Plan, work: FloatArray, kept: int) -> None:
     """Replace the (entries, LANES) lower triangles in `work` by Cholesky factors, and the last columns by what is left.
 
     A column begins as its own entries; each earlier column with an entry in its row then subtracts its products.
     """
+    rows, starts, by_row, row_starts, ends = plan
     n = len(starts) - 1
     column = np.empty((n, LANES))
     for k in range(n):

@@ -181,11 +181,12 @@ def _details(step: _StepSummary, run: _Run) -> str:
 
 
 def _turned(step: _StepSummary, run: _Run, truth: TorqueSeries | None) -> Iterator[str]:
+    driving = run.first["torque_source"]
     if step.wrist_from_rad is not None and step.wrist_to_rad is not None:
-        yield f"    turned by {step.wrist_to_rad - step.wrist_from_rad:+.3f} rad; torque source: {run.first['torque_source']}"
+        yield f"    turned by {step.wrist_to_rad - step.wrist_from_rad:+.3f} rad; torque source: {driving}"
     for name, series in _all_torques(run, truth).items():
         turning = series.between(step.from_ns, step.to_ns).torque_nm
-        if turning.size and name in ("true", run.first["torque_source"]):
+        if turning.size and name in ("true", driving):
             largest_nm = turning[np.abs(turning).argmax()]
             yield f"    {name:<10} {turning[-1]:+.4f} N·m at the end, {largest_nm:+.4f} at most"
 
@@ -203,8 +204,8 @@ def _held(
     truth: TorqueSeries | None,
     disturbances: list[tuple[int, str]],
 ) -> Iterator[str]:
-    held_s = (step.to_ns - from_ns) / 1e9
-    yield f"    set point {set_nm:+.3f} N·m, held for {held_s:.0f} s; torque source: {run.first['torque_source']}"
+    driving, held_s = run.first["torque_source"], (step.to_ns - from_ns) / 1e9
+    yield f"    set point {set_nm:+.3f} N·m, held for {held_s:.0f} s; torque source: {driving}"
     sources = _all_torques(run, truth)
     for name, series in sources.items():
         held = series.between(from_ns, step.to_ns).torque_nm
@@ -215,9 +216,7 @@ def _held(
                 f"within ± {BAND:.0%} for {share:.0%} of the time"
             )
     # Judge by the true torque, the load cell or another source, never by the one that drove the loop.
-    names = sorted(
-        set(sources) - {run.first["torque_source"]}, key=lambda name: (name != "true", name != LOAD_CELL, name)
-    )
+    names = sorted(set(sources) - {driving}, key=lambda name: (name != "true", name != LOAD_CELL, name))
     if not names:
         return
     judge = sources[names[0]]

@@ -17,7 +17,7 @@ from pathlib import Path
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.errors import BankError
-from shearloop.bank.estimation import FrameSeries, Name, Physics, fit
+from shearloop.bank.estimation import FrameSeries, Name, Physics, fit, measure_timing
 from shearloop.daemon.analysis.evaluate import EstimateTrack, draw_tracks, estimate_series, figures_of
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.cli.demo_calibration import calibrate, record
@@ -93,7 +93,9 @@ def later_frames(
             if name == "paper" and split.past.kind == "raw":
                 continue
             try:
-                calibration = fit(name, [split.past], split.title, physics, timed_by=split.timed_by)
+                calibration = fit(
+                    name, [split.past], split.title, physics, timing=measure_timing([split.past], split.timed_by)
+                )
             except BankError as error:
                 print(f"{split.title}, {name}: {error}")
                 continue
@@ -112,7 +114,8 @@ def other_day(recordings: Path, scratch: Path) -> Iterator[tuple[str, Figures | 
         for sides in FINGERTIPS:
             title = f"{name}, {' and '.join(sides)}"
             try:
-                calibration = fit(DEFAULT, [series.select_sides(sides)], name, timed_by=[series])
+                chosen = [series.select_sides(sides)]
+                calibration = fit(DEFAULT, chosen, name, timing=measure_timing(chosen, [series]))
             except BankError as error:
                 yield title, str(error)
                 continue

@@ -38,8 +38,8 @@ from shearloop.daemon.analysis.charts.simulated_loop import (
 )
 from shearloop.daemon.cli.demo_calibration import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
 from shearloop.daemon.control.creep import Creep, Stretch, fit_creep
+from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.control.margins import margin_refusal
-from shearloop.daemon.control.settings import LoopConfig
 from shearloop.daemon.synthetic_frames import RigFrames
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 from shearloop.drivers.emulators.gripper import Gripper

@@ -24,8 +24,7 @@ from shearloop.daemon.messaging.addresses import local_stop_address
 from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import CurveAuthenticator, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
-from shearloop.daemon.recording.identity import AttachedFile, daemon_identity, experiment_notes
-from shearloop.daemon.recording.recorder import Recorder
+from shearloop.daemon.recording.recorder import AttachedFile, Recorder, daemon_identity, experiment_notes
 from shearloop.daemon.rig import Rig, check_experiment, load_cell_calibration
 from shearloop.daemon.sensing.estimators import COMBINED, LiveEstimator, open_combined, open_estimator, torque_sources
 from shearloop.daemon.sensing.fingertip_task import CombinedFingertipTask, EstimatorTask, FingertipTask
@@ -196,7 +195,7 @@ class Daemon:
             self._experiment = ConfiguredExperiment(self._config.experiment, self.start_experiment, ended)
             self._add("experiment", partial(self._run_experiment, self._experiment))
         if self._recorder is not None:
-            self._add("recording", self._recorder.run, self._recorder.diagnostics)
+            self._add("recording", partial(self._record, self._recorder), self._recorder.diagnostics)
         self._add("commands", self._commands.run, self._command_diagnostics)
         if self._authenticator is not None:
             self._add("keys", self._authenticator.run)
@@ -280,13 +279,7 @@ class Daemon:
         """Return the recorder, if one is configured; raises UserError if it cannot write."""
         if self._config.recording is None:
             return None
-        recorder = Recorder(
-            self._config.recording.folder,
-            daemon_identity(self._config),
-            self._clock,
-            is_busy=self._experiment_runs,
-            on_failure=self._on_recording_error,
-        )
+        recorder = Recorder(self._config.recording.folder, daemon_identity(self._config), self._clock)
         self.publisher.add_listener(recorder.record_message)
         return recorder
 
@@ -296,13 +289,10 @@ class Daemon:
     def _on_link(self, device: str) -> Callable[[LinkEvent], None]:
         return self._rig.on_link(device) if self._rig is not None else partial(log_link, device)
 
-    def _experiment_runs(self) -> bool:
-        experiment = self._rig.control_loop.experiment if self._rig is not None else None
-        return experiment is not None and experiment.running
-
-    def _on_recording_error(self, error: str) -> None:
-        if self._rig is not None:
-            self._rig.control_loop.inputs.recording_error = error
+    async def _record(self, recorder: Recorder) -> None:
+        async for failure in recorder.flushes():
+            if self._rig is not None:
+                self._rig.control_loop.inputs.recording_error = failure
 
     def _log_recordings(self) -> None:
         if self._recorder is None:

@@ -3,19 +3,23 @@
 from shearloop.bank.estimation.calibration import NAMES, Calibration, Name
 from shearloop.bank.estimation.fitting import fit
 from shearloop.bank.estimation.fitting_raw import Physics
+from shearloop.bank.estimation.load_delay import TRUSTED, LoadTiming, measure_timing
 from shearloop.bank.estimation.session import EstimatorSession
 from shearloop.bank.estimation.values import Estimate, FrameSeries, Measured, TactileFrame, combine
 
 __all__ = [
     "NAMES",
+    "TRUSTED",
     "Calibration",
     "Estimate",
     "EstimatorSession",
     "FrameSeries",
+    "LoadTiming",
     "Measured",
     "Name",
     "Physics",
     "TactileFrame",
     "combine",
     "fit",
+    "measure_timing",
 ]

@@ -9,9 +9,8 @@ second). Emulated rigs without the filter give −0.08 to 0.05 s.
 """
 
 import contextlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TypeAlias
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.fingertip_validator import channel_noise
 from shearloop.bank.estimation.grip_segmentation import segment_grip
 from shearloop.bank.estimation.regressors import left_out_blocks
-from shearloop.bank.estimation.values import FrameSeries
+from shearloop.bank.estimation.values import FrameSeries, check_finite
 
 _STEP_S = 0.06
 _SHIFTS_S = np.round(np.arange(-6.0, 6.01, _STEP_S), 2)
@@ -58,89 +57,100 @@ _NOISE_READINGS, _LEAST_QUIET = 64, 4
 
 @dataclass(frozen=True, slots=True)
 class LoadDelay:
-    """Delay of the torques after the frames' motion in s, its standard error, and the explained share of change."""
+    """Delay of the torques after the frames' motion in s, its standard error, and the explained share of change.
+
+    few_frames is the number of gripped frames where they are too few to be sure, else 0.
+    """
 
     delay_s: float
     error_s: float
     explained: float
+    few_frames: int = 0
 
 
-def find_load_delay(series: FrameSeries) -> LoadDelay | None:
-    """Return the delay of the torques of raw frames; None where no shift stands out, as with few changes of load."""
-    part = segment_grip(series)[1]
-    return _best_side(series, part) if len(series.t_s[part]) >= _SURE_FRAMES else None
+@dataclass(frozen=True, slots=True)
+class LoadTiming:
+    """The series that show the torques' delay, the delay in each, and how far in s the torques may be off unnoticed.
+
+    warnings are doubts about each series' times, empty without any. Without references the user guarantees the timing.
+    """
+
+    references: Sequence[FrameSeries] = ()
+    delays: Sequence[LoadDelay | None] = ()
+    warnings: Sequence[str] = ()
+    uncertainty_s: float = 0.0
 
 
-# `find_load_delay`, or a cached version: it takes up to some tenths of a second per recording.
-DelayFinder: TypeAlias = Callable[[FrameSeries], LoadDelay | None]
+TRUSTED = LoadTiming()
 
 
-def check_load_delay(recordings: Sequence[FrameSeries], find: DelayFinder = find_load_delay) -> None:
-    """Raise CalibrationError for a recording with torques clearly stamped at other times than its frames."""
-    for one in recordings:
-        found = find(one)
-        if found is not None and (unusual := _unusual(one, found)):
+def measure_timing(recordings: Sequence[FrameSeries], others: Sequence[FrameSeries] = ()) -> LoadTiming:
+    """Return the timing of the torques of raw recordings: by themselves if any shows it, else by other fingertips'.
+
+    One clock has stamped them all. Another fingertip's board may have been dead, garbled or away: then it shows
+    nothing. Raises CalibrationError for a recording without torque, with values that are not finite, or with torques
+    clearly stamped at other times than its frames.
+    """
+    if not recordings or any(one.kind != "raw" for one in recordings):
+        return TRUSTED
+    check_finite(recordings)
+    timed = [(one, find_load_delay(one)) for one in recordings]
+    if not any(_is_sure(delay) for _, delay in timed):
+        shown = []
+        for one in others:
+            with contextlib.suppress(CalibrationError):
+                if np.isfinite(one.channels).all() and _is_sure(delay := find_load_delay(one)):
+                    shown.append((one, delay))
+        timed = shown or timed
+    sure = [delay if _is_sure(delay) else None for _, delay in timed]
+    for (one, _), delay in zip(timed, sure, strict=True):
+        if delay is not None and (unusual := _unusual(one, delay)):
             what, usual_s = unusual
             raise CalibrationError(
                 f"{what}, and this load cell's own delay is {usual_s:.2f} s: a calibration would learn the torque of "
                 "another moment; correct the load cell's clock and record again, or calibrate with "
-                f"--load-cell-delay-s {found.delay_s - usual_s:.2f}"
+                f"--load-cell-delay-s {delay.delay_s - usual_s:.2f}"
             )
+    error_s = min((delay.error_s for delay in sure if delay is not None), default=np.inf)
+    uncertainty_s = min(TWO_SIDED_95 * error_s, _UNCHECKED_S) if error_s > _LARGE_ERROR_S else 0.0
+    return LoadTiming([one for one, _ in timed], sure, [_doubt(*one) for one in timed], uncertainty_s)
 
 
-def load_delay_warning(series: FrameSeries, find: DelayFinder = find_load_delay) -> str:
-    """Return a doubt about the times of a recording's torques, empty without any.
+def find_load_delay(series: FrameSeries) -> LoadDelay | None:
+    """Return the delay of the torques of raw frames; None where no shift stands out, as with few changes of load.
 
-    With few gripped frames a peak elsewhere can be chance, so it is a warning and not a refusal.
+    It takes up to some tenths of a second. Raises CalibrationError for a recording without torque.
     """
+    part = segment_grip(series)[1]
+    if (n := len(series.t_s[part])) < _WARN_FRAMES:
+        return None
+    sides = (_delay_of_side(series, part, layer) for layer in range(len(series.sides)))
+    best = max((one for one in sides if one is not None), key=lambda one: one.explained, default=None)
+    return best if best is None or n >= _SURE_FRAMES else replace(best, few_frames=n)
+
+
+def load_delay_warning(series: FrameSeries) -> str:
+    """Return a doubt about the times of a recording's torques, empty without any."""
     if series.kind != "raw" or not np.abs(series.torque_nm).any():
         return ""
     try:
-        part = segment_grip(series)[1]
+        return _doubt(series, find_load_delay(series))
     except CalibrationError:
         return ""
-    n = len(series.t_s[part])
-    found = _best_side(series, part) if _WARN_FRAMES <= n < _SURE_FRAMES else find(series)
-    if found is None or (n < _SURE_FRAMES and found.explained < _WARN_EXPLAINED):
+
+
+def _doubt(series: FrameSeries, found: LoadDelay | None) -> str:
+    """Return why a delay is unusual. With few gripped frames it can be chance: a warning and not a refusal."""
+    if found is None or (found.few_frames and found.explained < _WARN_EXPLAINED):
         return ""
     if not (unusual := _unusual(series, found)):
         return ""
     what, usual_s = unusual
-    sure = "" if n >= _SURE_FRAMES else f" (though {n} gripped frames are too few to be sure)"
+    sure = f" (though {found.few_frames} gripped frames are too few to be sure)" if found.few_frames else ""
     return (
         f"{what}{sure}; check the load cell's clock, or calibrate with --load-cell-delay-s "
         f"{found.delay_s - usual_s:.2f}"
     )
-
-
-def timing_references(
-    recordings: Sequence[FrameSeries], others: Sequence[FrameSeries], find: DelayFinder = find_load_delay
-) -> Sequence[FrameSeries]:
-    """Return the series that show the torques' delay: the recordings if any does, else other fingertips' that do.
-
-    Another fingertip's board may have been dead, garbled or away: then it shows nothing.
-    Raises CalibrationError for a recording without torque.
-    """
-    if any(find(one) is not None for one in recordings):
-        return recordings
-    showing = []
-    for one in others:
-        with contextlib.suppress(CalibrationError):
-            if np.isfinite(one.channels).all() and find(one) is not None:
-                showing.append(one)
-    return showing or recordings
-
-
-def timing_uncertainty_s(recordings: Sequence[FrameSeries], find: DelayFinder = find_load_delay) -> float:
-    """Return how far in s the torques of raw frames may be off unnoticed; 0 where any recording shows the delay.
-
-    One clock has stamped them all. Raises CalibrationError for a recording without torque.
-    """
-    errors_s = [found.error_s for one in recordings if (found := find(one)) is not None]
-    if not errors_s:
-        return _UNCHECKED_S
-    least_s = min(errors_s)
-    return min(TWO_SIDED_95 * least_s, _UNCHECKED_S) if least_s > _LARGE_ERROR_S else 0.0
 
 
 def torque_bounds(series: FrameSeries, uncertainty_s: float) -> tuple[FloatArray, FloatArray]:
@@ -188,9 +198,8 @@ def is_filtered(torque_nm: FloatArray) -> bool | None:
     return False if next_one < -0.35 and one_after > -0.15 else None
 
 
-def _best_side(series: FrameSeries, part: slice) -> LoadDelay | None:
-    found = [one for layer in range(len(series.sides)) if (one := _delay_of_side(series, part, layer)) is not None]
-    return max(found, key=lambda one: one.explained, default=None)
+def _is_sure(found: LoadDelay | None) -> bool:
+    return found is not None and not found.few_frames
 
 
 def _delay_of_side(series: FrameSeries, part: slice, layer: int) -> LoadDelay | None:

@@ -143,6 +143,19 @@ class Estimate:
     lag_s: float = 0.0
 
 
+def check_finite(recordings: Sequence[FrameSeries]) -> None:
+    """Raise CalibrationError for a recording without frames, or with values that are not finite."""
+    for number, one in enumerate(recordings, 1):
+        which = f"recording {number} of {len(recordings)}"
+        if not len(one.t_s):
+            raise CalibrationError(f"{which} has no frames to calibrate on; leave it out, or use a longer part of it")
+        # A slice without a torque may be of a cylinder.
+        torque = one.torque_nm if one.kind == "raw" else np.zeros(0)
+        wrong = sum(int(np.count_nonzero(~np.isfinite(values))) for values in (one.t_s, one.channels, torque))
+        if wrong:
+            raise CalibrationError(f"{which} holds {wrong} values that are not finite numbers; leave those frames out")
+
+
 def distinct(measured: Sequence[Measured]) -> list[Measured]:
     """Return the most certain measurement of each thing, by rising value.
 

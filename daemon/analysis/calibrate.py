@@ -1,12 +1,11 @@
-"""Calibrates an estimator on recordings and reports on the result in sentences."""
+"""Calibrates an estimator on recordings."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
-from math import isnan
 from pathlib import Path
 
-from shearloop.bank.estimation import Calibration, FrameSeries, Name, Physics, fit, load_delay
+from shearloop.bank.estimation import TRUSTED, Calibration, FrameSeries, LoadTiming, Name, Physics, fit, measure_timing
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor
 from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, part_of, read_series, series_of
 from shearloop.daemon.errors import UserError
@@ -31,17 +30,71 @@ class CalibrationOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class CalibrationReport:
-    """A calibration with the result for scripts and the sentences for the user."""
+class CalibrationResult:
+    """A calibration, the number of frames behind it, the load cell's timing, and named doubts about it."""
 
     calibration: Calibration
-    result: dict[str, object]
-    sentences: list[str]
+    frames: int
+    timing: LoadTiming = TRUSTED
+    doubts: Sequence[str] = ()
+
+    @property
+    def quantities(self) -> list[str]:
+        """The calibrated quantities."""
+        return [name for name in ("torque", "diameter") if getattr(self.calibration, name) is not None]
+
+    @property
+    def regressor(self) -> IntervalRegressor | None:
+        """The torque's regressor, None without a torque."""
+        regressor = self.calibration.torque.regressor if self.calibration.torque is not None else None
+        return regressor if isinstance(regressor, IntervalRegressor) else None
+
+    @property
+    def reads_beyond(self) -> bool | None:
+        """Whether torques beyond the calibrated ones are seen to be beyond; None where that was not tested."""
+        one, calibration = self.regressor, self.calibration
+        if one is None or calibration.kind == "raw" or "full range" in calibration.assumptions:
+            return None
+        return not (one.low_end > one.low or one.high_end < one.high)
+
+    @property
+    def tool_mm(self) -> float | None:
+        """The diameter of the only tool in the recordings, None where it is not known."""
+        return None if math.isnan(self.calibration.tool_mm) else self.calibration.tool_mm
+
+    @property
+    def widening(self) -> float | None:
+        """The factor on the loads' intervals for unknown times, None where they are known."""
+        known = self.regressor is None or not self.timing.uncertainty_s
+        return None if known or self.regressor is None else round(self.regressor.timing_widening, 2)
+
+    def figures(self) -> dict[str, object]:
+        """Return the result for scripts."""
+        calibration, timing = self.calibration, self.timing
+        found: dict[str, object] = {
+            "estimator": calibration.estimator,
+            "quantities": self.quantities,
+            "frames": self.frames,
+            "sides": list(calibration.sides),
+            "source": calibration.source,
+            "assumptions": list(calibration.assumptions),
+        }
+        if self.regressor is not None:
+            found["sees_loads"] = not self.regressor.misses_loads
+        if self.reads_beyond is not None:
+            found["reads_beyond"] = self.reads_beyond
+        if timing.references:
+            found["load_cell_delay_s"] = [one and round(one.delay_s, 3) for one in timing.delays]
+            found["load_cell_warnings"] = list(self.doubts)
+            found["timing_uncertainty_s"] = round(timing.uncertainty_s, 3)
+        if self.widening is not None:
+            found["widening"] = self.widening
+        return found | ({"tool_mm": self.tool_mm} if calibration.kind == "raw" else {})
 
 
 def calibrate(
     paths: Sequence[Path], estimator: Name, physics: Physics, options: CalibrationOptions
-) -> CalibrationReport:
+) -> CalibrationResult:
     """Fit an estimator to recordings or folders of slices, oldest first.
 
     Raises UserError for options that do not fit the recordings, and CalibrationError for recordings that determine no
@@ -49,49 +102,39 @@ def calibrate(
     """
     check_paths_differ(paths)
     delay_s = options.load_cell_delay_s
-    series = [(path, one) for path in paths for one in read_series(path, options.sides, options.tool_mm)]
-    parts = [part_of(one, *options.time_range) for _, one in series]
-    check_no_copies([(str(path), part) for (path, _), part in zip(series, parts, strict=True)])
+    chosen: list[tuple[Path, FrameSeries]] = []
+    others: list[tuple[str, FrameSeries]] = []
+    for path in paths:
+        own, beside = _read(path, options)
+        chosen += [(path, part_of(one, *options.time_range)) for one in own]
+        others += [(f"{path.name}, {one.sides[0]}", part_of(one, *options.time_range)) for one in beside]
+    parts = [part for _, part in chosen]
+    check_no_copies([(str(path), part) for path, part in chosen])
     _check_options(options, parts)
     if delay_s:
         parts = [replace(one, torque_t_s=one.torque_t_s - delay_s) for one in parts]
-    others = _other_sides(paths, options) if options.sides is not None and delay_s is None else []
-    find_delay = cache(load_delay.find_load_delay)
+    timing = TRUSTED if delay_s is not None else measure_timing(parts, [one for _, one in others])
     calibration = fit(
-        estimator,
-        parts,
-        _source(paths, options),
-        physics,
-        trust_times=delay_s is not None,
-        full_range=options.assume_full_range,
-        timed_by=[one for _, one in others],
-        find_delay=find_delay,
+        estimator, parts, _source(paths, options), physics, timing=timing, full_range=options.assume_full_range
     )
     if options.assume_full_range and calibration.torque is None:
         raise UserError("--assume-full-range is about torques, and these slices have diameters only; leave it out")
-    frames = sum(len(one.t_s) for one in parts)
-    quantities = [name for name in ("torque", "diameter") if getattr(calibration, name) is not None]
-    result: dict[str, object] = {
-        "estimator": estimator,
-        "quantities": quantities,
-        "frames": frames,
-        "sides": list(calibration.sides),
-        "source": calibration.source,
-        "assumptions": list(calibration.assumptions),
-    }
-    sentences = [
-        f"Estimator {estimator}, {' and '.join(quantities)} from {frames} frames of the "
-        f"{' and '.join(calibration.sides)} side."
-    ]
-    report = CalibrationReport(calibration, result, sentences)
-    _report_torque(report, options)
-    if calibration.kind == "raw":
-        if delay_s is None:
-            named = [*((path.name, one) for (path, _), one in zip(series, parts, strict=True)), *others]
-            references = load_delay.timing_references(parts, [one for _, one in others], find_delay)
-            _report_timing(report, named, references, find_delay)
-        _report_tool(report)
-    return report
+    names = {id(one): name for name, one in (*((path.name, one) for path, one in chosen), *others)}
+    warned = zip(timing.references, timing.warnings, strict=True)
+    doubts = [f"{names[id(one)]}: {why}" for one, why in warned if why]
+    return CalibrationResult(calibration, sum(len(one.t_s) for one in parts), timing, doubts)
+
+
+def _read(path: Path, options: CalibrationOptions) -> tuple[list[FrameSeries], list[FrameSeries]]:
+    """Return a path's series, and those of its other sides: these may show the load cell's delay better."""
+    if path.is_dir():
+        return read_series(path), []
+    recording, sides = read_recording(path), options.sides
+    own = series_of(recording, sides, options.tool_mm)
+    if sides is None or options.load_cell_delay_s is not None:
+        return [own], []
+    others = [side for side in recording.sides if side not in sides]
+    return [own], [series_of(recording, (side,), options.tool_mm) for side in others]
 
 
 def _check_options(options: CalibrationOptions, parts: Sequence[FrameSeries]) -> None:
@@ -109,104 +152,9 @@ def _check_options(options: CalibrationOptions, parts: Sequence[FrameSeries]) ->
             raise UserError(f"{option} is for recordings: {why}; leave it out")
 
 
-def _other_sides(paths: Sequence[Path], options: CalibrationOptions) -> list[tuple[str, FrameSeries]]:
-    """Return the named series of the sides that are not calibrated: they may show the load cell's delay better."""
-    return [
-        (f"{path.name}, {side}", part_of(series_of(recording, (side,)), *options.time_range))
-        for path in paths
-        if not path.is_dir()
-        for recording in (read_recording(path),)
-        for side in recording.sides
-        if side not in (options.sides or ())
-    ]
-
-
 def _source(paths: Sequence[Path], options: CalibrationOptions) -> str:
     source = ", ".join(path.name for path in paths)
     start, stop = options.time_range
     if (start, stop) != (0.0, 1.0):
         source += f" from {start:g} to {stop:g}"
     return source + (f", load cell {options.load_cell_delay_s:g} s late" if options.load_cell_delay_s else "")
-
-
-def _report_torque(report: CalibrationReport, options: CalibrationOptions) -> None:
-    """Report whether loads are seen, and whether torques beyond the calibrated ones are predicted within them."""
-    calibration = report.calibration
-    if calibration.torque is None or not isinstance(regressor := calibration.torque.regressor, IntervalRegressor):
-        return
-    report.result["sees_loads"] = not regressor.misses_loads
-    if regressor.misses_loads:
-        report.sentences.append(_misses_loads(regressor, calibration))
-    if calibration.kind != "raw" and not options.assume_full_range:
-        extrapolates = not (regressor.low_end > regressor.low or regressor.high_end < regressor.high)
-        report.result["reads_beyond"] = extrapolates
-        if not extrapolates:
-            report.sentences.append(_range_ends(regressor))
-
-
-def _misses_loads(regressor: IntervalRegressor, calibration: Calibration) -> str:
-    low_nm, high_nm = (round(limit, 3) + 0.0 for limit in (regressor.low, regressor.high))
-    others = [] if calibration.estimator == ESTIMATORS[0] else [f"with --estimator {ESTIMATORS[0]}"]
-    others += ["on both fingertips"] if len(calibration.sides) == 1 else []
-    cure = f"Calibrate {' or '.join(others)}, or record" if others else "Record"
-    return (
-        "It does not see the load: too many of the loads left out for validation lay outside their intervals. So every "
-        f"interval spans all calibrated torques, {low_nm:g} to {high_nm:g} N·m, and the torque is useless. "
-        f"{cure} a grip in which the tool twists the gel more."
-    )
-
-
-def _range_ends(regressor: IntervalRegressor) -> str:
-    limits = (regressor.low, regressor.high, regressor.low_end, regressor.high_end, regressor.lowest, regressor.highest)
-    low_nm, high_nm, below_nm, above_nm, lowest_nm, highest_nm = (round(limit, 3) + 0.0 for limit in limits)
-    where = (
-        f"intervals of estimates below {below_nm:g} N·m reach to {lowest_nm:g} at least, of estimates above "
-        f"{above_nm:g} to {highest_nm:g} N·m"
-    )
-    if below_nm >= high_nm and above_nm <= low_nm:
-        where = f"all intervals reach from {lowest_nm:g} to {highest_nm:g} N·m at least, and the torque is useless"
-    return (
-        f"Torques beyond the calibrated {low_nm:g} to {high_nm:g} N·m may be estimated within them, as the outermost "
-        f"were when they were left out: {where}. Calibrate on all torques that will occur, and add --assume-full-range."
-    )
-
-
-def _report_timing(
-    report: CalibrationReport,
-    named: Sequence[tuple[str, FrameSeries]],
-    references: Sequence[FrameSeries],
-    find_delay: load_delay.DelayFinder,
-) -> None:
-    """Report the load cell's delay, doubts about it, and its effect on the intervals."""
-    delays_s = [found and round(found.delay_s, 3) for found in map(find_delay, references)]
-    known = ", ".join(f"{each:.2f}" for each in delays_s if each is not None)
-    uncertainty_s = round(load_delay.timing_uncertainty_s(references, find_delay), 3)
-    if known:
-        probably = "probably " if uncertainty_s else ""
-        report.sentences.append(f"The load is {probably}stamped {known} s after the frames move.")
-    doubts = [
-        f"{name}: {why}"
-        for name, one in named
-        if one in references and (why := load_delay.load_delay_warning(one, find_delay))
-    ]
-    report.sentences.extend(f"Warning: {doubt}." for doubt in doubts)
-    report.result.update(load_cell_delay_s=delays_s, load_cell_warnings=doubts, timing_uncertainty_s=uncertainty_s)
-    torque = report.calibration.torque
-    if torque is not None and uncertainty_s and isinstance(torque.regressor, IntervalRegressor):
-        report.result["widening"] = widening = round(torque.regressor.timing_widening, 2)
-        report.sentences.append(
-            f"Could not verify the load cell's timestamps: the load changed too few times. They may be "
-            f"{uncertainty_s:.2g} s off, so the intervals are wider, for loads {widening:.2g} times. Record more "
-            "changes of load, such as ten twists, or confirm the load cell's clock with --load-cell-delay-s 0."
-        )
-
-
-def _report_tool(report: CalibrationReport) -> None:
-    known_mm = None if isnan(report.calibration.tool_mm) else report.calibration.tool_mm
-    report.result["tool_mm"] = known_mm
-    report.sentences.append(
-        "The recordings do not name one tool's diameter, and on another tool the torque would be wrong: name it with "
-        "--tool-mm."
-        if known_mm is None
-        else f"The tool's diameter is {known_mm:.3g} mm."
-    )

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import channels_of_line
-from shearloop.bank.estimation import Calibration, FrameSeries, fit
+from shearloop.bank.estimation import Calibration, FrameSeries, fit, measure_timing
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.series import series_of
 from shearloop.daemon.recording.reader import read_recording
@@ -156,9 +156,8 @@ def record(
 def calibrate(recordings: list[FrameSeries], sides: Sides) -> Calibration:
     """Return the default estimator's calibration for these fingertips."""
     chosen = [one.select_sides(sides) for one in recordings]
-    return fit(
-        "motion_regression", chosen, "the emulated rig, by shearloop.daemon.cli.demo_calibration", timed_by=recordings
-    )
+    source = "the emulated rig, by shearloop.daemon.cli.demo_calibration"
+    return fit("motion_regression", chosen, source, timing=measure_timing(chosen, recordings))
 
 
 def main() -> None:

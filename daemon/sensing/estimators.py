@@ -72,6 +72,11 @@ class LiveEstimator:
         return f", assuming that {text}" if text else ""
 
     @property
+    def searches_bank(self) -> bool:
+        """Whether an estimate searches a bank, which takes many milliseconds; others take less than one."""
+        return self._matcher is not None
+
+    @property
     def grids(self) -> tuple[FloatArray, FloatArray] | None:
         """The k and the sigma of the bank's cells, None without a bank."""
         return (self._matcher.k_grid, self._matcher.sigma_grid) if self._matcher is not None else None
@@ -90,7 +95,7 @@ class LiveEstimator:
         self._session.set_tool(tool)
 
     def estimate(self, *frames: Frame) -> Estimate:
-        """Return the estimate of frames of one time, one for each side. It may take many milliseconds."""
+        """Return the estimate of frames of one time, one for each side. Searching a bank is slow."""
         if any(frame.repeated for frame in frames):
             return Estimate(valid=False, reasons=REPEATED_FRAME)
         usable = np.array([~(frame.saturated | frame.dead) for frame in frames])

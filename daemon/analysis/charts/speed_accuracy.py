@@ -18,7 +18,7 @@ from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatche
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.bank.errors import BankError
-from shearloop.bank.estimation import Calibration, FrameSeries, Name, Physics, fit
+from shearloop.bank.estimation import Calibration, FrameSeries, Name, Physics, fit, measure_timing
 from shearloop.bank.estimation.bank_match import NOT_TURNED, RefinedMatcher
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor, fit_interval_regressor
 from shearloop.bank.estimation.regressors import Ridge, ranked_channels
@@ -96,7 +96,7 @@ def estimators(split: Split, physics: Physics, sides: tuple[str, ...]) -> Iterat
     count = f", {sides[0] if len(sides) == 1 else 'both'}" if past.kind == "raw" else ""
     for name in _ESTIMATORS:
         try:
-            calibration = fit(name, [past], split.title, physics, timed_by=[split.past])
+            calibration = fit(name, [past], split.title, physics, timing=measure_timing([past], [split.past]))
         except BankError as error:
             print(f"{split.title}: {name}{count} is left out: {error}")
             continue

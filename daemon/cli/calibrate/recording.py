@@ -2,9 +2,15 @@
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_json, check_overwrite
 from shearloop.daemon.cli.output import print_result
+
+if TYPE_CHECKING:
+    from shearloop.bank.estimation import Calibration
+    from shearloop.bank.estimation.interval_regressor import IntervalRegressor
+    from shearloop.daemon.analysis.calibrate import CalibrationResult
 
 # A larger delay belongs to another recording.
 _LARGEST_DELAY_S = 600.0
@@ -79,8 +85,68 @@ def run(args: argparse.Namespace) -> int:
     physics = Physics(
         bank=Bank.open(args.bank) if args.bank else None, mesh=load_mesh(args.mesh) if args.mesh else None
     )
-    report = calibrate(args.recordings, args.estimator, physics, options)
-    report.calibration.save(args.out)
-    sentences = [*report.sentences, f"Written to {args.out}."]
-    print_result({"path": str(args.out), **report.result}, sentences, as_json=args.json)
+    result = calibrate(args.recordings, args.estimator, physics, options)
+    result.calibration.save(args.out)
+    sentences = [*sentences_of(result), f"Written to {args.out}."]
+    print_result({"path": str(args.out), **result.figures()}, sentences, as_json=args.json)
     return 0
+
+
+def sentences_of(result: "CalibrationResult") -> list[str]:
+    """Return what the user should know of a calibration."""
+    calibration, regressor, timing = result.calibration, result.regressor, result.timing
+    sentences = [
+        f"Estimator {calibration.estimator}, {' and '.join(result.quantities)} from {result.frames} frames of the "
+        f"{' and '.join(calibration.sides)} side."
+    ]
+    if regressor is not None and regressor.misses_loads:
+        sentences.append(_misses_loads(regressor, calibration))
+    if regressor is not None and result.reads_beyond is False:
+        sentences.append(_range_ends(regressor))
+    known = ", ".join(f"{one.delay_s:.2f}" for one in timing.delays if one is not None)
+    if known:
+        probably = "probably " if timing.uncertainty_s else ""
+        sentences.append(f"The load is {probably}stamped {known} s after the frames move.")
+    sentences += [f"Warning: {doubt}." for doubt in result.doubts]
+    if result.widening is not None:
+        sentences.append(
+            "Could not verify the load cell's timestamps: the load changed too few times. They may be "
+            f"{timing.uncertainty_s:.2g} s off, so the intervals are wider, for loads {result.widening:.2g} times. "
+            "Record more changes of load, such as ten twists, or confirm the load cell's clock with "
+            "--load-cell-delay-s 0."
+        )
+    if calibration.kind == "raw":
+        sentences.append(
+            "The recordings do not name one tool's diameter, and on another tool the torque would be wrong: name it "
+            "with --tool-mm."
+            if result.tool_mm is None
+            else f"The tool's diameter is {result.tool_mm:.3g} mm."
+        )
+    return sentences
+
+
+def _misses_loads(regressor: "IntervalRegressor", calibration: "Calibration") -> str:
+    low_nm, high_nm = (round(limit, 3) + 0.0 for limit in (regressor.low, regressor.high))
+    others = [] if calibration.estimator == ESTIMATORS[0] else [f"with --estimator {ESTIMATORS[0]}"]
+    others += ["on both fingertips"] if len(calibration.sides) == 1 else []
+    cure = f"Calibrate {' or '.join(others)}, or record" if others else "Record"
+    return (
+        "It does not see the load: too many of the loads left out for validation lay outside their intervals. So every "
+        f"interval spans all calibrated torques, {low_nm:g} to {high_nm:g} N·m, and the torque is useless. "
+        f"{cure} a grip in which the tool twists the gel more."
+    )
+
+
+def _range_ends(regressor: "IntervalRegressor") -> str:
+    limits = (regressor.low, regressor.high, regressor.low_end, regressor.high_end, regressor.lowest, regressor.highest)
+    low_nm, high_nm, below_nm, above_nm, lowest_nm, highest_nm = (round(limit, 3) + 0.0 for limit in limits)
+    where = (
+        f"intervals of estimates below {below_nm:g} N·m reach to {lowest_nm:g} at least, of estimates above "
+        f"{above_nm:g} to {highest_nm:g} N·m"
+    )
+    if below_nm >= high_nm and above_nm <= low_nm:
+        where = f"all intervals reach from {lowest_nm:g} to {highest_nm:g} N·m at least, and the torque is useless"
+    return (
+        f"Torques beyond the calibrated {low_nm:g} to {high_nm:g} N·m may be estimated within them, as the outermost "
+        f"were when they were left out: {where}. Calibrate on all torques that will occur, and add --assume-full-range."
+    )

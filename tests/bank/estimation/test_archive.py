@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shearloop.bank.errors import BankError, CalibrationError
-from shearloop.bank.estimation import Calibration, fit
+from shearloop.bank.estimation import TRUSTED, Calibration, fit
 from tests.bank.estimation.conftest import follow
 
 
@@ -91,7 +91,7 @@ def test_values_that_cannot_be_kept_and_files_that_cannot_be_written_are_errors(
 def test_assumptions_are_kept(motion_calibration, recorded, sliced, tmp_path):
     assert motion_calibration.assumptions == ()
     assert motion_calibration.assumption_text == ""
-    timed = fit("motion_regression", [recorded], "an emulated rig", trust_times=True)
+    timed = fit("motion_regression", [recorded], "an emulated rig", timing=TRUSTED)
     assert timed.assumption_text == "the load cell's delay is as given (--load-cell-delay-s)"
     path = tmp_path / "new.cal"
     fit("regression", [sliced()], "slices", full_range=True).save(path)

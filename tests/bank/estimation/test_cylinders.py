@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.estimation import EstimatorSession, fit
+from shearloop.bank.estimation import TRUSTED, EstimatorSession, fit
 from shearloop.bank.estimation.fitting_raw import CylinderGrip, fit_cylinders, fit_line
 from shearloop.bank.estimation.regressors import Ridge
 from tests.bank.estimation.conftest import follow
@@ -104,7 +104,7 @@ def cylinder(twisting, tips, millimetre, mm, seed):
 def test_a_diameter_is_of_this_grip_alone(twisting):
     """It is read from the mean place of a grip, and each grip has its own."""
     of = partial(cylinder, twisting, (1,), 2e-4)
-    calibration = fit("motion_regression", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "rig", trust_times=True)
+    calibration = fit("motion_regression", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "rig", timing=TRUSTED)
     tracker, read = EstimatorSession(calibration), []
     for number, mm in enumerate((12.0, 38.0)):
         later = of(mm, 10 + number)
@@ -118,7 +118,7 @@ def test_a_diameter_is_of_this_grip_alone(twisting):
 def test_the_first_frames_of_a_grip_have_the_interval_of_a_mean_of_few(twisting):
     """Of one frame the interval was that of a mean of sixty: on the played rig it held 0.7 of the tools."""
     of = partial(cylinder, twisting, (1, 2), 2e-5)
-    calibration = fit("motion_regression", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "rig", trust_times=True)
+    calibration = fit("motion_regression", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "rig", timing=TRUSTED)
     inside, widths = [], []
     for seed in range(20, 40):
         known_half_mm = calibration.diameter.regressor.intervals.half_widths[0]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import fit
+from shearloop.bank.estimation import TRUSTED, fit
 
 
 def with_a_nan(values):
@@ -20,7 +20,7 @@ def test_values_that_are_no_numbers_are_told(recorded, name):
     """They made the whole recording look gripped from the first frame on, or stamped at another time."""
     spoilt = replace(recorded, **{name: with_a_nan(getattr(recorded, name))})
     with pytest.raises(CalibrationError, match="recording 2 of 2 holds 1 values that are not finite numbers"):
-        fit("motion_regression", [recorded, spoilt], "rig", trust_times=True)
+        fit("motion_regression", [recorded, spoilt], "rig", timing=TRUSTED)
 
 
 def test_a_slice_with_a_value_that_is_no_number_is_told(sliced):
@@ -41,4 +41,4 @@ def test_a_torque_of_a_single_frame_is_too_little_to_calibrate_on(recorded):
     torque = recorded.torque_nm.copy()
     torque[900] = 1000.0
     with pytest.raises(CalibrationError, match="from the first torque to the last there are 1 frames"):
-        fit("motion_regression", [replace(recorded, torque_nm=torque)], "rig", trust_times=True)
+        fit("motion_regression", [replace(recorded, torque_nm=torque)], "rig", timing=TRUSTED)

@@ -2,23 +2,20 @@
 
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import fit, load_delay
+from shearloop.bank.estimation import TRUSTED, fit, load_delay
 from shearloop.bank.estimation.grip_segmentation import segment_grip
 from shearloop.bank.estimation.interval_regressor import student_inflation
 from shearloop.bank.estimation.load_delay import (
     LoadDelay,
-    check_load_delay,
     find_load_delay,
     is_filtered,
     load_delay_warning,
-    timing_references,
-    timing_uncertainty_s,
+    measure_timing,
     torque_bounds,
 )
 
@@ -40,7 +37,7 @@ def test_torques_that_are_stamped_at_other_times_are_refused(recorded, late_s):
 
 def test_torques_that_are_stamped_at_other_times_are_taken_where_somebody_vouches_for_them(recorded):
     late = replace(recorded, torque_t_s=recorded.torque_t_s + 0.8)
-    assert fit("regression", [late], "vouched for", trust_times=True).torque is not None
+    assert fit("regression", [late], "vouched for", timing=TRUSTED).torque is not None
 
 
 def noise(like: np.ndarray, taps: list[float]) -> np.ndarray:
@@ -78,16 +75,16 @@ def test_what_is_late_depends_on_the_load_cell(recorded, taps, late_s, sound):
         torque_nm=recorded.torque_nm + noise(recorded.torque_nm, taps),
     )
     with nullcontext() if sound else pytest.raises(CalibrationError, match="own delay"):
-        check_load_delay([late])
+        measure_timing([late])
 
 
 def test_lateness_that_is_uncertain_is_not_refused(recorded, monkeypatch):
     late = replace(recorded, torque_t_s=recorded.torque_t_s + 0.4)
     monkeypatch.setattr(load_delay, "_delay_of_side", lambda *_: LoadDelay(0.4, 0.1, 0.5))
-    check_load_delay([late])
+    measure_timing([late])
     monkeypatch.setattr(load_delay, "_delay_of_side", lambda *_: LoadDelay(0.4, 0.02, 0.5))
     with pytest.raises(CalibrationError, match=r"0\.40 ± 0\.02 s before the load .* --load-cell-delay-s 0\.32"):
-        check_load_delay([late])
+        measure_timing([late])
 
 
 def test_nothing_is_said_where_no_load_changes_the_frames(recorded):
@@ -111,8 +108,8 @@ def test_what_would_be_refused_is_doubted_and_so_is_a_clear_peak_of_few_frames(r
     assert "too few" not in load_delay_warning(late)
     gripped = len(recorded.t_s[segment_grip(recorded)[1]])
     monkeypatch.setattr(load_delay, "_SURE_FRAMES", gripped + 1)
-    assert find_load_delay(late) is None
-    check_load_delay([late])
+    assert find_load_delay(late).few_frames == gripped
+    measure_timing([late])
     assert f"though {gripped} gripped frames are too few to be sure" in load_delay_warning(late)
     monkeypatch.setattr(load_delay, "_WARN_EXPLAINED", 1.0)
     assert load_delay_warning(late) == "", "a peak that is less high may be chance"
@@ -125,12 +122,12 @@ def unmoved(recorded):
 
 
 def test_times_are_unchecked_where_no_recording_tells_or_only_roughly(recorded, monkeypatch):
-    assert timing_uncertainty_s([recorded]) == 0.0
-    assert timing_uncertainty_s([unmoved(recorded)]) == 0.75
-    assert timing_uncertainty_s([unmoved(recorded), recorded]) == 0.0, "one clock has stamped them all"
+    assert measure_timing([recorded]).uncertainty_s == 0.0
+    assert measure_timing([unmoved(recorded)]).uncertainty_s == 0.75
+    assert measure_timing([unmoved(recorded), recorded]).uncertainty_s == 0.0, "one clock has stamped them all"
     for error_s, unsure_s in ((0.05, 0.0), (0.2, 0.392), (2.0, 0.75)):
         monkeypatch.setattr(load_delay, "_delay_of_side", lambda *_, e=error_s: LoadDelay(0.0, e, 0.5))
-        assert timing_uncertainty_s([recorded]) == pytest.approx(unsure_s, abs=1e-3)
+        assert measure_timing([recorded]).uncertainty_s == pytest.approx(unsure_s, abs=1e-3)
 
 
 def test_a_board_beside_that_was_dead_garbled_or_away_spoils_no_times(recorded):
@@ -139,13 +136,12 @@ def test_a_board_beside_that_was_dead_garbled_or_away_spoils_no_times(recorded):
     garbled = replace(recorded, channels=np.where(np.arange(896) == 3, np.nan, recorded.channels))
     away = recorded.between(0, 12)
     for beside in (dead, garbled, away):
-        assert timing_references([recorded], [beside]) == [recorded]
-        assert (
-            fit("motion_regression", [recorded], "beside it", timed_by=[beside]).torque.regressor.timing_widening == 1.0
-        )
+        timing = measure_timing([recorded], [beside])
+        assert timing.references == [recorded]
+        assert timing.uncertainty_s == 0.0
         still = unmoved(recorded)
-        assert timing_references([still], [beside]) == [still], "it says nothing, and is not to be blamed"
-        assert timing_references([still], [beside, recorded]) == [recorded]
+        assert measure_timing([still], [beside]).references == [still], "it says nothing, and is not to be blamed"
+        assert measure_timing([still], [beside, recorded]).references == [recorded]
 
 
 def test_each_recording_is_looked_at_once(recorded, monkeypatch):
@@ -154,12 +150,10 @@ def test_each_recording_is_looked_at_once(recorded, monkeypatch):
     fit("regression", [recorded], "alone")
     assert len(looked) == len(set(looked)) == len(recorded.sides)
     looked.clear()
-    aligned = cache(find_load_delay)
-    fit("regression", [recorded], "and asked again", find_delay=aligned)
     still = unmoved(recorded)
-    assert timing_references([still], [recorded], aligned) == [recorded]
-    assert (load_delay_warning(still, aligned), load_delay_warning(recorded, aligned)) == ("", "")
-    assert timing_uncertainty_s([still, recorded], aligned) == 0.0
+    timing = measure_timing([still], [recorded])
+    assert (timing.references, timing.warnings, timing.uncertainty_s) == ([recorded], [""], 0.0)
+    fit("regression", [recorded], "with a timing", timing=timing)
     assert len(looked) == len(set(looked)) == 2 * len(recorded.sides)
 
 
@@ -175,7 +169,7 @@ def test_intervals_hold_what_times_that_could_not_be_checked_do_to_the_torque(re
     checked = fit("motion_regression", [recorded], "checked").torque.regressor
     monkeypatch.setattr(load_delay, "_delay_of_side", lambda *_: None)
     unchecked = fit("motion_regression", [recorded], "unchecked").torque.regressor
-    vouched = fit("motion_regression", [recorded], "vouched for", trust_times=True).torque.regressor
+    vouched = fit("motion_regression", [recorded], "vouched for", timing=TRUSTED).torque.regressor
     assert checked.timing_widening == vouched.timing_widening == 1.0
     assert unchecked.timing_widening > 1.1 * student_inflation(5), (
         "blocks of few loads tell little, and other times' loads are wider"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import EstimatorSession, Measured, TactileFrame, fit, fitting, fitting_raw
+from shearloop.bank.estimation import TRUSTED, EstimatorSession, Measured, TactileFrame, fit, fitting, fitting_raw
 from tests.bank.estimation.conftest import follow
 
 
@@ -212,7 +212,7 @@ def test_the_tool_of_a_calibration_is_the_one_that_the_gripper_held(recorded, mo
 
     def named(*held):
         series = [replace(recorded, gripper_mm=tool) for tool in held]
-        return fit("motion_regression", series, "rig", trust_times=True).tool_mm
+        return fit("motion_regression", series, "rig", timing=TRUSTED).tool_mm
 
     assert named(Measured(20.4, 1.2), Measured(19.8, 1.1)) == 19.8
     assert named(Measured(20.4, 1.2), None) == 20.4
@@ -223,7 +223,7 @@ def test_tools_that_turn_differently_give_no_torque_where_their_diameters_are_on
     monkeypatch.setattr(fitting_raw, "_TOOLS_MAY_LEAVE", 0.0)
     short = [replace(twisting(cycles=3, tips=(0,)), gripper_mm=Measured(mm, 1.0)) for mm in (10.0, 20.0)]
     with pytest.raises(CalibrationError, match="the tools of 10 and 20 mm turn so differently"):
-        fit("motion_regression", short, "rig", trust_times=True)
+        fit("motion_regression", short, "rig", timing=TRUSTED)
 
 
 def test_another_tool_is_refused_for_as_long_as_it_is_held(motion_calibration, twisting):

@@ -17,11 +17,10 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.export import count_messages, export
-from shearloop.daemon.recording.identity import AttachedFile, Identity, basic_identity
-from shearloop.daemon.recording.reader import read_recording
-from shearloop.daemon.recording.recorder import Recorder
-from shearloop.daemon.recording.repair import repair, summarise
+from shearloop.daemon.recording.reader import read_recording, repair, summarise
+from shearloop.daemon.recording.recorder import AttachedFile, Identity, Recorder
 from shearloop.daemon.recording.replay import RecordedRun
+from shearloop.daemon.recording.schema import basic_identity
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.recording.test_recorder import frame, torque
 from tests.daemon.recording.test_replay import replayed

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import Calibration, FrameSeries, Name, fit, load_delay
+from shearloop.bank.estimation import Calibration, FrameSeries, Name, fit, load_delay, measure_timing
 from shearloop.bank.estimation.bank_match import ElectrodeNumbering
 from shearloop.bank.estimation.load_delay import find_load_delay, is_filtered, load_delay_warning
 from shearloop.bank.estimation.novelty import NoveltyDetector
@@ -121,7 +121,9 @@ def test_cylinders_that_turn_differently_give_a_diameter_and_no_torque(cylinders
 )
 def test_later_twists(twists, sides, r, rmse_nm):
     series = twists.select_sides(sides)
-    calibration = fit("motion_regression", [part_of(series, 0, HALF)], "earlier", timed_by=[part_of(twists, 0, HALF)])
+    past = [part_of(series, 0, HALF)]
+    timing = measure_timing(past, [part_of(twists, 0, HALF)])
+    calibration = fit("motion_regression", past, "earlier", timing=timing)
     figures = figures_of([estimate_series(calibration, part_of(series, HALF - 0.015, 1))])
     assert figures["r"] >= r
     assert figures["rmse_nm"] <= rmse_nm
@@ -315,11 +317,11 @@ def test_a_load_half_a_second_off_in_a_short_recording_lies_within_the_intervals
 def test_a_fingertip_that_the_lever_hardly_moves_has_its_times_from_the_other_one(twists):
     left = twists.select_sides(("left",))
     assert fit("motion_regression", [left], "alone").torque.regressor.timing_widening > 1.1
-    timed = fit("motion_regression", [left], "with the right one", timed_by=[twists])
+    timed = fit("motion_regression", [left], "with the right one", timing=measure_timing([left], [twists]))
     assert timed.torque.regressor.timing_widening == 1.0
     late = replace(twists, torque_t_s=twists.torque_t_s + 0.54)
     with pytest.raises(CalibrationError, match="that moves them is stamped"):
-        fit("motion_regression", [late.select_sides(("left",))], "beside the right one", timed_by=[late])
+        measure_timing([late.select_sides(("left",))], [late])
 
 
 def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twists_file, tmp_path, capsys, monkeypatch):
@@ -341,7 +343,8 @@ def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twis
 
 @pytest.mark.parametrize("name", ["20241202_153632", "glitch_20241202_173837"])
 def test_nothing_is_said_of_the_times_of_a_recording_that_does_not_show_them(shared, tmp_path, name):
-    assert find_load_delay(imported(tmp_path / "other.mcap", shared / "recordings/streams" / name)) is None
+    found = find_load_delay(imported(tmp_path / "other.mcap", shared / "recordings/streams" / name))
+    assert found is None or found.few_frames
 
 
 def test_a_load_that_seems_stamped_early_is_told_and_not_refused(shared, twists_file, tmp_path, capsys):

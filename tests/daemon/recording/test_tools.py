@@ -12,10 +12,9 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.experiment_schema import ExperimentFile, WaitStep
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import EitFrame, wire_map
-from shearloop.daemon.recording.identity import Identity, basic_identity, experiment_notes
-from shearloop.daemon.recording.reader import read_recording
-from shearloop.daemon.recording.recorder import Recorder
-from shearloop.daemon.recording.repair import summarise
+from shearloop.daemon.recording.reader import read_recording, summarise
+from shearloop.daemon.recording.recorder import Identity, Recorder, experiment_notes
+from shearloop.daemon.recording.schema import basic_identity
 from shearloop.daemon.sensing.tool_diameter import tool_as_bytes
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.sample_messages import sample

@@ -102,6 +102,7 @@ def test_dead_channels_leave_the_rest_at_work_and_a_repeated_frame_is_refused(ca
 
 def test_a_bank_adds_k_sigma_and_heatmaps(calibration: Calibration, tiny_bank: Path) -> None:
     estimator = LiveEstimator(calibration, fingertip(bank=str(tiny_bank), matching="zero_lag"))
+    assert estimator.searches_bank
     played = series(seed=3)
     gripped = int((IDLE_S + 12.0) / PERIOD_S)
     for number in range(gripped):
@@ -118,6 +119,7 @@ def test_the_calibration_decides_the_estimator(files: dict[str, Path]) -> None:
     combined = open_combined(CombinedConfig(calibration=files["combined"]), tips)
     assert combined.calibration.sides == ("right", "left")
     assert combined.grids is None
+    assert not combined.searches_bank
 
 
 def test_doctor_and_check_show_the_assumptions(

@@ -16,7 +16,6 @@ from shearloop.bank.eit.channels import LINE_SLOTS, N_ELECTRODES, line_of_channe
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.daemon.errors import UserError
 from shearloop.drivers.eit_kit import ADC_STEP_V
-from shearloop.drivers.emulators.scene import ShearedFrame
 
 # Mean and frame-to-frame standard deviation of the recorded frames.
 MEAN_V = 0.13
@@ -171,10 +170,10 @@ class RigFrames:
         self._sigmas_cm = np.array([high, low])
         self._torques_nm = (self._sigmas_cm - rest) * LARGEST_TORQUE_NM / (largest - rest)
 
-    def line_of(self, gel: ShearedFrame) -> FloatArray:
-        """Return the board's line, (1024,) in volts, for the gel at each injection."""
-        sigma_cm = np.interp(gel.shear_torque_nm, self._torques_nm, self._sigmas_cm)
-        return self._synthesiser.line(self._k_cm(gel.diameter_mm), sigma_cm[INJECTIONS], gel.grip[INJECTIONS])
+    def line(self, grip: FloatArray, shear_torque_nm: FloatArray, diameter_mm: float) -> FloatArray:
+        """Return the board's line, (1024,) in volts, for grip (0…1) and shear at each injection, (32,) each."""
+        sigma_cm = np.interp(shear_torque_nm, self._torques_nm, self._sigmas_cm)
+        return self._synthesiser.line(self._k_cm(diameter_mm), sigma_cm[INJECTIONS], grip[INJECTIONS])
 
     def _k_cm(self, diameter_mm: float) -> float:
         slope = (K_CM[1] - K_CM[0]) / (DIAMETER_MM[1] - DIAMETER_MM[0])

@@ -46,7 +46,7 @@ Sides = tuple[str, ...]
 def lines_of(scene: Scene, frames: RigFrames) -> list[NDArray[np.float64]]:
     """Return the lines of both boards, (1024,) in volts, for frames that end now."""
     gel = scene.frame(FRAME_PERIOD_S)
-    return [frames.line_of(replace(gel, shear_torque_nm=sign * gel.shear_torque_nm)) for sign in SIDES.values()]
+    return [frames.line(gel.grip, sign * gel.shear_torque_nm, gel.diameter_mm) for sign in SIDES.values()]
 
 
 @dataclass(slots=True)

@@ -6,7 +6,7 @@ controller's cycle makes time pass, so that all devices see the same moment.
 
 import asyncio
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -15,7 +15,7 @@ from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.boards import LOAD_PERIOD_S, EitKitBoard, Hx711Board, Sketch
 from shearloop.drivers.emulators.gripper import URCAP_PORT, Gripper, GripperPlayer, ModbusSlave, UrcapSession
 from shearloop.drivers.emulators.ports import PtyServer, SocketServer
-from shearloop.drivers.emulators.scene import FloatArray, Joint, Scene, ShearedFrame, TwinSettings
+from shearloop.drivers.emulators.scene import FloatArray, Joint, Scene, TwinSettings
 from shearloop.drivers.emulators.skin import Gauges, SkinInstruments
 from shearloop.drivers.emulators.ur_controller import FAULTS, Controller
 from shearloop.drivers.emulators.ur_robot import ControllerSpec, Robot
@@ -32,8 +32,8 @@ COMMANDS = (
 class FrameSynthesiser(Protocol):
     """Makes the frames of one fingertip."""
 
-    def line_of(self, gel: ShearedFrame) -> FloatArray:
-        """Return the board's line, (1024,) in volts."""
+    def line(self, grip: FloatArray, shear_torque_nm: FloatArray, diameter_mm: float) -> FloatArray:
+        """Return the board's line, (1024,) in volts, for grip (0…1) and shear at each injection, (32,) each."""
 
 
 class RigSkin(Gauges, Protocol):
@@ -184,7 +184,7 @@ class EmulatedRig:
     def _frames(self, synthesiser: FrameSynthesiser, sign: float) -> Iterator[FloatArray]:
         while True:
             gel = self.scene.frame(FRAME_PERIOD_S)
-            yield synthesiser.line_of(replace(gel, shear_torque_nm=sign * gel.shear_torque_nm))
+            yield synthesiser.line(gel.grip, sign * gel.shear_torque_nm, gel.diameter_mm)
 
     def _torques_nm(self) -> Iterator[float]:
         while True:

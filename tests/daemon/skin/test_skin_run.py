@@ -195,7 +195,7 @@ async def test_one_daemon_carries_a_fingertip_and_a_skin(config: Callable[..., P
     async with running(config(skin=section(ADC))) as daemon:
         health = collector(daemon, "health")
         tasks = (await health.get())["tasks"]
-        assert all(tasks[name]["alive"] for name in ("right", "right.estimator", "skin", "skin.source"))
+        assert all(tasks[name]["alive"] for name in ("right", "skin", "skin.source"))
         assert "There is no serial port" in tasks["skin"]["last_loss"], "without its instruments the daemon runs on"
 
 

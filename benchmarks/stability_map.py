@@ -25,9 +25,8 @@ from shearloop.daemon.analysis.charts.simulated_loop import (
     UncompensatedController,
     run,
 )
-from shearloop.daemon.control.controller import TwistController
+from shearloop.daemon.control.controller import ControllerSettings, TwistController
 from shearloop.daemon.control.margins import LoopModel, gain_limit, pulse_response
-from shearloop.daemon.control.settings import ControllerSettings
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 
 COMMAND_S = 0.016
@@ -71,8 +70,9 @@ class LoopCase:
             )
         settings = ControllerSettings(
             stiffness_nm_per_rad=believed, sample_period_s=FRAME_PERIOD_S, window_s=FRAME_PERIOD_S, kp=kp, ki=ki,
-            wrist_bandwidth_per_s=BANDWIDTH_PER_S, ramp_nm_per_s=1e3, torque_limit_nm=1e3, speed_limit_rad_per_s=1e6,
-            acceleration_limit_rad_per_s2=1e9, travel_limit_rad=1e6, age_limit_s=10.0, stale_periods=np.inf,
+            wrist_bandwidth_per_s=BANDWIDTH_PER_S, ramp_nm_per_s=1e3, deadband_nm=0.0, torque_limit_nm=1e3,
+            speed_limit_rad_per_s=1e6, acceleration_limit_rad_per_s2=1e9, travel_limit_rad=1e6, age_limit_s=10.0,
+            stale_periods=np.inf,
         )  # fmt: skip
         # Enough known measurements for a gain of kp from the start.
         controller = TwistController(settings, 0, 0.0, 0.0, 1e9)

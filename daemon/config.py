@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model
-from shearloop.daemon.control.settings import LoopConfig
+from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.messaging.addresses import (
     COMMAND_ADDRESS,
     LARGEST_PORT,

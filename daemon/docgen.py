@@ -3,11 +3,9 @@
 import dataclasses
 import re
 import types
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
-
-import numpy as np
 
 from shearloop.daemon.cli.command import COMMANDS
 from shearloop.daemon.control.safety import TABLE, Response
@@ -94,10 +92,9 @@ def _type_name(hint: Any) -> str:
     if origin in (Union, types.UnionType):
         names = [_type_name(part) for part in get_args(hint) if part is not type(None)]
         return " or ".join([*dict.fromkeys(names), *(["nil"] if type(None) in get_args(hint) else [])])
-    if origin in (np.ndarray, tuple) or hint is np.ndarray:
-        return "array"
+    # Only arrays are left: NumPy's array type is an alias, and its origin depends on the versions.
     plain: dict[Any, str] = {float: "number", int: "integer", bool: "boolean", str: "text"}
-    return plain.get(hint, "map")
+    return plain.get(hint, "map" if origin is Mapping else "array")
 
 
 def _commands() -> str:

@@ -243,11 +243,11 @@ class LoadCell(serial_sensor.SerialSensor[LoadSample]):
         rate_hz: float = RATE_HZ,
         policy: ReconnectPolicy | None = None,
         on_event: Callable[[LinkEvent], None] = lambda _: None,
-        on_raw: serial_sensor.OnRaw = serial_sensor.ignore_raw,
+        inputs: serial_sensor.InputRecorder | None = None,
     ) -> None:
         link = SerialLink(serial_number=serial_number, path=path, baud=BAUD_RATE, policy=policy, on_event=on_event)
         # A fast board may seem silent to a busy computer; reopening would reset it.
-        super().__init__(link, 1.0 / min(rate_hz, RATE_HZ), on_raw)
+        super().__init__(link, 1.0 / min(rate_hz, RATE_HZ), inputs)
         self._parser = LoadParser(calibration, rate_hz)
         self._samples = 0
         self._flagged = 0

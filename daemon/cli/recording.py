@@ -9,7 +9,7 @@ from shearloop.daemon.cli.options import add_json
 from shearloop.daemon.cli.output import print_result, progress_bar
 
 if TYPE_CHECKING:
-    from shearloop.daemon.recording.repair import RecordingSummary
+    from shearloop.daemon.recording.reader import RecordingSummary
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _info(args: argparse.Namespace) -> int:
-    from shearloop.daemon.recording.repair import summarise
+    from shearloop.daemon.recording.reader import summarise
 
     for path in args.recordings:
         with progress_bar(path.name, path.stat().st_size if path.is_file() else 0, "B") as progress:
@@ -62,7 +62,7 @@ def _info(args: argparse.Namespace) -> int:
 def _summary_text(found: "RecordingSummary") -> str:
     from datetime import datetime
 
-    from shearloop.daemon.recording.identity import software_version
+    from shearloop.daemon.recording.schema import software_version
 
     lines = [str(found.path)]
     if found.first_ns is not None:
@@ -91,7 +91,7 @@ def _summary_text(found: "RecordingSummary") -> str:
 
 
 def _repair(args: argparse.Namespace) -> int:
-    from shearloop.daemon.recording.repair import FileCondition, repair
+    from shearloop.daemon.recording.reader import FileCondition, repair
 
     size = FileCondition.of_file(args.recording).size
     with progress_bar(args.recording.name, size, "B") as progress:

@@ -44,8 +44,8 @@ def run(args: argparse.Namespace) -> int:
     """Replay to the end and print the comparison with the recorded estimates."""
     from shearloop.daemon.config import load_daemon_config
     from shearloop.daemon.errors import UserError
-    from shearloop.daemon.recording.identity import code_digest
     from shearloop.daemon.recording.replay import RecordedRun
+    from shearloop.daemon.recording.schema import code_digest
 
     speed = parse_speed(args.speed)
     if args.more:

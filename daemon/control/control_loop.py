@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from shearloop.daemon.control.controller import TwistController
+from shearloop.daemon.control.controller import TwistController, WristCommand
 from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.experiment_schema import (
     ExperimentFile,
@@ -16,11 +16,10 @@ from shearloop.daemon.control.experiment_schema import (
     TareStep,
     first_turn_before_grip,
 )
-from shearloop.daemon.control.fault_detection import MonitorInputs, compared_for_s, detect_faults
+from shearloop.daemon.control.fault_detection import LoopInputs, MonitorInputs, compared_for_s, detect_faults
 from shearloop.daemon.control.identification import ToolModel
-from shearloop.daemon.control.loop_inputs import GripperStatus, LoopInputs, TorqueSample, TorqueSource
+from shearloop.daemon.control.loop_inputs import GripperStatus, LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDecision, SafetyMonitor
-from shearloop.daemon.control.settings import LoopConfig
 from shearloop.daemon.control.step_runner import (
     Action,
     ActionState,
@@ -32,7 +31,7 @@ from shearloop.daemon.control.step_runner import (
     StepContext,
     TrackTorque,
 )
-from shearloop.daemon.control.wrist_controller import WristController, WristVelocity
+from shearloop.daemon.control.wrist_controller import WristController
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +54,7 @@ class LoopStatus:
 
     phase: str
     activity: str
-    velocity: WristVelocity
+    velocity: WristCommand
     decision: SafetyDecision
 
 
@@ -76,7 +75,7 @@ class ControlLoop:
         self.inputs = LoopInputs(kept_s=compared_for_s(sources.values(), config))
         self.safety = SafetyMonitor()
         self.experiment: Experiment | None = None
-        self.status = LoopStatus("idle", "", WristVelocity(), SafetyDecision(Response.NOTE))
+        self.status = LoopStatus("idle", "", WristCommand(), SafetyDecision(Response.NOTE))
         self._wrists = {
             name: WristController(source, config) for name, source in sources.items() if source.measures_torque
         }
@@ -274,11 +273,9 @@ class ControlLoop:
         command, wrist = self._command, self._driving_wrist
         match command.wrist:
             case TrackTorque() as track if wrist.tracked != track:
-                reason = wrist.why_not_trackable(track, experiment.limits.torque_nm)
-                if reason:
+                if reason := wrist.close_loop(track, t_ns, wrist_rad, experiment.limits.torque_nm):
                     experiment.stop(f"step {command.step_index + 1} ({experiment.step.do}) cannot be done: {reason}")
                     return None
-                wrist.begin_tracking(track, t_ns, wrist_rad, experiment.limits.torque_nm)
             case _:
                 pass
         if command.action is None:
@@ -292,7 +289,7 @@ class ControlLoop:
             return None
         return command.action
 
-    def _velocity(self, t_ns: int, wrist_rad: float, origin_rad: float, *, still: bool) -> WristVelocity:
+    def _velocity(self, t_ns: int, wrist_rad: float, origin_rad: float, *, still: bool) -> WristCommand:
         wrist = self._driving_wrist
         if still:
             return wrist.hold()
@@ -319,7 +316,7 @@ class ControlLoop:
         experiment = self.experiment
         phase = experiment.phase.value if experiment is not None else "idle"
         reason = experiment.stop_reason if experiment is not None else ""
-        self.status = LoopStatus(phase, reason, WristVelocity(), decision)
+        self.status = LoopStatus(phase, reason, WristCommand(), decision)
         self._command = StepCommand()
         release = decision.response is Response.STOP_AND_RELEASE and not self._released
         self._released |= release
@@ -333,6 +330,7 @@ class ControlLoop:
         if arm is not None and self._origin_rad is not None:
             twisted_rad = arm.wrist_rad - self._origin_rad
         gripped = running and self._grips and not isinstance(self._command.action, GripTo)
+        controller = self.controller
         watched = MonitorInputs(
             driving=self._sources[drive],
             supervising=tuple(source for name, source in self._sources.items() if name != drive),
@@ -340,7 +338,7 @@ class ControlLoop:
             torque_needed=gripped and self._turns and not paused,
             gripped=gripped,
             twisted_rad=twisted_rad,
-            expected_nm=self._driving_wrist.expected_nm if running else None,
+            expected_nm=controller.torque_nm if running and controller is not None else None,
             overdue=experiment.overdue if running and experiment is not None else "",
             required=self._required,
         )

@@ -1,8 +1,8 @@
 """The twist controller: late, noisy torque measurements become a wrist speed, up to 125 times a second.
 
 The tool in the grip is a torsion spring on a wrist with a known angle: torque = K·(θ − θ₀) + d. The offset d takes in
-all that the spring does not explain (relaxation, hysteresis, slip, a wrong K). Only d is learnt from the torque sensor;
-the rest is known without delay.
+all that the spring does not explain (relaxation, hysteresis, slip, a wrong K). Only d is learnt from the torque sensor
+(`OffsetEstimator`); the rest is known without delay.
 
 - A measurement y belongs to a past time t_mid (an EIT frame: the middle of its acquisition). It is compared with the
   torque expected *at that time*: ν = y − K·(mean of θ over the acquisition − θ₀) − d. It is the delay compensator, the
@@ -24,9 +24,12 @@ from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated
 
-from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.daemon.control.settings import ControllerSettings
+from pydantic import ConfigDict, Field, model_validator
+from pydantic.dataclasses import dataclass as checked_dataclass
+
+from shearloop.daemon.control.loop_inputs import NotNegative, Positive, TorqueSample
 from shearloop.daemon.errors import UserError
 
 # The ramp does not catch up when the loop was late for longer than this.
@@ -40,6 +43,49 @@ _JUMP_SLACK, _JUMP_SUM = 1.0, 4.5
 _KNOWN_AFTER_JUMP = 3.0
 # A drift is extrapolated over at most this many dropped measurements.
 _MOST_MISSED = 4
+
+
+@checked_dataclass(frozen=True, slots=True, kw_only=True, config=ConfigDict(allow_inf_nan=False))
+class ControllerSettings:
+    """A controller's settings for one tool. Raises pydantic's ValidationError for a value out of its range."""
+
+    # Of the tool in the grip, as identified: torque over wrist angle.
+    stiffness_nm_per_rad: Positive
+    # Of the driving torque: how often it comes, and how long one measurement averages.
+    sample_period_s: Positive
+    window_s: Annotated[float, Field(ge=0, le=60)]
+    # By how much the torque lags behind its own stamp, as identified; 0 where the stamps are right.
+    lag_s: Annotated[float, Field(ge=0, le=5)] = 0.0
+    # Shares of an innovation: taken up at once, and per measurement from then on.
+    kp: Annotated[float, Field(gt=0, le=4)]
+    ki: Annotated[float, Field(ge=0, le=4)]
+    wrist_bandwidth_per_s: Positive
+    ramp_nm_per_s: Positive
+    # The wrist rests until the expected torque is this far from the set point.
+    deadband_nm: NotNegative
+    # Standard deviation of one measurement; 0 turns the detection of jumps off.
+    noise_nm: NotNegative = 0.0
+    # Innovations are clipped to this.
+    innovation_limit_nm: Annotated[float, Field(gt=0, allow_inf_nan=True)] = math.inf
+    # Bound on the integral: how fast the torque at a fixed angle may drift.
+    creep_limit_nm_per_s: Annotated[float, Field(ge=0, allow_inf_nan=True)] = math.inf
+    # The wrist is held when the torque at a fixed angle has moved by this much: slip, or a screw that broke loose.
+    offset_limit_nm: Annotated[float, Field(gt=0, allow_inf_nan=True)] = math.inf
+    torque_limit_nm: Positive
+    speed_limit_rad_per_s: Positive
+    acceleration_limit_rad_per_s2: Positive
+    # From the angle at the start, either way.
+    travel_limit_rad: Positive
+    # A measurement that is older than this on arrival is refused.
+    age_limit_s: Positive = 2.0
+    # Without a measurement for this many periods the wrist is held.
+    stale_periods: Annotated[float, Field(ge=1, allow_inf_nan=True)] = 2.5
+
+    @model_validator(mode="after")
+    def _damped(self) -> "ControllerSettings":
+        if self.ki > self.kp:
+            raise ValueError(f"ki ({self.ki:g}) must not exceed kp ({self.kp:g}); a tenth of kp² is usual")
+        return self
 
 
 class ControllerReason(StrEnum):
@@ -65,20 +111,17 @@ class ControllerRefusal(StrEnum):
     NO_ANGLE = "from a time at which the wrist angle is not known"
 
 
-_CLIPPED = frozenset({ControllerReason.TRAVEL, ControllerReason.SPEED})
-
-
 @dataclass(frozen=True, slots=True)
 class WristCommand:
-    """The wrist speed for now, and all reasons for a difference from the ideal one."""
+    """The wrist speed for now, and all reasons for a difference from the set point."""
 
-    speed_rad_per_s: float
-    reasons: tuple[ControllerReason, ...] = ()
+    speed_rad_per_s: float = 0.0
+    reasons: tuple[str, ...] = ()
 
     @property
     def holds(self) -> bool:
         """Whether the wrist is held, rather than driven with a clipped speed."""
-        return any(reason not in _CLIPPED for reason in self.reasons)
+        return not {ControllerReason.TRAVEL, ControllerReason.SPEED}.issuperset(self.reasons)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,13 +151,13 @@ class AngleHistory:
 
     def add(self, t_ns: int, angle_rad: float) -> bool:
         """Append an angle; return False, and drop it, if it is not later than the last one."""
+        integral = 0.0
         if self._t_ns:
             step_ns = t_ns - self._t_ns[-1]
             if step_ns <= 0:
                 return False
-            self._integral.append(self._integral[-1] + 0.5 * (angle_rad + self._angle_rad[-1]) * step_ns)
-        else:
-            self._integral.append(0.0)
+            integral = self._integral[-1] + 0.5 * (angle_rad + self._angle_rad[-1]) * step_ns
+        self._integral.append(integral)
         self._t_ns.append(t_ns)
         self._angle_rad.append(angle_rad)
         # One sample is kept from before the span, for its beginning.
@@ -126,18 +169,94 @@ class AngleHistory:
         """Return the mean angle in rad between two times; None where the history does not cover the interval."""
         if not self._t_ns or from_ns < self._t_ns[0] or to_ns > self._t_ns[-1] or to_ns < from_ns:
             return None
-        if to_ns == from_ns:
-            return self._at(from_ns)[0]
-        return (self._at(to_ns)[1] - self._at(from_ns)[1]) / (to_ns - from_ns)
+        angle, until_now, integral = 0.0, 0.0, 0.0
+        for t_ns in (from_ns, to_ns):
+            last = bisect_right(self._t_ns, t_ns) - 1
+            angle, since_ns = self._angle_rad[last], t_ns - self._t_ns[last]
+            if since_ns:
+                share = since_ns / (self._t_ns[last + 1] - self._t_ns[last])
+                angle += (self._angle_rad[last + 1] - angle) * share
+            until_now, integral = integral, self._integral[last] + 0.5 * (angle + self._angle_rad[last]) * since_ns
+        return angle if to_ns == from_ns else (integral - until_now) / (to_ns - from_ns)
 
-    def _at(self, t_ns: int) -> tuple[float, float]:
-        """Return the angle and the running integral at a time within the history."""
-        last = bisect_right(self._t_ns, t_ns) - 1
-        angle, since_ns = self._angle_rad[last], t_ns - self._t_ns[last]
-        if since_ns:
-            following = self._angle_rad[last + 1]
-            angle += (following - angle) * since_ns / (self._t_ns[last + 1] - self._t_ns[last])
-        return angle, self._integral[last] + 0.5 * (angle + self._angle_rad[last]) * since_ns
+
+class OffsetEstimator:
+    """Learns the tool's offset from late torques: the torque at every wrist angle. Times are CLOCK_MONOTONIC ns."""
+
+    def __init__(
+        self, settings: ControllerSettings, t_ns: int, angle_rad: float, torque_nm: float, known_measurements: float
+    ) -> None:
+        """Begin at a wrist angle and its torque, known as well as the mean of `known_measurements`."""
+        self.offset_nm = torque_nm
+        self.creep_nm = 0.0  # per measurement
+        self.innovation_nm: float | None = None
+        # The arrival of the latest measurement.
+        self.fresh_ns: int | None = None
+        # The torque at a fixed angle has moved too far since the reference.
+        self.lost = False
+        span_s = settings.age_limit_s + settings.window_s + settings.lag_s
+        self.angles = AngleHistory(int(1e9 * (span_s + 1.0)))
+        self.angles.add(t_ns, angle_rad)
+        self._settings = settings
+        self._reference_nm = torque_nm
+        self._origin_rad = angle_rad
+        self._known = known_measurements
+        self._sums = 0.0, 0.0
+        self._t_mid_ns = t_ns
+
+    def expected_nm(self, angle_rad: float) -> float:
+        """Return the tool's torque at a wrist angle."""
+        return self._settings.stiffness_nm_per_rad * (angle_rad - self._origin_rad) + self.offset_nm
+
+    def restart(self) -> None:
+        """Take the present offset as the reference: a grip that slipped may slip as far again before the next hold."""
+        self._reference_nm, self.lost = self.offset_nm, False
+
+    def measure(
+        self, torque_nm: float | None, t_mid_ns: int, t_ns: int, *, integrates: bool = True
+    ) -> ControllerRefusal | None:
+        """Use a torque of the time t_mid_ns that arrived at t_ns; return why it was rejected, or None.
+
+        The drift is learnt while the loop `integrates`.
+        """
+        own = self._settings
+        if torque_nm is None or not math.isfinite(torque_nm):
+            return ControllerRefusal.NOT_A_NUMBER
+        if t_mid_ns > t_ns:
+            return ControllerRefusal.FROM_THE_FUTURE
+        if t_mid_ns <= self._t_mid_ns:
+            return ControllerRefusal.OUT_OF_ORDER
+        if t_ns - t_mid_ns > own.age_limit_s * 1e9:
+            return ControllerRefusal.LATE
+        middle_ns, half_ns = t_mid_ns - int(own.lag_s * 1e9), int(own.window_s * 0.5e9)
+        angle = self.angles.mean(middle_ns - half_ns, middle_ns + half_ns)
+        if angle is None:
+            return ControllerRefusal.NO_ANGLE
+        missed = min(round((t_mid_ns - self._t_mid_ns) * 1e-9 / own.sample_period_s) - 1, _MOST_MISSED)
+        if self.fresh_ns is not None and missed > 0:
+            self.offset_nm += self.creep_nm * missed
+        self.innovation_nm = torque_nm - self.expected_nm(angle)
+        bounded = max(-own.innovation_limit_nm, min(own.innovation_limit_nm, self.innovation_nm))
+        if own.noise_nm and self.has_jumped(bounded / own.noise_nm):
+            self._known = min(self._known, _KNOWN_AFTER_JUMP)
+        self._known += 1.0
+        gain = max(own.kp, 1.0 / self._known)
+        if gain == own.kp and integrates:
+            most = own.creep_limit_nm_per_s * own.sample_period_s
+            self.creep_nm = max(-most, min(most, self.creep_nm + own.ki * bounded))
+        self.offset_nm += gain * bounded + self.creep_nm
+        self.lost |= abs(self.offset_nm - self._reference_nm) > own.offset_limit_nm
+        self._t_mid_ns, self.fresh_ns = t_mid_ns, t_ns
+        return None
+
+    def has_jumped(self, innovation_sigmas: float) -> bool:
+        """Update the two CUSUMs; return whether one exceeds the threshold, and reset both in that case."""
+        up, down = self._sums
+        up = max(up + innovation_sigmas - _JUMP_SLACK, 0.0)
+        down = max(down - innovation_sigmas - _JUMP_SLACK, 0.0)
+        jumped = max(up, down) > _JUMP_SUM
+        self._sums = (0.0, 0.0) if jumped else (up, down)
+        return jumped
 
 
 class TwistController:
@@ -159,19 +278,14 @@ class TwistController:
         if not (math.isfinite(angle_rad) and math.isfinite(torque_nm) and known_measurements >= 0.0):
             raise UserError("controller: it cannot start without a wrist angle and a torque that are numbers")
         self.settings = settings
-        span_s = settings.age_limit_s + settings.window_s + abs(settings.lag_s)
-        self._history = AngleHistory(int(1e9 * (span_s + 1.0)))
-        self._history.add(t_ns, angle_rad)
-        self._held = self._measured = self._moving = self._lost = False
+        self.estimator = OffsetEstimator(settings, t_ns, angle_rad, torque_nm, known_measurements)
+        # The expected torque at the latest command.
+        self.torque_nm = torque_nm
+        self._held = self._moving = False
         self._set_point_nm: float | None = None
         self._ramp_nm: float | None = None
-        self._innovation_nm: float | None = None
         self._origin_rad = self._angle_rad = angle_rad
-        self._offset_nm = self._first_offset_nm = torque_nm
-        self._creep_nm = 0.0  # per measurement
-        self._known = known_measurements
-        self._sum_up = self._sum_down = 0.0
-        self._t_mid_ns = self._fresh_ns = self._t_ns = t_ns
+        self._t_ns = t_ns
         self._wanted = self._sent = 0.0
 
     @property
@@ -180,10 +294,10 @@ class TwistController:
         return ControllerState(
             set_point_nm=self._set_point_nm,
             ramp_nm=self._ramp_nm,
-            torque_nm=self._expected_nm(self._angle_rad),
-            offset_nm=self._offset_nm,
-            creep_nm_per_s=self._creep_nm / self.settings.sample_period_s,
-            innovation_nm=self._innovation_nm,
+            torque_nm=self.estimator.expected_nm(self._angle_rad),
+            offset_nm=self.estimator.offset_nm,
+            creep_nm_per_s=self.estimator.creep_nm / self.settings.sample_period_s,
+            innovation_nm=self.estimator.innovation_nm,
         )
 
     def set_point(self, torque_nm: float) -> None:
@@ -196,20 +310,23 @@ class TwistController:
             raise UserError(f"controller: a set point of {torque_nm:g} N·m is not within the limit of {limit:g} N·m")
         self._set_point_nm = torque_nm
         if self._ramp_nm is None:
-            self._ramp_nm = self._expected_nm(self._angle_rad)
+            self._ramp_nm = self.estimator.expected_nm(self._angle_rad)
 
     def hold(self) -> None:
         """Hold the wrist until `resume`; measurements are still used."""
         self._held = True
 
     def resume(self) -> None:
-        """Continue after a hold; the ramp restarts at the present torque.
-
-        The present offset becomes the reference: a grip that slipped may slip as far again before the next hold.
-        """
-        self._held = self._lost = False
-        self._first_offset_nm = self._offset_nm
+        """Continue after a hold; the ramp restarts at the present torque."""
+        self._held = False
+        self.estimator.restart()
         self._rest()
+
+    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> ControllerRefusal | None:
+        """Use a torque of the time t_mid_ns that arrived at t_ns; return why it was rejected, or None."""
+        # Nothing is integrated while less was sent than was wanted.
+        clipped = abs(self._sent - self._wanted) > 1e-9 and abs(self._sent) < abs(self._wanted)
+        return self.estimator.measure(torque_nm, t_mid_ns, t_ns, integrates=not clipped)
 
     def command(self, t_ns: int, wrist_angle_rad: float, torques: Iterable[TorqueSample] = ()) -> WristCommand:
         """Return the wrist speed for now, from the angle that the robot reports (NaN: unknown) and new torques.
@@ -217,107 +334,72 @@ class TwistController:
         The torques come after the angle, which their windows need, and before the decision. The speed is 0 while
         anything forbids motion, and never exceeds the limit. It counts as sent until `sent` corrects it.
         """
-        elapsed_ns = min(max(t_ns - self._t_ns, 0), _LONGEST_STEP_NS)
+        own, tool = self.settings, self.estimator
+        elapsed_s = min(max(t_ns - self._t_ns, 0), _LONGEST_STEP_NS) / 1e9
         self._t_ns = max(t_ns, self._t_ns)
+        reasons = []
         if math.isfinite(wrist_angle_rad):
             self._angle_rad = wrist_angle_rad
-            self._history.add(t_ns, wrist_angle_rad)
-        for torque in torques:
-            torque_nm = torque.nearest_to(self._expected_nm(self._angle_rad))
-            self.measure(torque_nm, torque.t_mid_ns, torque.t_ns)
-        reasons = self._against_motion(t_ns, wrist_angle_rad)
-        if reasons or self._set_point_nm is None:
-            self._rest()
-            return WristCommand(0.0, reasons)
-        return self._drive(self._set_point_nm, elapsed_ns / 1e9)
-
-    def sent(self, speed_rad_per_s: float) -> None:
-        """Correct the speed that was sent for the last command, after clipping by driver and safety."""
-        self._sent = speed_rad_per_s if math.isfinite(speed_rad_per_s) else 0.0
-
-    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> ControllerRefusal | None:
-        """Use a torque of the time t_mid_ns that arrived at t_ns; return why it was rejected, or None."""
-        own = self.settings
-        if torque_nm is None or not math.isfinite(torque_nm):
-            return ControllerRefusal.NOT_A_NUMBER
-        if t_mid_ns > t_ns:
-            return ControllerRefusal.FROM_THE_FUTURE
-        if t_mid_ns <= self._t_mid_ns:
-            return ControllerRefusal.OUT_OF_ORDER
-        if t_ns - t_mid_ns > own.age_limit_s * 1e9:
-            return ControllerRefusal.LATE
-        middle_ns, half_ns = t_mid_ns - int(own.lag_s * 1e9), int(own.window_s * 0.5e9)
-        angle = self._history.mean(middle_ns - half_ns, middle_ns + half_ns)
-        if angle is None:
-            return ControllerRefusal.NO_ANGLE
-        missed = min(round((t_mid_ns - self._t_mid_ns) * 1e-9 / own.sample_period_s) - 1, _MOST_MISSED)
-        if self._measured and missed > 0:
-            self._offset_nm += self._creep_nm * missed
-        self._correct(torque_nm - self._expected_nm(angle))
-        self._t_mid_ns, self._fresh_ns, self._measured = t_mid_ns, t_ns, True
-        return None
-
-    def _correct(self, innovation_nm: float) -> None:
-        own = self.settings
-        self._innovation_nm = innovation_nm
-        bounded = max(-own.innovation_limit_nm, min(own.innovation_limit_nm, innovation_nm))
-        if own.noise_nm and self._has_jumped(bounded / own.noise_nm):
-            self._known = min(self._known, _KNOWN_AFTER_JUMP)
-        self._known += 1.0
-        gain = max(own.kp, 1.0 / self._known)
-        if gain == own.kp and not self._is_clipped():
-            most = own.creep_limit_nm_per_s * own.sample_period_s
-            self._creep_nm = max(-most, min(most, self._creep_nm + own.ki * bounded))
-        self._offset_nm += gain * bounded + self._creep_nm
-        self._lost |= abs(self._offset_nm - self._first_offset_nm) > own.offset_limit_nm
-
-    def _has_jumped(self, innovation_sigmas: float) -> bool:
-        """Update the two CUSUMs; return whether one exceeds the threshold, and reset both in that case."""
-        self._sum_up = max(self._sum_up + innovation_sigmas - _JUMP_SLACK, 0.0)
-        self._sum_down = max(self._sum_down - innovation_sigmas - _JUMP_SLACK, 0.0)
-        jumped = max(self._sum_up, self._sum_down) > _JUMP_SUM
-        if jumped:
-            self._sum_up = self._sum_down = 0.0
-        return jumped
-
-    def _against_motion(self, t_ns: int, wrist_angle_rad: float) -> tuple[ControllerReason, ...]:
-        """Return everything that forbids motion now."""
-        stale_ns = self.settings.stale_periods * self.settings.sample_period_s * 1e9
-        reasons = []
-        if not math.isfinite(wrist_angle_rad):
+            tool.angles.add(t_ns, wrist_angle_rad)
+        else:
             reasons.append(ControllerReason.NO_ANGLE)
+        for torque in torques:
+            torque_nm = torque.torque_nm
+            if torque_nm is not None and torque.low_nm is not None and torque.high_nm is not None:
+                # The torque of the friction band that is nearest to the expected one.
+                torque_nm = min(max(tool.expected_nm(self._angle_rad), torque.low_nm), torque.high_nm)
+            self.measure(torque_nm, torque.t_mid_ns, torque.t_ns)
+        self.torque_nm = tool.expected_nm(self._angle_rad)
         if self._held:
             reasons.append(ControllerReason.HELD)
         if self._set_point_nm is None:
             reasons.append(ControllerReason.NO_SET_POINT)
-        if not self._measured:
+        if tool.fresh_ns is None:
             reasons.append(ControllerReason.NOT_MEASURED)
-        elif t_ns - self._fresh_ns > stale_ns:
+        elif t_ns - tool.fresh_ns > own.stale_periods * own.sample_period_s * 1e9:
             reasons.append(ControllerReason.STALE)
-        if self._lost:
+        if tool.lost:
             reasons.append(ControllerReason.NOT_FOLLOWING)
-        return tuple(reasons)
+        if reasons or self._set_point_nm is None:
+            self._rest()
+            return WristCommand(0.0, tuple(reasons))
+        return self._drive(self._set_point_nm, elapsed_s)
+
+    def sent(self, speed_rad_per_s: float) -> None:
+        """Correct the speed that was sent for the last command, after clipping by driver and safety."""
+        self._sent = speed_rad_per_s if math.isfinite(speed_rad_per_s) else 0.0
 
     def _rest(self) -> None:
         """Stand still; the next ramp begins at the present torque."""
         self._moving = False
         self._wanted = self._sent = 0.0
         if self._set_point_nm is not None:
-            self._ramp_nm = self._expected_nm(self._angle_rad)
+            self._ramp_nm = self.torque_nm
 
     def _drive(self, set_point_nm: float, elapsed_s: float) -> WristCommand:
         own = self.settings
-        torque_nm = self._expected_nm(self._angle_rad)
-        ramp_nm = torque_nm if self._ramp_nm is None else self._ramp_nm
-        self._ramp_nm, slope = self._advance_ramp(ramp_nm, set_point_nm, elapsed_s)
-        missing_nm = self._ramp_nm - torque_nm
-        if self._rests(missing_nm, slope):
-            wanted = 0.0
-        else:
+        before_nm = self.torque_nm if self._ramp_nm is None else self._ramp_nm
+        self._ramp_nm, slope = self._advance_ramp(before_nm, set_point_nm, elapsed_s)
+        missing_nm = self._ramp_nm - self.torque_nm
+        bound_nm = own.deadband_nm * (_SETTLED_SHARE if self._moving else 1.0)
+        self._moving = slope != 0.0 or abs(missing_nm) > bound_nm
+        wanted = 0.0
+        if self._moving:
             wanted = (own.wrist_bandwidth_per_s * missing_nm + slope) / own.stiffness_nm_per_rad
-        speed, reasons = self._clip(wanted, elapsed_s)
+        speed = max(-own.speed_limit_rad_per_s, min(own.speed_limit_rad_per_s, wanted))
+        reasons = [ControllerReason.SPEED] if speed != wanted else []
+        # Only speeding up is limited; braking is not.
+        turning = abs(self._sent) if speed * self._sent > 0.0 else 0.0
+        fastest = turning + own.acceleration_limit_rad_per_s2 * elapsed_s
+        # Slow down towards the limit of the travel, so that one period does not overshoot it.
+        travel = self._angle_rad - self._origin_rad
+        room = max(own.travel_limit_rad - travel * math.copysign(1.0, speed), 0.0)
+        brakeable = own.wrist_bandwidth_per_s * room
+        if min(abs(speed), fastest) > brakeable:
+            reasons.append(ControllerReason.TRAVEL)
+        speed = math.copysign(min(abs(speed), fastest, brakeable), speed)
         self._wanted, self._sent = wanted, speed
-        return WristCommand(speed, reasons)
+        return WristCommand(speed, tuple(reasons))
 
     def _advance_ramp(self, ramp_nm: float, set_point_nm: float, elapsed_s: float) -> tuple[float, float]:
         """Return the ramp, moved no further than the wrist was commanded to turn, and its slope in N·m/s."""
@@ -329,34 +411,3 @@ class TwistController:
         turning = max(self._sent * towards, 0.0) + own.acceleration_limit_rad_per_s2 * elapsed_s
         slope = min(own.ramp_nm_per_s, own.stiffness_nm_per_rad * turning, abs(set_point_nm - ramp_nm) / elapsed_s)
         return ramp_nm + towards * slope * elapsed_s, towards * slope
-
-    def _rests(self, missing_nm: float, slope_nm_per_s: float) -> bool:
-        own = self.settings
-        bound = own.deadband_nm * (_SETTLED_SHARE if self._moving else 1.0)
-        self._moving = slope_nm_per_s != 0.0 or abs(missing_nm) > bound
-        return not self._moving
-
-    def _clip(self, wanted: float, elapsed_s: float) -> tuple[float, tuple[ControllerReason, ...]]:
-        own = self.settings
-        reasons = []
-        speed = max(-own.speed_limit_rad_per_s, min(own.speed_limit_rad_per_s, wanted))
-        if speed != wanted:
-            reasons.append(ControllerReason.SPEED)
-        # Only speeding up is limited; braking is not.
-        turning = abs(self._sent) if speed * self._sent > 0.0 else 0.0
-        fastest = turning + own.acceleration_limit_rad_per_s2 * elapsed_s
-        speed = math.copysign(min(abs(speed), fastest), speed)
-        travel = self._angle_rad - self._origin_rad
-        # Slow down towards the limit, so that one period does not overshoot it.
-        room = max(own.travel_limit_rad - travel * math.copysign(1.0, speed), 0.0)
-        if abs(speed) > own.wrist_bandwidth_per_s * room:
-            speed = math.copysign(own.wrist_bandwidth_per_s * room, speed)
-            reasons.append(ControllerReason.TRAVEL)
-        return speed, tuple(reasons)
-
-    def _is_clipped(self) -> bool:
-        """Whether less was sent than was wanted; nothing is integrated then."""
-        return abs(self._sent - self._wanted) > 1e-9 and abs(self._sent) < abs(self._wanted)
-
-    def _expected_nm(self, angle_rad: float) -> float:
-        return self.settings.stiffness_nm_per_rad * (angle_rad - self._origin_rad) + self._offset_nm

@@ -1,12 +1,12 @@
 """Fault detection: from the loop's inputs to the faults of the safety table, with their present numbers."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
-from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopInputs, TorqueSource
+from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.safety import Fault, FaultCode
-from shearloop.daemon.control.settings import LoopConfig
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, stale_after_s
 
 # 2.5 periods of their topics.
@@ -19,6 +19,60 @@ LATEST_LOOP_S = ARM_STALE_S - LONGEST_TICK_S
 # A longer absence is a paused process rather than a slow loop. CLOCK_MONOTONIC stands while the computer is suspended;
 # the devices that were lost report that case.
 AWAY_S = 1.0
+
+
+@dataclass(slots=True)
+class _History:
+    """Valid torques of one source, ordered by the time of measurement."""
+
+    t_mid_ns: list[int] = field(default_factory=list)
+    torque_nm: list[float] = field(default_factory=list)
+
+    def add(self, t_mid_ns: int, torque_nm: float, kept_ns: int) -> None:
+        """Append a torque, and trim once the list spans twice `kept_ns`."""
+        self.t_mid_ns.append(t_mid_ns)
+        self.torque_nm.append(torque_nm)
+        if self.t_mid_ns[0] < t_mid_ns - 2 * kept_ns:
+            old = bisect_left(self.t_mid_ns, t_mid_ns - kept_ns)
+            del self.t_mid_ns[:old], self.torque_nm[:old]
+
+    def mean(self, from_ns: int, to_ns: int) -> float | None:
+        """Return the mean torque between two times, ends included; None without any."""
+        first, end = bisect_left(self.t_mid_ns, from_ns), bisect_right(self.t_mid_ns, to_ns)
+        return sum(self.torque_nm[first:end]) / (end - first) if end > first else None
+
+
+@dataclass(slots=True)
+class LoopInputs:
+    """The latest inputs. `lost` and `died` map missing devices and dead tasks to a sentence.
+
+    Valid torques are kept for `kept_s`, to compare two sources at the same time.
+    """
+
+    kept_s: float = 10.0
+    torques: dict[str, TorqueSample] = field(default_factory=dict)
+    history: dict[str, _History] = field(default_factory=dict)
+    arm: ArmStatus | None = None
+    gripper: GripperStatus | None = None
+    lost: dict[str, str] = field(default_factory=dict)
+    died: Mapping[str, str] = field(default_factory=dict)
+    recording_error: str = ""
+    late_s: float = 0.0
+
+    def add_torque(self, torque: TorqueSample) -> None:
+        """Store a torque, unless it is older than the latest one of its source."""
+        known = self.torques.get(torque.source)
+        if known is not None and torque.t_mid_ns <= known.t_mid_ns:
+            return
+        self.torques[torque.source] = torque
+        if torque.torque_nm is not None:
+            history = self.history.setdefault(torque.source, _History())
+            history.add(torque.t_mid_ns, torque.torque_nm, round(self.kept_s * 1e9))
+
+    def mean_torque_nm(self, source: str, from_ns: int, to_ns: int) -> float | None:
+        """Return the mean of a source's valid torques between two times, or None without any."""
+        known = self.history.get(source)
+        return None if known is None else known.mean(from_ns, to_ns)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.daemon.control.settings import NotNegative, Positive
+from shearloop.daemon.control.loop_inputs import NotNegative, Positive
 from shearloop.daemon.errors import UserError
 
 # The grid of the torque's lag behind its stamp.

@@ -1,9 +1,41 @@
-"""Inputs of the control loop: the latest torques and device states, with their times. Values only."""
+"""Inputs of the control loop: its settings, and torques and device states with their times. Values only."""
 
 import math
-from bisect import bisect_left, bisect_right
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field
+
+from shearloop.daemon.config_file import ConfigModel
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+
+
+class LoopConfig(ConfigModel):
+    """Settings of the closed loop; docs/safety.md lists what each fault leads to."""
+
+    allowed_noise_nm: float = Field(default=0.0025, gt=0, le=1, description="true torque's std that noise may cause")
+    kp: float | None = Field(default=None, gt=0, le=1, description="fixes the gain, which else follows from the noise")
+    deadband_nm: float = Field(default=0.001, ge=0, le=1, description="error below which the wrist rests")
+    disagreement_nm: float = Field(default=0.05, gt=0, le=5)
+    max_innovation_nm: float = Field(default=0.08, gt=0, le=5)
+    max_offset_drift_nm: float = Field(
+        default=0.06, gt=0, le=5, description="drift of the torque at a fixed angle: slip"
+    )
+    wrist_speed_rad_per_s: float = Field(default=0.5, gt=0, le=3.14)
+    stale_after_s: float = Field(default=0.1, ge=0, le=10, description="no torque that is younger counts as stale")
+    wrist_acceleration_rad_per_s2: float = Field(default=4.0, gt=0, le=1000, description="given to the robot")
+    angle_bandwidth_per_s: float = Field(default=5.0, gt=0, le=80, description="how fast the wrist approaches an angle")
+    torque_bandwidth_per_s: float = Field(default=4.0, gt=0, le=30, description="how fast it approaches a torque")
+    actuation_s: float = Field(default=0.02, ge=0, le=0.2, description="from sending a speed until the angle shows it")
+    gain_margin: float = Field(default=2.0, ge=1, le=100)
+    phase_margin_deg: float = Field(default=45.0, ge=0, le=90)
+
+    @property
+    def planned_acceleration_rad_per_s2(self) -> float:
+        """The acceleration that controller and identification plan with; the robot keeps twice as much in reserve."""
+        return 0.5 * self.wrist_acceleration_rad_per_s2
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,12 +58,6 @@ class TorqueSample:
         """Treat NaN and infinity as no torque."""
         if self.torque_nm is not None and not math.isfinite(self.torque_nm):
             object.__setattr__(self, "torque_nm", None)
-
-    def nearest_to(self, expected_nm: float | None) -> float | None:
-        """Return the torque of the friction band that is nearest to the expected one."""
-        if self.torque_nm is None or self.low_nm is None or self.high_nm is None or expected_nm is None:
-            return self.torque_nm
-        return min(max(expected_nm, self.low_nm), self.high_nm)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,57 +107,3 @@ class TorqueSource:
     has_friction_band: bool = False
     from_robot: bool = False
     measures_torque: bool = True
-
-
-@dataclass(slots=True)
-class _History:
-    """Valid torques of one source, ordered by the time of measurement."""
-
-    t_mid_ns: list[int] = field(default_factory=list)
-    torque_nm: list[float] = field(default_factory=list)
-
-    def add(self, t_mid_ns: int, torque_nm: float, kept_ns: int) -> None:
-        """Append a torque, and trim once the list spans twice `kept_ns`."""
-        self.t_mid_ns.append(t_mid_ns)
-        self.torque_nm.append(torque_nm)
-        if self.t_mid_ns[0] < t_mid_ns - 2 * kept_ns:
-            old = bisect_left(self.t_mid_ns, t_mid_ns - kept_ns)
-            del self.t_mid_ns[:old], self.torque_nm[:old]
-
-    def mean(self, from_ns: int, to_ns: int) -> float | None:
-        """Return the mean torque between two times, ends included; None without any."""
-        first, end = bisect_left(self.t_mid_ns, from_ns), bisect_right(self.t_mid_ns, to_ns)
-        return sum(self.torque_nm[first:end]) / (end - first) if end > first else None
-
-
-@dataclass(slots=True)
-class LoopInputs:
-    """The latest inputs. `lost` and `died` map missing devices and dead tasks to a sentence.
-
-    Valid torques are kept for `kept_s`, to compare two sources at the same time.
-    """
-
-    kept_s: float = 10.0
-    torques: dict[str, TorqueSample] = field(default_factory=dict)
-    history: dict[str, _History] = field(default_factory=dict)
-    arm: ArmStatus | None = None
-    gripper: GripperStatus | None = None
-    lost: dict[str, str] = field(default_factory=dict)
-    died: Mapping[str, str] = field(default_factory=dict)
-    recording_error: str = ""
-    late_s: float = 0.0
-
-    def add_torque(self, torque: TorqueSample) -> None:
-        """Store a torque, unless it is older than the latest one of its source."""
-        known = self.torques.get(torque.source)
-        if known is not None and torque.t_mid_ns <= known.t_mid_ns:
-            return
-        self.torques[torque.source] = torque
-        if torque.torque_nm is not None:
-            history = self.history.setdefault(torque.source, _History())
-            history.add(torque.t_mid_ns, torque.torque_nm, round(self.kept_s * 1e9))
-
-    def mean_torque_nm(self, source: str, from_ns: int, to_ns: int) -> float | None:
-        """Return the mean of a source's valid torques between two times, or None without any."""
-        known = self.history.get(source)
-        return None if known is None else known.mean(from_ns, to_ns)

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_lyapunov
 
 from shearloop.bank.arrays import FloatArray
+from shearloop.daemon.control.controller import ControllerSettings
 from shearloop.daemon.control.identification import ToolModel
-from shearloop.daemon.control.settings import ControllerSettings, LoopConfig
+from shearloop.daemon.control.loop_inputs import LoopConfig
 
 ComplexArray = NDArray[np.complex128]
 

@@ -2,14 +2,12 @@
 
 import math
 from collections import deque
-from dataclasses import dataclass
 
-from shearloop.daemon.control.controller import TwistController
+from shearloop.daemon.control.controller import ControllerSettings, TwistController, WristCommand
 from shearloop.daemon.control.experiment_schema import IdentifyStep
 from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
-from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
+from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.margins import gain_for_noise, integral_gain, margin_refusal
-from shearloop.daemon.control.settings import ControllerSettings, LoopConfig
 from shearloop.daemon.control.step_runner import (
     ConstantVelocity,
     Hold,
@@ -28,14 +26,6 @@ CREEP_LIMIT_NM_PER_S = 0.005
 TRAVEL_LIMIT_RAD = 3.2
 # Innovations are clipped to three times the noise, and never below this.
 LEAST_INNOVATION_LIMIT_NM = 0.01
-
-
-@dataclass(frozen=True, slots=True)
-class WristVelocity:
-    """The wanted wrist speed, and the reasons for a difference from the set point."""
-
-    speed_rad_per_s: float = 0.0
-    reasons: tuple[str, ...] = ()
 
 
 class WristController:
@@ -57,11 +47,6 @@ class WristController:
         self._sent_rad_per_s = 0.0
         self._turned_ns = 0
 
-    @property
-    def expected_nm(self) -> float | None:
-        """The controller's expected torque at the present angle, while the loop is closed."""
-        return self.controller.state.torque_nm if self.controller is not None and self.tracked is not None else None
-
     def on_torque(self, torque: TorqueSample) -> None:
         """Pass a driving torque on to controller and identification."""
         if torque.source != self.source.name:
@@ -79,7 +64,7 @@ class WristController:
         if self._excitation is not None:
             self._excitation.sent(speed_rad_per_s)
 
-    def turn(self, setpoint: WristSetpoint, t_ns: int, wrist_rad: float, origin_rad: float) -> WristVelocity:
+    def turn(self, setpoint: WristSetpoint, t_ns: int, wrist_rad: float, origin_rad: float) -> WristCommand:
         """Return the speed for a set point; its angles count from origin_rad."""
         if not isinstance(setpoint, TrackTorque):
             # An open loop records no angles; the next closed loop starts from the torque measured then.
@@ -89,32 +74,34 @@ class WristController:
         self._held = False
         match setpoint:
             case Hold():
-                return WristVelocity()
+                return WristCommand()
             case MoveToAngle(angle_rad, speed_rad_per_s):
-                return self._towards(origin_rad + angle_rad - wrist_rad - self._on_the_way_rad(t_ns), speed_rad_per_s)
+                missing_rad = origin_rad + angle_rad - wrist_rad - self._on_the_way_rad(t_ns)
+                speed = min(abs(self._config.angle_bandwidth_per_s * missing_rad), speed_rad_per_s)
+                return self._clipped(math.copysign(speed, missing_rad))
             case ConstantVelocity(speed_rad_per_s):
-                return self._bounded(speed_rad_per_s)
+                return self._clipped(speed_rad_per_s)
             case TrackTorque():
-                return self._follow(setpoint, t_ns, wrist_rad)
+                if self.controller is None or self.tracked != setpoint:
+                    return WristCommand(reasons=("the loop has not been closed",))
+                command = self.controller.command(t_ns, wrist_rad, self._pending)
+                self._pending.clear()
+                return command
 
-    def why_not_trackable(self, setpoint: TrackTorque, torque_limit_nm: float) -> str | None:
-        """Return why a torque cannot be tracked with the identified tool, or None."""
-        if self.tool is None:
-            return "the tool has not been identified; put an `identify` step before the first `hold_torque`"
-        settings = controller_settings(self._config, self.tool, self.source, setpoint, torque_limit_nm)
-        return margin_refusal(settings, self.tool, self._config)
-
-    def begin_tracking(self, setpoint: TrackTorque, t_ns: int, wrist_rad: float, torque_limit_nm: float) -> None:
-        """Close the loop on a set point that `why_not_trackable` accepts."""
+    def close_loop(self, setpoint: TrackTorque, t_ns: int, wrist_rad: float, torque_limit_nm: float) -> str | None:
+        """Track a torque with the identified tool; return None, or why it cannot be tracked."""
         tool = self.tool
         if tool is None:
-            raise ValueError("a loop is closed on an identified tool")
+            return "the tool has not been identified; put an `identify` step before the first `hold_torque`"
+        settings = controller_settings(self._config, tool, self.source, setpoint, torque_limit_nm)
+        if refusal := margin_refusal(settings, tool, self._config):
+            return refusal
         if self.controller is None:
-            settings = controller_settings(self._config, tool, self.source, setpoint, torque_limit_nm)
             here_nm = tool.torque_nm + tool.stiffness_nm_per_rad * (wrist_rad - tool.angle_rad)
             self.controller = TwistController(settings, t_ns, wrist_rad, here_nm, tool.known_measurements)
         self.controller.set_point(setpoint.torque_nm)
         self.tracked = setpoint
+        return None
 
     def begin_identification(self, action: IdentifyStep, torque_limit_nm: float) -> None:
         """Begin the small twists that identify the tool."""
@@ -131,34 +118,27 @@ class WristController:
             )
         )
 
-    def identify(self, t_ns: int, wrist_rad: float) -> tuple[WristVelocity, str | None]:
+    def identify(self, t_ns: int, wrist_rad: float) -> tuple[WristCommand, str | None]:
         """Return the identification's speed, and at its end "" or an error."""
         step = self._excitation
         if step is None:
-            return WristVelocity(), "the identification was not started"
-        turn = self._bounded(step.command(t_ns, wrist_rad))
+            return WristCommand(), "the identification was not started"
+        speed_rad_per_s = step.command(t_ns, wrist_rad)
         if not step.done:
-            return turn, None
+            return WristCommand(speed_rad_per_s), None
         self.tool, self._excitation = step.result, None
-        return WristVelocity(), step.failure or ""
+        return WristCommand(), step.failure or ""
 
-    def hold(self) -> WristVelocity:
+    def hold(self) -> WristCommand:
         """Stand still; the next `turn` continues without a jump."""
         if self.controller is not None and not self._held:
             self.controller.hold()
         self._held = True
-        return WristVelocity()
+        return WristCommand()
 
     def reset(self) -> None:
         """Forget the tool, after a new grip or a new zero."""
         self.tool = self.controller = self.tracked = self._excitation = None
-
-    def _follow(self, setpoint: TrackTorque, t_ns: int, wrist_rad: float) -> WristVelocity:
-        if self.controller is None or self.tracked != setpoint:
-            return WristVelocity(reasons=("the loop has not been closed",))
-        command = self.controller.command(t_ns, wrist_rad, self._pending)
-        self._pending.clear()
-        return WristVelocity(self._bounded(command.speed_rad_per_s).speed_rad_per_s, tuple(map(str, command.reasons)))
 
     def _on_the_way_rad(self, t_ns: int) -> float:
         """Return the turn that was sent and does not show in the angle yet."""
@@ -171,19 +151,13 @@ class WristController:
             self._under_way.popleft()
         return sum(speed * held_s for _, speed, held_s in self._under_way)
 
-    def _towards(self, missing_rad: float, speed_rad_per_s: float) -> WristVelocity:
-        bandwidth_per_s = self._config.angle_bandwidth_per_s
-        speed = math.copysign(min(abs(bandwidth_per_s * missing_rad), speed_rad_per_s), missing_rad)
-        return self._bounded(speed)
-
-    def _bounded(self, speed_rad_per_s: float) -> WristVelocity:
+    def _clipped(self, speed_rad_per_s: float) -> WristCommand:
         if not math.isfinite(speed_rad_per_s):
-            return WristVelocity(0.0, ("the wanted speed is not a number",))
+            return WristCommand(0.0, ("the wanted speed is not a number",))
         limit = self._config.wrist_speed_rad_per_s
-        bounded = max(-limit, min(limit, speed_rad_per_s))
-        if bounded == speed_rad_per_s:
-            return WristVelocity(bounded)
-        return WristVelocity(bounded, (f"the wrist turns no faster than {limit:g} rad/s",))
+        clipped = max(-limit, min(limit, speed_rad_per_s))
+        reasons = () if clipped == speed_rad_per_s else (f"the wrist turns no faster than {limit:g} rad/s",)
+        return WristCommand(clipped, reasons)
 
 
 def controller_settings(

@@ -5,25 +5,34 @@ daemon, with each further experiment, and after an hour without an experiment.
 """
 
 import asyncio
+import hashlib
+import platform
 import re
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
+from io import FileIO
+from itertools import count
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+from pydantic_core import PydanticSerializationError
+
+from shearloop.bank.eit.bank_file import Bank
 from shearloop.daemon.clock import Clock
+from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.messages import Scalar
+from shearloop.daemon.messaging.messages import LoopState, Scalar
 from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.identity import AttachedFile, Identity
-from shearloop.daemon.recording.writer import McapFile
-from shearloop.drivers.serial_sensor import InputKind, OnRaw, RawEvent
+from shearloop.daemon.recording.writer import PARTIAL, McapFile
+from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 
 # A kill loses the data since the last flush, less than a second even on a busy computer.
 FLUSH_S = 0.5
@@ -32,6 +41,72 @@ MAX_WAITING_BYTES = 32 << 20
 LONGEST_IDLE_FILE_S = 3600.0
 # Memory of a message apart from its arrays.
 _OVERHEAD_BYTES = 1000
+# Configuration keys of files to attach. Secret keys are never attached, and a bank is identified by its hash.
+_ATTACHED = ("calibration", "robot", "experiment")
+# Calibrations and settings are far smaller.
+_LARGEST_ATTACHED_BYTES = 32 << 20
+# Phases of `loop.state` without a running experiment.
+_IDLE_PHASES = ("idle", "done", "stopped")
+
+
+@dataclass(frozen=True, slots=True)
+class AttachedFile:
+    """A file that is attached to the recording."""
+
+    name: str
+    media_type: str
+    data: bytes
+
+    @classmethod
+    def read(cls, path: Path) -> tuple["AttachedFile", ...]:
+        """Return the file, or nothing if it is missing, unreadable or too large."""
+        try:
+            if not path.is_file() or path.stat().st_size > _LARGEST_ATTACHED_BYTES:
+                return ()
+            media_type = "application/yaml" if path.suffix in (".yaml", ".yml") else "application/octet-stream"
+            return (cls(str(path), media_type, path.read_bytes()),)
+        except OSError:
+            return ()
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """The metadata and the attachments of a recording."""
+
+    metadata: Mapping[str, str]
+    attached: tuple[AttachedFile, ...] = ()
+
+
+def daemon_identity(config: DaemonConfig) -> Identity:
+    """Return the identity of a daemon's recordings: software, configuration, and the files that it names.
+
+    Raises BankError for a bank that cannot be opened, and UserError for a path that is not UTF-8.
+    """
+    metadata = schema.basic_identity(f"a daemon on {platform.node()}")
+    metadata["python"] = f"{platform.python_version()}, numpy {np.__version__}, {platform.machine()}"
+    for name, fingertip in config.fingertips.items():
+        if fingertip.bank is not None:
+            metadata[f"bank_{name}"] = Bank.open(fingertip.bank).identity
+    try:
+        as_json = config.model_dump_json(indent=1).encode()
+    except PydanticSerializationError as error:
+        folder = config.recording.folder if config.recording is not None else Path()
+        raise UserError(
+            "a recording keeps the configuration and its paths, and one of them is not UTF-8 (the folder of the "
+            f"recordings is {str(folder)!r}); choose another name"
+        ) from error
+    attached = {schema.CONFIGURATION: AttachedFile(schema.CONFIGURATION, "application/json", as_json)}
+    for key, path in config.walk():
+        if isinstance(path, Path) and key.rpartition(".")[2] in _ATTACHED:
+            for file in AttachedFile.read(path):
+                attached[file.name] = file
+                metadata[f"sha256 {path}"] = hashlib.sha256(file.data).hexdigest()
+    return Identity(metadata, tuple(attached.values()))
+
+
+def experiment_notes(experiment: ExperimentFile) -> dict[str, str]:
+    """Return the metadata of an experiment: its tool's diameter, if it names one."""
+    return {} if experiment.tool_mm is None else {schema.DIAMETER_NOTE: f"{experiment.tool_mm:g}"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,59 +119,68 @@ class _Item:
     begins_experiment: bool
 
 
+@dataclass(frozen=True, slots=True)
+class _SourceRecorder:
+    recorder: "Recorder"
+    source: str
+
+    def record(self, event: RawEvent) -> None:
+        self.recorder.record_input(self.source, event)
+
+
+@dataclass(slots=True)
+class _Counts:
+    """Numbers over all files. The event loop counts `queued_bytes` and `dropped` up, the writing thread the others."""
+
+    queued_bytes: int = 0
+    written_bytes: int = 0
+    dropped: int = 0
+    # Messages without a JSON form, and the latest error.
+    unwritable: int = 0
+    last_unwritable: str = ""
+
+
+@dataclass(slots=True)
+class _CurrentFile:
+    file: McapFile
+    began_ns: int
+    # Items lost before this file began.
+    lost_before: int
+    experiment: str = ""
+    offset_ns: int | None = None
+    closed: bool = False
+
+
 class Recorder:
-    """Writes files in a folder. `record_message`, `input_recorder` and `record_experiment` never block."""
+    """Writes files in a folder. `record_message`, `input_recorder` and `record_experiment` never block.
 
-    def __init__(
-        self,
-        folder: Path,
-        identity: Identity,
-        clock: Clock,
-        *,
-        is_busy: Callable[[], bool] = lambda: False,
-        on_failure: Callable[[str], None] = lambda _: None,
-        open_file: Callable[[Path], McapFile] = McapFile,
-        max_waiting_bytes: int = MAX_WAITING_BYTES,
-    ) -> None:
-        """Begin the first file; raises UserError if that is not possible.
+    `failure` is the error of the last flush, empty without one. `finished` lists the closed files.
+    """
 
-        `is_busy` returns whether an experiment is running. `on_failure` receives the error after each flush, empty
-        without an error.
-        """
+    def __init__(self, folder: Path, identity: Identity, clock: Clock) -> None:
+        """Begin the first file; raises UserError if that is not possible."""
         self._folder = folder
         self._identity = identity
         self._clock = clock
-        self._is_busy = is_busy
-        self._on_failure = on_failure
-        self._open_file = open_file
-        self._max_waiting_bytes = max_waiting_bytes
         self._queue: deque[_Item] = deque()
-        # One thread counts each of these up. Their difference is the size of the queue.
-        self._queued_bytes = 0
-        self._done_bytes = 0
-        self._dropped = 0
-        # Messages without a JSON form, and the latest error.
-        self._unwritable = 0
-        self._last_unwritable = ""
-        # Items lost before the current file began.
-        self._lost_before = 0
+        self._counts = _Counts()
+        self._experiment_runs = False
         # The latest tool event of each source.
         self._tools: dict[str, RawEvent] = {}
         # A flush may still run in its thread when the recorder is closed.
         self._lock = threading.Lock()
-        self._closed = False
         self.failure = ""
         self.finished: list[Path] = []
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._begin_file()
+            self._current = self._new_file(lost_before=0)
         except OSError as error:
             raise UserError(f"{folder}: cannot record there: {error.strerror}; choose another folder") from error
 
     @property
     def path(self) -> Path:
         """The current file."""
-        return self._file.partial
+        return self._current.file.partial
 
     def record_message(self, topic: str, content: Mapping[str, Any]) -> None:
         """Queue a published message."""
@@ -104,14 +188,14 @@ class Recorder:
         size = _OVERHEAD_BYTES + 2 * sum(len(value) for value in content.values() if isinstance(value, bytes))
         self._enqueue(size, partial(self._add_message, topic, content, self._clock.now_ns(), self._clock.offset_ns))
 
-    def input_recorder(self, source: str) -> OnRaw:
-        """Return a function that records the raw input of one source."""
+    def input_recorder(self, source: str) -> InputRecorder:
+        """Return the recorder of one source's raw input."""
+        return _SourceRecorder(self, source)
 
-        def record_input(event: RawEvent) -> None:
-            add = partial(self._add_input, source, event, self._clock.offset_ns)
-            self._enqueue(_OVERHEAD_BYTES + len(event.data), add)
-
-        return record_input
+    def record_input(self, source: str, event: RawEvent) -> None:
+        """Queue a raw input."""
+        add = partial(self._add_input, source, event, self._clock.offset_ns)
+        self._enqueue(_OVERHEAD_BYTES + len(event.data), add)
 
     def record_experiment(
         self, name: str, attached: tuple[AttachedFile, ...] = (), notes: Mapping[str, str] = MappingProxyType({})
@@ -121,105 +205,114 @@ class Recorder:
         add = partial(self._add_experiment, name, attached, notes, t_unix_ns)
         self._enqueue(_OVERHEAD_BYTES, add, begins_experiment=True)
 
-    async def run(self) -> None:
-        """Write every FLUSH_S until cancelled."""
+    async def flushes(self) -> AsyncIterator[str]:
+        """Write every FLUSH_S and yield `failure` each time."""
         loop = asyncio.get_running_loop()
         due_s = loop.time()
         while True:
             due_s = max(due_s + FLUSH_S, loop.time())
             await asyncio.sleep(due_s - loop.time())
             await asyncio.to_thread(self.write)
-            self._on_failure(self.failure)
+            yield self.failure
 
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the recorder's state for `health`."""
+        counts, file = self._counts, self._current.file
         return {
             "file": str(self.path),
             "files": len(self.finished) + 1,
-            "file_messages": self._file.messages,
-            "file_bytes": self._file.bytes_written,
+            "file_messages": file.messages,
+            "file_bytes": file.bytes_written,
             "waiting_bytes": self._waiting_bytes,
-            "errors": {kind: n for kind, n in (("dropped", self._dropped), ("unwritable", self._unwritable)) if n},
-            "error": self.failure or self._last_unwritable,
+            "errors": {kind: n for kind, n in (("dropped", counts.dropped), ("unwritable", counts.unwritable)) if n},
+            "error": self.failure or counts.last_unwritable,
         }
 
     def write(self) -> None:
         """Write the queue to the disk; an error is stored in `failure`, and the next call tries again."""
         with self._lock:
-            if not self._closed:
+            if not self._current.closed:
                 self._write()
 
     def close(self) -> None:
         """Write the queue and close the file; an error is stored in `failure`."""
         with self._lock:
-            if self._closed:
+            if self._current.closed:
                 return
-            self._closed = True
             try:
                 self._write()
             finally:
-                if self._file.messages or self._experiment:
-                    self._finish_file(self._file, self._experiment, self._dropped + self._unwritable)
+                current = self._current
+                current.closed = True
+                if current.file.messages or current.experiment:
+                    self._finish_file(current, self._counts.dropped + self._counts.unwritable)
                 else:
                     # The daemon stopped before its first message.
                     try:
-                        self._file.discard()
+                        current.file.discard()
                     except OSError as error:
                         self.failure = f"{self.path}: {error.strerror}"
 
     @property
     def _waiting_bytes(self) -> int:
-        return self._queued_bytes - self._done_bytes + self._file.bytes_waiting
+        return self._counts.queued_bytes - self._counts.written_bytes + self._current.file.bytes_waiting
 
     def _enqueue(self, size: int, add: Callable[[], None], *, begins_experiment: bool = False) -> None:
-        if self._waiting_bytes + size > self._max_waiting_bytes:
-            self._dropped += 1
+        if self._waiting_bytes + size > MAX_WAITING_BYTES:
+            self._counts.dropped += 1
             return
-        self._queued_bytes += size
-        self._queue.append(_Item(add, size, self._dropped, begins_experiment))
+        self._counts.queued_bytes += size
+        self._queue.append(_Item(add, size, self._counts.dropped, begins_experiment))
 
     def _write(self) -> None:
         self.failure = ""
         # Items that arrive meanwhile wait for the next flush.
         for _ in range(len(self._queue)):
             item = self._queue.popleft()
-            if self._experiment if item.begins_experiment else self._is_idle_too_long():
+            if self._current.experiment if item.begins_experiment else self._is_idle_too_long():
                 self._change_file(item.dropped)
             try:
                 item.add()
             finally:
-                self._done_bytes += item.size
+                self._counts.written_bytes += item.size
         self._flush()
 
     def _flush(self) -> bool:
         try:
-            self._file.flush()
+            self._current.file.flush()
         except OSError as error:
             self.failure = f"{self.path}: {error.strerror}"
             return False
         return True
 
     def _is_idle_too_long(self) -> bool:
-        return (self._clock.now_ns() - self._began_ns) / 1e9 > LONGEST_IDLE_FILE_S and not self._is_busy()
+        age_s = (self._clock.now_ns() - self._current.began_ns) / 1e9
+        return age_s > LONGEST_IDLE_FILE_S and not self._experiment_runs
 
     def _change_file(self, dropped: int) -> None:
         """Begin the next file; on failure continue with the current one. `dropped` counts the drops so far."""
         if not self._flush():
             return
-        previous, experiment = self._file, self._experiment
+        previous, lost = self._current, dropped + self._counts.unwritable
         try:
-            self._begin_file()
+            self._current = self._new_file(lost)
         except OSError as error:
             self.failure = f"{self._folder}: {error.strerror}"
             return
-        self._finish_file(previous, experiment, dropped + self._unwritable)
+        self._finish_file(previous, lost)
         for source, event in self._tools.items():
             # The tool is still held, and a replay of this file must know it.
-            self._add_input(source, replace(event, t_ns=self._began_ns), self._clock.offset_ns)
+            self._add_input(source, replace(event, t_ns=self._current.began_ns), self._clock.offset_ns)
 
-    def _begin_file(self) -> None:
+    def _new_file(self, lost_before: int) -> _CurrentFile:
         now_ns, offset_ns = self._clock.now_ns(), self._clock.offset_ns
-        file = self._create_file(datetime.fromtimestamp((now_ns + offset_ns) / 1e9, UTC).strftime("%Y-%m-%dT%H-%M-%SZ"))
+        name = datetime.fromtimestamp((now_ns + offset_ns) / 1e9, UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
+        # Another file may have begun in the same second.
+        for number in count(1):
+            with suppress(FileExistsError):
+                suffix = "" if number == 1 else f"-{number}"
+                file = McapFile(FileIO(self._folder / f"{name}{suffix}.mcap{PARTIAL}", "xb"))
+                break
         try:
             file.add_metadata(schema.METADATA, self._identity.metadata)
             for one in self._identity.attached:
@@ -230,62 +323,55 @@ class Recorder:
             with suppress(OSError):
                 file.discard()
             raise
-        self._file, self._began_ns = file, now_ns
-        self._offset_ns: int | None = None
-        self._experiment = ""
+        return _CurrentFile(file, now_ns, lost_before)
 
-    def _create_file(self, name: str) -> McapFile:
-        number, path = 1, self._folder / f"{name}.mcap"
-        while True:
-            try:
-                return self._open_file(path)
-            except FileExistsError:
-                # It began in the same second.
-                number += 1
-                path = self._folder / f"{name}-{number}.mcap"
-
-    def _finish_file(self, file: McapFile, experiment: str, lost: int) -> None:
+    def _finish_file(self, current: _CurrentFile, lost: int) -> None:
         """Close a file under a name with its experiment; if that fails, the PARTIAL file stays for a repair."""
-        slug = re.sub(r"[^a-z0-9.]+", "-", experiment.lower()).strip("-.")
-        if slug:
-            file.path = file.path.with_name(f"{file.path.stem}_{slug}.mcap")
+        file = current.file
+        began = file.partial.name.removesuffix(f".mcap{PARTIAL}")
+        slug = re.sub(r"[^a-z0-9.]+", "-", current.experiment.lower()).strip("-.")
+        path = file.partial.with_name(f"{began}_{slug}.mcap" if slug else f"{began}.mcap")
         try:
-            file.add_metadata(schema.END_METADATA, {"dropped": str(lost - self._lost_before)})
-            self.finished.append(file.close())
+            file.add_metadata(schema.END_METADATA, {"dropped": str(lost - current.lost_before)})
+            file.close(path)
         except OSError as error:
             self.failure = f"{file.partial}: {error.strerror}"
-        self._lost_before = lost
+        else:
+            self.finished.append(path)
 
     def _add_message(self, topic: str, content: Mapping[str, Any], now_ns: int, offset_ns: int) -> None:
+        if topic == LoopState.topic:
+            self._experiment_runs = content["phase"] not in _IDLE_PHASES
         self._add_clock(now_ns, offset_ns)
         name = schema.recorded_topic(topic, content["source"])
         try:
             data = schema.message_json(topic, content, offset_ns)
         except schema.NoJsonError as error:
-            self._unwritable += 1
-            self._last_unwritable = f"a message of {name} has no JSON form and is left out: {error}"
+            self._counts.unwritable += 1
+            self._counts.last_unwritable = f"a message of {name} has no JSON form and is left out: {error}"
             return
-        self._file.add(name, content["t_mono_ns"] + offset_ns, now_ns + offset_ns, data)
+        self._current.file.add(name, content["t_mono_ns"] + offset_ns, now_ns + offset_ns, data)
 
     def _add_input(self, source: str, event: RawEvent, offset_ns: int) -> None:
         if event.kind is InputKind.TOOL:
             self._tools[source] = event
         self._add_clock(event.t_ns, offset_ns)
         t_unix_ns = event.t_ns + offset_ns
-        self._file.add(schema.input_topic(source), t_unix_ns, t_unix_ns, schema.input_json(event))
+        self._current.file.add(schema.input_topic(source), t_unix_ns, t_unix_ns, schema.input_json(event))
 
     def _add_experiment(
         self, name: str, attached: tuple[AttachedFile, ...], notes: Mapping[str, str], t_unix_ns: int
     ) -> None:
-        self._experiment = name
-        self._file.add_metadata(schema.EXPERIMENT_METADATA, {**notes, "name": name, "t_unix_ns": str(t_unix_ns)})
+        current = self._current
+        current.experiment, self._experiment_runs = name, True
+        current.file.add_metadata(schema.EXPERIMENT_METADATA, {**notes, "name": name, "t_unix_ns": str(t_unix_ns)})
         for one in attached:
             if one not in self._identity.attached:
-                self._file.attach(one.name, one.media_type, one.data, t_unix_ns)
+                current.file.attach(one.name, one.media_type, one.data, t_unix_ns)
 
     def _add_clock(self, now_ns: int, offset_ns: int) -> None:
-        if offset_ns == self._offset_ns:
+        if offset_ns == self._current.offset_ns:
             return
-        self._offset_ns = offset_ns
+        self._current.offset_ns = offset_ns
         data = schema.as_json({"t_mono_ns": now_ns, "offset_ns": offset_ns})
-        self._file.add(schema.CLOCK_TOPIC, now_ns + offset_ns, now_ns + offset_ns, data)
+        self._current.file.add(schema.CLOCK_TOPIC, now_ns + offset_ns, now_ns + offset_ns, data)

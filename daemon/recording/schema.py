@@ -12,16 +12,20 @@ properties. A key without a value is therefore left out instead of null.
 """
 
 import dataclasses
+import hashlib
 import math
 import types
 import typing
 from collections.abc import Mapping
 from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic_core import to_json
 
+from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH
 from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitFrame, EitHeatmap, LoadTorque
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
@@ -48,6 +52,37 @@ _TIME = {"type": "integer", "description": "CLOCK_MONOTONIC in ns"}
 
 class NoJsonError(ValueError):
     """A value cannot be written as JSON."""
+
+
+def basic_identity(source: str) -> dict[str, str]:
+    """Return the metadata of every recording; `source` describes the origin of the data."""
+    return {
+        "format_version": FORMAT_VERSION,
+        "channel_table_hash": CHANNEL_TABLE_HASH,
+        "source": source,
+        "software": software_version(),
+        "code_sha256": code_digest(),
+    }
+
+
+def software_version() -> str:
+    """Return the installed version of shearloop."""
+    try:
+        return version("shearloop")
+    except PackageNotFoundError:
+        return "not installed"
+
+
+@cache
+def code_digest() -> str:
+    """Return a hash of shearloop's own sources; equal code must give equal replays."""
+    root = Path(__file__).resolve().parents[2]
+    digest = hashlib.sha256()
+    for package in ("bank", "drivers", "daemon"):
+        for path in sorted((root / package).rglob("*.py")):
+            digest.update(f"{path.relative_to(root)}\0".encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def recorded_topic(topic: str, source: str) -> str:

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.identity import basic_identity
 from shearloop.files import sync_directory
 
 PARTIAL = ".partial"
@@ -62,18 +61,17 @@ class _RetryStream:
 
 
 class McapFile:
-    """Writes PATH.partial and renames it to PATH when it is closed as complete.
+    """Writes an open file, NAME.mcap.partial, which `close` renames.
 
     `flush` writes the messages so far as one chunk. If that fails (OSError), no data is lost and the next flush tries
     again. Not thread-safe.
     """
 
-    def __init__(self, path: Path, file: io.FileIO | None = None) -> None:
-        """Create PATH.partial, or write to an open `file`; raises OSError, FileExistsError if it exists."""
-        self.path = path
-        self.partial = path.with_name(path.name + PARTIAL)
-        self._file = file if file is not None else io.FileIO(self.partial, "xb")
-        self._stream = _RetryStream(self._file)
+    def __init__(self, file: io.FileIO) -> None:
+        """Take over the file, which `close` and `discard` close."""
+        self.partial = Path(os.fsdecode(file.name))
+        self._file = file
+        self._stream = _RetryStream(file)
         # The MCAP writer calls only write, tell and flush.
         self._writer = new_writer(cast(IO[bytes], self._stream))
         self._schemas: dict[str, int] = {}
@@ -114,10 +112,10 @@ class McapFile:
         """End the chunk and write it to the disk; raises OSError, after which a later flush tries again."""
         self._writer.flush()  # type: ignore[no-untyped-call]  # mcap has no return annotation here
 
-    def close(self, complete: bool = True) -> Path:
-        """Write the index and return the file's path: PATH if it is complete, else PATH.partial.
+    def close(self, path: Path | None = None) -> None:
+        """Write the index, and rename the file to `path` if it is given.
 
-        Raises OSError if the disk is full; the flushed data then stays readable as PATH.partial.
+        Raises OSError if the disk is full; the flushed data then stays readable under the old name.
         """
         try:
             self._writer.finish()  # type: ignore[no-untyped-call]  # mcap has no return annotation here
@@ -125,11 +123,9 @@ class McapFile:
             os.fsync(self._file.fileno())
         finally:
             self._file.close()
-        if not complete:
-            return self.partial
-        self.partial.replace(self.path)
-        sync_directory(self.path.parent)
-        return self.path
+        if path is not None:
+            self.partial.replace(path)
+            sync_directory(path.parent)
 
     def discard(self) -> None:
         """Close and delete the file."""
@@ -151,11 +147,10 @@ class RecordingWriter:
         """Create `path`.partial; `source` describes the origin of the data. Raises UserError on failure."""
         self.path = Path(path)
         try:
-            partial = self.path.with_name(self.path.name + PARTIAL)
-            self._file = McapFile(self.path, io.FileIO(partial, "wb"))
+            self._file = McapFile(io.FileIO(f"{self.path}{PARTIAL}", "wb"))
         except OSError as error:
             raise self._write_error(error) from error
-        self._file.add_metadata(schema.METADATA, {**basic_identity(source), **(notes or {})})
+        self._file.add_metadata(schema.METADATA, {**schema.basic_identity(source), **(notes or {})})
 
     def add_frame(self, side: str, t_mid_unix_ns: int, arrival_unix_ns: int, line: NDArray[np.float64]) -> None:
         """Append one frame: the (1024,) values of its line in volts."""
@@ -175,7 +170,7 @@ class RecordingWriter:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Close the file, as complete if there was no error."""
         try:
-            self._file.close(complete=kind is None)
+            self._file.close(self.path if kind is None else None)
         except OSError as error:
             raise self._write_error(error) from error
 

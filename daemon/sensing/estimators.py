@@ -1,5 +1,6 @@
 """Estimators of the daemon: opened from the configuration, and run on the boards' frames. No I/O but the files."""
 
+import asyncio
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -72,11 +73,6 @@ class LiveEstimator:
         return f", assuming that {text}" if text else ""
 
     @property
-    def searches_bank(self) -> bool:
-        """Whether an estimate searches a bank, which takes many milliseconds; others take less than one."""
-        return self._matcher is not None
-
-    @property
     def grids(self) -> tuple[FloatArray, FloatArray] | None:
         """The k and the sigma of the bank's cells, None without a bank."""
         return (self._matcher.k_grid, self._matcher.sigma_grid) if self._matcher is not None else None
@@ -94,14 +90,22 @@ class LiveEstimator:
         """Set the diameter of the held tool: on another one than the calibration's there is no torque."""
         self._session.set_tool(tool)
 
-    def estimate(self, *frames: Frame) -> Estimate:
-        """Return the estimate of frames of one time, one for each side. Searching a bank is slow."""
+    async def estimate(self, *frames: Frame) -> Estimate:
+        """Return the estimate of frames of one time, one for each side.
+
+        A search of the bank runs in a thread: it can take half a second.
+        """
         if any(frame.repeated for frame in frames):
             return Estimate(valid=False, reasons=REPEATED_FRAME)
         usable = np.array([~(frame.saturated | frame.dead) for frame in frames])
         t_s = sum(frame.t_mid_ns for frame in frames) / len(frames) / 1e9
-        channels = np.array([frame.channels for frame in frames])
-        estimate = self._session.estimate(TactileFrame.of(t_s, channels, usable))
+        frame = TactileFrame.of(t_s, np.array([frame.channels for frame in frames]), usable)
+        if self._matcher is None:
+            return self._session.estimate(frame)
+        return await asyncio.to_thread(self._estimate_with_bank, frame)
+
+    def _estimate_with_bank(self, frame: TactileFrame) -> Estimate:
+        estimate = self._session.estimate(frame)
         difference = self._first_difference()
         if not estimate.valid or estimate.k is not None or self._matcher is None or difference is None:
             return estimate

@@ -11,9 +11,7 @@ import socket
 import stat
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import NamedTuple
+from collections.abc import Callable
 
 import dashboard_client
 import rtde_control
@@ -50,10 +48,12 @@ class UrArm:
         self._receiver = RtdeReceiver(settings.host, settings.rate_hz, settings.connect_timeout_s / 3)
         kind, ours = rtde_control.RTDEControlInterface, connections_to(RTDE_PORT)
         watchdog_ns = 1e9 / settings.watchdog_hz
-        with _timer_slack(min(_LONGEST_POLL_SLACK_NS, int(watchdog_ns / _SLACKS_PER_WATCHDOG))):
-            self._control = kind(settings.host, settings.rate_hz, int(kind.FLAG_NO_WAIT))
+        # The thread that ur-rtde starts here inherits the slack; 0 gives this one its default again.
+        _set_timer_slack(min(_LONGEST_POLL_SLACK_NS, int(watchdog_ns / _SLACKS_PER_WATCHDOG)))
+        self._control = kind(settings.host, settings.rate_hz, int(kind.FLAG_NO_WAIT))
+        _set_timer_slack(0)
         self._control_connections = connections_to(RTDE_PORT) - ours
-        self._takes_scripts = True
+        self._accepts_scripts = True
         # A linear move was begun, and the wrist has not turned since.
         self._may_move_linearly = False
         self._age = SampleAge()
@@ -74,8 +74,8 @@ class UrArm:
 
     @property
     def _connected(self) -> bool:
-        control = self._takes_scripts and self._control.isConnected()
-        return self._receiver.connected and control and all(one.is_open for one in self._control_connections)
+        control = self._accepts_scripts and self._control.isConnected()
+        return self._receiver.connected and control and all(is_open(*one) for one in self._control_connections)
 
     def wrist(self, command: WristSpeed) -> bool:
         """Turn wrist 3 and hold the other joints; not during a linear move."""
@@ -97,7 +97,7 @@ class UrArm:
 
     def stop_move(self, deceleration_rad_per_s2: float) -> bool:
         """Begin to end a linear move."""
-        # ur-rtde does not report whether the stop was taken; the heartbeat after it does.
+        # ur-rtde does not report whether the stop was accepted; the heartbeat after it does.
         self._send_once(self._control.stopJ, deceleration_rad_per_s2, asynchronous=True)
         return self.send_heartbeat()
 
@@ -124,19 +124,21 @@ class UrArm:
         """Send the control script; the program starts by itself, and ends when it receives nothing."""
         try:
             if self._script:
-                with _memory_file(self._script) as path:
-                    self._control.setCustomScriptFile(path)
+                with open(os.memfd_create("control.script"), "w") as file:
+                    file.write(self._script)
+                    file.flush()
+                    self._control.setCustomScriptFile(f"/proc/self/fd/{file.fileno()}")
             else:
                 self._control.reuploadScript()
         except RuntimeError as error:
             # The controller closed the script connection, and ur-rtde does not reopen it.
             sys.stderr.write(f"The control script could not be sent: {error}.\n")
-            self._takes_scripts = False
+            self._accepts_scripts = False
         self._script_readiness.command_sent()
-        return self._takes_scripts
+        return self._accepts_scripts
 
     def arm_watchdog(self) -> bool:
-        """Arm the robot's watchdog after an upload; taken only by a program that answers."""
+        """Arm the robot's watchdog after an upload; accepted only by a program that answers."""
         return self._send_once(self._control.setWatchdog, self._settings.watchdog_hz)
 
     def end_program(self) -> None:
@@ -152,27 +154,8 @@ class UrArm:
         self._script_readiness.command_sent()
         return done
 
-    def unlock(self) -> None:
-        """Unlock a protective stop; `DriverError` in its first 5 s."""
-        self._ask_dashboard("unlockProtectiveStop")
-
-    def close_popups(self) -> None:
-        """Close the pendant's popups."""
-        self._ask_dashboard("closeSafetyPopup", "closePopup")
-
-    def power_on(self) -> None:
-        """Begin to power the arm."""
-        self._ask_dashboard("powerOn")
-
-    def release_brakes(self) -> None:
-        """Begin to release the brakes."""
-        self._ask_dashboard("brakeRelease")
-
-    def stop_program(self) -> None:
-        """Stop any program that runs or is paused."""
-        self._ask_dashboard("stop")
-
-    def _ask_dashboard(self, *requests: str) -> None:
+    def ask_dashboard(self, *requests: str) -> None:
+        """Call methods of ur-rtde's dashboard client; `DriverError` if the controller refuses or does not answer."""
         dashboard = dashboard_client.DashboardClient(self._settings.host)
         try:
             dashboard.connect()
@@ -196,38 +179,8 @@ def arm_watchdog_in(script: str, watchdog_hz: float) -> str:
     return f"def rtde_control():\n{script.replace(_BEFORE_LOOP, armed + _BEFORE_LOOP)}end\n"
 
 
-@contextmanager
-def _memory_file(program: str) -> Iterator[str]:
-    descriptor = os.memfd_create("control.script")
-    try:
-        with os.fdopen(os.dup(descriptor), "w") as file:
-            file.write(program)
-        yield f"/proc/self/fd/{descriptor}"
-    finally:
-        os.close(descriptor)
-
-
-class TcpConnection(NamedTuple):
-    """A connection of this process: its descriptor and the kernel's inode, which a reused descriptor does not keep.
-
-    ur-rtde reconnects silently in a thread of its own. Commands on such a connection crash the process, so that a new
-    connection counts as a lost controller.
-    """
-
-    descriptor: int
-    inode: int
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the descriptor still belongs to this connection."""
-        try:
-            return os.fstat(self.descriptor).st_ino == self.inode
-        except OSError:
-            return False
-
-
-def connections_to(port: int) -> set[TcpConnection]:
-    """Return this process's TCP connections to a port."""
+def connections_to(port: int) -> set[tuple[int, int]]:
+    """Return this process's TCP connections to a port: the descriptor and the inode of each."""
     found = set()
     for name in os.listdir("/proc/self/fd"):
         # The descriptor may have been closed, or the socket may not be connected.
@@ -236,21 +189,24 @@ def connections_to(port: int) -> set[TcpConnection]:
             if stat.S_ISSOCK(status.st_mode):
                 with socket.socket(fileno=os.dup(int(name))) as one:
                     if one.family == socket.AF_INET and one.getpeername()[1] == port:
-                        found.add(TcpConnection(int(name), status.st_ino))
+                        found.add((int(name), status.st_ino))
     return found
 
 
-@contextmanager
-def _timer_slack(slack_ns: int) -> Iterator[None]:
-    """Give threads started meanwhile this timer slack (prctl(2)); without the right to, they only cost more."""
-    _set_timer_slack(slack_ns)
+def is_open(descriptor: int, inode: int) -> bool:
+    """Return whether a connection is the one that had this inode, which a reused descriptor does not keep.
+
+    ur-rtde reconnects silently in a thread of its own. Commands on such a connection crash the process, so that a new
+    connection counts as a lost controller.
+    """
     try:
-        yield
-    finally:
-        _set_timer_slack(0)  # this thread's default
+        return os.fstat(descriptor).st_ino == inode
+    except OSError:
+        return False
 
 
 def _set_timer_slack(slack_ns: int) -> None:
+    """Set prctl(2)'s timer slack; without the right to, the threads only cost more."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(slack_ns), 0, 0, 0) != 0:
         sys.stderr.write(f"The robot's threads wake more often than needed: {os.strerror(ctypes.get_errno())}.\n")

@@ -6,8 +6,14 @@ between cycles. After a motion has ended, only a new command begins one.
 
 from typing import TYPE_CHECKING
 
-from shearloop.drivers.ur.limits import is_recent, violation, why_unfit
+from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.messages import (
+    ROBOT_MODE_IDLE,
+    ROBOT_MODE_POWER_OFF,
+    ROBOT_MODE_RUNNING,
+    RUNTIME_STOPPED,
+    SAFETY_NORMAL,
+    SAFETY_REDUCED,
     Command,
     CommandReply,
     Disconnect,
@@ -20,16 +26,187 @@ from shearloop.drivers.ur.messages import (
     WristSpeed,
     ZeroForceTorque,
 )
-from shearloop.drivers.ur.motion_executor import MotionExecutor
-from shearloop.drivers.ur.recovery import Outcome, ProgramOwner, Recovery
+from shearloop.drivers.ur.motion import MotionExecutor, is_recent, violation, why_unfit
 from shearloop.drivers.ur.settings import UrSettings
 
 if TYPE_CHECKING:
     from shearloop.drivers.ur.arm import UrArm
 
+# The period of a request that the robot does not follow yet.
+_RETRY_S = 1.0
+# A program without heartbeats has ended by its watchdog after this time.
+ENDS_ITSELF_S = 2.0
+# The pauses between requests to stop a paused program; each may hang for another 2.5 s.
+STOP_RETRIES_S = (1.0, 2.0, 5.0, 10.0, 10.0)
+
+STILL_PAUSED = "The paused program could not be stopped ({reason}): stop it at the teach pendant, do not resume it."
+
 NOT_ENABLED = "Motion has not been enabled since the robot's process was started: enable it when the arm may move."
 BEING_MADE_READY = "The robot is being made ready (safety, power, control program): ask again in a second."
 LEAVING = "The daemon disconnects from the robot: start it again to go on."
+
+
+class Recovery:
+    """One attempt to make the robot ready: unlock, power, brakes, control program, watchdog.
+
+    Each cycle runs one step, and none waits, so that states keep coming while the arm powers up. A protective stop is
+    unlocked only on the operator's request (UR's own rule). Without one, only the control program is started.
+    """
+
+    def __init__(
+        self, arm: "UrArm", now_ns: int, timeout_s: float, *, operator_asked: bool, takes_over: bool = False
+    ) -> None:
+        """Begin. `operator_asked` allows unlocking, powering and stopping any program, `takes_over` a paused one."""
+        self._arm = arm
+        self._deadline_ns = now_ns + int(timeout_s * 1e9)
+        self._timeout_s = timeout_s
+        self._operator_asked = operator_asked
+        self._takes_over = takes_over
+        self._asked_ns: dict[str, int] = {}
+        # Whether the control program is being started, so that a program on the robot may be ours.
+        self.starts_program = self._uploaded = False
+        # Whether the attempt has succeeded, or why it has ended otherwise.
+        self.ready = False
+        self.refusal: str | None = None
+
+    def give_up(self, reason: str) -> None:
+        """End the attempt."""
+        self.refusal = reason
+
+    def advance(self, sample: RtdeSample, now_ns: int, *, recent: bool) -> bool:
+        """Do the step that is due in this cycle, unless the sample is old; return whether the attempt has ended."""
+        if self.refusal is None and now_ns > self._deadline_ns:
+            self.refusal = (
+                f"The robot did not get ready within {self._timeout_s:g} s (robot mode {sample.robot_mode}, safety "
+                f"mode {sample.safety_mode}, program state {sample.runtime_state}): look at the teach pendant."
+            )
+        if self.refusal is None and recent:
+            try:
+                self._step(sample, now_ns)
+            except DriverError as error:
+                self.refusal = f"The controller refused: {error}"
+        return self.ready or self.refusal is not None
+
+    def _step(self, sample: RtdeSample, now_ns: int) -> None:
+        safe = sample.safety_mode in (SAFETY_NORMAL, SAFETY_REDUCED)
+        if not (safe and sample.robot_mode == ROBOT_MODE_RUNNING):
+            self._make_safe(sample, now_ns, safe)
+            return
+        self._close_popups(now_ns)
+        if self._uploaded and sample.program_running:
+            # The control connection may see the program a sample later; then try again in the next cycle.
+            self.ready = self._arm.arm_watchdog()
+        elif sample.runtime_state != RUNTIME_STOPPED:
+            if self._operator_asked or (self._takes_over and sample.program_paused):
+                self._ask_dashboard(now_ns, "stop")
+            elif now_ns > self._asked_ns.setdefault("end", now_ns) + int(ENDS_ITSELF_S * 1e9):
+                # Not ours to stop. After the death of its daemon its watchdog would have ended it.
+                self.refusal = ""
+        elif not self.starts_program:
+            # Registers outlive the program: a new one would first execute the last command.
+            self.starts_program = self._arm.clear_command()
+        else:
+            if self._uploaded:
+                # A heartbeat, for a script that arms its watchdog before its loop.
+                self._arm.clear_command()
+            # The controller may be busy and drop an upload.
+            if self._is_due("upload", now_ns):
+                self._arm.upload()
+            self._uploaded = True
+
+    def _make_safe(self, sample: RtdeSample, now_ns: int, safe: bool) -> None:
+        if not self._operator_asked:
+            self.refusal = ""
+        elif sample.emergency_stop:
+            self.refusal = "The emergency stop is still pressed: make the cell safe, release it, and unlock again."
+        elif sample.protective_stop:
+            # Once: the controller refuses it in the first 5 s.
+            if "unlockProtectiveStop" not in self._asked_ns:
+                self._ask_dashboard(now_ns, "unlockProtectiveStop")
+        elif not safe:
+            self.refusal = f"Safety mode {sample.safety_mode} cannot be cured from here: look at the pendant."
+        else:
+            self._close_popups(now_ns)
+            if sample.robot_mode == ROBOT_MODE_POWER_OFF:
+                self._ask_dashboard(now_ns, "powerOn")
+            elif sample.robot_mode == ROBOT_MODE_IDLE:
+                self._ask_dashboard(now_ns, "brakeRelease")
+
+    def _close_popups(self, now_ns: int) -> None:
+        if self._operator_asked and "closePopup" not in self._asked_ns:
+            self._ask_dashboard(now_ns, "closePopup", "closeSafetyPopup")
+
+    def _ask_dashboard(self, now_ns: int, *requests: str) -> None:
+        if self._is_due(requests[0], now_ns):
+            self._arm.ask_dashboard(*requests)
+
+    def _is_due(self, step: str, now_ns: int) -> bool:
+        """Return whether a step is due, and note that it is taken: the robot may not follow a request at once."""
+        due = now_ns >= self._asked_ns.get(step, -(1 << 62)) + int(_RETRY_S * 1e9)
+        if due:
+            self._asked_ns[step] = now_ns
+        return due
+
+
+class ProgramOwner:
+    """Knows whether the program on the robot is ours, and stops ours while it is paused.
+
+    Resumed at the pendant, a paused program would go on with its last motion. Requests to stop it repeat less and less
+    often, a limited number of times; `failure` is the message for the operator. A program is another client's when it
+    plays on without our heartbeats: ours would end.
+    """
+
+    def __init__(self, arm: "UrArm", *, ours: bool) -> None:
+        self._arm = arm
+        self.ours = ours
+        # Whether the next cycle stops a paused program; the state before it announces that it may take long.
+        self.stop_announced = self._was_announced = False
+        self.failure = ""
+        self.failed_stops = 0
+        self._requests, self._next_ns = 0, 0
+        # When a program was being started last: an upload may take effect after its recovery was given up.
+        self._starting_ns: int | None = None
+        self._plays_without_us_ns: int | None = None
+
+    def may_be_ours(self, now_ns: int) -> bool:
+        """Return whether a program that plays is ours or may be, because one was just being started."""
+        return self.ours or (self._starting_ns is not None and now_ns - self._starting_ns <= ENDS_ITSELF_S * 1e9)
+
+    def update(self, sample: RtdeSample, now_ns: int, *, starting: bool, plays_without_us: bool) -> None:
+        """Take in a cycle's sample; `starting`: a program of ours is being started."""
+        self._was_announced, self.stop_announced = self.stop_announced, False
+        if not plays_without_us:
+            self._plays_without_us_ns = None
+        elif self._plays_without_us_ns is None:
+            self._plays_without_us_ns = now_ns
+        since_ns = self._plays_without_us_ns
+        foreign = since_ns is not None and now_ns - since_ns > ENDS_ITSELF_S * 1e9
+        if sample.runtime_state == RUNTIME_STOPPED or foreign:
+            # The next program may be anyone's, and ours may have ended between two samples.
+            self.ours = False
+            self._requests, self._next_ns, self.failure = 0, 0, ""
+        if starting:
+            self.ours, self._starting_ns = True, now_ns
+
+    def stop_paused(self, now_ns: int) -> None:
+        """Request a stop when it is due, in the cycle after the one that has announced it: it may take seconds."""
+        if now_ns < self._next_ns or self._requests > len(STOP_RETRIES_S):
+            return
+        if not self._was_announced:
+            self.stop_announced = True
+            return
+        if self._requests and not self.failure:
+            self._fail("the dashboard said that it is stopped, and it is not")
+        self._next_ns = now_ns + int(1e9 * STOP_RETRIES_S[min(self._requests, len(STOP_RETRIES_S) - 1)])
+        self._requests += 1
+        try:
+            self._arm.ask_dashboard("stop")
+        except DriverError as error:
+            self._fail(str(error))
+
+    def _fail(self, reason: str) -> None:
+        self.failed_stops += 1
+        self.failure = STILL_PAUSED.format(reason=reason.strip().removesuffix("."))
 
 
 class CommandHandler:
@@ -50,7 +227,7 @@ class CommandHandler:
         self._unlock_number: int | None = None
         self._held_reason = NOT_ENABLED
         self._daemon_alive_ns = now_ns
-        # Whether the daemon disconnects: only stops are taken from then on.
+        # Whether the daemon disconnects: only stops are accepted from then on.
         self.leaving = False
 
     @property
@@ -62,14 +239,6 @@ class CommandHandler:
     def recovering(self) -> bool:
         """Whether calls may take seconds: to the dashboard, or the first one to a new program."""
         return self._recovery is not None or self._program.stop_announced
-
-    def may_own_program(self, now_ns: int) -> bool:
-        """Return whether a program that plays is ours or may be, because one was just being started."""
-        return self._program.may_be_ours(now_ns)
-
-    def owns_paused_program(self, sample: RtdeSample) -> bool:
-        """Return whether a program of ours is paused and could be resumed at the pendant."""
-        return self._program.ours and sample.program_paused
 
     def take_rejection(self) -> bool:
         """Return, once, whether the robot rejected a command.
@@ -86,48 +255,65 @@ class CommandHandler:
         """Return the reply to a command; None when `tick` returns it later (`Unlock`)."""
         if isinstance(command, Stop) and self._recovery is not None and self._unlock_number is not None:
             self._recovery.give_up("Unlocking was ended by a stop.")
-        refusal = self._why_refused(command, sample)
+        unfit = self._why_unfit(sample)
+        match command:
+            case Disconnect():
+                self.leaving = True
+                if self._recovery is not None:
+                    self._recovery.give_up(LEAVING)
+                self._executor.stop_now(sample, now_ns, "the daemon disconnects")
+                return CommandReply()
+            case Stop(deceleration) if deceleration <= 0:
+                refusal = f"A deceleration of {deceleration:g} rad/s² is not above 0."
+            case Stop() if unfit:
+                refusal = f"Nothing can be sent, and the arm stops by itself. {unfit}"
+            case Stop():
+                refusal = self._executor.stop_on_command(number, command, sample, now_ns)
+            case _ if self.leaving:
+                refusal = LEAVING
+            case WristSpeed() | MoveLinear():
+                refusal = self._why_blocked(sample) or self._executor.begin(number, command, sample, now_ns)
+            case Unlock() if self._unlock_number is not None:
+                refusal = "Unlocking is under way."
+            case Unlock() if unfit:
+                if not self._executor.disabled_reason:
+                    self._executor.disable(unfit)
+                self._unlock_number = number
+                self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, operator_asked=True)
+                return None
+            case _ if self._recovery is not None:
+                refusal = BEING_MADE_READY
+            case Enable() | Unlock():
+                refusal = unfit or violation(sample, self._settings.limits)
+                if not refusal:
+                    self._held_reason = ""
+                return CommandReply(refusal=refusal)
+            case ZeroForceTorque():
+                # A new zero would only hide a value beyond its limit.
+                refusal = unfit or violation(sample, self._settings.limits)
+                if not (refusal or (self.at_rest and sample.rests)):
+                    refusal = "The wrench is zeroed only at rest: stop the arm first."
+                if not (refusal or self._arm.zero_wrench()):
+                    refusal = "The robot did not zero its force-torque sensor."
+                return CommandReply(refusal=refusal)
         if refusal:
             return CommandReply(refusal=refusal)
-        match command:
-            case WristSpeed():
-                self._executor.turn(number, command, sample, now_ns)
-            case MoveLinear():
-                self._executor.move(number, command, sample, now_ns)
-            case Stop():
-                self._executor.stop_on_command(number, command, sample, now_ns)
-            case Unlock() if self._why_unfit(sample):
-                self._begin_unlocking(number, sample, now_ns)
-                return None
-            case Enable() | Unlock():
-                self._held_reason = ""
-                return CommandReply()
-            case ZeroForceTorque():
-                zeroed = self._arm.zero_wrench()
-                return CommandReply(refusal="" if zeroed else "The robot did not zero its force-torque sensor.")
-            case Disconnect():
-                self._leave(sample, now_ns)
-                return CommandReply()
-        if self._executor.disabled_reason:
-            return CommandReply(refusal=self._executor.disabled_reason)
         return CommandReply(sent=self._executor.sent, clipped=self._executor.clipped)
 
     def tick(self, sample: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
         """Run one cycle: check the sample and send what is due; return the reply to an `Unlock` that has ended."""
         self._executor.watch(sample, now_ns)
         recent = is_recent(sample, self._settings)
-        without_us = self._recovery is not None or bool(self._executor.disabled_reason)
+        recovery = self._recovery
+        without_us = recovery is not None or bool(self._executor.disabled_reason)
         self._program.update(
             sample,
             now_ns,
-            starting=self._recovery is not None and self._recovery.starts_program,
+            starting=recovery is not None and recovery.starts_program,
             plays_without_us=without_us and sample.program_running and recent,
         )
-        if self._recovery is not None:
-            # Samples may stay old for minutes without counting as lost; the operator gets an answer all the same.
-            if recent or self._recovery.has_ended(now_ns):
-                return self._recover(self._recovery, sample, now_ns)
-            return None
+        if recovery is not None:
+            return self._end_recovery(recovery) if recovery.advance(sample, now_ns, recent=recent) else None
         unfit = self._why_unfit(sample)
         if unfit:
             # Nothing can be sent. The arm stops by itself, or by its watchdog, which is not fed now.
@@ -137,7 +323,7 @@ class CommandHandler:
                 self._executor.leave_to_watchdog(unfit)
             if not sample.program_running:
                 self._executor.disable(unfit)
-                if recent and self.owns_paused_program(sample) and not self.leaving:
+                if recent and self._program.ours and sample.program_paused and not self.leaving:
                     self._program.stop_paused(now_ns)
             return None
         beyond = violation(sample, self._settings.limits)
@@ -167,33 +353,6 @@ class CommandHandler:
             failed_program_stops=self._program.failed_stops,
         )
 
-    def _why_refused(self, command: Command, sample: RtdeSample) -> str:
-        """Return why a command is not carried out, or the empty string."""
-        if self.leaving and not isinstance(command, Stop | Disconnect):
-            return LEAVING
-        unfit = self._why_unfit(sample)
-        match command:
-            case WristSpeed() | MoveLinear():
-                return self._why_blocked(sample) or self._executor.why_refused(command, sample)
-            case Stop(deceleration) if deceleration <= 0:
-                return f"A deceleration of {deceleration:g} rad/s² is not above 0."
-            case Stop() if unfit:
-                return f"Nothing can be sent, and the arm stops by itself. {unfit}"
-            case Unlock() if self._unlock_number is not None:
-                return "Unlocking is under way."
-            case Unlock() if unfit:
-                return ""
-            case Enable() | Unlock() if self._recovery is not None:
-                return BEING_MADE_READY
-            case Enable() | Unlock():
-                return unfit or violation(sample, self._settings.limits)
-            case ZeroForceTorque():
-                rests = self.at_rest and sample.rests
-                moving = "" if rests else "The wrench is zeroed only at rest: stop the arm first."
-                # A new zero would only hide a value beyond its limit.
-                return unfit or violation(sample, self._settings.limits) or moving
-        return ""
-
     def _why_unfit(self, sample: RtdeSample) -> str:
         """Return why nothing can be sent to the robot, or the empty string."""
         return why_unfit(sample, self._settings) or self._executor.disabled_reason
@@ -205,32 +364,25 @@ class CommandHandler:
         reason = self._why_unfit(sample) or violation(sample, self._settings.limits) or self._held_reason
         return f"{reason} {self._program.failure}" if self._program.failure else reason
 
-    def _leave(self, sample: RtdeSample, now_ns: int) -> None:
-        self.leaving = True
-        if self._recovery is not None:
-            self._recovery.give_up(LEAVING)
-        self._executor.stop_now(sample, now_ns, "the daemon disconnects")
-
-    def _begin_unlocking(self, number: int, sample: RtdeSample, now_ns: int) -> None:
-        unfit = self._why_unfit(sample)
-        if not self._executor.disabled_reason:
-            self._executor.disable(unfit)
-        self._unlock_number = number
-        self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, operator_asked=True)
-
-    def _recover(self, recovery: Recovery, sample: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
-        outcome = recovery.advance(sample, now_ns)
-        if recovery.starts_program:
-            self._program.note_start(now_ns)
-        if outcome is Outcome.UNDER_WAY:
-            return None
+    def _end_recovery(self, recovery: Recovery) -> tuple[int, CommandReply] | None:
         self._recovery = None
-        if outcome is Outcome.DONE:
+        if recovery.ready:
             self._executor.enable()
         number, self._unlock_number = self._unlock_number, None
         if number is None:
             self._held_reason = recovery.refusal or self._held_reason
             return None
-        if outcome is Outcome.DONE:
+        if recovery.ready:
             self._held_reason = ""
-        return number, CommandReply(refusal=recovery.refusal)
+        return number, CommandReply(refusal=recovery.refusal or "")
+
+    def end_program(self, sample: RtdeSample, now_ns: int) -> None:
+        """End our program: also one that a late upload has started, and one that is paused. Leave other clients' alone.
+
+        Stopping a paused one may take seconds.
+        """
+        if sample.program_running:
+            if self._program.may_be_ours(now_ns):
+                self._arm.end_program()
+        elif self._program.ours and sample.program_paused:
+            self._arm.ask_dashboard("stop")

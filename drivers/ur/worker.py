@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NoReturn
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.controller import ProbeError, probe_controller
-from shearloop.drivers.ur.limits import why_unfit
+from shearloop.drivers.ur.motion import why_unfit
 from shearloop.drivers.ur.settings import UrSettings
 
 if TYPE_CHECKING:
@@ -165,7 +165,8 @@ def _control(pipe: Pipe, configured: messages.Configure, arm: "UrArm") -> NoRetu
         if not handler.take_rejection():
             pipe.send_latest(handler.state(sample, cycle))
         if (handler.leaving and handler.at_rest) or time.monotonic() > leave_s:
-            _end_program(settings, handler, arm)
+            _set_alarm(BRAKE_S + settings.hang_timeout_s)
+            handler.end_program(arm.read(), time.monotonic_ns())
             _exit(EXIT_DONE)
         # A late cycle begins at once; missed ones are skipped.
         due_s, cycle = max(due_s + period_s, time.monotonic()), cycle + 1
@@ -175,18 +176,6 @@ def _control(pipe: Pipe, configured: messages.Configure, arm: "UrArm") -> NoRetu
             elif pipe.wait(left_s):
                 # Carry a command out on arrival: waiting for the next cycle would delay the loop.
                 _handle_commands(pipe, handler, arm.read())
-
-
-def _end_program(settings: UrSettings, handler: CommandHandler, arm: "UrArm") -> None:
-    """End our program: also one that a late upload has started, and one that is paused. Leave other clients' alone."""
-    _set_alarm(settings.hang_timeout_s)
-    sample = arm.read()
-    if sample.program_running:
-        if handler.may_own_program(time.monotonic_ns()):
-            arm.end_program()
-    elif handler.owns_paused_program(sample):
-        _set_alarm(BRAKE_S + settings.hang_timeout_s)
-        arm.stop_program()
 
 
 def _handle_commands(pipe: Pipe, handler: CommandHandler, sample: messages.RtdeSample) -> None:

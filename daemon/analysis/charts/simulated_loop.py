@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.daemon.control.controller import TwistController, WristCommand
+from shearloop.daemon.control.controller import ControllerSettings, TwistController, WristCommand
 from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
 from shearloop.daemon.control.margins import gain_for_noise, integral_gain
-from shearloop.daemon.control.settings import ControllerSettings
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 
 PERIOD_S = 0.008

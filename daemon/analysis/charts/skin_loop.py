@@ -21,8 +21,7 @@ from shearloop.bank.skin.calibration import SkinCalibration, load_calibration
 from shearloop.daemon.analysis.charts.drawing import figure, look, save
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
-from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
-from shearloop.daemon.control.settings import LoopConfig
+from shearloop.daemon.control.loop_inputs import ArmStatus, LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.step_runner import ExperimentPhase
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque

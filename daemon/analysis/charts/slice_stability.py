@@ -46,7 +46,7 @@ from shearloop.daemon.analysis.charts.sources import (
     played_bank,
     torque_of,
 )
-from shearloop.daemon.synthetic import Synthesiser
+from shearloop.daemon.synthetic_frames import Synthesiser
 from shearloop.daemon.workers import Executor, in_order
 
 STEPS = 25

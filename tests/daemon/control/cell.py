@@ -11,9 +11,8 @@ import pytest
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.loop_inputs import GripperStatus
+from shearloop.daemon.control.loop_inputs import GripperStatus, LoopConfig
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
-from shearloop.daemon.control.settings import LoopConfig
 from shearloop.daemon.control.step_runner import ExperimentPhase, GripTo
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply, MoveLinear, RobotState, WristSpeed

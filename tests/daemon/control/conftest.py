@@ -2,8 +2,7 @@ from typing import Any
 
 import pytest
 
-from shearloop.daemon.control.controller import TwistController
-from shearloop.daemon.control.settings import ControllerSettings
+from shearloop.daemon.control.controller import ControllerSettings, TwistController
 
 DEFAULTS: dict[str, Any] = {
     "stiffness_nm_per_rad": 0.25,
@@ -52,7 +51,7 @@ class Bench:
         speeds = []
         for _ in range(round(seconds / 0.5)):
             speeds += self.advance(0.5)
-            middle = self.controller._history.mean(self.t_ns - 550_000_000, self.t_ns - 50_000_000)
+            middle = self.controller.estimator.angles.mean(self.t_ns - 550_000_000, self.t_ns - 50_000_000)
             if middle is not None:
                 self.measure(stiffness * (middle - origin_rad))
         return speeds

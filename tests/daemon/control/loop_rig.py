@@ -8,8 +8,7 @@ import numpy as np
 
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, TorqueSample, TorqueSource
-from shearloop.daemon.control.settings import LoopConfig
+from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.step_runner import Action, ExperimentPhase, GripTo
 from shearloop.drivers.emulators.scene import Twin, TwinSettings
 

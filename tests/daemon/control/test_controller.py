@@ -8,9 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from shearloop.daemon.control.controller import AngleHistory, ControllerReason, ControllerRefusal, TwistController
+from shearloop.daemon.control.controller import (
+    AngleHistory,
+    ControllerReason,
+    ControllerRefusal,
+    ControllerSettings,
+    TwistController,
+)
 from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.daemon.control.settings import ControllerSettings
 from shearloop.daemon.errors import UserError
 
 from .conftest import DEFAULTS, Bench
@@ -262,7 +267,7 @@ def test_a_drift_is_learnt_by_the_integral_and_bounded() -> None:
     bench = running(deadband_nm=0.0, creep_limit_nm_per_s=0.0005, ki=0.005)
     for number in range(80):
         bench.advance(0.5)
-        middle = bench.controller._history.mean(bench.t_ns - 550_000_000, bench.t_ns - 50_000_000)
+        middle = bench.controller.estimator.angles.mean(bench.t_ns - 550_000_000, bench.t_ns - 50_000_000)
         assert middle is not None
         bench.measure(0.25 * (middle - 0.3) - 0.0003 * 0.5 * number)
     assert bench.controller.state.creep_nm_per_s == pytest.approx(-0.0003, rel=0.05)
@@ -279,7 +284,7 @@ def test_a_jump_is_caught_up_with_faster_than_the_gain_alone_would() -> None:
         bench.measured_for(8.0)
         for _ in range(10):
             bench.advance(0.5)
-            middle = bench.controller._history.mean(bench.t_ns - 550_000_000, bench.t_ns - 50_000_000)
+            middle = bench.controller.estimator.angles.mean(bench.t_ns - 550_000_000, bench.t_ns - 50_000_000)
             assert middle is not None
             bench.measure(0.25 * (middle - 0.3) - 0.03)
         offsets[noise] = bench.controller.state.offset_nm
@@ -290,7 +295,7 @@ def test_a_jump_is_caught_up_with_faster_than_the_gain_alone_would() -> None:
 
 def test_noise_alone_hardly_ever_passes_for_a_jump(bench: Bench) -> None:
     noise = np.random.default_rng(5).normal(size=100_000).clip(-3.0, 3.0)
-    assert 1 <= sum(bench.controller._has_jumped(float(value)) for value in noise) <= 12
+    assert 1 <= sum(bench.controller.estimator.has_jumped(float(value)) for value in noise) <= 12
 
 
 # --- what is refused beforehand

@@ -5,14 +5,14 @@ import pytest
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.fault_detection import (
     ARM_STALE_S,
+    LoopInputs,
     MonitorInputs,
     compared_for_s,
     detect_faults,
 )
-from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopInputs, TorqueSample, TorqueSource
+from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.runner import PUBLISH_EVERY, wrench_source
 from shearloop.daemon.control.safety import TABLE, FaultCode, Response
-from shearloop.daemon.control.settings import LoopConfig
 from shearloop.drivers.ur.controller import SampleAge
 
 EIT = TorqueSource(name="right", period_s=0.5412, window_s=0.5412)

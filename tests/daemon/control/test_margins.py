@@ -8,7 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from shearloop.daemon.control.controller import ControllerSettings
 from shearloop.daemon.control.identification import ToolModel
+from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.control.margins import (
     MOST_GAIN,
     LoopModel,
@@ -25,7 +27,6 @@ from shearloop.daemon.control.margins import (
     with_gain,
     wrist_response,
 )
-from shearloop.daemon.control.settings import ControllerSettings, LoopConfig
 
 from .conftest import DEFAULTS
 

@@ -8,8 +8,7 @@ import pytest
 
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.device_commands import VelocityCommandSender
-from shearloop.daemon.control.loop_inputs import TorqueSource
-from shearloop.daemon.control.settings import LoopConfig
+from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
 from shearloop.daemon.control.step_runner import MoveToAngle
 from shearloop.daemon.control.wrist_controller import WristController
 from shearloop.drivers.ur.client import UrRobot

@@ -14,8 +14,8 @@ import numpy as np
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import EitFrame, wire_map
-from shearloop.daemon.recording.identity import Identity, basic_identity
-from shearloop.daemon.recording.recorder import Recorder
+from shearloop.daemon.recording.recorder import Identity, Recorder
+from shearloop.daemon.recording.schema import basic_identity
 from tests.daemon.sample_messages import sample
 
 # Five boards of frames: a kill in the middle of a write is likely.
@@ -30,7 +30,12 @@ async def write(folder: Path) -> None:
     (folder / "times").write_bytes(struct.pack("<qq", clock.now_ns(), clock.now_ns()))
     with (folder / "times").open("r+b") as file:
         times = mmap.mmap(file.fileno(), 0)
-    task = asyncio.create_task(recorder.run())
+
+    async def record() -> None:
+        async for _ in recorder.flushes():
+            pass
+
+    task = asyncio.create_task(record())
     generator = np.random.default_rng(1)
     seq = 0
     while not task.done():

@@ -17,11 +17,10 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.export import count_messages, export
-from shearloop.daemon.recording.identity import AttachedFile, Identity, basic_identity
-from shearloop.daemon.recording.reader import read_recording
-from shearloop.daemon.recording.recorder import Recorder
-from shearloop.daemon.recording.repair import repair, summarise
+from shearloop.daemon.recording.reader import read_recording, repair, summarise
+from shearloop.daemon.recording.recorder import AttachedFile, Identity, Recorder
 from shearloop.daemon.recording.replay import RecordedRun
+from shearloop.daemon.recording.schema import basic_identity
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.recording.test_recorder import frame, torque
 from tests.daemon.recording.test_replay import replayed
@@ -35,9 +34,9 @@ def content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     folder = tmp_path_factory.mktemp("whole")
     attached = AttachedFile("configuration.json", "application/json", json.dumps(CONFIGURATION).encode())
     recorder = Recorder(folder, Identity(basic_identity("a test"), (attached,)), Clock())
-    tap = recorder.input_recorder("right")
+    inputs = recorder.input_recorder("right")
     for number in range(4):
-        tap(RawEvent(InputKind.DATA, time.monotonic_ns(), b"0.1, 0.2\r\n"))
+        inputs.record(RawEvent(InputKind.DATA, time.monotonic_ns(), b"0.1, 0.2\r\n"))
         recorder.record_message("eit.frame", frame(number))
         recorder.record_message("load.torque", torque(number))
         if number == 1:

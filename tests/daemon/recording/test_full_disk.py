@@ -15,9 +15,8 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import recorder as recorder_module
 from shearloop.daemon.recording.export import count_messages
+from shearloop.daemon.recording.reader import repair, summarise
 from shearloop.daemon.recording.recorder import Recorder
-from shearloop.daemon.recording.repair import repair, summarise
-from shearloop.daemon.recording.writer import McapFile
 from tests.daemon.conftest import deadline
 from tests.daemon.recording.test_recorder import IDENTITY, frame, topics, torque
 
@@ -27,18 +26,6 @@ class SmallDisk(io.FileIO):
 
     room: int
 
-    @classmethod
-    def opener(cls, disks: "list[SmallDisk]", *rooms: int) -> Callable[[Path], McapFile]:
-        """Return what opens a recorder's files on disks with so much room, one after the other; it adds the disks."""
-
-        def open_file(path: Path) -> McapFile:
-            disk = cls(path.with_name(path.name + ".partial"), "xb")
-            disk.room = rooms[len(disks)]
-            disks.append(disk)
-            return McapFile(path, disk)
-
-        return open_file
-
     def write(self, data: Any, /) -> int:
         room = self.room - self.tell()
         if room <= 0:
@@ -46,9 +33,32 @@ class SmallDisk(io.FileIO):
         return super().write(data[:room])
 
 
-def test_a_full_disk_keeps_all_flushed_data(tmp_path: Path) -> None:
+@pytest.fixture
+def disks(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[SmallDisk]]:
+    """Lets the next files of recorders be on disks with so much room, one after the other; returns the list of them."""
+
+    def make(*rooms: int) -> list[SmallDisk]:
+        opened: list[SmallDisk] = []
+
+        def open_file(path: Path, mode: str) -> SmallDisk:
+            disk = SmallDisk(path, mode)
+            disk.room = rooms[len(opened)]
+            opened.append(disk)
+            return disk
+
+        monkeypatch.setattr(recorder_module, "FileIO", open_file)
+        return opened
+
+    return make
+
+
+Disks = Callable[..., list[SmallDisk]]
+
+
+def test_a_full_disk_keeps_all_flushed_data(tmp_path: Path, disks: Disks) -> None:
     for n, room in enumerate(np.random.default_rng(3).integers(2_000, 40_000, 50)):
-        recorder = Recorder(tmp_path / str(n), IDENTITY, Clock(), open_file=SmallDisk.opener([], int(room)))
+        disks(int(room))
+        recorder = Recorder(tmp_path / str(n), IDENTITY, Clock())
         safe = -1
         for number in range(12):
             recorder.record_message("eit.frame", frame(number))
@@ -66,9 +76,9 @@ def test_a_full_disk_keeps_all_flushed_data(tmp_path: Path) -> None:
         assert numbers == list(range(safe + 1))
 
 
-def test_no_data_is_missing_when_the_disk_has_room_again(tmp_path: Path) -> None:
-    disks: list[SmallDisk] = []
-    recorder = Recorder(tmp_path, IDENTITY, Clock(), open_file=SmallDisk.opener(disks, 20_000))
+def test_no_data_is_missing_when_the_disk_has_room_again(tmp_path: Path, disks: Disks) -> None:
+    opened = disks(20_000)
+    recorder = Recorder(tmp_path, IDENTITY, Clock())
     for number in range(20):
         recorder.record_message("eit.frame", frame(number))
         recorder.write()
@@ -78,8 +88,8 @@ def test_no_data_is_missing_when_the_disk_has_room_again(tmp_path: Path) -> None
     assert facts["waiting_bytes"] > 0
     recorder.record_experiment("another")
     recorder.write()
-    assert len(disks) == 1, "no other file is begun on a full disk"
-    disks[0].room = 10_000_000
+    assert len(opened) == 1, "no other file is begun on a full disk"
+    opened[0].room = 10_000_000
     recorder.write()
     assert recorder.failure == ""
     recorder.close()
@@ -88,12 +98,14 @@ def test_no_data_is_missing_when_the_disk_has_room_again(tmp_path: Path) -> None
     assert count_messages(path)["eit.frame.right"] == 20, "the checksums are those of one write"
 
 
-def test_a_file_that_cannot_be_started_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    opener = SmallDisk.opener([], 0, 100_000, 0, 0, 0, 100_000)
+def test_a_file_that_cannot_be_started_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disks: Disks
+) -> None:
+    disks(0, 100_000, 0, 0, 0, 100_000)
     with pytest.raises(UserError, match="cannot record there: No space left on device"):
-        Recorder(tmp_path, IDENTITY, Clock(), open_file=opener)
+        Recorder(tmp_path, IDENTITY, Clock())
     assert list(tmp_path.iterdir()) == []
-    recorder = Recorder(tmp_path, IDENTITY, Clock(), open_file=opener)
+    recorder = Recorder(tmp_path, IDENTITY, Clock())
     # Each item asks for another file, as all do after an hour; the disk has room for one at last.
     monkeypatch.setattr(recorder_module, "LONGEST_IDLE_FILE_S", -1.0)
     for number in range(3):
@@ -108,8 +120,11 @@ def test_a_file_that_cannot_be_started_is_removed(tmp_path: Path, monkeypatch: p
     assert [[one["seq"] for one in topics(path)["load.torque"]] for path in recorder.finished] == [[0, 1, 2], [3]]
 
 
-def test_the_queue_is_bounded_and_drops_are_counted_in_their_own_file(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path, IDENTITY, Clock(), max_waiting_bytes=100_000)
+def test_the_queue_is_bounded_and_drops_are_counted_in_their_own_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_module, "MAX_WAITING_BYTES", 100_000)
+    recorder = Recorder(tmp_path, IDENTITY, Clock())
     for number in range(20):
         recorder.record_message("eit.frame", frame(number))
     dropped = recorder.diagnostics()["errors"]["dropped"]
@@ -133,19 +148,16 @@ def test_the_queue_is_bounded_and_drops_are_counted_in_their_own_file(tmp_path: 
 
 @pytest.mark.parametrize("small_disk", ["64k"], indirect=True)
 async def test_a_real_full_disk_is_reported_and_the_file_can_be_repaired(small_disk: Path, tmp_path: Path) -> None:
-    flushed: asyncio.Queue[str] = asyncio.Queue()
-    recorder = Recorder(small_disk, IDENTITY, Clock(), on_failure=flushed.put_nowait)
-    task = asyncio.create_task(recorder.run())
+    recorder = Recorder(small_disk, IDENTITY, Clock())
     why, number = "", 0
     async with deadline("the recorder did not report the full disk"):
-        while not why:
+        async for why in recorder.flushes():
+            if why:
+                break
             assert number < 1000, "a disk of 64 kB took a thousand frames, and is not full"
             for _ in range(5):
                 recorder.record_message("eit.frame", frame(number))
                 number += 1
-            why = await flushed.get()
-    task.cancel()
-    await asyncio.gather(task, return_exceptions=True)
     await asyncio.to_thread(recorder.close)
     assert "No space left on device" in why
     repaired = repair(recorder.path, tmp_path / "saved.mcap")

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from shearloop.daemon.recording.repair import summarise
+from shearloop.daemon.recording.reader import summarise
 from tests.daemon.test_closed_loop import experiment, rig_config, running_rig, started
 
 __all__ = ["rig_config"]

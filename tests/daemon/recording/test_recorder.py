@@ -19,12 +19,11 @@ from shearloop.daemon.app import Daemon
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.messages import EitFrame, LoadTorque, wire_map
+from shearloop.daemon.messaging.messages import EitFrame, LoadTorque, LoopState, wire_map
 from shearloop.daemon.recording import recorder as recorder_module
-from shearloop.daemon.recording.identity import AttachedFile, Identity, basic_identity
-from shearloop.daemon.recording.reader import read_recording
-from shearloop.daemon.recording.recorder import Recorder
-from shearloop.daemon.recording.repair import repair, summarise
+from shearloop.daemon.recording.reader import read_recording, repair, summarise
+from shearloop.daemon.recording.recorder import AttachedFile, Identity, Recorder
+from shearloop.daemon.recording.schema import basic_identity
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.conftest import deadline
 from tests.daemon.sample_messages import sample
@@ -59,8 +58,8 @@ def topics(path: Path) -> dict[str, list[dict]]:
 def test_messages_are_recorded_with_schema_and_time(tmp_path: Path) -> None:
     clock = Clock()
     recorder = Recorder(tmp_path / "new" / "folder", IDENTITY, clock)
-    recorder.input_recorder("right")(RawEvent(InputKind.OPENED, 5))
-    recorder.input_recorder("right")(RawEvent(InputKind.DATA, 7, bytes(range(256))))
+    recorder.input_recorder("right").record(RawEvent(InputKind.OPENED, 5))
+    recorder.input_recorder("right").record(RawEvent(InputKind.DATA, 7, bytes(range(256))))
     one = frame(0)
     recorder.record_message("eit.frame", one)
     recorder.record_message("load.torque", torque(0, float("nan")))
@@ -131,15 +130,17 @@ def test_each_experiment_has_a_file_with_its_name(tmp_path: Path) -> None:
 
 
 def test_a_new_file_begins_after_an_hour_without_experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    busy = True
-    recorder = Recorder(tmp_path, IDENTITY, Clock(), is_busy=lambda: busy)
-    monkeypatch.setattr(recorder_module, "LONGEST_IDLE_FILE_S", -1.0)
+    recorder = Recorder(tmp_path, IDENTITY, Clock())
+    recorder.record_experiment("one")
     recorder.record_message("load.torque", torque(0))
     recorder.write()
-    busy = False
-    recorder.record_message("load.torque", torque(1))
+    monkeypatch.setattr(recorder_module, "LONGEST_IDLE_FILE_S", -1.0)
+    for number, phase in enumerate(("held", "done"), 1):
+        message = sample(LoopState, source="loop", phase=phase)
+        recorder.record_message("loop.state", wire_map(message, Clock().unix_s(message.t_mono_ns), number))
+        recorder.record_message("load.torque", torque(number))
     recorder.close()
-    assert [topics(path)["load.torque"][0]["seq"] for path in recorder.finished] == [0, 1]
+    assert [[one["seq"] for one in topics(path)["load.torque"]] for path in recorder.finished] == [[0, 1], [2]]
 
 
 def test_a_daemon_without_a_message_leaves_no_file(tmp_path: Path) -> None:

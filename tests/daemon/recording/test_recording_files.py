@@ -9,9 +9,10 @@ from shearloop.bank.eit.channels import line_of_channels
 from shearloop.daemon.analysis.series import read_series
 from shearloop.daemon.config import RecordingConfig, load_daemon_config
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording import identity
+from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.export import count_messages
 from shearloop.daemon.recording.reader import read_recording
+from shearloop.daemon.recording.recorder import daemon_identity
 from shearloop.daemon.recording.replay import RecordedRun
 from shearloop.daemon.recording.writer import RecordingWriter
 
@@ -64,10 +65,10 @@ def test_foreign_and_outdated_files_are_refused(tmp_path, monkeypatch, read):
         other = Writer(file)
         other.start()
         other.finish()
-    monkeypatch.setattr(identity, "CHANNEL_TABLE_HASH", "0" * 64)
-    written(tmp_path / "stale.mcap")
-    monkeypatch.setattr(identity, "FORMAT_VERSION", "1")
-    written(tmp_path / "old.mcap")
+    for name, key, value in (("stale", "CHANNEL_TABLE_HASH", "0" * 64), ("old", "FORMAT_VERSION", "1")):
+        with monkeypatch.context() as outdated:
+            outdated.setattr(schema, key, value)
+            written(tmp_path / f"{name}.mcap")
     for name, why in (
         ("text", r"text\.mcap: this is not an MCAP file"),
         ("other", "not a recording of shearloop"),
@@ -96,4 +97,4 @@ def test_a_folder_name_that_is_not_utf8_is_an_error(config):
     with pytest.raises(
         UserError, match=r"not UTF-8 \(the folder of the recordings is 'caf\\udce9'\); choose another name"
     ):
-        identity.daemon_identity(load_daemon_config(config()).model_copy(update={"recording": recorded}))
+        daemon_identity(load_daemon_config(config()).model_copy(update={"recording": recorded}))

@@ -12,10 +12,9 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.experiment_schema import ExperimentFile, WaitStep
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import EitFrame, wire_map
-from shearloop.daemon.recording.identity import Identity, basic_identity, experiment_notes
-from shearloop.daemon.recording.reader import read_recording
-from shearloop.daemon.recording.recorder import Recorder
-from shearloop.daemon.recording.repair import summarise
+from shearloop.daemon.recording.reader import read_recording, summarise
+from shearloop.daemon.recording.recorder import Identity, Recorder, experiment_notes
+from shearloop.daemon.recording.schema import basic_identity
 from shearloop.daemon.sensing.tool_diameter import tool_as_bytes
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.sample_messages import sample
@@ -41,10 +40,10 @@ def recorded(folder: Path, *held: tuple[int, Measured | None], named_mm: float |
     recorder.record_experiment(file.name, notes=experiment_notes(file))
     for number in range(40):
         clock.t_ns += PERIOD_NS
-        recorder.input_recorder("right")(RawEvent(InputKind.DATA, clock.t_ns, b'"kind":"tool", said the board'))
+        recorder.input_recorder("right").record(RawEvent(InputKind.DATA, clock.t_ns, b'"kind":"tool", said the board'))
         if number in told:
             tool = tool_as_bytes(number, told[number])
-            recorder.input_recorder("right")(RawEvent(InputKind.TOOL, clock.t_ns - PERIOD_NS // 2, tool))
+            recorder.input_recorder("right").record(RawEvent(InputKind.TOOL, clock.t_ns - PERIOD_NS // 2, tool))
         line = np.random.default_rng(number).uniform(0.01, 0.5, 1024)
         t_ns = clock.t_ns - PERIOD_NS // 2
         message = sample(EitFrame, source="right", t_mono_ns=t_ns, line=line, frame=number, age_s=0.3)

@@ -10,9 +10,8 @@ from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.settings import UrSettings
-from tests.drivers.ur.test_limits import AT_REST, LIMITS
+from tests.drivers.ur.test_limits import AT_REST, SETTINGS
 
-SETTINGS = UrSettings(host="10.0.0.1", limits=LIMITS)
 CYCLE_NS, WATCHDOG_NS = 8_000_000, 100_000_000
 POSE = (-0.5, -0.1, 0.45, 0.0, math.pi, 0.0)
 
@@ -27,9 +26,10 @@ class FakeArm:
         self.calls: list[str] = []
         self.reading = dataclasses.replace(AT_REST, runtime_state=1)
         self.target, self.acceleration = 0.0, 4.0
-        self.takes = True
+        self.accepts = True
         self.stops_moves = True
         self.unlockable = self.stoppable = True
+        self.stop_fails_silently = False
         self.stale_command = False
         self._resumed_target = 0.0
         self._watched = False
@@ -77,10 +77,10 @@ class FakeArm:
 
     def wrist(self, command: messages.WristSpeed) -> bool:
         self.note("wrist")
-        if self.takes:
+        if self.accepts:
             self.target, self.acceleration = command.rad_per_s, command.acceleration_rad_per_s2
             self.stale_command = True
-        return self.takes
+        return self.accepts
 
     def end_speed(self, deceleration_rad_per_s2: float) -> bool:
         self.note("end_speed")
@@ -89,14 +89,14 @@ class FakeArm:
 
     def move(self, _command: messages.MoveLinear) -> bool:
         self.note("move")
-        self.be(moving_linearly=self.takes)
-        return self.takes
+        self.be(moving_linearly=self.accepts)
+        return self.accepts
 
     def stop_move(self, _deceleration_rad_per_s2: float) -> bool:
         self.note("stop_move")
         if self.stops_moves:
             self.be(moving_linearly=False)
-        return self.takes
+        return self.accepts
 
     def send_heartbeat(self) -> bool:
         self.note("send_heartbeat")
@@ -111,28 +111,23 @@ class FakeArm:
         self.note("zero_wrench")
         return True
 
-    def unlock(self) -> None:
-        self.calls.append("unlock")
-        if not self.unlockable:
-            raise DriverError("not in the first 5 s")
-        self.be(safety_mode=1)
-
-    def close_popups(self) -> None:
-        self.calls.append("close_popups")
-
-    def power_on(self) -> None:
-        self.calls.append("power_on")
-        self.be(robot_mode=5)
-
-    def release_brakes(self) -> None:
-        self.calls.append("release_brakes")
-        self.be(robot_mode=7)
-
-    def stop_program(self) -> None:
-        self.calls.append("stop_program")
-        if not self.stoppable:
-            raise DriverError("the dashboard does not answer")
-        self.end_program()
+    def ask_dashboard(self, *requests: str) -> None:
+        self.calls.append(requests[0])
+        match requests[0]:
+            case "unlockProtectiveStop":
+                if not self.unlockable:
+                    raise DriverError("not in the first 5 s")
+                self.be(safety_mode=1)
+            case "powerOn":
+                self.be(robot_mode=5)
+            case "brakeRelease":
+                self.be(robot_mode=7)
+            case "stop" if self.stop_fails_silently:
+                pass
+            case "stop":
+                if not self.stoppable:
+                    raise DriverError("the dashboard does not answer")
+                self.end_program()
 
     def upload(self) -> bool:
         self.calls.append("upload")

@@ -9,13 +9,13 @@ from tests.drivers.ur.flight import POSE, SETTINGS, Flight, flying, turning
 @pytest.mark.parametrize("command", [WristSpeed(0.1, 1.0), Stop(4.0)])
 def test_robot_that_rejects_a_command_is_left_to_its_watchdog(command: WristSpeed | Stop) -> None:
     flight = turning()
-    flight.arm.takes = False
+    flight.arm.accepts = False
     assert "does not answer" in flight.ask(command).refusal
     flight.arm.calls.clear()
     flight.fly(50)
     assert flight.arm.calls == []
     assert (flight.wrist_speed, flight.arm.reading.program_running) == (0, False)
-    flight.arm.takes = True
+    flight.arm.accepts = True
     assert "unlock" in flight.ask(Enable()).refusal.lower()
     assert flight.ask(Unlock()).accepted
     assert flight.ask(WristSpeed(0.1, 1.0)).accepted
@@ -36,7 +36,7 @@ def test_linear_move_that_rejects_its_stop_is_left_to_the_watchdog() -> None:
     flight = flying()
     flight.ask(MoveLinear(POSE, 0.1, 0.5))
     flight.fly(3)
-    flight.arm.takes = False
+    flight.arm.accepts = False
     flight.arm.stops_moves = False
     flight.fly(60, daemon_alive=False)
     assert not flight.arm.reading.program_running
@@ -79,7 +79,7 @@ def test_foreign_program_is_stopped_only_on_unlock() -> None:
     assert flight.arm.calls == []
     assert "someone else" in flight.ask(WristSpeed(0.1, 1.0)).refusal
     assert flight.ask(Unlock()).accepted
-    assert "stop_program" in flight.arm.calls
+    assert "stop" in flight.arm.calls
 
 
 @pytest.mark.parametrize("takes_over", [False, True], ids=["daemon", "process"])
@@ -115,7 +115,7 @@ def test_foreign_program_gets_no_commands() -> None:
     assert "someone else" in flight.ask(Enable()).refusal
     assert flight.arm.calls == []
     assert flight.ask(Unlock()).accepted
-    assert flight.arm.calls[:4] == ["close_popups", "stop_program", "clear_command", "upload"]
+    assert flight.arm.calls[:4] == ["closePopup", "stop", "clear_command", "upload"]
 
 
 def test_program_after_an_abandoned_start_may_be_ours(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -129,9 +129,11 @@ def test_program_after_an_abandoned_start_may_be_ours(monkeypatch: pytest.Monkey
     flight.fly(5)
     assert not flight.state.recovering
     assert not flight.state.owns_program
-    assert flight.handler.may_own_program(flight.now_ns)
-    flight.fly(250)
-    assert not flight.handler.may_own_program(flight.now_ns)
+    for elapsed_cycles, program_running in ((0, False), (250, True)):
+        flight.fly(elapsed_cycles)
+        flight.arm.be(runtime_state=2)
+        flight.handler.end_program(flight.arm.reading, flight.now_ns)
+        assert flight.arm.reading.program_running == program_running
 
 
 def test_hard_limit_stops_until_enabled_again() -> None:
@@ -156,7 +158,7 @@ def test_protective_stop_is_unlocked_only_by_the_operator() -> None:
     flight.fly(100)
     assert flight.state.protective_stop
     assert flight.state.blocked.startswith("Protective stop")
-    assert flight.arm.calls == ["stop_program"], "nothing is unlocked"
+    assert flight.arm.calls == ["stop"], "nothing is unlocked"
     assert "Protective stop" in flight.ask(Enable()).refusal
 
     flight.arm.unlockable = False
@@ -164,7 +166,7 @@ def test_protective_stop_is_unlocked_only_by_the_operator() -> None:
     flight.arm.unlockable = True
     flight.arm.calls.clear()
     assert flight.ask(Unlock()).accepted
-    assert flight.arm.calls == ["unlock", "close_popups", "clear_command", "upload", "arm_watchdog"]
+    assert flight.arm.calls == ["unlockProtectiveStop", "closePopup", "clear_command", "upload", "arm_watchdog"]
     flight.fly(100)
     assert flight.wrist_speed == 0, "the speed from before the stop is not taken up again"
     assert flight.ask(WristSpeed(0.1, 1.0)).accepted
@@ -183,7 +185,7 @@ def test_recovery_from_an_emergency_stop_needs_the_button_released() -> None:
     flight.arm.calls.clear()
     assert flight.ask(Unlock()).accepted
     assert flight.arm.calls == [
-        "close_popups", "power_on", "release_brakes", "clear_command", "upload", "arm_watchdog",
+        "closePopup", "powerOn", "brakeRelease", "clear_command", "upload", "arm_watchdog",
     ]  # fmt: skip
 
 

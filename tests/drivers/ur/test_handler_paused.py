@@ -4,11 +4,11 @@ from itertools import pairwise
 
 import pytest
 
+from shearloop.drivers.ur.command_handler import STOP_RETRIES_S
 from shearloop.drivers.ur.messages import Disconnect, Enable, Unlock
-from shearloop.drivers.ur.recovery import STOP_RETRIES_S
 from tests.drivers.ur.flight import CYCLE_NS, Flight, flying, turning
 
-STOP_REQUEST = "stop_program"
+STOP_REQUEST = "stop"
 
 
 def stop_requests_s(flight: Flight, seconds: float) -> list[float]:
@@ -27,7 +27,7 @@ def test_paused_program_of_the_last_worker_is_stopped() -> None:
     flight.arm.be(runtime_state=2)
     flight.arm.protective_stop()
     flight.fly(4)
-    assert flight.arm.calls == ["stop_program"]
+    assert flight.arm.calls == ["stop"]
     assert not flight.handler.recovering
     flight.arm.be_resumed_at_the_pendant()
     flight.fly(5)
@@ -69,15 +69,14 @@ def test_silent_dashboard_is_retried_with_growing_pauses(takes_over: bool) -> No
 
 def test_ineffective_stop_is_retried_and_reported() -> None:
     flight = turning()
-    stop_program = flight.arm.stop_program
-    flight.arm.stop_program = lambda: None  # type: ignore[method-assign]
+    flight.arm.stop_fails_silently = True
     flight.arm.protective_stop()
     flight.fly(100)
     assert flight.state.failed_program_stops == 0, "it may take a moment"
     flight.fly(50)
     assert flight.state.failed_program_stops == 1
     assert "said that it is stopped, and it is not" in flight.state.blocked
-    flight.arm.stop_program = stop_program  # type: ignore[method-assign]
+    flight.arm.stop_fails_silently = False
     flight.fly_until(lambda state: "could not be stopped" not in state.blocked, 400)
     assert flight.arm.reading.runtime_state == 1
     assert flight.state.failed_program_stops == 1
@@ -133,7 +132,8 @@ def test_program_started_at_the_pendant_after_ours_is_left_alone() -> None:
     flight.fly(3)
     flight.arm.protective_stop()
     assert stop_requests_s(flight, 5.0) == []
-    assert not flight.handler.owns_paused_program(flight.arm.reading)
+    flight.handler.end_program(flight.arm.reading, flight.now_ns)
+    assert STOP_REQUEST not in flight.arm.calls
 
 
 def test_paused_program_left_behind_is_left_to_the_exit() -> None:
@@ -143,7 +143,9 @@ def test_paused_program_left_behind_is_left_to_the_exit() -> None:
     flight.fly(10)
     assert flight.ask(Disconnect()).accepted
     assert stop_requests_s(flight, 5.0) == [], "the exit stops it"
-    assert flight.handler.owns_paused_program(flight.arm.reading)
+    flight.arm.stoppable = True
+    flight.handler.end_program(flight.arm.reading, flight.now_ns)
+    assert flight.arm.calls[-1] == STOP_REQUEST
 
 
 def test_stopped_program_restarts_only_on_unlock() -> None:
@@ -209,7 +211,7 @@ def test_paused_program_of_unknown_owner_is_reported() -> None:
     flight.fly(5)
     assert "is paused" in flight.state.blocked
     assert "unlock, which stops it" in flight.state.blocked
-    assert "stop_program" not in flight.arm.calls
+    assert "stop" not in flight.arm.calls
     assert flight.ask(Unlock()).accepted
-    assert "stop_program" in flight.arm.calls
+    assert "stop" in flight.arm.calls
     assert not flight.state.blocked

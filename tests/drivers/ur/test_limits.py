@@ -4,15 +4,16 @@ import dataclasses
 import math
 
 import numpy as np
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from shearloop.drivers.ur.limits import clip_linear, clip_stop, clip_wrist, line_violation, violation
-from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
-from shearloop.drivers.ur.settings import Bound, JointRange, UrLimits, Workspace
+from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, WristSpeed
+from shearloop.drivers.ur.motion import clip_linear, clip_stop, clip_wrist, is_close, line_violation, violation
+from shearloop.drivers.ur.settings import Bound, JointRange, UrLimits, UrSettings, Workspace
 
-CYCLE_S, REACTION_S = 0.008, 0.04
+CYCLE_S = 0.008
 LIMITS = UrLimits(
     joints=JointRange((-6.0, -6.0, -3.0, -6.0, -6.0, -2.0), (6.0, 6.0, 3.0, 6.0, 6.0, 2.0), 0.1),
     workspace=Workspace((-0.8, -0.8, 0.0), (0.8, 0.8, 0.9), 0.02),
@@ -23,6 +24,7 @@ LIMITS = UrLimits(
     force_n=Bound(40.0, 60.0),
     torque_nm=Bound(4.0, 6.0),
 )
+SETTINGS = UrSettings(host="10.0.0.1", limits=LIMITS)
 AT_REST = RtdeSample(
     t_mono_ns=0,
     timestamp_s=0.0,
@@ -57,7 +59,7 @@ readings = st.builds(reading, st.floats(-2.5, 2.5), st.floats(-1.5, 1.5), st.flo
 
 @given(commands, readings)
 def test_wrist_command_is_within_the_limits_and_reports_clipping(asked: WristSpeed, now: RtdeSample) -> None:
-    sent, reasons = clip_wrist(asked, now, LIMITS, REACTION_S)
+    sent, reasons = clip_wrist(asked, now, SETTINGS)
     assert abs(sent.rad_per_s) <= min(LIMITS.wrist_speed_rad_per_s.inner, abs(asked.rad_per_s))
     assert sent.rad_per_s * asked.rad_per_s >= 0
     assert 0 < sent.acceleration_rad_per_s2 <= LIMITS.wrist_acceleration_rad_per_s2.inner
@@ -85,7 +87,7 @@ def test_arm_that_follows_stays_within_its_inner_range(
     under_way = [WristSpeed(0.0, 4.0)] * cycles_late
     for command, cycles in asked:
         for _ in range(cycles):
-            sent, _ = clip_wrist(command, reading(wrist_rad, speed), LIMITS, REACTION_S)
+            sent, _ = clip_wrist(command, reading(wrist_rad, speed), SETTINGS)
             under_way.append(sent)
             now = under_way.pop(0)
             step = now.acceleration_rad_per_s2 * CYCLE_S
@@ -98,10 +100,10 @@ def test_arm_that_follows_stays_within_its_inner_range(
 @given(above_0, st.floats(-1.9, 1.9), st.floats(-0.8, 0.8))
 def test_stop_brakes_within_the_range(asked: float, wrist_rad: float, speed: float) -> None:
     room = 1.9 - abs(wrist_rad) if wrist_rad * speed > 0 else 1.9 + abs(wrist_rad)
-    sent = clip_stop(Stop(asked), reading(wrist_rad, speed), LIMITS, REACTION_S).deceleration_rad_per_s2
+    sent = clip_stop(asked, reading(wrist_rad, speed), SETTINGS)
     assert 0 < sent <= LIMITS.wrist_acceleration_rad_per_s2.hard
-    if speed * speed / 2 / LIMITS.wrist_acceleration_rad_per_s2.inner + abs(speed) * REACTION_S < room:
-        assert speed * speed / 2 / sent + abs(speed) * REACTION_S <= room + 1e-9
+    if speed * speed / 2 / LIMITS.wrist_acceleration_rad_per_s2.inner + abs(speed) * SETTINGS.reaction_s < room:
+        assert speed * speed / 2 / sent + abs(speed) * SETTINGS.reaction_s <= room + 1e-9
 
 
 poses = st.tuples(*[anything] * 3, *[st.floats(-math.pi, math.pi)] * 3)
@@ -152,3 +154,33 @@ def test_torque_about_the_tool_axis_agrees_with_scipy(
     now = dataclasses.replace(AT_REST, tcp_pose=(0.0, 0.0, 0.0, *vector.tolist()), wrench=(0.0, 0.0, 0.0, *torque))
     axis = Rotation.from_rotvec(vector).as_matrix()[:, 2]
     assert math.isclose(now.wrist_torque_nm, float(axis @ np.array(torque)), abs_tol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ((0.0, math.pi, 0.0), (0.0, -math.pi, 0.0), True),
+        ((0.0, math.pi - 5e-4, 0.0), (0.0, -math.pi + 5e-4, 0.0), True),
+        ((0.0, 0.0, 0.0), (0.0, 2 * math.pi, 0.0), True),
+        ((0.0, math.pi, 0.0), (math.pi, 0.0, 0.0), False),
+        ((0.0, 0.0, 0.0), (0.0, 0.003, 0.0), False),
+    ],
+)
+def test_half_a_turn_is_the_same_either_way(
+    one: tuple[float, float, float], other: tuple[float, float, float], same: bool
+) -> None:
+    assert is_close((0.4, 0.1, 0.3, *one), (0.4, 0.1, 0.3, *other), 2e-3) is same
+    assert not is_close((0.4, 0.1, 0.3, *one), (0.4, 0.103, 0.3, *other), 2e-3)
+
+
+@given(st.tuples(*[st.floats(-1, 1)] * 3), st.floats(1e-3, math.pi), st.tuples(*[st.floats(-2e-3, 2e-3)] * 3))
+def test_closeness_agrees_with_scipy(
+    direction: tuple[float, float, float], angle: float, turned: tuple[float, float, float]
+) -> None:
+    one = np.array(direction) / (math.hypot(*direction) or 1.0) * angle
+    rotation = Rotation.from_rotvec(turned) * Rotation.from_rotvec(one)
+    close = is_close((0.0, 0.0, 0.0, *one.tolist()), (0.0, 0.0, 0.0, *rotation.as_rotvec().tolist()), 2e-3)
+    # At half a turn a rotation vector changes up to 1.6 times as much as the rotation.
+    apart_rad = math.hypot(*turned)
+    assert close or apart_rad > 2e-3 / 1.6
+    assert not close or apart_rad < 2.001e-3

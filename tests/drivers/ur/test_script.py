@@ -2,11 +2,10 @@
 
 import asyncio
 import sys
-from pathlib import Path
 
 import pytest
 
-from shearloop.drivers.ur.arm import _memory_file, arm_watchdog_in
+from shearloop.drivers.ur.arm import arm_watchdog_in
 from tests.drivers.ur.robots import ROOT
 from tests.emulator_process import EmulatorProcess as ControllerProcess
 
@@ -41,11 +40,6 @@ def test_script_differs_by_one_line_before_its_loop() -> None:
 def test_unknown_script_is_not_changed() -> None:
     assert not arm_watchdog_in("def other():\n  sync()\nend\n", 10.0)
     assert not arm_watchdog_in("        keep_running = True\n" * 2, 10.0)
-
-
-def test_memory_file_holds_the_program() -> None:
-    with _memory_file("a program\n") as path:
-        assert [Path(path).read_text() for _ in range(2)] == ["a program\n"] * 2
 
 
 @pytest.mark.real_time

@@ -111,7 +111,7 @@ def test_our_paused_program_is_stopped_on_exit(daemon: Daemon) -> None:
 
     arm = Stopped()
     fly(daemon, arm)
-    assert arm.calls[:4] == ["clear_command", "upload", "arm_watchdog", "stop_program"]
+    assert arm.calls[:4] == ["clear_command", "upload", "arm_watchdog", "stop"]
 
 
 def test_foreign_paused_program_is_not_stopped_on_exit(daemon: Daemon) -> None:

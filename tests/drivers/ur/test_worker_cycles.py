@@ -47,7 +47,7 @@ def test_command_is_sent_on_arrival_and_in_each_cycle(timed: Callable[..., Timed
 def test_protective_stop_seen_late_is_reported_as_such(timed: Callable[..., Timed], stopped_s: float) -> None:
     class Late(TimedArm):
         def wrist(self, command: WristSpeed) -> bool:
-            self.takes = worker.time.monotonic() < 1000.0 + stopped_s
+            self.accepts = worker.time.monotonic() < 1000.0 + stopped_s
             return super().wrist(command)
 
         def read(self) -> RtdeSample:

@@ -1,0 +1,470 @@
+"""One motion at a time: begun, kept within the limits in each cycle, and ended.
+
+No clock and no ur-rtde: the arm and the time are arguments. A motion that does not end as it should is left to the
+robot's watchdog: nothing more is sent to the program, and only a new program may move the arm.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from shearloop.drivers.ur.messages import (
+    ARRIVED,
+    ROBOT_MODE_RUNNING,
+    SAFETY_NORMAL,
+    SAFETY_REDUCED,
+    STOPPED_ON_COMMAND,
+    MotionKind,
+    MoveLinear,
+    RtdeSample,
+    Stop,
+    WristSpeed,
+)
+from shearloop.drivers.ur.settings import Bound, Six, UrLimits, UrSettings
+
+if TYPE_CHECKING:
+    from shearloop.drivers.ur.arm import UrArm
+
+WRIST = 5
+# The longest stop, however gentle the command.
+LONGEST_STOP_S = 1.0
+# Near the end of the range the speed is distance/t and takes effect after the reaction time:
+# x'(s) = -x(s - reaction)/t, which approaches the end without overshoot only for t ≥ e·reaction.
+_NO_OVERSHOOT = math.e
+# A short linear move may never be seen moving: an arm at rest within this distance of the end (m, rad) has arrived.
+CLOSE, ARRIVED_AFTER_S = 2e-3, 0.2
+# An idle arm may tremble, but not move this fast for this long.
+ASTRAY_RAD_PER_S, ASTRAY_S = 0.02, 0.2
+# The time allowed for a motion to end: nominal time × factor + constant.
+MOVE_SLACK_S, STOP_SLACK_S, SLACK = 2.0, 1.0, 1.5
+# The pendant's speed slider slows everything; below this a motion would have no end.
+SLOWEST_SCALING = 0.05
+
+NOT_OURS = (
+    "A program runs on the robot that someone else started or resumed: unlock to start the control program instead."
+)
+LEFT_TO_WATCHDOG = (
+    "{reason} The control program was left to the robot's watchdog, which ends it: unlock to start it again."
+)
+NOT_ACCEPTED = "The robot did not accept the {command}: its control program does not answer."
+NOT_STOPPING = "The arm did not come to rest in time after a stop: keep clear of it, look at the teach pendant."
+ASTRAY = "The arm moved without a command: check whether a person or another program moves it."
+
+
+@dataclass(slots=True)
+class _Turn:
+    """The wrist turns at the speed last asked for."""
+
+    asked: WristSpeed
+    asked_ns: int
+
+
+@dataclass(slots=True)
+class _Move:
+    """A linear move is under way."""
+
+    end: Six
+    begun_ns: int
+    deadline_ns: int
+    seen: bool = False
+
+
+@dataclass(slots=True)
+class _Braking:
+    """The arm is being stopped."""
+
+    deceleration_rad_per_s2: float
+    deadline_ns: int
+
+
+class MotionExecutor:
+    """Turns the wrist, moves along lines, and stops.
+
+    `disabled_reason` is why nothing may be sent to the program on the robot; empty while it may.
+    """
+
+    def __init__(self, settings: UrSettings, arm: "UrArm", now_ns: int) -> None:
+        self._settings = settings
+        self._arm = arm
+        # The number of the motion's command, why the motion ended, and the command last sent.
+        self.motion_id = 0
+        self.end_reason = ""
+        self.sent: WristSpeed | MoveLinear | Stop | None = None
+        self.clipped: tuple[str, ...] = ()
+        self.disabled_reason = NOT_OURS
+        self._motion: _Turn | _Move | _Braking | None = None
+        self._rejected = False
+        # The script's thread for speeds runs; it has to be ended before a linear move.
+        self._speed_thread = False
+        self._rested_ns = now_ns
+
+    @property
+    def motion(self) -> MotionKind:
+        """What the arm does on command."""
+        match self._motion:
+            case _Turn():
+                return "wrist"
+            case _Move():
+                return "linear"
+            case _Braking():
+                return "stopping"
+        return "idle"
+
+    def take_rejection(self) -> bool:
+        """Return, once, whether the robot rejected a command."""
+        rejected, self._rejected = self._rejected, False
+        return rejected
+
+    def begin(self, motion_id: int, asked: WristSpeed | MoveLinear, sample: RtdeSample, now_ns: int) -> str:
+        """Turn the wrist at a speed from now on, or begin a linear move; return why not, or the empty string."""
+        match asked, self._motion:
+            case WristSpeed(_, acceleration), _ if acceleration <= 0:
+                return f"An acceleration of {acceleration:g} rad/s² is not above 0."
+            case WristSpeed(), _Braking():
+                return "The arm is still stopping."
+            case WristSpeed(), _Move():
+                return "A linear move is under way: stop it."
+            case MoveLinear(_, speed, acceleration), _ if min(speed, acceleration) <= 0:
+                return "A linear move needs a speed and an acceleration above 0."
+            case MoveLinear(), motion if isinstance(motion, _Move | _Braking) or not sample.rests:
+                return "The arm moves: stop it before a linear move."
+        self.motion_id, self.end_reason = motion_id, ""
+        if isinstance(asked, WristSpeed):
+            self._motion = _Turn(asked, now_ns)
+            self._send_clipped_speed(asked, sample)
+        else:
+            self._end_speed_thread()
+            sent, self.clipped = clip_linear(asked, self._settings.limits)
+            self.sent = sent
+            deadline_ns = _deadline_ns(now_ns, _nominal_move_s(sent, sample), MOVE_SLACK_S, sample)
+            self._motion = _Move(sent.pose, now_ns, deadline_ns)
+            if not self._arm.move(sent):
+                self._reject("linear move")
+        return self.disabled_reason
+
+    def stop_on_command(self, motion_id: int, asked: Stop, sample: RtdeSample, now_ns: int) -> str:
+        """Stop at once, as hard as commanded within the needed and the allowed deceleration; return why not."""
+        deceleration = clip_stop(asked.deceleration_rad_per_s2, sample, self._settings)
+        if isinstance(self._motion, _Braking):
+            deceleration = max(deceleration, self._motion.deceleration_rad_per_s2)
+        self.motion_id, self.sent, self.clipped = motion_id, Stop(deceleration), ()
+        self.stop_now(sample, now_ns, STOPPED_ON_COMMAND, deceleration)
+        return self.disabled_reason
+
+    def stop_now(self, sample: RtdeSample, now_ns: int, reason: str, deceleration: float | None = None) -> None:
+        """Begin to stop and send it at once, without waiting for the next cycle."""
+        self.stop(sample, now_ns, reason, deceleration)
+        if isinstance(self._motion, _Braking) and self._speed_thread:
+            self._keep_stopping(self._motion, sample, now_ns)
+
+    def stop(self, sample: RtdeSample, now_ns: int, reason: str, deceleration: float | None = None) -> None:
+        """Begin to stop, by default as hard as allowed (rad/s²); the harder of two stops counts."""
+        deceleration = deceleration or self._settings.limits.wrist_acceleration_rad_per_s2.hard
+        match self._motion:
+            case None:
+                return
+            case _Braking(before) if before >= deceleration:
+                return
+            case _Turn() | _Move():
+                self.end_reason = reason
+        nominal_s = sample.fastest_rad_per_s / deceleration
+        self._motion = _Braking(deceleration, _deadline_ns(now_ns, nominal_s, STOP_SLACK_S, sample))
+        if not self._speed_thread and not self._arm.stop_move(deceleration):
+            self._reject("stop")
+
+    def enable(self) -> None:
+        """Send commands from now on: our program runs."""
+        self.disabled_reason = ""
+
+    def leave_to_watchdog(self, reason: str) -> None:
+        """Send nothing more to this program, so that the robot's watchdog ends it."""
+        self.disable(reason, LEFT_TO_WATCHDOG.format(reason=reason))
+
+    def disable(self, end_reason: str, disabled_reason: str = NOT_OURS) -> None:
+        """End the present motion on paper, and send nothing to the program on the robot."""
+        if isinstance(self._motion, _Turn | _Move):
+            self.end_reason = end_reason
+        self._motion, self._speed_thread = None, False
+        self.disabled_reason = disabled_reason
+
+    def watch(self, sample: RtdeSample, now_ns: int) -> None:
+        """Note whether an idle arm rests; call this in every cycle."""
+        if self._motion is not None or sample.fastest_rad_per_s < ASTRAY_RAD_PER_S:
+            self._rested_ns = now_ns
+
+    def keep(self, sample: RtdeSample, now_ns: int) -> None:
+        """Send what this cycle needs."""
+        if self.disabled_reason:
+            return
+        match self._motion:
+            case _Turn() as turn:
+                self._keep_turning(turn, sample, now_ns)
+            case _Move() as move:
+                self._keep_moving(move, sample, now_ns)
+            case _Braking() as braking:
+                self._keep_stopping(braking, sample, now_ns)
+            case None if now_ns - self._rested_ns > ASTRAY_S * 1e9:
+                self.end_reason = "it moved without a command"
+                self.leave_to_watchdog(ASTRAY)
+            case None:
+                self._arm.send_heartbeat()
+
+    def _keep_turning(self, turn: _Turn, sample: RtdeSample, now_ns: int) -> None:
+        if now_ns - turn.asked_ns > self._settings.command_timeout_s * 1e9:
+            late = f"the wrist speed was not renewed within {self._settings.command_timeout_s:g} s"
+            self.stop_now(sample, now_ns, late, self._settings.limits.wrist_acceleration_rad_per_s2.inner)
+        else:
+            self._send_clipped_speed(turn.asked, sample)
+
+    def _keep_moving(self, move: _Move, sample: RtdeSample, now_ns: int) -> None:
+        move.seen = move.seen or sample.moving_linearly
+        reason = line_violation(sample, self._settings.limits)
+        if now_ns > move.deadline_ns:
+            reason = "the linear move did not end within its time"
+        # The end of the move and the joint speeds come over two connections, and one may lag.
+        waited = now_ns - move.begun_ns > ARRIVED_AFTER_S * 1e9
+        ended = move.seen or (waited and is_close(sample.tcp_pose, move.end, CLOSE))
+        if ended and not sample.moving_linearly and sample.rests:
+            self._motion, self.end_reason = None, ARRIVED
+        elif reason:
+            self.stop(sample, now_ns, reason)
+            return
+        self._arm.send_heartbeat()
+
+    def _keep_stopping(self, braking: _Braking, sample: RtdeSample, now_ns: int) -> None:
+        if now_ns > braking.deadline_ns:
+            self.leave_to_watchdog(NOT_STOPPING)
+        elif self._speed_thread:
+            deceleration = clip_stop(braking.deceleration_rad_per_s2, sample, self._settings)
+            if self._send_speed(WristSpeed(0.0, deceleration)) and sample.rests:
+                self._end_speed_thread()
+                self._motion = None
+        else:
+            if not sample.moving_linearly and sample.rests:
+                self._motion = None
+            self._arm.send_heartbeat()
+
+    def _send_clipped_speed(self, asked: WristSpeed, sample: RtdeSample) -> None:
+        """Send the speed within the limits of this moment: the one check of all speeds that turn the wrist."""
+        self.sent, self.clipped = clip_wrist(asked, sample, self._settings)
+        self._send_speed(self.sent)
+
+    def _send_speed(self, command: WristSpeed) -> bool:
+        self._speed_thread = True
+        accepted = self._arm.wrist(command)
+        if not accepted:
+            # An earlier speed may still hold.
+            self._reject("wrist speed")
+        return accepted
+
+    def _reject(self, command: str) -> None:
+        self._rejected = True
+        self.leave_to_watchdog(NOT_ACCEPTED.format(command=command))
+
+    def _end_speed_thread(self) -> None:
+        if self._speed_thread:
+            self._arm.end_speed(self._settings.limits.wrist_acceleration_rad_per_s2.inner)
+            self._speed_thread = False
+
+
+def _nominal_move_s(move: MoveLinear, sample: RtdeSample) -> float:
+    distance_m = math.dist(move.pose[:3], sample.tcp_pose[:3])
+    # At most half a turn; a move that only turns takes its speed as rad/s.
+    way = max(distance_m, math.pi if distance_m < 1e-3 else 0.0)
+    return way / move.speed_m_per_s + move.speed_m_per_s / move.acceleration_m_per_s2
+
+
+def _deadline_ns(now_ns: int, nominal_s: float, slack_s: float, sample: RtdeSample) -> int:
+    longest_s = SLACK * nominal_s / max(SLOWEST_SCALING, sample.speed_scaling)
+    return now_ns + int(1e9 * (slack_s + (longest_s if math.isfinite(longest_s) else 0.0)))
+
+
+def is_close(pose: Six, other: Six, within: float) -> bool:
+    """Return whether two poses are less than `within` metres and radians apart.
+
+    A turn has several rotation vectors: at half a turn, as of a tool that points down, both signs are the same.
+    """
+    angle = math.hypot(*other[3:])
+    backwards = [x * (1.0 - 2.0 * math.pi / angle) if angle else x for x in other[3:]]
+    apart = min(math.dist(pose[3:], other[3:]), math.dist(pose[3:], backwards))
+    return math.dist(pose[:3], other[:3]) < within and apart < within
+
+
+def clip_wrist(asked: WristSpeed, sample: RtdeSample, settings: UrSettings) -> tuple[WristSpeed, tuple[str, ...]]:
+    """Return the wrist speed within the limits of speed, acceleration, force and range, and each reason for a change.
+
+    Near the end of the range the speed is the one that can still be braked within it: v·t + v²/2a = distance, with
+    t = e·`reaction_s`. Between the inner and the hard limit of force or torque the speed falls linearly to zero.
+    """
+    limits = settings.limits
+    reasons: list[str] = []
+    acceleration = _at_most(
+        asked.acceleration_rad_per_s2, limits.wrist_acceleration_rad_per_s2, "acceleration", reasons
+    )
+    braking = limits.wrist_acceleration_rad_per_s2.inner
+    room = max(_room(asked.rad_per_s, sample, limits), 0.0)
+    lag_s = _NO_OVERSHOOT * settings.reaction_s
+    brakeable = braking * (math.sqrt(lag_s**2 + 2 * room / braking) - lag_s)
+    top = limits.wrist_speed_rad_per_s.inner
+    speed = _at_most(abs(asked.rad_per_s), limits.wrist_speed_rad_per_s, "wrist speed", reasons, " rad/s")
+    if brakeable < speed:
+        speed = brakeable
+        reasons.append(f"wrist 3 at {sample.wrist_rad:.3f} rad is near the end of its range")
+    for share, reason in _fading(sample, limits):
+        if top * share < speed:
+            speed = top * share
+            reasons.append(reason)
+    target = math.copysign(speed, asked.rad_per_s)
+    ramp = _safe_ramp(acceleration, target, sample, settings)
+    if ramp > acceleration:
+        reasons.append(f"wrist 3 at {sample.wrist_rad:.3f} rad has to brake harder to stay within its range")
+    return WristSpeed(target, ramp), tuple(reasons)
+
+
+def clip_stop(asked: float, sample: RtdeSample, settings: UrSettings) -> float:
+    """Return a deceleration (rad/s²) between the needed one and the hard limit.
+
+    The needed one keeps the wrist within its range and ends the fastest joint's motion within `LONGEST_STOP_S`.
+    """
+    brisk = max(asked, sample.fastest_rad_per_s / LONGEST_STOP_S)
+    safe = _safe_ramp(brisk, 0.0, sample, settings)
+    return min(safe, settings.limits.wrist_acceleration_rad_per_s2.hard)
+
+
+def clip_linear(asked: MoveLinear, limits: UrLimits) -> tuple[MoveLinear, tuple[str, ...]]:
+    """Return the linear move within the inner workspace, speed and acceleration, and each reason for a change.
+
+    The box is convex: a line between two points inside it stays inside.
+    """
+    box = limits.workspace
+    reasons: list[str] = []
+    position = []
+    for axis, value, low, high in zip("xyz", asked.pose[:3], box.lower_m, box.upper_m, strict=True):
+        inside = min(max(value, low + box.margin_m), high - box.margin_m)
+        if inside != value:
+            reasons.append(f"{axis} = {value:.4f} m is outside the workspace; its edge is {inside:.4f} m")
+        position.append(inside)
+    speed = _at_most(asked.speed_m_per_s, limits.linear_speed_m_per_s, "linear speed", reasons)
+    acceleration = _at_most(
+        asked.acceleration_m_per_s2, limits.linear_acceleration_m_per_s2, "linear acceleration", reasons
+    )
+    x, y, z = position
+    return MoveLinear((x, y, z, *asked.pose[3:]), speed, acceleration), tuple(reasons)
+
+
+def is_recent(sample: RtdeSample, settings: UrSettings) -> bool:
+    """Return whether the connection is up and the sample is young enough to act on."""
+    return sample.connected and sample.age_ns <= settings.state_timeout_s * 1e9
+
+
+def why_unfit(sample: RtdeSample, settings: UrSettings) -> str:
+    """Return why the controller cannot take motion commands, or the empty string."""
+    if not sample.connected:
+        return f"The connection to the robot at {settings.host} is lost."
+    if not is_recent(sample, settings):
+        return (
+            f"The latest state from the controller at {settings.host} is {sample.age_ns / 1e9:.2f} s old: check its "
+            "cable, other traffic on the network, and with a simulator whether its clock is slower than real time."
+        )
+    if sample.protective_stop:
+        return "Protective stop: look for its cause, clear the workspace, then unlock (not in the first 5 s)."
+    if sample.emergency_stop:
+        return "Emergency stop: make the cell safe, release the button, then unlock."
+    if sample.safety_mode not in (SAFETY_NORMAL, SAFETY_REDUCED):
+        return _SAFETY.get(sample.safety_mode, f"The robot's safety system is in mode {sample.safety_mode}.")
+    if sample.robot_mode != ROBOT_MODE_RUNNING:
+        return f"The arm is not powered and released (robot mode {sample.robot_mode}): unlock to power it."
+    if sample.program_paused:
+        return (
+            "A program on the robot is paused, and goes on with what it did when it is resumed: stop it at the teach "
+            "pendant, or unlock, which stops it and starts the control program."
+        )
+    if not sample.program_running:
+        return (
+            "The control program on the robot does not run: it was stopped at the pendant, or by the watchdog when "
+            "commands came late. Unlock to start it again."
+        )
+    return ""
+
+
+_SAFETY = {
+    4: "The robot is in recovery mode: move it back within its safety limits at the teach pendant.",
+    5: "A safeguard stop holds the robot: close the safeguard, then unlock.",
+    8: "The robot's safety system reports a violation: restart it at the teach pendant.",
+    9: "The robot's safety system reports a fault: restart the controller.",
+}
+
+
+def violation(sample: RtdeSample, limits: UrLimits) -> str:
+    """Return a sentence that names the hard limit that the sample exceeds, or the empty string."""
+    if not all(map(math.isfinite, (*sample.q_rad, *sample.qd_rad_per_s, *sample.tcp_pose, *sample.wrench))):
+        return "The controller reports values that are no numbers."
+    joints, box = limits.joints, limits.workspace
+    for number, (q, low, high) in enumerate(zip(sample.q_rad, joints.lower_rad, joints.upper_rad, strict=True), 1):
+        if not low <= q <= high:
+            return f"Joint {number} is at {q:.3f} rad, beyond its hard limits of {low:g} and {high:g} rad."
+    for axis, value, low, high in zip("xyz", sample.tcp_pose[:3], box.lower_m, box.upper_m, strict=True):
+        if not low <= value <= high:
+            return f"The tool is at {axis} = {value:.3f} m, beyond the workspace's {low:g} to {high:g} m."
+    for name, value, bound, unit in (
+        ("Wrist speed", abs(sample.qd_rad_per_s[WRIST]), limits.wrist_speed_rad_per_s, "rad/s"),
+        ("Force", math.hypot(*sample.wrench[:3]), limits.force_n, "N"),
+        ("Torque", math.hypot(*sample.wrench[3:]), limits.torque_nm, "N m"),
+    ):
+        if value > bound.hard:
+            return f"{name} is {value:.2f} {unit}, beyond the hard limit of {bound.hard:g} {unit}."
+    return ""
+
+
+def line_violation(sample: RtdeSample, limits: UrLimits) -> str:
+    """Return a sentence that names the inner limit that a linear move has reached, or the empty string.
+
+    The joint angles and forces along a line are not known in advance, so that the move stops at the inner limits.
+    """
+    joints = limits.joints
+    braking = limits.wrist_acceleration_rad_per_s2.inner
+    for number, (q, qd, low, high) in enumerate(
+        zip(sample.q_rad, sample.qd_rad_per_s, joints.lower_rad, joints.upper_rad, strict=True), 1
+    ):
+        stops_at = q + math.copysign(qd * qd / (2 * braking), qd)
+        if (qd > 0 and stops_at > high - joints.margin_rad) or (qd < 0 and stops_at < low + joints.margin_rad):
+            return f"joint {number} at {q:.3f} rad came to the inner limit of its range"
+    fading = _fading(sample, limits)
+    return fading[0][1] if fading else ""
+
+
+def _at_most(asked: float, bound: Bound, name: str, reasons: list[str], unit: str = "") -> float:
+    if asked > bound.inner:
+        reasons.append(f"{name} is limited to {bound.inner:g}{unit}")
+    return min(asked, bound.inner)
+
+
+def _safe_ramp(asked: float, target: float, sample: RtdeSample, settings: UrSettings) -> float:
+    """Return the acceleration asked for, or full braking where the gentle ramp would leave the range."""
+    speed = sample.qd_rad_per_s[WRIST]
+    if target * math.copysign(1.0, speed) >= abs(speed):
+        return asked
+    room = _room(speed, sample, settings.limits) - abs(speed) * _NO_OVERSHOOT * settings.reaction_s
+    needed = math.inf if room <= 0 else speed * speed / (2 * room)
+    # Twice, because the needed braking only grows as the room shrinks.
+    return asked if asked >= 2 * needed else max(asked, settings.limits.wrist_acceleration_rad_per_s2.inner)
+
+
+def _room(direction: float, sample: RtdeSample, limits: UrLimits) -> float:
+    margin = limits.joints.margin_rad
+    if direction >= 0:
+        return limits.joints.upper_rad[WRIST] - margin - sample.wrist_rad
+    return sample.wrist_rad - limits.joints.lower_rad[WRIST] - margin
+
+
+def _fading(sample: RtdeSample, limits: UrLimits) -> list[tuple[float, str]]:
+    """Return the share of the speed left, and the reason, for each of force and torque above its inner limit."""
+    found = []
+    for name, value, bound, unit in (
+        ("force", math.hypot(*sample.wrench[:3]), limits.force_n, "N"),
+        ("torque", math.hypot(*sample.wrench[3:]), limits.torque_nm, "N m"),
+    ):
+        if value > bound.inner:
+            share = max(0.0, (bound.hard - value) / (bound.hard - bound.inner))
+            found.append((share, f"{name} of {value:.2f} {unit} is above the inner limit of {bound.inner:g} {unit}"))
+    return found

@@ -14,11 +14,11 @@ from shearloop.daemon.analysis.reproduce.analysis import (
     analyse_diameter,
     analyse_torque,
     correlation,
+    group_means,
     match_slices,
     score_models,
 )
 from shearloop.daemon.analysis.reproduce.banks import GRIDS, Grid, cached_bank, focused_grid
-from shearloop.daemon.analysis.reproduce.grouping import group_means
 from shearloop.daemon.recording.matlab import Slices, read_torque_slices
 
 

@@ -29,10 +29,9 @@ from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.drivers.calibration_files import load_calibration
 from shearloop.drivers.connection import LinkEvent
 from shearloop.drivers.load_cell import LoadCalibration
-from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
-from shearloop.drivers.robotiq.width import WidthCalibration
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.settings import read_settings
 

@@ -15,11 +15,10 @@ import pytest
 from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
 from shearloop.drivers.emulators.ports import PtyServer, SocketServer
 from shearloop.drivers.emulators.robotiq.gripper import Gripper, GripperMechanics, modbus_server, urcap_server
-from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.modbus_client import ModbusClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
-from shearloop.drivers.robotiq.width import WidthCalibration
 
 STEP_S = 0.01
 # Between two looks of the driver at its clock.

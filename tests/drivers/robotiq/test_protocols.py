@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from shearloop.drivers.errors import DeviceCalibrationError, DeviceLostError, ProtocolError
 from shearloop.drivers.robotiq import messages, modbus_client
+from shearloop.drivers.robotiq.gripper import WidthCalibration
 from shearloop.drivers.robotiq.socket_client import READ_ORDER, ReplyParser, readout_of, set_lines, value_of
-from shearloop.drivers.robotiq.width import WidthCalibration
 
 byte = st.integers(0, 255)
 

@@ -3,7 +3,7 @@
 import asyncio
 import math
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Mapping, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Sequence
 from contextlib import asynccontextmanager
 from typing import Self, TypeVar
 
@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import model_validator
 
 from shearloop.drivers.calibration_files import CalibrationModel, Finite, Positive
-from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
+from shearloop.drivers.connection import Diagnostics, LinkMonitor
 from shearloop.drivers.errors import DeviceCalibrationError, DriverError
 from shearloop.drivers.robotiq import messages
 
@@ -121,39 +121,27 @@ class RobotiqGripper:
         calibration: WidthCalibration,
         *,
         poll_s: float = POLL_S,
-        policy: ReconnectPolicy | None = None,
-        on_event: Callable[[LinkEvent], None] = lambda _: None,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
+        monitor: LinkMonitor | None = None,
     ) -> None:
         """Take a connection and the meaning of its counts; nothing is opened yet."""
         self._client = client
         self._calibration = calibration
         self._poll_s = poll_s
-        self._policy = policy or ReconnectPolicy()
-        self._on_event = on_event
-        self._clock_ns = clock_ns
+        self._monitor = monitor or LinkMonitor()
         self._lock = asyncio.Lock()
         self._seq = 0
         self._last_move: messages.GripperMove | None = None
-        self._connections = 0
         self._loss: DriverError | None = None
         self.connected = False
-        self.last_error = ""
         self.latest: messages.GripperState | None = None
 
-    def diagnostics(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:
+    def diagnostics(self) -> Diagnostics:
         """Return the gripper's part of `health`; counts are since the process began."""
-        return {
-            "connected": self.connected,
-            "states": self._seq,
-            "connections": self._connections,
-            "last_loss": self.last_error,
-        }
+        return {**self._monitor.diagnostics(connected=self.connected), "states": self._seq}
 
     async def connect(self) -> messages.GripperState:
         """Open the connection and return the first state; DeviceNotFoundError or DeviceLostError."""
         await self._client.connect()
-        self._connections += 1
         self.connected, self._loss = True, None
         # Another program may have commanded the gripper since.
         self._last_move = None
@@ -191,8 +179,8 @@ class RobotiqGripper:
         await self._wait_until(
             lambda now: not now.act and now.sta is messages.ActivationStatus.RESET, RESET_DEADLINE_NS, not_reset
         )
-        resume_ns = self._clock_ns() + PAUSE_NS
-        await self._wait_until(lambda _: self._clock_ns() >= resume_ns, RESET_DEADLINE_NS, not_reset)
+        resume_ns = time.monotonic_ns() + PAUSE_NS
+        await self._wait_until(lambda _: time.monotonic_ns() >= resume_ns, RESET_DEADLINE_NS, not_reset)
         # A rising edge of ACT, which also ends every fault.
         await _uninterrupted(self._write(messages.Activate()))
         return await self._wait_until(
@@ -236,7 +224,7 @@ class RobotiqGripper:
         self, done: Callable[[messages.Readout], bool], deadline_ns: int, failure: str
     ) -> messages.GripperState:
         """Return the first state that is `done`; GripperFaultError after the deadline."""
-        since_ns = self._clock_ns()
+        since_ns = time.monotonic_ns()
         while True:
             readout, t_ns = await _uninterrupted(self._read())
             if done(readout):
@@ -280,17 +268,13 @@ class RobotiqGripper:
         if self._loss is not None:
             raise self._loss
         state = await self.connect()
-        self._policy.connected(time.monotonic_ns())
-        self._on_event(LinkEvent(up=True, sentence=f"The gripper answers at {self._client.name}.", repeated=False))
+        self._monitor.connected(f"The gripper answers at {self._client.name}.", time.monotonic_ns())
         return state
 
     async def _wait_after(self, error: DriverError) -> None:
         await self.close()
         self._loss = None
-        self.last_error = str(error)
-        retry = self._policy.failed(time.monotonic_ns())
-        self._on_event(LinkEvent(up=False, sentence=self.last_error, repeated=retry.repeated))
-        await asyncio.sleep(retry.wait_s)
+        await asyncio.sleep(self._monitor.failed(error, time.monotonic_ns()))
 
     def clip(self, command: messages.GripperCommand) -> messages.SentCommand:
         """Return the command clipped to this gripper's limits and rounded to counts."""
@@ -321,7 +305,7 @@ class RobotiqGripper:
 
     async def _read(self) -> tuple[messages.Readout, int]:
         async with self._exchange():
-            t_ns = self._clock_ns()
+            t_ns = time.monotonic_ns()
             return await self._client.read(), t_ns
 
     async def _write(self, request: messages.Request) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
+from shearloop.drivers.connection import LinkEvent, LinkMonitor
 from shearloop.drivers.emulators.boards import PAPER_SKETCH, BoardFault, BoardFaultKind, Hx711Board, Sketch, parse_fault
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell, LoadSample
 from tests.running import Changes, pass_on, running
@@ -29,7 +29,7 @@ class Rig(Changes):
         self.samples.append(sample)
         self.note()
 
-    def on_event(self, event: LinkEvent) -> None:
+    def on_link_event(self, event: LinkEvent) -> None:
         self.events.append(event)
         self.note()
 
@@ -45,7 +45,7 @@ async def a_rig(
     plugged = asyncio.Event()
     board = Hx711Board(torque_nm, sketch, period_s=0.002, link=link, on_port=lambda _: plugged.set())
     rig = Rig(board)
-    rig.cell = cell = LoadCell(calibration, path=link, policy=ReconnectPolicy(0.001, 0.002), on_event=rig.on_event)
+    rig.cell = cell = LoadCell(calibration, path=link, monitor=LinkMonitor(rig, 0.001, 0.002))
 
     async with running(board.run()):
         await plugged.wait()

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.drivers.connection import LinkEvent, ReconnectPolicy, SerialLink, TcpLink
+from shearloop.drivers.connection import LinkEvent, LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.emulators.boards import EmulatedAdcBoard
 from shearloop.drivers.emulators.ports import PtyServer, SocketServer
 from shearloop.drivers.emulators.scpi import FaultyServer
 from shearloop.drivers.emulators.skin import NOISE_V, Circuit, EmulatedKeithley6430, EmulatedScanner
 from shearloop.drivers.shear_skin.instruments import OUTPUT, READ, SOURCE_BAUD, AdcBoard, Keithley6430, ScpiScanner
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
-from tests.running import DEADLINE_S, Changes, pass_on, running
+from tests.running import DEADLINE_S, Changes, LinkEvents, pass_on, running
 
 R1, R2 = 24.6, 25.3
 RATE_HZ = 500.0
@@ -36,7 +36,7 @@ class Bench(Changes):
         self.samples.append(sample)
         self.note()
 
-    def on_event(self, event: LinkEvent) -> None:
+    def on_link_event(self, event: LinkEvent) -> None:
         self.events.append(event)
         self.note()
 
@@ -84,18 +84,20 @@ async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: f
             circuit.voltages, period_s=1 / RATE_HZ, noise_v=NOISE_V, link=folder / "adc", on_port=on_port
         )
     bench = Bench(circuit, played, source_server, reader.command)
-    options = {"policy": ReconnectPolicy(0.001, 0.005), "on_event": bench.on_event}
+    source_monitor, daq_monitor = LinkMonitor(bench, 0.001, 0.005), LinkMonitor(bench, 0.001, 0.005)
     async with running(source_server.run(), reader.run()):
         await ready.acquire()
         await ready.acquire()
         if serial_source:
-            source_link = SerialLink(path=folder / "source", baud=SOURCE_BAUD, **options)
+            source_link = SerialLink(path=folder / "source", baud=SOURCE_BAUD, monitor=source_monitor)
         else:
-            source_link = TcpLink("127.0.0.1", way_in.port, **options)
+            source_link = TcpLink("127.0.0.1", way_in.port, monitor=source_monitor)
         if adc:
-            daq = AdcBoard(SerialLink(path=folder / "adc", **options), RATE_HZ)
+            daq = AdcBoard(SerialLink(path=folder / "adc", monitor=daq_monitor), RATE_HZ)
         else:
-            daq = ScpiScanner(TcpLink("127.0.0.1", scanner.port, **options), rate_hz=RATE_HZ, timeout_s=deadline_s)
+            daq = ScpiScanner(
+                TcpLink("127.0.0.1", scanner.port, monitor=daq_monitor), rate_hz=RATE_HZ, timeout_s=deadline_s
+            )
         bench.skin = ShearSkin(Keithley6430(source_link, period_s=0.01, timeout_s=deadline_s), daq)
         async with running(bench.skin.watch_source(), pass_on(bench.skin.samples(), bench.on_sample)):
             yield bench
@@ -299,16 +301,11 @@ async def test_lines_of_the_board_that_are_missing_torn_or_garbage_are_counted(t
 
 async def test_an_instrument_that_is_no_source_is_refused_by_name() -> None:
     scanner = SocketServer(lambda: EmulatedScanner(Circuit(lambda: (R1, R2))).feed, answer_s=0.0)
-    sentences: asyncio.Queue[str] = asyncio.Queue()
-
-    def on_event(event: LinkEvent) -> None:
-        if not event.up:
-            sentences.put_nowait(event.sentence)
-
+    told = LinkEvents()
     async with asyncio.timeout(DEADLINE_S):
         await scanner.restore()
-        source = Keithley6430(TcpLink("127.0.0.1", scanner.port, on_event=on_event))
+        source = Keithley6430(TcpLink("127.0.0.1", scanner.port, monitor=LinkMonitor(told)))
 
         async with running(pass_on(source.readings(), lambda _: None)):
-            assert "says it is 'Agilent Technologies,34972A" in await sentences.get()
+            assert "says it is 'Agilent Technologies,34972A" in (await told.down()).sentence
         await scanner.disconnect()

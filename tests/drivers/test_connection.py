@@ -155,7 +155,7 @@ async def test_a_write_that_nobody_takes_ends(monkeypatch: pytest.MonkeyPatch) -
 async def test_a_link_opens_a_device_that_comes_late_and_again_after_it_went(tmp_path: Path) -> None:
     told = LinkEvents()
     path = tmp_path / "port"
-from tests.running import DEADLINE_S, LinkEvents
+    with PtyPort(path) as peer, SerialLink(path=str(path), monitor=LinkMonitor(told, 0.01, 0.02)) as link:
         peer.unplug()
         opening = asyncio.create_task(link.open())
         async with asyncio.timeout(DEADLINE_S):
@@ -170,7 +170,10 @@ from tests.running import DEADLINE_S, LinkEvents
             peer.plug()
             port = await link.open()
             await port.write(b"again")
-from tests.running import DEADLINE_S, LinkEvents
+            assert await sent_to(peer, 5) == b"again"
+    assert link.diagnostics()["connections"] == 2
+    assert re.search("has gone|no serial port", str(link.diagnostics()["last_loss"]))
+    assert told.events[-1].up
     assert not path.is_symlink()
     assert link.port is None
 

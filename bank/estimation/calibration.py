@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS
-from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import (
     NOT_TURNED,
@@ -35,6 +34,7 @@ from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.bank.estimation.regressors import ChannelImputer
 from shearloop.bank.estimation.session_state import TemporalFeatures
 from shearloop.bank.estimation.values import Kind
+from shearloop.bank.polynomial import Polynomial
 from shearloop.files import replace_file
 
 FORMAT_VERSION = 4

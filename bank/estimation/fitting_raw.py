@@ -10,7 +10,6 @@ import numpy as np
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_CHANNELS, smoothed_along_channels
-from shearloop.bank.eit.polynomial import TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatcher, find_numbering, resolve_half_turn
 from shearloop.bank.estimation.calibration import NEEDS_BANK, Calibration, Name, OutputModel
@@ -30,6 +29,7 @@ from shearloop.bank.estimation.novelty import reciprocal_means
 from shearloop.bank.estimation.regressors import ChannelImputer, Regressor, Ridge, TobitRidge, later_origins
 from shearloop.bank.estimation.session_state import BASELINE_FRAMES, SessionState, TemporalFeatures
 from shearloop.bank.estimation.values import FrameSeries, Measured, TactileFrame, distinct
+from shearloop.bank.polynomial import TWO_SIDED_95
 
 if TYPE_CHECKING:
     from shearloop.bank.eit.mesh import Mesh

@@ -21,9 +21,9 @@ from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.matching import Match, ReferenceMatcher, best_match
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS
-from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError, MatchingError
 from shearloop.bank.estimation.calibration import DIAMETER_DEGREE, TORQUE_DEGREE
+from shearloop.bank.polynomial import Polynomial
 from shearloop.daemon.analysis.reproduce.grouping import group_means, kmeans_groups, place_in_series
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.matlab import (

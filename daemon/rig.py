@@ -22,7 +22,7 @@ from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import GripperStatus, TorqueSource
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.logs import log_event, log_link
+from shearloop.daemon.logs import log_link
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
@@ -33,7 +33,7 @@ from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.robotiq.width import WidthCalibration
-from shearloop.drivers.ur.client import UrLinkEvent, UrRobot
+from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.settings import read_settings
 
 
@@ -105,7 +105,7 @@ class Rig:
                 fingertip_diameter=fingertip_diameter,
                 measures_diameters=config.gripper.calibration is not None,
             )
-        self.robot = UrRobot(robot, on_link=self._on_robot_link)
+        self.robot = UrRobot(robot, DeviceLink(self, "robot"))
         self.runner = ControlLoopRunner(
             self.control_loop,
             self.robot,
@@ -119,12 +119,7 @@ class Rig:
 
     def on_link(self, device: str) -> Callable[[LinkEvent], None]:
         """Return a callback for link events of a device: it logs them, and the control loop reacts at once."""
-
-        def on_event(event: LinkEvent) -> None:
-            log_link(device, event)
-            self._set_link(device, event.up, event.sentence)
-
-        return on_event
+        return DeviceLink(self, device).on_link_event
 
     async def start(self, path: Path) -> str | None:
         """Begin the experiment of a file; return None, or why not. Raises UserError for an invalid file."""
@@ -152,22 +147,31 @@ class Rig:
             # The loop is cancelled before the next state.
             self.runner.decide_now()
 
-    def _on_robot_link(self, event: UrLinkEvent) -> None:
-        up = event.status == "up"
-        log_event("robot", up, event.sentence, repeated=event.losses > 1)
-        self._set_link("robot", up, event.sentence)
-
-    def _set_link(self, device: str, up: bool, sentence: str) -> None:
-        if up:
+    def set_link(self, device: str, event: LinkEvent) -> None:
+        """Let the control loop react to a device's loss or return at once."""
+        if event.up:
             self.control_loop.inputs.lost.pop(device, None)
         else:
-            self.control_loop.inputs.lost[device] = sentence
+            self.control_loop.inputs.lost[device] = event.sentence
             self.runner.decide_now()
 
     def _on_gripper_state(self, state: GripperStatus) -> None:
         known = self.control_loop.inputs.gripper
         if known is None or state.t_ns >= known.t_ns:
             self.control_loop.inputs.gripper = state
+
+
+class DeviceLink:
+    """Logs the link events of a device, and passes them to the control loop."""
+
+    def __init__(self, rig: Rig, device: str) -> None:
+        self._rig = rig
+        self._device = device
+
+    def on_link_event(self, event: LinkEvent) -> None:
+        """Handle a loss or a return."""
+        log_link(self._device, event)
+        self._rig.set_link(self._device, event)
 
 
 def read_experiment(path: Path) -> ExperimentFile:

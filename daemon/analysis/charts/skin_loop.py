@@ -127,7 +127,7 @@ class SkinLoop:
             if self._zero_begun and self.estimator.zero is not None:
                 self._zero_begun = False
                 self.brain.on_action_ended()
-        self.brain.inputs.arm = ArmStatus(self._angle_rad, self.t_ns)
+        self.brain.on_arm(ArmStatus(self._angle_rad, self.t_ns))
         orders = self.brain.tick(self.t_ns)
         speed = 0.0 if orders.stop else orders.wrist_rad_per_s
         self.brain.on_speed_sent(speed)

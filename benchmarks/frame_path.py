@@ -161,7 +161,7 @@ async def trace_frame(folder: Path, lines: Sequence[NDArray[np.float64]]) -> lis
             config = write_config(folder, **fingertip(folder, "board", PAUSE_S))
             async with running(config, "eit.estimate", "eit.frame") as subscriber:
                 await asyncio.to_thread(board.wait_for_start)
-                for number, line in enumerate(lines[FIRST_FRAME : FIRST_FRAME + FIRST_VALID_FRAME + TRACED]):
+                for number, line in enumerate(lines[FIRST_FRAME:]):
                     await asyncio.sleep(PAUSE_S)
                     trace.calls, trace.recording = [], number >= FIRST_VALID_FRAME
                     await asyncio.to_thread(board.send, line_text(line))
@@ -172,6 +172,8 @@ async def trace_frame(folder: Path, lines: Sequence[NDArray[np.float64]]) -> lis
                     trace.recording = False
                     if trace.calls and msgpack.unpackb(received["eit.estimate"])["valid"]:
                         ways.append(trace.calls)
+                    if len(ways) == TRACED:
+                        break
         finally:
             trace.remove()
     return shortest(ways)

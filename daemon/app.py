@@ -19,7 +19,7 @@ from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.health import HealthReporter, TaskFacts
-from shearloop.daemon.logs import log_link
+from shearloop.daemon.logs import LinkLog
 from shearloop.daemon.messaging.addresses import local_stop_address
 from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import CurveAuthenticator, load_server_keys
@@ -27,17 +27,17 @@ from shearloop.daemon.messaging.publisher import Listener, Publisher
 from shearloop.daemon.recording.recorder import AttachedFile, Recorder, daemon_identity, experiment_notes
 from shearloop.daemon.rig import Rig, check_experiment, load_cell_calibration
 from shearloop.daemon.sensing.estimators import COMBINED, LiveEstimator, open_combined, open_estimator, torque_sources
-from shearloop.daemon.sensing.fingertip_task import CombinedFingertipTask, EstimatorTask, FingertipTask
+from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipEstimates, FingertipTask
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
-from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, SkinTask
+from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, RecordedSkin, SkinTask
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.service import notify
 from shearloop.daemon.signals import ending_signals
 from shearloop.daemon.supervisor import Supervisor
-from shearloop.drivers.connection import LinkEvent
+from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.load_cell import LoadCell
-from shearloop.drivers.serial_sensor import OnRaw, ignore_raw
+from shearloop.drivers.serial_sensor import InputRecorder
 
 
 class Daemon:
@@ -120,23 +120,22 @@ class Daemon:
 
         gripper = self._rig.gripper if self._rig is not None else None
 
-        def estimator_task(name: str, estimator: LiveEstimator, period_s: Callable[[], float]) -> EstimatorTask:
-            return EstimatorTask(
+        def estimates(name: str, estimator: LiveEstimator) -> FingertipEstimates:
+            return FingertipEstimates(
                 name,
                 estimator,
                 publisher,
                 clock,
-                period_s=period_s,
-                on_torque=on_torque,
-                on_diameter=diameters.update,
-                held_tool=gripper.held_tool if gripper is not None else lambda _: None,
-                on_raw=self._on_raw(name),
+                loop=self._rig.control_loop if self._rig is not None else None,
+                gripper=gripper,
+                diameters=diameters,
+                inputs=self._inputs(name),
             )
 
-        pair: CombinedFingertipTask | None = None
+        pairs: CombinedFingertips | None = None
         if combined is not None:
             period_s = config.fingertips[combined.calibration.sides[0]].frame_period_s
-            pair = CombinedFingertipTask(estimator_task(COMBINED, combined, lambda: period_s), period_s)
+            pairs = CombinedFingertips(estimates(COMBINED, combined), period_s)
 
         def fingertip_task(name: str, estimator: LiveEstimator) -> FingertipTask:
             own = config.fingertips[name]
@@ -145,29 +144,25 @@ class Daemon:
                 serial_number=own.device.serial_number,
                 zero_slots=ZERO_SLOTS,
                 frame_period_s=own.frame_period_s,
-                on_event=self._on_link(name),
-                on_raw=self._on_raw(name),
-                **({"on_frame": partial(pair.on_frame, name)} if pair is not None else {}),
+                monitor=self._link_monitor(name),
+                inputs=self._inputs(name),
             )
             return FingertipTask(
-                board,
-                estimator_task(name, estimator, lambda: board.period_s),
-                publisher,
-                pair,
-                always_heatmap=own.heatmap == "always",
+                board, estimates(name, estimator), publisher, pairs, always_heatmap=own.heatmap == "always"
             )
 
         self._fingertips = {name: fingertip_task(name, estimator) for name, estimator in estimators.items()}
-        self._estimators = {name: task.estimator_task for name, task in self._fingertips.items()}
+        self._estimates = {name: task.estimates for name, task in self._fingertips.items()}
         for name, task in self._fingertips.items():
-            self._add(name, task.read, task.diagnostics, task.estimator_task.tare)
-            self._add(f"{name}.estimator", task.estimate)
-        if pair is not None:
-            self._estimators[COMBINED] = pair.estimator_task
-            self._add(COMBINED, pair.estimator_task.run, pair.diagnostics, pair.estimator_task.tare)
+            self._add(name, task.run, task.diagnostics, task.estimates.tare)
+        if pairs is not None:
+            self._estimates[COMBINED] = pairs.estimates
+            self.health.add(COMBINED, pairs.diagnostics)
+            self._tares[COMBINED] = pairs.estimates.tare
         self._skin: SkinTask | None = None
         if config.skin is not None:
-            self._skin = SkinTask(config.skin, publisher, clock, on_torque, self._on_raw)
+            inputs = {name: self._inputs(name) for name in RecordedSkin.sources}
+            self._skin = SkinTask(config.skin, publisher, clock, on_torque, inputs)
             self._add(SKIN, self._skin.read, self._skin.diagnostics, self._skin.tare)
             self._add(SKIN_SOURCE, self._skin.watch_source, self._skin.source_diagnostics)
         self._load_cell: LoadCellTask | None = None
@@ -178,8 +173,8 @@ class Daemon:
                 serial_number=port.serial_number,
                 path=port.path,
                 rate_hz=rate_hz,
-                on_event=self._on_link(LOAD_CELL),
-                on_raw=self._on_raw(LOAD_CELL),
+                monitor=self._link_monitor(LOAD_CELL),
+                inputs=self._inputs(LOAD_CELL),
             )
             self._load_cell = LoadCellTask(board, publisher, clock, on_torque, rate_hz)
             self._add(LOAD_CELL, self._load_cell.read, self._load_cell.diagnostics, self._load_cell.tare)
@@ -283,11 +278,11 @@ class Daemon:
         self.publisher.add_listener(recorder.record_message)
         return recorder
 
-    def _on_raw(self, source: str) -> OnRaw:
-        return ignore_raw if self._recorder is None else self._recorder.input_recorder(source)
+    def _inputs(self, source: str) -> InputRecorder | None:
+        return self._recorder.input_recorder(source) if self._recorder is not None else None
 
-    def _on_link(self, device: str) -> Callable[[LinkEvent], None]:
-        return self._rig.on_link(device) if self._rig is not None else partial(log_link, device)
+    def _link_monitor(self, device: str) -> LinkMonitor:
+        return self._rig.monitor(device) if self._rig is not None else LinkMonitor(LinkLog(device))
 
     async def _record(self, recorder: Recorder) -> None:
         async for failure in recorder.flushes():
@@ -312,7 +307,7 @@ class Daemon:
 
     async def _tare(self) -> str:
         """Zero every torque sensor; return the errors, or an empty string."""
-        tares = [task.tare_and_wait() for task in self._estimators.values()]
+        tares = [each.tare_and_wait() for each in self._estimates.values()]
         if self._skin is not None:
             tares.append(self._skin.zero())
         if self._load_cell is not None:

@@ -97,7 +97,7 @@ class Commands:
             raise CommandRefusedError("only `heatmap` can be set while the daemon runs, to always or on_request")
         names = _requested(request, self.fingertips, "fingertip {source!r}")
         for name in names:
-            self.fingertips[name].always_heatmap = heatmap == "always"
+            self.fingertips[name].show_heatmap(always=heatmap == "always")
         return {"set": names, "heatmap": heatmap}
 
     async def _status(self, _request: Request) -> Reply:

@@ -22,18 +22,17 @@ from shearloop.daemon.control.identification import Creep
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.logs import log_event, log_link
+from shearloop.daemon.logs import LinkLog
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.drivers.calibration_files import load_calibration
-from shearloop.drivers.connection import LinkEvent
+from shearloop.drivers.connection import LinkEvent, LinkMonitor
 from shearloop.drivers.load_cell import LoadCalibration
-from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
-from shearloop.drivers.robotiq.width import WidthCalibration
-from shearloop.drivers.ur.client import UrLinkEvent, UrRobot
+from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.settings import read_settings
 
 
@@ -99,13 +98,13 @@ class Rig:
         if config.gripper is not None:
             calibration = gripper_calibration(config.gripper)
             self.gripper = GripperTask(
-                RobotiqGripper(make_gripper_client(config.gripper), calibration, on_event=self.on_link("gripper")),
+                RobotiqGripper(make_gripper_client(config.gripper), calibration, monitor=self.monitor("gripper")),
                 publisher,
                 self.control_loop,
                 fingertip_diameter=fingertip_diameter,
                 measures_diameters=config.gripper.calibration is not None,
             )
-        self.robot = UrRobot(robot, on_link=self._on_robot_link)
+        self.robot = UrRobot(robot, self.monitor("robot"))
         self.runner = ControlLoopRunner(
             self.control_loop,
             self.robot,
@@ -117,14 +116,9 @@ class Rig:
             config.loop.wrist_acceleration_rad_per_s2,
         )
 
-    def on_link(self, device: str) -> Callable[[LinkEvent], None]:
-        """Return a callback for link events of a device: it logs them, and the control loop reacts at once."""
-
-        def on_event(event: LinkEvent) -> None:
-            log_link(device, event)
-            self._set_link(device, event.up, event.sentence)
-
-        return on_event
+    def monitor(self, device: str) -> LinkMonitor:
+        """Return the monitor of a device's link: it logs the events, and the control loop reacts at once."""
+        return LinkMonitor(DeviceLink(self, device))
 
     async def start(self, path: Path) -> str | None:
         """Begin the experiment of a file; return None, or why not. Raises UserError for an invalid file."""
@@ -152,15 +146,24 @@ class Rig:
             # The loop is cancelled before the next state.
             self.runner.decide_now()
 
-    def _on_robot_link(self, event: UrLinkEvent) -> None:
-        up = event.status == "up"
-        log_event("robot", up, event.sentence, repeated=event.losses > 1)
-        self._set_link("robot", up, event.sentence)
-
-    def _set_link(self, device: str, up: bool, sentence: str) -> None:
-        self.control_loop.on_link(device, sentence, up=up)
-        if not up:
+    def set_link(self, device: str, event: LinkEvent) -> None:
+        """Let the control loop react to a device's loss or return at once."""
+        self.control_loop.on_link(device, event.sentence, up=event.up)
+        if not event.up:
             self.runner.decide_now()
+
+
+class DeviceLink(LinkLog):
+    """Logs the link events of a device, and passes them to the control loop."""
+
+    def __init__(self, rig: Rig, device: str) -> None:
+        super().__init__(device)
+        self._rig = rig
+
+    def on_link_event(self, event: LinkEvent) -> None:
+        """Handle a loss or a return."""
+        super().on_link_event(event)
+        self._rig.set_link(self.device, event)
 
 
 def read_experiment(path: Path) -> ExperimentFile:

@@ -10,17 +10,16 @@ import os
 import re
 import time
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.drivers.connection import Diagnostics, LinkEvent, Port, SerialLink
+from shearloop.drivers.connection import Diagnostics, LinkMonitor, Port, SerialLink
 from shearloop.drivers.errors import DeviceLostError
 from shearloop.drivers.frame_clock import FrameClock
-from shearloop.drivers.serial_sensor import InputKind, LineSplitter, OnRaw, RawEvent, SerialSensor, ignore_raw
+from shearloop.drivers.serial_sensor import InputKind, InputRecorder, LineSplitter, RawEvent, SerialSensor
 
 N_VALUES = 1024
 CELL_BYTES = len(b"0.1234, ")
@@ -139,6 +138,7 @@ class Frame:
     channels: NDArray[np.float64]
     raw: NDArray[np.float64]
     line: bytes
+    t_begin_ns: int
     t_mid_ns: int
     t_arrival_ns: int
     seq: int
@@ -260,6 +260,7 @@ class FrameParser:
             channels=channels,
             raw=values,
             line=line,
+            t_begin_ns=self._last_mid_ns - self.clock.period_ns // 2,
             t_mid_ns=self._last_mid_ns,
             t_arrival_ns=t_arrival_ns,
             seq=self.frames,
@@ -276,8 +277,7 @@ class EitKit(SerialSensor[Frame]):
     """One board, named by USB serial number or path.
 
     `zero_slots` (1024,) is true where its injection pattern makes a value 0. `frame_period_s` is used until the period
-    is measured. `on_event` receives changes of the connection, `on_raw` every input of the parser, `on_frame` each
-    frame as soon as it is complete.
+    is measured. `inputs` keeps every input of the parser.
     """
 
     def __init__(
@@ -287,14 +287,12 @@ class EitKit(SerialSensor[Frame]):
         serial_number: str | None = None,
         path: str | os.PathLike[str] | None = None,
         frame_period_s: float = NOMINAL_PERIOD_NS / 1e9,
-        on_event: Callable[[LinkEvent], None] = lambda _: None,
-        on_raw: OnRaw = ignore_raw,
-        on_frame: Callable[[Frame], None] = lambda _: None,
+        monitor: LinkMonitor | None = None,
+        inputs: InputRecorder | None = None,
     ) -> None:
-        link = SerialLink(serial_number=serial_number, path=path, on_event=on_event)
-        super().__init__(link, frame_period_s, on_raw)
+        link = SerialLink(serial_number=serial_number, path=path, monitor=monitor)
+        super().__init__(link, frame_period_s, inputs)
         self._parser = FrameParser(zero_slots, nominal_period_ns=round(frame_period_s * 1e9))
-        self._on_frame = on_frame
         self._silences = 0
 
     @property
@@ -318,10 +316,7 @@ class EitKit(SerialSensor[Frame]):
         }
 
     def _parse(self, event: RawEvent) -> list[Frame]:
-        frames = self._parser.handle(event)
-        for frame in frames:
-            self._on_frame(frame)
-        return frames
+        return self._parser.handle(event)
 
     async def _on_open(self, port: Port) -> None:
         await port.write(START)

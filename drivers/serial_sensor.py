@@ -1,11 +1,12 @@
 """Sensors on serial lines: raw events, lines, and the loop that reads a board and reconnects to it."""
 
+import contextlib
 import time
 from abc import ABC, abstractmethod
-from collections.abc import AsyncGenerator, Callable, Sequence
+from collections.abc import AsyncGenerator, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Generic, TypeAlias, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from shearloop.drivers.connection import Diagnostics, Link, Port, Received
 from shearloop.drivers.errors import DeviceLostError, DriverError
@@ -37,11 +38,11 @@ class RawEvent:
     data: bytes = b""
 
 
-OnRaw: TypeAlias = Callable[[RawEvent], None]
+class InputRecorder(Protocol):
+    """Keeps the inputs of one source, so that a replay can repeat them."""
 
-
-def ignore_raw(_event: RawEvent) -> None:
-    """Drop a raw event."""
+    def record(self, event: RawEvent) -> None:
+        """Keep the next input; never blocks."""
 
 
 def transfer_ns(n_bytes: int, baud: int) -> int:
@@ -107,16 +108,23 @@ class SerialSensor(ABC, Generic[ValueT]):
     # The operator's checklist when nothing comes.
     silence_hint = ""
 
-    def __init__(self, link: Link, period_s: float, on_raw: OnRaw = ignore_raw) -> None:
-        """Use the link, not yet open, of a board with a line every `period_s`; `on_raw` receives every parser input."""
+    def __init__(self, link: Link, period_s: float, inputs: InputRecorder | None = None) -> None:
+        """Use the link, not yet open, of a board with a line every `period_s`; `inputs` keeps every parser input."""
         self._link = link
         self._period_s = period_s
-        self._on_raw = on_raw
+        self._inputs = inputs
         self._has_sent = False
         self._timeouts = 0
 
     async def readings(self) -> AsyncGenerator[ValueT]:
-        """Yield the values of every line, in order and without end; reconnects when the board disappears.
+        """Yield the values of every line, in order and without end, as `batches` does."""
+        async with contextlib.aclosing(self.batches()) as batches:
+            async for values in batches:
+                for value in values:
+                    yield value
+
+    async def batches(self) -> AsyncGenerator[Sequence[ValueT]]:
+        """Yield the values that each read completes, in order and without end; reconnects when the board disappears.
 
         Nothing is lost while the receiver is busy: the bytes wait in the kernel, then on the board. Iterate within
         `contextlib.aclosing`, which closes the port at the end.
@@ -129,8 +137,7 @@ class SerialSensor(ABC, Generic[ValueT]):
                     await self._link.lost(error)
                     continue
                 if received is not None:
-                    for value in self._dispatch(InputKind.DATA, received.t_arrival_ns, received.data):
-                        yield value
+                    yield self._dispatch(InputKind.DATA, received.t_arrival_ns, received.data)
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
@@ -138,7 +145,8 @@ class SerialSensor(ABC, Generic[ValueT]):
 
     def _dispatch(self, kind: InputKind, t_ns: int, data: bytes = b"") -> Sequence[ValueT]:
         event = RawEvent(kind, t_ns, data)
-        self._on_raw(event)
+        if self._inputs is not None:
+            self._inputs.record(event)
         return self._parse(event)
 
     async def _receive(self) -> Received | None:

@@ -172,7 +172,7 @@ class ControlLoopRunner:
             "connected": self._robot.state is not None,
             "states": self._robot.states,
             "errors": errors,
-            "error": "" if self._robot.link.status == "up" else self._robot.link.sentence,
+            "error": "" if self._robot.link.latest.up else self._robot.link.latest.sentence,
         }
 
     def _take_state(self, state: RobotState) -> None:

@@ -32,7 +32,7 @@ from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import LoopState, Scalar
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.writer import PARTIAL, McapFile
-from shearloop.drivers.serial_sensor import InputKind, OnRaw, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 
 # A kill loses the data since the last flush, less than a second even on a busy computer.
 FLUSH_S = 0.5
@@ -119,6 +119,15 @@ class _Item:
     begins_experiment: bool
 
 
+@dataclass(frozen=True, slots=True)
+class _SourceRecorder:
+    recorder: "Recorder"
+    source: str
+
+    def record(self, event: RawEvent) -> None:
+        self.recorder.record_input(self.source, event)
+
+
 @dataclass(slots=True)
 class _Counts:
     """Numbers over all files. The event loop counts `queued_bytes` and `dropped` up, the writing thread the others."""
@@ -179,14 +188,14 @@ class Recorder:
         size = _OVERHEAD_BYTES + 2 * sum(len(value) for value in content.values() if isinstance(value, bytes))
         self._enqueue(size, partial(self._add_message, topic, content, self._clock.now_ns(), self._clock.offset_ns))
 
-    def input_recorder(self, source: str) -> OnRaw:
-        """Return a function that records the raw input of one source."""
+    def input_recorder(self, source: str) -> InputRecorder:
+        """Return the recorder of one source's raw input."""
+        return _SourceRecorder(self, source)
 
-        def record_input(event: RawEvent) -> None:
-            add = partial(self._add_input, source, event, self._clock.offset_ns)
-            self._enqueue(_OVERHEAD_BYTES + len(event.data), add)
-
-        return record_input
+    def record_input(self, source: str, event: RawEvent) -> None:
+        """Queue a raw input."""
+        add = partial(self._add_input, source, event, self._clock.offset_ns)
+        self._enqueue(_OVERHEAD_BYTES + len(event.data), add)
 
     def record_experiment(
         self, name: str, attached: tuple[AttachedFile, ...] = (), notes: Mapping[str, str] = MappingProxyType({})

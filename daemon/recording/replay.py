@@ -205,7 +205,7 @@ class ReplayPipeline:
         if due:
             estimator.set_tool(tools[max(due)])
         self._latest_frame[source] = number
-        estimate = await asyncio.to_thread(estimator.estimate, *frames)
+        estimate = await estimator.estimate(*frames)
         # The replayed latency is 0; the recording holds the live one.
         arrival_ns = max(frame.t_arrival_ns for frame in frames)
         self._publisher.publish(estimate_message(source, frames, estimate, arrival_ns))

@@ -1,5 +1,6 @@
 """Estimators of the daemon: opened from the configuration, and run on the boards' frames. No I/O but the files."""
 
+import asyncio
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -47,7 +48,7 @@ class LiveEstimator:
         self.model = bank.model if bank is not None else ""
         self._matcher = _shared_matcher(bank, config.matching) if bank is not None else None
         matcher = None
-        if calibration.has_curves_only and self._matcher is not None:
+        if not calibration.sides and self._matcher is not None:
             calibration.check_bank(bank)
             matcher = PaperMatcher(self._matcher)
         self._session = EstimatorSession(
@@ -72,11 +73,6 @@ class LiveEstimator:
         return f", assuming that {text}" if text else ""
 
     @property
-    def searches_bank(self) -> bool:
-        """Whether an estimate searches a bank, which takes many milliseconds; others take less than one."""
-        return self._matcher is not None
-
-    @property
     def grids(self) -> tuple[FloatArray, FloatArray] | None:
         """The k and the sigma of the bank's cells, None without a bank."""
         return (self._matcher.k_grid, self._matcher.sigma_grid) if self._matcher is not None else None
@@ -94,14 +90,22 @@ class LiveEstimator:
         """Set the diameter of the held tool: on another one than the calibration's there is no torque."""
         self._session.set_tool(tool)
 
-    def estimate(self, *frames: Frame) -> Estimate:
-        """Return the estimate of frames of one time, one for each side. Searching a bank is slow."""
+    async def estimate(self, *frames: Frame) -> Estimate:
+        """Return the estimate of frames of one time, one for each side.
+
+        A search of the bank runs in a thread: it can take half a second.
+        """
         if any(frame.repeated for frame in frames):
             return Estimate(valid=False, reasons=REPEATED_FRAME)
         usable = np.array([~(frame.saturated | frame.dead) for frame in frames])
         t_s = sum(frame.t_mid_ns for frame in frames) / len(frames) / 1e9
-        channels = np.array([frame.channels for frame in frames])
-        estimate = self._session.estimate(TactileFrame.of(t_s, channels, usable))
+        frame = TactileFrame.of(t_s, np.array([frame.channels for frame in frames]), usable)
+        if self._matcher is None:
+            return self._session.estimate(frame)
+        return await asyncio.to_thread(self._estimate_with_bank, frame)
+
+    def _estimate_with_bank(self, frame: TactileFrame) -> Estimate:
+        estimate = self._session.estimate(frame)
         difference = self._first_difference()
         if not estimate.valid or estimate.k is not None or self._matcher is None or difference is None:
             return estimate
@@ -126,13 +130,13 @@ def open_estimator(config: FingertipConfig, name: str) -> LiveEstimator:
     """
     if config.calibration is not None and config.calibration.exists():
         calibration = _load(config.calibration, config.estimator)
-        if not calibration.has_curves_only and calibration.sides != (name,):
+        if calibration.sides and calibration.sides != (name,):
             raise UserError(
                 f"{config.calibration} is of the {' and '.join(calibration.sides)} fingertip, not of {name}; "
                 f"calibrate with `--sides {name}`, or name a calibration of both under `combined`"
             )
-        if calibration.has_curves_only and config.bank is None:
-            raise UserError(f"the paper's estimator of {name} needs its bank; add `bank:` to the fingertip")
+        if calibration.estimator.searches_bank and config.bank is None:
+            raise _without_bank(calibration.estimator.name, name)
         return _live(config.calibration, calibration, config)
     if config.estimator not in (None, "paper"):
         found = "none is configured" if config.calibration is None else f"{config.calibration} does not exist"
@@ -141,10 +145,14 @@ def open_estimator(config: FingertipConfig, name: str) -> LiveEstimator:
             f"`shearloop calibrate REC… --estimator {config.estimator} --out CAL`"
         )
     if config.bank is None:
-        raise UserError(f"the paper's estimator of {name} needs its bank; add `bank:` to the fingertip")
+        raise _without_bank("paper", name)
     if config.calibration is not None:
         return LiveEstimator(Calibration.load(config.calibration), config)
     return LiveEstimator(Calibration.uncalibrated(Bank.open(config.bank).identity), config)
+
+
+def _without_bank(estimator: str, name: str) -> UserError:
+    return UserError(f"the estimator {estimator} of {name} needs its bank; add `bank:` to the fingertip")
 
 
 def open_combined(config: CombinedConfig, fingertips: Mapping[str, FingertipConfig]) -> LiveEstimator:
@@ -203,9 +211,9 @@ def _load(path: Path, wanted: str | None) -> Calibration:
     calibration = Calibration.load(path)
     if calibration.kind != "raw":
         raise UserError(f"{path} was made from slices; the daemon has raw frames: calibrate on a recording of them")
-    if wanted not in (None, calibration.estimator):
+    if wanted not in (None, calibration.estimator.name):
         raise UserError(
-            f"{path} is a calibration of the estimator {calibration.estimator}, and {wanted} is configured; "
+            f"{path} is a calibration of the estimator {calibration.estimator.name}, and {wanted} is configured; "
             f"name the other, or calibrate with `--estimator {wanted}`"
         )
     return calibration

@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Generic, TypeVar
 
@@ -10,18 +9,19 @@ import numpy as np
 
 from shearloop.bank.estimation import Estimate, Measured
 from shearloop.daemon.clock import Clock
+from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.daemon.messaging.messages import EitEstimate, EitFrame, EitHeatmap, Scalar
+from shearloop.daemon.health import TaskFacts
+from shearloop.daemon.messaging.messages import EitEstimate, EitFrame, EitHeatmap
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.estimators import LiveEstimator
-from shearloop.daemon.sensing.tool_diameter import OnDiameter, tool_as_bytes
+from shearloop.daemon.sensing.tool_diameter import FingertipDiameters, tool_as_bytes
 from shearloop.drivers.eit_kit import EitKit, Frame
-from shearloop.drivers.serial_sensor import InputKind, OnRaw, RawEvent, ignore_raw
+from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 
 Item = TypeVar("Item")
 
-# Frames that may wait for the estimator. With more the port is not read: the board waits, and no frame is lost.
-MAX_BACKLOG = 8
 # Largest distance in time of a pair of frames, as a share of the frame period.
 _MAX_APART_PERIODS = 0.75
 
@@ -56,8 +56,8 @@ class FramePairing(Generic[Item]):
         return found
 
 
-class EstimatorTask:
-    """Estimates from queued frames in order, publishes the estimates, and passes them on."""
+class FingertipEstimates:
+    """Estimates from the frames of one fingertip, or of several together, for the control loop and for subscribers."""
 
     def __init__(
         self,
@@ -66,59 +66,43 @@ class EstimatorTask:
         publisher: Publisher,
         clock: Clock,
         *,
-        period_s: Callable[[], float],
-        on_torque: Callable[[TorqueSample], None],
-        on_diameter: OnDiameter | None = None,
-        held_tool: Callable[[int], Measured | None] = lambda _: None,
-        on_raw: OnRaw = ignore_raw,
+        loop: ControlLoop | None = None,
+        gripper: GripperTask | None = None,
+        diameters: FingertipDiameters | None = None,
+        inputs: InputRecorder | None = None,
     ) -> None:
-        """Take the estimator and its consumers; `period_s` gives the present frame period.
+        """Take the estimator and its consumers; the gripper gives the held tool.
 
-        `held_tool` gives the diameter of the held tool at a time.
+        `inputs` keeps the moments of tares and of changes of the tool.
         """
         self.name = name
         self.estimator = estimator
         self.count = 0
         self._publisher = publisher
         self._clock = clock
-        self._period_s = period_s
-        self._on_torque = on_torque
-        self._on_diameter = on_diameter
-        self._held_tool = held_tool
-        self._on_raw = on_raw
-        self._tool: Measured | None = None
-        self._queue: asyncio.Queue[tuple[Frame, ...]] = asyncio.Queue()
-        self._has_room = asyncio.Event()
-        self._has_room.set()
+        self._loop = loop
+        self._gripper = gripper
+        self._diameters = diameters
+        self._inputs = inputs
         self._tare_from_ns: int | None = None
         self._tared = asyncio.Event()
+        self._held: Measured | None = None
 
-    @property
-    def backlog(self) -> int:
-        """Number of frames that wait."""
-        return self._queue.qsize()
-
-    def submit(self, *frames: Frame) -> None:
-        """Queue the frames of one time, one for each side."""
-        self._queue.put_nowait(frames)
-        if self.backlog >= MAX_BACKLOG:
-            self._has_room.clear()
-
-    async def room(self) -> None:
-        """Wait until the queue has room, before reading more from the boards."""
-        await self._has_room.wait()
-
-    async def next(self) -> tuple[tuple[Frame, ...], Estimate]:
-        """Estimate from the frames that have waited longest, publish the estimate, and return both."""
-        frames = await self._queue.get()
-        if self.backlog < MAX_BACKLOG:
-            self._has_room.set()
-        return frames, await self.estimate(*frames)
-
-    async def run(self) -> None:
-        """Estimate from all frames in order, until cancelled."""
-        while True:
-            await self.next()
+    async def process(self, *frames: Frame) -> None:
+        """Estimate from the frames of one time, hand the estimate to the control loop, and publish it."""
+        self._prepare(frames)
+        estimate = await self.estimator.estimate(*frames)
+        now_ns = self._clock.now_ns()
+        message = estimate_message(self.name, frames, estimate, now_ns)
+        if self._loop is not None:
+            t_mid_ns = message.t_mono_ns - round(1e9 * estimate.lag_s)
+            self._loop.on_torque(TorqueSample(self.name, estimate.torque_nm, message.reason, t_mid_ns, now_ns))
+        if self._diameters is not None:
+            self._diameters.update(self.name, estimate, now_ns)
+        self._publisher.publish(message)
+        self.count += 1
+        if self._tare_from_ns is None and not self.estimator.taring:
+            self._tared.set()
 
     def tare(self) -> None:
         """Take a new homogeneous frame from frames acquired entirely after now."""
@@ -131,118 +115,96 @@ class EstimatorTask:
         await self._tared.wait()
         return ""
 
-    async def estimate(self, *frames: Frame) -> Estimate:
-        """Estimate from the frames of one time, publish the estimate, and pass it on.
-
-        The estimator runs in a thread, because a search of the bank would delay the loop.
-        """
-        self._apply_tare(frames)
-        self._apply_tool(frames[0].seq)
-        estimate = await asyncio.to_thread(self.estimator.estimate, *frames)
-        now_ns = self._clock.now_ns()
-        message = estimate_message(self.name, frames, estimate, now_ns)
-        lag_ns = round(1e9 * estimate.lag_s)
-        self._on_torque(TorqueSample(self.name, estimate.torque_nm, message.reason, message.t_mono_ns - lag_ns, now_ns))
-        if self._on_diameter is not None:
-            self._on_diameter(self.name, _diameter(estimate), now_ns)
-        self._publisher.publish(message)
-        self.count += 1
-        if self._tare_from_ns is None and not self.estimator.taring:
-            self._tared.set()
-        return estimate
-
-    def _apply_tare(self, frames: tuple[Frame, ...]) -> None:
-        begin_ns = min(frame.t_mid_ns for frame in frames) - round(0.5e9 * self._period_s())
-        if self._tare_from_ns is not None and begin_ns >= self._tare_from_ns:
+    def _prepare(self, frames: tuple[Frame, ...]) -> None:
+        """Begin a tare that is due, and take the held tool; a replay does both before the same frame."""
+        number, now_ns = frames[0].seq, self._clock.now_ns()
+        if self._tare_from_ns is not None and min(frame.t_begin_ns for frame in frames) >= self._tare_from_ns:
             self._tare_from_ns = None
-            # A replay tares before the same frame.
-            self._on_raw(RawEvent(InputKind.TARE, self._clock.now_ns(), str(frames[0].seq).encode()))
             self.estimator.tare()
-
-    def _apply_tool(self, frame: int) -> None:
-        now_ns = self._clock.now_ns()
-        tool = self._held_tool(now_ns)
-        if tool != self._tool:
-            self._tool = tool
-            self._on_raw(RawEvent(InputKind.TOOL, now_ns, tool_as_bytes(frame, tool)))
+            if self._inputs is not None:
+                self._inputs.record(RawEvent(InputKind.TARE, now_ns, str(number).encode()))
+        tool = self._gripper.held_tool(now_ns) if self._gripper is not None else None
+        if tool != self._held:
+            self._held = tool
             self.estimator.set_tool(tool)
+            if self._inputs is not None:
+                self._inputs.record(RawEvent(InputKind.TOOL, now_ns, tool_as_bytes(number, tool)))
 
 
-class CombinedFingertipTask:
-    """Pairs the frames of several fingertips and estimates from each pair."""
+class CombinedFingertips:
+    """Pairs the frames of several fingertips, and estimates from each pair."""
 
-    def __init__(self, estimator_task: EstimatorTask, period_s: float) -> None:
-        """Take the estimator of the pairs, and the frame period."""
-        self.estimator_task = estimator_task
-        self.sides = estimator_task.estimator.calibration.sides
+    def __init__(self, estimates: FingertipEstimates, period_s: float) -> None:
+        """Take the estimates of the pairs, and the frame period."""
+        self.estimates = estimates
+        self.sides = estimates.estimator.calibration.sides
         self._period_s = period_s
-        self._pairing: FramePairing[Frame] = FramePairing(self.sides, round(period_s * 1e9))
+        self.pairing: FramePairing[Frame] = FramePairing(self.sides, round(period_s * 1e9))
 
-    def on_frame(self, side: str, frame: Frame) -> None:
-        """Queue the pair that a frame completes.
-
-        Call this when the frame arrives: the order of arrival decides the pairs, and a replay finds the same ones.
-        """
-        if (pair := self._pairing.add(side, frame.t_mid_ns, frame)) is not None:
-            self.estimator_task.submit(*pair)
-
-    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+    def diagnostics(self) -> TaskFacts:
         """Return the values for the health message."""
-        task = self.estimator_task
-        return {"expected_hz": 1.0 / self._period_s, "estimates": task.count, "backlog": task.backlog}
+        return {"expected_hz": 1.0 / self._period_s, "estimates": self.estimates.count}
 
 
 class FingertipTask:
-    """Reads one board, publishes its frames, and estimates from each."""
+    """Reads one board, estimates from each frame, and publishes both."""
 
     def __init__(
         self,
         board: EitKit,
-        estimator_task: EstimatorTask,
+        estimates: FingertipEstimates,
         publisher: Publisher,
-        combined: CombinedFingertipTask | None = None,
+        combined: CombinedFingertips | None = None,
         *,
         always_heatmap: bool = False,
     ) -> None:
-        """Take the board, its estimator, and the task that also needs its frames, if there is one."""
-        self.name = estimator_task.name
-        self.estimator_task = estimator_task
-        self.always_heatmap = always_heatmap
+        """Take the board, its estimates, and the estimates that also need its frames, if there are any."""
+        self.name = estimates.name
+        self.estimates = estimates
+        self._always_heatmap = always_heatmap
         self._board = board
         self._publisher = publisher
         self._combined = combined
 
-    async def read(self) -> None:
-        """Publish and queue every frame until cancelled."""
-        async with contextlib.aclosing(self._board.readings()) as frames:
-            async for frame in frames:
-                self._publisher.publish(frame_message(self.name, frame))
-                self.estimator_task.submit(frame)
-                await self.estimator_task.room()
-                if self._combined is not None:
-                    await self._combined.estimator_task.room()
+    async def run(self) -> None:
+        """Process every frame until cancelled."""
+        async with contextlib.aclosing(self._board.batches()) as batches:
+            async for frames in batches:
+                # Before any estimate: the order of arrival decides the pairs, and a replay finds the same ones.
+                pairs = [self._pair(frame) for frame in frames]
+                for frame, pair in zip(frames, pairs, strict=True):
+                    await self.process_frame(frame, pair)
+                if frames:
+                    await self._publish_heatmap(frames[-1])
 
-    async def estimate(self) -> None:
-        """Estimate from every frame in order, and publish heatmaps, until cancelled."""
-        while True:
-            (frame,), _ = await self.estimator_task.next()
-            wanted = self.always_heatmap or self._publisher.has_subscriber(EitHeatmap.topic)
-            if wanted and not self.estimator_task.backlog:
-                await self._publish_heatmap(frame)
+    async def process_frame(self, frame: Frame, pair: tuple[Frame, ...] | None) -> None:
+        """Estimate from a frame and from the pair that it completes; publish the estimates, then the frame."""
+        await self.estimates.process(frame)
+        if pair is not None and self._combined is not None:
+            await self._combined.estimates.process(*pair)
+        self._publisher.publish(frame_message(self.name, frame))
 
-    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+    def show_heatmap(self, *, always: bool) -> None:
+        """Publish a heatmap with every frame, or only while somebody subscribes to it."""
+        self._always_heatmap = always
+
+    def diagnostics(self) -> TaskFacts:
         """Return the values for the health message."""
         board = self._board.diagnostics()
         return {
             **board,
             "rate_hz": board["measured_hz"],
             "error": board["last_frame_error"] if board["connected"] else board["last_loss"],
-            "estimates": self.estimator_task.count,
-            "backlog": self.estimator_task.backlog,
+            "estimates": self.estimates.count,
         }
 
+    def _pair(self, frame: Frame) -> tuple[Frame, ...] | None:
+        return self._combined.pairing.add(self.name, frame.t_mid_ns, frame) if self._combined is not None else None
+
     async def _publish_heatmap(self, frame: Frame) -> None:
-        estimator = self.estimator_task.estimator
+        estimator = self.estimates.estimator
+        if not (self._always_heatmap or self._publisher.has_subscriber(EitHeatmap.topic)):
+            return
         scores = await asyncio.to_thread(estimator.heatmap)
         if scores is None or estimator.grids is None:
             return
@@ -289,10 +251,3 @@ def estimate_message(name: str, frames: tuple[Frame, ...], estimate: Estimate, n
         frame=frames[0].seq,
         latency_s=(now_ns - max(frame.t_arrival_ns for frame in frames)) / 1e9,
     )
-
-
-def _diameter(estimate: Estimate) -> Measured | None:
-    low_mm, high_mm = estimate.diameter_low_mm, estimate.diameter_high_mm
-    if estimate.diameter_mm is None or low_mm is None or high_mm is None:
-        return None
-    return Measured(estimate.diameter_mm, 0.5 * (high_mm - low_mm))

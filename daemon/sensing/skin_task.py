@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Mapping
-from functools import partial
+from types import MappingProxyType
 
 from shearloop.bank.skin.calibration import SkinCalibration, load_calibration
 from shearloop.bank.skin.membrane import joule_heating_k
@@ -10,14 +10,14 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import InstrumentSocket, SerialDevice, SkinConfig
 from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.logs import log_link
+from shearloop.daemon.logs import LinkLog
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
 from shearloop.daemon.waiters import Waiters
 from shearloop.drivers import shear_skin
-from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkEvent, SerialLink, TcpLink
-from shearloop.drivers.serial_sensor import InputKind, OnRaw, RawEvent, ignore_raw
+from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, SerialLink, TcpLink
+from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.drivers.shear_skin import SOURCE_PERIOD_S, Keithley6430, PairParser, SkinSample, Voltages
 
 SKIN = "skin"
@@ -38,22 +38,24 @@ class SkinTask:
         publisher: Publisher,
         clock: Clock,
         on_torque: Callable[[TorqueSample], None] = lambda _: None,
-        on_raw: Callable[[str], OnRaw] = lambda _: ignore_raw,
+        inputs: Mapping[str, InputRecorder | None] = MappingProxyType({}),
     ) -> None:
-        """Build everything, not yet open; `on_raw` returns the callback for a source's raw events, by its name.
+        """Build everything, not yet open; `inputs` keeps the inputs of each source, by its name.
 
         Raises BankError for an unusable calibration and UserError if the instruments cannot measure these gauges.
         """
         calibration = load_calibration(config.calibration)
         check_circuit(config, calibration)
         self._skin = shear_skin.ShearSkin(
-            _current_source(config, on_raw(SKIN_SOURCE)), _daq(config, on_raw(SKIN_DAQ)), _gauge_ohm(calibration)
+            _current_source(config, inputs.get(SKIN_SOURCE)),
+            _daq(config, inputs.get(SKIN_DAQ)),
+            _gauge_ohm(calibration),
         )
         self._estimator = _estimator(config, calibration)
         self._publisher = publisher
         self._clock = clock
         self._on_torque = on_torque
-        self._on_raw = on_raw(SKIN)
+        self._inputs = inputs.get(SKIN)
         self._radius_m = _radius_m(config)
         self._zero_waiters = Waiters()
         self._reason = ""
@@ -77,7 +79,8 @@ class SkinTask:
     def tare(self) -> None:
         """Take a new zero from samples measured from now on."""
         now_ns = self._clock.now_ns()
-        self._on_raw(RawEvent(InputKind.TARE, now_ns))
+        if self._inputs is not None:
+            self._inputs.record(RawEvent(InputKind.TARE, now_ns))
         self._estimator.tare(now_ns)
 
     async def zero(self) -> str:
@@ -238,28 +241,26 @@ def _estimator(config: SkinConfig, calibration: SkinCalibration) -> SkinEstimato
     )
 
 
-def _current_source(config: SkinConfig, on_raw: OnRaw) -> Keithley6430:
+def _current_source(config: SkinConfig, inputs: InputRecorder | None) -> Keithley6430:
     source = config.source
-    link = _link(source.socket, source.serial, source.baud, partial(log_link, "skin source"))
-    return Keithley6430(link, source.current_ma * 1e-3, source.compliance_v, SOURCE_PERIOD_S, on_raw=on_raw)
+    link = _link(source.socket, source.serial, source.baud, LinkMonitor(LinkLog("skin source")))
+    return Keithley6430(link, source.current_ma * 1e-3, source.compliance_v, SOURCE_PERIOD_S, inputs=inputs)
 
 
-def _daq(config: SkinConfig, on_raw: OnRaw) -> shear_skin.Daq:
+def _daq(config: SkinConfig, inputs: InputRecorder | None) -> shear_skin.Daq:
     rate_hz, scanner, adc = config.daq.rate_hz, config.daq.scanner, config.daq.adc
-    on_event = partial(log_link, "skin daq")
+    monitor = LinkMonitor(LinkLog("skin daq"))
     if scanner is not None:
-        link = _link(scanner.socket, None, DEFAULT_BAUD, on_event)
-        return shear_skin.ScpiScanner(link, scanner.channels, rate_hz, scanner.range_v, on_raw=on_raw)
+        link = _link(scanner.socket, None, DEFAULT_BAUD, monitor)
+        return shear_skin.ScpiScanner(link, scanner.channels, rate_hz, scanner.range_v, inputs=inputs)
     if adc is not None:
-        return shear_skin.AdcBoard(_link(None, adc.device, DEFAULT_BAUD, on_event), rate_hz, adc.full_scale_v, on_raw)
+        return shear_skin.AdcBoard(_link(None, adc.device, DEFAULT_BAUD, monitor), rate_hz, adc.full_scale_v, inputs)
     raise ValueError("a skin needs an instrument that reads its voltages")
 
 
-def _link(
-    socket: InstrumentSocket | None, serial: SerialDevice | None, baud: int, on_event: Callable[[LinkEvent], None]
-) -> Link:
+def _link(socket: InstrumentSocket | None, serial: SerialDevice | None, baud: int, monitor: LinkMonitor) -> Link:
     if socket is not None:
-        return TcpLink(socket.host, socket.port, on_event=on_event)
+        return TcpLink(socket.host, socket.port, monitor=monitor)
     if serial is None:
         raise ValueError("an instrument needs a socket or a serial port")
-    return SerialLink(serial_number=serial.serial_number, path=serial.path, baud=baud, on_event=on_event)
+    return SerialLink(serial_number=serial.serial_number, path=serial.path, baud=baud, monitor=monitor)

@@ -1,13 +1,8 @@
 """Diameter of the tool from the fingertips. No I/O; times are passed in."""
 
-from collections.abc import Callable
-from typing import TypeAlias
-
-from shearloop.bank.estimation import Measured, combine
+from shearloop.bank.estimation import Estimate, Measured, combine
 from shearloop.daemon.messaging.messages import stale_after_s
 
-# Takes a source, its diameter or None, and the time in ns.
-OnDiameter: TypeAlias = Callable[[str, Measured | None, int], None]
 STALE_AFTER_NS = round(stale_after_s("eit.estimate") * 1e9)
 
 
@@ -33,12 +28,13 @@ class FingertipDiameters:
         self._combined = combined
         self._latest: dict[str, tuple[int, Measured]] = {}
 
-    def update(self, source: str, diameter: Measured | None, t_ns: int) -> None:
-        """Take a source's diameter at t_ns, None where it has none."""
-        if diameter is None:
+    def update(self, source: str, estimate: Estimate, t_ns: int) -> None:
+        """Take a source's estimate at t_ns."""
+        low_mm, high_mm = estimate.diameter_low_mm, estimate.diameter_high_mm
+        if estimate.diameter_mm is None or low_mm is None or high_mm is None:
             self._latest.pop(source, None)
         else:
-            self._latest[source] = (t_ns, diameter)
+            self._latest[source] = (t_ns, Measured(estimate.diameter_mm, 0.5 * (high_mm - low_mm)))
 
     def latest(self, t_ns: int) -> Measured | None:
         """Return the fingertips' diameter at t_ns, None where none of them has a recent one."""

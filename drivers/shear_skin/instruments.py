@@ -92,9 +92,9 @@ class Keithley6430(scpi.PolledInstrument[SourceReading]):
         compliance_v: float = COMPLIANCE_V,
         period_s: float = SOURCE_PERIOD_S,
         timeout_s: float = scpi.REPLY_TIMEOUT_S,
-        on_raw: serial_sensor.OnRaw = serial_sensor.ignore_raw,
+        inputs: serial_sensor.InputRecorder | None = None,
     ) -> None:
-        super().__init__(link, "The current source", period_s, timeout_s, on_raw)
+        super().__init__(link, "The current source", period_s, timeout_s, inputs)
         self.current_a = current_a
         self.compliance_v = compliance_v
         self._was_reset = False
@@ -196,9 +196,9 @@ class ScpiScanner(scpi.PolledInstrument[Voltages]):
         rate_hz: float = DAQ_RATE_HZ,
         range_v: float = SCANNER_RANGE_V,
         timeout_s: float = scpi.REPLY_TIMEOUT_S,
-        on_raw: serial_sensor.OnRaw = serial_sensor.ignore_raw,
+        inputs: serial_sensor.InputRecorder | None = None,
     ) -> None:
-        super().__init__(link, "The scanner", 1.0 / rate_hz, timeout_s, on_raw)
+        super().__init__(link, "The scanner", 1.0 / rate_hz, timeout_s, inputs)
         self._channels = f"(@{channels[0]},{channels[1]})"
         self._range_v = range_v
 
@@ -300,9 +300,9 @@ class AdcBoard(serial_sensor.SerialSensor[Voltages]):
         link: Link,
         rate_hz: float = DAQ_RATE_HZ,
         full_scale_v: float = ADC_FULL_SCALE_V,
-        on_raw: serial_sensor.OnRaw = serial_sensor.ignore_raw,
+        inputs: serial_sensor.InputRecorder | None = None,
     ) -> None:
-        super().__init__(link, 1.0 / rate_hz, on_raw)
+        super().__init__(link, 1.0 / rate_hz, inputs)
         self.period_s = 1.0 / rate_hz
         self._parser = PairParser(rate_hz, full_scale_v)
         self._count = 0

@@ -12,7 +12,7 @@ from typing import Generic, TypeVar
 
 from shearloop.drivers.connection import Diagnostics, Link, Port
 from shearloop.drivers.errors import DeviceLostError, DeviceSilentError, DriverError, ProtocolError
-from shearloop.drivers.serial_sensor import InputKind, LineSplitter, OnRaw, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, InputRecorder, LineSplitter, RawEvent
 
 # A reading of five elements is 70 characters long.
 MAX_REPLY_BYTES = 512
@@ -100,9 +100,9 @@ def parse_numbers(text: str, count: int, instrument: str) -> list[float]:
 class ScpiSession:
     """Queries and commands over a link that may break; after an error call `link.lost`."""
 
-    def __init__(self, link: Link, instrument: str, timeout_s: float, on_raw: OnRaw) -> None:
-        """Use the link; `instrument` names it in messages, `on_raw` receives queries and their replies."""
-        self._on_raw = on_raw
+    def __init__(self, link: Link, instrument: str, timeout_s: float, inputs: InputRecorder | None) -> None:
+        """Use the link; `instrument` names it in messages, `inputs` keeps queries and their replies."""
+        self._inputs = inputs
         self._link = link
         self._instrument = instrument
         self._timeout_s = timeout_s
@@ -138,8 +138,9 @@ class ScpiSession:
         asked_ns = monotonic_ns()
         await self.send(query)
         reply = await self._next(asked_ns, query)
-        self._on_raw(RawEvent(InputKind.ASKED, asked_ns, query.encode()))
-        self._on_raw(RawEvent(InputKind.DATA, reply.t_arrival_ns, reply.text.encode()))
+        if self._inputs is not None:
+            self._inputs.record(RawEvent(InputKind.ASKED, asked_ns, query.encode()))
+            self._inputs.record(RawEvent(InputKind.DATA, reply.t_arrival_ns, reply.text.encode()))
         return reply
 
     async def ask_until(self, query: str, answer: str, timeout_s: float) -> None:
@@ -195,10 +196,12 @@ class ScpiSession:
 class PolledInstrument(ABC, Generic[ReadingT]):
     """One SCPI instrument behind a link: set up once, then asked at a steady rate, and reconnected when lost."""
 
-    def __init__(self, link: Link, instrument: str, period_s: float, timeout_s: float, on_raw: OnRaw) -> None:
+    def __init__(
+        self, link: Link, instrument: str, period_s: float, timeout_s: float, inputs: InputRecorder | None
+    ) -> None:
         self._link = link
         self.period_s = period_s
-        self._session = ScpiSession(link, instrument, timeout_s, on_raw)
+        self._session = ScpiSession(link, instrument, timeout_s, inputs)
         self._strikes = 0
         self._count = 0
         self._errors: Counter[str] = Counter()

@@ -103,8 +103,8 @@ async def test_fingertip_names_do_not_collide_with_task_names(config: Write, tmp
         names = {*daemon.health.tasks(), *daemon._tasks}
         daemon.stop()
         await daemon.run()
-    assert {"right", "right.estimator", "robot", "gripper", "loop", "load_cell", "recording", "health"} <= names
-    assert (names | {COMBINED, SKIN, WRENCH}) - TAKEN_NAMES == {"right", "right.estimator"}
+    assert {"right", "robot", "gripper", "loop", "load_cell", "recording", "health"} <= names
+    assert (names | {COMBINED, SKIN, WRENCH}) - TAKEN_NAMES == {"right"}
 
 
 def fingertip(**changes: Any) -> dict[str, Any]:

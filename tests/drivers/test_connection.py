@@ -1,5 +1,6 @@
 import asyncio
 import os
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,25 +9,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers import connection
-from shearloop.drivers.connection import LinkEvent, ReconnectPolicy, SerialLink, SerialPort, find_port
+from shearloop.drivers.connection import LinkMonitor, SerialLink, SerialPort, find_port
 from shearloop.drivers.emulators.ports import PtyPort
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceUnavailableError
-from tests.running import DEADLINE_S, Changes
+from tests.running import DEADLINE_S, LinkEvents
 
 SECOND_NS = 1_000_000_000
 
 
-class Peer(PtyPort):
-    """The other end of a port, which keeps what it is sent."""
-
-    def __init__(self, link: Path | None = None) -> None:
-        self.received = bytearray()
-        self.changes = Changes()
-        super().__init__(self._hear, link)
-
-    def _hear(self, data: bytes) -> None:
-        self.received += data
-        self.changes.note()
+async def sent_to(peer: PtyPort, n_bytes: int) -> bytes:
+    data = b""
+    async with asyncio.timeout(DEADLINE_S):
+        while len(data) < n_bytes:
+            data += await peer.received.get()
+    return data
 
 
 async def read_exactly(port: SerialPort, n_bytes: int) -> bytes:
@@ -74,18 +70,17 @@ def test_a_file_is_no_port(tmp_path: Path) -> None:
 
 async def test_bytes_pass_unchanged_in_both_directions() -> None:
     data = bytes(range(256)) * 100
-    with Peer() as peer, SerialPort(peer.path) as port:
+    with PtyPort() as peer, SerialPort(peer.path) as port:
         async with asyncio.timeout(DEADLINE_S):
             sending = asyncio.create_task(peer.write(data))
             assert await read_exactly(port, len(data)) == data
             await sending
             await port.write(bytes(range(256)))
-            await peer.changes.until(lambda: len(peer.received) >= 256)
-    assert bytes(peer.received) == bytes(range(256))
+            assert await sent_to(peer, 256) == bytes(range(256))
 
 
 async def test_what_was_written_is_unread_at_once_until_it_is_read() -> None:
-    with Peer() as peer, SerialPort(peer.path) as port:
+    with PtyPort() as peer, SerialPort(peer.path) as port:
         assert not peer.unread
         for _ in range(200):
             await peer.write(b"half a line")
@@ -97,12 +92,12 @@ async def test_what_was_written_is_unread_at_once_until_it_is_read() -> None:
 
 async def test_a_port_is_had_by_one_program_at_a_time() -> None:
     in_use = pytest.raises(DeviceUnavailableError, match="in use by another program")
-    with Peer() as peer, SerialPort(peer.path), in_use:
+    with PtyPort() as peer, SerialPort(peer.path), in_use:
         SerialPort(peer.path)
 
 
 async def test_silence_is_no_loss_and_a_cancelled_read_loses_nothing() -> None:
-    with Peer() as peer, SerialPort(peer.path) as port:
+    with PtyPort() as peer, SerialPort(peer.path) as port:
         assert await port.read(0.01) is None
         reading = asyncio.create_task(port.read(DEADLINE_S))
         await asyncio.sleep(0)
@@ -119,7 +114,7 @@ async def test_bytes_wait_in_the_kernel_while_there_is_no_read(monkeypatch: pyte
     calls = []
     on_readable = SerialPort._on_readable
     monkeypatch.setattr(SerialPort, "_on_readable", lambda port, done: (calls.append(port), on_readable(port, done)))
-    with Peer() as peer, SerialPort(peer.path) as port:
+    with PtyPort() as peer, SerialPort(peer.path) as port:
         await peer.write(b"first")
         assert await read_exactly(port, 5) == b"first"
         calls.clear()
@@ -131,7 +126,7 @@ async def test_bytes_wait_in_the_kernel_while_there_is_no_read(monkeypatch: pyte
 
 
 async def test_what_came_before_the_port_went_is_read_and_then_the_loss_is_told() -> None:
-    with Peer() as peer, SerialPort(peer.path) as port:
+    with PtyPort() as peer, SerialPort(peer.path) as port:
         reading = asyncio.create_task(port.read(DEADLINE_S))
         await asyncio.sleep(0)
         peer.unplug()
@@ -143,7 +138,7 @@ async def test_what_came_before_the_port_went_is_read_and_then_the_loss_is_told(
 
 async def test_a_write_that_nobody_takes_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "WRITE_TIMEOUT_S", 0.05)
-    with Peer() as peer, SerialPort(peer.path) as port:
+    with PtyPort() as peer, SerialPort(peer.path) as port:
         assert peer._master is not None
         asyncio.get_running_loop().remove_reader(peer._master)
 
@@ -158,21 +153,13 @@ async def test_a_write_that_nobody_takes_ends(monkeypatch: pytest.MonkeyPatch) -
 
 
 async def test_a_link_opens_a_device_that_comes_late_and_again_after_it_went(tmp_path: Path) -> None:
-    events: list[LinkEvent] = []
-    policy = ReconnectPolicy(first_s=0.01, longest_s=0.02)
+    told = LinkEvents()
     path = tmp_path / "port"
-    missing = asyncio.Event()
-
-    def note(event: LinkEvent) -> None:
-        events.append(event)
-        if not event.up:
-            missing.set()
-
-    with Peer(path) as peer, SerialLink(path=str(path), policy=policy, on_event=note) as link:
+    with PtyPort(path) as peer, SerialLink(path=str(path), monitor=LinkMonitor(told, 0.01, 0.02)) as link:
         peer.unplug()
         opening = asyncio.create_task(link.open())
         async with asyncio.timeout(DEADLINE_S):
-            await missing.wait()
+            await told.down()
             peer.plug()
             port = await opening
             peer.unplug()
@@ -183,38 +170,41 @@ async def test_a_link_opens_a_device_that_comes_late_and_again_after_it_went(tmp
             peer.plug()
             port = await link.open()
             await port.write(b"again")
-            await peer.changes.until(lambda: peer.received == b"again")
-    assert link.connections == 2
-    assert "has gone" in link.last_error or "no serial port" in link.last_error
-    assert [event.up for event in events if event.up or not event.repeated][-1]
+            assert await sent_to(peer, 5) == b"again"
+    assert link.diagnostics()["connections"] == 2
+    assert re.search("has gone|no serial port", str(link.diagnostics()["last_loss"]))
+    assert told.events[-1].up
     assert not path.is_symlink()
     assert link.port is None
 
 
 async def test_a_link_that_leads_elsewhere_by_now_is_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "port"
-    with Peer(path), Peer(path) as second:
+    with PtyPort(path), PtyPort(path) as second:
         assert os.readlink(path) == second._terminal
     assert not path.is_symlink()
 
 
 def test_waits_grow_and_only_the_first_failure_is_news() -> None:
-    policy = ReconnectPolicy(first_s=0.2, longest_s=5.0)
-    retries = [policy.failed(0) for _ in range(8)]
-    assert [retry.wait_s for retry in retries] == [0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0, 5.0]
-    assert [retry.repeated for retry in retries] == [False] + 7 * [True]
-    policy.connected(100 * SECOND_NS)
-    assert policy.failed(105 * SECOND_NS).wait_s == 0.2, "it held, so it is a new loss"
-    policy.connected(106 * SECOND_NS)
-    assert policy.failed(107 * SECOND_NS).wait_s == 0.4, "it did not hold"
+    told = LinkEvents()
+    monitor = LinkMonitor(told)
+    loss = DeviceLostError("The device at port 1 has gone.")
+    assert [monitor.failed(loss, 0) for _ in range(8)] == [0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0, 5.0]
+    assert [event.repeated for event in told.losses] == [False] + 7 * [True]
+    monitor.connected("up", 100 * SECOND_NS)
+    assert monitor.failed(loss, 105 * SECOND_NS) == 0.2, "it held, so it is a new loss"
+    monitor.connected("up", 106 * SECOND_NS)
+    assert monitor.failed(loss, 107 * SECOND_NS) == 0.4, "it did not hold"
+    monitor.failed(DeviceLostError("Another reason."), 108 * SECOND_NS)
+    assert not told.events[-1].repeated
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 20 * SECOND_NS)), max_size=200))
 def test_waits_stay_within_their_bounds(steps: list[tuple[bool, int]]) -> None:
-    policy, now_ns = ReconnectPolicy(), 0
+    monitor, now_ns = LinkMonitor(), 0
     for connected, later_ns in steps:
         now_ns += later_ns
         if connected:
-            policy.connected(now_ns)
+            monitor.connected("up", now_ns)
         else:
-            assert 0.2 <= policy.failed(now_ns).wait_s <= 5.0
+            assert 0.2 <= monitor.failed(DeviceLostError("gone"), now_ns) <= 5.0

@@ -212,10 +212,10 @@ def test_a_supervising_sensor_that_is_gone_holds_the_wrist_at_once_and_says_whic
 def test_a_task_that_died_stops_the_wrist_and_says_of_what() -> None:
     rig = started(Rig(new_loop()), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
     rig.run(5)
-    rig.died = {"right.estimator": "ValueError: no number"}
+    rig.died = {"right": "ValueError: no number"}
     rig.step()
     assert phase(rig) is ExperimentPhase.STOPPED
-    assert "right.estimator: ValueError: no number" in rig.control_loop.status.decision.reasons[0]
+    assert "right: ValueError: no number" in rig.control_loop.status.decision.reasons[0]
 
 
 def test_a_single_torque_that_disagrees_holds_until_the_next_one_and_stops_nothing() -> None:

@@ -34,9 +34,9 @@ def content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     folder = tmp_path_factory.mktemp("whole")
     attached = AttachedFile("configuration.json", "application/json", json.dumps(CONFIGURATION).encode())
     recorder = Recorder(folder, Identity(basic_identity("a test"), (attached,)), Clock())
-    tap = recorder.input_recorder("right")
+    inputs = recorder.input_recorder("right")
     for number in range(4):
-        tap(RawEvent(InputKind.DATA, time.monotonic_ns(), b"0.1, 0.2\r\n"))
+        inputs.record(RawEvent(InputKind.DATA, time.monotonic_ns(), b"0.1, 0.2\r\n"))
         recorder.record_message("eit.frame", frame(number))
         recorder.record_message("load.torque", torque(number))
         if number == 1:

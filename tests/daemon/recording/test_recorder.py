@@ -58,8 +58,8 @@ def topics(path: Path) -> dict[str, list[dict]]:
 def test_messages_are_recorded_with_schema_and_time(tmp_path: Path) -> None:
     clock = Clock()
     recorder = Recorder(tmp_path / "new" / "folder", IDENTITY, clock)
-    recorder.input_recorder("right")(RawEvent(InputKind.OPENED, 5))
-    recorder.input_recorder("right")(RawEvent(InputKind.DATA, 7, bytes(range(256))))
+    recorder.input_recorder("right").record(RawEvent(InputKind.OPENED, 5))
+    recorder.input_recorder("right").record(RawEvent(InputKind.DATA, 7, bytes(range(256))))
     one = frame(0)
     recorder.record_message("eit.frame", one)
     recorder.record_message("load.torque", torque(0, float("nan")))

@@ -14,6 +14,7 @@ import pytest
 import yaml
 import zmq.asyncio
 
+from shearloop.bank.estimation import Measured
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import main
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
@@ -28,6 +29,7 @@ from shearloop.daemon.recording.replay import (
     ReplayPipeline,
     restored_wire_map,
 )
+from shearloop.daemon.sensing.fingertip_task import FingertipEstimates
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.test_run import recording
 
@@ -36,6 +38,16 @@ Messages = list[tuple[str, dict[str, Any]]]
 # Of the real recording's estimates with the tests' bank: what they were when it was last looked at with care.
 REFERENCE = Path(__file__).parents[2] / "data" / "replayed_stream.json"
 RELATIVE = 1e-9
+
+
+class Gripper:
+    """Holds a tool while the number of estimates is within a range."""
+
+    def __init__(self, estimates: FingertipEstimates, tool: Measured, held: range) -> None:
+        self._estimates, self._tool, self._held = estimates, tool, held
+
+    def held_tool(self, _t_ns: int) -> Measured | None:
+        return self._tool if self._estimates.count in self._held else None
 
 
 async def replayed(path: Path, speed: float, config: DaemonConfig | None = None) -> tuple[Messages, ReplayComparison]:

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import pytest
@@ -17,9 +17,10 @@ from shearloop.bank.eit.channels import channels_of_line, line_of_channels
 from shearloop.bank.estimation import FrameSeries, Measured, fit
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.drivers.eit_kit import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
-from tests.daemon.recording.test_replay import Messages, measured, replayed
+from tests.daemon.recording.test_replay import Gripper, Messages, measured, replayed
 
 N_FRAMES = 120
 GRIPPED = slice(25, 110)
@@ -89,8 +90,8 @@ async def record(config: Path, boards: dict[str, Path]) -> Messages:
         with zmq.asyncio.Context() as context:
             daemon = Daemon(load_daemon_config(config), context)
             daemon.publisher.add_listener(listen)
-            right = daemon._estimators["right"]
-            right._held_tool = lambda _: Measured(OTHER_MM, 0.5) if right.count in OTHER_TOOL else None
+            right = daemon._estimates["right"]
+            right._gripper = cast(GripperTask, Gripper(right, Measured(OTHER_MM, 0.5), OTHER_TOOL))
             running = asyncio.create_task(daemon.run())
             try:
                 await enough.wait()

@@ -4,14 +4,15 @@ import asyncio
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from shearloop.bank.estimation import Measured
+from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.recording.replay import RecordedRun
 from shearloop.daemon.sensing.estimators import LiveEstimator
-from tests.daemon.recording.test_replay import recording_daemon, replayed
+from tests.daemon.recording.test_replay import Gripper, recording_daemon, replayed
 
 OTHER_TOOL = Measured(14.0, 0.5)
 # The frames after which another tool is held, a further experiment is begun, and a zero is taken.
@@ -21,9 +22,9 @@ HELD, BEGUN, ZEROED, ENOUGH = 6, 12, 18, 40
 async def record(config: Path) -> list[dict[str, Any]]:
     """Run a daemon through two experiments; return what was published as estimates."""
     async with recording_daemon(config) as (daemon, published, until):
-        recorder, right = daemon._recorder, daemon._estimators["right"]
+        recorder, right = daemon._recorder, daemon._estimates["right"]
         assert recorder is not None
-        right._held_tool = lambda _: OTHER_TOOL if right.count >= HELD else None
+        right._gripper = cast(GripperTask, Gripper(right, OTHER_TOOL, range(HELD, ENOUGH)))
         recorder.record_experiment("first")
         await until(BEGUN)
         recorder.record_experiment("second")

@@ -40,10 +40,10 @@ def recorded(folder: Path, *held: tuple[int, Measured | None], named_mm: float |
     recorder.record_experiment(file.name, notes=experiment_notes(file))
     for number in range(40):
         clock.t_ns += PERIOD_NS
-        recorder.input_recorder("right")(RawEvent(InputKind.DATA, clock.t_ns, b'"kind":"tool", said the board'))
+        recorder.input_recorder("right").record(RawEvent(InputKind.DATA, clock.t_ns, b'"kind":"tool", said the board'))
         if number in told:
             tool = tool_as_bytes(number, told[number])
-            recorder.input_recorder("right")(RawEvent(InputKind.TOOL, clock.t_ns - PERIOD_NS // 2, tool))
+            recorder.input_recorder("right").record(RawEvent(InputKind.TOOL, clock.t_ns - PERIOD_NS // 2, tool))
         line = np.random.default_rng(number).uniform(0.01, 0.5, 1024)
         t_ns = clock.t_ns - PERIOD_NS // 2
         message = sample(EitFrame, source="right", t_mono_ns=t_ns, line=line, frame=number, age_s=0.3)

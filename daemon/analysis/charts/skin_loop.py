@@ -88,7 +88,7 @@ class SkinLoop:
         self.skin = SyntheticSkin(radius_mm=RADIUS_MM, normal_n=case.normal_n, seed=case.seed)
         configured_n = case.normal_n if case.configured_n is None else case.configured_n
         if not case.knows_friction:
-            calibration = replace(calibration, friction=0.0)
+            calibration = calibration.model_copy(update={"friction": 0.0})
         self.estimator = SkinEstimator(calibration, normal_n=configured_n)
         # The chart looks for the boundary, so every margin is allowed.
         config = LoopConfig(
@@ -134,7 +134,7 @@ class SkinLoop:
             if self._zero_begun and self.estimator.zero is not None:
                 self._zero_begun = False
                 self.brain.on_action_ended()
-        self.brain.inputs.arm = ArmStatus(self._angle_rad, self.t_ns)
+        self.brain.on_arm(ArmStatus(self._angle_rad, self.t_ns))
         orders = self.brain.tick(self.t_ns)
         speed = 0.0 if orders.stop else orders.wrist_rad_per_s
         self.brain.on_speed_sent(speed)

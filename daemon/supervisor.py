@@ -1,8 +1,8 @@
 """Restarts crashed tasks after a growing pause, and counts and reports the crashes."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import structlog
 
@@ -19,6 +19,13 @@ MAX_ERROR_LENGTH = 300
 def restart_pause_s(deaths_in_a_row: int) -> float:
     """Return the pause before the next start: it doubles from 0.5 s to 30 s."""
     return float(min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0 ** (deaths_in_a_row - 1)))
+
+
+class Task(Protocol):
+    """A part of the daemon that runs until it is cancelled, or until its work is done."""
+
+    async def run(self) -> None:
+        """Do the task's work."""
 
 
 @dataclass(slots=True)
@@ -47,8 +54,8 @@ class Supervisor:
         """Return the error of each dead task."""
         return {name: record.last_error for name, record in self.records.items() if not (record.alive or record.done)}
 
-    async def keep_running(self, name: str, run: Callable[[], Awaitable[None]]) -> None:
-        """Run `run()` until it returns; if it raises, log the error and restart it."""
+    async def keep_running(self, name: str, task: Task) -> None:
+        """Run a task until it returns; if it raises, log the error and restart it."""
         record = self.records.setdefault(name, TaskRecord())
         log = structlog.get_logger().bind(task=name)
         loop = asyncio.get_running_loop()
@@ -56,7 +63,7 @@ class Supervisor:
         while True:
             record.alive, started_s = True, loop.time()
             try:
-                await run()
+                await task.run()
             except Exception as error:  # an error of one task must not end the others
                 if is_cancelled():
                     log.exception("the task crashed while it was cancelled")

@@ -106,6 +106,23 @@ class ControlLoop:
         for wrist in self._wrists.values():
             wrist.on_torque(torque)
 
+    def on_gripper(self, gripper: GripperStatus) -> None:
+        """Take a state of the gripper, unless it is older than the latest one."""
+        known = self.inputs.gripper
+        if known is None or gripper.t_ns >= known.t_ns:
+            self.inputs.gripper = gripper
+
+    def on_link(self, device: str, sentence: str, *, up: bool) -> None:
+        """Take the return or the loss of a device, with a sentence."""
+        if up:
+            self.inputs.lost.pop(device, None)
+        else:
+            self.inputs.lost[device] = sentence
+
+    def on_recording_error(self, error: str) -> None:
+        """Take the present error of the recording; an empty string ends it."""
+        self.inputs.recording_error = error
+
     def start(self, file: ExperimentFile, t_ns: int) -> str | None:
         """Begin an experiment; return None, or why it cannot begin."""
         if self.experiment is not None and self.experiment.running:

@@ -42,7 +42,7 @@ class GripperTask:
         self._on_state = on_state
         self._fingertip_diameter = fingertip_diameter
 
-    async def read(self) -> None:
+    async def run(self) -> None:
         """Publish every state and pass it on, until cancelled."""
         async with contextlib.aclosing(self._gripper.states()) as states:
             async for state in states:

@@ -15,7 +15,7 @@ import zmq
 import zmq.asyncio
 
 from shearloop.daemon.messaging.keys import KeyPair
-from shearloop.daemon.messaging.messages import decode, encode
+from shearloop.daemon.messaging.messages import Scalar, decode, encode
 from shearloop.daemon.messaging.publisher import bind
 
 LARGEST_REQUEST_BYTES = 64 * 1024
@@ -167,6 +167,10 @@ class CommandServer:
         if not frequent or str(count).strip("0") == "1":
             structlog.get_logger().warning("command refused", reason=reason, count=count)
         return {"ok": False, "reason": reason}
+
+    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+        """Return the numbers of refused commands by kind, for `health`."""
+        return {"errors": dict(self.refused)}
 
     def close(self) -> None:
         """Close the socket after the last replies are sent."""

@@ -7,6 +7,7 @@ folder of the allowed clients' `.key` files is read again for each new connectio
 import os
 import struct
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -170,6 +171,10 @@ class CurveAuthenticator:
         requests = zmq.asyncio.Socket.from_socket(self._authenticator.zap_socket)
         while True:
             await self._authenticator.handle_zap_message(await requests.recv_multipart())
+
+    def diagnostics(self) -> Mapping[str, Mapping[str, int]]:
+        """Return the numbers of refused clients by kind, for `health`."""
+        return {"errors": dict(self.refused)}
 
     def close(self) -> None:
         """Stop; no client can connect any more."""

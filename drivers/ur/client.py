@@ -15,6 +15,7 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Any, Final, Literal, cast
 
+from shearloop.drivers.connection import Diagnostics
 from shearloop.drivers.errors import DeviceLostError, DriverError, ProtocolError, is_cancelled
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.controller import silent_sentence
@@ -90,6 +91,18 @@ class UrRobot:
     def state(self) -> messages.RobotState | None:
         """The latest state, or None while there is no connection."""
         return self._state
+
+    def diagnostics(self) -> Diagnostics:
+        """Return the robot's values for `health`; counts are since the process began."""
+        errors = dict(self.losses)
+        if self.failed_program_stops:
+            errors["paused program not stopped"] = self.failed_program_stops
+        return {
+            "connected": self._state is not None,
+            "states": self.states,
+            "errors": errors,
+            "error": "" if self.link.status == "up" else self.link.sentence,
+        }
 
     async def next_state(self) -> messages.RobotState:
         """Return the next state; waits through losses of the connection."""

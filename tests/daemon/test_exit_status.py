@@ -12,7 +12,7 @@ import zmq.asyncio
 
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.control.configured_experiment import ConfiguredExperiment, CrashMarker
+from shearloop.daemon.configured_experiment import ConfiguredExperiment, CrashMarker
 from shearloop.daemon.control.step_runner import ExperimentPhase
 from shearloop.daemon.errors import UserError
 from tests.daemon.conftest import Log, deadline, shearloop

@@ -131,11 +131,6 @@ def logging_to_stderr(*, json_lines: bool | None = None, level: int = logging.IN
 
 
 def log_link(device: str, event: LinkEvent) -> None:
-    """Log that a serial or network device came or went."""
-    log_event(device, event.up, event.sentence, repeated=event.repeated)
-
-
-def log_event(device: str, up: bool, sentence: str, *, repeated: bool) -> None:
     """Log a change of a link: a return as info, a loss as warning, a repeated loss as debug."""
     log = structlog.get_logger().bind(device=device)
-    (log.info if up else log.debug if repeated else log.warning)(sentence)
+    (log.info if event.up else log.debug if event.repeated else log.warning)(event.sentence)

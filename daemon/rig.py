@@ -23,7 +23,7 @@ from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.logs import log_event, log_link
+from shearloop.daemon.logs import log_link
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.recorder import AttachedFile, Recorder, experiment_notes
 from shearloop.daemon.sensing.estimators import COMBINED
@@ -38,7 +38,7 @@ from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.robotiq.width import WidthCalibration
-from shearloop.drivers.ur.client import UrLinkEvent, UrRobot
+from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.settings import read_settings
 
 
@@ -70,24 +70,17 @@ def gripper_calibration(config: GripperConfig) -> WidthCalibration:
 
 
 @dataclass(frozen=True, slots=True)
-class LinkObserver:
+class DeviceLink:
     """Logs the losses and returns of one device, and hands them to the control loop, where there is one."""
 
     device: str
     loop: ControlLoop | None
 
-    def on_event(self, event: LinkEvent) -> None:
-        """Take a loss or return of a serial or network device."""
+    def on_link_event(self, event: LinkEvent) -> None:
+        """Take a loss or a return."""
         log_link(self.device, event)
         if self.loop is not None:
             self.loop.on_link(self.device, event.sentence, up=event.up)
-
-    def on_robot_event(self, event: UrLinkEvent) -> None:
-        """Take a loss or return of the robot."""
-        up = event.status == "up"
-        log_event(self.device, up, event.sentence, repeated=event.losses > 1)
-        if self.loop is not None:
-            self.loop.on_link(self.device, event.sentence, up=up)
 
 
 def make_loop(config: DaemonConfig, sources: Mapping[str, TorqueSource]) -> ControlLoop | None:
@@ -112,7 +105,7 @@ def make_gripper(
         return None
     client, calibration = make_gripper_client(config.gripper), gripper_calibration(config.gripper)
     return GripperTask(
-        RobotiqGripper(client, calibration, on_event=LinkObserver("gripper", loop).on_event),
+        RobotiqGripper(client, calibration, on_event=DeviceLink("gripper", loop).on_link_event),
         publisher,
         loop.on_gripper,
         fingertip_diameter=diameters.latest,
@@ -139,7 +132,7 @@ class Rig:
             raise ValueError("a rig needs a robot")
         self.control_loop = loop
         self.gripper = gripper
-        self.robot = UrRobot(read_settings(config.robot), on_link=LinkObserver("robot", loop).on_robot_event)
+        self.robot = UrRobot(read_settings(config.robot), DeviceLink("robot", loop))
         self.runner = ControlLoopRunner(
             loop,
             self.robot,

@@ -10,7 +10,7 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.recorder import Recorder
-from shearloop.daemon.rig import LinkObserver, load_cell_calibration
+from shearloop.daemon.rig import DeviceLink, load_cell_calibration
 from shearloop.daemon.sensing.estimators import COMBINED, LiveEstimator
 from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipEstimates, FingertipTask
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
@@ -106,7 +106,7 @@ class SensorBuilder:
             serial_number=own.device.serial_number,
             zero_slots=ZERO_SLOTS,
             frame_period_s=own.frame_period_s,
-            on_event=LinkObserver(name, self.loop).on_event,
+            on_event=DeviceLink(name, self.loop).on_link_event,
             inputs=self._inputs(name),
         )
 
@@ -119,7 +119,7 @@ class SensorBuilder:
             serial_number=own.device.serial_number,
             path=own.device.path,
             rate_hz=own.rate_hz,
-            on_event=LinkObserver(LOAD_CELL, self.loop).on_event,
+            on_event=DeviceLink(LOAD_CELL, self.loop).on_link_event,
             inputs=self._inputs(LOAD_CELL),
         )
         return LoadCellTask(board, self.publisher, self.clock, self.loop, own.rate_hz)

@@ -6,8 +6,6 @@ from typing import Protocol
 
 import structlog
 
-from shearloop.drivers.errors import is_cancelled
-
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 30.0
 # After a run of this length, the next pause is short again.
@@ -65,7 +63,9 @@ class Supervisor:
             try:
                 await task.run()
             except Exception as error:  # an error of one task must not end the others
-                if is_cancelled():
+                # Before Python 3.13 a task group that fails while it is cancelled raises only the failure.
+                own = asyncio.current_task()
+                if own is not None and own.cancelling():
                     log.exception("the task crashed while it was cancelled")
                     raise asyncio.CancelledError from error
                 deaths = 1 if loop.time() - started_s > RECOVERED_AFTER_S else deaths + 1

@@ -11,7 +11,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Self, TypeAlias
+from typing import NamedTuple, Protocol, Self, TypeAlias
 
 import serial
 from serial.tools import list_ports
@@ -276,6 +276,13 @@ class LinkEvent:
     up: bool
     sentence: str
     repeated: bool
+
+
+class LinkObserver(Protocol):
+    """Receives the changes of a link."""
+
+    def on_link_event(self, event: LinkEvent) -> None:
+        """React to a change at once; never blocks."""
 
 
 class Link(ABC):

@@ -1,6 +1,4 @@
-"""Errors of devices; each message is a sentence for the person at the bench. Also how a task sees its cancellation."""
-
-import asyncio
+"""Errors of devices; each message is a sentence for the person at the bench."""
 
 
 class DriverError(Exception):
@@ -29,13 +27,3 @@ class DeviceUnavailableError(DriverError):
 
 class DeviceCalibrationError(DriverError):
     """A calibration is unusable, or measurements do not allow one; the message gives the reason."""
-
-
-def is_cancelled() -> bool:
-    """Return whether someone asked the current task to end.
-
-    Before Python 3.13 a task group that fails while it is cancelled raises only the failure, so a restart loop has to
-    ask here. A group leaves the same mark if its body ends before its tasks, so keep the body running.
-    """
-    task = asyncio.current_task()
-    return task is not None and task.cancelling() > 0

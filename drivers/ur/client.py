@@ -12,16 +12,14 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass
-from typing import Any, Final, Literal, cast
+from typing import Any, Final, Literal, Protocol, cast
 
-from shearloop.drivers.connection import Diagnostics
-from shearloop.drivers.errors import DeviceLostError, DriverError, ProtocolError, is_cancelled
+from shearloop.drivers.connection import Diagnostics, LinkEvent, LinkObserver
+from shearloop.drivers.errors import DeviceLostError, DriverError, ProtocolError
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.controller import silent_sentence
 from shearloop.drivers.ur.settings import UrSettings
 
-LinkStatus = Literal["starting", "up", "down"]
 LossKind = messages.FailureKind | Literal["crashed", "hung", "garbled"]
 
 PAUSES_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
@@ -47,30 +45,19 @@ class LostError(DeviceLostError):
         self.kind: LossKind = kind
 
 
-@dataclass(frozen=True, slots=True)
-class UrLinkEvent:
-    """The link to the robot came up or went down; `sentence` is for the operator."""
-
-    t_mono_ns: int
-    status: LinkStatus
-    sentence: str
-    kind: LossKind | None = None
-    losses: int = 0
-
-
 class UrRobot:
-    """A UR arm: `run` in a task of the daemon, `send` commands, read `state`."""
+    """A UR arm: `run` in a task of the daemon, `send` commands, read `state` (None while there is no connection)."""
 
-    def __init__(self, settings: UrSettings, on_link: Callable[[UrLinkEvent], None] | None = None) -> None:
-        """Take the settings; `on_link` receives each loss and each return."""
+    def __init__(self, settings: UrSettings, observer: LinkObserver | None = None) -> None:
+        """Take the settings; `observer` receives each loss and each return."""
         self.settings = settings
-        self.link = UrLinkEvent(time.monotonic_ns(), "starting", "The robot's process has not been started.")
+        self.state: messages.RobotState | None = None
+        self.link = LinkEvent(up=False, sentence="The robot's process has not been started.", repeated=False)
         self.losses: Counter[str] = Counter()
         # How many states have come, and how many times our program was paused and did not stop on request.
         self.states = 0
         self.failed_program_stops = 0
-        self._on_link = on_link or (lambda _event: None)
-        self._state: messages.RobotState | None = None
+        self._observer = observer
         self._connection: WorkerConnection | None = None
         self._replies: dict[int, Callable[[messages.CommandReply], None]] = {}
         self._number = 0
@@ -78,19 +65,9 @@ class UrRobot:
         self._next: asyncio.Future[messages.RobotState] | None = None
 
     @property
-    def pid(self) -> int | None:
-        """The worker's process id, or None while there is none."""
-        return self._connection.pid if self._connection is not None else None
-
-    @property
     def takes_over(self) -> bool:
         """Whether the connection was just lost, so that a program of ours may still be on the robot."""
         return time.monotonic() - self._lost_s < TAKES_OVER_S
-
-    @property
-    def state(self) -> messages.RobotState | None:
-        """The latest state, or None while there is no connection."""
-        return self._state
 
     def diagnostics(self) -> Diagnostics:
         """Return the robot's values for `health`; counts are since the process began."""
@@ -98,10 +75,10 @@ class UrRobot:
         if self.failed_program_stops:
             errors["paused program not stopped"] = self.failed_program_stops
         return {
-            "connected": self._state is not None,
+            "connected": self.state is not None,
             "states": self.states,
             "errors": errors,
-            "error": "" if self.link.status == "up" else self.link.sentence,
+            "error": "" if self.link.up else self.link.sentence,
         }
 
     async def next_state(self) -> messages.RobotState:
@@ -127,7 +104,7 @@ class UrRobot:
         When the worker dies first, the command is refused and not sent again. An exception in `on_reply` ends the
         connection; where that has ended, it goes to the event loop's handler.
         """
-        if self._connection is None or self._state is None:
+        if self._connection is None or self.state is None:
             on_reply(messages.CommandReply(refusal=f"The robot is not connected. {self.link.sentence}"))
             return
         self._number += 1
@@ -154,37 +131,28 @@ class UrRobot:
             except LostError as loss:
                 attempts = 1 if time.monotonic() - started_s > STEADY_S else attempts + 1
                 self.losses[loss.kind] += 1
-                self._notify_link("down", str(loss), loss.kind)
+                self._notify_link(LinkEvent(up=False, sentence=str(loss), repeated=attempts > 1))
             await asyncio.sleep(PAUSES_S[min(attempts, len(PAUSES_S)) - 1])
 
     async def _run_worker(self) -> None:
-        connection = WorkerConnection(self.settings, self.handle_message)
+        connection = WorkerConnection(self.settings, self)
         await asyncio.get_running_loop().subprocess_exec(
             lambda: connection, sys.executable, "-m", "shearloop.drivers.ur.worker"
         )
         connection.send(messages.Configure(self.settings, self.takes_over))
         self._connection = connection
-        loss: BaseException | None = None
         try:
-            async with asyncio.TaskGroup() as tasks:
-                tasks.create_task(connection.keep_alive())
-                await connection.listen()
-        except* LostError as group:
-            loss = group.exceptions[0]
+            await connection.listen()
         finally:
             self._disconnect()
             await _finish(connection.end())
-        if loss is not None:
-            if is_cancelled():
-                raise asyncio.CancelledError
-            raise loss
 
     def _disconnect(self) -> None:
         self._connection = None
-        if self._state is not None:
+        if self.state is not None:
             # A lost network does not make a foreign program ours.
-            self._lost_s = time.monotonic() if self._state.owns_program else -math.inf
-        self._state = None
+            self._lost_s = time.monotonic() if self.state.owns_program else -math.inf
+        self.state = None
         replies, self._replies = self._replies, {}
         unanswered = messages.CommandReply(
             refusal="The robot's process ended before it answered; nothing is sent again."
@@ -196,15 +164,14 @@ class UrRobot:
         """Handle a message of the worker."""
         match message:
             case messages.RobotState():
-                before, self._state = self._state, message
+                before, self.state = self.state, message
                 self.states += 1
                 # Each worker counts from zero.
                 counted = before.failed_program_stops if before is not None else 0
                 self.failed_program_stops += message.failed_program_stops - counted
                 if before is None:
-                    self._notify_link(
-                        "up", f"The robot at {self.settings.host} is connected. {message.blocked}".strip()
-                    )
+                    sentence = f"The robot at {self.settings.host} is connected. {message.blocked}".strip()
+                    self._notify_link(LinkEvent(up=True, sentence=sentence, repeated=False))
                 if self._next is not None:
                     self._next.set_result(message)
                     self._next = None
@@ -215,20 +182,27 @@ class UrRobot:
             case messages.Failed():
                 raise LostError(message.kind, message.sentence)
 
-    def _notify_link(self, status: LinkStatus, sentence: str, kind: LossKind | None = None) -> None:
-        self.link = UrLinkEvent(time.monotonic_ns(), status, sentence, kind, self.losses.total())
-        self._on_link(self.link)
+    def _notify_link(self, event: LinkEvent) -> None:
+        self.link = event
+        if self._observer is not None:
+            self._observer.on_link_event(event)
+
+
+class MessageHandler(Protocol):
+    """Receives the messages of a worker."""
+
+    def handle_message(self, number: int, message: messages.Message) -> None:
+        """Handle a message; an exception ends the connection."""
 
 
 class WorkerConnection(asyncio.SubprocessProtocol):
     """The pipes to one worker process, its end, and the reason for that."""
 
-    def __init__(self, settings: UrSettings, on_message: Callable[[int, messages.Message], None]) -> None:
-        """`on_message` receives each message with its number."""
+    def __init__(self, settings: UrSettings, handler: MessageHandler) -> None:
         self._settings = settings
-        self._on_message = on_message
+        self._handler = handler
         self._decoder = messages.MessageDecoder()
-        self._received_s = self._sent_s = time.monotonic()
+        self._received_s = time.monotonic()
         # Done when the worker has ended and all of its output was read.
         self._ended = asyncio.get_running_loop().create_future()
         # Done then too (None), or with an error that ends the connection before. The error is a result, because asyncio
@@ -244,14 +218,8 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         self._process = cast(asyncio.SubprocessTransport, transport)
         self._stdin = cast(asyncio.WriteTransport, self._process.get_pipe_transport(0))
 
-    @property
-    def pid(self) -> int | None:
-        """The worker's process id."""
-        return self._process.get_pid()
-
     def send(self, message: messages.Message, number: int = 0) -> None:
         """Send a message to the worker."""
-        self._sent_s = time.monotonic()
         self._stdin.write(messages.encode(message, number))
 
     def pipe_data_received(self, fd: int, data: bytes) -> None:
@@ -271,7 +239,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
                     self._activity = CONTROLLING
                     longest_s = messages.RECOVERY_HANG_S if message.recovering else self._settings.hang_timeout_s
                     self._timeout_s = longest_s + GRACE_S
-                self._on_message(number, message)
+                self._handler.handle_message(number, message)
         except ProtocolError as error:
             self._kill()
             self._closed.set_result(LostError("garbled", str(error)))
@@ -285,29 +253,19 @@ class WorkerConnection(asyncio.SubprocessProtocol):
             self._closed.set_result(None)
 
     async def listen(self) -> None:
-        """Wait for the end of the connection; kill a worker that is silent for too long.
+        """Send heartbeats until the connection ends, four within the silence timeout; kill a worker that is silent.
 
         Raises:
             LostError: always, in the end.
         """
         while not self._closed.done():
-            left_s = self._received_s + self._timeout_s - time.monotonic()
-            if left_s <= 0:
+            if time.monotonic() - self._received_s > self._timeout_s:
                 self._kill()
                 raise LostError("hung", self._hung_sentence(self._timeout_s))
-            await asyncio.wait([self._closed], timeout=min(left_s, self._settings.hang_timeout_s))
+            self.send(messages.Heartbeat())
+            await asyncio.wait([self._closed], timeout=self._settings.silence_timeout_s / 4)
         error = self._closed.result()
         raise error if error is not None else self._died()
-
-    async def keep_alive(self) -> None:
-        """Send heartbeats four times within the silence timeout, unless commands go out as often."""
-        longest_s = self._settings.silence_timeout_s / 4
-        while True:
-            left_s = longest_s - (time.monotonic() - self._sent_s)
-            if left_s <= 0:
-                self.send(messages.Heartbeat())
-                left_s = longest_s
-            await asyncio.sleep(left_s)
 
     async def end(self) -> None:
         """Disconnect the worker, and kill it after `EXIT_S`."""

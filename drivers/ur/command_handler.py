@@ -172,10 +172,6 @@ class ProgramOwner:
         """Return whether a program that plays is ours or may be, because one was just being started."""
         return self.ours or (self._starting_ns is not None and now_ns - self._starting_ns <= ENDS_ITSELF_S * 1e9)
 
-    def note_start(self, now_ns: int) -> None:
-        """Note that a program of ours is being started."""
-        self.ours, self._starting_ns = True, now_ns
-
     def update(self, sample: RtdeSample, now_ns: int, *, starting: bool, plays_without_us: bool) -> None:
         """Take in a cycle's sample; `starting`: a program of ours is being started."""
         self._was_announced, self.stop_announced = self.stop_announced, False
@@ -187,8 +183,10 @@ class ProgramOwner:
         foreign = since_ns is not None and now_ns - since_ns > ENDS_ITSELF_S * 1e9
         if sample.runtime_state == RUNTIME_STOPPED or foreign:
             # The next program may be anyone's, and ours may have ended between two samples.
-            self.ours = starting
+            self.ours = False
             self._requests, self._next_ns, self.failure = 0, 0, ""
+        if starting:
+            self.ours, self._starting_ns = True, now_ns
 
     def stop_paused(self, now_ns: int) -> None:
         """Request a stop when it is due, in the cycle after the one that has announced it: it may take seconds."""
@@ -257,30 +255,49 @@ class CommandHandler:
         """Return the reply to a command; None when `tick` returns it later (`Unlock`)."""
         if isinstance(command, Stop) and self._recovery is not None and self._unlock_number is not None:
             self._recovery.give_up("Unlocking was ended by a stop.")
-        refusal = self._why_refused(command, sample)
+        unfit = self._why_unfit(sample)
+        match command:
+            case Disconnect():
+                self.leaving = True
+                if self._recovery is not None:
+                    self._recovery.give_up(LEAVING)
+                self._executor.stop_now(sample, now_ns, "the daemon disconnects")
+                return CommandReply()
+            case Stop(deceleration) if deceleration <= 0:
+                refusal = f"A deceleration of {deceleration:g} rad/s² is not above 0."
+            case Stop() if unfit:
+                refusal = f"Nothing can be sent, and the arm stops by itself. {unfit}"
+            case Stop():
+                refusal = self._executor.stop_on_command(number, command, sample, now_ns)
+            case _ if self.leaving:
+                refusal = LEAVING
+            case WristSpeed() | MoveLinear():
+                refusal = self._why_blocked(sample) or self._executor.begin(number, command, sample, now_ns)
+            case Unlock() if self._unlock_number is not None:
+                refusal = "Unlocking is under way."
+            case Unlock() if unfit:
+                if not self._executor.disabled_reason:
+                    self._executor.disable(unfit)
+                self._unlock_number = number
+                self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, operator_asked=True)
+                return None
+            case _ if self._recovery is not None:
+                refusal = BEING_MADE_READY
+            case Enable() | Unlock():
+                refusal = unfit or violation(sample, self._settings.limits)
+                if not refusal:
+                    self._held_reason = ""
+                return CommandReply(refusal=refusal)
+            case ZeroForceTorque():
+                # A new zero would only hide a value beyond its limit.
+                refusal = unfit or violation(sample, self._settings.limits)
+                if not (refusal or (self.at_rest and sample.rests)):
+                    refusal = "The wrench is zeroed only at rest: stop the arm first."
+                if not (refusal or self._arm.zero_wrench()):
+                    refusal = "The robot did not zero its force-torque sensor."
+                return CommandReply(refusal=refusal)
         if refusal:
             return CommandReply(refusal=refusal)
-        match command:
-            case WristSpeed():
-                self._executor.turn(number, command, sample, now_ns)
-            case MoveLinear():
-                self._executor.move(number, command, sample, now_ns)
-            case Stop():
-                self._executor.stop_on_command(number, command, sample, now_ns)
-            case Unlock() if self._why_unfit(sample):
-                self._begin_unlocking(number, sample, now_ns)
-                return None
-            case Enable() | Unlock():
-                self._held_reason = ""
-                return CommandReply()
-            case ZeroForceTorque():
-                zeroed = self._arm.zero_wrench()
-                return CommandReply(refusal="" if zeroed else "The robot did not zero its force-torque sensor.")
-            case Disconnect():
-                self._leave(sample, now_ns)
-                return CommandReply()
-        if self._executor.disabled_reason:
-            return CommandReply(refusal=self._executor.disabled_reason)
         return CommandReply(sent=self._executor.sent, clipped=self._executor.clipped)
 
     def tick(self, sample: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
@@ -296,10 +313,7 @@ class CommandHandler:
             plays_without_us=without_us and sample.program_running and recent,
         )
         if recovery is not None:
-            ended = recovery.advance(sample, now_ns, recent=recent)
-            if recovery.starts_program:
-                self._program.note_start(now_ns)
-            return self._end_recovery(recovery) if ended else None
+            return self._end_recovery(recovery) if recovery.advance(sample, now_ns, recent=recent) else None
         unfit = self._why_unfit(sample)
         if unfit:
             # Nothing can be sent. The arm stops by itself, or by its watchdog, which is not fed now.
@@ -339,33 +353,6 @@ class CommandHandler:
             failed_program_stops=self._program.failed_stops,
         )
 
-    def _why_refused(self, command: Command, sample: RtdeSample) -> str:
-        """Return why a command is not carried out, or the empty string."""
-        if self.leaving and not isinstance(command, Stop | Disconnect):
-            return LEAVING
-        unfit = self._why_unfit(sample)
-        match command:
-            case WristSpeed() | MoveLinear():
-                return self._why_blocked(sample) or self._executor.why_refused(command, sample)
-            case Stop(deceleration) if deceleration <= 0:
-                return f"A deceleration of {deceleration:g} rad/s² is not above 0."
-            case Stop() if unfit:
-                return f"Nothing can be sent, and the arm stops by itself. {unfit}"
-            case Unlock() if self._unlock_number is not None:
-                return "Unlocking is under way."
-            case Unlock() if unfit:
-                return ""
-            case Enable() | Unlock() if self._recovery is not None:
-                return BEING_MADE_READY
-            case Enable() | Unlock():
-                return unfit or violation(sample, self._settings.limits)
-            case ZeroForceTorque():
-                rests = self.at_rest and sample.rests
-                moving = "" if rests else "The wrench is zeroed only at rest: stop the arm first."
-                # A new zero would only hide a value beyond its limit.
-                return unfit or violation(sample, self._settings.limits) or moving
-        return ""
-
     def _why_unfit(self, sample: RtdeSample) -> str:
         """Return why nothing can be sent to the robot, or the empty string."""
         return why_unfit(sample, self._settings) or self._executor.disabled_reason
@@ -376,19 +363,6 @@ class CommandHandler:
             return BEING_MADE_READY
         reason = self._why_unfit(sample) or violation(sample, self._settings.limits) or self._held_reason
         return f"{reason} {self._program.failure}" if self._program.failure else reason
-
-    def _leave(self, sample: RtdeSample, now_ns: int) -> None:
-        self.leaving = True
-        if self._recovery is not None:
-            self._recovery.give_up(LEAVING)
-        self._executor.stop_now(sample, now_ns, "the daemon disconnects")
-
-    def _begin_unlocking(self, number: int, sample: RtdeSample, now_ns: int) -> None:
-        unfit = self._why_unfit(sample)
-        if not self._executor.disabled_reason:
-            self._executor.disable(unfit)
-        self._unlock_number = number
-        self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, operator_asked=True)
 
     def _end_recovery(self, recovery: Recovery) -> tuple[int, CommandReply] | None:
         self._recovery = None

@@ -115,9 +115,9 @@ class MotionExecutor:
         rejected, self._rejected = self._rejected, False
         return rejected
 
-    def why_refused(self, command: WristSpeed | MoveLinear, sample: RtdeSample) -> str:
-        """Return why a motion cannot begin now, or the empty string."""
-        match command, self._motion:
+    def begin(self, motion_id: int, asked: WristSpeed | MoveLinear, sample: RtdeSample, now_ns: int) -> str:
+        """Turn the wrist at a speed from now on, or begin a linear move; return why not, or the empty string."""
+        match asked, self._motion:
             case WristSpeed(_, acceleration), _ if acceleration <= 0:
                 return f"An acceleration of {acceleration:g} rad/s² is not above 0."
             case WristSpeed(), _Braking():
@@ -128,31 +128,28 @@ class MotionExecutor:
                 return "A linear move needs a speed and an acceleration above 0."
             case MoveLinear(), motion if isinstance(motion, _Move | _Braking) or not sample.rests:
                 return "The arm moves: stop it before a linear move."
-        return ""
+        self.motion_id, self.end_reason = motion_id, ""
+        if isinstance(asked, WristSpeed):
+            self._motion = _Turn(asked, now_ns)
+            self._send_clipped_speed(asked, sample)
+        else:
+            self._end_speed_thread()
+            sent, self.clipped = clip_linear(asked, self._settings.limits)
+            self.sent = sent
+            deadline_ns = _deadline_ns(now_ns, _nominal_move_s(sent, sample), MOVE_SLACK_S, sample)
+            self._motion = _Move(sent.pose, now_ns, deadline_ns)
+            if not self._arm.move(sent):
+                self._reject("linear move")
+        return self.disabled_reason
 
-    def turn(self, motion_id: int, asked: WristSpeed, sample: RtdeSample, now_ns: int) -> None:
-        """Turn the wrist at this speed from now on."""
-        self._motion, self.motion_id, self.end_reason = _Turn(asked, now_ns), motion_id, ""
-        self._send_clipped_speed(asked, sample)
-
-    def move(self, motion_id: int, asked: MoveLinear, sample: RtdeSample, now_ns: int) -> None:
-        """Begin a linear move of an arm at rest."""
-        self._end_speed_thread()
-        sent, self.clipped = clip_linear(asked, self._settings.limits)
-        self.sent, self.motion_id, self.end_reason = sent, motion_id, ""
-        self._motion = _Move(
-            sent.pose, now_ns, _deadline_ns(now_ns, _nominal_move_s(sent, sample), MOVE_SLACK_S, sample)
-        )
-        if not self._arm.move(sent):
-            self._reject("linear move")
-
-    def stop_on_command(self, motion_id: int, asked: Stop, sample: RtdeSample, now_ns: int) -> None:
-        """Stop at once, as hard as commanded within the needed and the allowed deceleration."""
+    def stop_on_command(self, motion_id: int, asked: Stop, sample: RtdeSample, now_ns: int) -> str:
+        """Stop at once, as hard as commanded within the needed and the allowed deceleration; return why not."""
         deceleration = clip_stop(asked.deceleration_rad_per_s2, sample, self._settings)
         if isinstance(self._motion, _Braking):
             deceleration = max(deceleration, self._motion.deceleration_rad_per_s2)
         self.motion_id, self.sent, self.clipped = motion_id, Stop(deceleration), ()
         self.stop_now(sample, now_ns, STOPPED_ON_COMMAND, deceleration)
+        return self.disabled_reason
 
     def stop_now(self, sample: RtdeSample, now_ns: int, reason: str, deceleration: float | None = None) -> None:
         """Begin to stop and send it at once, without waiting for the next cycle."""

@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import time
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -10,7 +9,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.rig import Rig
-from shearloop.drivers.ur.client import UrLinkEvent
+from shearloop.drivers.connection import LinkEvent
 from tests.daemon.control.cell import Published
 
 SOURCES = {"right": TorqueSource(name="right", period_s=0.5)}
@@ -37,13 +36,13 @@ async def a_rig() -> AsyncIterator[Rig]:
 async def test_a_robot_that_is_lost_is_told_at_once_and_not_when_its_state_is_missed() -> None:
     async with a_rig() as rig:
         assert rig.control_loop.status.decision.faults == ()
-        rig._on_robot_link(UrLinkEvent(time.monotonic_ns(), "down", "the robot's process died", "crashed", 1))
+        rig.set_link("robot", LinkEvent(up=False, sentence="the robot's process died", repeated=False))
         assert "the robot's process died" in " ".join(rig.control_loop.status.decision.reasons)
 
 
 async def test_a_device_that_is_lost_before_the_loop_runs_and_after_its_end_is_noted() -> None:
     async with a_rig() as rig:
         pass
-    rig._on_robot_link(UrLinkEvent(time.monotonic_ns(), "down", "the robot's process died", "crashed", 1))
+    rig.set_link("robot", LinkEvent(up=False, sentence="the robot's process died", repeated=False))
     assert rig.control_loop.inputs.lost == {"robot": "the robot's process died"}
     assert rig.control_loop.status.decision.faults == ()

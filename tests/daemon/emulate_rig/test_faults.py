@@ -11,7 +11,6 @@ from shearloop.drivers.errors import DeviceLostError, DriverError
 from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import ObjectStatus
-from shearloop.drivers.ur.client import UrLinkEvent as RobotLink
 from shearloop.drivers.ur.messages import Unlock
 from tests.daemon.emulate_rig.rig import (
     COUNTS,
@@ -25,6 +24,7 @@ from tests.daemon.emulate_rig.rig import (
     torque_of,
     until,
 )
+from tests.drivers.ur.robots import Link
 
 pytestmark = pytest.mark.real_time
 
@@ -38,8 +38,8 @@ async def test_disturbances_reach_the_tool_and_robot_faults_the_robot(rig: RigPr
         truth = await rig.truth(lambda truth: bool(truth["torque_nm"]))
         assert truth["torque_nm"] == pytest.approx(0.05, rel=0.05)
         assert await torque_of(load) == pytest.approx(0.05, rel=0.08)
-        links: asyncio.Queue[RobotLink] = asyncio.Queue()
-        async with arm_at(rig, links.put_nowait) as arm:
+        link = Link()
+        async with arm_at(rig, link) as arm:
             await until(arm, lambda state: state.wrist_torque_nm < -0.04)
             await rig.fault("slip 0.01")
             await until(arm, lambda state: -0.02 < state.wrist_torque_nm < 0.0)
@@ -54,9 +54,7 @@ async def test_disturbances_reach_the_tool_and_robot_faults_the_robot(rig: RigPr
                 while not (await arm.send(Unlock())).accepted:
                     await arm.next_state()
             await rig.fault("drop-rtde")
-            async with asyncio.timeout(DEADLINE_S):
-                while (await links.get()).status != "down":
-                    continue
+            await link.down(within_s=DEADLINE_S)
         await rig.fault("joint seized")
         assert (await rig.truth())["joint"] == "seized"
         await rig.fault("joint lever")

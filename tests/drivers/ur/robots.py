@@ -6,7 +6,8 @@ import dataclasses
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
-from shearloop.drivers.ur.client import UrLinkEvent, UrRobot
+from shearloop.drivers.connection import LinkEvent
+from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, RobotState
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 
@@ -17,17 +18,17 @@ class Link:
     """A robot's link events."""
 
     def __init__(self) -> None:
-        self.events: list[UrLinkEvent] = []
+        self.events: list[LinkEvent] = []
         self._changed = asyncio.Event()
 
-    def __call__(self, event: UrLinkEvent) -> None:
+    def on_link_event(self, event: LinkEvent) -> None:
         self.events.append(event)
         self._changed.set()
 
-    async def down(self, number: int = 1, within_s: float = 15.0) -> UrLinkEvent:
+    async def down(self, number: int = 1, within_s: float = 15.0) -> LinkEvent:
         """Wait for the loss of this number and return it."""
         async with asyncio.timeout(within_s):
-            while len(losses := [event for event in self.events if event.status == "down"]) < number:
+            while len(losses := [event for event in self.events if not event.up]) < number:
                 self._changed.clear()
                 await self._changed.wait()
         return losses[number - 1]
@@ -64,3 +65,11 @@ async def until(robot: UrRobot, condition: Callable[[RobotState], bool], within_
 async def enable(robot: UrRobot) -> None:
     await until(robot, lambda state: state.program_running and not state.recovering)
     assert (await robot.send(Enable())).accepted
+
+
+def pid_of(robot: UrRobot) -> int:
+    """Return the worker's process id."""
+    assert robot._connection is not None
+    pid = robot._connection._process.get_pid()
+    assert pid is not None
+    return pid

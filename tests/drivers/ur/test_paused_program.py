@@ -9,7 +9,7 @@ import pytest
 
 from shearloop.drivers.emulators.ur.server import SCRIPT_PORT
 from shearloop.drivers.ur.client import UrRobot
-from tests.drivers.ur.robots import Link, enable, running, settings_for, until
+from tests.drivers.ur.robots import Link, enable, pid_of, running, settings_for, until
 from tests.emulator_process import EmulatorProcess as ControllerProcess
 
 pytestmark = pytest.mark.real_time
@@ -31,8 +31,7 @@ async def begin_foreign_program(controller: ControllerProcess) -> None:
 
 async def kill(robot: UrRobot, link: Link) -> None:
     """Kill the worker and wait for the next one's first state."""
-    assert robot.pid is not None
-    os.kill(robot.pid, signal.SIGKILL)
+    os.kill(pid_of(robot), signal.SIGKILL)
     await link.down()
     await robot.next_state()
 
@@ -61,9 +60,8 @@ async def test_program_started_after_a_lost_worker_is_left_alone(
     link = Link()
     async with running(settings_for(controller.host), link) as robot:
         await enable(robot)
-        assert robot.pid is not None
         since_ns = time.monotonic_ns()
-        os.kill(robot.pid, signal.SIGKILL)
+        os.kill(pid_of(robot), signal.SIGKILL)
         await controller.event("program-ended", since_ns)
         await begin_foreign_program(controller)
         since_ns = time.monotonic_ns()
@@ -88,11 +86,10 @@ async def test_our_paused_program_is_stopped_by_the_next_worker(controller: Cont
     link = Link()
     async with running(settings_for(controller.host), link) as robot:
         await enable(robot)
-        assert robot.pid is not None
-        os.kill(robot.pid, signal.SIGSTOP)
+        os.kill(pid_of(robot), signal.SIGSTOP)
         await controller.fault(f"stop-hangs {hangs}")
         since_ns = await controller.fault("protective-stop")
-        os.kill(robot.pid, signal.SIGKILL)
+        os.kill(pid_of(robot), signal.SIGKILL)
         await link.down()
         assert (await controller.event("program-ended", since_ns))["detail"] == STOPPED
         assert robot.failed_program_stops == hangs

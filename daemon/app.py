@@ -18,7 +18,7 @@ from shearloop.daemon.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.health import HealthReporter, Reporter, TaskFacts
 from shearloop.daemon.messaging.addresses import local_stop_address
 from shearloop.daemon.messaging.command_server import CommandServer
-from shearloop.daemon.messaging.keys import CurveAuthenticator, KeyPair, load_server_keys
+from shearloop.daemon.messaging.keys import CurveAuthenticator, Refusals, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
 from shearloop.daemon.recording.recorder import Recorder, daemon_identity
 from shearloop.daemon.rig import Rig, check_experiment, make_gripper, make_loop
@@ -59,6 +59,12 @@ class Daemon:
         self._stop_when_done = config.stop_when_done
         with contextlib.ExitStack() as opened:
             keys = load_server_keys(config.curve.server_key) if config.curve is not None else None
+            refusals = Refusals()
+            # It must exist before a socket is bound.
+            authenticator: CurveAuthenticator | None = None
+            if config.curve is not None and config.network_addresses:
+                authenticator = CurveAuthenticator(context, config.curve.clients, refusals)
+                opened.callback(authenticator.close)
             self.publisher = opened.enter_context(contextlib.closing(Publisher(context, config.publish, clock, keys)))
             self.recorder = _open_recorder(config, clock, self.publisher)
             if self.recorder is not None:
@@ -70,18 +76,26 @@ class Daemon:
                 stop = self._stop if config.stop_when_done else None
                 self._experiment = ConfiguredExperiment(config.experiment, self._rig, stop)
             self.commands = Commands(self._rig, self.sensors, self._experiment, self.health, self._stop)
-            sockets = _open_command_sockets(config, context, self.commands, keys, opened)
+            server = CommandServer(context, config.commands, self.commands.handlers(), refusals, keys)
+            opened.callback(server.close)
+            open_stop: CommandServer | None = None
+            if "commands" in config.network_addresses:
+                address = local_stop_address(config.commands)
+                open_stop = CommandServer(context, address, self.commands.open_handlers(), refusals)
+                opened.callback(open_stop.close)
             self._close = opened.pop_all().close
         tasks: dict[str, Task | None] = {
             **self.sensors.tasks(),
             **(self._rig.tasks() if self._rig is not None else {}),
             "experiment": self._experiment,
             "recording": RecordingTask(self.recorder, self._rig) if self.recorder is not None else None,
-            **sockets,
+            "keys": authenticator,
+            "commands": server,
+            "open_stop": open_stop,
             "health": self.health,
         }
         self._tasks = {name: task for name, task in tasks.items() if task is not None}
-        for name, part in {**self._tasks, COMBINED: self.sensors.combined}.items():
+        for name, part in {**self._tasks, COMBINED: self.sensors.combined, "commands": refusals}.items():
             if isinstance(part, Reporter):
                 self.health.add(name, part)
 
@@ -164,29 +178,6 @@ def _build_rig(
     if loop is None:
         return sensors, None
     return sensors, Rig(config, loop, gripper, sensors.tareable(), publisher, clock, supervisor, recorder)
-
-
-def _open_command_sockets(
-    config: DaemonConfig,
-    context: zmq.asyncio.Context,
-    commands: Commands,
-    keys: KeyPair | None,
-    opened: contextlib.ExitStack,
-) -> dict[str, Task]:
-    """Return the tasks of the command sockets, and of the keys that their clients need."""
-    tasks: dict[str, Task] = {}
-
-    def add(name: str, task: CommandServer | CurveAuthenticator) -> None:
-        opened.callback(task.close)
-        tasks[name] = task
-
-    if config.curve is not None and config.network_addresses:
-        add("keys", CurveAuthenticator(context, config.curve.clients))
-    add("commands", CommandServer(context, config.commands, commands.handlers(), keys))
-    if "commands" in config.network_addresses:
-        address = local_stop_address(config.commands)
-        add("open_stop", CommandServer(context, address, commands.open_handlers()))
-    return tasks
 
 
 async def run_daemon(

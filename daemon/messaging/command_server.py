@@ -6,7 +6,7 @@ Requests and replies are msgpack maps. A request is `{"command": NAME, …}`, a 
 
 import asyncio
 import time
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, TypeAlias
 
@@ -14,8 +14,8 @@ import structlog
 import zmq
 import zmq.asyncio
 
-from shearloop.daemon.messaging.keys import KeyPair
-from shearloop.daemon.messaging.messages import Scalar, decode, encode
+from shearloop.daemon.messaging.keys import KeyPair, Refusals
+from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import bind
 
 LARGEST_REQUEST_BYTES = 64 * 1024
@@ -83,12 +83,13 @@ class CommandServer:
         context: zmq.asyncio.Context,
         address: str,
         handlers: Mapping[str, Handler],
+        refusals: Refusals,
         keys: KeyPair | None = None,
     ) -> None:
         """Bind the socket; raises UserError if the address is in use, malformed, or needs keys."""
         self._handlers = handlers
         self._limit = RateLimit()
-        self.refused: Counter[str] = Counter()
+        self.refused = refusals.counts
         self._running: set[asyncio.Task[None]] = set()
         self._socket = context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 100)
@@ -167,10 +168,6 @@ class CommandServer:
         if not frequent or str(count).strip("0") == "1":
             structlog.get_logger().warning("command refused", reason=reason, count=count)
         return {"ok": False, "reason": reason}
-
-    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
-        """Return the numbers of refused commands by kind, for `health`."""
-        return {"errors": dict(self.refused)}
 
     def close(self) -> None:
         """Close the socket after the last replies are sent."""

@@ -40,10 +40,10 @@ from shearloop.daemon.cli.demo_calibration import ACTIVATE, GRIP, IDLE_S, SETTLE
 from shearloop.daemon.control.creep import Creep, Stretch, fit_creep
 from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.control.margins import margin_refusal
-from shearloop.daemon.synthetic import frame_maker
+from shearloop.daemon.synthetic_frames import RigFrames
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S
-from shearloop.drivers.emulators.rig import SIDES, FrameOf
-from shearloop.drivers.emulators.robotiq.gripper import Gripper
+from shearloop.drivers.emulators.gripper import Gripper
+from shearloop.drivers.emulators.rig import SIDES
 from shearloop.drivers.emulators.scene import Joint, Scene, Twin, TwinSettings
 
 PlantOf = Callable[[SimulatedSensor, np.random.Generator], Plant]
@@ -99,7 +99,7 @@ class TwinPlant(Plant):
 class RigPlant(Plant):
     """The emulated rig with both boards' frames as a plant; an estimator's torques are the measurements."""
 
-    frame_of: FrameOf = field(kw_only=True)
+    frames: RigFrames = field(kw_only=True)
     tracker: EstimatorSession = field(kw_only=True)
     scene: Scene = field(init=False)
     not_valid: int = 0
@@ -133,7 +133,7 @@ class RigPlant(Plant):
         if self.t_s < self._next_end_s:
             return
         self._next_end_s += FRAME_PERIOD_S
-        lines, t_mid_s = lines_of(self.scene, self.frame_of), self.t_s - FRAME_PERIOD_S / 2
+        lines, t_mid_s = lines_of(self.scene, self.frames), self.t_s - FRAME_PERIOD_S / 2
         true_nm = self.scene.conversion_nm(FRAME_PERIOD_S)
         estimate = self.tracker.estimate(TactileFrame.of(t_mid_s, np.array([channels_of_line(one) for one in lines])))
         if estimate.torque_nm is None or estimate.torque_low_nm is None or estimate.torque_high_nm is None:
@@ -255,7 +255,7 @@ def estimator_in_the_loop(bank: Path, calibration: Calibration, seeds: Sequence[
     for seed in seeds:
         plant = RigPlant(
             SimulatedTool(), EIT, np.random.default_rng((30, seed)),
-            frame_of=frame_maker(bank, seed), tracker=EstimatorSession(calibration),
+            frames=RigFrames(bank, seed), tracker=EstimatorSession(calibration),
         )  # fmt: skip
         rows.append(step(plant, scenario)[0])
         plants.append(plant)

@@ -80,7 +80,7 @@ class TemporalFeatures:
 
     @classmethod
     def fit(
-        cls, parts: list[FloatArray], validators: tuple[FingertipValidator, ...], n_directions: int, n_lags: int
+        cls, parts: Sequence[FloatArray], validators: tuple[FingertipValidator, ...], n_directions: int, n_lags: int
     ) -> Self:
         """Fit the main directions of motion to each recording's (n, m, 896) gripped frames."""
         directions = []
@@ -94,6 +94,16 @@ class TemporalFeatures:
         """Return the (…, m·p) positions of (…, m, 896) frames along the directions."""
         found = np.einsum("...mc,mpc->...mp", channels, self.directions)
         return np.asarray(found.reshape(*found.shape[:-2], -1))
+
+    def complete(self, difference: FloatArray, usable: BoolArray, sides: Sequence[FingertipValidator]) -> FloatArray:
+        """Return a (m, 896) difference to the idle frame with unusable channels imputed along motion and grip."""
+        if usable.all():
+            return difference
+        imputed = [
+            self.impute(layer, difference[layer], usable[layer], one.noise, one.gripped - one.idle)
+            for layer, one in enumerate(sides)
+        ]
+        return np.where(usable, difference, imputed)
 
     def impute(
         self, layer: int, moved: FloatArray, usable: BoolArray, noise: FloatArray, *grip: FloatArray
@@ -118,13 +128,34 @@ class TemporalFeatures:
         return np.concatenate([moved, from_idle]) if self.uses_position else moved
 
 
+class _NoMotion(TemporalFeatures):
+    """No motion: for estimators that read each frame alone."""
+
+    def project(self, channels: FloatArray) -> FloatArray:
+        """Return no position."""
+        return np.zeros((*channels.shape[:-2], 0))
+
+    def complete(self, difference: FloatArray, _usable: BoolArray, _sides: Sequence[FingertipValidator]) -> FloatArray:
+        """Return the difference: the estimator imputes channels."""
+        return difference
+
+    def impute(self, _layer: int, moved: FloatArray, *_: object) -> FloatArray:
+        """Return no motion."""
+        return np.zeros_like(moved)
+
+
+NO_MOTION = _NoMotion(np.zeros((0, 0, N_CHANNELS)), 0)
+
+
 class SessionState:
     """State of one session of raw frames; every frame goes through `process` in order."""
+
+    curves_only, refuses_repeats = False, True
 
     def __init__(
         self,
         validators: tuple[FingertipValidator, ...],
-        temporal: TemporalFeatures | None,
+        motion: TemporalFeatures = NO_MOTION,
         period_s: float = np.inf,
         idle_frames: int = 0,
     ) -> None:
@@ -132,8 +163,8 @@ class SessionState:
         self._fingertips = FingertipSet(validators)
         # A board that drops half of its frames does not show its period, so the configured one is a bound.
         self._period_s = period_s
-        self._temporal = temporal
-        n_lags = temporal.n_lags if temporal is not None else 0
+        self._motion = motion
+        n_lags = motion.n_lags
         # Positions of the last frames along the directions, and which of them are interpolated.
         self._positions: deque[FloatArray] = deque(maxlen=n_lags + 1)
         self._bridged: deque[bool] = deque(maxlen=n_lags + 1)
@@ -173,11 +204,9 @@ class SessionState:
         return all(self._idle)
 
     @property
-    def temporal_features(self) -> FloatArray | None:
-        """Features of the last frames' motion, None while frames are missing or no motion is used."""
-        if self._temporal is None or len(self._positions) < self._temporal.n_lags + 1:
-            return None
-        return self._temporal.features(self._positions, self._from_idle)
+    def motion(self) -> FloatArray:
+        """Features of the last frames' motion."""
+        return self._motion.features(self._positions, self._from_idle)
 
     def process(self, frame: TactileFrame) -> ProcessedFrame:
         """Take the next frame and return it with the reasons against it."""
@@ -278,13 +307,7 @@ class SessionState:
 
     def _difference(self, channels: FloatArray, usable: BoolArray) -> FloatArray:
         """Return the (m, 896) difference to the idle frame, unusable channels imputed."""
-        difference = channels - self._baselines
-        if self._temporal is not None and not usable.all():
-            for layer, one in enumerate(self._fingertips.sides):
-                grip = one.gripped - one.idle
-                imputed = self._temporal.impute(layer, difference[layer], usable[layer], one.noise, grip)
-                difference[layer] = np.where(usable[layer], difference[layer], imputed)
-        return difference
+        return self._motion.complete(channels - self._baselines, usable, self._fingertips.sides)
 
     def _finish(self, channels: FloatArray, usable: BoolArray) -> ProcessedFrame:
         # At the calibration's gain. It does not change while gripped.
@@ -298,9 +321,7 @@ class SessionState:
             self._forget_grip()
             reason = f"no grip at the {' and '.join(loose)} fingertip"
         else:
-            position, self._from_idle = np.zeros((2, 0))
-            if self._temporal is not None:
-                position, self._from_idle = self._temporal.project(np.array([channels / self._gains, difference]))
+            position, self._from_idle = self._motion.project(np.array([channels / self._gains, difference]))
             self._remember(position)
             if missing := (self._positions.maxlen or 0) - len(self._positions):
                 reason = f"gripped too recently: {missing} more frames are needed"
@@ -356,12 +377,12 @@ class SessionState:
             return channels
         if self._before is None:
             return np.where(usable, channels, self._fingertips.gripped)
-        assumed = self._before.copy()
-        if self._temporal is not None:
-            for layer, one in enumerate(self._fingertips.sides):
-                moved = channels[layer] - self._before[layer]
-                assumed[layer] += self._temporal.impute(layer, moved, usable[layer], one.noise)
-        return np.where(usable, channels, assumed)
+        moved = channels - self._before
+        assumed = [
+            self._motion.impute(layer, moved[layer], usable[layer], one.noise)
+            for layer, one in enumerate(self._fingertips.sides)
+        ]
+        return np.where(usable, channels, self._before + assumed)
 
     def _update_baseline(self, channels: FloatArray, frame: TactileFrame) -> None:
         """Follow the idle frame while nothing is gripped; a session that begins gripped keeps the calibration's.
@@ -412,9 +433,9 @@ class PaperState:
     Trehan et al. 2025, section 2. Without a validator nothing is known of the fingertip but its first frames.
     """
 
-    has_baseline = True
-    temporal_features = None
+    curves_only, refuses_repeats, has_baseline = True, False, True
     held_frames = 1
+    motion: FloatArray = np.zeros(0)
 
     def __init__(self, baseline_frames: int, average_frames: int, max_gap_s: float) -> None:
         """Begin a session with `baseline_frames` untouched frames; a longer gap restarts the average."""
@@ -471,3 +492,17 @@ class PaperState:
         own = (np.array(self._tare_frames) - self._homogeneous).var(axis=0, ddof=1)
         variance = (freedom * own + _POOLED_FREEDOM * own.mean()) / (freedom + _POOLED_FREEDOM)
         return np.asarray(np.sqrt(np.maximum(variance, LEAST_NOISE_V**2)))
+
+
+class SliceState:
+    """State of slices, which are differences already: nothing but the last one."""
+
+    curves_only, refuses_repeats, has_baseline, taring = False, False, True, False
+    held_frames = 1
+    motion: FloatArray = np.zeros(0)
+    mean_difference: FloatArray = np.zeros((1, N_CHANNELS))
+
+    def process(self, frame: TactileFrame) -> ProcessedFrame:
+        """Take the next slice and return its magnitudes."""
+        self.mean_difference = np.abs(frame.channels)
+        return ProcessedFrame(self.mean_difference, (), frame.usable)

@@ -21,11 +21,11 @@ from shearloop.daemon.analysis.series import series_of
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.schema import DIAMETER_NOTE
 from shearloop.daemon.recording.writer import RecordingWriter
-from shearloop.daemon.synthetic import frame_maker
+from shearloop.daemon.synthetic_frames import RigFrames
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 from shearloop.drivers.emulators.boards import LOAD_PERIOD_S
-from shearloop.drivers.emulators.rig import NOISE_NM, SIDES, FrameOf
-from shearloop.drivers.emulators.robotiq.gripper import Gripper, GripperRegisters
+from shearloop.drivers.emulators.gripper import Gripper, GripperRegisters
+from shearloop.drivers.emulators.rig import NOISE_NM, SIDES
 from shearloop.drivers.emulators.scene import Scene
 
 # Three diameters are enough to interpolate; five halve the interval.
@@ -43,10 +43,10 @@ _OPEN = replace(GRIP, pos=0)
 Sides = tuple[str, ...]
 
 
-def lines_of(scene: Scene, frame_of: FrameOf) -> list[NDArray[np.float64]]:
+def lines_of(scene: Scene, frames: RigFrames) -> list[NDArray[np.float64]]:
     """Return the lines of both boards, (1024,) in volts, for frames that end now."""
-    seen = scene.frame(FRAME_PERIOD_S)
-    return [frame_of(seen.grip, sign * seen.shear_torque_nm, seen.diameter_mm) for sign in SIDES.values()]
+    gel = scene.frame(FRAME_PERIOD_S)
+    return [frames.line(gel.grip, sign * gel.shear_torque_nm, gel.diameter_mm) for sign in SIDES.values()]
 
 
 @dataclass(slots=True)
@@ -86,10 +86,10 @@ class RecordedTwists:
 class TwistPlayer:
     """One scene with a tool, and its recording."""
 
-    def __init__(self, frame_of: FrameOf, diameter_mm: float, seed: int) -> None:
+    def __init__(self, frames: RigFrames, diameter_mm: float, seed: int) -> None:
         self.recorded = RecordedTwists()
         self._random = np.random.default_rng(seed)
-        self._frame_of = frame_of
+        self._frames = frames
         self._gripper = Gripper(object_mm=diameter_mm)
         self._scene = Scene(self._gripper)
         self._wrist_rad = 0.0
@@ -134,7 +134,7 @@ class TwistPlayer:
         if now_s >= self._due_frame_s:
             self._due_frame_s += FRAME_PERIOD_S
             self.recorded.frame_s.append(now_s - FRAME_PERIOD_S / 2)
-            self.recorded.lines.append(lines_of(self._scene, self._frame_of))
+            self.recorded.lines.append(lines_of(self._scene, self._frames))
         if now_s >= self._due_torque_s:
             self._due_torque_s += LOAD_PERIOD_S
             self.recorded.torque_s.append(now_s - LOAD_PERIOD_S / 2)
@@ -146,9 +146,9 @@ def record(
     bank: Path, seed: int, diameters_mm: tuple[float, ...] = DIAMETERS_MM
 ) -> Iterator[tuple[float, RecordedTwists]]:
     """Yield each cylinder's diameter and recording."""
-    frame_of = frame_maker(bank, seed)
+    frames = RigFrames(bank, seed)
     for number, diameter_mm in enumerate(diameters_mm):
-        play = TwistPlayer(frame_of, diameter_mm, seed + number)
+        play = TwistPlayer(frames, diameter_mm, seed + number)
         play.run()
         yield diameter_mm, play.recorded
 

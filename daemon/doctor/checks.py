@@ -214,9 +214,9 @@ def check_calibration(name: str, fingertip: FingertipConfig) -> Finding:
     except (UserError, BankError) as error:
         return from_error(subject, error, "there is no torque")
     calibration = estimator.calibration
-    if calibration.has_curves_only:
+    if not calibration.sides:
         return good(subject, f"{fingertip.calibration} belongs to this bank")
-    found = f"{fingertip.calibration} is for this fingertip, estimator {calibration.estimator}"
+    found = f"{fingertip.calibration} is for this fingertip, estimator {calibration.estimator.name}"
     return good(subject, found + estimator.assumptions)
 
 
@@ -226,7 +226,7 @@ def _check_combined(combined: CombinedConfig, fingertips: dict[str, FingertipCon
     except (UserError, BankError) as error:
         return from_error("combined calibration", error, "there is no combined estimate")
     found = f"{combined.calibration} is for {' and '.join(estimator.calibration.sides)}"
-    found += f", estimator {estimator.calibration.estimator}{estimator.assumptions}"
+    found += f", estimator {estimator.calibration.estimator.name}{estimator.assumptions}"
     return good("combined calibration", found)
 
 

@@ -1,11 +1,12 @@
-"""The boards that send lines over a pseudo-terminal, emulated byte for byte: EIT-kit, load cell, converter board."""
+"""The boards that send lines over a pseudo-terminal, emulated byte for byte: EIT-kit and load cell."""
 
 import asyncio
+import contextlib
 import itertools
 import math
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S, N_VALUES
-from shearloop.drivers.emulators.ports import Outage, PtyPort
+from shearloop.drivers.emulators.ports import PtyPort
 from shearloop.drivers.load_cell import COUNTS_MAX, COUNTS_MIN
 
 FLOOD_BYTES = 100_000
@@ -33,10 +34,7 @@ class BoardFaultKind(Enum):
     # The next line arrives broken.
     CUT_LINE = "cut-line"
     WRONG_COUNT = "wrong-count"
-    NOT_A_NUMBER = "not-a-number"
     NAN = "nan"
-    NEGATIVE = "negative"
-    ZERO = "zero"
     SPIKE = "spike"
     TORN = "torn"
     MISSING = "missing"
@@ -90,27 +88,18 @@ def parse_fault(text: str, kinds: Collection[BoardFaultKind]) -> BoardFault:
 class EmulatedBoard(ABC):
     """An emulated board on a pseudo-terminal.
 
-    `on_port` receives the port's path whenever it appears. `inject` applies faults to the next lines, one each.
-    `sent` counts intact lines. Without a reader the terminal fills up; then the board waits and `port.held_up` is set.
+    `inject` applies faults to the next lines, one each. Without a reader the terminal fills up; then the board waits
+    and `port.held_up` is set.
     """
 
     faults: Collection[BoardFaultKind]
 
-    def __init__(
-        self,
-        period_s: float,
-        link: Path | None,
-        on_port: Callable[[str], None],
-        seed: int,
-        on_bytes: Callable[[bytes], None] = lambda _: None,
-    ) -> None:
-        self._period_s = period_s
-        self._on_port = on_port
-        self._random = Random(seed)
-        self.port = PtyPort(on_bytes, link)
-        self._injected: deque[BoardFault] = deque()
-        self.sent = 0
+    def __init__(self, period_s: float, link: Path | None, seed: int) -> None:
+        self.port = PtyPort(link)
         self.finished = asyncio.Event()
+        self._period_s = period_s
+        self._random = Random(seed)
+        self._injected: deque[BoardFault] = deque()
 
     @abstractmethod
     async def run(self) -> None:
@@ -131,10 +120,6 @@ class EmulatedBoard(ABC):
         else:
             self.inject(parse_fault(text, self.faults))
 
-    def _plug(self) -> None:
-        self.port.plug()
-        self._on_port(self.port.path)
-
     def _garbage(self, count: int) -> bytes:
         return bytes(self._random.choices(range(128, 256), k=count))
 
@@ -152,8 +137,8 @@ class EitKitBoard(EmulatedBoard):
     """
 
     faults = (
-        *(_K.CUT_LINE, _K.WRONG_COUNT, _K.NOT_A_NUMBER, _K.NAN, _K.NEGATIVE, _K.ZERO),
-        *(_K.GARBAGE, _K.FLOOD, _K.REPEAT, _K.SILENCE, _K.UNPLUG),
+        *(_K.CUT_LINE, _K.WRONG_COUNT, _K.NAN, _K.GARBAGE, _K.FLOOD, _K.REPEAT),
+        *(_K.SILENCE, _K.UNPLUG),
     )
 
     def __init__(
@@ -163,40 +148,36 @@ class EitKitBoard(EmulatedBoard):
         period_s: float = FRAME_PERIOD_S,
         link: Path | None = None,
         fault_at: Mapping[int, BoardFault] | None = None,
-        on_port: Callable[[str], None] = lambda _: None,
         seed: int = 0,
     ) -> None:
-        super().__init__(period_s, link, on_port, seed, self._received)
+        super().__init__(period_s, link, seed)
         self._frames = frames
         self._fault_at = dict(fault_at or {})
-        self._started = asyncio.Event()
-        self._outage = Outage()
-        self._waits_for_start = False
+        self._recovered = asyncio.Event()
+        self._silent = False
 
     def recover(self) -> None:
         """End every fault and plug the port in."""
         self._injected.clear()
-        self._outage.end()
-        if self._waits_for_start:
-            self._started.set()
+        self._recovered.set()
+        if self._silent:
+            self.port.received.put_nowait(b"y")
 
     async def run(self) -> None:
         """Play until cancelled; at the end of the frames the board stays plugged in and `finished` is set."""
         loop = asyncio.get_running_loop()
         with self.port:
-            self._on_port(self.port.path)
-            due_s = 0.0
+            await self._wait_for_start()
+            due_s = loop.time()
             frames = iter(self._frames)
             for number in itertools.count():
-                if not self._started.is_set():
-                    await self._started.wait()
-                    due_s = loop.time()
                 due_s += self._period_s
                 await asyncio.sleep(due_s - loop.time())
                 fault = self._fault_at.pop(number, None) or (self._injected.popleft() if self._injected else None)
                 if fault is not None and fault.kind is _K.SILENCE:
-                    await self._fall_silent(fault.amount)
-                    fault = None
+                    self._silent = fault.amount is None
+                    await (self._wait_for_start() if fault.amount is None else self._pause(fault.amount))
+                    self._silent, fault = False, None
                 values = next(frames, None)
                 if values is None:
                     break
@@ -207,16 +188,15 @@ class EitKitBoard(EmulatedBoard):
             self.finished.set()
             await loop.create_future()
 
-    def _received(self, data: bytes) -> None:
-        if b"y" in data:
-            self._started.set()
-
     async def _send(self, line: bytes, fault: BoardFault | None) -> None:
         match None if fault is None else fault.kind:
-            case None:
-                pass
             case _K.UNPLUG:
-                await self._unplug(line, 1.0 if fault is None or fault.amount is None else fault.amount)
+                await self.port.write(line[: len(line) // 2])
+                await self.port.break_off()
+                await self._pause(None if fault is None else fault.amount)
+                self.port.plug()
+                # Without power the board has forgotten its start.
+                await self._wait_for_start()
                 return
             case _K.GARBAGE:
                 await self.port.write(self._garbage(700) + b"\n")
@@ -224,45 +204,26 @@ class EitKitBoard(EmulatedBoard):
                 await self.port.write(bytes(self._random.choices(b"0123456789., ", k=FLOOD_BYTES)) + b"\n")
             case _K.REPEAT:
                 await self.port.write(line)
-                self.sent += 1
-            case kind:
-                await self.port.write(self._broken(line, kind))
-                return
+            case _K.CUT_LINE:
+                line = line[: self._random.randrange(len(line) // 10, len(line) - 10)] + b"\n"
+            case _K.WRONG_COUNT | _K.NAN as kind:
+                values = line.split(b", ")
+                position = self._random.choice([n for n, value in enumerate(values[:-1]) if float(value)])
+                values[position : position + 1] = [b"nan"] if kind is _K.NAN else []
+                line = b", ".join(values)
         await self.port.write(line)
-        self.sent += 1
 
-    def _broken(self, line: bytes, kind: BoardFaultKind) -> bytes:
-        if kind is _K.CUT_LINE:
-            return line[: self._random.randrange(len(line) // 10, len(line) - 10)] + b"\n"
-        values = line.split(b", ")
-        position = self._random.choice([n for n, value in enumerate(values[:-1]) if float(value)])
-        if kind is _K.WRONG_COUNT:
-            del values[position]
-        else:
-            values[position] = {
-                _K.NOT_A_NUMBER: b"0.1x34",
-                _K.NAN: b"nan",
-                _K.NEGATIVE: b"-" + values[position],
-                _K.ZERO: b"0.0000",
-            }[kind]
-        return b", ".join(values)
+    async def _wait_for_start(self) -> None:
+        while not self.port.received.empty():
+            self.port.received.get_nowait()
+        while b"y" not in await self.port.received.get():
+            continue
 
-    async def _fall_silent(self, seconds: float | None) -> None:
-        if seconds is not None:
-            await self._outage.wait(seconds)
-            return
-        self._started.clear()
-        self._waits_for_start = True
-        await self._started.wait()
-        self._waits_for_start = False
-
-    async def _unplug(self, line: bytes, seconds: float) -> None:
-        await self.port.write(line[: len(line) // 2])
-        await self.port.break_off()
-        # Without power the board forgets its start.
-        self._started.clear()
-        await self._outage.wait(seconds)
-        self._plug()
+    async def _pause(self, seconds: float | None) -> None:
+        self._recovered.clear()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await self._recovered.wait()
 
 
 class ConverterBoard(EmulatedBoard):
@@ -271,10 +232,8 @@ class ConverterBoard(EmulatedBoard):
     Timed faults without a duration last until the next one or `recover`.
     """
 
-    def __init__(
-        self, period_s: float, link: Path | None = None, on_port: Callable[[str], None] = lambda _: None, seed: int = 0
-    ) -> None:
-        super().__init__(period_s, link, on_port, seed)
+    def __init__(self, period_s: float, link: Path | None = None, seed: int = 0) -> None:
+        super().__init__(period_s, link, seed)
         self._lasting: BoardFaultKind | None = None
         self._lasts_until_s = 0.0
         self._last_line = b""
@@ -295,7 +254,6 @@ class ConverterBoard(EmulatedBoard):
         loop = asyncio.get_running_loop()
         due_s = loop.time()
         with self.port:
-            self._on_port(self.port.path)
             while True:
                 due_s = max(due_s + self._period_s, loop.time() - CATCH_UP_S)
                 await asyncio.sleep(due_s - loop.time())
@@ -304,12 +262,8 @@ class ConverterBoard(EmulatedBoard):
                 except StopIteration:
                     break
                 line = self._with_faults(line, loop.time())
-                if line:
-                    try:
-                        await self.port.write(line)
-                    except ConnectionError:  # unplugged while the line waited for a reader
-                        continue
-                    self.sent += 1
+                with contextlib.suppress(ConnectionError):  # unplugged while the line waited for a reader
+                    await self.port.write(line)
             self.finished.set()
             await loop.create_future()
 
@@ -350,7 +304,7 @@ class ConverterBoard(EmulatedBoard):
 
     def _end_lasting(self) -> None:
         if self._lasting is _K.UNPLUG:
-            self._plug()
+            self.port.plug()
         self._lasting = None
 
 
@@ -372,57 +326,25 @@ PAPER_SKETCH = Sketch(counts_per_nm=1.0, tare_counts=0.0, noise_counts=2e-5, dec
 
 
 class Hx711Board(ConverterBoard):
-    """The load cell's board: converts what `torque_nm` returns, until that raises StopIteration."""
+    """The load cell's board: converts each of `torques_nm`, requested at the end of its conversion."""
 
     faults = (_K.GARBAGE, _K.SPIKE, _K.TORN, _K.SILENCE, _K.SATURATION, _K.STUCK, _K.UNPLUG, _K.JUMP)
 
     def __init__(
         self,
-        torque_nm: Callable[[], float],
+        torques_nm: Iterable[float],
         sketch: Sketch | None = None,
         *,
         period_s: float = LOAD_PERIOD_S,
         link: Path | None = None,
-        on_port: Callable[[str], None] = lambda _: None,
         seed: int = 0,
     ) -> None:
-        super().__init__(period_s, link, on_port, seed)
-        self._torque_nm = torque_nm
+        super().__init__(period_s, link, seed)
+        self._torques_nm = iter(torques_nm)
         self._sketch = sketch or Sketch()
 
     def _convert(self) -> bytes:
         sketch = self._sketch
-        counts = sketch.tare_counts + sketch.counts_per_nm * (self._torque_nm() + self._offset)
+        counts = sketch.tare_counts + sketch.counts_per_nm * (next(self._torques_nm) + self._offset)
         counts += self._random.gauss(0.0, sketch.noise_counts)
         return f"{min(max(counts, COUNTS_MIN), COUNTS_MAX):.{sketch.decimals}f}\r\n".encode()
-
-
-class EmulatedAdcBoard(ConverterBoard):
-    """The skin's converter board, an ADS1220: a line `v1,v2` in volts of what `voltages` returns."""
-
-    faults = (_K.MISSING, _K.GARBAGE, _K.TORN, _K.SILENCE, _K.STUCK, _K.UNPLUG)
-
-    # 24 bits over ±0.512 V, at gain 4.
-    FULL_SCALE_V, STEP_V = 0.512, 0.512 / 2**23
-
-    def __init__(
-        self,
-        voltages: Callable[[], tuple[float, float]],
-        *,
-        period_s: float,
-        noise_v: float,
-        link: Path | None = None,
-        on_port: Callable[[str], None] = lambda _: None,
-        seed: int = 0,
-    ) -> None:
-        super().__init__(period_s, link, on_port, seed)
-        self._voltages = voltages
-        self._noise_v = noise_v
-
-    def _convert(self) -> bytes:
-        v1_v, v2_v = self._voltages()
-        return f"{self._quantise(v1_v):.6f},{self._quantise(v2_v):.6f}\r\n".encode()
-
-    def _quantise(self, volts: float) -> float:
-        steps = round((volts + self._random.gauss(0.0, self._noise_v)) / self.STEP_V)
-        return min(max(steps * self.STEP_V, -self.FULL_SCALE_V), self.FULL_SCALE_V)

@@ -5,47 +5,31 @@ import contextlib
 import os
 import select
 import tty
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from copy import copy
 from pathlib import Path
-from typing import Self, TypeAlias
+from typing import Protocol, Self
 
-# Turns received bytes into a reply, empty for none.
-Answer: TypeAlias = Callable[[bytes], bytes]
+from shearloop.drivers.emulators import number_between
 
 READ_BYTES = 4096
 # A reader that empties a full buffer in parts shows it as empty for a moment: look several times.
 EMPTY_LOOKS = 3
 # How long a port that is about to hang up waits for its reader.
 UNREAD_S = 0.5
-
-
-class Outage:
-    """A pause of limited or unlimited time that can be ended early."""
-
-    def __init__(self) -> None:
-        self._ended = asyncio.Event()
-
-    async def wait(self, seconds: float | None) -> None:
-        """Wait for `seconds` (None: without limit) or until `end` is called."""
-        self._ended.clear()
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(seconds):
-                await self._ended.wait()
-
-    def end(self) -> None:
-        """End the current pause."""
-        self._ended.set()
+OUTAGES = "silence [SECONDS], unplug [SECONDS], break-off (the next answer stops half-way, with the connection), normal"
 
 
 class PtyPort:
     """The device's end of a serial port; as a context it is plugged in, and unplugged at the end.
 
-    `on_bytes` receives the other side's bytes. With `link`, a symbolic link of that name leads to the port while it is
-    plugged in, as udev's links do. Plug and unplug it in the same event loop.
+    `received` gets the other side's bytes, and `appearances` the port's path whenever it is plugged in. With `link`, a
+    symbolic link of that name leads to the plugged-in port, as udev's links do. Use it in one event loop.
     """
 
-    def __init__(self, on_bytes: Callable[[bytes], None], link: Path | None = None) -> None:
-        self._on_bytes = on_bytes
+    def __init__(self, link: Path | None = None) -> None:
+        self.received: asyncio.Queue[bytes] = asyncio.Queue()
+        self.appearances: asyncio.Queue[str] = asyncio.Queue()
         self._link = link
         self._master: int | None = None
         # Held open, so that the port outlives the programs that open it.
@@ -70,9 +54,11 @@ class PtyPort:
         self.unplug()
 
     def plug(self) -> None:
-        """Make the port appear, under a new terminal."""
+        """Make the port appear, under a new terminal; OSError if the link cannot be made."""
         if self._master is not None:
             return
+        if self._link is not None and self._link.exists() and not self._link.is_symlink():
+            raise FileExistsError(f"{self._link} is a file")
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -82,6 +68,7 @@ class PtyPort:
             fresh.symlink_to(self._terminal)
             fresh.replace(self._link)
         asyncio.get_running_loop().add_reader(self._master, self._receive, self._master)
+        self.appearances.put_nowait(self.path)
 
     def unplug(self) -> None:
         """Make the port disappear: its users are hung up on and unread bytes are lost."""
@@ -99,7 +86,7 @@ class PtyPort:
 
     def _receive(self, master: int) -> None:
         with contextlib.suppress(BlockingIOError):
-            self._on_bytes(os.read(master, READ_BYTES))
+            self.received.put_nowait(os.read(master, READ_BYTES))
 
     @property
     def unread(self) -> bool:
@@ -125,19 +112,15 @@ class PtyPort:
                 await self._room.wait()
                 self.held_up.clear()
 
-    async def drain(self, timeout_s: float) -> None:
-        """Wait until the other side has read everything, or for `timeout_s`."""
+    async def break_off(self) -> None:
+        """Hang up once the other side has read everything; a pseudo-terminal would take unread bytes back."""
         loop = asyncio.get_running_loop()
-        end_s = loop.time() + timeout_s
+        end_s = loop.time() + UNREAD_S
         empty_looks = 0
         # The kernel has no event for a buffer that was read.
         while empty_looks < EMPTY_LOOKS and loop.time() < end_s:
             await asyncio.sleep(0.001)
             empty_looks = 0 if self.unread else empty_looks + 1
-
-    async def break_off(self) -> None:
-        """Hang up once the other side has read everything; a pseudo-terminal would take unread bytes back."""
-        await self.drain(UNREAD_S)
         self.unplug()
 
     def _on_room(self, master: int) -> None:
@@ -145,98 +128,139 @@ class PtyPort:
         self._room.set()
 
 
-class PtyServer:
-    """A device on a pseudo-terminal that answers requests. `on_port` receives its path whenever it appears.
+class Session(Protocol):
+    """A device as one connection sees it."""
 
-    While `silent` it answers nothing; with `breaks_off` the next answer stops half-way and the port reappears.
+    def feed(self, data: bytes) -> bytes:
+        """Return the replies to received bytes, empty for none."""
+
+
+class Server(ABC):
+    """A device that answers requests, after `answer_s`, and its outages.
+
+    `appearances` gets the port's path or address whenever it can be opened.
     """
 
-    def __init__(
-        self,
-        answer: Answer,
-        link: Path | None = None,
-        on_port: Callable[[str], None] = lambda _: None,
-        answer_s: float = 0.0,
-    ) -> None:
-        self._answer = answer
-        self._port = PtyPort(self._received, link)
-        self._on_port = on_port
+    appearances: asyncio.Queue[str]
+
+    def __init__(self, answer_s: float) -> None:
         self._answer_s = answer_s
-        self._replies: asyncio.Queue[bytes] = asyncio.Queue()
-        self.silent = False
-        self.breaks_off = False
+        self._silent = False
+        self._breaks_off = False
+        self._connected = True
+        self._changed = asyncio.Event()
+        self._recovery: asyncio.TimerHandle | None = None
+
+    async def run(self) -> None:
+        """Serve until cancelled; OSError if the port is taken."""
+        try:
+            while True:
+                self._changed.clear()
+                await (self.restore() if self._connected else self.disconnect())
+                await self._changed.wait()
+        finally:
+            await self.disconnect()
+
+    @abstractmethod
+    async def restore(self) -> None:
+        """Make the port available, unless it is; OSError if it is taken."""
+
+    @abstractmethod
+    async def disconnect(self) -> None:
+        """Break every connection and make the port unavailable."""
+
+    def command(self, text: str) -> None:
+        """Begin or end an outage; ValueError, with a sentence, for another command."""
+        match text.split():
+            case ["silence" | "unplug" as kind, *seconds] if len(seconds) < 2:
+                times_s = [
+                    number_between(each, 0.0, 1e9, "no time in seconds; write for instance 2.5") for each in seconds
+                ]
+                self.recover()
+                self._silent = kind == "silence"
+                self._connect(connected=kind == "silence")
+                for time_s in times_s:
+                    self._recovery = asyncio.get_running_loop().call_later(time_s, self.recover)
+            case ["break-off"]:
+                self._breaks_off = True
+            case ["normal"]:
+                self.recover()
+            case _:
+                raise ValueError(f"{text!r} is no command; there are {OUTAGES}")
+
+    def recover(self) -> None:
+        """End every outage."""
+        if self._recovery is not None:
+            self._recovery.cancel()
+        self._silent = self._breaks_off = False
+        self._connect(connected=True)
+
+    def _connect(self, *, connected: bool) -> None:
+        self._connected = connected
+        self._changed.set()
+
+    def _ends_half_way(self) -> bool:
+        """Return whether this answer stops half-way; the next one does not."""
+        breaks_off, self._breaks_off = self._breaks_off, False
+        return breaks_off
+
+
+class PtyServer(Server):
+    """A device that answers requests on a pseudo-terminal."""
+
+    def __init__(self, session: Session, link: Path | None = None, answer_s: float = 0.0) -> None:
+        super().__init__(answer_s)
+        self._session = session
+        self._port = PtyPort(link)
+        self.appearances = self._port.appearances
 
     async def run(self) -> None:
         """Serve until cancelled."""
-        await self.restore()
-        with self._port:
+        async with asyncio.TaskGroup() as group:
+            group.create_task(super().run())
             while True:
-                reply = await self._replies.get()
+                data = await self._port.received.get()
+                reply = self._session.feed(data)
+                if not reply or self._silent:
+                    continue
                 # The time of the measurement.
                 await asyncio.sleep(self._answer_s)
                 with contextlib.suppress(ConnectionError):  # unplugged in between
-                    if self.breaks_off:
-                        self.breaks_off = False
+                    if self._ends_half_way():
                         await self._port.write(reply[: len(reply) // 2])
                         await self._port.break_off()
-                        await self.restore()
+                        self._port.plug()
                     else:
                         await self._port.write(reply)
 
     async def restore(self) -> None:
         """Plug the port in."""
         self._port.plug()
-        self._on_port(self._port.path)
 
     async def disconnect(self) -> None:
         """Unplug the port."""
         self._port.unplug()
 
-    def _received(self, data: bytes) -> None:
-        reply = self._answer(data)
-        if reply and not self.silent:
-            self._replies.put_nowait(reply)
 
+class SocketServer(Server):
+    """A device that answers requests on a socket; each connection gets a copy of `session`."""
 
-class SocketServer:
-    """A device on a socket; `new_answer` returns a function for each connection. `on_port` receives its address.
-
-    While `silent` it answers nothing; with `breaks_off` the next answer stops half-way and the connection closes.
-    """
-
-    def __init__(
-        self,
-        new_answer: Callable[[], Answer],
-        host: str = "127.0.0.1",
-        port: int = 0,
-        on_port: Callable[[str], None] = lambda _: None,
-        answer_s: float = 0.0,
-    ) -> None:
-        self._new_answer = new_answer
+    def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 0, answer_s: float = 0.0) -> None:
+        super().__init__(answer_s)
+        self._session = session
         self._host = host
-        self._answer_s = answer_s
-        self._on_port = on_port
         self._server: asyncio.Server | None = None
         self._connections: dict[asyncio.Task[None], asyncio.StreamWriter] = {}
+        self.appearances = asyncio.Queue()
         # With 0, a free port from the first start on.
         self.port = port
-        self.silent = False
-        self.breaks_off = False
-
-    async def run(self) -> None:
-        """Serve until cancelled; OSError if the port is taken."""
-        await self.restore()
-        try:
-            await asyncio.get_running_loop().create_future()
-        finally:
-            await self.disconnect()
 
     async def restore(self) -> None:
         """Listen, unless it does already."""
         if self._server is None:
             self._server = await asyncio.start_server(self._serve, self._host, self.port)
             self.port = self._server.sockets[0].getsockname()[1]
-            self._on_port(f"{self._host}:{self.port}")
+            self.appearances.put_nowait(f"{self._host}:{self.port}")
 
     async def disconnect(self) -> None:
         """Abort every connection and stop listening."""
@@ -251,19 +275,18 @@ class SocketServer:
             await asyncio.wait(self._connections)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        answer = self._new_answer()
+        session = copy(self._session)
         task = asyncio.current_task()
         if task is None:
             raise RuntimeError("a connection is served by a task")
         self._connections[task] = writer
         try:
             while data := await reader.read(READ_BYTES):
-                replies = answer(data)
-                if replies and not self.silent:
+                replies = session.feed(data)
+                if replies and not self._silent:
                     # The time of the measurement.
                     await asyncio.sleep(self._answer_s)
-                    if self.breaks_off:
-                        self.breaks_off = False
+                    if self._ends_half_way():
                         writer.write(replies[: len(replies) // 2])
                         break
                     writer.write(replies)

@@ -14,7 +14,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.drivers.emulators.robotiq.gripper import Gripper
+from shearloop.drivers.emulators.gripper import Gripper
 
 FloatArray = NDArray[np.float64]
 

@@ -1,15 +1,20 @@
-"""The shear skin's instruments, emulated byte for byte around one circuit: current source, scanner, converter board."""
+"""The shear skin's instruments, emulated byte for byte around one circuit: current source, scanner, converter board.
+
+Source and scanner understand SCPI: headers in long or short form, an error queue.
+"""
 
 import asyncio
+import re
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
-from shearloop.drivers.emulators import number_between, scpi
-from shearloop.drivers.emulators.boards import EmulatedAdcBoard
+from shearloop.drivers.emulators import number_between
+from shearloop.drivers.emulators.boards import BoardFaultKind, ConverterBoard
 from shearloop.drivers.emulators.ports import PtyServer, SocketServer
 
 # The conductance of an open circuit's insulation.
@@ -39,10 +44,24 @@ SCANNER_NO_ERROR = '+0,"No error"'
 OVERLOAD_V = 9.9e37
 OVERRANGE = 1.2
 
-# Returns the resistances of gauge 1 and gauge 2, in Ω.
-Gauges: TypeAlias = Callable[[], tuple[float, float]]
+MAX_LINE_BYTES = 512
+MAX_ERRORS = 10
+UNDEFINED_HEADER = '-113,"Undefined header"'
+SETTINGS_CONFLICT = '-221,"Settings conflict"'
+OUT_OF_RANGE = '-222,"Parameter data out of range"'
+ILLEGAL_VALUE = '-224,"Illegal parameter value"'
+
+# Returns the answer to a query, or None for a command; the argument is the text after the header.
+Handler: TypeAlias = Callable[[str], str | None]
 # The path of an instrument's pseudo-terminal, or host and port of its socket.
 Address: TypeAlias = Path | tuple[str, int]
+
+
+class Gauges(Protocol):
+    """A skin's two gauges."""
+
+    def resistances_ohm(self) -> tuple[float, float]:
+        """Return R₁ and R₂ now."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +100,7 @@ class Circuit:
 
     def state(self, time_s: float) -> CircuitState:
         """Return current and voltages."""
-        ohm = [self._resistance(name, r, time_s) for name, r in zip(GAUGES, self.gauges(), strict=True)]
+        ohm = [self._resistance(name, r, time_s) for name, r in zip(GAUGES, self.gauges.resistances_ohm(), strict=True)]
         whole_ohm = sum(ohm) + self.lead_ohm
         compliance = self.output_on and abs(self.level_a * whole_ohm) > self.compliance_v
         current_a = 0.0
@@ -136,7 +155,99 @@ class Circuit:
         return self._drifted.get(gauge, 0.0) + per_s * (time_s - since_s)
 
 
-class EmulatedKeithley6430(scpi.ScpiInterpreter):
+class ScpiError(Exception):
+    """A handler's refusal; its text goes into the error queue."""
+
+
+class ScpiInterpreter:
+    """One instrument's command interpreter; refused commands go into the error queue and get no reply. No I/O."""
+
+    def __init__(self, identity: str, commands: Mapping[str, Handler], no_error: str) -> None:
+        """Map headers, as manuals write them (`SOURce:CURRent[:LEVel]`, a query with `?`), to handlers."""
+        self._commands = [(_pattern(header), handler) for header, handler in commands.items()]
+        self._commands += [
+            (_pattern("*IDN?"), lambda _: identity),
+            (_pattern("*CLS"), lambda _: self.errors.clear()),
+            (_pattern("*OPC?"), lambda _: "1"),
+            (_pattern("SYSTem:ERRor[:NEXT]?"), lambda _: self.errors.popleft() if self.errors else no_error),
+        ]
+        self._buffer = b""
+        self.errors: deque[str] = deque(maxlen=MAX_ERRORS)
+
+    def feed(self, data: bytes) -> bytes:
+        """Return the replies to the lines that `data` completes."""
+        *lines, self._buffer = (self._buffer + data).replace(b"\r", b"\n").split(b"\n")
+        self._buffer = self._buffer[-MAX_LINE_BYTES:]
+        return b"".join(self._line(line.decode("ascii", "replace").strip()) for line in lines)
+
+    def _line(self, line: str) -> bytes:
+        answers = [answer for unit in filter(None, line.split(";")) if (answer := self._unit(unit.strip())) is not None]
+        return ";".join(answers).encode() + b"\n" if answers else b""
+
+    def _unit(self, unit: str) -> str | None:
+        header, _, argument = unit.partition(" ")
+        for pattern, handler in self._commands:
+            if pattern.fullmatch(header):
+                try:
+                    return handler(argument.strip())
+                except ScpiError as error:
+                    self.errors.append(str(error))
+                    return None
+        self.errors.append(UNDEFINED_HEADER)
+        return None
+
+
+def parse_number(text: str, low: float, high: float) -> float:
+    """Return a command's number; ScpiError for other text or out of range."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise ScpiError(ILLEGAL_VALUE) from None
+    if not low <= value <= high:
+        raise ScpiError(OUT_OF_RANGE)
+    return value
+
+
+def accept_number(low: float, high: float) -> Handler:
+    """Return a handler that checks a number and ignores it."""
+
+    def check(text: str) -> None:
+        parse_number(text.split(",", 1)[0], low, high)
+
+    return check
+
+
+def accept_word(*words: str) -> Handler:
+    """Return a handler that refuses other words."""
+
+    def check(text: str) -> None:
+        if text.upper() not in words:
+            raise ScpiError(ILLEGAL_VALUE)
+
+    return check
+
+
+def parse_boolean(text: str) -> bool:
+    """Return a command's truth value; ScpiError for other text."""
+    values = {"ON": True, "1": True, "OFF": False, "0": False}
+    if text.upper() not in values:
+        raise ScpiError(ILLEGAL_VALUE)
+    return values[text.upper()]
+
+
+def _pattern(header: str) -> re.Pattern[str]:
+    """Return the pattern of a header: each word in long form or as its capitals, brackets optional."""
+
+    def word(match: re.Match[str]) -> str:
+        text = match[0]
+        short = "".join(letter for letter in text if letter.isupper())
+        return f"(?:{text}|{short})1?" if short != text else text
+
+    words = re.sub(r"[A-Za-z]{2,}", word, header.replace("*", r"\*").replace("?", r"\?"))
+    return re.compile(":?" + words.replace("[", "(?:").replace("]", ")?"), re.IGNORECASE)
+
+
+class EmulatedKeithley6430(ScpiInterpreter):
     """The current source; replies as its manual (6430-901-01, sections 13 and 17) gives them."""
 
     def __init__(self, circuit: Circuit, seed: int = 0) -> None:
@@ -148,15 +259,15 @@ class EmulatedKeithley6430(scpi.ScpiInterpreter):
             {
                 "*RST": self._reset,
                 # Sourcing a voltage is not emulated.
-                "SOURce:FUNCtion[:MODE]": scpi.accept_word("CURR", "CURRENT"),
-                "SOURce:CURRent:MODE": scpi.accept_word("FIX", "FIXED"),
-                "SOURce:CURRent:RANGe": scpi.accept_number(-MAX_A, MAX_A),
+                "SOURce:FUNCtion[:MODE]": accept_word("CURR", "CURRENT"),
+                "SOURce:CURRent:MODE": accept_word("FIX", "FIXED"),
+                "SOURce:CURRent:RANGe": accept_number(-MAX_A, MAX_A),
                 "SOURce:CURRent[:LEVel][:IMMediate][:AMPLitude]": self._set_level,
-                "SENSe:FUNCtion:CONCurrent": scpi.accept_word("ON", "1", "OFF", "0"),
+                "SENSe:FUNCtion:CONCurrent": accept_word("ON", "1", "OFF", "0"),
                 "SENSe:FUNCtion[:ON]": self._set_measured,
                 "SENSe:VOLTage[:DC]:PROTection[:LEVel]": self._set_compliance,
-                "SENSe:VOLTage[:DC]:RANGe[:UPPer]": scpi.accept_number(-MAX_V, MAX_V),
-                "SENSe:VOLTage[:DC]:NPLCycles": scpi.accept_number(0.01, 10.0),
+                "SENSe:VOLTage[:DC]:RANGe[:UPPer]": accept_number(-MAX_V, MAX_V),
+                "SENSe:VOLTage[:DC]:NPLCycles": accept_number(0.01, 10.0),
                 "FORMat:ELEMents[:SENSe]": self._set_elements,
                 "OUTPut[:STATe]": self._switch,
                 "OUTPut[:STATe]?": lambda _: str(int(circuit.output_on)),
@@ -173,10 +284,10 @@ class EmulatedKeithley6430(scpi.ScpiInterpreter):
         self.circuit.compliance_v = 21.0
 
     def _set_level(self, text: str) -> None:
-        self.circuit.level_a = scpi.parse_number(text, -MAX_A, MAX_A)
+        self.circuit.level_a = parse_number(text, -MAX_A, MAX_A)
 
     def _set_compliance(self, text: str) -> None:
-        self.circuit.compliance_v = scpi.parse_number(text, 2e-4, MAX_V)
+        self.circuit.compliance_v = parse_number(text, 2e-4, MAX_V)
 
     def _set_measured(self, text: str) -> None:
         self._measured = _parse_names(text, {"VOLT", "CURR", "RES"})
@@ -185,11 +296,11 @@ class EmulatedKeithley6430(scpi.ScpiInterpreter):
         self._elements = _parse_names(text, {*ELEMENTS})
 
     def _switch(self, text: str) -> None:
-        self.circuit.output_on = scpi.parse_boolean(text)
+        self.circuit.output_on = parse_boolean(text)
 
     def _read(self, _: str) -> str:
         if not self.circuit.output_on:
-            raise scpi.ScpiError(OUTPUT_IS_OFF)
+            raise ScpiError(OUTPUT_IS_OFF)
         now_s = time.monotonic()
         state = self.circuit.state(now_s)
         volts = state.source_v + self._random.gauss(0.0, SOURCE_NOISE_V)
@@ -207,11 +318,11 @@ def _parse_names(text: str, allowed: set[str]) -> set[str]:
     """Return the short forms of comma-separated names, quoted or not; ScpiError for an unknown one."""
     names = {part.strip().strip("'\"").upper().removesuffix(":DC")[:4] for part in text.split(",")}
     if not names <= allowed:
-        raise scpi.ScpiError(scpi.ILLEGAL_VALUE)
+        raise ScpiError(ILLEGAL_VALUE)
     return names
 
 
-class EmulatedScanner(scpi.ScpiInterpreter):
+class EmulatedScanner(ScpiInterpreter):
     """A scanning multimeter; the first two channels of a scan are the gauges."""
 
     def __init__(self, circuit: Circuit, seed: int = 0) -> None:
@@ -223,7 +334,7 @@ class EmulatedScanner(scpi.ScpiInterpreter):
             {
                 "*RST": self._reset,
                 "CONFigure:VOLTage:DC": self._configure,
-                "[SENSe:]VOLTage:DC:NPLCycles": scpi.accept_number(0.02, 200.0),
+                "[SENSe:]VOLTage:DC:NPLCycles": accept_number(0.02, 200.0),
                 "ROUTe:SCAN": self._set_scan,
                 "READ?": self._read,
             },
@@ -235,16 +346,16 @@ class EmulatedScanner(scpi.ScpiInterpreter):
         self._channels = 0
 
     def _configure(self, text: str) -> None:
-        self._range_v = scpi.parse_number(text.split(",", 1)[0], 0.0, 300.0)
+        self._range_v = parse_number(text.split(",", 1)[0], 0.0, 300.0)
 
     def _set_scan(self, text: str) -> None:
         if not (text.startswith("(@") and text.endswith(")")):
-            raise scpi.ScpiError(scpi.ILLEGAL_VALUE)
+            raise ScpiError(ILLEGAL_VALUE)
         self._channels = text.count(",") + 1
 
     def _read(self, _: str) -> str:
         if not self._channels:
-            raise scpi.ScpiError(scpi.SETTINGS_CONFLICT)
+            raise ScpiError(SETTINGS_CONFLICT)
         return ",".join(self._digits(volts) for volts in self._circuit.voltages()[: self._channels])
 
     def _digits(self, volts: float) -> str:
@@ -254,48 +365,57 @@ class EmulatedScanner(scpi.ScpiInterpreter):
         return f"{volts:+.8E}"
 
 
-def play_source(
-    circuit: Circuit, address: Address | None, on_port: Callable[[str], None], *, speed: float = 1.0, seed: int = 0
-) -> scpi.FaultyServer:
-    """Return the current source at an address; None for a new pseudo-terminal."""
-    feed = EmulatedKeithley6430(circuit, seed).feed
-    if isinstance(address, tuple):
-        return scpi.FaultyServer(SocketServer(lambda: feed, *address, on_port=on_port, answer_s=ANSWER_S / speed))
-    return scpi.FaultyServer(PtyServer(feed, address, on_port, answer_s=ANSWER_S / speed))
+class EmulatedAdcBoard(ConverterBoard):
+    """A converter board, an ADS1220: sends a line `v1,v2` in volts for each conversion."""
 
-
-def play_daq(
-    circuit: Circuit, address: Address | None, on_port: Callable[[str], None], *, speed: float = 1.0, seed: int = 0
-) -> scpi.FaultyServer | EmulatedAdcBoard:
-    """Return a scanner on a socket, or a converter board on a pseudo-terminal."""
-    if isinstance(address, tuple):
-        feed = EmulatedScanner(circuit, seed).feed
-        return scpi.FaultyServer(SocketServer(lambda: feed, *address, on_port=on_port, answer_s=ANSWER_S / speed))
-    period_s = DAQ_PERIOD_S / speed
-    return EmulatedAdcBoard(
-        circuit.voltages, period_s=period_s, noise_v=NOISE_V, link=address, on_port=on_port, seed=seed
+    faults = (
+        *(BoardFaultKind.MISSING, BoardFaultKind.GARBAGE, BoardFaultKind.TORN),
+        *(BoardFaultKind.SILENCE, BoardFaultKind.STUCK, BoardFaultKind.UNPLUG),
     )
+
+    # 24 bits over ±0.512 V, at gain 4.
+    FULL_SCALE_V, STEP_V = 0.512, 0.512 / 2**23
+
+    def __init__(
+        self, circuit: Circuit, *, period_s: float = DAQ_PERIOD_S, link: Path | None = None, seed: int = 0
+    ) -> None:
+        super().__init__(period_s, link, seed)
+        self._circuit = circuit
+
+    def _convert(self) -> bytes:
+        v1_v, v2_v = self._circuit.voltages()
+        return f"{self._quantise(v1_v):.6f},{self._quantise(v2_v):.6f}\r\n".encode()
+
+    def _quantise(self, volts: float) -> float:
+        steps = round((volts + self._random.gauss(0.0, NOISE_V)) / self.STEP_V)
+        return min(max(steps * self.STEP_V, -self.FULL_SCALE_V), self.FULL_SCALE_V)
 
 
 class SkinInstruments:
-    """Current source and DAQ of one skin; `gauges` returns its resistances."""
+    """Current source and DAQ of one skin: a scanner on a socket, or a converter board on a pseudo-terminal.
+
+    An address is None for a pseudo-terminal without a name. `source_port` and `daq_port` get the path or address
+    whenever it appears.
+    """
 
     def __init__(
-        self,
-        gauges: Gauges,
-        source_at: Address | None,
-        daq_at: Address | None,
-        *,
-        on_port: Callable[[str, str], None] = lambda _device, _port: None,
-        speed: float = 1.0,
-        seed: int = 0,
+        self, gauges: Gauges, source_at: Address | None, daq_at: Address | None, *, speed: float = 1.0, seed: int = 0
     ) -> None:
-        """Use the addresses; `on_port` receives `source` or `daq` and its address whenever it appears."""
         self.circuit = Circuit(gauges)
-        self._source = play_source(
-            self.circuit, source_at, lambda port: on_port("source", port), speed=speed, seed=seed
+        source, answer_s = EmulatedKeithley6430(self.circuit, seed), ANSWER_S / speed
+        self._source: SocketServer | PtyServer = (
+            SocketServer(source, *source_at, answer_s)
+            if isinstance(source_at, tuple)
+            else PtyServer(source, source_at, answer_s)
         )
-        self._daq = play_daq(self.circuit, daq_at, lambda port: on_port("daq", port), speed=speed, seed=seed + 1)
+        self.source_port = self._source.appearances
+        self._daq: SocketServer | EmulatedAdcBoard
+        if isinstance(daq_at, tuple):
+            self._daq = SocketServer(EmulatedScanner(self.circuit, seed + 1), *daq_at, answer_s)
+            self.daq_port = self._daq.appearances
+        else:
+            self._daq = EmulatedAdcBoard(self.circuit, period_s=DAQ_PERIOD_S / speed, link=daq_at, seed=seed + 1)
+            self.daq_port = self._daq.port.appearances
 
     async def run(self) -> None:
         """Play until cancelled; OSError, in a group, if an address is taken."""
@@ -310,6 +430,9 @@ class SkinInstruments:
                 self._source.command(" ".join(words))
             case ["daq", *words] if words:
                 self._daq.command(" ".join(words))
+            case ["silence" | "unplug", *_]:
+                # Without its voltages the skin measures nothing.
+                self._daq.command(text)
             case ["normal"]:
                 self.circuit.mend()
                 self._source.command("normal")

@@ -313,7 +313,10 @@ def blocking_fault(readout: messages.Readout) -> str:
 
 async def _uninterrupted(exchange: Coroutine[object, object, T]) -> T:
     """Await an exchange that goes on when its caller is cancelled: breaking it off would cost the connection."""
-    return await asyncio.shield(asyncio.ensure_future(exchange))
+    task = asyncio.ensure_future(exchange)
+    # `states` reports a failure that comes after its caller was cancelled.
+    task.add_done_callback(lambda done: done.cancelled() or done.exception())
+    return await asyncio.shield(task)
 
 
 def _clip(name: str, value: float, low: float, high: float, unit: str, clipped: list[str]) -> float:

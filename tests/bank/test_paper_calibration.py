@@ -115,7 +115,7 @@ def test_a_saved_calibration_is_loaded_as_it_was_and_has_the_same_bytes_each_tim
     assert loaded.torque is not None
     assert CALIBRATION.torque is not None
     assert loaded.torque.regressor == CALIBRATION.torque.regressor
-    assert loaded.has_curves_only
+    assert loaded.sides == ()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.cal", "b.cal"]
 
 

@@ -196,7 +196,6 @@ def test_the_end_of_the_input_ends_the_calibration_with_a_sentence(tmp_path: Pat
     ("arguments", "said"),
     [
         ("hx711 --speed 0", "--speed 0"),
-        ("hx711 --fault spark", "there is no fault 'spark'"),
         ("hx711 --torque-nm nan", "finite"),
         ("gripper-socket --port 70000", "no port"),
         ("gripper-socket --object-mm 900", "width in mm"),
@@ -223,7 +222,7 @@ def test_a_gripper_socket_fails_on_request() -> None:
             assert client.recv(64) == b"FLT 00\n"
             gripper.tell("fault 14")
             gripper.tell("what")
-            gripper.tell("lose 0.01")
+            gripper.tell("unplug 0.01")
             # The connection breaks, and the address is listened on again.
             with contextlib.suppress(ConnectionResetError):
                 while client.recv(64):

@@ -157,11 +157,9 @@ async def test_without_recording_and_bank_the_demos_fingertip_is_twisted() -> No
         ("ur", "--rate-hz 5", "--rate-hz 5 is outside 50 to 1000"),
         # An address for documentation (RFC 5737), which no machine has.
         ("ur", "--host 192.0.2.1", "cannot listen on 192.0.2.1"),
-        ("skin", "--sweep-n 9", "--sweep-n 9 is beyond the 5 N"),
-        ("skin", "--sweep-n 1 --robot 127.0.0.1", "leave --sweep-n or --robot out"),
         ("skin", "--speed 0", "--speed 0 is not above 0"),
         ("skin", "--source-port 70000", "--source-port 70000 is no port"),
-        ("skin-daq", "--link /dev/null/daq", "--link /dev/null/daq cannot be made"),
+        ("skin", "--daq-link /dev/null/daq", "--link /dev/null/daq cannot be made"),
     ],
 )
 def test_a_mistake_is_one_sentence_and_status_two(

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shearloop.daemon.cli.emulate.skin import PushedSkin
+from shearloop.daemon.cli.emulate.rig import PushedSkin
 from shearloop.daemon.synthetic_skin import SyntheticSkin
 from shearloop.drivers.connection import Link, SerialLink, TcpLink
-from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings, RigSkin
-from shearloop.drivers.emulators.robotiq.gripper import GripperRegisters
+from shearloop.drivers.emulators.gripper import GripperRegisters
+from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings
 from shearloop.drivers.shear_skin import AdcBoard, Daq, Keithley6430, ScpiScanner, ShearSkin, SkinFault, SkinSample
 from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.daemon.emulate_rig.test_mistakes import Blank
 from tests.running import pass_on, running
 
 SPEED = 20
@@ -75,26 +76,23 @@ async def test_both_instruments_tied_by_one_skin_are_read_and_obey(tmp_path: Pat
         assert b"'nonsense' is no fault of the circuit; there are open 1|2" in await process.stderr.read()
 
 
-async def test_source_and_scanner_are_played_alone_too() -> None:
-    speed = ("--speed", str(SPEED), "--port", "0")
-    async with (
-        shearloop("emulate", "skin-source", *speed, stdin=asyncio.subprocess.PIPE) as source,
-        shearloop("emulate", "skin-daq", *speed, stdin=asyncio.subprocess.PIPE) as daq,
-    ):
-        scanner = ScpiScanner(tcp(await line(daq)), rate_hz=10 * SPEED)
-        async with read(tcp(await line(source)), scanner) as samples:
+async def test_source_and_scanner_are_played_on_sockets_too() -> None:
+    arguments = ("--speed", str(SPEED), "--source-port", "0", "--daq-port", "0")
+    async with shearloop("emulate", "skin", *arguments, stdin=asyncio.subprocess.PIPE) as process:
+        places = dict([(await line(process)).split(), (await line(process)).split()])
+        scanner = ScpiScanner(tcp(places["daq"]), rate_hz=10 * SPEED)
+        async with read(tcp(places["source"]), scanner) as samples:
             await until(samples, r1_ohm=24.6)
-            await told(daq, "short 2")
+            await told(process, "short 2")
             await until(samples, SkinFault.SHORT_2)
-            await told(daq, "mend")
-            await told(source, "leads 1000")
+            await told(process, "mend")
+            await told(process, "leads 1000")
             await until(samples, SkinFault.COMPLIANCE)
 
 
 def test_on_the_rig_the_robot_s_motion_shears_the_skin(tmp_path: Path) -> None:
-    pushed = PushedSkin(SyntheticSkin())
-    skin = RigSkin(lambda nm, gripped: pushed.follow_grip(nm, gripped=gripped, lever_m=0.02), pushed.resistances_ohm)
-    rig = EmulatedRig(RigSettings(run_dir=tmp_path, skin=True), lambda *_: np.zeros(1024), skin=skin)
+    pushed = PushedSkin(SyntheticSkin(), lever_m=0.02)
+    rig = EmulatedRig(RigSettings(run_dir=tmp_path), Blank(), pushed)
     robot, gripper = rig.controller.robot, rig.scene.gripper
 
     def pass_s(seconds: float) -> None:

@@ -11,22 +11,17 @@ from shearloop.drivers import connection
 from shearloop.drivers.connection import LinkEvent, ReconnectPolicy, SerialLink, SerialPort, find_port
 from shearloop.drivers.emulators.ports import PtyPort
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceUnavailableError
-from tests.running import DEADLINE_S, Changes
+from tests.running import DEADLINE_S
 
 SECOND_NS = 1_000_000_000
 
 
-class Peer(PtyPort):
-    """The other end of a port, which keeps what it is sent."""
-
-    def __init__(self, link: Path | None = None) -> None:
-        self.received = bytearray()
-        self.changes = Changes()
-        super().__init__(self._hear, link)
-
-    def _hear(self, data: bytes) -> None:
-        self.received += data
-        self.changes.note()
+async def sent_to(peer: PtyPort, n_bytes: int) -> bytes:
+    data = b""
+    async with asyncio.timeout(DEADLINE_S):
+        while len(data) < n_bytes:
+            data += await peer.received.get()
+    return data
 
 
 async def read_exactly(port: SerialPort, n_bytes: int) -> bytes:
@@ -74,18 +69,17 @@ def test_a_file_is_no_port(tmp_path: Path) -> None:
 
 async def test_bytes_pass_unchanged_in_both_directions() -> None:
     data = bytes(range(256)) * 100
-    with Peer() as peer, SerialPort(peer.path) as port:
+    with PtyPort() as peer, SerialPort(peer.path) as port:
         async with asyncio.timeout(DEADLINE_S):
             sending = asyncio.create_task(peer.write(data))
             assert await read_exactly(port, len(data)) == data
             await sending
             await port.write(bytes(range(256)))
-            await peer.changes.until(lambda: len(peer.received) >= 256)
-    assert bytes(peer.received) == bytes(range(256))
+            assert await sent_to(peer, 256) == bytes(range(256))
 
 
 async def test_what_was_written_is_unread_at_once_until_it_is_read() -> None:
-    with Peer() as peer, SerialPort(peer.path) as port:
+    with PtyPort() as peer, SerialPort(peer.path) as port:
         assert not peer.unread
         for _ in range(200):
             await peer.write(b"half a line")
@@ -97,12 +91,12 @@ async def test_what_was_written_is_unread_at_once_until_it_is_read() -> None:
 
 async def test_a_port_is_had_by_one_program_at_a_time() -> None:
     in_use = pytest.raises(DeviceUnavailableError, match="in use by another program")
-    with Peer() as peer, SerialPort(peer.path), in_use:
+    with PtyPort() as peer, SerialPort(peer.path), in_use:
         SerialPort(peer.path)
 
 
 async def test_silence_is_no_loss_and_a_cancelled_read_loses_nothing() -> None:
-    with Peer() as peer, SerialPort(peer.path) as port:
+    with PtyPort() as peer, SerialPort(peer.path) as port:
         assert await port.read(0.01) is None
         reading = asyncio.create_task(port.read(DEADLINE_S))
         await asyncio.sleep(0)
@@ -119,7 +113,7 @@ async def test_bytes_wait_in_the_kernel_while_there_is_no_read(monkeypatch: pyte
     calls = []
     on_readable = SerialPort._on_readable
     monkeypatch.setattr(SerialPort, "_on_readable", lambda port, done: (calls.append(port), on_readable(port, done)))
-    with Peer() as peer, SerialPort(peer.path) as port:
+    with PtyPort() as peer, SerialPort(peer.path) as port:
         await peer.write(b"first")
         assert await read_exactly(port, 5) == b"first"
         calls.clear()
@@ -131,7 +125,7 @@ async def test_bytes_wait_in_the_kernel_while_there_is_no_read(monkeypatch: pyte
 
 
 async def test_what_came_before_the_port_went_is_read_and_then_the_loss_is_told() -> None:
-    with Peer() as peer, SerialPort(peer.path) as port:
+    with PtyPort() as peer, SerialPort(peer.path) as port:
         reading = asyncio.create_task(port.read(DEADLINE_S))
         await asyncio.sleep(0)
         peer.unplug()
@@ -143,7 +137,7 @@ async def test_what_came_before_the_port_went_is_read_and_then_the_loss_is_told(
 
 async def test_a_write_that_nobody_takes_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "WRITE_TIMEOUT_S", 0.05)
-    with Peer() as peer, SerialPort(peer.path) as port:
+    with PtyPort() as peer, SerialPort(peer.path) as port:
         assert peer._master is not None
         asyncio.get_running_loop().remove_reader(peer._master)
 
@@ -168,7 +162,7 @@ async def test_a_link_opens_a_device_that_comes_late_and_again_after_it_went(tmp
         if not event.up:
             missing.set()
 
-    with Peer(path) as peer, SerialLink(path=str(path), policy=policy, on_event=note) as link:
+    with PtyPort(path) as peer, SerialLink(path=str(path), policy=policy, on_event=note) as link:
         peer.unplug()
         opening = asyncio.create_task(link.open())
         async with asyncio.timeout(DEADLINE_S):
@@ -183,7 +177,7 @@ async def test_a_link_opens_a_device_that_comes_late_and_again_after_it_went(tmp
             peer.plug()
             port = await link.open()
             await port.write(b"again")
-            await peer.changes.until(lambda: peer.received == b"again")
+            assert await sent_to(peer, 5) == b"again"
     assert link.connections == 2
     assert "has gone" in link.last_error or "no serial port" in link.last_error
     assert [event.up for event in events if event.up or not event.repeated][-1]
@@ -193,7 +187,7 @@ async def test_a_link_opens_a_device_that_comes_late_and_again_after_it_went(tmp
 
 async def test_a_link_that_leads_elsewhere_by_now_is_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "port"
-    with Peer(path), Peer(path) as second:
+    with PtyPort(path), PtyPort(path) as second:
         assert os.readlink(path) == second._terminal
     assert not path.is_symlink()
 

@@ -82,10 +82,7 @@ async def test_a_reader_that_stops_for_a_while_loses_nothing(tmp_path: Path) -> 
     [
         (BoardFaultKind.CUT_LINE, FrameErrorKind.WRONG_COUNT, True),
         (BoardFaultKind.WRONG_COUNT, FrameErrorKind.WRONG_COUNT, True),
-        (BoardFaultKind.NOT_A_NUMBER, FrameErrorKind.NOT_A_NUMBER, True),
         (BoardFaultKind.NAN, FrameErrorKind.NAN, True),
-        (BoardFaultKind.NEGATIVE, FrameErrorKind.NEGATIVE, True),
-        (BoardFaultKind.ZERO, FrameErrorKind.ZERO_CHANNEL, True),
         (BoardFaultKind.GARBAGE, FrameErrorKind.WRONG_COUNT, False),
         (BoardFaultKind.FLOOD, FrameErrorKind.TOO_LONG, False),
     ],

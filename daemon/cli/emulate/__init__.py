@@ -5,17 +5,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from shearloop.daemon.cli.emulate import boards, rig, robots, skin
+from shearloop.daemon.cli.emulate import devices, rig
 from shearloop.daemon.errors import UserError
 
-DEVICES = {**boards.DEVICES, **robots.DEVICES, **skin.DEVICES, **rig.DEVICES}
+DEVICES = {**devices.DEVICES, **rig.DEVICES}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add a sub-parser per device."""
-    devices = parser.add_subparsers(dest="device", metavar="DEVICE", required=True)
+    parsers = parser.add_subparsers(dest="device", metavar="DEVICE", required=True)
     for name, device in DEVICES.items():
-        device.configure(devices.add_parser(name, help=device.summary, description=f"Play {device.summary}."))
+        device.configure(parsers.add_parser(name, help=device.summary, description=f"Play {device.summary}."))
 
 
 class _RaisingParser(argparse.ArgumentParser):

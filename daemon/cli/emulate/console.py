@@ -8,8 +8,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Coroutine, Iterator
-from functools import partial
+from collections.abc import Callable, Coroutine, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,8 +17,6 @@ from shearloop.daemon.signals import ending_signals
 
 STDIN = 0
 READ_BYTES = 4096
-
-print_port = partial(print, flush=True)
 
 
 class Device(NamedTuple):
@@ -35,12 +32,22 @@ def print_event(event: str, **fields: object) -> None:
     print(json.dumps({"t_mono_ns": time.monotonic_ns(), "event": event, **fields}), flush=True)
 
 
-def play(device: Coroutine[None, None, None], on_command: Callable[[str], None]) -> None:
+def play(
+    device: Coroutine[None, None, None],
+    on_command: Callable[[str], None],
+    ports: "Mapping[str, asyncio.Queue[str]] | None" = None,
+) -> None:
     """Run `device` until it ends, SIGINT, SIGTERM or SIGHUP comes, or standard input is closed.
 
-    Each line of standard input, if that is a pipe or a terminal, goes to `on_command`; a ValueError is printed.
+    Each line of standard input, if that is a pipe or a terminal, goes to `on_command`; a ValueError is printed. What
+    the queues of `ports` get is printed behind their names.
     """
-    asyncio.run(_play(device, on_command))
+    asyncio.run(_play(device, on_command, ports or {}))
+
+
+async def _print_port(name: str, appearances: "asyncio.Queue[str]") -> None:
+    while True:
+        print(f"{name}{await appearances.get()}", flush=True)
 
 
 @contextlib.contextmanager
@@ -55,9 +62,14 @@ def report_busy_address(what: str, cure: str) -> Iterator[None]:
         raise UserError(f"{what}: {error}; {cure}") from None
 
 
-async def _play(device: Coroutine[None, None, None], on_command: Callable[[str], None]) -> None:
+async def _play(
+    device: Coroutine[None, None, None],
+    on_command: Callable[[str], None],
+    ports: "Mapping[str, asyncio.Queue[str]]",
+) -> None:
     loop = asyncio.get_running_loop()
     task = asyncio.create_task(device)
+    printing = [asyncio.create_task(_print_port(*port)) for port in ports.items()]
     partial_line = bytearray()
 
     def read() -> None:
@@ -83,6 +95,15 @@ async def _play(device: Coroutine[None, None, None], on_command: Callable[[str],
             await task
     finally:
         loop.remove_reader(STDIN)
+        for each in printing:
+            each.cancel()
+
+
+def checked_port(option: str, port: int) -> int:
+    """Return a port's number; UserError for an impossible one."""
+    if not 0 <= port <= 65535:
+        raise UserError(f"--{option} {port} is no port; give 0 to 65535")
+    return port
 
 
 def add_link(parser: argparse.ArgumentParser) -> None:
@@ -112,8 +133,8 @@ def check_positive(args: argparse.Namespace, *names: str) -> None:
             raise UserError(f"--{name.replace('_', '-')} {value:g} is not above 0")
 
 
-def check_range(args: argparse.Namespace, name: str, low: float, high: float, unit: str = "") -> None:
+def check_range(args: argparse.Namespace, name: str, low: float, high: float) -> None:
     """Raise UserError for an argument outside a range."""
     value = getattr(args, name)
     if not low <= value <= high:
-        raise UserError(f"--{name.replace('_', '-')} {value:g} is outside {low:g} to {high:g}{unit}")
+        raise UserError(f"--{name.replace('_', '-')} {value:g} is outside {low:g} to {high:g}")

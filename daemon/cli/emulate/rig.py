@@ -1,6 +1,7 @@
-"""`shearloop emulate rig`: arm, gripper, load cell and two fingertips in one process, twisting one tool."""
+"""The emulated devices that share one physics: `emulate rig`, and `emulate skin` with the robot that turns it."""
 
 import argparse
+import asyncio
 import json
 import time
 from contextlib import nullcontext
@@ -10,22 +11,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from shearloop.daemon.cli.emulate import console
-from shearloop.daemon.cli.emulate.robots import add_robot, print_robot_event, robot_make
+from shearloop.daemon.cli.emulate.devices import add_robot, print_robot_event, robot_make
 from shearloop.daemon.errors import UserError
+from shearloop.drivers.emulators import number_between
 
 if TYPE_CHECKING:
-    from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings, RigSkin
+    from shearloop.daemon.synthetic_skin import SyntheticSkin
+    from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings
     from shearloop.drivers.emulators.scene import Truth
+    from shearloop.drivers.emulators.skin import Address, SkinInstruments
+    from shearloop.drivers.emulators.ur_controller import Controller
 
 JOINTS = ("lever", "tightening", "seized", "stripping")
-EPILOG = """Prints `rig ready` and all addresses, then the robot's events, a JSON object a line.
+TRUTH_PERIOD_S = 0.1
+# The gauges' drift advances in steps of this.
+REST_S = 1.0
+RIG_EPILOG = """Prints `rig ready` and all addresses, then the robot's events, a JSON object a line.
 Commands, one a line on standard input:
   truth                       print the true state: torque, angles, width, diameter
   kick NM                     turn the workpiece so that the torque jumps by NM
   slip [NM]                   let the tool slip in the grip until NM (0) remain
   joint KIND                  put the tool on another joint: lever, tightening, seized, stripping
   object MM | object none     put something of that width between the fingers, or take it away
-  silence DEVICE [SECONDS]    silence a device: right, left, load, gripper, robot
+  silence DEVICE [SECONDS]    silence a device: right, left, load, gripper, robot, skin
   unplug DEVICE [SECONDS]     disconnect a device, without a number until `replug DEVICE`
   right|left FAULT            any fault of `emulate eit-kit`, for instance right cut-line
   load FAULT                  any fault of `emulate hx711`, for instance load spike
@@ -36,11 +44,53 @@ Commands, one a line on standard input:
 With --speed N gel, fingers and boards are N times as fast. The arm turns at its own pace unless --arm-speed says
 otherwise: a loop in real time then sees angles change that many times as fast, and needs a slower controller.
 """
+SKIN_EPILOG = """Prints the addresses of source and DAQ, again each time they appear.
+Commands, one a line on standard input:
+  shear N                        push the skin (not while a robot turns it)
+  open 1|2, short 1|2, reversed 1|2, swapped, drift 1|2 SHARE_PER_S, leads OHM, mend
+                                 faults of the circuit
+  source silence [SECONDS] | unplug [SECONDS] | break-off | normal
+  daq silence [SECONDS] | unplug [SECONDS] | normal; of a scanner break-off (the next answer ends half-way), of a
+                                 converter board missing, garbage, torn, stuck [SECONDS]
+  robot FAULT                    any fault of `emulate ur`
+  normal                         end all faults of circuit and instruments
+"""
 
 
-def _configure(parser: argparse.ArgumentParser) -> None:
+class PushedSkin:
+    """A synthetic skin that drifts with the clock, pushed by commands, by a robot's tool, or by a gripped tool."""
+
+    def __init__(self, skin: "SyntheticSkin", lever_m: float = 0.015) -> None:
+        self.skin = skin
+        self._normal_n = skin.normal_n
+        self._lever_m = lever_m
+        self._rested_s = time.monotonic()
+        self._first_rad: float | None = None
+
+    def resistances_ohm(self) -> tuple[float, float]:
+        """Return R₁ and R₂ now."""
+        now_s = time.monotonic()
+        if now_s - self._rested_s >= REST_S:
+            self.skin.rest(now_s - self._rested_s)
+            self._rested_s = now_s
+        return self.skin.resistances_ohm()
+
+    def step(self, dt_s: float, wrist_rad: float) -> float:  # noqa: ARG002 - the skin has no dynamics
+        """Turn the tool with the wrist, counted from its first angle; return the torque on the flange."""
+        if self._first_rad is None:
+            self._first_rad = wrist_rad
+        self.skin.turn(wrist_rad - self._first_rad)
+        return -self.skin.torque_nm
+
+    def follow_grip(self, torque_nm: float, *, gripped: bool) -> None:
+        """Shear the skin by a gripped tool's torque at the lever; an open grip does not touch it."""
+        self.skin.normal_n = self._normal_n if gripped else 0.0
+        self.skin.push(torque_nm / self._lever_m if gripped else 0.0)
+
+
+def _configure_rig(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
+    parser.epilog = RIG_EPILOG
     parser.add_argument("--bank", type=Path, required=True, metavar="FILE", help="synthesise frames from its signals")
     parser.add_argument(
         "--run-dir",
@@ -68,40 +118,64 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--paper-sketch", action="store_true", help="the load cell sends N·m, as the paper's, not counts"
     )
-    sigma = parser.add_mutually_exclusive_group()
-    sigma.add_argument(
-        "--sigma", type=float, nargs=2, metavar=("REST", "LARGEST"), help="sigma at 0 and at 0.14 N·m (1.85 1.25)"
+    parser.add_argument(
+        "--sigma",
+        type=float,
+        nargs=2,
+        default=(1.85, 1.25),
+        metavar=("REST", "LARGEST"),
+        help="sigma at 0 and at 0.14 N·m (1.85 1.25)",
     )
-    sigma.add_argument("--calibration", type=Path, metavar="FILE", help="take sigma from this calibration's torques")
     add_robot(parser)
 
 
-def _run(args: argparse.Namespace) -> int:
-    from shearloop.daemon.synthetic import frame_maker
+def _run_rig(args: argparse.Namespace) -> int:
+    from shearloop.daemon.synthetic_frames import RigFrames
+    from shearloop.daemon.synthetic_skin import SyntheticSkin
     from shearloop.drivers.emulators.rig import EmulatedRig
 
-    settings = _settings(args)
-    frames = frame_maker(args.bank, args.seed, sigma=args.sigma, calibration=args.calibration)
-    with nullcontext() if args.truth is None else _open_truth(args.truth) as file:
-        rig = EmulatedRig(
-            settings,
-            frames,
-            skin=_skin(args) if args.skin else None,
-            on_event=print_robot_event,
-            on_truth=None if file is None else partial(_write_truth, file),
-            on_ready=partial(_print_ready, settings),
-        )
-        with console.report_busy_address(
+    settings = _rig_settings(args)
+    frames = RigFrames(args.bank, args.seed, args.sigma)
+    # The skin bears half of the tool's torque; the other finger bears the other half.
+    skin = PushedSkin(SyntheticSkin(seed=args.seed), args.diameter_mm * 1e-3) if args.skin else None
+    rig = EmulatedRig(settings, frames, skin)
+    with (
+        nullcontext() if args.truth is None else _open_truth(args.truth) as file,
+        console.report_busy_address(
             f"the rig cannot be played on {args.host} and in {args.run_dir}",
             "choose another --host or --run-dir, or end what uses them",
-        ):
-            console.play(rig.run(), partial(_obey, rig))
+        ),
+    ):
+        console.play(_play_rig(rig, args, file), partial(_obey, rig))
     return 0
 
 
-def _settings(args: argparse.Namespace) -> "RigSettings":
+async def _play_rig(rig: "EmulatedRig", args: argparse.Namespace, truth: TextIO | None) -> None:
+    async with rig.controller, asyncio.TaskGroup() as group:
+        group.create_task(rig.run())
+        group.create_task(_print_ready(rig, args.host))
+        if truth is not None:
+            group.create_task(_write_truths(rig, truth, TRUTH_PERIOD_S / args.speed))
+        async for event in rig.controller.run():
+            print_robot_event(event)
+
+
+async def _print_ready(rig: "EmulatedRig", host: str) -> None:
+    places = {name: await port.get() for name, port in rig.ports.items()}
+    print("rig ready", *(f"{name}={place}" for name, place in {"robot": host, **places}.items()), flush=True)
+
+
+async def _write_truths(rig: "EmulatedRig", file: TextIO, period_s: float) -> None:
+    due_s = time.monotonic()
+    while True:
+        file.write(json.dumps({"t_mono_ns": time.monotonic_ns(), **_fields(rig.scene.truth())}) + "\n")
+        due_s = max(due_s + period_s, time.monotonic())
+        await asyncio.sleep(due_s - time.monotonic())
+
+
+def _rig_settings(args: argparse.Namespace) -> "RigSettings":
     from shearloop.drivers.emulators.boards import PAPER_SKETCH
-    from shearloop.drivers.emulators.rig import NOISE_NM, RigSettings
+    from shearloop.drivers.emulators.rig import NOISE_NM, Pace, RigSettings
     from shearloop.drivers.emulators.scene import Joint, TwinSettings
 
     console.check_positive(args, "speed", "arm_speed", "gel_stiffness")
@@ -114,10 +188,8 @@ def _settings(args: argparse.Namespace) -> "RigSettings":
         gripper=args.gripper,
         twin=TwinSettings(joint=Joint(args.joint), gel_stiffness_nm_per_rad=args.gel_stiffness),
         diameter_mm=args.diameter_mm,
-        speed=args.speed,
-        arm_speed=args.arm_speed,
+        pace=Pace(args.speed, args.arm_speed),
         rate_hz=args.rate_hz,
-        skin=args.skin,
         make=make,
         seed=args.seed,
     )
@@ -127,23 +199,7 @@ def _settings(args: argparse.Namespace) -> "RigSettings":
         args.run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"--run-dir {args.run_dir} cannot be made ({error.strerror}); choose another") from None
-    for link in settings.ports.values():
-        console.checked_link(link)
     return settings
-
-
-def _skin(args: argparse.Namespace) -> "RigSkin":
-    """Return a skin that bears half of the tool's torque; the other finger bears the other half."""
-    from shearloop.daemon.cli.emulate.skin import PushedSkin
-    from shearloop.daemon.synthetic_skin import SyntheticSkin
-    from shearloop.drivers.emulators.rig import RigSkin
-
-    pushed, lever_m = PushedSkin(SyntheticSkin(seed=args.seed)), args.diameter_mm * 1e-3
-
-    def follow(torque_nm: float, gripped: bool) -> None:
-        pushed.follow_grip(torque_nm, gripped=gripped, lever_m=lever_m)
-
-    return RigSkin(follow, pushed.resistances_ohm)
 
 
 def _obey(rig: "EmulatedRig", line: str) -> None:
@@ -161,18 +217,81 @@ def _open_truth(path: Path) -> TextIO:
         raise UserError(f"--truth {path} cannot be written ({error.strerror}); choose another file") from None
 
 
-def _write_truth(file: TextIO, truth: "Truth") -> None:
-    file.write(json.dumps({"t_mono_ns": time.monotonic_ns(), **_fields(truth)}) + "\n")
-
-
-def _print_ready(settings: "RigSettings") -> None:
-    places = {device: str(path) for device, path in settings.ports.items()}
-    places.setdefault("gripper", f"{settings.host}:{settings.gripper_port}")
-    print("rig ready", *(f"{name}={place}" for name, place in {"robot": settings.host, **places}.items()), flush=True)
-
-
 def _fields(truth: "Truth") -> dict[str, object]:
     return {name: round(value, 9) if isinstance(value, float) else value for name, value in asdict(truth).items()}
 
 
-DEVICES = {"rig": console.Device("all devices of the rig, tied by one physics", _configure, _run)}
+def _configure_skin(parser: argparse.ArgumentParser) -> None:
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = SKIN_EPILOG
+    for name, link_help, port_help in (
+        ("source", "a name for the source's RS-232 port", "the source on a socket instead"),
+        ("daq", "a name for a converter board's port", "a scanner on a socket instead"),
+    ):
+        addresses = parser.add_mutually_exclusive_group()
+        addresses.add_argument(f"--{name}-link", type=Path, metavar="PATH", help=link_help)
+        addresses.add_argument(f"--{name}-port", type=int, metavar="N", help=port_help)
+    parser.add_argument("--bind", default="127.0.0.1", metavar="ADDRESS", help="of the sockets (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of all noise (default: %(default)s)")
+    parser.add_argument("--speed", type=float, default=1.0, metavar="N", help="times the instruments' own pace")
+    robot = parser.add_argument_group("a robot whose wrist turns a tool on the skin")
+    robot.add_argument("--robot", metavar="HOST", help="play a UR controller on this address of this machine")
+    robot.add_argument("--rate-hz", type=float, default=500.0, help="control cycles per second (default: %(default)s)")
+
+
+def _run_skin(args: argparse.Namespace) -> int:
+    from shearloop.daemon.synthetic_skin import SyntheticSkin
+    from shearloop.drivers.emulators.skin import SkinInstruments
+    from shearloop.drivers.emulators.ur_controller import Controller
+    from shearloop.drivers.emulators.ur_robot import Robot
+
+    console.check_positive(args, "speed")
+    console.check_range(args, "rate_hz", 50, 1000)
+    pushed = PushedSkin(SyntheticSkin(seed=args.seed))
+    source_at, daq_at = (_address(args, name) for name in ("source", "daq"))
+    instruments = SkinInstruments(pushed, source_at, daq_at, speed=args.speed, seed=args.seed)
+    controller = None
+    if args.robot is not None:
+        controller = Controller(Robot(plant=pushed), host=args.robot, rate_hz=args.rate_hz)
+
+    def on_command(line: str) -> None:
+        match line.split():
+            case ["robot", *words] if controller is not None:
+                controller.command(" ".join(words))
+            case ["shear", newtons]:
+                pushed.skin.push(
+                    number_between(newtons, -20.0, 20.0, "no force of at most 20 N; write for instance 0.5")
+                )
+            case _:
+                instruments.command(line)
+
+    ports = {"source ": instruments.source_port, "daq ": instruments.daq_port}
+    with console.report_busy_address("the skin cannot be played", "choose another port or address"):
+        console.play(_play_skin(instruments, controller), on_command, ports)
+    return 0
+
+
+def _address(args: argparse.Namespace, name: str) -> "Address | None":
+    """Return the given address; None for an unnamed pseudo-terminal."""
+    port = getattr(args, f"{name}_port")
+    if port is None:
+        return console.checked_link(getattr(args, f"{name}_link"))
+    return args.bind, console.checked_port(f"{name}-port", port)
+
+
+async def _play_skin(instruments: "SkinInstruments", controller: "Controller | None") -> None:
+    if controller is None:
+        await instruments.run()
+        return
+    async with controller, asyncio.TaskGroup() as group:
+        group.create_task(instruments.run())
+        async for _ in controller.run():
+            pass
+
+
+DEVICES = {
+    "skin": console.Device(
+        "the shear skin with source and DAQ, and the robot that turns it", _configure_skin, _run_skin
+    ),
+    "rig": console.Device("all devices of the rig, tied by one physics", _configure_rig, _run_rig),
+}

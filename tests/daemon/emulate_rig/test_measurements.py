@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shearloop.bank.estimation import Calibration
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import ObjectStatus
@@ -78,19 +77,12 @@ async def test_a_twist_is_felt_by_load_cell_wrench_and_both_fingertips_and_is_go
         assert abs(sigma_of(await mean_of(right) - free[0])) < 0.02
 
 
-async def test_the_modbus_gripper_the_papers_sketch_a_calibration_and_the_truth_in_a_file(
-    bank: Path, tmp_path: Path
-) -> None:
-    from shearloop.bank.eit.bank_file import Bank
-
-    sigma = np.linspace(1.0, 2.0, 20)
-    calibration = tmp_path / "calibration.cal"
-    Calibration.from_matches(Bank.open(bank).identity, "synthetic", torque=(sigma, 0.4 - 0.2 * sigma)).save(calibration)
+async def test_the_modbus_gripper_the_papers_sketch_a_sigma_and_the_truth_in_a_file(bank: Path, tmp_path: Path) -> None:
     run_dir, truth = tmp_path / "run", tmp_path / "truth.jsonl"
     arguments = ("--bank", str(bank), "--run-dir", str(run_dir), *PACE, "--gripper", "modbus", "--paper-sketch")
-    files = ("--truth", str(truth), "--calibration", str(calibration))
+    others = ("--truth", str(truth), "--sigma", "2.0", "1.3")
     rig = RigProcess(
-        "rig", *arguments, *files, "--diameter-mm", "40", "--gel-stiffness", "0.4", module=3, ready="rig ready"
+        "rig", *arguments, *others, "--diameter-mm", "40", "--gel-stiffness", "0.4", module=3, ready="rig ready"
     )
     rig.run_dir = run_dir
     try:
@@ -110,7 +102,7 @@ async def test_the_modbus_gripper_the_papers_sketch_a_calibration_and_the_truth_
             assert await torque_of(load) == pytest.approx(-0.06, rel=0.08)
             shear_nm = (await rig.truth())["shear_torque_nm"]
             seen_nm = 0.4 - 0.2 * sigma_of(await mean_of(right) - free)
-            assert seen_nm == pytest.approx(shear_nm, abs=0.004), "σ is where the calibration has that torque"
+            assert seen_nm == pytest.approx(shear_nm, abs=0.004), "σ falls by 5 cm per N·m"
             await rig.fault("slip")
             slipped_rad = (await rig.truth(lambda truth: bool(truth["slipped_rad"])))["slipped_rad"]
             assert slipped_rad == pytest.approx(-0.06 * (1 / 0.4 + 1 / 20), rel=0.1), "a softer gel was asked for"

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from shearloop.bank.eit.channels import channels_of_line
 from shearloop.daemon.cli import main
+from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings
 
 
 @pytest.mark.parametrize(
@@ -22,7 +23,6 @@ from shearloop.daemon.cli import main
         (["--truth", "/nowhere/truth"], "--truth /nowhere/truth cannot be written"),
         (["--sigma", "1.2", "1.8"], "give the larger one first"),
         (["--sigma", "3.0", "1.8"], "the bank has no signal at sigma = 3"),
-        (["--calibration", "absent.yaml"], "absent.yaml"),
         # An address for documentation (RFC 5737), which no machine has.
         (["--host", "192.0.2.1"], "the rig cannot be played on 192.0.2.1"),
     ],
@@ -36,6 +36,13 @@ def test_mistakes_are_told(
     assert complaint.count("\n") == 1
 
 
+class Blank:
+    """An untouched fingertip."""
+
+    def line(self, *_: object) -> NDArray[np.float64]:
+        return np.zeros(1024)
+
+
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [
@@ -43,14 +50,12 @@ def test_mistakes_are_told(
         ("kick hard", "'hard' is no torque in N·m"),
         ("kick 0.1", "kick needs a tool in the grip"),
         ("joint loose", "there is no joint 'loose'; there are lever"),
-        ("unplug toaster", "there is no device 'toaster'; there are load, gripper, robot, right, left"),
+        ("unplug toaster", "there is no device 'toaster'; there are right, left, load, gripper, robot"),
         ("right explode", "there is no fault 'explode'"),
         ("gripper fault 99", "'99' is not a fault code"),
     ],
 )
 def test_what_is_no_command_is_said_to_be_none(line: str, sentence: str, tmp_path: Path) -> None:
-    from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings
-
-    rig = EmulatedRig(RigSettings(run_dir=tmp_path), lambda _grip, _shear, _diameter: channels_of_line(np.zeros(1024)))
+    rig = EmulatedRig(RigSettings(run_dir=tmp_path), Blank())
     with pytest.raises(ValueError, match=sentence):
         rig.command(line)

@@ -89,26 +89,18 @@ async def played(
     folder: Path, *, socket: bool = False, daemon: dict[str, Any] | None = None, **changes: Any
 ) -> AsyncIterator[Played]:
     skin = SyntheticSkin()
-    places: dict[str, str] = {}
-    ready = asyncio.Semaphore(0)
-
-    def on_port(device: str, port: str) -> None:
-        places[device] = port
-        ready.release()
-
     instruments = SkinInstruments(
-        skin.resistances_ohm,
+        skin,
         folder / "skin-source",
         ("127.0.0.1", 0) if socket else folder / "skin-daq",
-        on_port=on_port,
         speed=RATE_HZ / 10,
     )
     playing = asyncio.create_task(instruments.run())
-    await ready.acquire()
-    await ready.acquire()
+    await instruments.source_port.get()
+    place = await instruments.daq_port.get()
     daq = ADC
     if socket:
-        host, port = places["daq"].split(":")
+        host, port = place.split(":")
         daq = {"scanner": {"socket": {"host": host, "port": int(port)}}}
     try:
         async with running(written(folder, {**(daemon or {}), "skin": section(daq, **changes)})) as run:

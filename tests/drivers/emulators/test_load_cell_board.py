@@ -1,8 +1,7 @@
 """The driver against the played board, over a real pseudo-terminal: torque comes through, and every fault is met."""
 
-import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Iterable
 from itertools import repeat
 from pathlib import Path
 
@@ -37,18 +36,17 @@ class Rig(Changes):
 @contextlib.asynccontextmanager
 async def a_rig(
     tmp_path: Path,
-    torque_nm: Callable[[], float] = lambda: 0.03,
+    torques_nm: Iterable[float] = repeat(0.03),
     sketch: Sketch = SKETCH,
     calibration: LoadCalibration = CALIBRATION,
 ) -> AsyncIterator[Rig]:
     link = tmp_path / "load"
-    plugged = asyncio.Event()
-    board = Hx711Board(torque_nm, sketch, period_s=0.002, link=link, on_port=lambda _: plugged.set())
+    board = Hx711Board(torques_nm, sketch, period_s=0.002, link=link)
     rig = Rig(board)
     rig.cell = cell = LoadCell(calibration, path=link, policy=ReconnectPolicy(0.001, 0.002), on_event=rig.on_event)
 
     async with running(board.run()):
-        await plugged.wait()
+        await board.port.appearances.get()
         async with running(pass_on(cell.readings(), rig.on_sample)):
             yield rig
 
@@ -60,8 +58,8 @@ async def a_rig(
 async def test_torque_comes_through_from_either_sketch(
     tmp_path: Path, sketch: Sketch, calibration: LoadCalibration, noise_nm: float
 ) -> None:
-    torques = iter([0.0, *(0.001 * n for n in range(60))])
-    async with a_rig(tmp_path, torques.__next__, sketch, calibration) as rig:
+    torques = [0.0, *(0.001 * n for n in range(60))]
+    async with a_rig(tmp_path, torques, sketch, calibration) as rig:
         await rig.until(lambda: rig.samples and rig.samples[-1].torque_nm > 0.0585)
         sent = {round(0.001 * n, 3) for n in range(60)}
         for sample in rig.samples[1:]:
@@ -133,7 +131,7 @@ async def test_silence_is_reported_as_a_loss(tmp_path: Path) -> None:
 
 
 async def test_a_tare_takes_effect_with_the_next_sample(tmp_path: Path) -> None:
-    async with a_rig(tmp_path, repeat(0.03).__next__) as rig:
+    async with a_rig(tmp_path) as rig:
         await rig.until(lambda: len(rig.samples) > 3)
         rig.cell.tare(rig.samples[-1].raw)
         n = len(rig.samples)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from shearloop.drivers.emulators.robotiq.gripper import Gripper, GripperRegisters
+from shearloop.drivers.emulators.gripper import Gripper, GripperRegisters
 from shearloop.drivers.emulators.scene import Joint, Scene, Truth, TwinSettings
 
 DT_S = 0.002

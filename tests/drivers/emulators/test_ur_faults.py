@@ -2,9 +2,9 @@
 
 import pytest
 
-from shearloop.drivers.emulators.ur.robot import Robot
-from shearloop.drivers.emulators.ur.rtde import ConnectionFaults
-from shearloop.drivers.emulators.ur.server import Controller
+from shearloop.drivers.emulators.ur_controller import Controller
+from shearloop.drivers.emulators.ur_robot import Robot
+from shearloop.drivers.emulators.ur_rtde import ConnectionFaults
 
 
 def test_faults_are_carried_out_and_ended() -> None:
@@ -14,12 +14,12 @@ def test_faults_are_carried_out_and_ended() -> None:
         "registers-in-use", "local-control", "refuse-protocol on", "stop-hangs 2", "protective-stop",
         "emergency-stop",
     ):  # fmt: skip
-        controller.apply_fault(line)
+        controller.command(line)
     assert controller.faults == ConnectionFaults(True, True, True, 2)
     assert robot.safety.safety_mode == 7
-    controller.apply_fault("registers-in-use off")
+    controller.command("registers-in-use off")
     assert not controller.faults.registers_in_use
-    controller.apply_fault("normal")
+    controller.command("normal")
     assert (controller.faults, robot.safety.safety_mode) == (ConnectionFaults(), 1)
 
 
@@ -29,4 +29,4 @@ def test_faults_are_carried_out_and_ended() -> None:
 )
 def test_unknown_fault_is_refused(line: str, said: str) -> None:
     with pytest.raises(ValueError, match=said):
-        Controller(Robot()).apply_fault(line)
+        Controller(Robot()).command(line)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from shearloop.drivers.emulators.ur.motion import jacobian, link_frames
+from shearloop.drivers.emulators.ur_arm import jacobian, link_frames
 
 angles = st.floats(-math.pi, math.pi)
 joints = st.tuples(*[angles] * 6).map(np.array)

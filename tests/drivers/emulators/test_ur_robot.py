@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shearloop.drivers.emulators.ur import robot as control_script
-from shearloop.drivers.emulators.ur.robot import MODE_POWER_OFF, MODE_RUNNING, PAUSED, STOPPED, ControllerSpec, Robot
+from shearloop.drivers.emulators import ur_robot as control_script
+from shearloop.drivers.emulators.ur_robot import MODE_POWER_OFF, MODE_RUNNING, PAUSED, STOPPED, ControllerSpec, Robot
 
 DT_S = 0.002
 
@@ -234,13 +234,23 @@ def test_emergency_stop_cuts_power_that_returns_in_two_steps() -> None:
     assert robot.program_running
 
 
+class Spring:
+    """A spring of 2 N·m/rad on the wrist."""
+
+    def __init__(self) -> None:
+        self.seen_s = 0.0
+
+    def step(self, dt_s: float, wrist_rad: float) -> float:
+        self.seen_s += dt_s
+        return -2.0 * wrist_rad
+
+
 def test_wrench_is_the_plants_torque_about_the_tool_axis() -> None:
-    stiffness_nm_per_rad, damping = 2.0, 0.1
-    robot = Robot(plant=lambda angle, speed, _dt_s: -stiffness_nm_per_rad * angle - damping * speed)
+    robot = Robot(plant=Spring())
     robot.upload()
     turn(robot, 0.5, 10.0)
     wait(robot, 1.0)
-    expected = -stiffness_nm_per_rad * robot.arm.q_rad[5] - damping * 0.5
+    expected = -2.0 * robot.arm.q_rad[5]
     # The tool points down: its axis is -z of the base.
     assert robot.arm.wrench == pytest.approx([0, 0, 0, 0, 0, -expected], abs=1e-9)
     robot.registers.write("input_int_register_0", 0, robot.time_s)
@@ -250,15 +260,14 @@ def test_wrench_is_the_plants_torque_about_the_tool_axis() -> None:
 
 
 def test_fast_arm_motion_keeps_the_controllers_time() -> None:
-    seen: list[float] = []
-    robots = [Robot(plant=lambda angle, _speed, dt_s: seen.append(dt_s) or angle, pace=pace) for pace in (1.0, 20.0)]
-    for robot in robots:
-        seen.clear()
+    springs = Spring(), Spring()
+    robots = [Robot(plant=spring, pace=pace) for spring, pace in zip(springs, (1.0, 20.0), strict=True)]
+    for robot, spring in zip(robots, springs, strict=True):
         robot.upload()
         turn(robot, 0.1, 4.0)
         wait(robot, 0.5)
         assert robot.arm.qd_rad_per_s[5] == pytest.approx(0.1), "in its own time it turns at the commanded speed"
-        assert sum(seen) == pytest.approx(robot.time_s), "the plant's time is the controller's"
+        assert spring.seen_s == pytest.approx(robot.time_s), "the plant's time is the controller's"
     slow, fast = robots
     assert slow.time_s == fast.time_s == pytest.approx(0.5, abs=2 * DT_S)
     lost_rad = 0.5 * 0.1**2 / 4.0  # while getting up to speed

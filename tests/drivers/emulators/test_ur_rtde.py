@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers.emulators.ur import server
-from shearloop.drivers.emulators.ur.robot import ControllerSpec, Robot
-from shearloop.drivers.emulators.ur.rtde import (
+from shearloop.drivers.emulators import ur_controller
+from shearloop.drivers.emulators.ur_robot import ControllerSpec, Robot
+from shearloop.drivers.emulators.ur_rtde import (
     ConnectionFaults,
     NotRtdeError,
     RtdeSession,
@@ -143,9 +143,9 @@ async def test_clock_runs_on_while_the_emulator_is_paused(monkeypatch: pytest.Mo
         except StopIteration:
             raise asyncio.CancelledError from None
 
-    monkeypatch.setattr(server, "time", SimpleNamespace(monotonic=lambda: now_s))
-    controller = server.Controller(robot, rate_hz=500.0)
-    monkeypatch.setattr(server, "asyncio", SimpleNamespace(sleep=sleep))
+    monkeypatch.setattr(ur_controller, "time", SimpleNamespace(monotonic=lambda: now_s))
+    controller = ur_controller.Controller(robot, rate_hz=500.0)
+    monkeypatch.setattr(ur_controller, "asyncio", SimpleNamespace(sleep=sleep))
     with pytest.raises(asyncio.CancelledError):
         async for _ in controller.run():
             pass

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
-from shearloop.drivers.emulators.ports import PtyServer, SocketServer
-from shearloop.drivers.emulators.robotiq.gripper import Gripper, GripperMechanics, modbus_server, urcap_server
+from shearloop.drivers.emulators.gripper import Gripper, GripperMechanics, ModbusSlave, UrcapSession
+from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.modbus_client import ModbusClient
@@ -32,7 +32,7 @@ WAYS = pytest.mark.parametrize("way", ["socket", "modbus"])
 @dataclass
 class Rig:
     model: Gripper
-    server: SocketServer | PtyServer
+    server: Server
     t_s: float = 0.0
     steps_left: int = MOST_STEPS
     stopped: bool = False
@@ -50,21 +50,21 @@ class Rig:
             self.lost.set()
 
     def silence(self, silent: bool) -> None:
-        self.server.silent = silent
+        self.server.command("silence" if silent else "normal")
 
 
 @contextlib.asynccontextmanager
 async def a_rig(way: str, tmp_path: Path) -> AsyncIterator[Rig]:
     model = Gripper(MECHANICS)
-    server: SocketServer | PtyServer
+    server: Server
     client: GripperClient
     if way == "socket":
-        socket = server = urcap_server(model, port=0)
+        socket = server = SocketServer(UrcapSession(model))
         await socket.restore()
         client = SocketClient("127.0.0.1", socket.port, reply_deadline_s=0.2)
     else:
         link = tmp_path / "gripper"
-        server = modbus_server(model, link)
+        server = PtyServer(ModbusSlave(model), link)
         await server.restore()
         client = ModbusClient(path=str(link), reply_deadline_s=0.2)
     rig = Rig(model, server)

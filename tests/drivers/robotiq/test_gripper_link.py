@@ -9,7 +9,7 @@ import pytest
 from pymodbus.client import AsyncModbusSerialClient
 from pymodbus.pdu import ModbusPDU
 
-from shearloop.drivers.emulators.robotiq.gripper import ModbusSlave
+from shearloop.drivers.emulators.gripper import ModbusSlave
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DriverError
 from shearloop.drivers.robotiq.messages import ActivationStatus, GripperCommand
 from tests.drivers.robotiq.gripper_rig import WAYS, a_rig
@@ -153,8 +153,8 @@ async def test_gripper_without_power_is_not_read_as_zero(tmp_path: Path) -> None
 async def test_damaged_modbus_reply_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     feed = ModbusSlave.feed
 
-    def damaged(slave: ModbusSlave, data: bytes, t_s: float) -> bytes:
-        *reply, last = feed(slave, data, t_s)
+    def damaged(slave: ModbusSlave, data: bytes) -> bytes:
+        *reply, last = feed(slave, data)
         return bytes([*reply, last ^ 0xFF])
 
     async with a_rig("modbus", tmp_path) as rig:

@@ -10,10 +10,8 @@ from pathlib import Path
 import pytest
 
 from shearloop.drivers.connection import LinkEvent, ReconnectPolicy, SerialLink, TcpLink
-from shearloop.drivers.emulators.boards import EmulatedAdcBoard
-from shearloop.drivers.emulators.ports import PtyServer, SocketServer
-from shearloop.drivers.emulators.scpi import FaultyServer
-from shearloop.drivers.emulators.skin import NOISE_V, Circuit, EmulatedKeithley6430, EmulatedScanner
+from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
+from shearloop.drivers.emulators.skin import Circuit, EmulatedAdcBoard, EmulatedKeithley6430, EmulatedScanner
 from shearloop.drivers.shear_skin.instruments import OUTPUT, READ, SOURCE_BAUD, AdcBoard, Keithley6430, ScpiScanner
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
 from tests.running import DEADLINE_S, Changes, pass_on, running
@@ -24,7 +22,7 @@ RATE_HZ = 500.0
 
 class Bench(Changes):
     def __init__(
-        self, circuit: Circuit, played: EmulatedKeithley6430, source: FaultyServer, reader: Callable[[str], None]
+        self, circuit: Circuit, played: EmulatedKeithley6430, source: Server, reader: Callable[[str], None]
     ) -> None:
         super().__init__()
         self.circuit, self.played, self.source, self.reader = circuit, played, source, reader
@@ -59,39 +57,39 @@ class Bench(Changes):
             pytest.fail(f"no sample says {faults}; the last one: {self.samples[-1:]}")
 
 
+class Unstrained:
+    def resistances_ohm(self) -> tuple[float, float]:
+        return R1, R2
+
+
+class Replaceable:
+    """A source that a test can replace while it is connected."""
+
+    def __init__(self, played: EmulatedKeithley6430) -> None:
+        self._played = played
+
+    def feed(self, data: bytes) -> bytes:
+        return self._played.feed(data)
+
+
 @contextlib.asynccontextmanager
 async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: float = 2.0) -> AsyncIterator[Bench]:
-    circuit = Circuit(lambda: (R1, R2))
-    ready = asyncio.Semaphore(0)
+    circuit = Circuit(Unstrained())
     played = EmulatedKeithley6430(circuit)
-
-    def on_port(_: str) -> None:
-        ready.release()
-
-    def answer(data: bytes) -> bytes:
-        return played.feed(data)  # replaced by some tests
-
-    way_in = (
-        PtyServer(answer, folder / "source", on_port)
-        if serial_source
-        else SocketServer(lambda: answer, on_port=on_port)
-    )
-    source_server = FaultyServer(way_in)
-    scanner = SocketServer(lambda: EmulatedScanner(circuit).feed, on_port=on_port)
-    reader = FaultyServer(scanner)
-    if adc:
-        reader = EmulatedAdcBoard(
-            circuit.voltages, period_s=1 / RATE_HZ, noise_v=NOISE_V, link=folder / "adc", on_port=on_port
-        )
+    socket = SocketServer(Replaceable(played))
+    source_server = PtyServer(Replaceable(played), folder / "source") if serial_source else socket
+    scanner = SocketServer(EmulatedScanner(circuit))
+    board = EmulatedAdcBoard(circuit, period_s=1 / RATE_HZ, link=folder / "adc")
+    reader = board if adc else scanner
     bench = Bench(circuit, played, source_server, reader.command)
     options = {"policy": ReconnectPolicy(0.001, 0.005), "on_event": bench.on_event}
     async with running(source_server.run(), reader.run()):
-        await ready.acquire()
-        await ready.acquire()
+        await source_server.appearances.get()
+        await (board.port if adc else scanner).appearances.get()
         if serial_source:
             source_link = SerialLink(path=folder / "source", baud=SOURCE_BAUD, **options)
         else:
-            source_link = TcpLink("127.0.0.1", way_in.port, **options)
+            source_link = TcpLink("127.0.0.1", socket.port, **options)
         if adc:
             daq = AdcBoard(SerialLink(path=folder / "adc", **options), RATE_HZ)
         else:
@@ -298,7 +296,7 @@ async def test_lines_of_the_board_that_are_missing_torn_or_garbage_are_counted(t
 
 
 async def test_an_instrument_that_is_no_source_is_refused_by_name() -> None:
-    scanner = SocketServer(lambda: EmulatedScanner(Circuit(lambda: (R1, R2))).feed, answer_s=0.0)
+    scanner = SocketServer(EmulatedScanner(Circuit(Unstrained())))
     sentences: asyncio.Queue[str] = asyncio.Queue()
 
     def on_event(event: LinkEvent) -> None:

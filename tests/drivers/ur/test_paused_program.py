@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from shearloop.drivers.emulators.ur.server import SCRIPT_PORT
+from shearloop.drivers.emulators.ur_controller import SCRIPT_PORT
 from shearloop.drivers.ur.client import UrRobot
 from tests.drivers.ur.robots import Link, enable, pid_of, running, settings_for, until
 from tests.emulator_process import EmulatorProcess as ControllerProcess

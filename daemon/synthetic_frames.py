@@ -14,8 +14,6 @@ from shearloop.bank.eit.bank_file import Bank, BankDefinition
 from shearloop.bank.eit.build import RowSolver
 from shearloop.bank.eit.channels import LINE_SLOTS, N_ELECTRODES, line_of_channels
 from shearloop.bank.eit.mesh import Mesh
-from shearloop.bank.estimation import Calibration
-from shearloop.bank.estimation.interval_regressor import PolynomialRegressor
 from shearloop.daemon.errors import UserError
 from shearloop.drivers.eit_kit import ADC_STEP_V
 
@@ -33,7 +31,6 @@ INJECTIONS: NDArray[np.int64] = LINE_SLOTS // N_ELECTRODES
 SIGMA_CM, LARGEST_TORQUE_NM = (1.85, 1.25), 0.14
 K_CM, DIAMETER_MM = (3.78, 3.47), (10.0, 40.0)
 MAX_WIDTH_MM = 140.0
-N_PLACES = 2000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,73 +151,44 @@ def _neighbours(grid: FloatArray, values: FloatArray, name: str) -> Iterator[tup
     yield np.minimum(below + 1, len(grid) - 1), places - below
 
 
-def frame_maker(
-    bank_path: Path, seed: int, *, sigma: tuple[float, float] | None = None, calibration: Path | None = None
-) -> Callable[[FloatArray, FloatArray, float], FloatArray]:
-    """Return a function from each injection's grip and shear torque, (32,) each, and a diameter to a line (1024,).
+class RigFrames:
+    """The frames of the emulated rig's fingertips, from a bank.
 
-    σ falls linearly with the torque, from `sigma[0]` at none to `sigma[1]` at 0.14 N·m, and rises for negative
-    torques; or it follows a calibration. Beyond the bank σ and k stay at its edge. Raises UserError for a σ at rest
-    outside the bank, BankError for unreadable files.
+    σ falls linearly with the torque, from `sigma_cm[0]` at none to `sigma_cm[1]` at 0.14 N·m, and rises for negative
+    torques. k falls with the diameter. Beyond the bank σ and k stay at its edge.
     """
-    bank = Bank.open(bank_path)
-    synthesiser = Synthesiser(bank, seed=seed)
-    torques_nm, sigmas = _linear(bank, *(sigma or SIGMA_CM)) if calibration is None else _inverse(bank, calibration)
 
-    def frame_of(grip: FloatArray, shear_torque_nm: FloatArray, diameter_mm: float) -> FloatArray:
-        sigma_cm = np.interp(shear_torque_nm, torques_nm, sigmas)
-        return synthesiser.line(_k_cm(bank, diameter_mm), sigma_cm[INJECTIONS], grip[INJECTIONS])
+    def __init__(self, bank_path: Path, seed: int, sigma_cm: tuple[float, float] = SIGMA_CM) -> None:
+        """Open the bank; raises UserError for a σ at rest outside of it, BankError for an unreadable file."""
+        rest, largest = sigma_cm
+        if largest >= rest:
+            raise UserError(f"--sigma {rest:g} {largest:g}: sigma falls as the torque rises; give the larger one first")
+        self._bank = Bank.open(bank_path)
+        self._synthesiser = Synthesiser(self._bank, seed=seed)
+        low, high = self._sigma_range(rest)
+        # (2,) the ascending ends of the line, in N·m and cm.
+        self._sigmas_cm = np.array([high, low])
+        self._torques_nm = (self._sigmas_cm - rest) * LARGEST_TORQUE_NM / (largest - rest)
 
-    return frame_of
+    def line(self, grip: FloatArray, shear_torque_nm: FloatArray, diameter_mm: float) -> FloatArray:
+        """Return the board's line, (1024,) in volts, for grip (0…1) and shear at each injection, (32,) each."""
+        sigma_cm = np.interp(shear_torque_nm, self._torques_nm, self._sigmas_cm)
+        return self._synthesiser.line(self._k_cm(diameter_mm), sigma_cm[INJECTIONS], grip[INJECTIONS])
 
+    def _k_cm(self, diameter_mm: float) -> float:
+        slope = (K_CM[1] - K_CM[0]) / (DIAMETER_MM[1] - DIAMETER_MM[0])
+        k = K_CM[0] + slope * (diameter_mm - DIAMETER_MM[0])
+        return float(np.clip(k, self._bank.k_grid[0], self._bank.k_grid[-1]))
 
-def _k_cm(bank: Bank, diameter_mm: float) -> float:
-    slope = (K_CM[1] - K_CM[0]) / (DIAMETER_MM[1] - DIAMETER_MM[0])
-    k = K_CM[0] + slope * (diameter_mm - DIAMETER_MM[0])
-    return float(min(max(k, bank.k_grid[0]), bank.k_grid[-1]))
-
-
-def _linear(bank: Bank, rest: float, largest: float) -> tuple[FloatArray, FloatArray]:
-    """Return ascending torques and their σ: a line over the bank's σ."""
-    if largest >= rest:
-        raise UserError(f"--sigma {rest:g} {largest:g}: sigma falls as the torque rises; give the larger one first")
-    low, high = _sigma_range(bank, rest)
-    sigmas = np.array([high, low])
-    return (sigmas - rest) * LARGEST_TORQUE_NM / (largest - rest), sigmas
-
-
-def _inverse(bank: Bank, path: Path) -> tuple[FloatArray, FloatArray]:
-    """Return ascending torques and their σ: a calibration's curve, while it falls, over the bank's σ."""
-    calibration = Calibration.load(path)
-    calibration.check_bank(bank)
-    if calibration.torque is None or not isinstance(calibration.torque.regressor, PolynomialRegressor):
-        raise UserError(f"{path} has no curve of torque over sigma; give --sigma instead")
-    curve = calibration.torque.regressor.polynomial
-    low, high = _sigma_range(bank, (curve.x_low + curve.x_high) / 2)
-    sigmas = np.linspace(high, low, N_PLACES)
-    torques_nm = np.array([curve(sigma) for sigma in sigmas])
-    rising = np.diff(torques_nm) > 0
-    inside = np.flatnonzero((sigmas[1:] >= curve.x_low) & (sigmas[:-1] <= curve.x_high))
-    first, last = _run(rising, int(inside[0]))
-    if last < inside[-1]:
-        raise UserError(f"{path}: its torque does not fall with sigma everywhere; give --sigma instead")
-    kept = slice(first, last + 2)  # a step has two ends
-    return torques_nm[kept], sigmas[kept]
-
-
-def _sigma_range(bank: Bank, within: float) -> tuple[float, float]:
-    """Return the ends of the σ around `within` with a signal at every k of a tool."""
-    thick, thin = np.searchsorted(bank.k_grid, [_k_cm(bank, MAX_WIDTH_MM), _k_cm(bank, 0.0)])
-    valid = bank.valid[max(thick - 1, 0) : thin + 1].min(axis=0)
-    at = int(np.searchsorted(bank.sigma_grid, within))
-    if within < bank.sigma_grid[0] or at == len(valid) or not valid[at]:
-        raise UserError(f"the bank has no signal at sigma = {within:g}; give another --sigma or another bank")
-    first, last = _run(valid, at)
-    return float(bank.sigma_grid[first]), float(bank.sigma_grid[last])
-
-
-def _run(flags: BoolArray, at: int) -> tuple[int, int]:
-    """Return the first and last index of the true values around an index."""
-    missing = np.flatnonzero(~flags)
-    first = int(missing[missing < at].max(initial=-1)) + 1
-    return first, int(missing[missing > at].min(initial=len(flags))) - 1
+    def _sigma_range(self, rest: float) -> tuple[float, float]:
+        """Return the ends of the σ around `rest` with a signal at every k of a tool."""
+        bank = self._bank
+        thick, thin = np.searchsorted(bank.k_grid, [self._k_cm(MAX_WIDTH_MM), self._k_cm(0.0)])
+        valid = bank.valid[max(thick - 1, 0) : thin + 1].min(axis=0)
+        at = int(np.searchsorted(bank.sigma_grid, rest))
+        if rest < bank.sigma_grid[0] or at == len(valid) or not valid[at]:
+            raise UserError(f"the bank has no signal at sigma = {rest:g}; give another --sigma or another bank")
+        missing = np.flatnonzero(~valid)
+        first = int(missing[missing < at].max(initial=-1)) + 1
+        last = int(missing[missing > at].min(initial=len(valid))) - 1
+        return float(bank.sigma_grid[first]), float(bank.sigma_grid[last])

@@ -6,13 +6,12 @@ Modbus: application protocol 1.1b3 and serial line 1.02; registers: the gripper'
 
 import asyncio
 import struct
-from collections.abc import Callable
+import time
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 from shearloop.drivers.emulators import number_between
-from shearloop.drivers.emulators.ports import Outage, PtyServer, SocketServer
+from shearloop.drivers.emulators.ports import Server
 
 COUNTS_MAX = 255
 FIRST_MAJOR_FAULT = 10
@@ -32,11 +31,6 @@ ILLEGAL_FUNCTION, ILLEGAL_ADDRESS = 1, 2
 LONGEST_FRAME, PAUSE_S = 256, 0.1
 
 STEP_S = 0.008
-COMMANDS = (
-    "object MM puts something of that width between the fingers, object none takes it away; "
-    "fault CODE makes the gripper report a fault, cool ends one below 10; "
-    "lose [SECONDS] breaks the connection, silence [SECONDS] leaves requests without an answer"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,16 +233,6 @@ class UrcapSession:
         return b"ack"
 
 
-def urcap_server(
-    gripper: Gripper,
-    host: str = "127.0.0.1",
-    port: int = URCAP_PORT,
-    on_port: Callable[[str], None] = lambda _: None,
-) -> SocketServer:
-    """Return a server of the gripper's socket; `on_port` receives its address whenever it appears."""
-    return SocketServer(lambda: UrcapSession(gripper).feed, host, port, on_port)
-
-
 def crc16(data: bytes) -> bytes:
     """Return the frame check, low byte first: CRC-16 with the polynomial 0xA001, reflected, from 0xFFFF."""
     crc = 0xFFFF
@@ -267,7 +251,11 @@ class ModbusSlave:
         self._buffer = b""
         self._last_s = 0.0
 
-    def feed(self, data: bytes, t_s: float) -> bytes:
+    def feed(self, data: bytes) -> bytes:
+        """Return the reply frames to bytes of now."""
+        return self.replies(data, time.monotonic())
+
+    def replies(self, data: bytes, t_s: float) -> bytes:
         """Return the reply frames to the bytes at `t_s`; damaged requests and those to other devices get none."""
         if t_s - self._last_s > PAUSE_S:
             self._buffer = b""
@@ -313,81 +301,36 @@ def _request_length(buffer: bytes) -> int | None:
     return 8
 
 
-def modbus_server(
-    gripper: Gripper, link: Path | None = None, on_port: Callable[[str], None] = lambda _: None
-) -> PtyServer:
-    """Return a server of the serial line on a pseudo-terminal; `on_port` receives its path whenever it appears."""
-    slave = ModbusSlave(gripper)
-    return PtyServer(lambda data: slave.feed(data, asyncio.get_running_loop().time()), link, on_port)
-
-
 class GripperPlayer:
     """One gripper with one server, moved in real time or a multiple, with faults by commands."""
 
-    def __init__(self, gripper: Gripper, server: SocketServer | PtyServer, speed: float = 1.0) -> None:
+    def __init__(self, gripper: Gripper, server: Server, speed: float = 1.0) -> None:
+        self.server = server
         self._gripper = gripper
-        self._server = server
         self._speed = speed
-        self._outages: asyncio.Queue[float] = asyncio.Queue()
-        self._outage = Outage()
 
     async def run(self) -> None:
         """Play until cancelled."""
         async with asyncio.TaskGroup() as group:
-            group.create_task(self.serve())
-            group.create_task(self._move())
-
-    async def serve(self) -> None:
-        """Serve until cancelled; the caller moves the gripper by its `step`."""
-        async with asyncio.TaskGroup() as group:
-            group.create_task(self._server.run())
-            group.create_task(self._break())
-
-    def recover(self) -> None:
-        """End outages, and a fault below 10; the client has to end one from 10 on."""
-        self._outage.end()
-        self._end_silence()
-        self._gripper.clear_minor()
+            group.create_task(self.server.run())
+            last_s = time.monotonic()
+            while True:
+                await asyncio.sleep(STEP_S)
+                now_s = time.monotonic()
+                self._gripper.step((now_s - last_s) * self._speed)
+                last_s = now_s
 
     def command(self, text: str) -> None:
         """Carry out a line; ValueError, with a sentence, for an invalid one."""
         match text.split():
-            case ["object", "none"]:
+            case ["object", "none"] | ["drop"]:
                 self._gripper.put_between(None)
             case ["object", width]:
                 self._gripper.put_between(number_between(width, 0.0, 140.0, "not a width in mm from 0 to 140"))
             case ["fault", code]:
                 self._gripper.fail(int(number_between(code, 0, 15, "not a fault code from 0 to 15")))
-            case ["cool"]:
-                self._gripper.clear_minor()
-            case ["lose", *seconds] if len(seconds) < 2:
-                self._outages.put_nowait(_seconds(seconds))
-            case ["silence", *seconds] if len(seconds) < 2:
-                self._server.silent = True
-                if seconds:
-                    asyncio.get_running_loop().call_later(_seconds(seconds), self._end_silence)
             case _:
-                raise ValueError(f"{text!r} is no command; {COMMANDS}")
-
-    def _end_silence(self) -> None:
-        self._server.silent = False
-
-    async def _move(self) -> None:
-        loop = asyncio.get_running_loop()
-        last_s = loop.time()
-        while True:
-            await asyncio.sleep(STEP_S)
-            now_s = loop.time()
-            self._gripper.step((now_s - last_s) * self._speed)
-            last_s = now_s
-
-    async def _break(self) -> None:
-        while True:
-            seconds = await self._outages.get()
-            await self._server.disconnect()
-            await self._outage.wait(seconds)
-            await self._server.restore()
-
-
-def _seconds(words: list[str]) -> float:
-    return number_between(words[0], 0.0, 86400.0, "not a time in seconds from 0 to 86400") if words else 0.0
+                self.server.command(text)
+                if text == "normal":
+                    # The client has to end a fault from 10 on.
+                    self._gripper.clear_minor()

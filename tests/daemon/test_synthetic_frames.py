@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, ZERO_SLOTS, channels_of_line
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.synthetic import INJECTIONS, Synthesiser, TwistProgramme, twist_frames
+from shearloop.daemon.synthetic_frames import INJECTIONS, Synthesiser, TwistProgramme, twist_frames
 from shearloop.drivers.eit_kit import FrameParser
 from shearloop.drivers.emulators.boards import format_line
 

@@ -6,8 +6,8 @@ import struct
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from shearloop.drivers.emulators.ur.motion import Vector
-from shearloop.drivers.emulators.ur.robot import (
+from shearloop.drivers.emulators.ur_arm import Vector
+from shearloop.drivers.emulators.ur_robot import (
     COMMAND,
     MODE_RUNNING,
     SAFETY_EMERGENCY_STOP,

@@ -11,15 +11,13 @@ program, as in URScript. Commands that the driver never sends end the program.
 
 import math
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
-from shearloop.drivers.emulators.ur.motion import Arm, Motion, PathError, Vector
+from shearloop.drivers.emulators.ur_arm import Arm, Motion, PathError, Vector
 
-# Torque in N·m on the tool about its own axis, from the wrist's angle in rad, its speed in rad/s and the step in s.
-WristPlant = Callable[[float, float, float], float]
 # An event's name and detail.
 Event = tuple[str, str]
 
@@ -36,6 +34,13 @@ ASYNC_RUNNING = 1 << 15
 COMMAND = "input_int_register_0"
 # With a number for the frequency: the script's text also has the call for its command, with a variable.
 _ARMED = re.compile(rb'rtde_set_watchdog\("input_int_register_0", ([0-9.]+), "stop"\)')
+
+
+class WristPlant(Protocol):
+    """What the wrist turns."""
+
+    def step(self, dt_s: float, wrist_rad: float) -> float:
+        """Advance by dt_s with the wrist's angle; return the torque on the tool about its own axis in N·m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,7 +301,7 @@ class Robot:
         for _ in range(parts):
             self._move(dt_s * self._pace / parts)
             if self._plant is not None:
-                self.arm.load(self._plant(float(self.arm.q_rad[5]), float(self.arm.qd_rad_per_s[5]), dt_s / parts))
+                self.arm.load(self._plant.step(dt_s / parts, float(self.arm.q_rad[5])))
 
     def stand_still(self, seconds: float) -> None:
         """Let only the clock go on."""

@@ -9,8 +9,8 @@ from dataclasses import replace
 from typing import Any
 
 from shearloop.drivers.emulators import number_between
-from shearloop.drivers.emulators.ur.robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, Robot, RobotEvent, armed_hz
-from shearloop.drivers.emulators.ur.rtde import ConnectionFaults, NotRtdeError, RtdeSession
+from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, Robot, RobotEvent, armed_hz
+from shearloop.drivers.emulators.ur_rtde import ConnectionFaults, NotRtdeError, RtdeSession
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 # A control script closes its outermost block in the first column.
@@ -87,7 +87,7 @@ class Controller:
             for event in self.robot.take_events():
                 yield event
 
-    def apply_fault(self, line: str) -> None:
+    def command(self, line: str) -> None:
         """Carry out a fault, as `protective-stop` or `silence 2`; ValueError where the line is none."""
         match line.split():
             case ["protective-stop"]:

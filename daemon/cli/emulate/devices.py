@@ -1,0 +1,318 @@
+"""The emulated devices that stand alone: `eit-kit`, `hx711`, `ur`, `gripper-socket` and `gripper-modbus`."""
+
+import argparse
+import math
+from collections.abc import Iterator
+from itertools import cycle, repeat
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from shearloop.daemon.cli.emulate import console
+from shearloop.daemon.errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from shearloop.bank.eit.mesh import Mesh
+    from shearloop.daemon.synthetic_frames import Signals
+    from shearloop.drivers.emulators.boards import BoardFault
+    from shearloop.drivers.emulators.ur_controller import Controller
+    from shearloop.drivers.emulators.ur_robot import ControllerSpec, RobotEvent
+
+DEMO_BANK = Path(__file__).resolve().parents[3] / "config" / "banks" / "demo.yaml"
+# The paper's screwdriver: σ at rest and at the largest torque of its peak samples, in N·m.
+K_CM = 3.25
+SIGMA_AT_REST_CM, SIGMA_AT_LARGEST_CM, LARGEST_TORQUE_NM = 1.85, 1.25, 0.14
+LEVER_ARM_M, STANDARD_GRAVITY = 0.035, 9.80665
+UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standard input:
+  protective-stop         stop for safety, pause the program
+  emergency-stop          press the button: stop, end the program, power off
+  release                 release the button; power comes back from the dashboard
+  drop-rtde               close the RTDE connections, but not the dashboard's
+  silence SECONDS         send nothing on any port
+  stop-hangs N            ignore the dashboard's next N stop commands, without an answer
+  registers-in-use [off]  refuse input registers as if a fieldbus had them
+  local-control [off]     leave remote control
+  refuse-protocol [off]   refuse the RTDE protocol version
+  normal                  end all of them
+"""
+
+
+def _configure_eit_kit(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "Prints the port's path, again each time it is plugged in. A fault's name on standard input applies to the "
+        "next frame: cut-line, wrong-count, nan, garbage, flood, repeat, silence [SECONDS], unplug [SECONDS]. A "
+        "silence without a number lasts until the board is started again; `normal` ends every fault."
+    )
+    frames = parser.add_argument_group("frames")
+    frames.add_argument("--recording", type=Path, metavar="FILE", help="a recorded stream (.mat)")
+    frames.add_argument("--side", choices=("left", "right"), help="which fingertip, if the file holds both")
+    frames.add_argument(
+        "--bank",
+        type=Path,
+        metavar="FILE",
+        help="synthesise twists from this bank's signals (default, without --recording: the demo's fingertip, solved)",
+    )
+    frames.add_argument(
+        "--sigma",
+        type=float,
+        nargs=2,
+        default=(SIGMA_AT_REST_CM, SIGMA_AT_LARGEST_CM),
+        metavar=("REST", "LARGEST"),
+        help=f"sigma at no torque and at {LARGEST_TORQUE_NM} N·m (default: {SIGMA_AT_REST_CM} {SIGMA_AT_LARGEST_CM})",
+    )
+    frames.add_argument("--seed", type=int, default=0, help="of noise and garbage (default: %(default)s)")
+    frames.add_argument("--once", action="store_true", help="play the recording once, then be silent")
+    parser.add_argument(
+        "--speed", type=float, default=1.0, metavar="N", help="times the board's 1.85 frames per second"
+    )
+    console.add_link(parser)
+    parser.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="NAME[:SECONDS]@FRAME",
+        help="a fault of one frame, counted from 0; may be given several times",
+    )
+
+
+def _run_eit_kit(args: argparse.Namespace) -> int:
+    from shearloop.drivers.eit_kit import FRAME_PERIOD_S
+    from shearloop.drivers.emulators.boards import EitKitBoard
+
+    console.check_positive(args, "speed")
+    link = console.checked_link(args.link)
+    fault_at = dict(_numbered_fault(text) for text in args.fault)
+    board = EitKitBoard(
+        _frames(args, FRAME_PERIOD_S),
+        period_s=FRAME_PERIOD_S / args.speed,
+        link=link,
+        fault_at=fault_at,
+        seed=args.seed,
+    )
+    console.play(board.run(), board.command, {"": board.port.appearances})
+    return 0
+
+
+def _numbered_fault(argument: str) -> "tuple[int, BoardFault]":
+    from shearloop.drivers.emulators.boards import EitKitBoard, parse_fault
+
+    name, _, frame = argument.partition("@")
+    if not frame.isdecimal():
+        raise UserError(f"--fault {argument} names no frame; write NAME@FRAME, for instance cut-line@20")
+    try:
+        return int(frame), parse_fault(name, EitKitBoard.faults)
+    except ValueError as error:
+        raise UserError(f"--fault {argument}: {error}") from None
+
+
+def _frames(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.float64]"]:
+    if args.recording is not None and args.bank is not None:
+        raise UserError("give either --recording FILE to play a recording or --bank FILE to synthesise frames")
+    if args.recording is None:
+        if args.once:
+            raise UserError("--once is for a recording; synthetic frames have no end")
+        return _synthetic(args, period_s)
+    from shearloop.daemon.recording.matlab import read_stream
+
+    lines = read_stream(args.recording, args.side).lines
+    return iter(lines) if args.once else cycle(lines)
+
+
+def _synthetic(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.float64]"]:
+    from shearloop.bank.eit.bank_file import Bank
+    from shearloop.daemon.synthetic_frames import Synthesiser, TwistProgramme, solve_signals, twist_frames
+
+    rest, largest = args.sigma
+
+    def sigma_of_torque(torque_nm: float) -> float:
+        return float(rest + (largest - rest) * torque_nm / LARGEST_TORQUE_NM)
+
+    if args.bank is not None:
+        signals: Signals = Bank.open(args.bank)
+    else:
+        signals = solve_signals(_demo_mesh(), K_CM, min(rest, largest), max(rest, largest))
+    synthesiser = Synthesiser(signals, seed=args.seed)
+    # Report a wrong sigma before a port appears.
+    for torque_nm in (0.0, LARGEST_TORQUE_NM):
+        synthesiser.signal(K_CM, sigma_of_torque(torque_nm))
+    return twist_frames(synthesiser, TwistProgramme(), k=K_CM, sigma_of_torque=sigma_of_torque, period_s=period_s)
+
+
+def _demo_mesh() -> "Mesh":
+    from shearloop.daemon.bank_config import load_bank_plan
+
+    if not DEMO_BANK.is_file():
+        raise UserError(f"{DEMO_BANK} is not there; give --recording FILE to play, or --bank FILE to synthesise from")
+    return load_bank_plan(DEMO_BANK).mesh
+
+
+def _configure_hx711(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "Prints the port's path, again each time it is plugged in. A fault's name on standard input applies to the "
+        "next line: garbage, spike, torn; or to what follows: silence [SECONDS], saturation [SECONDS], stuck "
+        "[SECONDS], unplug [SECONDS], jump NM; `normal` ends them. `torque NM` sets the torque, `mass G` that of a "
+        "mass on the lever."
+    )
+    parser.add_argument("--torque-nm", type=float, default=0.0, metavar="NM", help="the torque (default: %(default)s)")
+    parser.add_argument("--paper-sketch", action="store_true", help="send N·m, as the paper's board did, not counts")
+    parser.add_argument("--seed", type=int, default=0, help="of noise and garbage (default: %(default)s)")
+    parser.add_argument("--speed", type=float, default=1.0, metavar="N", help="times the board's 10.9 lines per second")
+    console.add_link(parser)
+
+
+def _run_hx711(args: argparse.Namespace) -> int:
+    from shearloop.drivers.emulators.boards import LOAD_PERIOD_S, PAPER_SKETCH, Hx711Board, Sketch
+
+    console.check_positive(args, "speed")
+    if not math.isfinite(args.torque_nm):
+        raise UserError("--torque-nm must be finite")
+    held_nm = args.torque_nm
+    board = Hx711Board(
+        (held_nm for _ in repeat(None)),
+        PAPER_SKETCH if args.paper_sketch else Sketch(),
+        period_s=LOAD_PERIOD_S / args.speed,
+        link=console.checked_link(args.link),
+        seed=args.seed,
+    )
+
+    def on_command(line: str) -> None:
+        nonlocal held_nm
+        match line.split():
+            case ["torque", number]:
+                held_nm = _finite(number)
+            case ["mass", number]:
+                held_nm = _finite(number) * 1e-3 * STANDARD_GRAVITY * LEVER_ARM_M
+            case _:
+                board.command(line)
+
+    console.play(board.run(), on_command, {"": board.port.appearances})
+    return 0
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is not a finite number")
+    return value
+
+
+def add_robot(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of every emulated controller."""
+    parser.add_argument("--rate-hz", type=float, default=500.0, help="control cycles per second (default: %(default)s)")
+    parser.add_argument("--unlock-wait-s", type=float, default=5.0, help="time in which a stop is not unlocked (5)")
+    parser.add_argument("--power-on-s", type=float, default=1.0, help="time of each power-on step (default: 1)")
+
+
+def robot_make(args: argparse.Namespace, version: tuple[int, ...] | None = None) -> "ControllerSpec":
+    """Return the controller's make; UserError for a wrong rate."""
+    from shearloop.drivers.emulators.ur_robot import ControllerSpec
+
+    console.check_range(args, "rate_hz", 50, 1000)
+    times = {name: getattr(args, name) for name in ("unlock_wait_s", "power_on_s")}
+    return ControllerSpec(**times) if version is None else ControllerSpec(version=version, **times)
+
+
+def print_robot_event(event: "RobotEvent") -> None:
+    """Print an event of the robot."""
+    console.print_event(
+        event.name,
+        detail=event.detail,
+        time_s=round(event.time_s, 6),
+        since_command_s=round(event.since_command_s, 6),
+        q_rad=[round(angle, 9) for angle in event.q_rad],
+    )
+
+
+def _configure_ur(parser: argparse.ArgumentParser) -> None:
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = UR_FAULTS
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="address to listen on; its ports 29999, 30003 and 30004 are the client's"
+    )
+    parser.add_argument("--version", default="5.17.3.0", help="PolyScope version to give (default: %(default)s)")
+    add_robot(parser)
+
+
+def _run_ur(args: argparse.Namespace) -> int:
+    from shearloop.drivers.emulators.ur_controller import Controller
+    from shearloop.drivers.emulators.ur_robot import Robot
+
+    try:
+        version = tuple(int(part) for part in args.version.split("."))
+    except ValueError:
+        raise UserError(f"--version {args.version} is no version; write for instance 5.17.3.0") from None
+    controller = Controller(Robot(robot_make(args, version)), host=args.host, rate_hz=args.rate_hz)
+
+    def on_command(line: str) -> None:
+        controller.command(line)
+        console.print_event("obeyed", detail=line)
+
+    with console.report_busy_address(f"the controller cannot listen on {args.host}", "choose another --host"):
+        console.play(_play_ur(controller, args.host), on_command)
+    return 0
+
+
+async def _play_ur(controller: "Controller", host: str) -> None:
+    async with controller:
+        console.print_event("listening", detail=host)
+        async for event in controller.run():
+            print_robot_event(event)
+
+
+def _configure_gripper(parser: argparse.ArgumentParser, printed: str) -> None:
+    parser.epilog = (
+        f"Prints {printed}, again each time it comes back. On standard input: `object MM` puts something of that width "
+        "between the fingers, `object none` takes it away; `fault CODE` makes the gripper report a fault; `unplug "
+        "[SECONDS]` breaks the connection, `silence [SECONDS]` answers nothing, `break-off` ends the next answer "
+        "half-way; `normal` ends them, and a fault below 10."
+    )
+    parser.add_argument("--speed", type=float, default=1.0, metavar="N", help="times the gripper's own pace")
+    parser.add_argument("--object-mm", type=float, metavar="MM", help="the width of an object between the fingers")
+
+
+def _configure_gripper_socket(parser: argparse.ArgumentParser) -> None:
+    _configure_gripper(parser, "its address")
+    parser.add_argument(
+        "--bind", default="127.0.0.1", metavar="ADDRESS", help="address to listen on (default: %(default)s)"
+    )
+    parser.add_argument("--port", type=int, default=63352, help="0 for a free one (default: %(default)s)")
+
+
+def _configure_gripper_modbus(parser: argparse.ArgumentParser) -> None:
+    _configure_gripper(parser, "the port's path")
+    console.add_link(parser)
+
+
+def _run_gripper(args: argparse.Namespace) -> int:
+    from shearloop.drivers.emulators.gripper import Gripper, GripperPlayer, ModbusSlave, UrcapSession
+    from shearloop.drivers.emulators.ports import PtyServer, SocketServer
+
+    console.check_positive(args, "speed")
+    gripper = Gripper()
+    server: SocketServer | PtyServer
+    if args.device == "gripper-modbus":
+        server = PtyServer(ModbusSlave(gripper), console.checked_link(args.link))
+    else:
+        server = SocketServer(UrcapSession(gripper), args.bind, console.checked_port("port", args.port))
+    player = GripperPlayer(gripper, server, args.speed)
+    if args.object_mm is not None:
+        try:
+            player.command(f"object {args.object_mm}")
+        except ValueError as error:
+            raise UserError(f"--object-mm: {error}") from None
+    with console.report_busy_address("the gripper cannot be played", "choose another port or bind address"):
+        console.play(player.run(), player.command, {"": server.appearances})
+    return 0
+
+
+DEVICES = {
+    "eit-kit": console.Device("the EIT board of a fingertip, on a pseudo-terminal", _configure_eit_kit, _run_eit_kit),
+    "hx711": console.Device("the load cell's board, on a pseudo-terminal", _configure_hx711, _run_hx711),
+    "ur": console.Device("a UR robot's controller, on an address of this machine", _configure_ur, _run_ur),
+    "gripper-socket": console.Device("a 2F-140 behind the URCap's socket", _configure_gripper_socket, _run_gripper),
+    "gripper-modbus": console.Device(
+        "a 2F-140 on Modbus RTU, on a pseudo-terminal", _configure_gripper_modbus, _run_gripper
+    ),
+}

@@ -1,1 +1,0 @@
-"""An emulated Robotiq 2F-140 behind the URCap's socket or Modbus RTU."""

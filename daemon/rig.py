@@ -1,7 +1,6 @@
 """The rig: builds gripper, robot and control loop from the configuration, and checks its experiment."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.logs import log_link
+from shearloop.daemon.logs import LinkLog
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.recorder import AttachedFile, Recorder, experiment_notes
 from shearloop.daemon.sensing.estimators import COMBINED
@@ -32,12 +31,11 @@ from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.supervisor import Supervisor, Task
 from shearloop.daemon.taring import Sensor, tare_all
 from shearloop.drivers.calibration_files import load_calibration
-from shearloop.drivers.connection import LinkEvent
+from shearloop.drivers.connection import LinkEvent, LinkMonitor
 from shearloop.drivers.load_cell import LoadCalibration
-from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
-from shearloop.drivers.robotiq.width import WidthCalibration
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.settings import read_settings
 
@@ -69,18 +67,18 @@ def gripper_calibration(config: GripperConfig) -> WidthCalibration:
     return load_calibration(config.calibration, WidthCalibration)
 
 
-@dataclass(frozen=True, slots=True)
-class DeviceLink:
+class DeviceLink(LinkLog):
     """Logs the losses and returns of one device, and hands them to the control loop, where there is one."""
 
-    device: str
-    loop: ControlLoop | None
+    def __init__(self, device: str, loop: ControlLoop | None) -> None:
+        super().__init__(device)
+        self._loop = loop
 
     def on_link_event(self, event: LinkEvent) -> None:
         """Take a loss or a return."""
-        log_link(self.device, event)
-        if self.loop is not None:
-            self.loop.on_link(self.device, event.sentence, up=event.up)
+        super().on_link_event(event)
+        if self._loop is not None:
+            self._loop.on_link(self.device, event.sentence, up=event.up)
 
 
 def make_loop(config: DaemonConfig, sources: Mapping[str, TorqueSource]) -> ControlLoop | None:
@@ -105,7 +103,7 @@ def make_gripper(
         return None
     client, calibration = make_gripper_client(config.gripper), gripper_calibration(config.gripper)
     return GripperTask(
-        RobotiqGripper(client, calibration, on_event=DeviceLink("gripper", loop).on_link_event),
+        RobotiqGripper(client, calibration, monitor=LinkMonitor(DeviceLink("gripper", loop))),
         publisher,
         loop.on_gripper,
         fingertip_diameter=diameters.latest,
@@ -132,7 +130,7 @@ class Rig:
             raise ValueError("a rig needs a robot")
         self.control_loop = loop
         self.gripper = gripper
-        self.robot = UrRobot(read_settings(config.robot), DeviceLink("robot", loop))
+        self.robot = UrRobot(read_settings(config.robot), LinkMonitor(DeviceLink("robot", loop)))
         self.runner = ControlLoopRunner(
             loop,
             self.robot,

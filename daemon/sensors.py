@@ -18,6 +18,7 @@ from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, RecordedSkin, 
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.supervisor import Task
 from shearloop.daemon.taring import Sensor
+from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.serial_sensor import InputRecorder
@@ -106,7 +107,7 @@ class SensorBuilder:
             serial_number=own.device.serial_number,
             zero_slots=ZERO_SLOTS,
             frame_period_s=own.frame_period_s,
-            on_event=DeviceLink(name, self.loop).on_link_event,
+            monitor=LinkMonitor(DeviceLink(name, self.loop)),
             inputs=self._inputs(name),
         )
 
@@ -119,7 +120,7 @@ class SensorBuilder:
             serial_number=own.device.serial_number,
             path=own.device.path,
             rate_hz=own.rate_hz,
-            on_event=DeviceLink(LOAD_CELL, self.loop).on_link_event,
+            monitor=LinkMonitor(DeviceLink(LOAD_CELL, self.loop)),
             inputs=self._inputs(LOAD_CELL),
         )
         return LoadCellTask(board, self.publisher, self.clock, self.loop, own.rate_hz)

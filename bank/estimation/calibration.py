@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS
-from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatcher
 from shearloop.bank.estimation.estimator import Estimator, OutputModel
@@ -28,6 +27,7 @@ from shearloop.bank.estimation.interval_regressor import PolynomialRegressor
 from shearloop.bank.estimation.ridge_estimators import PaperEstimator
 from shearloop.bank.estimation.values import Kind
 from shearloop.bank.estimators import estimator_class
+from shearloop.bank.polynomial import Polynomial
 from shearloop.files import replace_file
 
 FORMAT_VERSION = 4

@@ -9,7 +9,6 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.channels import N_CHANNELS, smoothed_along_channels
-from shearloop.bank.eit.polynomial import TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatch
 from shearloop.bank.estimation.estimator import (
@@ -36,6 +35,7 @@ from shearloop.bank.estimation.interval_regressor import (
 from shearloop.bank.estimation.novelty import fitted_parts, reciprocal_means
 from shearloop.bank.estimation.regressors import InverseCalibration, Ridge, TobitRidge
 from shearloop.bank.estimation.session_state import BASELINE_FRAMES, NO_MOTION, TemporalFeatures
+from shearloop.bank.polynomial import TWO_SIDED_95
 
 # Directions of motion per fingertip, and frames back: 13 frames are 7 s, about twice the gel's creep.
 _N_DIRECTIONS, _N_LAGS = 4, 12

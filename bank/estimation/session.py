@@ -8,7 +8,6 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.polynomial import TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatch, BankMatcher
 from shearloop.bank.estimation.calibration import LARGEST_TOOL_SHARE, Calibration
@@ -17,6 +16,7 @@ from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.novelty import FAMILIAR, Novelty
 from shearloop.bank.estimation.session_state import BASELINE_FRAMES, PaperState, SessionState, SliceState
 from shearloop.bank.estimation.values import Estimate, Measured, TactileFrame
+from shearloop.bank.polynomial import TWO_SIDED_95
 
 REPEATED_FRAME = ("the board sent the same frame again",)
 _UNITS: dict[Quantity, str] = {"torque": "N·m", "diameter": "mm"}

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration
+from shearloop.bank.polynomial import Polynomial
 
 BANK = "ab" * 32
 SIGMA, K = np.linspace(1.2, 1.9, 30), np.linspace(3.4, 3.8, 12)

@@ -24,7 +24,7 @@ from shearloop.bank.estimation.interval_regressor import (
 )
 from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.bank.estimation.regressors import ChannelImputer, Ridge, later_origins
-from shearloop.bank.estimation.session_state import NO_MOTION, TemporalFeatures
+from shearloop.bank.estimation.session_state import Motion
 
 if TYPE_CHECKING:
     from shearloop.bank.eit.mesh import Mesh
@@ -160,9 +160,9 @@ class Estimator:
         return self.needs == "bank"
 
     @property
-    def motion(self) -> TemporalFeatures:
-        """The motion of the gel that a session follows."""
-        return NO_MOTION
+    def motion(self) -> Motion:
+        """What a session remembers of the gel's motion."""
+        return Motion()
 
     def with_imputer(self, positions: FloatArray, validators: tuple[FingertipValidator, ...]) -> Self:
         """Return the estimator with the imputer of (n, m·896) gripped differences in units of noise."""

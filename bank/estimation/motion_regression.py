@@ -1,4 +1,9 @@
-"""The estimator of motion, the default: the gel's motion over the last seconds; for slices a curve over the value."""
+"""The estimator of motion, the default: the gel's motion over the last seconds; for slices a curve over the value.
+
+Its features are how far the frame has moved since each of the last frames, in a few directions per fingertip. The gel
+creeps for seconds under a held twist, so its speed shows torque that its position does not, and slow drift of the
+baseline leaves no trace. Where the gel holds its position, that position is a feature too and shows a long twist.
+"""
 
 import math
 from collections.abc import Sequence
@@ -34,7 +39,7 @@ from shearloop.bank.estimation.interval_regressor import (
 )
 from shearloop.bank.estimation.novelty import fitted_parts, reciprocal_means
 from shearloop.bank.estimation.regressors import InverseCalibration, Ridge, TobitRidge
-from shearloop.bank.estimation.session_state import BASELINE_FRAMES, NO_MOTION, TemporalFeatures
+from shearloop.bank.estimation.session_state import BASELINE_FRAMES, Motion
 from shearloop.bank.polynomial import TWO_SIDED_95
 
 # Directions of motion per fingertip, and frames back: 13 frames are 7 s, about twice the gel's creep.
@@ -54,6 +59,68 @@ _ROUNDING = 1e-9
 # Inverse calibration over torque and over diameter: degree, directions of drift, trend. The torque's have the least
 # mean error over six origins (19 to 44 of 49 slices, evaluated on all later ones; docs/decisions/0042).
 _CURVES: dict[Quantity, tuple[int, int, bool]] = {"torque": (3, 3, True), "diameter": (1, 1, False)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TemporalFeatures(Motion):
+    """Directions (m, p, 896) along which each side's motion is measured, in units of noise, and how far back.
+
+    With uses_position the position relative to the idle frame is a feature too.
+    """
+
+    directions: FloatArray
+    n_lags: int
+    uses_position: bool = False
+
+    @classmethod
+    def fit(
+        cls, parts: Sequence[FloatArray], validators: tuple[FingertipValidator, ...], n_directions: int, n_lags: int
+    ) -> Self:
+        """Fit the main directions of motion to each recording's (n, m, 896) gripped frames."""
+        directions = []
+        for layer, one in enumerate(validators):
+            moved = np.vstack([(part[n_lags:, layer] - part[:-n_lags, layer]) / one.noise for part in parts])
+            rows = np.linalg.svd(moved, full_matrices=False)[2][:n_directions] / one.noise
+            directions.append(rows * np.sign(rows.sum(axis=1, keepdims=True)))
+        return cls(np.array(directions), n_lags)
+
+    def project(self, channels: FloatArray) -> FloatArray:
+        """Return the (…, m·p) positions of (…, m, 896) frames along the directions."""
+        found = np.einsum("...mc,mpc->...mp", channels, self.directions)
+        return np.asarray(found.reshape(*found.shape[:-2], -1))
+
+    def fill(self, moved: FloatArray, usable: BoolArray, sides: Sequence[FingertipValidator]) -> FloatArray:
+        """Return the motion (m, 896) since the last frame, unusable channels along the directions."""
+        imputed = [self._impute(layer, moved[layer], usable[layer], one.noise) for layer, one in enumerate(sides)]
+        return np.where(usable, moved, imputed)
+
+    def complete(self, difference: FloatArray, usable: BoolArray, sides: Sequence[FingertipValidator]) -> FloatArray:
+        """Return a (m, 896) difference to the idle frame, unusable channels along the directions and the grip."""
+        if usable.all():
+            return difference
+        imputed = [
+            self._impute(layer, difference[layer], usable[layer], one.noise, one.gripped - one.idle)
+            for layer, one in enumerate(sides)
+        ]
+        return np.where(usable, difference, imputed)
+
+    def _impute(
+        self, layer: int, moved: FloatArray, usable: BoolArray, noise: FloatArray, *grip: FloatArray
+    ) -> FloatArray:
+        alive = np.isfinite(noise)
+        modes = np.vstack([self.directions[layer] * np.where(alive, noise, 0.0) ** 2, *grip])
+        weights = np.where(usable & alive, 1.0 / noise, 0.0)
+        found = np.linalg.lstsq((modes * weights).T, moved * weights, rcond=None)[0]
+        return np.asarray(found @ modes)
+
+    def features(self, positions: Sequence[FloatArray], from_idle: FloatArray) -> FloatArray:
+        """Return n_lags · m·p features of motion, nearest lag first, and m·p of position where it is used.
+
+        positions are the last n_lags + 1 (m·p,) positions; from_idle (m·p,) is the newest one relative to idle.
+        """
+        rows = np.array(positions)
+        moved = (rows[-1] - rows[-2::-1]).ravel()
+        return np.concatenate([moved, from_idle]) if self.uses_position else moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +147,9 @@ class MotionRegression(Estimator):
         return cls(material.scale, temporal=replace(temporal, uses_position=True))
 
     @property
-    def motion(self) -> TemporalFeatures:
-        """The motion of the gel that a session follows."""
-        return self.temporal or NO_MOTION
+    def motion(self) -> Motion:
+        """What a session remembers of the gel's motion."""
+        return self.temporal or Motion()
 
     def with_imputer(self, _positions: FloatArray, _validators: tuple[FingertipValidator, ...]) -> Self:
         """Return the estimator itself: its session imputes channels along the motion."""
@@ -116,8 +183,9 @@ class MotionRegression(Estimator):
     ) -> tuple[Self, IntervalRegressor, float]:
         """Return the torque's regressor, and the estimator with position where that does better on later frames."""
         fit = TobitRidge.fit if is_one_sided(torque_nm) else Ridge.fit_scaled
-        motion = self.motion
-        n_motion = motion.n_lags * motion.directions.shape[0] * motion.directions.shape[1]
+        if (temporal := self.temporal) is None:
+            raise ValueError("raw frames have motion")
+        n_motion = temporal.n_lags * temporal.directions.shape[0] * temporal.directions.shape[1]
         choices = {False: features[:, :n_motion], True: features}
         errors = {used: best_strength(one, torque_nm, fit, _MOTION_STRENGTHS)[1] for used, one in choices.items()}
         unexplained = errors[False] / float(torque_nm.var())
@@ -125,7 +193,7 @@ class MotionRegression(Estimator):
         regressor = fit_interval_regressor(
             choices[used], torque_nm, fit, strengths=_MOTION_STRENGTHS, limit_features=True, bounds=bounds
         )
-        chosen = replace(self, temporal=replace(motion, uses_position=used))
+        chosen = replace(self, temporal=replace(temporal, uses_position=used))
         return chosen, regressor, errors[used] / float(torque_nm.var())
 
     def fit_diameter(self, rows: list[CalibrationRow]) -> OutputModel:

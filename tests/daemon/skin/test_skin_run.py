@@ -33,7 +33,7 @@ class Played:
 
     @property
     def refused_lines(self) -> int:
-        skin = self.daemon._skin
+        skin = self.daemon.sensors.skin
         assert skin is not None
         errors = skin.diagnostics()["errors"]
         assert isinstance(errors, Mapping)

@@ -8,7 +8,6 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.experiment_schema import (
     ExperimentFile,
     GripStep,
@@ -19,6 +18,7 @@ from shearloop.daemon.control.experiment_schema import (
     check_limits,
 )
 from shearloop.daemon.control.gripper_task import GripperTask
+from shearloop.daemon.control.identification import Creep
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
 from shearloop.daemon.errors import UserError
@@ -105,7 +105,7 @@ def make_gripper(
     return GripperTask(
         RobotiqGripper(client, calibration, monitor=LinkMonitor(DeviceLink("gripper", loop))),
         publisher,
-        loop.on_gripper,
+        loop,
         fingertip_diameter=diameters.latest,
         measures_diameters=config.gripper.calibration is not None,
     )
@@ -138,7 +138,7 @@ class Rig:
             partial(tare_all, sensors.values()),
             publisher,
             clock,
-            supervisor.deaths,
+            supervisor.dead,
             config.loop.wrist_acceleration_rad_per_s2,
         )
         self._recorder = recorder

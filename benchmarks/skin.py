@@ -14,33 +14,30 @@ from functools import partial
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
+from shearloop.bank.skin.characterisation import loading, loop, responses
 from shearloop.bank.skin.membrane import (
     PAPER_SECTION,
     loading_response,
     paper_membrane,
-    response_of_strains,
     section_membrane,
 )
 from shearloop.bank.skin.plane_strain import (
-    MESH_56,
     MESH_112,
-    MESH_448,
-    MESH_1792,
     MeshSize,
     condense,
-    gauge_strains,
+    gauge_responses,
     states_along,
 )
-from shearloop.bank.skin.statistics import loading, loop, responses
 
 NORMAL_N, AMPLITUDE_N = 1.0, 1.0
+MESHES = {56: MeshSize(3, 4, 6, 2, 2), 112: MESH_112, 448: MESH_112.refined(2)}
 Model = Callable[[FloatArray], FloatArray]
 
 
 def two_dimensional(mesh: MeshSize) -> Model:
     """Return the 2-D model on a mesh."""
     skin = condense(PAPER_SECTION, mesh)
-    return lambda path: response_of_strains(*gauge_strains(skin, states_along(skin, NORMAL_N, path.tolist())).T)
+    return lambda path: gauge_responses(skin, states_along(skin, NORMAL_N, path.tolist()))
 
 
 def models() -> dict[str, Model]:
@@ -51,14 +48,14 @@ def models() -> dict[str, Model]:
         ),
         "1-D, paper's F/(EA)": partial(responses, paper_membrane(), normal_n=NORMAL_N),
         "1-D, section's EA": partial(responses, section_membrane(), normal_n=NORMAL_N),
-        **{f"2-D, {mesh.elements} elements": two_dimensional(mesh) for mesh in (MESH_56, MESH_112, MESH_448)},
+        **{f"2-D, {elements} elements": two_dimensional(mesh) for elements, mesh in MESHES.items()},
     }
 
 
 def main() -> None:
     """Measure and print a table."""
     up, there_and_back = loading(AMPLITUDE_N), loop(AMPLITUDE_N)
-    reference = two_dimensional(MESH_1792)
+    reference = two_dimensional(MESH_112.refined(4))
     true_up, true_loop = reference(up), reference(there_and_back)
     scale = abs(true_loop).max()
     print("| model | µs per step | loading | whole loop |\n|---|---|---|---|")

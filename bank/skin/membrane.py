@@ -1,4 +1,4 @@
-"""The skin in one dimension: cross-section, gauges, closed-form response, and the membrane model used at run time.
+"""The skin in one dimension: cross-section, closed-form response, and the membrane model used at run time.
 
 Yin, Santos, Posner, "Bioinspired flexible microfluidic shear force sensor skin", Sensors and Actuators A 264 (2017).
 The angle θ is the paper's: 0° and 180° at the brackets, 90° under the load. A positive shear force pulls towards
@@ -10,14 +10,12 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import NamedTuple
 
-import numpy as np
-
-from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError, GeometryError
 
 EXCITATION_A = 5e-3
-# Eutectic gallium indium at room temperature.
-EGAIN_RESISTIVITY_OHM_M = 29.4e-8
+# ρ N L / (w h): eutectic gallium indium at room temperature, in 70 strips of 3 mm without the turns between them (the
+# paper's section 2), 50 µm wide and high.
+GAUGE_RESISTANCE_OHM = 29.4e-8 * 70 * 3e-3 / (50e-6 * 50e-6)
 # One gauge, 7 mm by 3 mm.
 SENSOR_AREA_M2 = 7e-3 * 3e-3
 # Usual for still air.
@@ -85,59 +83,12 @@ class Section:
 PAPER_SECTION = Section()
 
 
-@dataclass(frozen=True, slots=True)
-class Gauge:
-    """A serpentine of N strips, without the turns between them, as in the paper (N ≫ 1; its section 2)."""
-
-    strips: int = 70
-    strip_length_m: float = 3e-3
-    channel_width_m: float = 50e-6
-    channel_height_m: float = 50e-6
-    resistivity_ohm_m: float = EGAIN_RESISTIVITY_OHM_M
-
-    @property
-    def resistance_ohm(self) -> float:
-        """ρ N L / (w h), unloaded."""
-        length_m = self.strips * self.strip_length_m
-        return self.resistivity_ohm_m * length_m / (self.channel_width_m * self.channel_height_m)
-
-    def power_at_current_w(self, current_a: float = EXCITATION_A) -> float:
-        """Return the heat where a current source feeds the gauge, 5 mA in the paper."""
-        return (current_a * self.resistance_ohm) ** 2 / self.resistance_ohm
-
-    def joule_heating_k(self, current_a: float = EXCITATION_A) -> float:
-        """Return the steady temperature rise of the gauge's area in still air."""
-        return joule_heating_k(self.power_at_current_w(current_a))
-
-
 def joule_heating_k(power_w: float) -> float:
     """Return the steady temperature rise of a gauge's area in still air, one side cooled: P / (h A).
 
     Conduction into skin and core is neglected, so the true rise is smaller; the paper gives at most 5 K.
     """
     return power_w / (CONVECTION_W_M2_K * SENSOR_AREA_M2)
-
-
-def measured_response(
-    r1_ohm: FloatArray, r2_ohm: FloatArray, r1_unloaded_ohm: float, r2_unloaded_ohm: float
-) -> FloatArray:
-    """Return the normalised response ΔR₁/R₁₀ − ΔR₂/R₂₀ = F (ε₁ − ε₂), the measured side of equation (1).
-
-    Raises CalibrationError where an unloaded resistance is not a positive number.
-    """
-    for name, unloaded in (("R1", r1_unloaded_ohm), ("R2", r2_unloaded_ohm)):
-        if not (np.isfinite(unloaded) and unloaded > 0):
-            raise CalibrationError(
-                f"The unloaded resistance of {name} is {unloaded} Ω; measure it again with the skin at rest."
-            )
-    ratio: FloatArray = r1_ohm / r1_unloaded_ohm - r2_ohm / r2_unloaded_ohm
-    return ratio
-
-
-def response_of_strains(strain_1: FloatArray, strain_2: FloatArray) -> FloatArray:
-    """Return F (ε₁ − ε₂), the modelled side of equation (1)."""
-    modelled: FloatArray = GAUGE_FACTOR * (strain_1 - strain_2)
-    return modelled
 
 
 # The closed form balances moments about the core's centre. The tension at mid-thickness, N = F_t R_out/R, is shared by
@@ -155,14 +106,10 @@ def sensitivity_per_n(section: Section) -> float:
     return GAUGE_FACTOR * flat * pressed * lever * capstan
 
 
-def deadband_n(section: Section, normal_n: float) -> float:
-    """Return the shear force at which the skin under the load begins to slip, μ F_n R_in/R_out."""
-    return section.friction * normal_n * section.inner_radius_mm / section.outer_radius_mm
-
-
 def loading_response(section: Section, normal_n: float, shear_n: float) -> float:
-    """Return the closed-form response while a shear force rises from zero."""
-    beyond = max(abs(shear_n) - deadband_n(section, normal_n), 0.0)
+    """Return the closed-form response while a shear force rises from zero; the skin slips beyond μ F_n R_in/R_out."""
+    deadband_n = section.friction * normal_n * section.inner_radius_mm / section.outer_radius_mm
+    beyond = max(abs(shear_n) - deadband_n, 0.0)
     return math.copysign(sensitivity_per_n(section) * beyond, shear_n)
 
 
@@ -189,13 +136,11 @@ class ShearInterval(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MembraneState:
-    """The membrane at rest: net tension at the load (positive: side 1) and tension at both gauges, in N; strains."""
+    """The membrane at rest: net tension at the load (positive: side 1) and tension at both gauges, in N."""
 
     net_tension_n: float = 0.0
     gauge_tension_1_n: float = 0.0
     gauge_tension_2_n: float = 0.0
-    strain_1: float = 0.0
-    strain_2: float = 0.0
 
 
 UNSTRETCHED = MembraneState()
@@ -228,28 +173,20 @@ class Membrane:
         up = math.exp(self.friction * self.gauge_angle_rad)
         tension_1 = _clip(state.gauge_tension_1_n, max(net, 0.0) / up, max(net, 0.0) * up)
         tension_2 = _clip(state.gauge_tension_2_n, max(-net, 0.0) / up, max(-net, 0.0) * up)
-        stiffness = self.axial_stiffness_n
-        return MembraneState(net, tension_1, tension_2, tension_1 / stiffness, tension_2 / stiffness)
+        return MembraneState(net, tension_1, tension_2)
 
     def response(self, state: MembraneState) -> float:
         """Return F (ε₁ − ε₂), equation (1) of the paper."""
-        return self.gauge_factor * (state.strain_1 - state.strain_2)
-
-    def shear_from_response(
-        self, response: float, normal_n: float, direction: Direction = Direction.UNKNOWN
-    ) -> ShearInterval:
-        """Return the shear force (N) of a response, with the interval that friction leaves open.
-
-        While the magnitude of the response rises or falls, the skin slips all the way to the gauge, and the force is
-        one number. In an unknown direction it lies between the two; without response, within the deadband.
-        """
-        tension = response * self.axial_stiffness_n / self.gauge_factor
-        return self.shear_from_tensions(tension, tension, tension, normal_n, direction)
+        return self.gauge_factor * (state.gauge_tension_1_n - state.gauge_tension_2_n) / self.axial_stiffness_n
 
     def shear_from_tensions(
         self, low_n: float, tension_n: float, high_n: float, normal_n: float, direction: Direction
     ) -> ShearInterval:
-        """Return the shear force for a net tension at the gauges (N) that lies between low and high."""
+        """Return the shear force for a net tension at the gauges (N) that lies between low and high.
+
+        While the magnitude of the response rises or falls, the skin slips all the way to the gauge, and one tension
+        gives one force. In an unknown direction it lies between the two; without tension, within the deadband.
+        """
         low, high = self._bounds(low_n, normal_n, direction)[0], self._bounds(high_n, normal_n, direction)[1]
         if low_n <= 0 <= high_n:
             slack = self._bounds(0.0, normal_n, direction)
@@ -282,15 +219,16 @@ def direction_of(before: float, now: float, noise: float) -> Direction:
     return Direction.LOADING if change > 0 else Direction.UNLOADING
 
 
-def paper_membrane(section: Section = PAPER_SECTION) -> Membrane:
+def paper_membrane() -> Membrane:
     """Return the membrane with the paper's own F/(EA) = 0.088 1/N."""
-    return Membrane(GAUGE_FACTOR / PAPER_SENSITIVITY_PER_N, section.friction, section.gauge_angle_rad)
+    return Membrane(GAUGE_FACTOR / PAPER_SENSITIVITY_PER_N, PAPER_SECTION.friction, PAPER_SECTION.gauge_angle_rad)
 
 
-def section_membrane(section: Section = PAPER_SECTION) -> Membrane:
+def section_membrane() -> Membrane:
     """Return the membrane with the stiffness that modulus and cross-section give in plane strain."""
-    stiffness = GAUGE_FACTOR / sensitivity_per_n(replace(section, friction=0.0))
-    return Membrane(stiffness, section.friction, section.gauge_angle_rad)
+    return replace(
+        paper_membrane(), axial_stiffness_n=GAUGE_FACTOR / sensitivity_per_n(replace(PAPER_SECTION, friction=0.0))
+    )
 
 
 def _clip(value: float, low: float, high: float) -> float:

@@ -117,10 +117,7 @@ def _run(
                 devices=[emulator.device for emulator in emulators],
             )
         if args.show:
-            summary = RunSummary(
-                lambda lines: out.write("\n".join(("", *lines, "", ""))), truth.torques, lambda: events.sent
-            )
-            listeners += [EstimatePrinter(out), summary]
+            listeners += [EstimatePrinter(out), RunSummary(out, truth, events)]
         finished = asyncio.run(run_daemon(config, tuple(listeners), diagnostics, on_ready))
     if slices is not None:
         out.write(f"{args.slices}: {slices.summary}\n")

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from shearloop.bank.errors import GeometryError
 from shearloop.bank.skin.membrane import PAPER_SECTION as SECTION
 from shearloop.bank.skin.plane_strain import (
-    MESH_112,
     CondensedSkin,
     MeshSize,
     annulus_mesh,
@@ -58,7 +57,7 @@ def test_a_ring_under_pressure_converges_at_the_rates_of_quadratic_elements() ->
 
 def test_the_mesh_is_the_half_annulus_with_the_load_s_and_gauges_ends_on_element_edges() -> None:
     mesh = annulus_mesh(SECTION)
-    assert mesh.t.shape[1] == MESH_112.elements == 112
+    assert mesh.t.shape[1] == 112
     area = skfem.Functional(lambda _: 1.0).assemble(skfem.Basis(mesh, skfem.ElementQuad2()))
     assert area == pytest.approx(np.pi * SECTION.mid_radius_mm * SECTION.thickness_mm, rel=1e-7)
     vertices = np.unique(mesh.t)
@@ -109,14 +108,6 @@ def test_condensation_only_leaves_out_what_was_eliminated(skin_112: CondensedSki
         expected = ((t[-1] - t[0]) / span + mean_radial) / SECTION.mid_radius_mm
         assert weights @ strain == pytest.approx(expected, rel=1e-4)
         assert abs(expected) > 1e-3
-
-
-def test_the_load_moves_as_the_work_it_does(skin_112: CondensedSkin) -> None:
-    nothing = np.zeros(2 * len(skin_112.contact_deg))
-    movement = skin_112.load_movement_mm(nothing, 0.0, 1.0)
-    assert movement[1] > 0
-    assert abs(movement[0]) < 1e-9 * movement[1], "by symmetry"
-    np.testing.assert_allclose(skin_112.load_compliance, skin_112.load_compliance.T, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("wrong", [(0, 1, 1, 1, 2), (1, 1, 1, 1, 1), (1, 1, 1, 1, 3)])

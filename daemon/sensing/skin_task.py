@@ -45,7 +45,7 @@ MAX_WARMING_K = 5.0
 class SkinSourceTask:
     """Keeps the current source set up and read."""
 
-    skin: shear_skin.ShearSkin
+    skin: ShearSkin
 
     async def run(self) -> None:
         """Read until cancelled."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from shearloop.daemon.cli.bank import build
 from shearloop.daemon.cli.bank.build import MODEL_NAMES, add_overrides, overrides
 from shearloop.daemon.cli.options import add_json, check_overwrite
-from shearloop.daemon.cli.output import print_result
+from shearloop.daemon.cli.terminal import print_result
 from shearloop.daemon.errors import UserError
 
 _ACTIONS = {

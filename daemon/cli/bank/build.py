@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shearloop.daemon.cli.options import add_cluster, add_json, check_overwrite
-from shearloop.daemon.cli.output import progress_bar
+from shearloop.daemon.cli.terminal import progress_bar
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.signals import report_interrupt
 

@@ -17,7 +17,8 @@ from pathlib import Path
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.errors import BankError
-from shearloop.bank.estimation import FrameSeries, Name, Physics, fit, measure_timing
+from shearloop.bank.estimation import FrameSeries, Physics, fit, measure_timing
+from shearloop.bank.estimators import DEFAULT, EstimatorName
 from shearloop.daemon.analysis.evaluate import EstimateTrack, draw_tracks, estimate_series, figures_of
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.cli.demo_calibration import calibrate, record
@@ -26,7 +27,6 @@ from shearloop.daemon.recording.reader import read_recording
 from shearloop.drivers.emulators.rig import SIDES
 
 Figures = dict[str, float | int | None]
-DEFAULT: Name = "motion_regression"
 
 # Three and four of five repeats; about half of the cylinders' slices; five of ten twists.
 SLICE_SHARES = (0.592, 0.796)
@@ -84,8 +84,8 @@ def splits(recordings: Path, scratch: Path) -> Iterator[AccuracySplit]:
 
 
 def later_frames(
-    recordings: Path, scratch: Path, names: list[Name], physics: Physics
-) -> Iterator[tuple[str, Name, EstimateTrack]]:
+    recordings: Path, scratch: Path, names: list[EstimatorName], physics: Physics
+) -> Iterator[tuple[str, EstimatorName, EstimateTrack]]:
     """Yield the estimates of every estimator on every split; print why one cannot be fitted."""
     for split in splits(recordings, scratch):
         for name in names:
@@ -149,7 +149,7 @@ def main() -> None:
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     physics = Physics(Bank.open(args.bank), load_mesh(args.mesh))
-    names: list[Name] = ["paper", "bank", "regression", DEFAULT, "reconstruction"]
+    names: list[EstimatorName] = ["paper", "bank", "regression", DEFAULT, "reconstruction"]
     found: dict[str, dict[str, Figures]] = {}
     tracks: dict[str, EstimateTrack] = {}
     print(

@@ -14,11 +14,11 @@ from functools import partial
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
+from shearloop.bank.skin.characterisation import loading, loop, responses
 from shearloop.bank.skin.membrane import (
     PAPER_SECTION,
     loading_response,
     paper_membrane,
-    response_of_strains,
     section_membrane,
 )
 from shearloop.bank.skin.plane_strain import (
@@ -28,10 +28,9 @@ from shearloop.bank.skin.plane_strain import (
     MESH_1792,
     MeshSize,
     condense,
-    gauge_strains,
+    gauge_responses,
     states_along,
 )
-from shearloop.bank.skin.statistics import loading, loop, responses
 
 NORMAL_N, AMPLITUDE_N = 1.0, 1.0
 Model = Callable[[FloatArray], FloatArray]
@@ -40,7 +39,7 @@ Model = Callable[[FloatArray], FloatArray]
 def two_dimensional(mesh: MeshSize) -> Model:
     """Return the 2-D model on a mesh."""
     skin = condense(PAPER_SECTION, mesh)
-    return lambda path: response_of_strains(*gauge_strains(skin, states_along(skin, NORMAL_N, path.tolist())).T)
+    return lambda path: gauge_responses(skin, states_along(skin, NORMAL_N, path.tolist()))
 
 
 def models() -> dict[str, Model]:

@@ -19,7 +19,7 @@ from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.health import HealthReporter, TaskFacts
-from shearloop.daemon.logs import log_link
+from shearloop.daemon.logs import LinkLog
 from shearloop.daemon.messaging.addresses import local_stop_address
 from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import CurveAuthenticator, load_server_keys
@@ -34,7 +34,7 @@ from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.service import notify
 from shearloop.daemon.signals import ending_signals
 from shearloop.daemon.supervisor import Supervisor
-from shearloop.drivers.connection import LinkEvent
+from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.serial_sensor import InputRecorder
@@ -144,7 +144,7 @@ class Daemon:
                 serial_number=own.device.serial_number,
                 zero_slots=ZERO_SLOTS,
                 frame_period_s=own.frame_period_s,
-                on_event=self._on_link(name),
+                monitor=self._link_monitor(name),
                 inputs=self._inputs(name),
             )
             return FingertipTask(
@@ -173,7 +173,7 @@ class Daemon:
                 serial_number=port.serial_number,
                 path=port.path,
                 rate_hz=rate_hz,
-                on_event=self._on_link(LOAD_CELL),
+                monitor=self._link_monitor(LOAD_CELL),
                 inputs=self._inputs(LOAD_CELL),
             )
             self._load_cell = LoadCellTask(board, publisher, clock, on_torque, rate_hz)
@@ -281,8 +281,8 @@ class Daemon:
     def _inputs(self, source: str) -> InputRecorder | None:
         return self._recorder.input_recorder(source) if self._recorder is not None else None
 
-    def _on_link(self, device: str) -> Callable[[LinkEvent], None]:
-        return self._rig.on_link(device) if self._rig is not None else partial(log_link, device)
+    def _link_monitor(self, device: str) -> LinkMonitor:
+        return self._rig.monitor(device) if self._rig is not None else LinkMonitor(LinkLog(device))
 
     async def _record(self, recorder: Recorder) -> None:
         async for failure in recorder.flushes():

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model
 from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.messaging.addresses import (
@@ -51,9 +52,6 @@ class SerialDevice(ConfigModel):
     path: Path | None = Field(None, description="path of the port, such as /dev/serial/by-id/…")
 
     _one_name = either("serial_number", "path")
-
-
-EstimatorName = Literal["paper", "bank", "regression", "reconstruction", "motion_regression"]
 
 
 class CreepConfig(ConfigModel):

@@ -130,7 +130,13 @@ def logging_to_stderr(*, json_lines: bool | None = None, level: int = logging.IN
             structlog.configure(logger_factory=structlog.WriteLoggerFactory(sys.stderr))
 
 
-def log_link(device: str, event: LinkEvent) -> None:
-    """Log a change of a link: a return as info, a loss as warning, a repeated loss as debug."""
-    log = structlog.get_logger().bind(device=device)
-    (log.info if event.up else log.debug if event.repeated else log.warning)(event.sentence)
+class LinkLog:
+    """Logs the link events of a device: a return as info, a loss as warning, a repeated loss as debug."""
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+
+    def on_link_event(self, event: LinkEvent) -> None:
+        """Log an event."""
+        log = structlog.get_logger().bind(device=self.device)
+        (log.info if event.up else log.debug if event.repeated else log.warning)(event.sentence)

@@ -22,17 +22,16 @@ from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import GripperStatus, TorqueSource
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.logs import log_link
+from shearloop.daemon.logs import LinkLog
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.drivers.calibration_files import load_calibration
-from shearloop.drivers.connection import LinkEvent
+from shearloop.drivers.connection import LinkEvent, LinkMonitor
 from shearloop.drivers.load_cell import LoadCalibration
-from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
-from shearloop.drivers.robotiq.width import WidthCalibration
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.settings import read_settings
 
@@ -99,13 +98,13 @@ class Rig:
         if config.gripper is not None:
             calibration = gripper_calibration(config.gripper)
             self.gripper = GripperTask(
-                RobotiqGripper(make_gripper_client(config.gripper), calibration, on_event=self.on_link("gripper")),
+                RobotiqGripper(make_gripper_client(config.gripper), calibration, monitor=self.monitor("gripper")),
                 publisher,
                 self._on_gripper_state,
                 fingertip_diameter=fingertip_diameter,
                 measures_diameters=config.gripper.calibration is not None,
             )
-        self.robot = UrRobot(robot, DeviceLink(self, "robot"))
+        self.robot = UrRobot(robot, self.monitor("robot"))
         self.runner = ControlLoopRunner(
             self.control_loop,
             self.robot,
@@ -117,9 +116,9 @@ class Rig:
             config.loop.wrist_acceleration_rad_per_s2,
         )
 
-    def on_link(self, device: str) -> Callable[[LinkEvent], None]:
-        """Return a callback for link events of a device: it logs them, and the control loop reacts at once."""
-        return DeviceLink(self, device).on_link_event
+    def monitor(self, device: str) -> LinkMonitor:
+        """Return the monitor of a device's link: it logs the events, and the control loop reacts at once."""
+        return LinkMonitor(DeviceLink(self, device))
 
     async def start(self, path: Path) -> str | None:
         """Begin the experiment of a file; return None, or why not. Raises UserError for an invalid file."""
@@ -161,17 +160,17 @@ class Rig:
             self.control_loop.inputs.gripper = state
 
 
-class DeviceLink:
+class DeviceLink(LinkLog):
     """Logs the link events of a device, and passes them to the control loop."""
 
     def __init__(self, rig: Rig, device: str) -> None:
+        super().__init__(device)
         self._rig = rig
-        self._device = device
 
     def on_link_event(self, event: LinkEvent) -> None:
         """Handle a loss or a return."""
-        log_link(self._device, event)
-        self._rig.set_link(self._device, event)
+        super().on_link_event(event)
+        self._rig.set_link(self.device, event)
 
 
 def read_experiment(path: Path) -> ExperimentFile:

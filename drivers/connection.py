@@ -9,9 +9,9 @@ import errno
 import os
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, Self, TypeAlias
+from typing import Protocol, Self, TypeAlias
 
 import serial
 from serial.tools import list_ports
@@ -235,40 +235,6 @@ class TcpPort:
 Port: TypeAlias = SerialPort | TcpPort
 
 
-class Retry(NamedTuple):
-    """The pause before the next attempt, and whether this failure follows another one."""
-
-    wait_s: float
-    repeated: bool
-
-
-class ReconnectPolicy:
-    """Pauses between attempts: `first_s`, then twice as long each time, up to `longest_s`. No I/O."""
-
-    def __init__(self, first_s: float = 0.2, longest_s: float = 5.0) -> None:
-        self._first_s = first_s
-        self._longest_s = longest_s
-        self._failures = 0
-        self._connected_ns: int | None = None
-
-    def connected(self, now_ns: int) -> None:
-        """Note a new connection."""
-        self._connected_ns = now_ns
-
-    def failed(self, now_ns: int) -> Retry:
-        """Return when to retry after a failed attempt or a lost connection.
-
-        A connection shorter than the longest pause counts as a further failure, so a flapping device is not reopened
-        five times a second.
-        """
-        if self._connected_ns is not None and now_ns - self._connected_ns >= self._longest_s * 1e9:
-            self._failures = 0
-        self._connected_ns = None
-        retry = Retry(min(self._first_s * 2.0 ** min(self._failures, 32), self._longest_s), self._failures > 0)
-        self._failures += 1
-        return retry
-
-
 @dataclass(frozen=True, slots=True)
 class LinkEvent:
     """A port was opened (`up`), lost or not found; `repeated` events are for the debug log."""
@@ -285,21 +251,68 @@ class LinkObserver(Protocol):
         """React to a change at once; never blocks."""
 
 
+class LinkMonitor:
+    """Counts a device's connections, reports each change, and spaces the attempts. No I/O.
+
+    The pauses are `first_s`, then twice as long each time, up to `longest_s`. `latest` is the last event.
+    """
+
+    def __init__(self, observer: LinkObserver | None = None, first_s: float = 0.2, longest_s: float = 5.0) -> None:
+        self._observer = observer
+        self._first_s = first_s
+        self._longest_s = longest_s
+        self._failures = 0
+        self._connected_ns: int | None = None
+        self._connections = 0
+        self._last_error = ""
+        self.latest = LinkEvent(up=False, sentence="It has not been connected yet.", repeated=False)
+
+    def connected(self, sentence: str, now_ns: int) -> None:
+        """Note a new connection."""
+        self._connected_ns = now_ns
+        self._connections += 1
+        self._notify(LinkEvent(up=True, sentence=sentence, repeated=False))
+
+    def failed(self, error: DriverError, now_ns: int) -> float:
+        """Note a failed attempt or a lost connection; return the pause before the next attempt in s.
+
+        A connection shorter than the longest pause counts as a further failure, so a flapping device is not reopened
+        five times a second.
+        """
+        if self._connected_ns is not None and now_ns - self._connected_ns >= self._longest_s * 1e9:
+            self._failures = 0
+        self._connected_ns = None
+        before, self._last_error = self._last_error, str(error)
+        # A different error is news even without a pause in between.
+        repeated = self._failures > 0 and _without_digits(before) == _without_digits(self._last_error)
+        pause_s = min(self._first_s * 2.0 ** min(self._failures, 32), self._longest_s)
+        self._failures += 1
+        self._notify(LinkEvent(up=False, sentence=self._last_error, repeated=repeated))
+        return pause_s
+
+    def diagnostics(self, *, connected: bool) -> dict[str, bool | int | str]:
+        """Return the connection's part of `health`; counts are since the process began."""
+        return {"connected": connected, "connections": self._connections, "last_loss": self._last_error}
+
+    def _notify(self, event: LinkEvent) -> None:
+        self.latest = event
+        if self._observer is not None:
+            self._observer.on_link_event(event)
+
+
+def _without_digits(text: str) -> str:
+    return "".join(letter for letter in text if not letter.isdigit())
+
+
 class Link(ABC):
     """Keeps a device connected: finds it, opens it, and reopens it after a loss.
 
-    Use it as a context, which closes the port at the end. `port` is the open port or None; `connections` counts how
-    often it was opened. `on_event` receives every change.
+    Use it as a context, which closes the port at the end. `port` is the open port or None.
     """
 
-    def __init__(
-        self, *, policy: ReconnectPolicy | None = None, on_event: Callable[[LinkEvent], None] = lambda _: None
-    ) -> None:
-        self._policy = policy or ReconnectPolicy()
-        self._on_event = on_event
+    def __init__(self, monitor: LinkMonitor | None) -> None:
+        self._monitor = monitor or LinkMonitor()
         self.port: Port | None = None
-        self.connections = 0
-        self.last_error = ""
 
     @abstractmethod
     async def _connect(self) -> Port:
@@ -315,7 +328,7 @@ class Link(ABC):
 
     def diagnostics(self) -> dict[str, bool | int | str]:
         """Return the connection's part of `health`."""
-        return {"connected": self.port is not None, "connections": self.connections, "last_loss": self.last_error}
+        return self._monitor.diagnostics(connected=self.port is not None)
 
     async def open(self) -> Port:
         """Return the open port; waits until the device is there."""
@@ -325,33 +338,22 @@ class Link(ABC):
             except DriverError as error:
                 await self.lost(error)
             else:
-                self.connections += 1
-                self._policy.connected(time.monotonic_ns())
-                self._on_event(LinkEvent(up=True, sentence=f"{self.port.path} is open.", repeated=False))
+                self._monitor.connected(f"{self.port.path} is open.", time.monotonic_ns())
         return self.port
 
     async def lost(self, error: DriverError) -> None:
         """Close the port, report the error, and pause before the next attempt."""
-        await asyncio.sleep(self.give_up(error).wait_s)
+        await asyncio.sleep(self.give_up(error))
 
-    def give_up(self, error: DriverError) -> Retry:
-        """Close the port and report the error; return when to retry."""
+    def give_up(self, error: DriverError) -> float:
+        """Close the port and report the error; return the pause before the next attempt in s."""
         self._close()
-        before, self.last_error = self.last_error, str(error)
-        retry = self._policy.failed(time.monotonic_ns())
-        # A different error is news even without a pause in between.
-        repeated = retry.repeated and _without_digits(before) == _without_digits(self.last_error)
-        self._on_event(LinkEvent(up=False, sentence=self.last_error, repeated=repeated))
-        return retry
+        return self._monitor.failed(error, time.monotonic_ns())
 
     def _close(self) -> None:
         if self.port is not None:
             self.port.close()
             self.port = None
-
-
-def _without_digits(text: str) -> str:
-    return "".join(letter for letter in text if not letter.isdigit())
 
 
 class SerialLink(Link):
@@ -363,12 +365,11 @@ class SerialLink(Link):
         serial_number: str | None = None,
         path: str | os.PathLike[str] | None = None,
         baud: int = DEFAULT_BAUD,
-        policy: ReconnectPolicy | None = None,
-        on_event: Callable[[LinkEvent], None] = lambda _: None,
+        monitor: LinkMonitor | None = None,
     ) -> None:
         if (serial_number is None) == (path is None):
             raise ValueError("give either the USB serial number of a device or the path of its port")
-        super().__init__(policy=policy, on_event=on_event)
+        super().__init__(monitor)
         self._serial_number = serial_number
         self._path = None if path is None else os.fspath(path)
         self._baud = baud
@@ -380,15 +381,8 @@ class SerialLink(Link):
 class TcpLink(Link):
     """Keeps a TCP connection to an instrument open."""
 
-    def __init__(
-        self,
-        host: str,
-        port: int,
-        *,
-        policy: ReconnectPolicy | None = None,
-        on_event: Callable[[LinkEvent], None] = lambda _: None,
-    ) -> None:
-        super().__init__(policy=policy, on_event=on_event)
+    def __init__(self, host: str, port: int, *, monitor: LinkMonitor | None = None) -> None:
+        super().__init__(monitor)
         self._host = host
         self._port = port
 

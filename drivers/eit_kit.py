@@ -10,14 +10,13 @@ import os
 import re
 import time
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.drivers.connection import Diagnostics, LinkEvent, Port, SerialLink
+from shearloop.drivers.connection import Diagnostics, LinkMonitor, Port, SerialLink
 from shearloop.drivers.errors import DeviceLostError
 from shearloop.drivers.frame_clock import FrameClock
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, LineSplitter, RawEvent, SerialSensor
@@ -278,7 +277,7 @@ class EitKit(SerialSensor[Frame]):
     """One board, named by USB serial number or path.
 
     `zero_slots` (1024,) is true where its injection pattern makes a value 0. `frame_period_s` is used until the period
-    is measured. `on_event` receives changes of the connection, `inputs` every input of the parser.
+    is measured. `inputs` keeps every input of the parser.
     """
 
     def __init__(
@@ -288,10 +287,10 @@ class EitKit(SerialSensor[Frame]):
         serial_number: str | None = None,
         path: str | os.PathLike[str] | None = None,
         frame_period_s: float = NOMINAL_PERIOD_NS / 1e9,
-        on_event: Callable[[LinkEvent], None] = lambda _: None,
+        monitor: LinkMonitor | None = None,
         inputs: InputRecorder | None = None,
     ) -> None:
-        link = SerialLink(serial_number=serial_number, path=path, on_event=on_event)
+        link = SerialLink(serial_number=serial_number, path=path, monitor=monitor)
         super().__init__(link, frame_period_s, inputs)
         self._parser = FrameParser(zero_slots, nominal_period_ns=round(frame_period_s * 1e9))
         self._silences = 0

@@ -9,13 +9,12 @@ import os
 import re
 import time
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Self
 
 from shearloop.drivers import serial_sensor
 from shearloop.drivers.calibration_files import CalibrationModel, Finite, Positive
-from shearloop.drivers.connection import Diagnostics, LinkEvent, ReconnectPolicy, SerialLink
+from shearloop.drivers.connection import Diagnostics, LinkMonitor, SerialLink
 
 BAUD_RATE = 115200
 # Measured on the paper's rig (4882 lines in 447 s); the data sheet says 10 samples a second.
@@ -241,11 +240,10 @@ class LoadCell(serial_sensor.SerialSensor[LoadSample]):
         serial_number: str | None = None,
         path: str | os.PathLike[str] | None = None,
         rate_hz: float = RATE_HZ,
-        policy: ReconnectPolicy | None = None,
-        on_event: Callable[[LinkEvent], None] = lambda _: None,
+        monitor: LinkMonitor | None = None,
         inputs: serial_sensor.InputRecorder | None = None,
     ) -> None:
-        link = SerialLink(serial_number=serial_number, path=path, baud=BAUD_RATE, policy=policy, on_event=on_event)
+        link = SerialLink(serial_number=serial_number, path=path, baud=BAUD_RATE, monitor=monitor)
         # A fast board may seem silent to a busy computer; reopening would reset it.
         super().__init__(link, 1.0 / min(rate_hz, RATE_HZ), inputs)
         self._parser = LoadParser(calibration, rate_hz)

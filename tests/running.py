@@ -5,6 +5,8 @@ from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine
 from contextlib import aclosing, asynccontextmanager
 from typing import Any, TypeVar
 
+from shearloop.drivers.connection import LinkEvent
+
 # Guards against a test that hangs; none waits for so long.
 DEADLINE_S = 30
 ValueT = TypeVar("ValueT")
@@ -53,3 +55,24 @@ class Changes:
             while not condition():
                 self._changed.clear()
                 await self._changed.wait()
+
+
+class LinkEvents(Changes):
+    """The events of a link."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.events: list[LinkEvent] = []
+
+    def on_link_event(self, event: LinkEvent) -> None:
+        self.events.append(event)
+        self.note()
+
+    async def down(self, number: int = 1) -> LinkEvent:
+        """Wait for the loss of this number and return it."""
+        await self.until(lambda: len(self.losses) >= number)
+        return self.losses[number - 1]
+
+    @property
+    def losses(self) -> list[LinkEvent]:
+        return [event for event in self.events if not event.up]

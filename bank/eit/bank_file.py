@@ -73,7 +73,7 @@ class BankDefinition:
                 raise ModelError(f"the {name.replace('_', ' ')} must be finite numbers that ascend")
             grid.setflags(write=False)
             object.__setattr__(self, name, grid)
-        if self.sigma_grid[0] <= 0 and model.sigma_unit != "not used":
+        if self.sigma_grid[0] <= 0 and model.uses_sigma:
             raise ModelError(f"sigma must be above 0 for the model {self.model}, not {self.sigma_grid[0]:g}")
 
     @property

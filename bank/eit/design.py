@@ -1,42 +1,139 @@
-"""The smallest bank that a recording asks for: each choice is the coarsest that adds less than a third of the noise.
+"""How well the basis models explain measured differences, and the smallest bank that a recording asks for.
 
-Errors are relative L2 errors of a difference frame, in units of the measured noise of one frame. They add as squares,
-so a third adds little: √(1 + 1/9) = 1.05. Torque is read from the frames' change with it, so channels and injections
-are judged by the torque's standard deviation by generalised least squares.
+Two scores rank the models, as in figure 5 of Trehan et al. 2025. `envelope_score` is the paper's: the rank correlation
+of the envelopes of a raw difference and a simulated signal, at the best circular shift. It is averaged over a few
+settings of models centred on the fingertip, because it jumps between settings. `matching_scores` is the matcher's own:
+the largest normalised cross-correlation at the best of many settings.
+
+A design takes the coarsest of each choice that adds less than a third of the noise. Errors are relative L2 errors of a
+difference frame, in units of the measured noise of one frame. They add as squares, so a third adds little:
+√(1 + 1/9) = 1.05. Injections are judged by the standard deviation of a torque that generalised least squares reads from
+the frames' change with it.
 """
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.signal import find_peaks
+from scipy.stats import rankdata
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
 from shearloop.bank.eit.fingertip import Fingertip
-from shearloop.bank.eit.forward import BatchForwardModel, ForwardModel
-from shearloop.bank.eit.model_scores import Setting, searched_settings
+from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.matching import ReferenceMatcher
 from shearloop.bank.eit.models import MODELS, conductivity
-from shearloop.bank.errors import CalibrationError
+from shearloop.bank.errors import CalibrationError, MatchingError
 
+# As in the paper: peaks of an envelope are this many channels apart, and a moving average smooths it.
+_PEAK_DISTANCE = 50
+_AVERAGED = 5
 # The share of the noise that each choice may add.
 ALLOWED = 1.0 / 3.0
 CHANNEL_S = 0.6e-3
 # Above 0.5 cm the electrodes determine the mesh.
 MESH_SIZES_CM = (0.5, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.05)
 COUNTS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 150)
-RANKS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-CHANNEL_COUNTS = (8, 16, 32, 64, 112, 168, 224, 280, 336, 392, 448, 504, 560, 616, 672, 728, 784, 840, 896)
-_WITHOUT_SIGMA = tuple(name for name, model in MODELS.items() if model.sigma_unit == "not used")
 _FOLDS = 8
 # Errors of linear elements are proportional to the mesh size: two fine meshes extrapolate to the limit.
 _FINE_CM = (0.05, 0.035)
-# Places along k and along sigma that judge a rank. Nine are too few: they underestimate the error threefold.
-_RANKED = 17
 _N_DRIFT = 2
 _MIN_FRAMES = 8
 # A smaller share of a frame is rounding: the board's converter alone makes thousands of times as much noise.
 _MIN_NOISE = 1e-6
+
+
+class Setting(NamedTuple):
+    """One k and σ of a model."""
+
+    k: float
+    sigma: float
+
+
+def centred_settings(model: str, centre: float) -> list[Setting]:
+    """Return settings of a model that is centred on the fingertip, in cm (modulated Gaussian: k in rad/cm)."""
+    widths = {
+        "step": [1.0],
+        "linear": [2.0, 2.5, 3.0, 4.0, 6.0],
+        "cut_linear": [2.0, 3.0, 4.0],
+        "gaussian_derivative": [0.7, 0.8, 0.9, 1.0, 1.2, 1.5],
+        "modulated_gaussian": [0.3, 0.4, 0.5],
+    }[model]
+    places = {"cut_linear": [1.0, 2.0, 3.0], "modulated_gaussian": [4.0, 5.0, 6.0]}.get(model, [centre])
+    return [Setting(k, sigma) for k in places for sigma in widths]
+
+
+def searched_settings(model: str, height: float) -> list[Setting]:
+    """Return settings all over a fingertip of this height, in cm, to search for the best one."""
+    up = (height * np.linspace(0.1, 0.9, 9)).tolist()
+    places, widths = {
+        "step": (up, [1.0]),
+        "linear": (up, [2.5, 4.0, 6.0, 10.0]),
+        "cut_linear": ([0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.4], [2.0, 3.0, 4.0]),
+        "gaussian_derivative": (up, [0.65, 0.8, 1.0, 1.2, 1.5, 1.9, 2.5]),
+        "modulated_gaussian": ([1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0.3, 0.4, 0.6, 0.9, 1.2]),
+    }[model]
+    return [Setting(k, sigma) for k in places for sigma in widths]
+
+
+def simulated_signals(forward: ForwardModel, model: str, settings: Sequence[Setting]) -> FloatArray:
+    """Return the (m, 896) difference signals of the settings whose conductivity is positive everywhere."""
+    homogeneous = forward.homogeneous()
+    cells = [conductivity(forward.mesh, model, k, sigma) for k, sigma in settings]
+    signals = [forward.voltages(cell) - homogeneous for cell in cells if cell.min() > 0]
+    return np.array(signals).reshape(-1, N_CHANNELS)
+
+
+def envelope(magnitudes: FloatArray) -> FloatArray:
+    """Return the (896,) smoothed curve over the peaks of (896,) magnitudes, the last channel followed by the first.
+
+    Raises MatchingError where there are no two peaks to carry it.
+    """
+    thrice = np.tile(magnitudes, 3)
+    peaks, _ = find_peaks(thrice, distance=_PEAK_DISTANCE)
+    if len(peaks) < 2:
+        raise MatchingError("a signal without peaks has no envelope")
+    curve = CubicSpline(peaks, thrice[peaks])(np.arange(N_CHANNELS, 2 * N_CHANNELS))
+    return _moving_average(curve)
+
+
+def envelope_score(difference: FloatArray, signal: FloatArray) -> float:
+    """Return Spearman's correlation of the envelopes of two (896,) signals, the largest over all circular shifts.
+
+    The difference is smoothed beforehand. Raises MatchingError as `envelope` does.
+    """
+    a, b = _ranks(envelope(_moving_average(np.abs(difference)))), _ranks(envelope(np.abs(signal)))
+    correlations = np.fft.irfft(np.fft.rfft(a) * np.conj(np.fft.rfft(b)), N_CHANNELS)
+    return float(correlations.max())
+
+
+def mean_envelope_score(difference: FloatArray, signals: FloatArray) -> float:
+    """Return the mean of the envelope scores of (m, 896) signals, for one (896,) difference."""
+    return float(np.mean([envelope_score(difference, signal) for signal in signals]))
+
+
+def matching_scores(differences: FloatArray, signals: FloatArray) -> FloatArray:
+    """Return the (n,) best scores, over (m, 896) signals and all lags, of (n, 896) differences."""
+    m = len(signals)
+    matcher = ReferenceMatcher(
+        signals[:, None].astype(np.float32), np.ones((m, 1), dtype=np.bool_), np.arange(float(m)), np.zeros(1)
+    )
+    best: FloatArray = matcher.heatmaps(differences).max(axis=(1, 2))
+    return best
+
+
+def _moving_average(values: FloatArray) -> FloatArray:
+    return np.asarray(np.mean([np.roll(values, shift) for shift in range(_AVERAGED)], axis=0))
+
+
+def _ranks(values: FloatArray) -> FloatArray:
+    """Return ranks of mean 0 and norm 1, so that their correlation is a sum of products."""
+    ranks = rankdata(values) - (len(values) + 1) / 2
+    return np.asarray(ranks / np.linalg.norm(ranks))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,9 +200,6 @@ class DesignChoice:
         return self.chosen.added <= ALLOWED
 
 
-_ONE_SIGMA = DesignChoice("cells along sigma", "cells", (DesignStep(1, 0.0, "the model does not depend on sigma"),))
-
-
 @dataclass(frozen=True, slots=True)
 class ModelFit:
     """A model against the data: error of held-out channels relative to the frame, and its standard error.
@@ -136,42 +230,46 @@ class Design:
     mesh: DesignChoice
     k_count: DesignChoice
     sigma_count: DesignChoice
-    rank: DesignChoice
-    channels: DesignChoice
     injections: DesignChoice
+
+    @property
+    def choices(self) -> tuple[DesignChoice, ...]:
+        """All choices."""
+        return self.mesh, self.k_count, self.sigma_count, self.injections
 
 
 def design_bank(measured: MeasuredFrames, fingertip: Fingertip) -> Design:
     """Return the choices for frames of this fingertip. Raises BankError for a geometry that cannot be solved on."""
-    forward = BatchForwardModel(replace(fingertip, mesh_size_cm=0.2).mesh())
-    signals = {name: _signals(forward, name, searched_settings(name, forward.mesh.height_cm)) for name in MODELS}
-    models = tuple(_model_fit(measured, name, signals[name][1]) for name in MODELS)
+    forward = ForwardModel(replace(fingertip, mesh_size_cm=0.2).mesh())
+    searched = {name: _positive(forward, name, searched_settings(name, forward.mesh.height_cm)) for name in MODELS}
+    signals = {name: np.abs(simulated_signals(forward, name, settings)) for name, settings in searched.items()}
+    models = tuple(_model_fit(measured, name, signals[name]) for name in MODELS)
     model = min(models, key=lambda one: one.penalised).model
-    settings, own = signals[model]
-    k_range, sigma_range = _ranges(measured, settings, own)
-    # The searched settings are positive everywhere; take the nearest to the middle of the ranges.
-    middle = min(settings, key=lambda one: abs(one.k - sum(k_range) / 2) + abs(one.sigma - sum(sigma_range) / 2))
-    if one_sigma := model in _WITHOUT_SIGMA:
-        sigma_range = (middle.sigma, middle.sigma)
+    k_range, sigma_range = _ranges(measured, searched[model], signals[model])
+    # Not every conductivity is positive in the middle of the ranges: take the nearest that is.
+    middle = min(searched[model], key=lambda one: abs(one.k - sum(k_range) / 2) + abs(one.sigma - sum(sigma_range) / 2))
     noise = measured.relative_noise
+    if uses_sigma := MODELS[model].uses_sigma:
+        sigma_count = _count_choice(forward, model, middle, "sigma", sigma_range, noise)
+    else:
+        alike = DesignStep(1, 0.0, "the model does not depend on sigma")
+        sigma_count = DesignChoice("cells along sigma", "cells", (alike,))
     return Design(
-        noise, models, model, k_range, sigma_range,
-        _mesh_choice(fingertip, model, middle, noise),
-        _count_choice(forward, model, k_range, lambda k: Setting(k, middle.sigma), noise, "k"),
-        _ONE_SIGMA if one_sigma else _count_choice(
-            forward, model, sigma_range, lambda s: Setting(middle.k, s), noise, "sigma"
-        ),
-        _rank_choice(forward, model, k_range, sigma_range, noise),
-        *_board_choices(measured),
-    )  # fmt: skip
+        relative_noise=noise,
+        models=models,
+        model=model,
+        k_range=k_range,
+        sigma_range=sigma_range if uses_sigma else (middle.sigma, middle.sigma),
+        mesh=_mesh_choice(fingertip, model, middle, noise),
+        k_count=_count_choice(forward, model, middle, "k", k_range, noise),
+        sigma_count=sigma_count,
+        injections=_injection_choice(measured),
+    )
 
 
-def _signals(forward: BatchForwardModel, model: str, settings: Sequence[Setting]) -> tuple[list[Setting], FloatArray]:
-    """Return the settings with a positive conductivity, and their (m, 896) magnitudes."""
-    cells = [conductivity(forward.mesh, model, *setting) for setting in settings]
-    kept = [i for i, cell in enumerate(cells) if cell.min() > 0]
-    voltages = forward.voltages(np.array([np.ones(len(forward.mesh.triangles)), *(cells[i] for i in kept)]))
-    return [settings[i] for i in kept], np.abs(voltages[1:] - voltages[0])
+def _positive(forward: ForwardModel, model: str, settings: Sequence[Setting]) -> list[Setting]:
+    """Return the settings with a positive conductivity."""
+    return [one for one in settings if conductivity(forward.mesh, model, *one).min() > 0]
 
 
 def _fit(frames: FloatArray, signals: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -191,7 +289,7 @@ def _model_fit(measured: MeasuredFrames, model: str, signals: FloatArray) -> Mod
         predicted = amplitude[np.arange(len(frames)), best][:, None] * signals[best][:, out]
         left += ((frames[:, out] - predicted) ** 2).sum(axis=1)
     share = left / (frames**2).sum(axis=1)
-    p = 2 if model in _WITHOUT_SIGMA else 3
+    p = 3 if MODELS[model].uses_sigma else 2
     error = float(np.sqrt(share.mean()))
     penalised = float(np.sqrt(share.mean() * (1 + p * np.log(N_CHANNELS) / N_CHANNELS)))
     return ModelFit(model, p, error, float(share.std() / np.sqrt(len(share)) / (2 * error)), penalised)
@@ -219,9 +317,8 @@ def _shape_error(one: FloatArray, other: FloatArray) -> float:
 
 def _mesh_choice(fingertip: Fingertip, model: str, place: Setting, noise: float) -> DesignChoice:
     def solved(size: float) -> tuple[FloatArray, int]:
-        forward = ForwardModel(mesh := replace(fingertip, mesh_size_cm=size).mesh())
-        signal = forward.voltages(conductivity(mesh, model, *place)) - forward.homogeneous()
-        return np.abs(signal), len(mesh.triangles)
+        forward = ForwardModel(replace(fingertip, mesh_size_cm=size).mesh())
+        return np.abs(simulated_signals(forward, model, [place])[0]), len(forward.mesh.triangles)
 
     coarse, fine = (solved(size)[0] for size in _FINE_CM)
     truth = fine + (fine - coarse) / (_FINE_CM[0] / _FINE_CM[1] - 1.0)
@@ -233,20 +330,18 @@ def _mesh_choice(fingertip: Fingertip, model: str, place: Setting, noise: float)
 
 
 def _count_choice(
-    forward: BatchForwardModel,
-    model: str,
-    ends: tuple[float, float],
-    at: Callable[[float], Setting],
-    noise: float,
-    name: str,
+    forward: ForwardModel, model: str, middle: Setting, name: str, ends: tuple[float, float], noise: float
 ) -> DesignChoice:
-    """Choose the number of cells between the ends: the error is that of a frame half-way between two cells."""
-    steps, unit = [], MODELS[model].k_unit if name == "k" else MODELS[model].sigma_unit
+    """Choose the number of cells along `name` (k or sigma): the error is that of a frame half-way between two cells."""
+    steps, unit = [], getattr(MODELS[model], f"{name}_unit")
     for count in COUNTS:
         spacing = (ends[1] - ends[0]) / (count - 1)
         # Half a cell away from places all over the range; the worst counts.
-        places = np.linspace(ends[0] + spacing, ends[1] - spacing, 4)
-        pairs = (_signals(forward, model, [at(v), at(v + spacing / 2)])[1] for v in places.tolist())
+        places = np.linspace(ends[0] + spacing, ends[1] - spacing, 4).tolist()
+        pairs = (
+            np.abs(simulated_signals(forward, model, [middle._replace(**{name: at}) for at in (v, v + spacing / 2)]))
+            for v in places
+        )
         # A cell whose conductivity would not be positive does not exist.
         found = [_shape_error(*pair) for pair in pairs if len(pair) == 2]
         if not found:
@@ -258,24 +353,8 @@ def _count_choice(
     return DesignChoice(f"cells along {name}", "cells", tuple(steps))
 
 
-def _rank_choice(
-    forward: BatchForwardModel, model: str, k: tuple[float, float], sigma: tuple[float, float], noise: float
-) -> DesignChoice:
-    ks, sigmas = (np.unique(np.linspace(*ends, _RANKED)).tolist() for ends in (k, sigma))
-    signals = _signals(forward, model, [Setting(a, b) for a in ks for b in sigmas])[1]
-    signals /= np.linalg.norm(signals, axis=1, keepdims=True)
-    squares = np.linalg.svd(signals, compute_uv=False) ** 2
-    steps = [
-        DesignStep(
-            rank, float(np.sqrt(squares[rank:].sum() / squares.sum())) / noise, f"{4 * rank} bytes a cell, of 3584"
-        )
-        for rank in RANKS
-    ]
-    return DesignChoice("rank of the bank", "numbers a cell", tuple(steps))
-
-
-def _board_choices(measured: MeasuredFrames) -> tuple[DesignChoice, DesignChoice]:
-    """Choose channels and injections by the torque's standard deviation.
+def _injection_choice(measured: MeasuredFrames) -> DesignChoice:
+    """Choose injections by the torque's standard deviation, each the best to add to those before.
 
     The recording gives the frames' slope over torque, their drift about it and their noise. Without a known torque the
     main direction of the frames' variation replaces the slope.
@@ -292,33 +371,22 @@ def _board_choices(measured: MeasuredFrames) -> tuple[DesignChoice, DesignChoice
     _, s, vt = np.linalg.svd(residual, full_matrices=False)
     drift = vt[:_N_DRIFT].T * (s[:_N_DRIFT] / np.sqrt(max(len(frames) - 2, 1)))
 
-    def spread(channels: IntArray) -> float:
-        """Return the standard deviation of a torque read from these channels."""
+    def variance(channels: IntArray) -> float:
+        """Return the variance of a torque read from these channels."""
         b, v = slope[channels] / measured.noise_v, drift[channels] / measured.noise_v
         inner = np.linalg.inv(np.eye(_N_DRIFT) + v.T @ v)
-        information = float(b @ b - (b @ v) @ inner @ (v.T @ b))
-        return float(1.0 / np.sqrt(max(information, 1e-300)))
+        return 1.0 / max(float(b @ b - (b @ v) @ inner @ (v.T @ b)), 1e-300)
 
-    least = spread(np.arange(N_CHANNELS))
+    def channels_of(injections: Sequence[int]) -> IntArray:
+        return np.flatnonzero(np.isin(CHANNELS[:, 0], injections))
 
-    def added(channels: IntArray) -> float:
-        return float(np.sqrt(max((spread(channels) / least) ** 2 - 1.0, 0.0)))
-
-    # Channels are ordered by their weight in that reading, which takes the drift out.
-    inner = np.linalg.inv(np.eye(_N_DRIFT) * measured.noise_v**2 + drift.T @ drift)
-    order = np.argsort(-np.abs(slope - drift @ (inner @ (drift.T @ slope))), kind="stable")
-    channels = [DesignStep(n, added(order[:n]), _rate(n)) for n in CHANNEL_COUNTS]
-    injection = CHANNELS[:, 0]
+    least = variance(np.arange(N_CHANNELS))
     taken: list[int] = []
     steps = []
-    while len(taken) < N_ELECTRODES:
-        rest = [one for one in range(N_ELECTRODES) if one not in taken]
-        taken.append(min(rest, key=lambda one: spread(np.flatnonzero(np.isin(injection, [*taken, one])))))
-        chosen = np.flatnonzero(np.isin(injection, taken))
-        cost = f"{_rate(len(chosen))}; injections {', '.join(map(str, sorted(taken)))}"
-        steps.append(DesignStep(len(taken), added(chosen), cost))
-    return DesignChoice("channels", "of 896", tuple(channels)), DesignChoice("injections", "of 32", tuple(steps))
-
-
-def _rate(channels: int) -> str:
-    return f"{1.0 / (channels * CHANNEL_S):.2f} frames/s at {1e3 * CHANNEL_S:g} ms a channel"
+    while rest := [one for one in range(N_ELECTRODES) if one not in taken]:
+        taken.append(min(rest, key=lambda one: variance(channels_of([*taken, one]))))
+        channels = channels_of(taken)
+        rate = f"{1.0 / (len(channels) * CHANNEL_S):.2f} frames/s at {1e3 * CHANNEL_S:g} ms a channel"
+        added = float(np.sqrt(max(variance(channels) / least - 1.0, 0.0)))
+        steps.append(DesignStep(len(taken), added, f"{rate}; injections {', '.join(map(str, sorted(taken)))}"))
+    return DesignChoice("injections", "of 32", tuple(steps))

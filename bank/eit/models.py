@@ -33,6 +33,11 @@ class BasisModel:
     sigma_unit: str
     function: Callable[[FloatArray, float, float, float], FloatArray]
 
+    @property
+    def uses_sigma(self) -> bool:
+        """Whether f depends on σ."""
+        return self.sigma_unit != "not used"
+
 
 @dataclass(frozen=True, slots=True)
 class Variation:
@@ -143,7 +148,7 @@ class ConductivityModel:
         basis = model_named(model)
         if not (np.isfinite(k) and np.isfinite(sigma)):
             raise ModelError(f"k and sigma must be finite numbers, not k = {k} and sigma = {sigma}")
-        if sigma <= 0 and basis.sigma_unit != "not used":
+        if sigma <= 0 and basis.uses_sigma:
             raise ModelError(f"sigma must be above 0 for the model {model}, not {sigma}")
         means = [basis.function(heights, k, sigma, self._centre).sum(axis=0) for heights in self._heights]
         shape = np.concatenate(means) / len(self._heights[0])

@@ -1,30 +1,35 @@
 """The same match as from the whole heatmap, from a few of its cells: cells that cannot be the maximum are not scored.
 
-A compressed bank (`compression`) bounds the scores of groups of cells, then of cells. Cells bounded below a score that
-another cell reaches are dropped; the rest is scored in float64. The compression decides the time, never the result.
+A compressed bank bounds the scores of groups of cells, then of cells. Cells bounded below a score that another cell
+reaches are dropped; the rest is scored in float64. The compression decides the time, never the result.
+
+Every unit signal b of the bank is split as b = Φ c + d, with Φ (896 × r) an orthonormal basis fitted to the bank, d
+orthogonal to it and ‖d‖ = ρ. For a frame y with g = Φᵀ y and t = ‖y − Φ g‖, Cauchy and Schwarz give
+
+    b·y = c·g + d·(y − Φ g) ≤ c·g + ρ t,
+
+and for all cells with c within a radius e of a centre m, b·y ≤ m·g + e ‖g‖ + ρ t. The first direction of Φ is the mean
+signal. It is nowhere negative, and neither are the frames, so g₁ ≥ 0. With the largest c₁ of the cells in place of m₁,
+e and ‖g‖ need only cover the other directions, where a frame is far shorter. A bound is the product of a row (m, e, ρ)
+and a column (g, ‖g‖, t), so many bounds are one matrix product in float32.
 """
 
+import heapq
+import math
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import count
 from operator import itemgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import fft
+from scipy import fft, linalg
 
 from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.compression import (
-    COARSE_RANK,
-    ROUNDING,
-    SEED_LEVEL,
-    CompressedBank,
-    columns,
-    compress,
-)
 from shearloop.bank.eit.matching import (
     CHUNK_CELLS,
     RUNNER_UP_RADIUS,
@@ -36,6 +41,26 @@ from shearloop.bank.eit.matching import (
     unit_magnitudes,
 )
 
+# Number of cells, spread over the bank, that the basis is fitted to: neighbouring cells are alike.
+_FITTED_CELLS = 1024
+# Cells in memory at a time while a bank is compressed.
+_COMPRESSED_CELLS = 128
+# Numbers per cell: few to find the neighbourhood, more to separate its cells.
+COARSE_RANK = 24
+FINE_RANK = 96
+# Number of groups, and the mean number of cells in a group at least.
+_N_GROUPS = 512
+_MIN_GROUP_CELLS = 4
+# Groups are split by their radius plus ρ times a usual t.
+_USUAL_T = 0.5
+# Frames fall where cells are dense, so groups of many cells are split slightly sooner.
+_CROWDING = 0.1
+# Rounding of float32 in a bound, and in the square of t. Sums of 98 products and a transform of 1792 values of norm 1
+# lose 5e-6 by the usual estimates; 3e-7 is observed.
+ROUNDING = 2e-5
+_SQUARE_ROUNDING = 4e-6
+# Rounding of float64 in the square of ρ.
+_SQUARE_ROUNDING_64 = 1e-12
 # Rounding of a sum of 896 products in float64; where a tie hangs on less, the reference decides. And in float32.
 _ROUNDING_64 = 1e-14
 _ROUNDING_32 = 6e-5
@@ -55,9 +80,6 @@ _SLACK = 0.01
 # More bounds than this (16 MB) are not computed: all cells and lags remain.
 _MAX_BOUNDS = 1 << 22
 
-# The conjugate transforms of the basis's first directions, (r, n // 2 + 1), by length n.
-Spectra = Mapping[int, NDArray[np.complex64]]
-
 
 class _UndecidedError(Exception):
     """Rounding of float64 decides which cells tie."""
@@ -69,6 +91,135 @@ class Candidates(NamedTuple):
     cells: IntArray
     bounds: Float32Array
     frames: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CompressedBank:
+    """Rows of bounds; a bound is a row times a column of `columns`.
+
+    basis (R, 896), most important directions first; fine (n, R + 2) and coarse (n, r + 2) rows of the n cells; groups
+    (m, r + 2), the rows of groups of cells. overlaps (1792,) bound the norm of a signal's overlap with a frame at the
+    lags from −896 up. Cell i belongs to group group_of[i]; members[j] are the cells of group j, and centres[j] is the
+    cell nearest to its centre.
+    """
+
+    basis: Float32Array
+    fine: Float32Array
+    coarse: Float32Array
+    groups: Float32Array
+    overlaps: FloatArray
+    group_of: IntArray
+    members: tuple[IntArray, ...]
+    centres: IntArray
+
+
+def compress(unit_signals: Callable[[IntArray], FloatArray], cells: IntArray) -> CompressedBank:
+    """Compress the unit signals of n cells; `unit_signals` returns the (m, 896) signals of some of them."""
+    gram, total = np.zeros((N_CHANNELS, N_CHANNELS)), np.zeros(N_CHANNELS)
+    fitted = cells[:: max(len(cells) // _FITTED_CELLS, 1)]
+    for some in _chunks(fitted):
+        part = unit_signals(some)
+        gram += part.T @ part
+        total += part.sum(axis=0)
+    rank = min(FINE_RANK, len(fitted), N_CHANNELS)
+    mean = total / np.linalg.norm(total)
+    at_mean = gram @ mean
+    # Remove the mean from the Gram matrix and put it back with the largest weight, so that it comes first.
+    above = mean @ at_mean + 2 * len(fitted)
+    gram -= np.outer(mean, at_mean) + np.outer(at_mean, mean) - above * np.outer(mean, mean)
+    _, ascending = linalg.eigh(gram, subset_by_index=[N_CHANNELS - rank, N_CHANNELS - 1])
+    basis = np.column_stack([mean, ascending[:, -2::-1]])
+    found = []
+    least, most = np.ones(N_CHANNELS), np.zeros(N_CHANNELS)
+    for some in _chunks(cells):
+        part = unit_signals(some)
+        found.append(part @ basis)
+        energy = np.cumsum(np.square(part), axis=1)
+        least, most = np.minimum(least, energy.min(axis=0)), np.maximum(most, energy.max(axis=0))
+    numbers = np.vstack(found)
+    coarse = _cell_rows(numbers[:, :COARSE_RANK])
+    members, rows = zip(*_partition(coarse, min(_N_GROUPS, len(cells) // _MIN_GROUP_CELLS)), strict=True)
+    group_of = np.empty(len(cells), dtype=np.int64)
+    for group, chosen in enumerate(members):
+        group_of[chosen] = group
+    return CompressedBank(
+        basis=np.ascontiguousarray(basis.T, dtype=np.float32),
+        fine=_cell_rows(numbers),
+        coarse=coarse,
+        groups=np.array(rows),
+        overlaps=np.sqrt(np.maximum(np.concatenate([1 - least[::-1], most[::-1]]), 0.0)),
+        group_of=group_of,
+        members=members,
+        centres=np.array([_central_cell(coarse, chosen) for chosen in members]),
+    )
+
+
+def columns(parts: NDArray[np.floating[Any]], squared_norms: FloatArray) -> Float32Array:
+    """Return the (r + 2, n) columns of n frames y: parts (r, n) are Φᵀ y, squared_norms (n,) are ‖y‖²."""
+    across = np.einsum("ij,ij->j", parts[1:], parts[1:])
+    found = np.empty((len(parts) + 2, parts.shape[1]), dtype=np.float32)
+    found[:-2] = parts
+    found[-2] = np.sqrt(across)
+    found[-1] = np.sqrt(np.maximum(squared_norms - parts[0] ** 2 - across, 0.0) + _SQUARE_ROUNDING)
+    return found
+
+
+def _chunks(cells: IntArray) -> Iterable[IntArray]:
+    return (cells[start : start + _COMPRESSED_CELLS] for start in range(0, len(cells), _COMPRESSED_CELLS))
+
+
+def _cell_rows(numbers: FloatArray) -> Float32Array:
+    rows = np.zeros((len(numbers), numbers.shape[1] + 2), dtype=np.float32)
+    rows[:, :-2] = numbers
+    rows[:, -1] = np.sqrt(np.maximum(1 - np.einsum("ij,ij->i", numbers, numbers), 0.0) + _SQUARE_ROUNDING_64)
+    return rows
+
+
+def _group_row(cells: Float32Array) -> Float32Array:
+    """Return the row that bounds all of some cells' rows."""
+    centre = cells[:, :-2].mean(axis=0)
+    # The largest along the first direction and of ρ.
+    row: Float32Array = cells.max(axis=0)
+    row[1:-2] = centre[1:]
+    row[-2] = math.sqrt(_squared_distances(cells[:, 1:-2], centre[1:]).max())
+    return row
+
+
+def _partition(cells: Float32Array, size: int) -> list[tuple[IntArray, Float32Array]]:
+    """Split the cells into as many groups as `size`, or fewer where cells are alike.
+
+    Returns every group's cells and the row that bounds them. The group with the widest bound is split in two, between
+    the cell farthest from its centre and the cell farthest from that one.
+    """
+    order = count()
+
+    def entry(chosen: IntArray) -> tuple[float, int, IntArray, Float32Array]:
+        row = _group_row(cells[chosen])
+        radius, left_out = row[-2:].tolist()
+        width = (radius + _USUAL_T * left_out) * len(chosen) ** _CROWDING if radius > ROUNDING else 0.0
+        return -width, next(order), chosen, row
+
+    heap = [entry(np.arange(len(cells)))]
+    while len(heap) < size and heap[0][0] < 0:
+        _, _, chosen, _ = heapq.heappop(heap)
+        points = cells[chosen, :-2]
+        one = points[np.argmax(_squared_distances(points, points.mean(axis=0)))]
+        other = points[np.argmax(_squared_distances(points, one))]
+        nearer = (points - (one + other) / 2) @ (one - other) > 0
+        heapq.heappush(heap, entry(chosen[nearer]))
+        heapq.heappush(heap, entry(chosen[~nearer]))
+    return [(chosen, row) for _, _, chosen, row in heap]
+
+
+def _central_cell(cells: Float32Array, chosen: IntArray) -> int:
+    points = cells[chosen, :-2]
+    return int(chosen[np.argmin(_squared_distances(points, points.mean(axis=0)))])
+
+
+def _squared_distances(points: Float32Array, place: Float32Array) -> Float32Array:
+    apart = points - place
+    squares: Float32Array = np.einsum("ij,ij->i", apart, apart)
+    return squares
 
 
 class ZeroLagBounds:
@@ -95,33 +246,30 @@ class ZeroLagBounds:
 
 
 class AllLagsBounds:
-    """A unit frame (896,), bounded at all lags: lags are dropped first, then groups, then cells.
+    """A unit frame (896,), bounded at all lags for a matcher: lags are dropped first, then groups, then cells.
 
-    A lag is the place in the padded frame where the shifted frame begins: 896 for no shift. `score(cell, frames)`
-    returns the highest score of a cell at (m, 896) frames. `reached` is a promising cell and a score that it reaches.
+    A lag is the place in the padded frame where the shifted frame begins: 896 for no shift. `reached` is a promising
+    cell and a score that it reaches.
     """
 
-    def __init__(
-        self, bank: CompressedBank, spectra: Spectra, frame: FloatArray, score: Callable[[int, FloatArray], float]
-    ) -> None:
-        self._bank, self._spectra, self._score = bank, spectra, score
-        self._single = frame.astype(np.float32)
+    def __init__(self, matcher: "PrunedMatcher", frame: FloatArray) -> None:
+        self._matcher, bank = matcher, matcher.compressed
         self._padded = np.zeros(3 * N_CHANNELS)
         self._padded[N_CHANNELS : 2 * N_CHANNELS] = frame
         # The squared norm of the frame's overlap with the channels at each lag.
         self._energies = np.zeros(2 * N_CHANNELS)
         np.cumsum((frame * frame)[:-1], out=self._energies[1:N_CHANNELS])
         self._energies[N_CHANNELS:] = np.maximum(1.0 - self._energies[:N_CHANNELS], 0.0)
-        self._centres = bank.levels[SEED_LEVEL].rows[:, :-2]
-        at_0 = bank.basis[: self._centres.shape[1]] @ self._single
-        cell = self._likeliest(bank.members[int((self._centres @ at_0).argmax())], at_0)
-        reached = cell, score(cell, frame[None])
+        centres = bank.groups[:, :-2]
+        at_0 = bank.basis[:COARSE_RANK] @ frame.astype(np.float32)
+        cell = self._likeliest(bank.members[int((centres @ at_0).argmax())], at_0)
+        reached = cell, matcher.score(cell, frame[None])
         self._bound_groups(reached[1] - _SLACK)
         # The likeliest lags (m,), the frame's numbers there (r, m), and the groups' estimates (m, n).
         n_seeds = min(_SEED_LAGS, len(self._lags))
         likeliest = np.argpartition(self._highest, -n_seeds)[-n_seeds:]
         at_lags = self._columns[:-2, likeliest]
-        self._seeds = self._lags[likeliest], at_lags, at_lags.T @ self._centres.T
+        self._seeds = self._lags[likeliest], at_lags, at_lags.T @ centres.T
         self.reached = max(reached, self.seed() or reached, key=itemgetter(1))
 
     def seed(self, outside: BoolArray | None = None) -> tuple[int, float] | None:
@@ -132,31 +280,23 @@ class AllLagsBounds:
         """
         lags, at_lags, estimates = self._seeds
         if outside is not None:
-            estimates = np.where(outside[self._bank.centres], estimates, -np.inf)
+            estimates = np.where(outside[self._matcher.compressed.centres], estimates, -np.inf)
         lag, group = divmod(int(np.argmax(estimates)), estimates.shape[1])
         if estimates[lag, group] == -np.inf:
             return None
-        cells = self._bank.members[group]
+        cells = self._matcher.compressed.members[group]
         if outside is not None:
             cells = cells[outside[cells]]
         cell = self._likeliest(cells, at_lags[:, lag])
-        return cell, self._score(cell, self._frames(lags[lag, None]))
+        return cell, self._matcher.score(cell, self._frames(lags[lag, None]))
 
     def candidates(self, score: float) -> Candidates:
-        """Return the cells that may reach a score: groups are bounded first, then their parts, then cells."""
+        """Return the cells that may reach a score: groups are bounded first, then cells."""
         if score < self._bounded_down_to:
             self._bound_groups(score)
-        bank, least = self._bank, np.float32(score - ROUNDING)
+        bank, least = self._matcher.compressed, np.float32(score - ROUNDING)
         (at,) = (self._highest >= least).nonzero()
         alive = (self._group_bounds.take(at, axis=1) >= least).any(axis=1)
-        for level in bank.levels[1:]:
-            groups = np.flatnonzero(alive.take(level.part_of))
-            alive = np.zeros(len(level.rows), dtype=np.bool_)
-            alive[groups] = True
-            if len(groups) * len(at) <= _MAX_BOUNDS:
-                reach = least <= self._columns.take(at, axis=1).T @ level.rows.take(groups, axis=0).T
-                alive[groups] = reach.any(axis=0)
-                at = at[reach.any(axis=1)]
         cells = np.flatnonzero(alive.take(bank.group_of))
         if len(cells) * len(at) > _MAX_BOUNDS:
             return Candidates(cells, np.full(len(cells), np.inf, dtype=np.float32), self._frames(self._lags[at]))
@@ -168,19 +308,21 @@ class AllLagsBounds:
         return Candidates(cells, (finest.T @ bank.fine.take(cells, axis=0).T).max(axis=0), frames)
 
     def _likeliest(self, cells: IntArray, parts: Float32Array) -> int:
-        return int(cells[np.argmax(self._bank.coarse.take(cells, axis=0)[:, :-2] @ parts)])
+        return int(cells[np.argmax(self._matcher.compressed.coarse.take(cells, axis=0)[:, :-2] @ parts)])
 
     def _bound_groups(self, score: float) -> None:
-        """Bound the first level's groups at all lags that let any cell reach the score."""
+        """Bound the groups at all lags that let any cell reach the score."""
+        bank, spectra = self._matcher.compressed, self._matcher.spectra
         self._bounded_down_to = score
-        overlap = self._bank.overlaps * np.sqrt(self._energies) >= score - ROUNDING
+        overlap = bank.overlaps * np.sqrt(self._energies) >= score - ROUNDING
         first, end = int(overlap.argmax()), 2 * N_CHANNELS - int(overlap[::-1].argmax())
-        length = next(n for n in self._spectra if n >= max(2 * N_CHANNELS - first, end))
-        parts = fft.irfft(fft.rfft(self._single, length) * self._spectra[length], length)
+        length = next(n for n in spectra if n >= max(2 * N_CHANNELS - first, end))
+        single = self._padded[N_CHANNELS : 2 * N_CHANNELS].astype(np.float32)
+        parts = fft.irfft(fft.rfft(single, length) * spectra[length], length)
         self._lags = np.arange(first, end)
         numbers = np.concatenate([parts[:, length + first - N_CHANNELS :], parts[:, : end - N_CHANNELS]], axis=1)
         self._columns = columns(numbers, self._energies[first:end])
-        self._group_bounds = self._bank.levels[0].rows @ self._columns
+        self._group_bounds = bank.groups @ self._columns
         self._highest = self._group_bounds.max(axis=0)
 
     def _frames(self, lags: IntArray) -> FloatArray:
@@ -199,7 +341,7 @@ class _PruningMatcher(Matcher):
         A valid cell without signal raises MatchingError here, not at the first frame.
         """
         super().__init__(signals, valid, k_grid, sigma_grid)
-        self._bank = compress(self._unit_signals, self._cells)
+        self.compressed = compress(self._unit_signals, self._cells)
         self._norms = np.concatenate([np.linalg.norm(self._magnitudes(cells), axis=1) for cells in self._chunks()])
         self._row, self._column = np.divmod(self._cells, valid.shape[1])
 
@@ -227,7 +369,7 @@ class _PruningMatcher(Matcher):
         """
         likeliest = int(candidates.cells[candidates.bounds.argmax()])
         if likeliest != seed:
-            reached = max(reached, self._score(likeliest, candidates.frames))
+            reached = max(reached, self.score(likeliest, candidates.frames))
         cells = candidates.cells[candidates.bounds >= reached - ROUNDING]
         parts = [
             self._contenders(frame, cells[i : i + CHUNK_CELLS], candidates.frames, reached)
@@ -253,7 +395,7 @@ class _PruningMatcher(Matcher):
             cells, magnitudes = cells[close], magnitudes[close]
         return cells, (frames @ magnitudes.astype(np.float64).T).max(axis=0) / self._norms[cells]
 
-    def _score(self, cell: int, frames: FloatArray) -> float:
+    def score(self, cell: int, frames: FloatArray) -> float:
         """Return a cell's highest score at the lags of (m, 896) frames."""
         magnitudes = np.abs(self._signals[self._cells[cell]], dtype=np.float64)
         return float((frames @ magnitudes).max() / self._norms[cell])
@@ -283,7 +425,7 @@ class PrunedZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
     """Matches at lag 0 alone. All cells are bounded at once: one lag takes few operations per cell."""
 
     def _search(self, frame: FloatArray, runner_up: bool) -> Match:
-        bounds = ZeroLagBounds(self._bank, frame)
+        bounds = ZeroLagBounds(self.compressed, frame)
         best = self._best(frame, bounds)
         outside = self._outside(best[0], RUNNER_UP_RADIUS)
         if not (runner_up and outside.any()):
@@ -294,7 +436,7 @@ class PrunedZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
     def _best(self, frame: FloatArray, bounds: ZeroLagBounds) -> tuple[int, float]:
         """Return the cell of the highest score among those not left out, and the score."""
         seed = bounds.seed()
-        reached = self._score(seed, bounds.frames)
+        reached = self.score(seed, bounds.frames)
         return self._best_candidate(frame, bounds.candidates(reached), reached, seed)
 
 
@@ -306,10 +448,11 @@ class PrunedMatcher(_PruningMatcher, ReferenceMatcher):
     def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Compress the bank; arguments and errors as `Matcher`."""
         super().__init__(signals, valid, k_grid, sigma_grid)
-        self._spectra = {n: np.conj(fft.rfft(self._bank.basis[:COARSE_RANK], n)) for n in _LENGTHS}
+        # The conjugate transforms of the basis's first directions, (r, n // 2 + 1), by length n.
+        self.spectra = {n: np.conj(fft.rfft(self.compressed.basis[:COARSE_RANK], n)) for n in _LENGTHS}
 
     def _search(self, frame: FloatArray, runner_up: bool) -> Match:
-        bounds = AllLagsBounds(self._bank, self._spectra, frame, self._score)
+        bounds = AllLagsBounds(self, frame)
         near, reached = bounds.reached
         if not runner_up:
             return self._match(self._best_candidate(frame, bounds.candidates(reached), reached), None)

@@ -1,22 +1,21 @@
 """Estimators: `fit` makes a calibration from recordings; an `EstimatorSession` turns frames into estimates with it."""
 
-from shearloop.bank.estimation.calibration import NAMES, Calibration, Name
+from shearloop.bank.estimation.calibration import Calibration
+from shearloop.bank.estimation.estimator import Estimator, Physics
 from shearloop.bank.estimation.fitting import fit
-from shearloop.bank.estimation.fitting_raw import Physics
 from shearloop.bank.estimation.load_delay import TRUSTED, LoadTiming, measure_timing
 from shearloop.bank.estimation.session import EstimatorSession
 from shearloop.bank.estimation.values import Estimate, FrameSeries, Measured, TactileFrame, combine
 
 __all__ = [
-    "NAMES",
     "TRUSTED",
     "Calibration",
     "Estimate",
+    "Estimator",
     "EstimatorSession",
     "FrameSeries",
     "LoadTiming",
     "Measured",
-    "Name",
     "Physics",
     "TactileFrame",
     "combine",

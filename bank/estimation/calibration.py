@@ -1,4 +1,4 @@
-"""Calibration of one estimator: its fingertips, its features of a frame, and its file.
+"""Calibration of one estimator: its fingertips, its outputs, and its file.
 
 The file is a zip of a YAML header and NumPy arrays with checksums. It keeps any tree of frozen dataclasses of numbers,
 texts, tuples and arrays. Equal calibrations are equal bytes: fixed dates, fixed order, no compression.
@@ -19,22 +19,15 @@ from numpy.typing import NDArray
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS
-from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.bank_match import (
-    NOT_TURNED,
-    BankMatch,
-    BankMatcher,
-    ElectrodeNumbering,
-    PaperMatcher,
-    RefinedMatcher,
-)
+from shearloop.bank.estimation.bank_match import BankMatcher
+from shearloop.bank.estimation.estimator import Estimator, OutputModel
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
-from shearloop.bank.estimation.interval_regressor import IntervalRegressor, PolynomialRegressor
-from shearloop.bank.estimation.novelty import NoveltyDetector
-from shearloop.bank.estimation.regressors import ChannelImputer
-from shearloop.bank.estimation.session_state import TemporalFeatures
+from shearloop.bank.estimation.interval_regressor import PolynomialRegressor
+from shearloop.bank.estimation.ridge_estimators import PaperEstimator
 from shearloop.bank.estimation.values import Kind
+from shearloop.bank.estimators import estimator_class
+from shearloop.bank.polynomial import Polynomial
 from shearloop.files import replace_file
 
 FORMAT_VERSION = 4
@@ -44,79 +37,41 @@ _FILE_KIND = "shearloop estimator calibration"
 _HEADER = "calibration.yaml"
 _DATE = (1980, 1, 1, 0, 0, 0)
 
-Name = Literal["paper", "bank", "regression", "reconstruction", "motion_regression"]
-NAMES: tuple[Name, ...] = get_args(Name)
-NEEDS_BANK: tuple[Name, ...] = ("paper", "bank")
-Quantity = Literal["torque", "diameter"]
 # What the user guarantees, with the end of a sentence that says so.
 Assumption = Literal["full range", "load timing"]
 _ASSUMPTION_TEXTS: dict[Assumption, str] = {
     "full range": "no torque exceeds its slices (--assume-full-range)",
     "load timing": "the load cell's delay is as given (--load-cell-delay-s)",
 }
-# Columns of the paper's features (k, sigma, sigma²).
-PAPER_COLUMNS: dict[Quantity, slice] = {"torque": slice(1, 3), "diameter": slice(0, 1)}
 TORQUE_DEGREE, DIAMETER_DEGREE = 2, 1
-# Two cells of the paper's bank.
-_LEAST_MARGIN_K_CM = 0.05
 # Tools differ if their diameters differ by a larger share.
 LARGEST_TOOL_SHARE = 0.15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OutputModel:
-    """How one quantity is predicted: its regressor, and for differences the detector of novel ones.
-
-    k_range holds the least and largest matched k in cm, or nothing without a bank.
-    """
-
-    regressor: IntervalRegressor | PolynomialRegressor
-    novelty: NoveltyDetector | None
-    k_range: FloatArray
-
-    def match_reasons(self, match: BankMatch | None) -> tuple[str, ...]:
-        """Return the reason against a bank match far from the calibrated ones, if there is one."""
-        if match is None or not len(self.k_range):
-            return ()
-        low, high = self.k_range.tolist()
-        margin = max(high - low, _LEAST_MARGIN_K_CM)
-        if low - margin <= match.k <= high + margin:
-            return ()
-        return (
-            f"the bank fits best at k = {match.k:.2f} cm, outside the calibrated {low:.2f} to {high:.2f} cm; "
-            "the match is on another ridge of the bank",
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """All that an estimator knows of its fingertips; `source` describes the data in words.
+    """An estimator with its fingertips and the models of its outputs; `source` describes the data in words.
 
-    validators and temporal are for raw frames. scale (m, 896) divides differences per channel and is infinite for dead
-    ones; image (p, 896) maps them to pixels. bank_identity is empty for an estimator without a bank. tool_mm is the
-    diameter of the only tool in the recordings, else NaN. imputer serves raw frames that are read without memory.
+    sides is empty where nothing is known of the fingertip but the paper's curves over k and sigma. validators are for
+    raw frames. bank_identity is empty for an estimator without a bank. tool_mm is the diameter of the only tool in the
+    recordings, else NaN.
     """
 
-    estimator: Name
+    estimator: Estimator
     kind: Kind
     sides: tuple[str, ...]
     source: str
     bank_identity: str
-    scale: FloatArray
     tool_mm: float = np.nan
-    numbering: ElectrodeNumbering = NOT_TURNED
     validators: tuple[FingertipValidator, ...] = ()
-    temporal: TemporalFeatures | None = None
-    image: FloatArray | None = None
     torque: OutputModel | None = None
     diameter: OutputModel | None = None
-    imputer: ChannelImputer | None = None
     assumptions: tuple[Assumption, ...] = ()
 
     @classmethod
     def uncalibrated(cls, bank_identity: str) -> Self:
         """Return the paper's estimator on a bank without any fit: it gives k and sigma alone."""
-        return cls("paper", "raw", (), "", bank_identity, np.ones((1, N_CHANNELS)))
+        return cls(PaperEstimator(np.ones((1, N_CHANNELS))), "raw", (), "", bank_identity)
 
     @classmethod
     def from_matches(
@@ -141,14 +96,9 @@ class Calibration:
             return OutputModel(PolynomialRegressor(symbol, Polynomial.fit(*points, degree)), None, np.zeros(0))
 
         return cls(
-            "paper", "raw", (), source, bank_identity, np.ones((1, N_CHANNELS)),
+            PaperEstimator(np.ones((1, N_CHANNELS))), "raw", (), source, bank_identity,
             torque=model("sigma", TORQUE_DEGREE, torque), diameter=model("k", DIAMETER_DEGREE, diameter),
         )  # fmt: skip
-
-    @property
-    def has_curves_only(self) -> bool:
-        """Whether nothing is known of the fingertip but curves over k and sigma: no validators, no side."""
-        return self.kind == "raw" and not self.validators
 
     @property
     def assumption_text(self) -> str:
@@ -159,7 +109,11 @@ class Calibration:
         """Write the file, the same bytes for the same calibration; CalibrationError where that fails."""
         path = Path(path)
         arrays: dict[str, NDArray[Any]] = {}
-        content = _to_plain(self, "", arrays)
+        content = {
+            "estimator": self.estimator.name,
+            **_to_plain(self, "", arrays),
+            **_to_plain(self.estimator, "", arrays),
+        }
         members = {f"{name}.npy": _npy_bytes(array) for name, array in sorted(arrays.items())}
         header = {
             "kind": _FILE_KIND,
@@ -200,7 +154,9 @@ class Calibration:
                 f"{CHANNEL_TABLE_HASH[:12]}…; calibrate again"
             )
         try:
-            restored: Self = _from_plain(cls, header["content"], "", arrays)
+            content = header["content"]
+            estimator = _from_plain(estimator_class(content["estimator"]), content, "", arrays)
+            restored: Self = _from_plain(cls, {**content, "estimator": estimator}, "", arrays)
         except (KeyError, TypeError, ValueError, IndexError, StopIteration, CalibrationError) as error:
             raise CalibrationError(
                 f"{path}: the file does not describe a calibration of this version ({error}); use the version that "
@@ -211,7 +167,7 @@ class Calibration:
     def check_bank(self, bank: Bank | None) -> Bank:
         """Return the bank; raises CalibrationError where it is missing or not the calibration's."""
         if bank is None:
-            raise CalibrationError(f"the estimator {self.estimator} needs its bank; name it with --bank")
+            raise CalibrationError(f"the estimator {self.estimator.name} needs its bank; name it with --bank")
         if bank.identity != self.bank_identity:
             raise CalibrationError(
                 f"the calibration was made with the bank {self.bank_identity[:12]}…, and {bank.path} is "
@@ -221,45 +177,7 @@ class Calibration:
 
     def matcher(self, bank: Bank | None) -> BankMatcher | None:
         """Return the matcher of an estimator that needs a bank, None for others; raises as `check_bank` does."""
-        if self.estimator not in NEEDS_BANK:
-            return None
-        bank = self.check_bank(bank)
-        return PaperMatcher(bank) if self.estimator == "paper" else RefinedMatcher(bank, self.numbering)
-
-    def features(
-        self, matcher: BankMatcher | None, difference: FloatArray, temporal: FloatArray | None, t_s: float
-    ) -> tuple[FloatArray, BankMatch | None]:
-        """Return the features of (m, 896) differences at t_s, and the bank match if there is one.
-
-        With temporal features these are the features. A slice has its time as a feature, because the gel drifts.
-        """
-        if self.temporal is not None:
-            if temporal is None:
-                raise ValueError("an estimator of motion needs the last frames")
-            return temporal, None
-        if matcher is not None:
-            matches = [matcher.match(layer) for layer in difference]
-            if self.estimator == "paper":
-                # The paper reads one fingertip: torque from sigma, diameter from k.
-                return np.array([matches[0].k, matches[0].sigma, matches[0].sigma ** 2]), matches[0]
-            return np.concatenate([one.features for one in matches]), matches[0]
-        if self.image is not None:
-            return (difference @ self.image.T).ravel(), None
-        features = (difference / self.scale).ravel()
-        return (np.append(features, t_s) if self.estimator == "motion_regression" else features), None
-
-    def columns(self, quantity: Quantity, features: FloatArray) -> FloatArray:
-        """Return those (…, d) features that a quantity is predicted from."""
-        return features[..., PAPER_COLUMNS[quantity]] if self.estimator == "paper" else features
-
-    def inputs(self, quantity: Quantity, features: FloatArray, mean_difference: FloatArray) -> FloatArray:
-        """Return the (d,) inputs of a quantity's regressor from a frame's features and its grip's mean difference.
-
-        An estimator of motion reads the diameter from the gel's mean position in this grip.
-        """
-        if self.temporal is not None and quantity == "diameter":
-            return np.asarray((mean_difference / self.scale).ravel())
-        return self.columns(quantity, features)
+        return self.estimator.matcher(self.check_bank(bank)) if self.estimator.searches_bank else None
 
 
 def _read_members(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
@@ -299,7 +217,13 @@ def _npy_bytes(array: NDArray[Any]) -> bytes:
 def _to_plain(value: Any, path: str, arrays: dict[str, NDArray[Any]]) -> Any:
     """Return YAML's view of a value; its arrays go into `arrays` by their path."""
     if is_dataclass(value):
-        return {one.name: _to_plain(getattr(value, one.name), f"{path}/{one.name}", arrays) for one in fields(value)}
+        parts = {one.name: getattr(value, one.name) for one in fields(value)}
+        # An estimator's fields stand beside its calibration's.
+        return {
+            name: _to_plain(part, f"{path}/{name}", arrays)
+            for name, part in parts.items()
+            if not isinstance(part, Estimator)
+        }
     if isinstance(value, np.ndarray):
         name = path.strip("/").replace("/", ".")
         arrays[name] = value
@@ -314,6 +238,8 @@ def _to_plain(value: Any, path: str, arrays: dict[str, NDArray[Any]]) -> Any:
 def _from_plain(kind: Any, plain: Any, path: str, arrays: dict[str, NDArray[Any]]) -> Any:
     """Return the value of type `kind` that `_to_plain` made plain."""
     origin, name = get_origin(kind), path.strip("/")
+    if isinstance(plain, Estimator):
+        return plain
     if origin in (Union, types.UnionType):
         choices = [choice for choice in get_args(kind) if choice is not type(None)]
         if plain is None:

@@ -1,7 +1,6 @@
 """Fitting an estimator to slices: differences of one fingertip, each with a torque or a diameter."""
 
-from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,18 +8,13 @@ from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.channels import N_CHANNELS, N_ELECTRODES
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatcher, ElectrodeNumbering
-from shearloop.bank.estimation.calibration import Calibration, OutputModel, Quantity
-from shearloop.bank.estimation.fitting_raw import Physics, k_range, ridge_fit, strengths_for
+from shearloop.bank.estimation.calibration import Assumption, Calibration
+from shearloop.bank.estimation.estimator import Estimator, OutputModel, Physics, Quantity, Reading
 from shearloop.bank.estimation.interval_regressor import Mixtures, fit_interval_regressor
-from shearloop.bank.estimation.novelty import NoveltyDetector, fitted_parts
-from shearloop.bank.estimation.regressors import InverseCalibration, Regressor, later_origins
+from shearloop.bank.estimation.novelty import NoveltyDetector
+from shearloop.bank.estimation.regressors import later_origins
 from shearloop.bank.estimation.values import FrameSeries
 
-# Inverse calibration over torque and over diameter: degree, directions of drift, trend. The torque's have the least
-# mean error over six origins (19 to 44 of 49 slices, evaluated on all later ones; docs/decisions/0042).
-_TORQUE_CURVE, _DIAMETER_CURVE = (3, 3, True), (1, 1, False)
-# With a block left out, enough remain for novelty detection, or for the torque's curve.
-_LEAST_TORQUE_SLICES, _LEAST_FOR_CURVE = 10, 14
 # Foreign frames: every eighth of a turn, plain and mirrored, except the own numbering. Of a few numberings alone the
 # result depends on the choice: single ones give half to twice the median.
 _NUMBERINGS = [(turn, mirrored) for turn in range(0, N_ELECTRODES, N_ELECTRODES // 8) for mirrored in (False, True)][1:]
@@ -44,7 +38,7 @@ def fit_slices(
             f"slices of {len(blank.sides)} fingertips ({', '.join(blank.sides)}) do not fit into one calibration; make "
             "one for each"
         )
-    is_curve = blank.estimator == "motion_regression"
+    estimator = blank.estimator
     frames = np.concatenate([one.channels for one in recordings])
     times = _consecutive([one.t_s for one in recordings])
     torque = np.concatenate([one.torque_at_frames() for one in recordings])
@@ -58,53 +52,52 @@ def fit_slices(
         known = np.isfinite(values)
         if not known.any():
             continue
-        n, least = int(known.sum()), _LEAST_FOR_CURVE if is_curve else _LEAST_TORQUE_SLICES
-        if quantity == "torque" and n < least:
+        n = int(known.sum())
+        if quantity == "torque" and n < estimator.least_slices:
             raise CalibrationError(
-                f"{n} slices with a torque are too few for the estimator {blank.estimator}; record {least} or more"
+                f"{n} slices with a torque are too few for the estimator {estimator.name}; record "
+                f"{estimator.least_slices} or more"
             )
         differences = np.abs(frames[known])
         # First, because it checks that a board sent the slices.
         novelty = NoveltyDetector.fit(differences[:, 0])
-        features = np.array(
-            [
-                blank.features(matcher, one, None, t_s)[0]
-                for one, t_s in zip(differences, times[known].tolist(), strict=True)
-            ]
-        )
-        test = None
-        if quantity == "torque":
-            test = ContaminationTest(differences[:, 0], _features_of(blank, matcher, times[known]))
-        degree, n_drift, trend = _TORQUE_CURVE if quantity == "torque" else _DIAMETER_CURVE
-        if is_curve:
-            _check_distinct(quantity, values[known], degree)
+        reader = SliceReader(estimator, matcher, times[known])
+        features = np.array([reader.features(one, row) for row, one in enumerate(differences[:, 0])])
+        test = ContaminationTest(differences[:, 0], reader) if quantity == "torque" else None
         regressor = fit_interval_regressor(
-            blank.columns(quantity, features),
+            features[:, estimator.columns[quantity]],
             values[known],
-            _curve_fit(degree, n_drift, trend) if is_curve else ridge_fit(blank.estimator),
-            strengths=strengths_for(blank.estimator),
+            estimator.slices_fit(quantity, values[known]),
+            strengths=estimator.strengths,
             left_out=later_origins(n) if quantity == "torque" else (),
             growth=test.growth if test is not None else None,
             mixtures=test.accepted if test is not None else None,
             full_range=full_range,
         )
-        models[quantity] = OutputModel(regressor, novelty, k_range(blank.estimator, features))
+        models[quantity] = OutputModel(regressor, novelty, estimator.k_range(features))
     if not models:
         raise CalibrationError("the slices come with neither torque nor diameter")
-    return replace(blank, torque=models.get("torque"), diameter=models.get("diameter"))
+    assumptions: tuple[Assumption, ...] = ("full range",) if full_range and "torque" in models else ()
+    return replace(blank, torque=models.get("torque"), diameter=models.get("diameter"), assumptions=assumptions)
 
 
-def _features_of(
-    blank: Calibration, matcher: BankMatcher | None, t_s: FloatArray
-) -> Callable[[FloatArray, int], FloatArray]:
-    """Return a function from a (896,) difference and its row to the torque's features."""
-    return lambda difference, row: blank.columns(
-        "torque", blank.features(matcher, difference[None], None, float(t_s[row]))[0]
-    )
+@dataclass(frozen=True, slots=True, eq=False)
+class SliceReader:
+    """Makes features of slices at the times t_s (n,)."""
 
+    estimator: Estimator
+    matcher: BankMatcher | None
+    t_s: FloatArray
 
-def _curve_fit(degree: int, n_drift: int, trend: bool) -> Callable[[FloatArray, FloatArray, float], Regressor]:
-    return lambda features, values, _: InverseCalibration.fit(features, values, degree, n_drift, trend=trend)
+    def features(self, difference: FloatArray, row: int) -> FloatArray:
+        """Return the (d,) features of a (896,) difference at the time of a row."""
+        slice_ = difference[None]
+        reading = Reading(slice_, float(self.t_s[row]), slice_, np.zeros(0), self.matcher)
+        return self.estimator.features(reading)[0]
+
+    def torque_inputs(self, difference: FloatArray, row: int) -> FloatArray:
+        """Return those features that the torque is predicted from."""
+        return self.features(difference, row)[self.estimator.columns["torque"]]
 
 
 class ContaminationTest:
@@ -115,10 +108,10 @@ class ContaminationTest:
     electrodes renumbered.
     """
 
-    def __init__(self, differences: FloatArray, features_of: Callable[[FloatArray, int], FloatArray]) -> None:
-        """Take (n, 896) differences in time order, and a function from one and its row to (d,) features."""
+    def __init__(self, differences: FloatArray, reader: SliceReader) -> None:
+        """Take (n, 896) differences in time order, and their reader."""
         self._differences = differences
-        self._features_of = features_of
+        self._reader = reader
         mean = differences.mean(axis=0)
         self._foreign = [
             mean[ElectrodeNumbering(turn, mirrored, score=1.0, runner_up=0.0).model_channels()]
@@ -148,7 +141,7 @@ class ContaminationTest:
                     limit_shares.append(novelty.limit_share)
                     key = row, number, share
                     if key not in self._features:
-                        self._features[key] = self._features_of(mixed, row)
+                        self._features[key] = self._reader.torque_inputs(mixed, row)
                     features.append(self._features[key])
         return Mixtures(np.array(rows, dtype=np.int64), np.array(features), np.array(limit_shares))
 
@@ -157,19 +150,6 @@ class ContaminationTest:
         if key not in self._detectors:
             self._detectors[key] = NoveltyDetector.fit(self._differences[past])
         return self._detectors[key]
-
-
-def _check_distinct(quantity: Quantity, values: FloatArray, degree: int) -> None:
-    """Raise CalibrationError where a part of (n,) values has too few distinct ones for a curve."""
-    if np.ptp(values) == 0:
-        return
-    for rows in fitted_parts(len(values)):
-        n_distinct = len(np.unique(values[rows]))
-        if n_distinct <= degree:
-            raise CalibrationError(
-                f"{len(rows)} of the {len(values)} slices have too few different {quantity}s for the estimator "
-                f"motion_regression, {n_distinct}; record more of them, in turn"
-            )
 
 
 def _consecutive(times: list[FloatArray]) -> FloatArray:

@@ -15,7 +15,6 @@ import numpy as np
 from scipy.special import stdtrit
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
-from shearloop.bank.eit.polynomial import TWO_SIDED_95, Polynomial
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.regressors import (
     InverseCalibration,
@@ -24,6 +23,7 @@ from shearloop.bank.estimation.regressors import (
     later_splits,
     left_out_blocks,
 )
+from shearloop.bank.polynomial import TWO_SIDED_95, Polynomial
 
 LEVEL = 0.95
 LEAST_IN_STRATUM = 20

@@ -8,22 +8,19 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.polynomial import TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatch, BankMatcher
-from shearloop.bank.estimation.calibration import LARGEST_TOOL_SHARE, Calibration, OutputModel, Quantity
+from shearloop.bank.estimation.calibration import LARGEST_TOOL_SHARE, Calibration
+from shearloop.bank.estimation.estimator import NO_ERRORS, OutputModel, Quantity, Reading
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
-from shearloop.bank.estimation.interval_regressor import IntervalRegressor
-from shearloop.bank.estimation.novelty import FAMILIAR, Novelty, NoveltyDetector
-from shearloop.bank.estimation.regressors import Ridge
-from shearloop.bank.estimation.session_state import BASELINE_FRAMES, PaperState, SessionState
+from shearloop.bank.estimation.novelty import FAMILIAR, Novelty
+from shearloop.bank.estimation.session_state import BASELINE_FRAMES, PaperState, SessionState, SliceState
 from shearloop.bank.estimation.values import Estimate, Measured, TactileFrame
+from shearloop.bank.polynomial import TWO_SIDED_95
 
 REPEATED_FRAME = ("the board sent the same frame again",)
 _UNITS: dict[Quantity, str] = {"torque": "N·m", "diameter": "mm"}
 _AMBIGUOUS = ("two positions of the bank far apart fit the frame equally well",)
-_NO_ERRORS: FloatArray = np.zeros((0, 1, N_CHANNELS))
 # A longer gap restarts the average of frames.
 _MAX_GAP_S = 3.0
 
@@ -33,20 +30,16 @@ _Interval = tuple[float, float, float]
 
 @dataclass(slots=True)
 class _Inputs:
-    """Inputs of the regressors: a (m, 896) difference at t_s, temporal features, the grip's mean difference.
+    """Inputs of the regressors: a reading, its features, and which (m, 896) channels are usable.
 
-    usable_share of all channels are usable. Imputed ones have the (k, m, 896) errors, one standard deviation each.
+    Imputed channels have the (k, m, 896) errors, one standard deviation each.
     """
 
-    difference: FloatArray
-    temporal: FloatArray | None
-    usable: BoolArray
-    t_s: float
-    mean_difference: FloatArray
-    usable_share: float
-    errors: FloatArray
+    reading: Reading
     features: FloatArray
     match: BankMatch | None
+    usable: BoolArray
+    errors: FloatArray
 
 
 class EstimatorSession:
@@ -73,7 +66,6 @@ class EstimatorSession:
         self._averaging = (average_frames, max_gap_s)
         self._baseline_frames = baseline_frames
         self._matcher = matcher or calibration.matcher(bank)
-        self._position_noise_mm = _position_noise_mm(calibration)
         self.set_tool(None)
         self.reset()
 
@@ -103,11 +95,14 @@ class EstimatorSession:
     def reset(self, idle_frames: int = 0) -> None:
         """Forget the session: the next frame is its first, and the next `idle_frames` usable ones are untouched."""
         calibration = self.calibration
-        self._state: SessionState | PaperState | None = None
-        if calibration.has_curves_only:
+        self._state: SessionState | PaperState | SliceState
+        if calibration.kind != "raw":
+            self._state = SliceState()
+        elif not calibration.sides:
             self._state = PaperState(idle_frames or self._baseline_frames, *self._averaging)
-        elif calibration.kind == "raw":
-            self._state = SessionState(calibration.validators, calibration.temporal, self._period_s, idle_frames)
+        else:
+            motion = calibration.estimator.motion
+            self._state = SessionState(calibration.validators, motion, self._period_s, idle_frames)
         self._difference: FloatArray | None = None
         self._latest: list[bytes] = []
 
@@ -119,7 +114,7 @@ class EstimatorSession:
     @property
     def taring(self) -> bool:
         """Whether frames are being averaged into the idle frame."""
-        return self._state is not None and self._state.taring
+        return self._state.taring
 
     @property
     def difference(self) -> FloatArray | None:
@@ -131,15 +126,14 @@ class EstimatorSession:
 
         Raises CalibrationError for a frame of another number of sides.
         """
-        if frame.channels.shape != self.calibration.scale.shape:
+        shape = self.calibration.estimator.scale.shape
+        if frame.channels.shape != shape:
             raise CalibrationError(
-                f"the calibration is of {len(self.calibration.scale)} sides ({', '.join(self.calibration.sides)}), "
-                f"and the frame has the shape {frame.channels.shape}"
+                f"the calibration is of {shape[0]} sides ({', '.join(self.calibration.sides)}), and the frame has the "
+                f"shape {frame.channels.shape}"
             )
         self._difference = None
-        if self._state is None:
-            return self._predict(np.abs(frame.channels), frame.usable, frame.t_s)
-        if isinstance(self._state, SessionState) and self._repeats(frame.channels):
+        if self._state.refuses_repeats and self._repeats(frame.channels):
             return Estimate(valid=False, reasons=REPEATED_FRAME)
         processed = self._state.process(frame)
         if processed.reasons:
@@ -150,20 +144,18 @@ class EstimatorSession:
     def _predict(self, difference: FloatArray, usable: BoolArray, t_s: float) -> Estimate:
         calibration, state = self.calibration, self._state
         outputs, reasons = self._select_outputs(difference, usable)
-        if not outputs and not calibration.has_curves_only:
+        if not outputs and not state.curves_only:
             return Estimate(valid=False, reasons=tuple(reasons))
-        usable_share, errors = np.count_nonzero(usable) / usable.size, _NO_ERRORS
-        if usable_share < 1.0 and calibration.temporal is None:
+        errors = NO_ERRORS
+        if not usable.all():
             novelty = next((one.novelty for one, _ in outputs.values() if one.novelty is not None), None)
-            difference, errors = self._impute(usable, difference, novelty)
-            if self._difference is not None:
-                self._difference = difference
-        temporal = state.temporal_features if state is not None else None
-        features, match = calibration.features(self._matcher, difference, temporal, t_s)
+            difference, errors = calibration.estimator.impute(difference, usable, novelty)
+            self._difference = difference
+        reading = Reading(difference, t_s, state.mean_difference, state.motion, self._matcher)
+        features, match = calibration.estimator.features(reading)
         if match is not None and match.ambiguous:
             return _estimate({}, _AMBIGUOUS, match)
-        mean_difference = state.mean_difference if state is not None else difference
-        inputs = _Inputs(difference, temporal, usable, t_s, mean_difference, usable_share, errors, features, match)
+        inputs = _Inputs(reading, features, match, usable, errors)
         values: dict[Quantity, _Interval] = {}
         for quantity, (model, novelty_result) in outputs.items():
             value, against = self._predict_quantity(quantity, model, novelty_result, inputs)
@@ -171,7 +163,7 @@ class EstimatorSession:
             if not against:
                 values[quantity] = value
         torque_missing = calibration.torque is not None and "torque" not in values
-        if calibration.kind == "raw" and (torque_missing or (calibration.has_curves_only and reasons)):
+        if calibration.kind == "raw" and (torque_missing or (state.curves_only and reasons)):
             # A frame beyond the calibrated torques is beyond the calibrated diameters too.
             values.clear()
         return _estimate(values, reasons, match)
@@ -181,7 +173,7 @@ class EstimatorSession:
     ) -> tuple[dict[Quantity, tuple[OutputModel, Novelty]], list[str]]:
         """Return the models to apply to a frame with its novelty, and the reasons against the others."""
         calibration, state = self.calibration, self._state
-        if calibration.has_curves_only and calibration.torque is None:
+        if state.curves_only and calibration.torque is None:
             fitted = calibration.diameter is not None
             return {}, [
                 "the calibration was made without torques: sigma has no torque"
@@ -199,7 +191,7 @@ class EstimatorSession:
                 continue
             novelty = model.novelty.assess(difference[0], usable[0]) if model.novelty is not None else FAMILIAR
             against = (*novelty.reasons, *(self._tool_reasons if quantity == "torque" else ()))
-            if quantity == "diameter" and state is not None and not state.has_baseline:
+            if quantity == "diameter" and not state.has_baseline:
                 # The gel's position means nothing without its idle position.
                 if calibration.torque is None:
                     reasons.append("the fingertip was gripped from the first frame on: its idle frame is not known")
@@ -213,42 +205,30 @@ class EstimatorSession:
         self, quantity: Quantity, model: OutputModel, novelty: Novelty, inputs: _Inputs
     ) -> tuple[_Interval, tuple[str, ...]]:
         """Return one quantity with its interval, and the reasons against it."""
-        features = self.calibration.inputs(quantity, inputs.features, inputs.mean_difference)
-        complete = None
-        # The paper's match ignores a frame's amplitude.
-        if quantity == "torque" and novelty.missing_share and self.calibration.estimator != "paper":
-            complete = self._regressor_inputs(quantity, inputs.difference / (1.0 - novelty.missing_share), inputs)
-        value = model.regressor.predict(features, inputs.usable_share, novelty.widening, novelty.limit_share, complete)
+        reading, estimator = inputs.reading, self.calibration.estimator
+        features, complete = estimator.inputs(quantity, inputs.features, reading), None
+        if quantity == "torque" and novelty.missing_share and estimator.uses_amplitude:
+            complete = self._regressor_inputs(quantity, reading, reading.difference / (1.0 - novelty.missing_share))
+        usable_share = np.count_nonzero(inputs.usable) / inputs.usable.size
+        value = model.regressor.predict(features, usable_share, novelty.widening, novelty.limit_share, complete)
         dead: tuple[str, ...] = ()
         if len(inputs.errors):
-            changed = [self._regressor_inputs(quantity, inputs.difference + one, inputs) for one in inputs.errors]
+            changed = [self._regressor_inputs(quantity, reading, reading.difference + one) for one in inputs.errors]
             error = TWO_SIDED_95 * math.hypot(*(model.regressor.predict(one)[0] - value[0] for one in changed))
             if 2 * error > value[1] + value[2]:
                 # The dead channels carried the value; the imputed ones are a guess.
                 dead = _dead_channel_reasons(self.calibration.validators, inputs.usable)
             value = _widened(value, error)
-        if quantity == "diameter" and self._state is not None:
-            value = _widened(value, self._position_noise_mm / math.sqrt(self._state.held_frames))
+        if quantity == "diameter":
+            value = _widened(value, estimator.position_noise_mm(model.regressor) / math.sqrt(self._state.held_frames))
         against = dead or model.match_reasons(inputs.match)
         return value, against or model.regressor.range_reasons(value[0], features, quantity, _UNITS[quantity])
 
-    def _regressor_inputs(self, quantity: Quantity, difference: FloatArray, inputs: _Inputs) -> FloatArray:
+    def _regressor_inputs(self, quantity: Quantity, reading: Reading, difference: FloatArray) -> FloatArray:
         """Return the regressor's inputs if this were the frame's difference."""
-        features, _ = self.calibration.features(self._matcher, difference, inputs.temporal, inputs.t_s)
-        return self.calibration.inputs(quantity, features, inputs.mean_difference)
-
-    def _impute(
-        self, usable: BoolArray, difference: FloatArray, novelty: NoveltyDetector | None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return a (m, 896) difference with unusable channels imputed, and their errors (k, m, 896)."""
-        if self.calibration.imputer is not None:
-            return self.calibration.imputer.impute(difference, usable)
-        if novelty is None:
-            return difference, _NO_ERRORS
-        # An inverse calibration ignores NaN; other regressors need a value.
-        ignores = self.calibration.estimator == "motion_regression"
-        imputed = np.full(N_CHANNELS, np.nan) if ignores else novelty.impute(difference[0], usable[0])
-        return np.where(usable, difference, imputed), _NO_ERRORS
+        changed = replace(reading, difference=difference)
+        estimator = self.calibration.estimator
+        return estimator.inputs(quantity, estimator.features(changed)[0], changed)
 
 
 def _dead_channel_reasons(validators: tuple[FingertipValidator, ...], usable: BoolArray) -> tuple[str, ...]:
@@ -260,21 +240,6 @@ def _dead_channel_reasons(validators: tuple[FingertipValidator, ...], usable: Bo
         for one, n in zip(validators, missing, strict=True)
         if n
     )
-
-
-def _position_noise_mm(calibration: Calibration) -> float:
-    """Return the diameter's 95 % error from the noise of one frame, where each feature has a noise of 1; else 0.
-
-    A mean of n frames has a root of n less. The calibrated interval lacks this noise: it comes from means of whole
-    grips, which have little noise left.
-    """
-    model = calibration.diameter
-    if model is None or calibration.temporal is None or not isinstance(model.regressor, IntervalRegressor):
-        return 0.0
-    if not isinstance(model.regressor.point, Ridge):
-        return 0.0
-    weights = model.regressor.point.weights
-    return TWO_SIDED_95 * math.sqrt(weights @ weights)
 
 
 def _widened(value: _Interval, error: float) -> _Interval:

@@ -1,9 +1,6 @@
 """State of one session: the idle frame and the last few seconds.
 
-The state makes two kinds of features. The difference to the idle frame serves estimators without memory. The temporal
-features are how far the frame has moved since each of the last frames, in a few directions per fingertip: the gel
-creeps for seconds under a held twist, so its speed shows torque that its position does not, and slow drift of the
-baseline leaves no trace. Where the gel holds its position, that position is a feature too and shows a long twist.
+A frame passes the timer, the checks of its channels, the idle frames, the grips, and the memory of this grip.
 """
 
 import math
@@ -67,140 +64,310 @@ class ProcessedFrame:
         return cls(np.zeros(usable.shape), reasons, usable)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TemporalFeatures:
-    """Directions (m, p, 896) along which each side's motion is measured, in units of noise, and how far back.
+class Motion:
+    """What a session remembers of the gel's motion: nothing, for estimators that read each frame alone."""
 
-    With uses_position the position relative to the idle frame is a feature too.
-    """
-
-    directions: FloatArray
-    n_lags: int
-    uses_position: bool = False
-
-    @classmethod
-    def fit(
-        cls, parts: list[FloatArray], validators: tuple[FingertipValidator, ...], n_directions: int, n_lags: int
-    ) -> Self:
-        """Fit the main directions of motion to each recording's (n, m, 896) gripped frames."""
-        directions = []
-        for layer, one in enumerate(validators):
-            moved = np.vstack([(part[n_lags:, layer] - part[:-n_lags, layer]) / one.noise for part in parts])
-            rows = np.linalg.svd(moved, full_matrices=False)[2][:n_directions] / one.noise
-            directions.append(rows * np.sign(rows.sum(axis=1, keepdims=True)))
-        return cls(np.array(directions), n_lags)
+    n_lags: int = 0
 
     def project(self, channels: FloatArray) -> FloatArray:
-        """Return the (…, m·p) positions of (…, m, 896) frames along the directions."""
-        found = np.einsum("...mc,mpc->...mp", channels, self.directions)
-        return np.asarray(found.reshape(*found.shape[:-2], -1))
+        """Return the (…, p) positions of (…, m, 896) frames."""
+        return np.zeros((*channels.shape[:-2], 0))
 
-    def impute(
-        self, layer: int, moved: FloatArray, usable: BoolArray, noise: FloatArray, *grip: FloatArray
-    ) -> FloatArray:
-        """Return the motion of all (896,) channels of a side, from the usable ones.
+    def features(self, _positions: Sequence[FloatArray], _from_idle: FloatArray) -> FloatArray:
+        """Return the features of the last n_lags + 1 (p,) positions, and of the newest one's (p,) way from idle."""
+        return np.zeros(0)
 
-        It is along the directions and along the (896,) grip, if given.
-        """
-        alive = np.isfinite(noise)
-        modes = np.vstack([self.directions[layer] * np.where(alive, noise, 0.0) ** 2, *grip])
-        weights = np.where(usable & alive, 1.0 / noise, 0.0)
-        found = np.linalg.lstsq((modes * weights).T, moved * weights, rcond=None)[0]
-        return np.asarray(found @ modes)
+    def fill(self, moved: FloatArray, usable: BoolArray, _sides: Sequence[FingertipValidator]) -> FloatArray:
+        """Return the motion (m, 896) since the last frame with unusable channels imputed."""
+        return np.where(usable, moved, 0.0)
 
-    def features(self, positions: Sequence[FloatArray], from_idle: FloatArray) -> FloatArray:
-        """Return n_lags · m·p features of motion, nearest lag first, and m·p of position where it is used.
+    def complete(self, difference: FloatArray, _usable: BoolArray, _sides: Sequence[FingertipValidator]) -> FloatArray:
+        """Return a (m, 896) difference to the idle frame, unusable channels imputed unless the estimator does that."""
+        return difference
 
-        positions are the last n_lags + 1 (m·p,) positions; from_idle (m·p,) is the newest one relative to idle.
-        """
-        rows = np.array(positions)
-        moved = (rows[-1] - rows[-2::-1]).ravel()
-        return np.concatenate([moved, from_idle]) if self.uses_position else moved
+
+class FrameTimer:
+    """Finds gaps and missing frames by the frames' times."""
+
+    def __init__(self, period_s: float) -> None:
+        """Begin with the board's period: one that drops half of its frames does not show it, so it is a bound."""
+        self._period_s = period_s
+        self._t_s = -np.inf
+        self._steps_s: deque[float] = deque(maxlen=_STEPS)
+
+    def missing_before(self, t_s: float) -> int | None:
+        """Return how many frames are missing before the next one, None after a gap."""
+        step_s, self._t_s = t_s - self._t_s, t_s
+        learned_s = sorted(self._steps_s)[_STEPS // 2] if len(self._steps_s) == _STEPS else np.inf
+        period_s = min(learned_s, self._period_s)
+        if 0 < step_s <= _LARGEST_GAP_S:
+            self._steps_s.append(step_s)
+        if not 0 < step_s <= min(_LARGEST_GAP_S, _LARGEST_GAP_SHARE * period_s):
+            return None
+        return int(step_s > _MISSING_SHARE * period_s)
+
+
+class IdleFrames:
+    """The idle (m, 896) frame: the calibration's until the session has its own, and (m, 1) gains over it."""
+
+    def __init__(self, fingertips: FingertipSet, wanted: int) -> None:
+        """Begin; the operator guarantees that the first `wanted` usable frames are untouched."""
+        self._sides = fingertips.sides
+        self.baselines: FloatArray = fingertips.idle.copy()
+        self.gains: FloatArray = np.ones((len(self._sides), 1))
+        self._frames: list[deque[FloatArray]] = [deque(maxlen=BASELINE_FRAMES) for _ in self._sides]
+        self._followed = False
+        self._wanted = wanted
+        self._tare_frames: list[FloatArray] = []
+        self._least = min(_LEAST_IDLE, wanted or _LEAST_IDLE)
+
+    @property
+    def taring(self) -> bool:
+        """Whether frames are being averaged into the idle frame."""
+        return len(self._tare_frames) < self._wanted
+
+    @property
+    def begun(self) -> bool:
+        """Whether any frame has been looked at."""
+        return self._followed or bool(self._tare_frames)
+
+    @property
+    def complete(self) -> bool:
+        """Whether this session has seen every fingertip idle."""
+        return all(self._frames)
+
+    def last_tare_frame(self) -> FloatArray | None:
+        """Return the last frame of a tare that is not complete."""
+        return self._tare_frames[-1] if self._tare_frames and self.taring else None
+
+    def add_to_tare(self, channels: FloatArray) -> str:
+        """Take the tare's next frame and return how many there are."""
+        self._tare_frames.append(channels)
+        n = len(self._tare_frames)
+        if n == self._wanted:
+            self.baselines, self._followed = np.mean(self._tare_frames, axis=0), True
+            for layer, frames in enumerate(self._frames):
+                frames.extend(one[layer] for one in self._tare_frames)
+            self._update_gains()
+        return f"taking the homogeneous frame, {n} of {self._wanted}"
+
+    def restart_tare(self) -> None:
+        """Forget the frames of a tare that is not complete."""
+        if self.taring:
+            self._tare_frames.clear()
+
+    def idle_sides(self, channels: FloatArray) -> list[int]:
+        """Return the sides where a frame without a grip is idle."""
+        first, self._followed = not self._followed, True
+        found = []
+        for layer, one in enumerate(self._sides):
+            frames = self._frames[layer]
+            # One frame is a poor baseline: accept the first few unless they look clearly gripped.
+            learned = len(frames) >= self._least
+            limit = 0.5 * one.grip_threshold if learned else max(_OUTRIGHT, one.grip_threshold)
+            following = bool(frames) and one.grip_score(channels[layer], self.baselines[layer]) < limit
+            if following or (first and one.looks_idle(channels[layer])):
+                found.append(layer)
+        return found
+
+    def follow(self, layer: int, channels: FloatArray, *, restart: bool) -> None:
+        """Average an idle frame of one side, alone if the earlier ones lack some of its channels."""
+        if restart:
+            self._frames[layer].clear()
+        self._frames[layer].append(channels)
+        self.baselines[layer] = np.mean(self._frames[layer], axis=0)
+        self._update_gains()
+
+    def least_score(self, layer: int) -> float:
+        """Return the score that a grip needs: with a baseline of a few frames only a strong one counts."""
+        learning = 0 < len(self._frames[layer]) < self._least
+        return max(_OUTRIGHT, self._sides[layer].grip_threshold) if learning else -np.inf
+
+    def _update_gains(self) -> None:
+        if self.complete:
+            gains = [one.gain(idle) for one, idle in zip(self._sides, self.baselines, strict=True)]
+            self.gains = np.array(gains)[:, None]
+
+
+class Grips:
+    """Which fingertips are gripped, by their scores and by steps."""
+
+    def __init__(self, sides: Sequence[FingertipValidator]) -> None:
+        """Begin without a grip."""
+        self._sides = sides
+        self._detectors = [GripDetector(one.grip_threshold) for one in sides]
+        self._released = [False for _ in sides]
+        self._passed: deque[FloatArray] = deque(maxlen=STEP_FRAMES + 1)
+
+    def forget_steps(self) -> None:
+        """Forget the last frames."""
+        self._passed.clear()
+
+    def loose_sides(self, channels: FloatArray, idle: IdleFrames) -> list[str]:
+        """Take the next (m, 896) frame and return the sides that are not gripped."""
+        self._passed.append(channels)
+        loose = []
+        for layer, one in enumerate(self._sides):
+            if len(self._passed) > STEP_FRAMES and max(one.step_limit, one.fall_limit) < math.inf:
+                now, then, base = (
+                    each[layer] / idle.gains[layer] for each in (channels, self._passed[0], idle.baselines)
+                )
+                released = one.released(now, then, base)
+                self._released[layer] = self._released[layer] if released is None else released
+            score, grip = one.grip_score(channels[layer], idle.baselines[layer]), self._detectors[layer]
+            counts = grip.gripped or score > idle.least_score(layer)
+            if not (counts and grip.update(score)) or self._released[layer]:
+                loose.append(one.side)
+        return loose
+
+
+class GripMemory:
+    """The last positions of this grip, some of them interpolated, and its mean (m, 896) difference to idle."""
+
+    def __init__(self, motion: Motion, n_sides: int) -> None:
+        """Begin without a grip."""
+        self._motion = motion
+        self._positions: deque[FloatArray] = deque(maxlen=motion.n_lags + 1)
+        self._bridged: deque[bool] = deque(maxlen=motion.n_lags + 1)
+        self._skipped_in_a_row = 0
+        self._from_idle: FloatArray = np.zeros(0)
+        # Over the last valid frames, and their number.
+        self.mean_difference: FloatArray = np.zeros((n_sides, N_CHANNELS))
+        self.held_frames = 0
+
+    @property
+    def empty(self) -> bool:
+        """Whether no frame of a grip is remembered."""
+        return not self._positions
+
+    @property
+    def features(self) -> FloatArray:
+        """Features of the last frames' motion."""
+        return self._motion.features(self._positions, self._from_idle)
+
+    def forget(self) -> None:
+        """Forget the grip."""
+        self._positions.clear()
+        self._bridged.clear()
+        self._skipped_in_a_row, self.held_frames = 0, 0
+        self.mean_difference = np.zeros_like(self.mean_difference)
+
+    def skip(self, missing: int) -> None:
+        """Leave a frame out; after too many in a row the last position is too old."""
+        self._skipped_in_a_row += 1
+        if self._skipped_in_a_row > _LARGEST_BRIDGED:
+            self.forget()
+        elif self._positions:
+            self._repeat_position(1 + missing)
+
+    def remember(self, channels: FloatArray, difference: FloatArray, missing: int) -> str:
+        """Take the next gripped frame, interpolate those before it, and return the reason against an estimate."""
+        position, self._from_idle = self._motion.project(np.array([channels, difference]))
+        self._skipped_in_a_row = 0
+        if self._positions:
+            self._repeat_position(missing)
+        between = 0
+        while between < len(self._bridged) and self._bridged[-1 - between]:
+            between += 1
+        if 0 < between < len(self._positions):
+            begin = self._positions[-1 - between]
+            for i in range(1, between + 1):
+                self._positions[i - 1 - between] = begin + i / (between + 1) * (position - begin)
+        self._positions.append(position)
+        self._bridged.append(False)
+        if wanted := self._motion.n_lags + 1 - len(self._positions):
+            return f"gripped too recently: {wanted} more frames are needed"
+        if sum(self._bridged) > _LARGEST_BRIDGED:
+            return "too many of the last frames were disturbed or are missing"
+        self.held_frames = min(self.held_frames + 1, _HELD_FRAMES)
+        self.mean_difference = self.mean_difference + (difference - self.mean_difference) / self.held_frames
+        return ""
+
+    def _repeat_position(self, times: int) -> None:
+        """Repeat the last position for missing frames until the next frame allows interpolation."""
+        for _ in range(times):
+            self._positions.append(self._positions[-1])
+            self._bridged.append(True)
 
 
 class SessionState:
     """State of one session of raw frames; every frame goes through `process` in order."""
 
+    curves_only, refuses_repeats = False, True
+
     def __init__(
         self,
         validators: tuple[FingertipValidator, ...],
-        temporal: TemporalFeatures | None,
+        motion: Motion,
         period_s: float = np.inf,
         idle_frames: int = 0,
     ) -> None:
         """Begin a session; the operator guarantees that its first `idle_frames` usable frames are untouched."""
         self._fingertips = FingertipSet(validators)
-        # A board that drops half of its frames does not show its period, so the configured one is a bound.
-        self._period_s = period_s
-        self._temporal = temporal
-        n_lags = temporal.n_lags if temporal is not None else 0
-        # Positions of the last frames along the directions, and which of them are interpolated.
-        self._positions: deque[FloatArray] = deque(maxlen=n_lags + 1)
-        self._bridged: deque[bool] = deque(maxlen=n_lags + 1)
-        self._from_idle: FloatArray = np.zeros(0)
-        self._skipped_in_a_row = 0
-        self._idle: list[deque[FloatArray]] = [deque(maxlen=BASELINE_FRAMES) for _ in validators]
-        # The calibration's idle frame until the session has its own, and (m, 1) gains of the session's over it.
-        self._baselines = self._fingertips.idle.copy()
-        self._gains: FloatArray = np.ones((len(validators), 1))
-        # Mean (m, 896) difference to the idle frame over this grip's last valid frames, and their number.
-        self.mean_difference: FloatArray = np.zeros_like(self._baselines)
-        self.held_frames = 0
-        self._begun = False
+        self._motion = motion
+        self._timer = FrameTimer(period_s)
+        self._idle = IdleFrames(self._fingertips, idle_frames)
+        self._grips = Grips(validators)
+        self._memory = GripMemory(motion, len(validators))
         self._before: FloatArray | None = None
         self._disturbed: FloatArray | None = None
-        self._t_s = -np.inf
-        self._steps_s: deque[float] = deque(maxlen=_STEPS)
-        self._frame_missing = False
-        self._passed: deque[FloatArray] = deque(maxlen=STEP_FRAMES + 1)
-        self._released = [False for _ in validators]
-        self._grips = [GripDetector(one.grip_threshold) for one in validators]
         self._lost: BoolArray = np.zeros((len(validators), N_CHANNELS), dtype=np.bool_)
         # Channels that were unusable when the session began: their idle voltages are unknown.
         self._unknown: BoolArray = self._lost
-        self._idle_wanted = idle_frames
-        self._tare_frames: list[FloatArray] = []
-        self._least_idle = min(_LEAST_IDLE, idle_frames or _LEAST_IDLE)
 
     @property
     def taring(self) -> bool:
         """Whether frames are being averaged into the idle frame."""
-        return len(self._tare_frames) < self._idle_wanted
+        return self._idle.taring
 
     @property
     def has_baseline(self) -> bool:
         """Whether this session has seen every fingertip idle."""
-        return all(self._idle)
+        return self._idle.complete
 
     @property
-    def temporal_features(self) -> FloatArray | None:
-        """Features of the last frames' motion, None while frames are missing or no motion is used."""
-        if self._temporal is None or len(self._positions) < self._temporal.n_lags + 1:
-            return None
-        return self._temporal.features(self._positions, self._from_idle)
+    def motion(self) -> FloatArray:
+        """Features of the last frames' motion."""
+        return self._memory.features
+
+    @property
+    def mean_difference(self) -> FloatArray:
+        """Mean (m, 896) difference to the idle frame over this grip's last valid frames."""
+        return self._memory.mean_difference
+
+    @property
+    def held_frames(self) -> int:
+        """The number of frames in the mean difference."""
+        return self._memory.held_frames
 
     def process(self, frame: TactileFrame) -> ProcessedFrame:
         """Take the next frame and return it with the reasons against it."""
-        self._advance_time(frame.t_s)
+        missing = self._timer.missing_before(frame.t_s)
+        if missing is None:
+            # The last frames do not show how the gel has moved. In a tare, compare with its last frame: a tool may
+            # have been gripped or released in the gap.
+            self._memory.forget()
+            self._grips.forget_steps()
+            self._before, self._disturbed, missing = self._idle.last_tare_frame(), None, 0
         channels, usable, reasons, jumping_shares = self._check(frame)
         if any(reasons):
             # One garbled frame is no other fingertip: skip it like a disturbed one.
             self._disturbed = None
-            self._skip()
+            self._memory.skip(missing)
             return ProcessedFrame.refused(usable, *filter(None, reasons))
         if jumping_shares and (disturbance := self._fingertips.disturbance(jumping_shares)):
-            return self._bridge(channels, disturbance, usable)
-        if self._before is None and not self._begun and not self._tare_frames:
+            self._bridge(channels, missing)
+            return ProcessedFrame.refused(usable, disturbance)
+        is_first = self._before is None
+        if is_first and not self._idle.begun:
             self._unknown = ~usable
+        self._disturbed, self._before = None, channels
         if self.taring:
-            return self._add_to_tare(channels, usable)
-        if self._before is None:
-            self._before = channels
+            return ProcessedFrame.refused(usable, self._idle.add_to_tare(channels))
+        if is_first:
             return ProcessedFrame.refused(usable, "there is no earlier frame to compare with")
-        self._disturbed, self._before, self._skipped_in_a_row = None, channels, 0
         self._update_baseline(channels, frame)
-        self._detect_release(channels)
-        return self._finish(channels, usable)
+        return self._finish(channels, usable, missing)
 
     def _check(self, frame: TactileFrame) -> tuple[FloatArray, BoolArray, list[str], list[float]]:
         """Return the filled channels, the usable ones, each side's reason, and its share of jumping channels.
@@ -220,190 +387,53 @@ class SessionState:
             channels = self._fill(frame.channels, usable)
         return channels, usable, reasons, shares
 
-    def _advance_time(self, t_s: float) -> None:
-        step_s, self._t_s, self._frame_missing = t_s - self._t_s, t_s, False
-        learned_s = sorted(self._steps_s)[_STEPS // 2] if len(self._steps_s) == _STEPS else np.inf
-        period_s = min(learned_s, self._period_s)
-        if 0 < step_s <= _LARGEST_GAP_S:
-            self._steps_s.append(step_s)
-        if not 0 < step_s <= min(_LARGEST_GAP_S, _LARGEST_GAP_SHARE * period_s):
-            # After a gap the last frames do not show how the gel has moved.
-            self._forget_grip()
-            self._before = self._disturbed = None
-            self._passed.clear()
-            if self._tare_frames and self.taring:
-                # Compare with the tare's last frame: a tool may have been gripped or released in the gap.
-                self._before = self._tare_frames[-1]
-            return
-        self._frame_missing = step_s > _MISSING_SHARE * period_s
-
-    def _remember(self, position: FloatArray) -> None:
-        """Append a position; interpolate the skipped or missing ones before it."""
-        if self._frame_missing and self._positions:
-            self._repeat_position()
-        between = 0
-        while between < len(self._bridged) and self._bridged[-1 - between]:
-            between += 1
-        if 0 < between < len(self._positions):
-            begin = self._positions[-1 - between]
-            for i in range(1, between + 1):
-                self._positions[i - 1 - between] = begin + i / (between + 1) * (position - begin)
-        self._positions.append(position)
-        self._bridged.append(False)
-
-    def _repeat_position(self) -> None:
-        """Repeat the last position for a missing frame until the next frame allows interpolation."""
-        self._positions.append(self._positions[-1])
-        self._bridged.append(True)
-
-    def _skip(self) -> None:
-        """Leave a frame out; after too many in a row the last position is too old."""
-        self._skipped_in_a_row += 1
-        if self._skipped_in_a_row > _LARGEST_BRIDGED:
-            self._forget_grip()
-        elif self._positions:
-            for _ in range(1 + self._frame_missing):
-                self._repeat_position()
-
-    def _add_to_tare(self, channels: FloatArray, usable: BoolArray) -> ProcessedFrame:
-        self._disturbed, self._before = None, channels
-        self._tare_frames.append(channels)
-        n, wanted = len(self._tare_frames), self._idle_wanted
-        if n == wanted:
-            self._baselines, self._begun = np.mean(self._tare_frames, axis=0), True
-            for layer, idle in enumerate(self._idle):
-                idle.extend(one[layer] for one in self._tare_frames)
-            self._update_gains()
-        return ProcessedFrame.refused(usable, f"taking the homogeneous frame, {n} of {wanted}")
-
-    def _difference(self, channels: FloatArray, usable: BoolArray) -> FloatArray:
-        """Return the (m, 896) difference to the idle frame, unusable channels imputed."""
-        difference = channels - self._baselines
-        if self._temporal is not None and not usable.all():
-            for layer, one in enumerate(self._fingertips.sides):
-                grip = one.gripped - one.idle
-                imputed = self._temporal.impute(layer, difference[layer], usable[layer], one.noise, grip)
-                difference[layer] = np.where(usable[layer], difference[layer], imputed)
-        return difference
-
-    def _finish(self, channels: FloatArray, usable: BoolArray) -> ProcessedFrame:
-        # At the calibration's gain. It does not change while gripped.
-        difference = self._difference(channels, usable) / self._gains
-        loose, reason = [], ""
-        for layer, one in enumerate(self._fingertips.sides):
-            gripped = self._is_gripped(layer, one.grip_score(channels[layer], self._baselines[layer]))
-            if self._released[layer] or not gripped:
-                loose.append(one.side)
-        if loose:
-            self._forget_grip()
-            reason = f"no grip at the {' and '.join(loose)} fingertip"
-        else:
-            position, self._from_idle = np.zeros((2, 0))
-            if self._temporal is not None:
-                position, self._from_idle = self._temporal.project(np.array([channels / self._gains, difference]))
-            self._remember(position)
-            if missing := (self._positions.maxlen or 0) - len(self._positions):
-                reason = f"gripped too recently: {missing} more frames are needed"
-            elif sum(self._bridged) > _LARGEST_BRIDGED:
-                reason = "too many of the last frames were disturbed or are missing"
-        if reason:
-            return ProcessedFrame(difference, (reason,), usable)
-        self.held_frames = min(self.held_frames + 1, _HELD_FRAMES)
-        self.mean_difference = self.mean_difference + (difference - self.mean_difference) / self.held_frames
-        return ProcessedFrame(difference, (), usable)
-
-    def _is_gripped(self, layer: int, score: float) -> bool:
-        """Return whether a fingertip is gripped; with a baseline of a few frames only a strong grip counts."""
-        grip = self._grips[layer]
-        learning = 0 < len(self._idle[layer]) < self._least_idle and not grip.gripped
-        strong = max(_OUTRIGHT, self._fingertips.sides[layer].grip_threshold)
-        return grip.update(score) if not learning or score > strong else False
-
-    def _detect_release(self, channels: FloatArray) -> None:
-        self._passed.append(channels)
-        if len(self._passed) <= STEP_FRAMES:
-            return
-        for layer, one in enumerate(self._fingertips.sides):
-            if max(one.step_limit, one.fall_limit) == math.inf:
-                continue
-            now, then, idle = (
-                each[layer] / self._gains[layer] for each in (channels, self._passed[0], self._baselines)
-            )
-            released = one.released(now, then, idle)
-            if released is not None:
-                self._released[layer] = released
-
-    def _bridge(self, channels: FloatArray, disturbance: str, usable: BoolArray) -> ProcessedFrame:
-        """Skip a disturbed frame; if the next one agrees with it, the change is real and the past is void."""
-        confirmed = self._disturbed is not None and all(
-            share <= LARGEST_JUMPING_SHARE
-            for share in self._fingertips.jumping_shares(channels, self._disturbed, self._fingertips.alive)
-        )
-        if confirmed:
-            self._forget_grip()
-            self._disturbed, self._before = None, channels
-            if self.taring:
-                # The tool was gripped or released meanwhile: start the tare again.
-                self._tare_frames.clear()
-        else:
-            self._disturbed = channels
-            self._skip()
-        return ProcessedFrame.refused(usable, disturbance)
-
     def _fill(self, channels: FloatArray, usable: BoolArray) -> FloatArray:
         """Return the channels with unusable ones moved on from the last frame as the usable ones moved."""
         if usable.all():
             return channels
         if self._before is None:
             return np.where(usable, channels, self._fingertips.gripped)
-        assumed = self._before.copy()
-        if self._temporal is not None:
-            for layer, one in enumerate(self._fingertips.sides):
-                moved = channels[layer] - self._before[layer]
-                assumed[layer] += self._temporal.impute(layer, moved, usable[layer], one.noise)
-        return np.where(usable, channels, assumed)
+        moved = self._motion.fill(channels - self._before, usable, self._fingertips.sides)
+        return np.where(usable, channels, self._before + moved)
+
+    def _bridge(self, channels: FloatArray, missing: int) -> None:
+        """Skip a disturbed frame; if the next one agrees with it, the change is real and the past is void."""
+        confirmed = self._disturbed is not None and all(
+            share <= LARGEST_JUMPING_SHARE
+            for share in self._fingertips.jumping_shares(channels, self._disturbed, self._fingertips.alive)
+        )
+        if confirmed:
+            # In a tare, the tool was gripped or released meanwhile.
+            self._memory.forget()
+            self._disturbed, self._before = None, channels
+            self._idle.restart_tare()
+        else:
+            self._disturbed = channels
+            self._memory.skip(missing)
 
     def _update_baseline(self, channels: FloatArray, frame: TactileFrame) -> None:
         """Follow the idle frame while nothing is gripped; a session that begins gripped keeps the calibration's.
 
         Channels that were unknown and work again in an idle frame are restored in `channels` (m, 896).
         """
-        first, self._begun = not self._begun, True
-        if self._positions:
-            return
-        for layer, one in enumerate(self._fingertips.sides):
-            idle = self._idle[layer]
-            begun = first and one.looks_idle(channels[layer])
-            # One frame is a poor baseline: accept the first few unless they look clearly gripped.
-            learned = len(idle) >= self._least_idle
-            limit = 0.5 * one.grip_threshold if learned else max(_OUTRIGHT, one.grip_threshold)
-            following = bool(idle) and one.grip_score(channels[layer], self._baselines[layer]) < limit
-            if begun or following:
-                self._restore_channels(layer, channels, frame)
-                idle.append(channels[layer])
-                self._baselines[layer] = np.mean(idle, axis=0)
-                self._update_gains()
+        for layer in self._idle.idle_sides(channels) if self._memory.empty else ():
+            back = self._unknown[layer]
+            if back.any():
+                back = back & (mask_saturated(frame.channels, frame.usable) & ~self._lost)[layer]
+                channels[layer, back] = frame.channels[layer, back]
+                self._unknown[layer] &= ~back
+            self._idle.follow(layer, channels[layer], restart=bool(back.any()))
 
-    def _restore_channels(self, layer: int, channels: FloatArray, frame: TactileFrame) -> None:
-        if not self._unknown[layer].any():
-            return
-        working = mask_saturated(frame.channels, frame.usable) & ~self._lost
-        back = self._unknown[layer] & working[layer]
-        if back.any():
-            # Earlier idle frames lack these channels.
-            self._idle[layer].clear()
-            channels[layer, back] = frame.channels[layer, back]
-            self._unknown[layer] &= ~back
-
-    def _update_gains(self) -> None:
-        if self.has_baseline:
-            gains = [one.gain(idle) for one, idle in zip(self._fingertips.sides, self._baselines, strict=True)]
-            self._gains = np.array(gains)[:, None]
-
-    def _forget_grip(self) -> None:
-        self._positions.clear()
-        self._bridged.clear()
-        self.mean_difference, self.held_frames = np.zeros_like(self._baselines), 0
+    def _finish(self, channels: FloatArray, usable: BoolArray, missing: int) -> ProcessedFrame:
+        # At the calibration's gain. It does not change while gripped.
+        difference = channels - self._idle.baselines
+        difference = self._motion.complete(difference, usable, self._fingertips.sides) / self._idle.gains
+        if loose := self._grips.loose_sides(channels, self._idle):
+            self._memory.forget()
+            reason = f"no grip at the {' and '.join(loose)} fingertip"
+        else:
+            reason = self._memory.remember(channels / self._idle.gains, difference, missing)
+        return ProcessedFrame(difference, (reason,) if reason else (), usable)
 
 
 class PaperState:
@@ -412,9 +442,9 @@ class PaperState:
     Trehan et al. 2025, section 2. Without a validator nothing is known of the fingertip but its first frames.
     """
 
-    has_baseline = True
-    temporal_features = None
+    curves_only, refuses_repeats, has_baseline = True, False, True
     held_frames = 1
+    motion: FloatArray = np.zeros(0)
 
     def __init__(self, baseline_frames: int, average_frames: int, max_gap_s: float) -> None:
         """Begin a session with `baseline_frames` untouched frames; a longer gap restarts the average."""
@@ -471,3 +501,17 @@ class PaperState:
         own = (np.array(self._tare_frames) - self._homogeneous).var(axis=0, ddof=1)
         variance = (freedom * own + _POOLED_FREEDOM * own.mean()) / (freedom + _POOLED_FREEDOM)
         return np.asarray(np.sqrt(np.maximum(variance, LEAST_NOISE_V**2)))
+
+
+class SliceState:
+    """State of slices, which are differences already: nothing but the last one."""
+
+    curves_only, refuses_repeats, has_baseline, taring = False, False, True, False
+    held_frames = 1
+    motion: FloatArray = np.zeros(0)
+    mean_difference: FloatArray = np.zeros((1, N_CHANNELS))
+
+    def process(self, frame: TactileFrame) -> ProcessedFrame:
+        """Take the next slice and return its magnitudes."""
+        self.mean_difference = np.abs(frame.channels)
+        return ProcessedFrame(self.mean_difference, (), frame.usable)

@@ -9,8 +9,8 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.polynomial import TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
+from shearloop.bank.polynomial import TWO_SIDED_95
 
 # "raw": volts as the board sends them. "difference": |frame − homogeneous frame|, smoothed over time.
 Kind = Literal["raw", "difference"]

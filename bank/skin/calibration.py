@@ -1,23 +1,28 @@
-"""A skin's calibration: friction, and one rising curve from tension at the gauges to response.
+"""A skin's calibration, one rising curve from tension at the gauges to response, and the tracking of a shear force.
 
 The curve is a straight line through the origin up to 1.2 N. Beyond, to 5 N and more, it has as many straight pieces as
 the recorded data support. Rising straight pieces invert without iteration. The fit reads a table of recorded
 resistances and forces: the membrane's two plays turn the forces into the tension at the gauges, friction included, and
 leave the coefficient of friction and the curve to be fitted. The daemon loads calibrations, so scipy.optimize is
 imported only to fit.
+
+Friction gives one response a band of forces. A rising or falling response proves slip, and the force is at an end of
+the band. A constant one leaves it anywhere within: it is then taken to be at its last known place, moved no further
+than the band demands (the inverse of a play).
 """
 
 import csv
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections import deque
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 from scipy.special import stdtrit
 
-from shearloop.bank.arrays import FloatArray, IntArray
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.skin.membrane import (
     PAPER_SECTION,
@@ -25,12 +30,12 @@ from shearloop.bank.skin.membrane import (
     Direction,
     Membrane,
     ShearInterval,
+    direction_of,
     measured_response,
 )
 from shearloop.yaml_files import read_yaml, save_yaml, validated
 
 FORMAT = "shearloop skin calibration 1"
-_LISTS = ("tension_n", "response", "rest_ohm")
 COLUMNS = ("r1_ohm", "r2_ohm", "shear_n", "normal_n")
 # A load cell at rest may read slightly negative; a skin cannot be pulled off its core.
 MAX_PULL_N = 0.05
@@ -45,6 +50,16 @@ NOT_RISING = (
     "The response does not rise with the shear force everywhere; check that R1 is the gauge stretched by a positive "
     "shear force, and that no gauge is broken."
 )
+# A response has moved when it differs by this many standard deviations of the compared means: by chance about once a
+# week at ten responses a second.
+STANDARD_DEVIATIONS = 5.0
+# Responses averaged before they are compared.
+AVERAGED = 3
+# A slip proves the direction for this long. A longer time misses a hand that turns back, a shorter one forgets a slow
+# loading between two responses.
+MEMORY_S = 0.2
+# While the skin sticks, the reference response is averaged over about this many: noise chose the first one.
+SETTLES_OVER = 20.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,35 +72,33 @@ class CalibrationTable:
     normal_n: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class SkinCalibration:
+class SkinCalibration(BaseModel):
     """Friction, and the curve from net tension at the gauges (N) to response, both rising.
 
     `response_half_width` is the 95 % prediction interval of one response. `rows` were fitted; `rows_beyond` lie outside
     the curve, too few for a piece of their own. `rest_ohm` are R₁ and R₂ without load, to judge a later zero by.
     """
 
-    friction: float
-    gauge_angle_deg: float
-    linear_to_n: float
-    tension_n: tuple[float, ...]
-    response: tuple[float, ...]
-    response_half_width: float
-    rows: int
-    rows_beyond: int
-    rest_ohm: tuple[float, float]
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
-    def __post_init__(self) -> None:
-        """Refuse a curve that cannot be inverted."""
-        if len(self.tension_n) != len(self.response) or len(self.tension_n) < 2:
-            raise CalibrationError("The calibration's tension_n and response must be two lists of the same length.")
-        for name, values in (("tension_n", self.tension_n), ("response", self.response)):
-            if not (np.isfinite(values).all() and (np.diff(values) > 0).all()):
-                raise CalibrationError(f"The calibration's {name} must rise from each value to the next.")
-        if not (0 <= self.friction <= 1 and self.response_half_width >= 0):
-            raise CalibrationError("The calibration's friction must lie in [0, 1], its response_half_width be ≥ 0.")
-        if not (np.isfinite(self.rest_ohm).all() and min(self.rest_ohm) > 0):
-            raise CalibrationError("The calibration's rest_ohm must be two resistances above 0.")
+    friction: float = Field(ge=0, le=1)
+    gauge_angle_deg: float = Field(gt=0, lt=90)
+    linear_to_n: float = Field(gt=0)
+    tension_n: tuple[float, ...] = Field(min_length=2, strict=False)
+    response: tuple[float, ...] = Field(min_length=2, strict=False)
+    response_half_width: float = Field(ge=0)
+    rows: int = Field(ge=1)
+    rows_beyond: int = Field(ge=0)
+    rest_ohm: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = Field(strict=False)
+
+    @field_validator("tension_n", "response")
+    @classmethod
+    def _rises(cls, values: tuple[float, ...], info: ValidationInfo) -> tuple[float, ...]:
+        if (np.diff(values) <= 0).any():
+            raise ValueError("must rise from each value to the next")
+        if len(info.data.get("tension_n", values)) != len(values):
+            raise ValueError("must have as many values as tension_n")
+        return values
 
     @property
     def slope_per_n(self) -> float:
@@ -170,208 +183,228 @@ def _numbers(path: Path, line: int, row: dict[str | None, str]) -> list[float]:
     return numbers
 
 
-class _CalibrationFile(BaseModel):
-    """The content of a calibration file."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-
-    format: str = Field(pattern=f"^{FORMAT}$")
-    friction: float = Field(ge=0, le=1)
-    gauge_angle_deg: float = Field(gt=0, lt=90)
-    linear_to_n: float = Field(gt=0)
-    tension_n: list[float] = Field(min_length=2)
-    response: list[float] = Field(min_length=2)
-    response_half_width: float = Field(ge=0)
-    rows: int = Field(ge=1)
-    rows_beyond: int = Field(ge=0)
-    rest_ohm: list[float] = Field(min_length=2, max_length=2)
-
-
 def save_calibration(calibration: SkinCalibration, path: Path) -> None:
     """Write a calibration as YAML, replacing the file at once."""
-    lists = {name: list(getattr(calibration, name)) for name in _LISTS}
-    save_yaml(path, {"format": FORMAT, **asdict(calibration), **lists}, CalibrationError)
+    save_yaml(path, {"format": FORMAT, **calibration.model_dump()}, CalibrationError)
 
 
 def load_calibration(path: Path) -> SkinCalibration:
     """Return the calibration in a YAML file; raises CalibrationError naming the file and every wrong key."""
     document = read_yaml(path, CalibrationError, "calibration", "; make it with `shearloop skin calibrate`.")
-    if not (isinstance(document, dict) and "format" in document):
+    if not (isinstance(document, dict) and document.pop("format", None) == FORMAT):
         raise CalibrationError(
             f"{path} is not a calibration as `shearloop skin calibrate` writes it: it has no `format: {FORMAT}`."
         )
-    values = validated(document, _CalibrationFile, str(path), CalibrationError).model_dump(exclude={"format"})
-    try:
-        return SkinCalibration(**values | {name: tuple(values[name]) for name in _LISTS})
-    except CalibrationError as error:
-        raise CalibrationError(f"{path}: {error}") from error
+    return validated(document, SkinCalibration, str(path), CalibrationError)
 
 
-def responses_of_table(
-    table: CalibrationTable, unloaded_below_n: float = UNLOADED_BELOW_N
-) -> tuple[FloatArray, IntArray]:
+def fit_calibration(table: CalibrationTable, *, friction: float | None = None) -> SkinCalibration:
+    """Return the least-squares calibration of a table; friction is fitted too unless given.
+
+    Raises CalibrationError where the table has too few rows, no row at rest or does not determine friction, and where
+    the response does not rise with the force.
+    """
+    response, loading = _responses(table)
+    loaded, idle = loading > 0, loading == 0
+    forces = np.column_stack([loading, table.shear_n, table.normal_n])[loaded]
+    nominal = _tensions(forces, PAPER_SECTION.friction if friction is None else friction)
+    upper, lower = _knots(nominal), _knots(-nominal)
+    kept = (len(upper) > 0) | (nominal <= LINEAR_TO_N)
+    kept &= (len(lower) > 0) | (-nominal <= LINEAR_TO_N)
+    curve = _CurveFit(forces, kept, response[loaded][kept], upper, lower)
+    if curve.freedom < 3:
+        raise CalibrationError(
+            f"{len(curve.response)} rows under load cannot carry {1 + len(upper) + len(lower)} pieces of curve and an "
+            "interval; record more."
+        )
+    # The response must go with the tension, not against it.
+    if float(nominal[kept] @ curve.response) <= 0.0:
+        raise CalibrationError(NOT_RISING)
+    if friction is None:
+        friction = curve.best_friction()
+    knots, responses, half_width = curve.fit(friction)
+    return SkinCalibration(
+        friction=friction,
+        gauge_angle_deg=math.degrees(PAPER_SECTION.gauge_angle_rad),
+        linear_to_n=LINEAR_TO_N,
+        tension_n=tuple(knots.tolist()),
+        response=tuple(responses.tolist()),
+        response_half_width=half_width,
+        rows=len(curve.response),
+        rows_beyond=int((~kept).sum()),
+        rest_ohm=(float(table.r1_ohm[idle].mean()), float(table.r2_ohm[idle].mean())),
+    )
+
+
+def _responses(table: CalibrationTable) -> tuple[FloatArray, IntArray]:
     """Return the (rows,) responses and each row's loading, counted from 1; 0 for rows without load.
 
     Each loading begins with rows without load; their mean resistances normalise it, as in the paper.
     """
-    idle = (abs(table.shear_n) <= unloaded_below_n) & (abs(table.normal_n) <= unloaded_below_n)
+    idle = (abs(table.shear_n) <= UNLOADED_BELOW_N) & (abs(table.normal_n) <= UNLOADED_BELOW_N)
     if not idle.size or not idle[0]:
         raise CalibrationError(
-            f"The table must begin with a row without load (both forces below {unloaded_below_n} N): "
+            f"The table must begin with a row without load (both forces below {UNLOADED_BELOW_N} N): "
             "it gives the resistances at rest."
         )
     loading = np.cumsum(idle & ~np.concatenate([[False], idle[:-1]]))
     response = np.empty(len(idle))
     for number in range(1, loading[-1] + 1):
         rows = loading == number
-        at_rest = rows & idle
-        r1_at_rest, r2_at_rest = float(table.r1_ohm[at_rest].mean()), float(table.r2_ohm[at_rest].mean())
-        response[rows] = measured_response(table.r1_ohm[rows], table.r2_ohm[rows], r1_at_rest, r2_at_rest)
+        at_rest = [float(ohm[rows & idle].mean()) for ohm in (table.r1_ohm, table.r2_ohm)]
+        response[rows] = measured_response(table.r1_ohm[rows], table.r2_ohm[rows], *at_rest)
     return response, np.where(idle, 0, loading)
 
 
-def fit_calibration(
-    table: CalibrationTable,
-    *,
-    friction: float | None = None,
-    gauge_angle_deg: float = math.degrees(PAPER_SECTION.gauge_angle_rad),
-    linear_to_n: float = LINEAR_TO_N,
-    unloaded_below_n: float = UNLOADED_BELOW_N,
-) -> SkinCalibration:
-    """Return the least-squares calibration of a table; friction is fitted too unless given.
-
-    Raises CalibrationError where the table has too few rows, no row at rest or does not determine friction, and where
-    the response does not rise with the force.
-    """
-    response, loading = responses_of_table(table, unloaded_below_n)
-    loaded, gauge_angle_rad = loading > 0, math.radians(gauge_angle_deg)
-    columns = loading[loaded], table.shear_n[loaded], table.normal_n[loaded]
-    forces = list(zip(*(column.tolist() for column in columns), strict=True))
-    start = PAPER_SECTION.friction if friction is None else friction
-    nominal = _tensions(forces, gauge_angle_rad, start)
-    upper, lower = _knots(nominal, linear_to_n), _knots(-nominal, linear_to_n)
-    kept = (len(upper) > 0) | (nominal <= linear_to_n)
-    kept &= (len(lower) > 0) | (-nominal <= linear_to_n)
-    curve = _CurveFit(
-        lambda mu: _tensions(forces, gauge_angle_rad, mu)[kept], response[loaded][kept], linear_to_n, upper, lower
-    )
-    if curve.rows < curve.pieces + 3:
-        raise CalibrationError(
-            f"{curve.rows} rows under load cannot carry {curve.pieces} pieces of curve and an interval; record more."
-        )
-    # The response must go with the tension, not against it.
-    if float(nominal[kept] @ curve.response) <= 0.0:
-        raise CalibrationError(NOT_RISING)
-    if friction is None:
-        friction = _fit_friction(curve)
-    knots, responses, half_width = curve.fit(friction)
-    idle = loading == 0
-    return SkinCalibration(
-        friction=friction,
-        gauge_angle_deg=math.degrees(gauge_angle_rad),
-        linear_to_n=linear_to_n,
-        tension_n=tuple(knots.tolist()),
-        response=tuple(responses.tolist()),
-        response_half_width=half_width,
-        rows=curve.rows,
-        rows_beyond=int((~kept).sum()),
-        rest_ohm=(float(table.r1_ohm[idle].mean()), float(table.r2_ohm[idle].mean())),
-    )
-
-
-def _tensions(forces: Sequence[tuple[int, float, float]], gauge_angle_rad: float, friction: float) -> FloatArray:
-    """Return the net tension (rows,) at the gauges, in N, for rows of (loading, shear, normal force).
+def _tensions(forces: FloatArray, friction: float) -> FloatArray:
+    """Return the net tension (rows,) at the gauges, in N, for rows (loading, shear force, normal force).
 
     Each loading starts from the unstretched skin.
     """
-    membrane = Membrane(1.0, friction, gauge_angle_rad, 1.0)
-    state, current, found = UNSTRETCHED, 0, []
-    for loading, shear_n, normal_n in forces:
-        if loading != current:
-            state, current = UNSTRETCHED, loading
-        state = membrane.step(state, shear_n, normal_n)
-        found.append(state.gauge_tension_1_n - state.gauge_tension_2_n)
+    membrane = Membrane(1.0, friction, PAPER_SECTION.gauge_angle_rad, 1.0)
+    state, current, found = UNSTRETCHED, 0.0, []
+    for loading, shear_n, normal_n in forces.tolist():
+        state = membrane.step(state if loading == current else UNSTRETCHED, shear_n, normal_n)
+        current = loading
+        found.append(membrane.response(state))
     return np.array(found)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class _CurveFit:
     """Response against tension in straight pieces: one through the origin, others beyond its ends.
 
-    `tensions` returns the tension (rows,) for a friction.
+    forces are rows as `_tensions` takes them; response (m,) are those of the rows kept; upper and lower are the
+    tensions where the pieces beyond begin.
     """
 
-    def __init__(
-        self,
-        tensions: Callable[[float], FloatArray],
-        response: FloatArray,
-        linear_to_n: float,
-        upper: FloatArray,
-        lower: FloatArray,
-    ) -> None:
-        self._tensions, self.response = tensions, response
-        self._linear_to_n, self._upper, self._lower = linear_to_n, upper, lower
-        self.rows = len(response)
-        self.pieces = 1 + len(upper) + len(lower)
+    forces: FloatArray
+    kept: BoolArray
+    response: FloatArray
+    upper: FloatArray
+    lower: FloatArray
+
+    @property
+    def freedom(self) -> int:
+        """The degrees of freedom of the residuals."""
+        return len(self.response) - 1 - len(self.upper) - len(self.lower)
 
     def squares(self, friction: float) -> float:
         """Return the sum of squared residuals with the best curve for this friction."""
-        from scipy.optimize import nnls
-
-        return float(nnls(self._design(self._tensions(friction)), self.response)[1] ** 2)
+        return self._best_curve(friction)[3] ** 2
 
     def fit(self, friction: float) -> tuple[FloatArray, FloatArray, float]:
         """Return the best curve's knots (N) and responses there, and the half width of its prediction interval."""
-        from scipy.optimize import nnls
-
-        tension = self._tensions(friction)
-        design = self._design(tension)
-        slopes, distance = nnls(design, self.response)
+        tension, design, slopes, distance = self._best_curve(friction)
         ends = min(float(tension.min()), 0.0), max(float(tension.max()), 0.0)
-        knots = np.concatenate([[ends[0]], -self._lower[::-1], self._upper, [ends[1]]])
+        knots = np.concatenate([[ends[0]], -self.lower[::-1], self.upper, [ends[1]]])
         if not (slopes > 0).all() or not (np.diff(knots) > 0).all():
             raise CalibrationError(NOT_RISING)
         leverage = (np.linalg.qr(design).Q ** 2).sum(axis=1).max()
-        freedom = self.rows - self.pieces
-        scatter = distance / math.sqrt(freedom)
-        half_width = float(stdtrit(freedom, 0.975)) * scatter * math.sqrt(1 + leverage)
+        scatter = distance / math.sqrt(self.freedom)
+        half_width = float(stdtrit(self.freedom, 0.975)) * scatter * math.sqrt(1 + leverage)
         return knots, self._design(knots) @ slopes, half_width
 
+    def best_friction(self) -> float:
+        """Return the friction of the least squares; raises CalibrationError where another one is about as good."""
+        from scipy.optimize import minimize_scalar
+
+        coarse = np.linspace(0.0, MAX_FRICTION, 26)
+        best = coarse[int(np.argmin([self.squares(mu) for mu in coarse]))]
+        bounds = max(best - coarse[1], 0.0), min(best + coarse[1], MAX_FRICTION)
+        friction = float(minimize_scalar(self.squares, bounds=bounds, method="bounded", options={"xatol": 1e-6}).x)
+        # A wrong friction must make the fit visibly worse.
+        least = self.squares(friction)
+        neighbours = [mu for mu in (friction - FRICTION_STD, friction + FRICTION_STD) if mu >= 0]
+        worse = min(map(self.squares, neighbours)) - least
+        if worse <= max(least / max(self.freedom, 1), 1e-9 * float(self.response @ self.response)):
+            raise CalibrationError(
+                "The table does not determine the friction of the skin; load it under more normal force, load and "
+                "unload it, or give the coefficient (--friction)."
+            )
+        return friction
+
+    def _best_curve(self, friction: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+        """Return the rows' tensions and pieces, the pieces' slopes, and the norm of the residuals."""
+        from scipy.optimize import nnls
+
+        tension = _tensions(self.forces, friction)[self.kept]
+        design = self._design(tension)
+        slopes, distance = nnls(design, self.response)
+        return tension, design, slopes, float(distance)
+
     def _design(self, tension: FloatArray) -> FloatArray:
-        columns = [np.clip(tension, -self._linear_to_n, self._linear_to_n)]
-        columns += _hinges(tension, self._upper) + [-column for column in _hinges(-tension, self._lower)]
+        """Return the part of each tension within each piece; the last pieces are open."""
+        columns = [np.clip(tension, -LINEAR_TO_N, LINEAR_TO_N)]
+        for sign, knots in ((1.0, self.upper), (-1.0, self.lower)):
+            widths = np.append(np.diff(knots), math.inf)
+            columns += [sign * np.clip(sign * tension - at, 0.0, w) for at, w in zip(knots, widths, strict=False)]
         return np.column_stack(columns)
 
 
-def _hinges(tension: FloatArray, knots: FloatArray) -> list[FloatArray]:
-    """Return the part of the tension within each piece; the last piece is open."""
-    widths = np.append(np.diff(knots), math.inf)
-    return [np.clip(tension - knot, 0.0, width) for knot, width in zip(knots, widths, strict=False)]
-
-
-def _knots(tension: FloatArray, linear_to_n: float) -> FloatArray:
+def _knots(tension: FloatArray) -> FloatArray:
     """Return where the pieces beyond the straight one begin: as many as the rows support, with equal shares."""
-    beyond = np.sort(tension[tension > linear_to_n])
+    beyond = np.sort(tension[tension > LINEAR_TO_N])
     pieces = min(MAX_PIECES, len(beyond) // MIN_ROWS_PER_PIECE)
     if not pieces:
         return np.empty(0)
     begins = beyond[np.arange(1, pieces) * len(beyond) // pieces]
-    return np.unique(np.append(linear_to_n, begins))
+    return np.unique(np.append(LINEAR_TO_N, begins))
 
 
-def _fit_friction(curve: _CurveFit) -> float:
-    from scipy.optimize import minimize_scalar
+class DirectionFinder:
+    """Finds from successive responses whether the magnitude of the force rises, falls, or may do either."""
 
-    coarse = np.linspace(0.0, MAX_FRICTION, 26)
-    best = coarse[int(np.argmin([curve.squares(mu) for mu in coarse]))]
-    bounds = max(best - coarse[1], 0.0), min(best + coarse[1], MAX_FRICTION)
-    friction = float(minimize_scalar(curve.squares, bounds=bounds, method="bounded", options={"xatol": 1e-6}).x)
-    # A wrong friction must make the fit visibly worse.
-    least = curve.squares(friction)
-    neighbours = [mu for mu in (friction - FRICTION_STD, friction + FRICTION_STD) if mu >= 0]
-    worse = min(map(curve.squares, neighbours)) - least
-    if worse <= max(least / max(curve.rows - curve.pieces, 1), 1e-9 * float(curve.response @ curve.response)):
-        raise CalibrationError(
-            "The table does not determine the friction of the skin; load it under more normal force, load and "
-            "unload it, or give the coefficient (--friction)."
-        )
-    return friction
+    def __init__(self, noise: float) -> None:
+        """Take the standard deviation of one response."""
+        self.threshold = STANDARD_DEVIATIONS * noise * math.sqrt(2.0 / AVERAGED)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the past after missing responses."""
+        self._latest: deque[float] = deque(maxlen=AVERAGED)
+        self._turning: float | None = None
+        self._direction = Direction.UNKNOWN
+        self._seen_s = -math.inf
+
+    def update(self, time_s: float, response: float) -> Direction:
+        """Return the direction at this time; call in order of time."""
+        self._latest.append(response)
+        if len(self._latest) < AVERAGED:
+            return Direction.UNKNOWN
+        mean = sum(self._latest) / AVERAGED
+        if self._turning is None:
+            self._turning = mean
+        elif self._turning * mean < 0:
+            # The force passed through zero and rises from there.
+            self._turning = 0.0
+        moved = direction_of(self._turning, mean, self.threshold)
+        if moved is not Direction.UNKNOWN:
+            self._turning, self._direction, self._seen_s = mean, moved, time_s
+        elif time_s - self._seen_s > MEMORY_S:
+            self._direction = Direction.UNKNOWN
+            self._turning += (mean - self._turning) / SETTLES_OVER
+        return self._direction
+
+
+class ForceFollower:
+    """Keeps the most plausible force of the band that each response leaves open; begins at zero force."""
+
+    def __init__(self, calibration: SkinCalibration, slack: float) -> None:
+        """Take a calibration, and the change of response that may be noise."""
+        self._calibration = calibration
+        self._slack_n = slack / calibration.slope_per_n
+        self._shear_n = 0.0
+
+    def update(self, response: float, normal_n: float, direction: Direction) -> ShearInterval:
+        """Return the most plausible shear force (N) of a response, within the band that friction leaves.
+
+        The band belongs to an exact response; a known direction gives it no width.
+        """
+        band = self._calibration.band(response, normal_n, direction)
+        if direction is not Direction.UNKNOWN:
+            self._shear_n = band.shear_n
+            return band
+        low_n, high_n = band.low_n - self._slack_n, band.high_n + self._slack_n
+        self._shear_n = min(max(self._shear_n, low_n), high_n)
+        return ShearInterval(self._shear_n, low_n, high_n)

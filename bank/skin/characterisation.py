@@ -1,31 +1,173 @@
-"""The paper's figures of merit next to the models' and estimators': one table and three figures' curves.
+"""A skin's figures of merit by the paper's definitions: estimators, one table, and the curves of three figures.
 
-Noise, drift and temperature are properties of a made skin. For those the table shows estimates from synthetic
-recordings with the paper's figure as the true one.
+Responses follow equation (1), forces are in N. Noise, drift and temperature are properties of a made skin. For those
+the table shows estimates from synthetic recordings with the paper's figure as the true one.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import ndtri, stdtrit
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.skin import membrane, statistics
-from shearloop.bank.skin.membrane import PAPER_SECTION, Gauge, Section, response_of_strains
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.skin.membrane import (
+    EXCITATION_A,
+    GAUGE_RESISTANCE_OHM,
+    PAPER_SECTION,
+    PAPER_SENSITIVITY_PER_N,
+    UNSTRETCHED,
+    Membrane,
+    joule_heating_k,
+    loading_response,
+    paper_membrane,
+    sensitivity_per_n,
+)
 from shearloop.bank.skin.plane_strain import (
     ContactState,
     apply_load,
     condense,
-    gauge_strains,
+    gauge_responses,
     midline_strain,
     states_along,
     unloaded,
 )
-from shearloop.bank.skin.statistics import loading, loop, responses
 
 NORMAL_FORCES_N = (0.5, 1.0, 1.5, 2.0)
 FULL_RANGE_N = 5.0
 PAPER_MEASURED_SENSITIVITY = {0.5: "0.078", 1.0: "0.076", 1.5: "0.080", 2.0: "0.080"}
+
+
+def origin_slope(shear_n: FloatArray, response: FloatArray) -> float:
+    """Return Σxy/Σx², the slope in 1/N of the straight line through the origin.
+
+    The sensitivity of the paper's table 1: over one loading from zero in equal steps up to the normal force (at most
+    1.2 N), deadband included. It is about μ F_n Σx/Σx² smaller than the slope beyond the deadband.
+    """
+    squares = float(shear_n @ shear_n)
+    if not squares > 0:
+        raise CalibrationError("A sensitivity needs at least one response at a shear force other than zero.")
+    return float(shear_n @ response) / squares
+
+
+def noise_floor_n(time_s: FloatArray, response: FloatArray, sensitivity_per_n: float, window_s: float = 1.0) -> float:
+    """Return the standard deviation within windows of 1 s at constant load, in N; variances are pooled over windows.
+
+    A last window that is not full is left out. Raises CalibrationError where no window holds two values.
+    """
+    window = np.floor((time_s - time_s[0]) / window_s + 1e-9).astype(np.int64)
+    counts = np.bincount(window)
+    full = np.flatnonzero((counts >= 2) & (counts >= 0.9 * np.median(counts)))
+    if not full.size:
+        raise CalibrationError(f"The noise floor needs at least two responses within {window_s} s; record faster.")
+    squares = sum(float(np.var(response[window == i]) * counts[i]) for i in full)
+    return math.sqrt(squares / float((counts[full] - 1).sum())) / sensitivity_per_n
+
+
+@dataclass(frozen=True, slots=True)
+class LineFit:
+    """A straight calibration line, response = offset + slope · force, and its scatter."""
+
+    slope_per_n: float
+    offset: float
+    scatter: float
+    n: int
+    mean_n: float
+    spread_n2: float
+
+    def prediction_half_width_n(self, shear_n: float, confidence: float = 0.95) -> float:
+        """Return ± the interval (N) of a new single force read off the line near `shear_n`.
+
+        t(n−2) · s / slope · √(1 + 1/n + (x − x̄)² / Σ(x − x̄)²).
+        """
+        quantile = float(stdtrit(self.n - 2, (1 + confidence) / 2))
+        widening = 1 + 1 / self.n + (shear_n - self.mean_n) ** 2 / self.spread_n2
+        return quantile * self.scatter / abs(self.slope_per_n) * math.sqrt(widening)
+
+
+def fit_line(shear_n: FloatArray, response: FloatArray) -> LineFit:
+    """Return the least-squares line of at least three responses; raises CalibrationError for fewer."""
+    n = len(shear_n)
+    spread = float(np.var(shear_n) * n)
+    if n < 3 or not spread > 0:
+        raise CalibrationError("A calibration line needs at least three responses, at more than one shear force.")
+    slope, offset = (float(value) for value in np.polyfit(shear_n, response, 1))
+    left = response - offset - slope * shear_n
+    scatter = math.sqrt(float(left @ left) / (n - 2))
+    return LineFit(slope, offset, scatter, n, float(shear_n.mean()), spread)
+
+
+def loading(up_to_n: float, step_n: float = 0.1) -> FloatArray:
+    """Return the paper's shear forces: from the first step to `up_to_n`, without zero."""
+    return np.arange(1.0, round(up_to_n / step_n) + 1) * step_n
+
+
+def loop(amplitude_n: float, step_n: float = 0.1) -> FloatArray:
+    """Return a whole cycle: from the first step to the amplitude, to its negative, and back to the amplitude."""
+    n = round(amplitude_n / step_n)
+    return np.concatenate([np.arange(1.0, n), np.arange(n, -n, -1), np.arange(-n, n + 1)]) * step_n
+
+
+def responses(membrane: Membrane, shear_n: Iterable[float], normal_n: float) -> FloatArray:
+    """Return the membrane's responses along a path of shear forces, from the unstretched skin."""
+    state, found = UNSTRETCHED, []
+    for shear in shear_n:
+        state = membrane.step(state, float(shear), normal_n)
+        found.append(membrane.response(state))
+    return np.array(found)
+
+
+@dataclass(frozen=True, slots=True)
+class SkinFigures:
+    """The figures that a bench measures; the defaults are the paper's.
+
+    The noise floor and the 95 % prediction interval in N; the drift (std over an hour) and the largest response to 2 N
+    of normal force, as responses; the relative change of sensitivity per kelvin (less than 2 % over 15 K).
+    """
+
+    noise_floor_n: float = 0.0016
+    prediction_half_width_n: float = 0.0802
+    drift_std: float = 1.48e-4
+    crosstalk: float = 1.24e-4
+    sensitivity_per_k: float = 0.02 / 15
+
+
+def estimated_figures(membrane: Membrane, true: SkinFigures, rng: np.random.Generator) -> SkinFigures:
+    """Return the estimates from synthetic recordings of a skin with these true figures.
+
+    The recordings: ten minutes at constant load (10 Hz), 20 loadings from −1 N to 1 N each read once at every 0.1 N,
+    one hour at 0.01 Hz, normal forces up to 2 N without shear (a minute each, averaged), and 20 loadings each at 25 °C
+    and 40 °C, averaged over 1 s as in the paper.
+    """
+    sensitivity = membrane.gauge_factor / membrane.axial_stiffness_n
+    noise = true.noise_floor_n * sensitivity
+
+    time_s = np.arange(6000) / 10
+    still = 0.5 * sensitivity + rng.normal(0, noise, len(time_s))
+
+    shear_n = np.tile(np.concatenate([-loading(1.0)[::-1], [0.0], loading(1.0)]), 20)
+    scatter = true.prediction_half_width_n / float(ndtri(0.975)) * sensitivity
+    line = fit_line(shear_n, shear_n * sensitivity + rng.normal(0, scatter, len(shear_n)))
+
+    wandering = 0.15 * sensitivity + rng.normal(0, true.drift_std, 36)
+
+    normal_n = np.array([0.5, 1.0, 1.5, 2.0])
+    pressed = true.crosstalk * normal_n / 2 + rng.normal(0, noise / np.sqrt(600), len(normal_n))
+
+    warm_k = 15.0
+    cold, hot = (
+        fit_line(shear_n, shear_n * factor + rng.normal(0, noise / np.sqrt(10), len(shear_n))).slope_per_n
+        for factor in (sensitivity, sensitivity * (1 + true.sensitivity_per_k * warm_k))
+    )
+    return SkinFigures(
+        noise_floor_n=noise_floor_n(time_s, still, sensitivity),
+        prediction_half_width_n=line.prediction_half_width_n(0.0),
+        drift_std=float(np.std(wandering, ddof=1)),
+        crosstalk=float(abs(pressed).max()),
+        sensitivity_per_k=(hot / cold - 1) / warm_k,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +210,13 @@ class Characterisation:
     wide_by_normal: dict[float, ResponseCurve]
 
 
-def characterise(rng: np.random.Generator, section: Section = PAPER_SECTION) -> Characterisation:
+def characterise(rng: np.random.Generator) -> Characterisation:
     """Return the contents of the paper's table 1 and figures 5 to 7, from the models; takes a few seconds."""
-    models = _Models(section)
+    models = _Models()
     pressed = apply_load(models.skin, unloaded(models.skin), 1.0, 0.0)
     profiles = [pressed, *states_along(models.skin, 1.0, loading(1.0))]
     return Characterisation(
-        rows=(*_model_rows(models, profiles[-1]), *_gauge_rows(), *_estimator_rows(models, rng)),
+        rows=(*_model_rows(models, profiles[-1]), *_estimator_rows(models, rng)),
         midline_deg=models.skin.midline_deg,
         strain_profiles=np.array([midline_strain(models.skin, state) for state in profiles]),
         near_zero=models.curve(loading(0.15, 0.005), 1.0),
@@ -84,22 +226,20 @@ def characterise(rng: np.random.Generator, section: Section = PAPER_SECTION) -> 
 
 
 class _Models:
-    """The three models of one section, each as responses along a path of shear forces."""
+    """The three models of the paper's section, each as responses along a path of shear forces."""
 
-    def __init__(self, section: Section) -> None:
-        self.section = section
-        self.membrane = membrane.paper_membrane(section)
-        self.skin = condense(section)
+    def __init__(self) -> None:
+        self.membrane = paper_membrane()
+        self.skin = condense(PAPER_SECTION)
 
     def in_closed_form(self, shear_n: FloatArray, normal_n: float) -> FloatArray:
-        return np.array([membrane.loading_response(self.section, normal_n, float(s)) for s in shear_n])
+        return np.array([loading_response(PAPER_SECTION, normal_n, s) for s in shear_n.tolist()])
 
     def in_1d(self, shear_n: FloatArray, normal_n: float) -> FloatArray:
         return responses(self.membrane, shear_n.tolist(), normal_n)
 
     def in_2d(self, shear_n: FloatArray, normal_n: float, friction: float | None = None) -> FloatArray:
-        states = states_along(self.skin, normal_n, shear_n.tolist(), friction=friction)
-        return response_of_strains(*gauge_strains(self.skin, states).T)
+        return gauge_responses(self.skin, states_along(self.skin, normal_n, shear_n.tolist(), friction=friction))
 
     def curve(self, shear_n: FloatArray, normal_n: float) -> ResponseCurve:
         return ResponseCurve(
@@ -111,7 +251,7 @@ class _Models:
 
 
 def _model_rows(models: _Models, fully_loaded: ContactState) -> list[FigureOfMerit]:
-    section, skin = models.section, models.skin
+    skin = models.skin
 
     def each(estimate: Callable[[FloatArray, FloatArray], float], normal_n: float) -> list[float]:
         shear_n = loading(normal_n)
@@ -125,56 +265,50 @@ def _model_rows(models: _Models, fully_loaded: ContactState) -> list[FigureOfMer
             "1/N",
             "0.078",
             PAPER_MEASURED_SENSITIVITY[normal_n],
-            *each(statistics.origin_slope, normal_n),
+            *each(origin_slope, normal_n),
         )
         for normal_n in NORMAL_FORCES_N
     ]
     strain = midline_strain(skin, fully_loaded)
     flank = strain[(skin.midline_deg > 15) & (skin.midline_deg < 75)]
-    falls = 100 * (1 - float(np.exp(-section.friction * np.radians(60))))
+    falls = 100 * (1 - float(np.exp(-PAPER_SECTION.friction * np.radians(60))))
     strain_1, strain_2 = skin.gauge_weights @ strain
-    without = membrane.sensitivity_per_n(replace(section, friction=0.0))
-    no_friction = statistics.origin_slope(loading(1.0), models.in_2d(loading(1.0), 1.0, friction=0.0))
+    without = sensitivity_per_n(replace(PAPER_SECTION, friction=0.0))
+    no_friction = origin_slope(loading(1.0), models.in_2d(loading(1.0), 1.0, friction=0.0))
     pressed = models.in_2d(np.zeros(1), 2.0)[0]
-    given = models.membrane.gauge_factor / models.membrane.axial_stiffness_n
+    power_w = EXCITATION_A**2 * GAUGE_RESISTANCE_OHM
     return [
         *rows,
         FigureOfMerit("slope beyond the deadband, Fn = 1 N", "1/N", "", "", *each(_slope, 1.0)),
-        FigureOfMerit("slope without friction", "1/N", "0.088", "", without, given, no_friction),
+        FigureOfMerit("slope without friction", "1/N", "0.088", "", without, PAPER_SENSITIVITY_PER_N, no_friction),
         FigureOfMerit("deadband, Fn = 1 N", "N", "0.04", "0.04", *each(_kink, 1.0)),
         FigureOfMerit(
             "fall of tension between 75° and 15°", "%", "< 4", "", falls, falls, 100 * np.ptp(flank) / flank.max()
         ),
         FigureOfMerit("|ε₂/ε₁|, Fn = Ft = 1 N", "", "much lower", "much lower", 0.0, 0.0, abs(strain_2 / strain_1)),
         FigureOfMerit("response to 2 N of normal force alone", "", "", "< 1.24e-4", 0.0, 0.0, abs(pressed)),
+        FigureOfMerit("gauge resistance", "Ω", "25", "25", GAUGE_RESISTANCE_OHM),
+        FigureOfMerit("power of a gauge at 5 mA", "mW", "", "", 1e3 * power_w),
+        FigureOfMerit("Joule heating at 5 mA", "K", "< 5", "", joule_heating_k(power_w)),
     ]
 
 
 def _slope(shear_n: FloatArray, response: FloatArray) -> float:
-    return statistics.fit_line(shear_n, response).slope_per_n
+    return fit_line(shear_n, response).slope_per_n
 
 
 def _kink(shear_n: FloatArray, response: FloatArray) -> float:
-    line = statistics.fit_line(shear_n, response)
+    line = fit_line(shear_n, response)
     return -line.offset / line.slope_per_n
 
 
-def _gauge_rows() -> list[FigureOfMerit]:
-    gauge = Gauge()
-    return [
-        FigureOfMerit("gauge resistance", "Ω", "25", "25", gauge.resistance_ohm),
-        FigureOfMerit("power of a gauge at 5 mA", "mW", "", "", 1e3 * gauge.power_at_current_w()),
-        FigureOfMerit("Joule heating at 5 mA", "K", "< 5", "", gauge.joule_heating_k()),
-    ]
-
-
 def _estimator_rows(models: _Models, rng: np.random.Generator) -> list[FigureOfMerit]:
-    found = statistics.estimated_figures(models.membrane, statistics.SkinFigures(), rng)
-    bits = statistics.dynamic_range_bits(FULL_RANGE_N, found.noise_floor_n)
+    found = estimated_figures(models.membrane, SkinFigures(), rng)
+    bits = math.log2(FULL_RANGE_N / found.noise_floor_n)
     up, around = loading(1.0), loop(1.0)
 
     def half_width(shear_n: FloatArray, response: FloatArray) -> float:
-        return statistics.fit_line(shear_n, response).prediction_half_width_n(0.0)
+        return fit_line(shear_n, response).prediction_half_width_n(0.0)
 
     both_ways = np.concatenate([-up, up])
     loaded = [half_width(both_ways, np.concatenate([-y, y])) for y in (models.in_1d(up, 1.0), models.in_2d(up, 1.0))]

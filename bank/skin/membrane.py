@@ -1,4 +1,4 @@
-"""The skin in one dimension: cross-section, gauges, closed-form response, and the membrane model used at run time.
+"""The skin in one dimension: cross-section, closed-form response, and the membrane model used at run time.
 
 Yin, Santos, Posner, "Bioinspired flexible microfluidic shear force sensor skin", Sensors and Actuators A 264 (2017).
 The angle θ is the paper's: 0° and 180° at the brackets, 90° under the load. A positive shear force pulls towards
@@ -16,8 +16,9 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError, GeometryError
 
 EXCITATION_A = 5e-3
-# Eutectic gallium indium at room temperature.
-EGAIN_RESISTIVITY_OHM_M = 29.4e-8
+# ρ N L / (w h): eutectic gallium indium at room temperature, in 70 strips of 3 mm without the turns between them (the
+# paper's section 2), 50 µm wide and high.
+GAUGE_RESISTANCE_OHM = 29.4e-8 * 70 * 3e-3 / (50e-6 * 50e-6)
 # One gauge, 7 mm by 3 mm.
 SENSOR_AREA_M2 = 7e-3 * 3e-3
 # Usual for still air.
@@ -85,31 +86,6 @@ class Section:
 PAPER_SECTION = Section()
 
 
-@dataclass(frozen=True, slots=True)
-class Gauge:
-    """A serpentine of N strips, without the turns between them, as in the paper (N ≫ 1; its section 2)."""
-
-    strips: int = 70
-    strip_length_m: float = 3e-3
-    channel_width_m: float = 50e-6
-    channel_height_m: float = 50e-6
-    resistivity_ohm_m: float = EGAIN_RESISTIVITY_OHM_M
-
-    @property
-    def resistance_ohm(self) -> float:
-        """ρ N L / (w h), unloaded."""
-        length_m = self.strips * self.strip_length_m
-        return self.resistivity_ohm_m * length_m / (self.channel_width_m * self.channel_height_m)
-
-    def power_at_current_w(self, current_a: float = EXCITATION_A) -> float:
-        """Return the heat where a current source feeds the gauge, 5 mA in the paper."""
-        return (current_a * self.resistance_ohm) ** 2 / self.resistance_ohm
-
-    def joule_heating_k(self, current_a: float = EXCITATION_A) -> float:
-        """Return the steady temperature rise of the gauge's area in still air."""
-        return joule_heating_k(self.power_at_current_w(current_a))
-
-
 def joule_heating_k(power_w: float) -> float:
     """Return the steady temperature rise of a gauge's area in still air, one side cooled: P / (h A).
 
@@ -132,12 +108,6 @@ def measured_response(
             )
     ratio: FloatArray = r1_ohm / r1_unloaded_ohm - r2_ohm / r2_unloaded_ohm
     return ratio
-
-
-def response_of_strains(strain_1: FloatArray, strain_2: FloatArray) -> FloatArray:
-    """Return F (ε₁ − ε₂), the modelled side of equation (1)."""
-    modelled: FloatArray = GAUGE_FACTOR * (strain_1 - strain_2)
-    return modelled
 
 
 # The closed form balances moments about the core's centre. The tension at mid-thickness, N = F_t R_out/R, is shared by
@@ -235,21 +205,14 @@ class Membrane:
         """Return F (ε₁ − ε₂), equation (1) of the paper."""
         return self.gauge_factor * (state.strain_1 - state.strain_2)
 
-    def shear_from_response(
-        self, response: float, normal_n: float, direction: Direction = Direction.UNKNOWN
-    ) -> ShearInterval:
-        """Return the shear force (N) of a response, with the interval that friction leaves open.
-
-        While the magnitude of the response rises or falls, the skin slips all the way to the gauge, and the force is
-        one number. In an unknown direction it lies between the two; without response, within the deadband.
-        """
-        tension = response * self.axial_stiffness_n / self.gauge_factor
-        return self.shear_from_tensions(tension, tension, tension, normal_n, direction)
-
     def shear_from_tensions(
         self, low_n: float, tension_n: float, high_n: float, normal_n: float, direction: Direction
     ) -> ShearInterval:
-        """Return the shear force for a net tension at the gauges (N) that lies between low and high."""
+        """Return the shear force for a net tension at the gauges (N) that lies between low and high.
+
+        While the magnitude of the response rises or falls, the skin slips all the way to the gauge, and one tension
+        gives one force. In an unknown direction it lies between the two; without tension, within the deadband.
+        """
         low, high = self._bounds(low_n, normal_n, direction)[0], self._bounds(high_n, normal_n, direction)[1]
         if low_n <= 0 <= high_n:
             slack = self._bounds(0.0, normal_n, direction)

@@ -26,14 +26,10 @@ from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import BankError, GeometryError
-from shearloop.bank.skin.membrane import Section
+from shearloop.bank.skin.membrane import GAUGE_FACTOR, Section
 
 # Random starts at a friction of 1 take up to about 45 steps, a step of loading 3 to 25.
 MAX_STEPS = 200
-# Thick skins, nearly incompressible ones and a friction of 1 sometimes need another start.
-RESTARTS = 6
-# Rounds of relaxation before a restart; each costs as much as one or two Newton steps.
-SWEEPS = 20
 # Relative to the largest contact force: about a thousand roundings.
 TOLERANCE = 1e-11
 # Below this fraction of a step Φ does not fall: the step alternates between two pieces of Φ.
@@ -108,24 +104,18 @@ class CondensedSkin:
     """The skin as seen from its n contact nodes and m mid-line facets; forces in N, displacements in mm.
 
     `compliance` is (2n, 2n), radial components first. `load_displacement` (2n, 2) and `load_strain` (m, 2) answer a
-    unit normal force (towards the core) and a unit shear force; `load_compliance` (2, 2) is the movement of the loaded
-    arc itself. `strain_of_contact` is (m, 2n). `gauge_weights` (2, m) average over each gauge.
+    unit normal force (towards the core) and a unit shear force. `strain_of_contact` is (m, 2n). `gauge_weights` (2, m)
+    average over each gauge.
     """
 
     section: Section
     contact_deg: FloatArray
     compliance: FloatArray
     load_displacement: FloatArray
-    load_compliance: FloatArray
     midline_deg: FloatArray
     strain_of_contact: FloatArray
     load_strain: FloatArray
     gauge_weights: FloatArray
-
-    def load_movement_mm(self, contact_force_n: FloatArray, normal_n: float, shear_n: float) -> FloatArray:
-        """Return the mean movement (2,) of the loaded arc: towards the core and along the shear force."""
-        moved: FloatArray = self.load_displacement.T @ contact_force_n + self.load_compliance @ (normal_n, shear_n)
-        return moved
 
 
 def condense(section: Section, size: MeshSize = MESH_112) -> CondensedSkin:
@@ -156,7 +146,6 @@ class _Assembly:
             contact_deg=contact_deg,
             compliance=contact @ by_contact,
             load_displacement=contact @ by_load,
-            load_compliance=load.T @ by_load,
             midline_deg=midline_deg,
             strain_of_contact=strain @ by_contact,
             load_strain=strain @ by_load,
@@ -242,12 +231,6 @@ class ContactState:
     contact_force_n: FloatArray
     along_mm: FloatArray
 
-    @property
-    def touching(self) -> BoolArray:
-        """The (n,) nodes that press on the core; the others have lifted off."""
-        pressing: BoolArray = self.contact_force_n[: len(self.along_mm)] > 0
-        return pressing
-
 
 def unloaded(skin: CondensedSkin) -> ContactState:
     """Return the skin as it is mounted: without load, without contact force."""
@@ -256,23 +239,15 @@ def unloaded(skin: CondensedSkin) -> ContactState:
 
 
 def apply_load(
-    skin: CondensedSkin,
-    before: ContactState,
-    normal_n: float,
-    shear_n: float,
-    *,
-    friction: float | None = None,
-    start_force_n: FloatArray | None = None,
+    skin: CondensedSkin, before: ContactState, normal_n: float, shear_n: float, *, friction: float | None = None
 ) -> ContactState:
     """Return the state after one increment of load (N) from `before`; friction is the section's unless given.
 
-    The Newton iteration starts from the contact forces `start_force_n` (2n,), by default those of `before`. Raises
-    ContactError where it does not converge.
+    Raises ContactError where the contact conditions cannot be met.
     """
     friction = skin.section.friction if friction is None else friction
-    start = before.contact_force_n if start_force_n is None else start_force_n
     free = skin.load_displacement @ (normal_n, shear_n)
-    force = solve_contact(skin.compliance, free, before.along_mm, friction, start)
+    force = solve_contact(skin.compliance, free, before.along_mm, friction, before.contact_force_n)
     n = len(before.along_mm)
     return ContactState(normal_n, shear_n, force, skin.compliance[n:] @ force + free[n:])
 
@@ -304,6 +279,11 @@ def gauge_strains(skin: CondensedSkin, states: Iterable[ContactState]) -> FloatA
     return np.array([skin.gauge_weights @ midline_strain(skin, state) for state in states])
 
 
+def gauge_responses(skin: CondensedSkin, states: Iterable[ContactState]) -> FloatArray:
+    """Return the (states,) responses F (ε₁ − ε₂), the modelled side of the paper's equation (1)."""
+    return gauge_strains(skin, states) @ [GAUGE_FACTOR, -GAUGE_FACTOR]
+
+
 def solve_contact(
     compliance: FloatArray, displacement: FloatArray, along_before: FloatArray, friction: float, start: FloatArray
 ) -> FloatArray:
@@ -315,32 +295,13 @@ def solve_contact(
     if not (np.isfinite(displacement).all() and np.isfinite(start).all()):
         raise ContactError("The skin's load is not a number; give its normal and shear force in N.")
     problem = _Problem(compliance, displacement, along_before, friction)
-    rng = np.random.default_rng(0)
-    force, steps, found = _newton(problem, start)
-    for attempt in range(RESTARTS):
-        if found:
-            break
-        # The guesses repeat: restart where each node meets its own conditions, or at random.
-        start = rng.normal(0.0, abs(force).max(), len(force)) if attempt % 2 else problem.relaxed(force)
-        force, more, found = _newton(problem, start)
-        steps += more
-    if not found:
-        raise ContactError(
-            f"The contact of the skin did not converge in {steps} steps at a friction of {friction}; "
-            "apply the load in smaller steps."
-        )
-    return force
-
-
-def _newton(problem: "_Problem", force: FloatArray) -> tuple[FloatArray, int, bool]:
-    """Return the forces reached from one start, the number of steps, and whether they meet the conditions."""
-    weight = 0
+    force, weight = start, 0
     residual, guess = problem.residual(force, WEIGHTS[weight])
     smallest = np.finfo(np.float64).tiny
-    for step in range(MAX_STEPS):
+    for _ in range(MAX_STEPS):
         size = np.linalg.norm(residual)
         if size <= max(TOLERANCE * abs(force).max(), smallest):
-            return force, step, True
+            return force
         towards = problem.solve(guess) - force
         length = 1.0
         while length >= SHORTEST_STEP:
@@ -352,7 +313,10 @@ def _newton(problem: "_Problem", force: FloatArray) -> tuple[FloatArray, int, bo
             length, weight = 1.0, (weight + 1) % len(WEIGHTS)
             new_residual, new_guess = problem.residual(force + towards, WEIGHTS[weight])
         force, residual, guess = force + length * towards, new_residual, new_guess
-    return force, MAX_STEPS, False
+    raise ContactError(
+        f"The contact of the skin did not converge in {MAX_STEPS} steps at a friction of {friction}; "
+        "apply the load in smaller steps."
+    )
 
 
 class _Guess(NamedTuple):
@@ -384,21 +348,6 @@ class _Problem:
         wanted = np.concatenate([pressing, np.clip(trial[n:], -bound, bound)])
         slipping = np.sign(trial[n:]) * (abs(trial[n:]) >= bound)
         return force - wanted, _Guess(trial[:n] > 0, slipping)
-
-    def relaxed(self, force: FloatArray) -> FloatArray:
-        """Return the forces after some rounds in which each node in turn meets its own conditions (Gauss-Seidel)."""
-        n, force = self.n, force.copy()
-        for _ in range(SWEEPS):
-            for node in range(n):
-                force[node] = max(self._alone(force, node, 0.0), 0.0)
-                bound = self.friction * force[node]
-                force[n + node] = min(max(self._alone(force, n + node, self.along_before[node]), -bound), bound)
-        return force
-
-    def _alone(self, force: FloatArray, row: int, before_mm: float) -> float:
-        """Return the force component that, with all others fixed, moves its node back to its previous place."""
-        moved_mm = self.compliance[row] @ force + self.displacement[row] - before_mm
-        return float(force[row] - self.stiffness[row] * moved_mm)
 
     def solve(self, guess: _Guess) -> FloatArray:
         """Return the forces of a guess: u_n = 0 where touching; there u_t as before or λ_t = ±μ λ_n."""

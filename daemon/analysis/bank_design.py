@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.bank.eit.design import ALLOWED, Design, DesignChoice, MeasuredFrames, design_bank
+from shearloop.bank.eit.design import ALLOWED, Design, MeasuredFrames, design_bank
 from shearloop.bank.estimation.fingertip_validator import channel_noise
 from shearloop.bank.estimation.grip_segmentation import segment_grip
 from shearloop.bank.estimation.values import FrameSeries
@@ -110,15 +110,10 @@ def model_lines(design: Design) -> list[str]:
     ]
 
 
-def choices_of(design: Design) -> tuple[DesignChoice, ...]:
-    """Return all choices, in the table's order."""
-    return (design.mesh, design.k_count, design.sigma_count, design.rank, design.channels, design.injections)
-
-
 def choice_lines(design: Design) -> list[str]:
     """Return each choice with its error and the next finer step's."""
     found = []
-    for one in choices_of(design):
+    for one in design.choices:
         step, after = one.chosen, one.next_step
         text = f"{one.name}: {step.setting:g} {one.unit} ({step.cost}) adds {step.added:.2f} of the noise"
         if not one.enough:

@@ -5,13 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from shearloop.bank.estimation import TRUSTED, Calibration, FrameSeries, LoadTiming, Name, Physics, fit, measure_timing
+from shearloop.bank.estimation import TRUSTED, Calibration, FrameSeries, LoadTiming, Physics, fit, measure_timing
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor
+from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, part_of, read_series, series_of
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.reader import read_recording
-
-ESTIMATORS: tuple[Name, ...] = ("motion_regression", "regression", "bank", "paper", "reconstruction")
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +71,7 @@ class CalibrationResult:
         """Return the result for scripts."""
         calibration, timing = self.calibration, self.timing
         found: dict[str, object] = {
-            "estimator": calibration.estimator,
+            "estimator": calibration.estimator.name,
             "quantities": self.quantities,
             "frames": self.frames,
             "sides": list(calibration.sides),
@@ -93,7 +92,7 @@ class CalibrationResult:
 
 
 def calibrate(
-    paths: Sequence[Path], estimator: Name, physics: Physics, options: CalibrationOptions
+    paths: Sequence[Path], estimator: EstimatorName, physics: Physics, options: CalibrationOptions
 ) -> CalibrationResult:
     """Fit an estimator to recordings or folders of slices, oldest first.
 

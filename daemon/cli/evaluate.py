@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
         out = args.out or args.calibration.with_suffix(".png")
         titles = [f"{path.name}, {' and '.join(part.sides)}" for (path, _), part in zip(named, parts, strict=True)]
         try:
-            draw_tracks(tracks, titles, f"{calibration.estimator}, fitted to {calibration.source}", out)
+            draw_tracks(tracks, titles, f"{calibration.estimator.name}, fitted to {calibration.source}", out)
         except ModuleNotFoundError as error:
             raise UserError(f"the figure needs {error.name}: `pip install 'shearloop[plot]'`") from error
         except OSError as error:

@@ -4,8 +4,8 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Mapping
 
-from shearloop.bank.eit.polynomial import TWO_SIDED_95
 from shearloop.bank.estimation import Measured, combine
+from shearloop.bank.polynomial import TWO_SIDED_95
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.loop_inputs import GripperStatus
 from shearloop.daemon.control.step_runner import GripTo

@@ -168,7 +168,7 @@ class ControlLoopRunner:
             "connected": self._robot.state is not None,
             "states": self._robot.states,
             "errors": errors,
-            "error": "" if self._robot.link.up else self._robot.link.sentence,
+            "error": "" if self._robot.link.latest.up else self._robot.link.latest.sentence,
         }
 
     @property

@@ -222,15 +222,15 @@ def check_bank(name: str, fingertip: FingertipConfig, geometry: Path | None = No
 
 def _calibration(name: str, fingertip: FingertipConfig) -> str:
     estimator = open_estimator(fingertip, name)
-    if estimator.calibration.has_curves_only:
+    if not estimator.calibration.sides:
         return f"{fingertip.calibration} belongs to this bank"
-    kind = estimator.calibration.estimator
+    kind = estimator.calibration.estimator.name
     return f"{fingertip.calibration} is for this fingertip, estimator {kind}{estimator.assumptions}"
 
 
 def _combined(combined: CombinedConfig, fingertips: dict[str, FingertipConfig]) -> str:
     estimator = open_combined(combined, fingertips)
-    sides, kind = " and ".join(estimator.calibration.sides), estimator.calibration.estimator
+    sides, kind = " and ".join(estimator.calibration.sides), estimator.calibration.estimator.name
     return f"{combined.calibration} is for {sides}, estimator {kind}{estimator.assumptions}"
 
 

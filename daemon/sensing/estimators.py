@@ -48,7 +48,7 @@ class LiveEstimator:
         self.model = bank.model if bank is not None else ""
         self._matcher = _shared_matcher(bank, config.matching) if bank is not None else None
         matcher = None
-        if calibration.has_curves_only and self._matcher is not None:
+        if not calibration.sides and self._matcher is not None:
             calibration.check_bank(bank)
             matcher = PaperMatcher(self._matcher)
         self._session = EstimatorSession(
@@ -130,13 +130,13 @@ def open_estimator(config: FingertipConfig, name: str) -> LiveEstimator:
     """
     if config.calibration is not None and config.calibration.exists():
         calibration = _load(config.calibration, config.estimator)
-        if not calibration.has_curves_only and calibration.sides != (name,):
+        if calibration.sides and calibration.sides != (name,):
             raise UserError(
                 f"{config.calibration} is of the {' and '.join(calibration.sides)} fingertip, not of {name}; "
                 f"calibrate with `--sides {name}`, or name a calibration of both under `combined`"
             )
-        if calibration.has_curves_only and config.bank is None:
-            raise UserError(f"the paper's estimator of {name} needs its bank; add `bank:` to the fingertip")
+        if calibration.estimator.searches_bank and config.bank is None:
+            raise _without_bank(calibration.estimator.name, name)
         return _live(config.calibration, calibration, config)
     if config.estimator not in (None, "paper"):
         found = "none is configured" if config.calibration is None else f"{config.calibration} does not exist"
@@ -145,10 +145,14 @@ def open_estimator(config: FingertipConfig, name: str) -> LiveEstimator:
             f"`shearloop calibrate REC… --estimator {config.estimator} --out CAL`"
         )
     if config.bank is None:
-        raise UserError(f"the paper's estimator of {name} needs its bank; add `bank:` to the fingertip")
+        raise _without_bank("paper", name)
     if config.calibration is not None:
         return LiveEstimator(Calibration.load(config.calibration), config)
     return LiveEstimator(Calibration.uncalibrated(Bank.open(config.bank).identity), config)
+
+
+def _without_bank(estimator: str, name: str) -> UserError:
+    return UserError(f"the estimator {estimator} of {name} needs its bank; add `bank:` to the fingertip")
 
 
 def open_combined(config: CombinedConfig, fingertips: Mapping[str, FingertipConfig]) -> LiveEstimator:
@@ -207,9 +211,9 @@ def _load(path: Path, wanted: str | None) -> Calibration:
     calibration = Calibration.load(path)
     if calibration.kind != "raw":
         raise UserError(f"{path} was made from slices; the daemon has raw frames: calibrate on a recording of them")
-    if wanted not in (None, calibration.estimator):
+    if wanted not in (None, calibration.estimator.name):
         raise UserError(
-            f"{path} is a calibration of the estimator {calibration.estimator}, and {wanted} is configured; "
+            f"{path} is a calibration of the estimator {calibration.estimator.name}, and {wanted} is configured; "
             f"name the other, or calibrate with `--estimator {wanted}`"
         )
     return calibration

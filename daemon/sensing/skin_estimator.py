@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 # scipy.stats would cost the daemon 40 MB and half of its start-up time.
 from scipy.special import chdtri
 
-from shearloop.bank.eit.polynomial import TWO_SIDED_95
-from shearloop.bank.skin.calibration import SkinCalibration
+from shearloop.bank.polynomial import TWO_SIDED_95
+from shearloop.bank.skin.calibration import DirectionFinder, ForceFollower, SkinCalibration
 from shearloop.bank.skin.membrane import Direction, ShearInterval
-from shearloop.bank.skin.tracking import DirectionFinder, ForceFollower
 from shearloop.drivers.shear_skin import SkinSample
 
 # The slack gauge is compressed by at most this share of the other's stretch (0.125 in the 2-D reference, see

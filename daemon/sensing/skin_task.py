@@ -2,7 +2,6 @@
 
 import contextlib
 from collections.abc import Callable, Mapping
-from functools import partial
 from types import MappingProxyType
 
 from shearloop.bank.skin.calibration import SkinCalibration, load_calibration
@@ -11,13 +10,13 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import InstrumentSocket, SerialDevice, SkinConfig
 from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.logs import log_link
+from shearloop.daemon.logs import LinkLog
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
 from shearloop.daemon.waiters import Waiters
 from shearloop.drivers import shear_skin
-from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkEvent, SerialLink, TcpLink
+from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.drivers.shear_skin import SOURCE_PERIOD_S, Keithley6430, PairParser, SkinSample, Voltages
 
@@ -244,26 +243,24 @@ def _estimator(config: SkinConfig, calibration: SkinCalibration) -> SkinEstimato
 
 def _current_source(config: SkinConfig, inputs: InputRecorder | None) -> Keithley6430:
     source = config.source
-    link = _link(source.socket, source.serial, source.baud, partial(log_link, "skin source"))
+    link = _link(source.socket, source.serial, source.baud, LinkMonitor(LinkLog("skin source")))
     return Keithley6430(link, source.current_ma * 1e-3, source.compliance_v, SOURCE_PERIOD_S, inputs=inputs)
 
 
 def _daq(config: SkinConfig, inputs: InputRecorder | None) -> shear_skin.Daq:
     rate_hz, scanner, adc = config.daq.rate_hz, config.daq.scanner, config.daq.adc
-    on_event = partial(log_link, "skin daq")
+    monitor = LinkMonitor(LinkLog("skin daq"))
     if scanner is not None:
-        link = _link(scanner.socket, None, DEFAULT_BAUD, on_event)
+        link = _link(scanner.socket, None, DEFAULT_BAUD, monitor)
         return shear_skin.ScpiScanner(link, scanner.channels, rate_hz, scanner.range_v, inputs=inputs)
     if adc is not None:
-        return shear_skin.AdcBoard(_link(None, adc.device, DEFAULT_BAUD, on_event), rate_hz, adc.full_scale_v, inputs)
+        return shear_skin.AdcBoard(_link(None, adc.device, DEFAULT_BAUD, monitor), rate_hz, adc.full_scale_v, inputs)
     raise ValueError("a skin needs an instrument that reads its voltages")
 
 
-def _link(
-    socket: InstrumentSocket | None, serial: SerialDevice | None, baud: int, on_event: Callable[[LinkEvent], None]
-) -> Link:
+def _link(socket: InstrumentSocket | None, serial: SerialDevice | None, baud: int, monitor: LinkMonitor) -> Link:
     if socket is not None:
-        return TcpLink(socket.host, socket.port, on_event=on_event)
+        return TcpLink(socket.host, socket.port, monitor=monitor)
     if serial is None:
         raise ValueError("an instrument needs a socket or a serial port")
-    return SerialLink(serial_number=serial.serial_number, path=serial.path, baud=baud, on_event=on_event)
+    return SerialLink(serial_number=serial.serial_number, path=serial.path, baud=baud, monitor=monitor)

@@ -1,19 +1,25 @@
-"""The gripper: activation, motion, state, reconnection, over either connection."""
+"""The gripper over either connection: widths, activation, motion, state, reconnection."""
 
 import asyncio
 import math
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Sequence
 from contextlib import asynccontextmanager
-from typing import TypeVar
+from typing import Self, TypeVar
 
-from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
-from shearloop.drivers.errors import DriverError
+import numpy as np
+from pydantic import model_validator
+
+from shearloop.drivers.calibration_files import CalibrationModel, Finite, Positive
+from shearloop.drivers.connection import Diagnostics, LinkMonitor
+from shearloop.drivers.errors import DeviceCalibrationError, DriverError
 from shearloop.drivers.robotiq import messages
-from shearloop.drivers.robotiq.width import COUNTS_MAX, WidthCalibration
 
 T = TypeVar("T")
 
+COUNTS_MAX = 255
+COUNTS = 0, COUNTS_MAX
+STROKE_MM = 140.0
 POLL_S = 0.1
 # The pause between reset and activation that Robotiq's own clients keep.
 PAUSE_NS = 500_000_000
@@ -23,6 +29,82 @@ ACTIVATION_DEADLINE_NS = 15_000_000_000
 # The full stroke at the slowest speed takes 4.7 s.
 MOTION_DEADLINE_NS = 10_000_000_000
 _OVER_TEMPERATURE, _NO_COMMUNICATION = 8, 9
+
+
+class WidthCalibration(CalibrationModel):
+    """The line through two positions of known width: the width is taken as linear in counts.
+
+    The fingers of a 2F-140 stop before the motor's spindle does: a real one goes from about 3 to about 230 counts, not
+    from 0 to 255 (Robotiq knowledge base, "Encoder bytes, adaptive gripper"), and fingertips change that.
+    `std_mm` is the standard deviation of the width about the line; `width_std_mm` adds the encoder's step of one count.
+    """
+
+    open_counts: Finite
+    open_mm: Positive
+    closed_counts: Finite
+    closed_mm: Finite = 0.0
+    std_mm: Positive
+
+    @model_validator(mode="after")
+    def _two_different_widths(self) -> Self:
+        if self.open_counts >= self.closed_counts or self.open_mm <= self.closed_mm:
+            raise ValueError("the open position must have fewer counts and more millimetres than the closed one")
+        return self
+
+    @classmethod
+    def nominal(cls) -> Self:
+        """Return the data sheet's line for a bare 2F-140: good enough to move, not to measure a diameter."""
+        return cls(open_counts=3.0, open_mm=STROKE_MM, closed_counts=230.0, closed_mm=0.0, std_mm=3.0)
+
+    @classmethod
+    def of_gauges(cls, gauges: Sequence[tuple[float, float]]) -> Self:
+        """Return the least-squares line through (counts, width in mm) pairs of gripped objects.
+
+        From three pairs on, the scatter about the line is the standard deviation, and one count at least. Raises
+        DeviceCalibrationError when no falling line fits.
+        """
+        if len({width for _, width in gauges}) < 2:
+            raise DeviceCalibrationError("A width calibration needs objects of at least two different diameters.")
+        counts, widths = (np.array(column, dtype=float) for column in zip(*gauges, strict=True))
+        counts_per_mm, closed_counts = (float(value) for value in np.polyfit(widths, counts, 1))
+        # Less than a quarter of the nominal slope means objects in the wrong order.
+        if counts_per_mm > -0.25 * COUNTS_MAX / STROKE_MM:
+            raise DeviceCalibrationError(
+                "The fingers did not stop further closed on the smaller objects: were they measured in the order "
+                "given, and did the fingers hold each of them?"
+            )
+        residuals = (counts - (closed_counts + counts_per_mm * widths)) / counts_per_mm
+        scatter_mm = math.sqrt(float(residuals @ residuals) / (len(gauges) - 2)) if len(gauges) > 2 else 0.0
+        if scatter_mm > 0.02 * STROKE_MM:
+            raise DeviceCalibrationError(
+                f"The diameters scatter by {scatter_mm:.1f} mm about a straight line: check them, and that each object "
+                "was gripped at the same place of the fingertips."
+            )
+        return cls(
+            open_counts=closed_counts + counts_per_mm * STROKE_MM,
+            open_mm=STROKE_MM,
+            closed_counts=closed_counts,
+            std_mm=max(scatter_mm, -1 / counts_per_mm),
+        )
+
+    @property
+    def mm_per_count(self) -> float:
+        """The change of width per count, mm; negative."""
+        return (self.open_mm - self.closed_mm) / (self.open_counts - self.closed_counts)
+
+    def width_mm(self, counts: float) -> float:
+        """Return the width at a position, mm."""
+        return self.closed_mm + (counts - self.closed_counts) * self.mm_per_count
+
+    def counts(self, width_mm: float) -> int:
+        """Return the position nearest to a width, within 0…255."""
+        exact = self.closed_counts + (width_mm - self.closed_mm) / self.mm_per_count
+        return min(max(round(exact), 0), COUNTS_MAX)
+
+    @property
+    def width_std_mm(self) -> float:
+        """The standard deviation of a measured width, mm: of the line and of the encoder's step."""
+        return math.hypot(self.std_mm, self.mm_per_count / math.sqrt(12))
 
 
 class RobotiqGripper:
@@ -39,39 +121,27 @@ class RobotiqGripper:
         calibration: WidthCalibration,
         *,
         poll_s: float = POLL_S,
-        policy: ReconnectPolicy | None = None,
-        on_event: Callable[[LinkEvent], None] = lambda _: None,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
+        monitor: LinkMonitor | None = None,
     ) -> None:
         """Take a connection and the meaning of its counts; nothing is opened yet."""
         self._client = client
         self._calibration = calibration
         self._poll_s = poll_s
-        self._policy = policy or ReconnectPolicy()
-        self._on_event = on_event
-        self._clock_ns = clock_ns
+        self._monitor = monitor or LinkMonitor()
         self._lock = asyncio.Lock()
         self._seq = 0
         self._last_move: messages.GripperMove | None = None
-        self._connections = 0
         self._loss: DriverError | None = None
         self.connected = False
-        self.last_error = ""
         self.latest: messages.GripperState | None = None
 
-    def diagnostics(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:
+    def diagnostics(self) -> Diagnostics:
         """Return the gripper's part of `health`; counts are since the process began."""
-        return {
-            "connected": self.connected,
-            "states": self._seq,
-            "connections": self._connections,
-            "last_loss": self.last_error,
-        }
+        return {**self._monitor.diagnostics(connected=self.connected), "states": self._seq}
 
     async def connect(self) -> messages.GripperState:
         """Open the connection and return the first state; DeviceNotFoundError or DeviceLostError."""
         await self._client.connect()
-        self._connections += 1
         self.connected, self._loss = True, None
         # Another program may have commanded the gripper since.
         self._last_move = None
@@ -109,8 +179,8 @@ class RobotiqGripper:
         await self._wait_until(
             lambda now: not now.act and now.sta is messages.ActivationStatus.RESET, RESET_DEADLINE_NS, not_reset
         )
-        resume_ns = self._clock_ns() + PAUSE_NS
-        await self._wait_until(lambda _: self._clock_ns() >= resume_ns, RESET_DEADLINE_NS, not_reset)
+        resume_ns = time.monotonic_ns() + PAUSE_NS
+        await self._wait_until(lambda _: time.monotonic_ns() >= resume_ns, RESET_DEADLINE_NS, not_reset)
         # A rising edge of ACT, which also ends every fault.
         await _uninterrupted(self._write(messages.Activate()))
         return await self._wait_until(
@@ -154,7 +224,7 @@ class RobotiqGripper:
         self, done: Callable[[messages.Readout], bool], deadline_ns: int, failure: str
     ) -> messages.GripperState:
         """Return the first state that is `done`; GripperFaultError after the deadline."""
-        since_ns = self._clock_ns()
+        since_ns = time.monotonic_ns()
         while True:
             readout, t_ns = await _uninterrupted(self._read())
             if done(readout):
@@ -198,17 +268,13 @@ class RobotiqGripper:
         if self._loss is not None:
             raise self._loss
         state = await self.connect()
-        self._policy.connected(time.monotonic_ns())
-        self._on_event(LinkEvent(up=True, sentence=f"The gripper answers at {self._client.name}.", repeated=False))
+        self._monitor.connected(f"The gripper answers at {self._client.name}.", time.monotonic_ns())
         return state
 
     async def _wait_after(self, error: DriverError) -> None:
         await self.close()
         self._loss = None
-        self.last_error = str(error)
-        retry = self._policy.failed(time.monotonic_ns())
-        self._on_event(LinkEvent(up=False, sentence=self.last_error, repeated=retry.repeated))
-        await asyncio.sleep(retry.wait_s)
+        await asyncio.sleep(self._monitor.failed(error, time.monotonic_ns()))
 
     def clip(self, command: messages.GripperCommand) -> messages.SentCommand:
         """Return the command clipped to this gripper's limits and rounded to counts."""
@@ -218,33 +284,28 @@ class RobotiqGripper:
             )
         clipped: list[str] = []
         calibration = self._calibration
+        speeds = messages.SPEED_MIN_MM_S, messages.SPEED_MAX_MM_S
+        forces = messages.FORCE_MIN_N, messages.FORCE_MAX_N
         narrowest_mm, widest_mm = calibration.width_mm(COUNTS_MAX), calibration.width_mm(0)
         width_mm = _clip("width", command.width_mm, narrowest_mm, widest_mm, "mm", clipped)
-        speed_mm_s = _clip(
-            "speed", command.speed_mm_s, messages.SPEED_MIN_MM_S, messages.SPEED_MAX_MM_S, "mm/s", clipped
-        )
-        force_n = _clip("force", command.force_n, messages.FORCE_MIN_N, messages.FORCE_MAX_N, "N", clipped)
+        speed_mm_s = _clip("speed", command.speed_mm_s, *speeds, "mm/s", clipped)
+        force_n = _clip("force", command.force_n, *forces, "N", clipped)
         request = messages.GripperMove(
             calibration.counts(width_mm),
-            round(
-                (speed_mm_s - messages.SPEED_MIN_MM_S)
-                / (messages.SPEED_MAX_MM_S - messages.SPEED_MIN_MM_S)
-                * COUNTS_MAX
-            ),
-            round((force_n - messages.FORCE_MIN_N) / (messages.FORCE_MAX_N - messages.FORCE_MIN_N) * COUNTS_MAX),
+            round(float(np.interp(speed_mm_s, speeds, COUNTS))),
+            round(float(np.interp(force_n, forces, COUNTS))),
         )
         return messages.SentCommand(
             width_mm=calibration.width_mm(request.position),
-            speed_mm_s=messages.SPEED_MIN_MM_S
-            + request.speed / COUNTS_MAX * (messages.SPEED_MAX_MM_S - messages.SPEED_MIN_MM_S),
-            force_n=messages.FORCE_MIN_N + request.force / COUNTS_MAX * (messages.FORCE_MAX_N - messages.FORCE_MIN_N),
+            speed_mm_s=float(np.interp(request.speed, COUNTS, speeds)),
+            force_n=float(np.interp(request.force, COUNTS, forces)),
             request=request,
             clipped=tuple(clipped),
         )
 
     async def _read(self) -> tuple[messages.Readout, int]:
         async with self._exchange():
-            t_ns = self._clock_ns()
+            t_ns = time.monotonic_ns()
             return await self._client.read(), t_ns
 
     async def _write(self, request: messages.Request) -> None:

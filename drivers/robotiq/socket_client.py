@@ -5,9 +5,7 @@ or with `POS ?` when the controller has no value, for example because the grippe
 """
 
 import asyncio
-from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import partial
 
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, ProtocolError
 from shearloop.drivers.robotiq import messages
@@ -24,56 +22,38 @@ READ_ORDER = ("ACT", "STA", "GTO", "PRE", "OBJ", "POS", "FLT", "COU")
 _OPTIONAL = ("COU",)
 
 
-def set_lines(request: messages.Request) -> list[bytes]:
+def set_lines(request: messages.Request) -> list[str]:
     """Return the lines of a request; each is acknowledged before the next."""
     match request:
         case messages.Reset():
-            return [b"SET ACT 0\n", b"SET ATR 0\n"]
+            return ["SET ACT 0", "SET ATR 0"]
         case messages.Activate():
-            return [b"SET ACT 1\n"]
+            return ["SET ACT 1"]
         case messages.GripperHalt():
-            return [b"SET GTO 0\n"]
+            return ["SET GTO 0"]
         case messages.GripperMove(position, speed, force):
-            return [f"SET POS {position} SPE {speed} FOR {force} GTO 1\n".encode()]
+            return [f"SET POS {position} SPE {speed} FOR {force} GTO 1"]
 
 
-class ReplyParser:
-    """Collects the bytes of one reply at a time. No I/O."""
+def take_answer(line: str, received: bytes) -> tuple[str, bytes] | None:
+    """Return the value asked for, or `ack`, and the bytes after it; None while the answer is incomplete.
 
-    def __init__(self) -> None:
-        self._buffer = b""
-
-    def check_empty(self) -> None:
-        """Raise ProtocolError when bytes are left that no request asked for."""
-        if self._buffer.strip():
-            raise ProtocolError(f"The gripper's socket sent {self._buffer!r} without a request.")
-
-    def feed(self, data: bytes) -> None:
-        """Add received bytes; ProtocolError when they are longer than any reply."""
-        self._buffer += data
-        if len(self._buffer) > MAX_REPLY_BYTES:
-            raise ProtocolError(f"The gripper's socket answered with {self._buffer!r}; is this the URCap's port?")
-
-    def take_ack(self) -> str | None:
-        """Return "ack", or None while it is incomplete; ProtocolError for anything else."""
-        text = self._buffer.lstrip()
+    Raises ProtocolError for an answer to something else.
+    """
+    text = received.lstrip()
+    if len(text) > MAX_REPLY_BYTES:
+        raise ProtocolError(f"The gripper's socket answered with {text!r}; is this the URCap's port?")
+    if line.startswith("SET"):
         if not _ACK.startswith(text[: len(_ACK)]):
             raise ProtocolError(f"The gripper's socket answered a command with {text!r} instead of {_ACK!r}.")
-        if len(text) < len(_ACK):
-            return None
-        self._buffer = text[len(_ACK) :]
-        return _ACK.decode()
-
-    def take_value(self, variable: str) -> str | None:
-        """Return the variable's value as sent, or None while the line is incomplete; ProtocolError for another."""
-        line, end, rest = self._buffer.lstrip().partition(b"\n")
-        if not end:
-            return None
-        self._buffer = rest
-        name, _, value = line.strip().decode("ascii", "replace").partition(" ")
-        if name != variable or not value:
-            raise ProtocolError(f"The gripper's socket answered {line!r} when asked for {variable}.")
-        return value
+        return (_ACK.decode(), text[len(_ACK) :]) if len(text) >= len(_ACK) else None
+    answer, end, rest = text.partition(b"\n")
+    if not end:
+        return None
+    name, _, value = answer.strip().decode("ascii", "replace").partition(" ")
+    if f"GET {name}" != line or not value:
+        raise ProtocolError(f"The gripper's socket answered {answer!r} to {line!r}.")
+    return value, rest
 
 
 def value_of(variable: str, text: str) -> int | None:
@@ -108,10 +88,6 @@ def readout_of(values: dict[str, int | None]) -> messages.Readout:
         raise ProtocolError(f"The gripper's status is not in its manual: {error}.") from error
 
 
-# A line to send, and a function that takes its answer from the parser.
-_Question = tuple[bytes, Callable[[ReplyParser], str | None]]
-
-
 class SocketClient:
     """One connection to the URCap. Any failure closes it: afterwards a reply could belong to another request."""
 
@@ -121,7 +97,7 @@ class SocketClient:
         self._port = port
         self._deadline_s = reply_deadline_s
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
-        self._parser = ReplyParser()
+        self._received = b""
 
     @property
     def name(self) -> str:
@@ -131,7 +107,7 @@ class SocketClient:
     async def connect(self) -> None:
         """Open the connection; DeviceNotFoundError when nothing listens there."""
         await self.close()
-        self._parser = ReplyParser()
+        self._received = b""
         try:
             async with asyncio.timeout(CONNECT_DEADLINE_S):
                 self._streams = await asyncio.open_connection(self._host, self._port)
@@ -151,36 +127,34 @@ class SocketClient:
 
     async def read(self) -> messages.Readout:
         """Return the status registers, requested one by one; DeviceLostError or ProtocolError."""
-        answers = await self._ask(
-            [(f"GET {name}\n".encode(), partial(ReplyParser.take_value, variable=name)) for name in READ_ORDER]
-        )
-        return readout_of({name: value_of(name, text) for name, text in zip(READ_ORDER, answers, strict=True)})
+        return readout_of({name: value_of(name, await self._ask(f"GET {name}")) for name in READ_ORDER})
 
     async def write(self, request: messages.Request) -> None:
         """Send a request and wait for its acknowledgement; DeviceLostError or ProtocolError."""
-        await self._ask([(line, ReplyParser.take_ack) for line in set_lines(request)])
+        for line in set_lines(request):
+            await self._ask(line)
 
-    async def _ask(self, questions: Sequence[_Question]) -> list[str]:
+    async def _ask(self, line: str) -> str:
+        """Send a line and return the value asked for, or `ack`."""
         if self._streams is None:
             raise DeviceLostError(f"There is no connection to the gripper at {self.name} at present.")
         reader, writer = self._streams
-        answers = []
         try:
-            for line, take in questions:
-                self._parser.check_empty()
-                writer.write(line)
-                until_s = asyncio.get_running_loop().time() + self._deadline_s
-                while (answer := take(self._parser)) is None:
-                    self._parser.feed(await self._receive(reader, line, until_s))
-                answers.append(answer)
+            if self._received.strip():
+                raise ProtocolError(f"The gripper's socket sent {self._received!r} without a request.")
+            writer.write(f"{line}\n".encode())
+            until_s = asyncio.get_running_loop().time() + self._deadline_s
+            while (taken := take_answer(line, self._received)) is None:
+                self._received += await self._receive(reader, line, until_s)
         except BaseException as error:
             await self.close()
             if isinstance(error, OSError):
                 raise DeviceLostError(f"The connection to the gripper at {self.name} broke: {error}.") from error
             raise
-        return answers
+        answer, self._received = taken
+        return answer
 
-    async def _receive(self, reader: asyncio.StreamReader, line: bytes, until_s: float) -> bytes:
+    async def _receive(self, reader: asyncio.StreamReader, line: str, until_s: float) -> bytes:
         data = b""
         for due_s in (until_s, 0.0):
             # Twice: when this process was paused, the answer may have arrived together with the deadline.
@@ -190,8 +164,7 @@ class SocketClient:
                     break
         else:
             raise DeviceLostError(
-                f"The gripper's socket at {self.name} gave no whole answer to {line.decode().strip()!r} within "
-                f"{self._deadline_s:g} s."
+                f"The gripper's socket at {self.name} gave no whole answer to {line!r} within {self._deadline_s:g} s."
             )
         if not data:
             raise DeviceLostError(f"The controller closed the gripper's socket at {self.name}.")

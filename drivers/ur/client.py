@@ -12,9 +12,9 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Coroutine
-from typing import Any, Final, Literal, Protocol, cast
+from typing import Any, Literal, Protocol, cast
 
-from shearloop.drivers.connection import LinkEvent, LinkObserver
+from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.errors import DeviceLostError, DriverError, ProtocolError
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.controller import silent_sentence
@@ -22,9 +22,6 @@ from shearloop.drivers.ur.settings import UrSettings
 
 LossKind = messages.FailureKind | Literal["crashed", "hung", "garbled"]
 
-PAUSES_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
-# After this time without a loss the pauses start again with the shortest.
-STEADY_S = 30.0
 # A program found this soon after a loss counts as left behind by the lost worker.
 TAKES_OVER_S = 10.0
 # A disconnecting worker stops the arm (1 s) and ends the program; after this time it is killed.
@@ -48,16 +45,14 @@ class LostError(DeviceLostError):
 class UrRobot:
     """A UR arm: `run` in a task of the daemon, `send` commands, read `state` (None while there is no connection)."""
 
-    def __init__(self, settings: UrSettings, observer: LinkObserver | None = None) -> None:
-        """Take the settings; `observer` receives each loss and each return."""
+    def __init__(self, settings: UrSettings, monitor: LinkMonitor | None = None) -> None:
         self.settings = settings
         self.state: messages.RobotState | None = None
-        self.link = LinkEvent(up=False, sentence="The robot's process has not been started.", repeated=False)
+        self.link = monitor or LinkMonitor()
         self.losses: Counter[str] = Counter()
         # How many states have come, and how many times our program was paused and did not stop on request.
         self.states = 0
         self.failed_program_stops = 0
-        self._observer = observer
         self._connection: WorkerConnection | None = None
         self._replies: dict[int, Callable[[messages.CommandReply], None]] = {}
         self._number = 0
@@ -93,7 +88,7 @@ class UrRobot:
         connection; where that has ended, it goes to the event loop's handler.
         """
         if self._connection is None or self.state is None:
-            on_reply(messages.CommandReply(refusal=f"The robot is not connected. {self.link.sentence}"))
+            on_reply(messages.CommandReply(refusal=f"The robot is not connected. {self.link.latest.sentence}"))
             return
         self._number += 1
         self._replies[self._number] = on_reply
@@ -111,16 +106,12 @@ class UrRobot:
                 "3.12 on x86-64 Linux and none for 3.13 or later: run shearloop with Python 3.11 or 3.12, then "
                 "`pip install 'ur-rtde>=1.6'`."
             )
-        attempts = 0
         while True:
-            started_s = time.monotonic()
             try:
                 await self._run_worker()
             except LostError as loss:
-                attempts = 1 if time.monotonic() - started_s > STEADY_S else attempts + 1
                 self.losses[loss.kind] += 1
-                self._notify_link(LinkEvent(up=False, sentence=str(loss), repeated=attempts > 1))
-            await asyncio.sleep(PAUSES_S[min(attempts, len(PAUSES_S)) - 1])
+                await asyncio.sleep(self.link.failed(loss, time.monotonic_ns()))
 
     async def _run_worker(self) -> None:
         connection = WorkerConnection(self.settings, self)
@@ -159,7 +150,7 @@ class UrRobot:
                 self.failed_program_stops += message.failed_program_stops - counted
                 if before is None:
                     sentence = f"The robot at {self.settings.host} is connected. {message.blocked}".strip()
-                    self._notify_link(LinkEvent(up=True, sentence=sentence, repeated=False))
+                    self.link.connected(sentence, time.monotonic_ns())
                 if self._next is not None:
                     self._next.set_result(message)
                     self._next = None
@@ -169,11 +160,6 @@ class UrRobot:
                     on_reply(message)
             case messages.Failed():
                 raise LostError(message.kind, message.sentence)
-
-    def _notify_link(self, event: LinkEvent) -> None:
-        self.link = event
-        if self._observer is not None:
-            self._observer.on_link_event(event)
 
 
 class MessageHandler(Protocol):

@@ -7,9 +7,7 @@ from scipy.io import loadmat
 from scipy.stats import spearmanr
 
 from shearloop.bank.eit.channels import N_CHANNELS, channels_of_line
-from shearloop.bank.eit.forward import ForwardModel
-from shearloop.bank.eit.mesh import load_mesh
-from shearloop.bank.eit.model_scores import (
+from shearloop.bank.eit.design import (
     Setting,
     centred_settings,
     envelope,
@@ -19,6 +17,8 @@ from shearloop.bank.eit.model_scores import (
     searched_settings,
     simulated_signals,
 )
+from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.eit.models import MODELS, conductivity
 from shearloop.bank.errors import MatchingError
 

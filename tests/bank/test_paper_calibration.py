@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration
+from shearloop.bank.polynomial import Polynomial
 
 BANK = "ab" * 32
 SIGMA, K = np.linspace(1.2, 1.9, 30), np.linspace(3.4, 3.8, 12)
@@ -115,7 +115,7 @@ def test_a_saved_calibration_is_loaded_as_it_was_and_has_the_same_bytes_each_tim
     assert loaded.torque is not None
     assert CALIBRATION.torque is not None
     assert loaded.torque.regressor == CALIBRATION.torque.regressor
-    assert loaded.has_curves_only
+    assert loaded.sides == ()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.cal", "b.cal"]
 
 

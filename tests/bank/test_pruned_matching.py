@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.io import loadmat
 
-from shearloop.bank.eit import compression, pruned_matching
+from shearloop.bank.eit import pruned_matching
 from shearloop.bank.eit.channels import N_CHANNELS, channels_of_line
 from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatcher
 from shearloop.bank.eit.pruned_matching import PrunedMatcher
@@ -114,7 +114,7 @@ def test_banks_of_a_few_numbers_where_many_cells_tie(kind, n_k, n_sigma, few, se
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("bank", [BANK, bank_of_noise()], ids=["smooth", "noise"])
 def test_a_basis_that_is_fitted_to_few_cells_bounds_all(kind, bank, monkeypatch) -> None:
-    monkeypatch.setattr(compression, "_FITTED_CELLS", 5)
+    monkeypatch.setattr(pruned_matching, "_FITTED_CELLS", 5)
     slow, fast = pair(*kind, bank)
     random = np.random.default_rng(7)
     for signal in bank[0][bank[1]][::40]:

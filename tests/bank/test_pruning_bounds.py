@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 
 from shearloop.bank.eit import pruned_matching
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.compression import COARSE_RANK, ROUNDING, columns
 from shearloop.bank.eit.matching import Matcher, unit_magnitudes
-from shearloop.bank.eit.pruned_matching import AllLagsBounds, ZeroLagBounds
+from shearloop.bank.eit.pruned_matching import COARSE_RANK, ROUNDING, AllLagsBounds, ZeroLagBounds, columns
 from tests.bank.small_banks import BANK, PAIRS, assert_same, both, cells, without_runner_up
 
 
@@ -30,7 +29,7 @@ def test_no_bound_is_below_its_score(cell, noise, seed) -> None:
     (frame,) = unit_magnitudes(noisy[None])
     signals = np.abs(BANK[0][BANK[1]].astype(np.float64))
     scores = (signals @ frame) / np.linalg.norm(signals, axis=1)
-    found = ZeroLagBounds(fast._bank, frame)
+    found = ZeroLagBounds(fast.compressed, frame)
     everything = found.candidates(-1.0)
     np.testing.assert_array_equal(everything.cells, np.arange(len(scores)))
     assert (everything.bounds - scores).min() >= -ROUNDING / 2
@@ -40,7 +39,7 @@ def test_no_bound_is_below_its_score(cell, noise, seed) -> None:
 
 def test_no_group_of_cells_is_bounded_below_one_of_them() -> None:
     """By frames that point from one cell to another, or along the mean: where a centre alone says too little."""
-    bank = PAIRS[0][1]._bank
+    bank = PAIRS[0][1].compressed
     signals = np.abs(BANK[0][BANK[1]].astype(np.float64))
     signals /= np.linalg.norm(signals, axis=1, keepdims=True)
     apart = np.maximum(signals[::3, None] - 0.95 * signals[None, ::7], 0.0).reshape(-1, N_CHANNELS)
@@ -48,11 +47,8 @@ def test_no_group_of_cells_is_bounded_below_one_of_them() -> None:
     frames /= np.linalg.norm(frames, axis=1, keepdims=True)
     scores = frames @ signals.T
     at = columns((frames @ bank.basis[:COARSE_RANK].T).T.astype(np.float32), np.ones(len(frames)))
-    group_of = bank.group_of
-    for level in reversed(bank.levels):
-        highest = np.array([scores[:, group_of == group].max(axis=1) for group in range(len(level.rows))])
-        assert (level.rows @ at - highest).min() >= -ROUNDING / 2
-        group_of = level.part_of[group_of]
+    highest = np.array([scores[:, members].max(axis=1) for members in bank.members])
+    assert (bank.groups @ at - highest).min() >= -ROUNDING / 2
 
 
 @settings(max_examples=12, deadline=None)
@@ -60,7 +56,7 @@ def test_no_group_of_cells_is_bounded_below_one_of_them() -> None:
 def test_no_bound_at_any_lag_is_below_its_score(cell, noise, seed) -> None:
     slow, fast = PAIRS[0]
     frame = BANK[0][cell] + noise * np.random.default_rng(seed).normal(size=N_CHANNELS)
-    found = AllLagsBounds(fast._bank, fast._spectra, unit_magnitudes(frame[None])[0], fast._score)
+    found = AllLagsBounds(fast, unit_magnitudes(frame[None])[0])
     scores = slow.heatmap(frame)[BANK[1]]
     best, reached = found.reached
     assert 0 < reached <= scores[best] + 1e-12

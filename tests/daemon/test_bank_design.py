@@ -9,9 +9,8 @@ from scipy.io import savemat
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.build import build_bank
 from shearloop.bank.eit.channels import N_CHANNELS, N_LINE_VALUES
-from shearloop.bank.eit.design import MeasuredFrames, design_bank
+from shearloop.bank.eit.design import MeasuredFrames, Setting, design_bank, simulated_signals
 from shearloop.bank.eit.forward import ForwardModel
-from shearloop.bank.eit.model_scores import Setting, simulated_signals
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import NOT_TURNED, RefinedMatcher
 from shearloop.bank.estimation.values import FrameSeries

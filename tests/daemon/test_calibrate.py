@@ -12,7 +12,7 @@ import pytest
 
 from shearloop.drivers.calibration_files import load_calibration
 from shearloop.drivers.load_cell import LoadCalibration
-from shearloop.drivers.robotiq.width import WidthCalibration
+from shearloop.drivers.robotiq.gripper import WidthCalibration
 
 SHEARLOOP = (sys.executable, "-m", "shearloop")
 COUNTS_PER_NM = 420e3 / (9.80665 * 0.035)

@@ -1,5 +1,6 @@
 import asyncio
 import os
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers import connection
-from shearloop.drivers.connection import LinkEvent, ReconnectPolicy, SerialLink, SerialPort, find_port
+from shearloop.drivers.connection import LinkMonitor, SerialLink, SerialPort, find_port
 from shearloop.drivers.emulators.ports import PtyPort
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceUnavailableError
-from tests.running import DEADLINE_S
+from tests.running import DEADLINE_S, LinkEvents
 
 SECOND_NS = 1_000_000_000
 
@@ -152,21 +153,13 @@ async def test_a_write_that_nobody_takes_ends(monkeypatch: pytest.MonkeyPatch) -
 
 
 async def test_a_link_opens_a_device_that_comes_late_and_again_after_it_went(tmp_path: Path) -> None:
-    events: list[LinkEvent] = []
-    policy = ReconnectPolicy(first_s=0.01, longest_s=0.02)
+    told = LinkEvents()
     path = tmp_path / "port"
-    missing = asyncio.Event()
-
-    def note(event: LinkEvent) -> None:
-        events.append(event)
-        if not event.up:
-            missing.set()
-
-    with PtyPort(path) as peer, SerialLink(path=str(path), policy=policy, on_event=note) as link:
+    with PtyPort(path) as peer, SerialLink(path=str(path), monitor=LinkMonitor(told, 0.01, 0.02)) as link:
         peer.unplug()
         opening = asyncio.create_task(link.open())
         async with asyncio.timeout(DEADLINE_S):
-            await missing.wait()
+            await told.down()
             peer.plug()
             port = await opening
             peer.unplug()
@@ -178,9 +171,9 @@ async def test_a_link_opens_a_device_that_comes_late_and_again_after_it_went(tmp
             port = await link.open()
             await port.write(b"again")
             assert await sent_to(peer, 5) == b"again"
-    assert link.connections == 2
-    assert "has gone" in link.last_error or "no serial port" in link.last_error
-    assert [event.up for event in events if event.up or not event.repeated][-1]
+    assert link.diagnostics()["connections"] == 2
+    assert re.search("has gone|no serial port", str(link.diagnostics()["last_loss"]))
+    assert told.events[-1].up
     assert not path.is_symlink()
     assert link.port is None
 
@@ -193,22 +186,25 @@ async def test_a_link_that_leads_elsewhere_by_now_is_left_alone(tmp_path: Path) 
 
 
 def test_waits_grow_and_only_the_first_failure_is_news() -> None:
-    policy = ReconnectPolicy(first_s=0.2, longest_s=5.0)
-    retries = [policy.failed(0) for _ in range(8)]
-    assert [retry.wait_s for retry in retries] == [0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0, 5.0]
-    assert [retry.repeated for retry in retries] == [False] + 7 * [True]
-    policy.connected(100 * SECOND_NS)
-    assert policy.failed(105 * SECOND_NS).wait_s == 0.2, "it held, so it is a new loss"
-    policy.connected(106 * SECOND_NS)
-    assert policy.failed(107 * SECOND_NS).wait_s == 0.4, "it did not hold"
+    told = LinkEvents()
+    monitor = LinkMonitor(told)
+    loss = DeviceLostError("The device at port 1 has gone.")
+    assert [monitor.failed(loss, 0) for _ in range(8)] == [0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0, 5.0]
+    assert [event.repeated for event in told.losses] == [False] + 7 * [True]
+    monitor.connected("up", 100 * SECOND_NS)
+    assert monitor.failed(loss, 105 * SECOND_NS) == 0.2, "it held, so it is a new loss"
+    monitor.connected("up", 106 * SECOND_NS)
+    assert monitor.failed(loss, 107 * SECOND_NS) == 0.4, "it did not hold"
+    monitor.failed(DeviceLostError("Another reason."), 108 * SECOND_NS)
+    assert not told.events[-1].repeated
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 20 * SECOND_NS)), max_size=200))
 def test_waits_stay_within_their_bounds(steps: list[tuple[bool, int]]) -> None:
-    policy, now_ns = ReconnectPolicy(), 0
+    monitor, now_ns = LinkMonitor(), 0
     for connected, later_ns in steps:
         now_ns += later_ns
         if connected:
-            policy.connected(now_ns)
+            monitor.connected("up", now_ns)
         else:
-            assert 0.2 <= policy.failed(now_ns).wait_s <= 5.0
+            assert 0.2 <= monitor.failed(DeviceLostError("gone"), now_ns) <= 5.0

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import LINE_SLOTS, ZERO_SLOTS, line_of_channels
 from shearloop.drivers import eit_kit
-from shearloop.drivers.connection import LinkEvent
+from shearloop.drivers.connection import LinkEvent, LinkMonitor
 from shearloop.drivers.eit_kit import ADC_STEP_V, EitKit, Frame, FrameErrorKind
 from shearloop.drivers.emulators.boards import BoardFault, BoardFaultKind, EitKitBoard, format_line
-from tests.running import DEADLINE_S, running, take
+from tests.running import DEADLINE_S, LinkEvents, running, take
 
 PERIOD_S = 0.003
 
@@ -28,11 +28,11 @@ async def play(
     lines: Iterable[NDArray[np.float64]], n_frames: int, tmp_path: Path, faults: dict[int, BoardFault] | None = None
 ) -> tuple[EitKit, list[Frame], list[LinkEvent]]:
     link = tmp_path / "eit"
-    events: list[LinkEvent] = []
+    told = LinkEvents()
     async with running(EitKitBoard(lines, period_s=PERIOD_S, link=link, fault_at=faults).run()):
-        kit = EitKit(zero_slots=ZERO_SLOTS, path=link, frame_period_s=PERIOD_S, on_event=events.append)
+        kit = EitKit(zero_slots=ZERO_SLOTS, path=link, frame_period_s=PERIOD_S, monitor=LinkMonitor(told))
         frames = await take(kit.readings(), n_frames)
-    return kit, frames, events
+    return kit, frames, told.events
 
 
 def assert_same(frames: list[Frame], lines: Iterable[NDArray[np.float64]]) -> None:
@@ -153,19 +153,12 @@ async def test_a_driver_that_begins_while_the_board_sends_takes_up_with_the_next
 
 
 async def test_a_board_that_is_not_there_is_awaited_and_told_of_once(tmp_path: Path) -> None:
-    events: list[LinkEvent] = []
-    missed_twice = asyncio.Event()
-
-    def note(event: LinkEvent) -> None:
-        events.append(event)
-        if len(events) == 2:
-            missed_twice.set()
-
-    kit = EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit", on_event=note)
+    told = LinkEvents()
+    kit = EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit", monitor=LinkMonitor(told))
     taking = asyncio.create_task(take(kit.readings(), 1))
-    await missed_twice.wait()
+    await told.down(2)
     async with running(EitKitBoard(some_lines(1), period_s=PERIOD_S, link=tmp_path / "eit").run()):
         (frame,) = await taking
     assert frame.seq == 0
-    assert [event.repeated for event in events if not event.up][:2] == [False, True]
-    assert "There is no serial port" in events[0].sentence
+    assert [event.repeated for event in told.losses][:2] == [False, True]
+    assert "There is no serial port" in told.events[0].sentence

@@ -15,13 +15,13 @@ from shearloop.bank.estimation import (
     Estimate,
     EstimatorSession,
     FrameSeries,
-    Name,
     Physics,
     TactileFrame,
     fit,
 )
 from shearloop.bank.estimation.bank_match import ElectrodeNumbering
 from shearloop.bank.estimation.fingertip_validator import channel_noise
+from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.analysis.bank_design import residual_noise
 from shearloop.daemon.analysis.charts.sources import Split
 from shearloop.daemon.workers import Executor, in_order
@@ -255,10 +255,10 @@ def sweep(tracker: EstimatorSession, scene: FaultScene, fault: FrameFault) -> Fa
             faulty = fault.apply(scene, level, np.random.default_rng((5, draw)))
             estimates += estimate_frames(tracker, faulty)
         levels.append(judge_level(estimates, np.tile(truth, draws), level))
-    return fault_curve(fault.name, fault.unit, tracker.calibration.estimator, levels)
+    return fault_curve(fault.name, fault.unit, tracker.calibration.estimator.name, levels)
 
 
-def fitted(split: Split, names: Sequence[Name], physics: Physics) -> list[Calibration]:
+def fitted(split: Split, names: Sequence[EstimatorName], physics: Physics) -> list[Calibration]:
     """Return the calibrations that the past allows; print the reason for each missing one."""
     found = []
     for name in names:
@@ -269,7 +269,9 @@ def fitted(split: Split, names: Sequence[Name], physics: Physics) -> list[Calibr
     return found
 
 
-def misaligned(split: Split, names: Sequence[Name], physics: Physics, shifts_s: Sequence[float]) -> list[FaultCurve]:
+def misaligned(
+    split: Split, names: Sequence[EstimatorName], physics: Physics, shifts_s: Sequence[float]
+) -> list[FaultCurve]:
     """Return curves of estimators calibrated on torques stamped too late by each shift.
 
     A refused calibration gives no valid estimate.
@@ -278,7 +280,7 @@ def misaligned(split: Split, names: Sequence[Name], physics: Physics, shifts_s: 
     judged = shortened(split.future)
     for shift in shifts_s:
         late = replace(split.past, torque_t_s=split.past.torque_t_s + shift)
-        calibrated = {one.estimator: one for one in fitted(replace(split, past=late), names, physics)}
+        calibrated = {one.estimator.name: one for one in fitted(replace(split, past=late), names, physics)}
         for name, found in levels.items():
             if name in calibrated:
                 estimates = estimate_frames(EstimatorSession(calibrated[name], physics.bank), FaultyFrames(judged))
@@ -310,7 +312,9 @@ def scene_for(split: Split, bank: Bank) -> FaultScene:
     return FaultScene(series, idle, float(np.median(channel_noise(split.past.channels[:, 0]))), foreign)
 
 
-def sweeps(split: Split, names: Sequence[Name], physics: Physics, bank: Bank, executor: Executor) -> list[FaultCurve]:
+def sweeps(
+    split: Split, names: Sequence[EstimatorName], physics: Physics, bank: Bank, executor: Executor
+) -> list[FaultCurve]:
     """Return the curves of all estimators through all faults; each estimator is one task for the workers."""
     tasks = fitted(split, names, physics)
     found = in_order(executor.map(sweep_estimator, (scene_for(split, bank), str(bank.path.resolve())), tasks))

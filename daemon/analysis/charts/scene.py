@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from shearloop.bank.eit.design import ALLOWED, Design, DesignChoice, MeasuredFrames, design_bank
 from shearloop.bank.eit.fingertip import Fingertip
-from shearloop.daemon.analysis.bank_design import choices_of, doubts, scene_of
+from shearloop.daemon.analysis.bank_design import doubts, scene_of
 from shearloop.daemon.analysis.charts.drawing import SHADES, figure, save, slug
 from shearloop.daemon.analysis.charts.sources import Split, own_fingertip
 from shearloop.daemon.workers import Executor, in_order
@@ -39,20 +39,19 @@ def designed_on(fingertip: Fingertip, scene: MeasuredFrames) -> Design:
 
 def write(title: str, design: Design, out: Path) -> list[Path]:
     """Draw and write a design."""
-    made = figure(15, 13)
-    grid = made.add_gridspec(3, 3, height_ratios=[1, 1, 0.95])
-    choices = choices_of(design)
-    for place, choice in zip(((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)), choices, strict=True):
-        _draw_choice(made.add_subplot(grid[place]), choice)
-    _draw_models(made.add_subplot(grid[2, 0]), design)
-    _draw_table(made.add_subplot(grid[2, 1:]), choices)
+    made = figure(17, 9)
+    grid = made.add_gridspec(2, 4)
+    for column, choice in enumerate(design.choices):
+        _draw_choice(made.add_subplot(grid[0, column]), choice)
+    _draw_models(made.add_subplot(grid[1, 0]), design)
+    _draw_table(made.add_subplot(grid[1, 1:]), design.choices)
     made.suptitle(
         f"How much model {title} needs: its noise is {design.relative_noise:.1%} of a difference frame; "
         "ring: the coarsest that adds less than a third of it",
         fontsize=13,
     )  # fmt: skip
     content = asdict(design) | {
-        "allowed": ALLOWED, "chosen": {one.name: asdict(one.chosen) | {"enough": one.enough} for one in choices},
+        "allowed": ALLOWED, "chosen": {one.name: asdict(one.chosen) | {"enough": one.enough} for one in design.choices},
     }  # fmt: skip
     return save(made, content, out, f"scene-{slug(title)}")
 

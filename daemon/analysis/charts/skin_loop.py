@@ -79,7 +79,7 @@ class SkinLoop:
         self.skin = SyntheticSkin(radius_mm=RADIUS_MM, normal_n=case.normal_n, seed=case.seed)
         configured_n = case.normal_n if case.configured_n is None else case.configured_n
         if not case.knows_friction:
-            calibration = replace(calibration, friction=0.0)
+            calibration = calibration.model_copy(update={"friction": 0.0})
         self.estimator = SkinEstimator(calibration, normal_n=configured_n)
         # The chart looks for the boundary, so every margin is allowed.
         config = LoopConfig(

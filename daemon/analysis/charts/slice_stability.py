@@ -19,7 +19,6 @@ from shearloop.bank.estimation import (
     Calibration,
     EstimatorSession,
     FrameSeries,
-    Name,
     Physics,
     TactileFrame,
     bank_match,
@@ -29,6 +28,7 @@ from shearloop.bank.estimation.bank_match import NOT_TURNED
 from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
 from shearloop.bank.estimation.novelty import NoveltyDetector, ReciprocityCheck
 from shearloop.bank.estimation.regressors import Ridge
+from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.analysis.charts.fault_sweeps import (
     FaultCurve,
     FaultLevel,
@@ -91,10 +91,10 @@ def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[Con
     }
     found = [ContinuityWalk(name, _read(split, locator, path), share) for name, locator in locators.items()]
     for calibration in calibrations:
-        if calibration.estimator in ("regression", "motion_regression"):
+        if not calibration.estimator.needs:
             tracker = EstimatorSession(calibration, bank)
             torque = [tracker.estimate(TactileFrame.of(0.0, one[None])).torque_nm for one in path]
-            found.append(ContinuityWalk(calibration.estimator, np.array(torque, dtype=float), share))
+            found.append(ContinuityWalk(calibration.estimator.name, np.array(torque, dtype=float), share))
     return found
 
 
@@ -160,7 +160,7 @@ def calibration_parts(torque_nm: FloatArray) -> dict[str, list[CalibrationPart]]
 
 
 def extrapolate(
-    split: Split, names: Sequence[Name], bank: Bank, mesh: Mesh | None, executor: Executor
+    split: Split, names: Sequence[EstimatorName], bank: Bank, mesh: Mesh | None, executor: Executor
 ) -> list[Extrapolation]:
     """Return each estimator beyond the torques it was calibrated on; each calibration is one task for the workers.
 
@@ -197,7 +197,7 @@ def select_rows(series: FrameSeries, rows: Rows) -> FrameSeries:
 Outcome = tuple[FaultLevel, float | None, str]
 
 
-def judge_others(shared: tuple[FrameSeries, str, Mesh | None], task: tuple[Name, CalibrationPart]) -> Outcome:
+def judge_others(shared: tuple[FrameSeries, str, Mesh | None], task: tuple[EstimatorName, CalibrationPart]) -> Outcome:
     """Return the figures and the median width of a part's judged slices, and the reason of a refused calibration."""
     (series, path, mesh), (name, part) = shared, task
     bank = Bank.open(path)
@@ -216,7 +216,7 @@ def judge_others(shared: tuple[FrameSeries, str, Mesh | None], task: tuple[Name,
 
 
 def _extrapolation(
-    title: str, which: str, name: Name, steps: Sequence[tuple[CalibrationPart, Outcome]]
+    title: str, which: str, name: EstimatorName, steps: Sequence[tuple[CalibrationPart, Outcome]]
 ) -> Extrapolation:
     for part, (_, _, refusal) in steps:
         if refusal:
@@ -351,7 +351,7 @@ def sweep_rims(calibrations: Sequence[Calibration], bank: Bank, scratch: Path) -
                 judge_level(estimate_frames(tracker, FaultyFrames(one)), one.torque_nm, level)
                 for level, one in zip(rim.levels, series, strict=True)
             ]
-            yield fault_curve(rim.name, rim.unit, tracker.calibration.estimator, levels)
+            yield fault_curve(rim.name, rim.unit, tracker.calibration.estimator.name, levels)
 
 
 def _series(synthesiser: Synthesiser, homogeneous: FloatArray, k: float, sigma: float) -> FrameSeries:

@@ -18,10 +18,11 @@ from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatche
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.bank.errors import BankError
-from shearloop.bank.estimation import Calibration, FrameSeries, Name, Physics, fit, measure_timing
+from shearloop.bank.estimation import Calibration, FrameSeries, Physics, fit, measure_timing
 from shearloop.bank.estimation.bank_match import NOT_TURNED, RefinedMatcher
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor, fit_interval_regressor
 from shearloop.bank.estimation.regressors import Ridge, ranked_channels
+from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.analysis.charts import drawing
 from shearloop.daemon.analysis.charts.drawing import LINES, MARKS, SHADES
 from shearloop.daemon.analysis.charts.forward_methods import CELLS, SolvedForward, forward_methods
@@ -30,7 +31,7 @@ from shearloop.daemon.analysis.charts.sources import Split
 from shearloop.daemon.analysis.evaluate import estimate_series
 
 Single = NDArray[np.float32]
-_ESTIMATORS: tuple[Name, ...] = ("bank", "regression", "reconstruction", "motion_regression")
+_ESTIMATORS: tuple[EstimatorName, ...] = ("bank", "regression", "reconstruction", "motion_regression")
 RANKS = (4, 8, 16, 32, 64, 128)
 CHANNEL_COUNTS = (8, 16, 32, 64, 128, 272, 512)
 # The paper's polynomial needs no regularisation.

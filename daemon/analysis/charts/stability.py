@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.mesh import Mesh
-from shearloop.bank.estimation import Name, Physics
+from shearloop.bank.estimation import Physics
+from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.analysis.charts import skin_loop, slice_stability
 from shearloop.daemon.analysis.charts.drawing import SHADES, figure, look, save, slug
 from shearloop.daemon.analysis.charts.fault_sweeps import BROKEN_SHARE, FaultCurve, fitted, misaligned, sweeps
@@ -21,8 +22,8 @@ from shearloop.daemon.analysis.charts.sources import Split, splits
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.workers import Executor
 
-SLICE_NAMES: tuple[Name, ...] = ("paper", "bank", "regression", "reconstruction", "motion_regression")
-STREAM_NAMES: tuple[Name, ...] = ("bank", "regression", "motion_regression")
+SLICE_NAMES: tuple[EstimatorName, ...] = ("paper", "bank", "regression", "reconstruction", "motion_regression")
+STREAM_NAMES: tuple[EstimatorName, ...] = ("bank", "regression", "motion_regression")
 SHIFTS_S = (-0.54, -0.27, -0.13, 0.0, 0.13, 0.27, 0.54, 1.08)
 
 

@@ -10,20 +10,20 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import channels_of_line, smoothed_along_channels
-from shearloop.bank.eit.forward import ForwardModel
-from shearloop.bank.eit.matching import Match, ReferenceMatcher, best_match
-from shearloop.bank.eit.mesh import Mesh
-from shearloop.bank.eit.model_scores import (
+from shearloop.bank.eit.design import (
     centred_settings,
     matching_scores,
     mean_envelope_score,
     searched_settings,
     simulated_signals,
 )
+from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.matching import Match, ReferenceMatcher, best_match
+from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS
-from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError, MatchingError
 from shearloop.bank.estimation.calibration import DIAMETER_DEGREE, TORQUE_DEGREE
+from shearloop.bank.polynomial import Polynomial
 from shearloop.daemon.analysis.reproduce.grouping import group_means, kmeans_groups, place_in_series
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.matlab import (

@@ -16,9 +16,9 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.matching import Match
 from shearloop.bank.eit.models import MODELS
-from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration
+from shearloop.bank.polynomial import Polynomial
 from shearloop.daemon.analysis.charts.drawing import figure, lay_out
 from shearloop.daemon.analysis.reproduce.analysis import DiameterResult, Matches, ModelScores, TorqueResult
 

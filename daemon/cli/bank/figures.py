@@ -118,7 +118,7 @@ def models_figure(mesh: Mesh) -> Figure:
         curve.axvline(0, color=_GREY, linewidth=0.6)
         curve.set(xlim=(-1.1, 1.1), ylim=(low[1], high[1]), ylabel="y (cm)")
         parameters = [f"k = {k:.3g} {basis.k_unit}"]
-        if basis.sigma_unit != "not used":
+        if basis.uses_sigma:
             parameters.append(f"σ = {sigma:.3g} {basis.sigma_unit}")
         curve.set_title(f"{basis.title}: {', '.join(parameters)}", fontsize=9, loc="left")
         drawn = plane.tripcolor(

@@ -45,11 +45,10 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
     from shearloop.drivers.calibration_files import save_calibration
-    from shearloop.drivers.robotiq.gripper import RobotiqGripper
+    from shearloop.drivers.robotiq.gripper import STROKE_MM, RobotiqGripper, WidthCalibration
     from shearloop.drivers.robotiq.messages import GripperClient
     from shearloop.drivers.robotiq.modbus_client import ModbusClient
     from shearloop.drivers.robotiq.socket_client import SocketClient
-    from shearloop.drivers.robotiq.width import STROKE_MM, WidthCalibration
 
     if any(not 0 < diameter < STROKE_MM for diameter in args.diameter_mm) or len(set(args.diameter_mm)) < 2:
         raise UserError(f"give at least two different --diameter-mm between 0 and {STROKE_MM:g}")
@@ -108,8 +107,8 @@ async def _grip(
 
 async def _contact(gripper: "RobotiqGripper", force_n: float) -> int | None:
     """Close and open; return the position of the contact, or None without one."""
+    from shearloop.drivers.robotiq.gripper import STROKE_MM
     from shearloop.drivers.robotiq.messages import SPEED_MIN_MM_S, GripperCommand, ObjectStatus
-    from shearloop.drivers.robotiq.width import STROKE_MM
 
     # Beyond the fingers' stop: reaching the target is never a contact.
     closed = await gripper.finish(await gripper.move(GripperCommand(-STROKE_MM, SPEED_MIN_MM_S, force_n)))

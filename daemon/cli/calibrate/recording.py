@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from shearloop.bank.estimators import DEFAULT, ESTIMATORS
 from shearloop.daemon.cli.options import add_json, check_overwrite
 from shearloop.daemon.cli.terminal import print_result
 
@@ -14,7 +15,6 @@ if TYPE_CHECKING:
 
 # A larger delay belongs to another recording.
 _LARGEST_DELAY_S = 600.0
-ESTIMATORS = ("motion_regression", "regression", "bank", "paper", "reconstruction")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -23,7 +23,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "recordings", nargs="+", type=Path, metavar="REC", help="recordings (.mcap) or folders of slices, oldest first"
     )
     parser.add_argument(
-        "--estimator", choices=ESTIMATORS, default=ESTIMATORS[0], help="estimator to calibrate (default: %(default)s)"
+        "--estimator", choices=ESTIMATORS, default=DEFAULT, help="estimator to calibrate (default: %(default)s)"
     )
     parser.add_argument("--out", type=Path, required=True, metavar="CAL", help="calibration to write")
     parser.add_argument("--bank", type=Path, metavar="FILE", help="a bank, which the estimators paper and bank need")
@@ -96,7 +96,7 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
     """Return what the user should know of a calibration."""
     calibration, regressor, timing = result.calibration, result.regressor, result.timing
     sentences = [
-        f"Estimator {calibration.estimator}, {' and '.join(result.quantities)} from {result.frames} frames of the "
+        f"Estimator {calibration.estimator.name}, {' and '.join(result.quantities)} from {result.frames} frames of the "
         f"{' and '.join(calibration.sides)} side."
     ]
     if regressor is not None and regressor.misses_loads:
@@ -127,7 +127,7 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
 
 def _misses_loads(regressor: "IntervalRegressor", calibration: "Calibration") -> str:
     low_nm, high_nm = (round(limit, 3) + 0.0 for limit in (regressor.low, regressor.high))
-    others = [] if calibration.estimator == ESTIMATORS[0] else [f"with --estimator {ESTIMATORS[0]}"]
+    others = [] if calibration.estimator.name == DEFAULT else [f"with --estimator {DEFAULT}"]
     others += ["on both fingertips"] if len(calibration.sides) == 1 else []
     cure = f"Calibrate {' or '.join(others)}, or record" if others else "Record"
     return (

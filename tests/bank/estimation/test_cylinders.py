@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.estimation import TRUSTED, EstimatorSession, fit
-from shearloop.bank.estimation.fitting_raw import CylinderGrip, fit_cylinders, fit_line
+from shearloop.bank.estimation.motion_regression import CylinderGrip, fit_cylinders, fit_line
 from shearloop.bank.estimation.regressors import Ridge
 from tests.bank.estimation.conftest import follow
 

@@ -5,7 +5,7 @@ import pytest
 
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS
 from shearloop.bank.estimation import Estimate, EstimatorSession, FrameSeries, TactileFrame
-from shearloop.bank.estimation.session_state import SessionState
+from shearloop.bank.estimation.session_state import Motion, SessionState
 from tests.bank.estimation.conftest import IDLE_S, PERIOD_S
 
 GRIPPED = round(IDLE_S / PERIOD_S) + 2
@@ -58,7 +58,7 @@ def test_channels_that_come_back_while_idle_are_used_from_then_on(
     motion_calibration, twisting, with_motion, kind
 ) -> None:
     calibration, series = motion_calibration, twisting(seed=3, cycles=2)
-    motion = calibration.temporal if with_motion else None
+    motion = calibration.estimator.motion if with_motion else Motion()
     memory = SessionState(calibration.validators, motion, period_s=PERIOD_S)
     moments = [memory.process(frame) for frame in without(slice(0, 12), kind, series)]
     whole = SessionState(calibration.validators, motion, period_s=PERIOD_S)

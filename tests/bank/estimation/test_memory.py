@@ -24,7 +24,7 @@ def like(motion_calibration):
 def test_a_frame_from_before_a_zero_is_not_one_of_the_last_frames(motion_calibration, like):
     """A zero that is asked for while a tool is held, which is let go and gripped again before it is complete."""
     tracker, told = EstimatorSession(motion_calibration), []
-    n_lags = motion_calibration.temporal.n_lags
+    n_lags = motion_calibration.estimator.motion.n_lags
     before = [*np.zeros(12), *UP, *np.ones(n_lags)]
     for i, share in enumerate([*before, *DOWN, *UP, *np.ones(n_lags + 1)]):
         if i == len(before):
@@ -49,7 +49,7 @@ def test_a_grip_a_third_as_strong_as_the_one_before_the_zero_is_one(motion_calib
 
 def test_a_zero_during_which_a_tool_is_let_go_begins_anew(motion_calibration, like):
     """The mean of gripped and idle frames was taken for an idle one, and what was gripped next was read from there."""
-    memory = SessionState(motion_calibration.validators, motion_calibration.temporal, idle_frames=8)
+    memory = SessionState(motion_calibration.validators, motion_calibration.estimator.motion, idle_frames=8)
     told = [memory.process(like(0.5 * i, share)).reasons for i, share in enumerate([1, 1, 1, 1, 1, *np.zeros(9)])]
     assert [why[0] for why in told[2:5]] == [f"taking the homogeneous frame, {n} of 8" for n in (3, 4, 5)]
     assert all("jumped" in why[0] for why in told[5:7])
@@ -64,7 +64,7 @@ def test_a_zero_during_which_a_tool_is_let_go_begins_anew(motion_calibration, li
 @pytest.mark.parametrize("step_s", [1.5, 20.0, -5.0])
 def test_a_zero_in_whose_gap_a_tool_is_let_go_or_gripped_begins_anew(motion_calibration, like, first, then, step_s):
     """After frames that were lost the next one was compared with none before, and half of the zero was of a tool."""
-    memory = SessionState(motion_calibration.validators, motion_calibration.temporal, idle_frames=8)
+    memory = SessionState(motion_calibration.validators, motion_calibration.estimator.motion, idle_frames=8)
     for i in range(5):
         memory.process(like(0.5 * i, first))
     told = [memory.process(like(2.0 + step_s + 0.5 * i, then)).reasons for i in range(9)]
@@ -74,7 +74,7 @@ def test_a_zero_in_whose_gap_a_tool_is_let_go_or_gripped_begins_anew(motion_cali
 
 
 def test_a_zero_with_a_gap_in_which_nothing_happens_goes_on(motion_calibration, like):
-    memory = SessionState(motion_calibration.validators, motion_calibration.temporal, idle_frames=8)
+    memory = SessionState(motion_calibration.validators, motion_calibration.estimator.motion, idle_frames=8)
     for i in range(8):
         memory.process(like(0.5 * i + 20.0 * (i > 4), 0.0))
     assert not memory.taring
@@ -82,7 +82,7 @@ def test_a_zero_with_a_gap_in_which_nothing_happens_goes_on(motion_calibration, 
 
 def test_a_zero_of_two_frames_is_a_baseline_for_a_weak_grip(motion_calibration, like):
     """With fewer than five idle frames only an outright grip was one, and others were taken for idle."""
-    memory = SessionState(motion_calibration.validators, motion_calibration.temporal, idle_frames=2)
+    memory = SessionState(motion_calibration.validators, motion_calibration.estimator.motion, idle_frames=2)
     seen = [memory.process(like(0.5 * i, share)) for i, share in enumerate([0, 0, *np.full(18, 0.3)])]
     assert not seen[-1].reasons
     steps = np.array([guard.gripped - guard.idle for guard in motion_calibration.validators])
@@ -146,7 +146,7 @@ def sessions(draw):
 
 def test_what_is_valid_is_of_one_grip_and_hardly_made_up(motion_calibration):
     """Against a plain account of what happened: whatever frames are lost or spoilt, and whatever happens meanwhile."""
-    guards, motion = motion_calibration.validators, motion_calibration.temporal
+    guards, motion = motion_calibration.validators, motion_calibration.estimator.motion
     idle, gripped = (np.array([getattr(guard, name) for guard in guards]) for name in ("idle", "gripped"))
     begun = [*[("good", False)] * 12, ("good", True), *[("good", False)] * 14]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import TRUSTED, EstimatorSession, Measured, TactileFrame, fit, fitting, fitting_raw
+from shearloop.bank.estimation import TRUSTED, EstimatorSession, Measured, TactileFrame, fit, fitting
 from tests.bank.estimation.conftest import follow
 
 
@@ -208,7 +208,7 @@ def test_a_session_that_begins_with_a_spoilt_frame_gets_over_it(motion_calibrati
 
 def test_the_tool_of_a_calibration_is_the_one_that_the_gripper_held(recorded, monkeypatch):
     """Two grips of one tool differ by less than the gripper can tell; two tools are not one."""
-    monkeypatch.setattr(fitting, "fit_raw", lambda blank, *_: blank)
+    monkeypatch.setattr(fitting, "_fit_raw", lambda blank, *_: blank)
 
     def named(*held):
         series = [replace(recorded, gripper_mm=tool) for tool in held]
@@ -220,7 +220,7 @@ def test_the_tool_of_a_calibration_is_the_one_that_the_gripper_held(recorded, mo
 
 
 def test_tools_that_turn_differently_give_no_torque_where_their_diameters_are_only_felt(twisting, monkeypatch):
-    monkeypatch.setattr(fitting_raw, "_TOOLS_MAY_LEAVE", 0.0)
+    monkeypatch.setattr(fitting, "_TOOLS_MAY_LEAVE", 0.0)
     short = [replace(twisting(cycles=3, tips=(0,)), gripper_mm=Measured(mm, 1.0)) for mm in (10.0, 20.0)]
     with pytest.raises(CalibrationError, match="the tools of 10 and 20 mm turn so differently"):
         fit("motion_regression", short, "rig", timing=TRUSTED)

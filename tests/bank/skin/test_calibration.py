@@ -16,8 +16,8 @@ from shearloop.bank.skin.calibration import (
     read_table,
     save_calibration,
 )
+from shearloop.bank.skin.characterisation import loading, loop
 from shearloop.bank.skin.membrane import UNSTRETCHED, Direction, Membrane, paper_membrane
-from shearloop.bank.skin.statistics import loading, loop
 
 MEMBRANE = paper_membrane()
 R1, R2 = 24.6, 25.3
@@ -108,7 +108,17 @@ def test_without_direction_the_interval_is_wider_and_holds_the_force(path: list[
 def exact_calibration() -> SkinCalibration:
     knots = (-5.0, -1.2, 1.2, 5.0)
     angle = float(np.degrees(MEMBRANE.gauge_angle_rad))
-    return SkinCalibration(0.04, angle, 1.2, knots, tuple(map(upturn, knots)), 1e-4, 100, 0, (R1, R2))
+    return SkinCalibration(
+        friction=0.04,
+        gauge_angle_deg=angle,
+        linear_to_n=1.2,
+        tension_n=knots,
+        response=tuple(map(upturn, knots)),
+        response_half_width=1e-4,
+        rows=100,
+        rows_beyond=0,
+        rest_ohm=(R1, R2),
+    )
 
 
 def test_the_deadband_is_taken_out_only_where_the_direction_is_known(calibration: SkinCalibration) -> None:
@@ -189,7 +199,7 @@ def test_a_calibration_comes_back_from_its_file(calibration: SkinCalibration, tm
         ("rows_beyond: 0", "rows_beyond: 0\ncolour: red", "colour"),
         ("linear_to_n: 1.2\n", "", "linear_to_n"),
         ("calibration 1", "calibration 2", "format"),
-        ("- -1.2", "- 1.3", "tension_n must rise"),
+        ("- -1.2", "- 1.3", "tension_n` must rise"),
         ("rows: 100", "rows: [", r"line \d+, column \d+: "),
     ],
 )

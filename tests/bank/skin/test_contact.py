@@ -8,7 +8,8 @@ import pytest
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.skin import membrane as membrane_model
-from shearloop.bank.skin.membrane import GAUGE_FACTOR, Section, response_of_strains, section_membrane
+from shearloop.bank.skin.characterisation import fit_line, loading, loop, origin_slope, responses
+from shearloop.bank.skin.membrane import GAUGE_FACTOR, Section, section_membrane
 from shearloop.bank.skin.membrane import PAPER_SECTION as SECTION
 from shearloop.bank.skin.plane_strain import (
     CondensedSkin,
@@ -17,13 +18,13 @@ from shearloop.bank.skin.plane_strain import (
     MeshSize,
     apply_load,
     condense,
+    gauge_responses,
     gauge_strains,
     midline_strain,
     solve_contact,
     states_along,
     unloaded,
 )
-from shearloop.bank.skin.statistics import fit_line, loading, loop, origin_slope, responses
 
 NORMAL_FORCES = (0.5, 1.0, 1.5, 2.0)
 
@@ -34,10 +35,6 @@ def loadings(skin_112: CondensedSkin) -> dict[float, list[ContactState]]:
     return {normal_n: states_along(skin_112, normal_n, loading(normal_n)) for normal_n in NORMAL_FORCES}
 
 
-def responses_of(skin: CondensedSkin, states: list[ContactState]) -> FloatArray:
-    return response_of_strains(*gauge_strains(skin, states).T)
-
-
 def shears(states: list[ContactState]) -> FloatArray:
     return np.array([state.shear_n for state in states])
 
@@ -46,7 +43,7 @@ def test_its_sensitivity_is_the_paper_s_within_20_percent_without_tuning(
     skin_112: CondensedSkin, loadings: dict[float, list[ContactState]]
 ) -> None:
     for states in loadings.values():
-        response = responses_of(skin_112, states)
+        response = gauge_responses(skin_112, states)
         for found in (fit_line(shears(states), response).slope_per_n, origin_slope(shears(states), response)):
             assert 0.085 <= found <= 0.090
             assert found == pytest.approx(0.078, rel=0.2)
@@ -56,20 +53,20 @@ def test_its_sensitivity_does_not_depend_on_the_normal_force(
     skin_112: CondensedSkin, loadings: dict[float, list[ContactState]]
 ) -> None:
     for estimate in (origin_slope, lambda x, y: fit_line(x, y).slope_per_n):
-        found = [estimate(shears(states), responses_of(skin_112, states)) for states in loadings.values()]
+        found = [estimate(shears(states), gauge_responses(skin_112, states)) for states in loadings.values()]
         assert np.ptp(found) < 0.005 * np.mean(found)
 
 
 def test_it_begins_to_respond_at_the_paper_s_0_04_newton(
     skin_112: CondensedSkin, loadings: dict[float, list[ContactState]]
 ) -> None:
-    line = fit_line(shears(loadings[1.0]), responses_of(skin_112, loadings[1.0]))
+    line = fit_line(shears(loadings[1.0]), gauge_responses(skin_112, loadings[1.0]))
     kink_n = -line.offset / line.slope_per_n
     assert kink_n == pytest.approx(0.040, abs=0.005)
     assert kink_n == pytest.approx(membrane_model.deadband_n(SECTION, 1.0), rel=0.02)
     # And seen from near by: before it only the loaded patch itself gives way, behind it is the full slope.
     fine = np.arange(1, 13) * 0.01
-    response = responses_of(skin_112, states_along(skin_112, 1.0, fine))
+    response = gauge_responses(skin_112, states_along(skin_112, 1.0, fine))
     slopes = np.diff(response) / 0.01 / line.slope_per_n
     assert abs(slopes[fine[1:] < 0.0301]).max() < 0.1
     assert slopes[fine[1:] > 0.0499] == pytest.approx(1.0, abs=0.03)
@@ -91,7 +88,7 @@ def test_the_compressed_side_lifts_off_and_hardly_responds(
         strain_1, strain_2 = gauge_strains(skin_112, states)[-1]
         assert strain_2 < 0 < strain_1
         assert abs(strain_2 / strain_1) < 0.15
-        touching = states[-1].touching
+        touching = states[-1].contact_force_n[: len(skin_112.contact_deg)] > 0
         compressed, stretched = skin_112.contact_deg > 95, (skin_112.contact_deg > 5) & (skin_112.contact_deg < 85)
         assert touching[compressed].mean() < 0.1
         assert touching[stretched].mean() > 0.95
@@ -100,7 +97,7 @@ def test_the_compressed_side_lifts_off_and_hardly_responds(
 def test_there_is_no_response_to_normal_force_alone(skin_112: CondensedSkin) -> None:
     for normal_n in NORMAL_FORCES:
         pressed = apply_load(skin_112, unloaded(skin_112), normal_n, 0.0)
-        assert abs(responses_of(skin_112, [pressed])).max() < 1e-6
+        assert abs(gauge_responses(skin_112, [pressed])).max() < 1e-6
         under_load = abs(skin_112.midline_deg - 90) < 5
         strain = abs(midline_strain(skin_112, pressed))
         assert strain[under_load].max() > 50 * strain[~under_load & (abs(skin_112.midline_deg - 90) > 20)].max()
@@ -121,7 +118,7 @@ def test_it_agrees_with_the_closed_form_within_one_percent(changed: dict[str, fl
     section = replace(SECTION, **changed)
     skin = condense(section)
     states = states_along(skin, 1.0, loading(1.0))
-    slope = fit_line(shears(states), responses_of(skin, states)).slope_per_n
+    slope = fit_line(shears(states), gauge_responses(skin, states)).slope_per_n
     assert slope == pytest.approx(membrane_model.sensitivity_per_n(section), rel=tolerance)
 
 
@@ -134,7 +131,7 @@ def test_beyond_the_paper_s_friction_the_closed_form_holds_with_friction_where_i
     skin = condense(section)
     # From half of the load on, well beyond the deadband.
     states = states_along(skin, 1.0, loading(1.0))[5:]
-    both = fit_line(shears(states), responses_of(skin, states)).slope_per_n
+    both = fit_line(shears(states), gauge_responses(skin, states)).slope_per_n
     slack = -2 * fit_line(shears(states), gauge_strains(skin, states)[:, 1]).slope_per_n
     smooth = membrane_model.sensitivity_per_n(replace(section, friction=0.0))
     on_core = friction * section.gauge_angle_rad * section.inner_radius_mm / section.mid_radius_mm
@@ -230,12 +227,13 @@ def test_it_converges_from_random_starts_and_in_one_jump(skin_112: CondensedSkin
     rng = np.random.default_rng(1)
     n = len(skin_112.contact_deg)
     for normal_n, shear_n in [(1.0, 0.0), (1.0, 1.0), (2.0, -1.5), (0.5, 3.0)]:
+        free = skin_112.load_displacement @ (normal_n, shear_n)
         jumps = [
-            apply_load(skin_112, unloaded(skin_112), normal_n, shear_n, friction=friction, start_force_n=start)
+            solve_contact(skin_112.compliance, free, np.zeros(n), friction, start)
             for start in [np.zeros(2 * n), *rng.normal(0, (0.01, 1, 10), (2 * n, 3)).T]
         ]
         for jump in jumps[1:]:
-            np.testing.assert_allclose(jump.contact_force_n, jumps[0].contact_force_n, atol=1e-12)
+            np.testing.assert_allclose(jump, jumps[0], atol=1e-12)
 
 
 def test_one_jump_ends_where_small_steps_do_while_the_load_only_rises(
@@ -243,7 +241,7 @@ def test_one_jump_ends_where_small_steps_do_while_the_load_only_rises(
 ) -> None:
     pressed = apply_load(skin_112, unloaded(skin_112), 1.0, 0.0)
     jump = apply_load(skin_112, pressed, 1.0, 1.0)
-    found = responses_of(skin_112, [jump, loadings[1.0][-1]])
+    found = gauge_responses(skin_112, [jump, loadings[1.0][-1]])
     assert found[0] == pytest.approx(found[1], rel=1e-6)
 
 
@@ -261,20 +259,10 @@ def test_random_histories_of_slip_do_not_stop_it() -> None:
         assert force[:n].min() >= 0
 
 
-@pytest.mark.parametrize(
-    ("changed", "friction", "normal_n"),
-    [
-        ({"thickness_mm": 6.0}, 0.04, 5.0),
-        ({"poisson_ratio": 0.4999}, 1.0, 1.0),
-        ({"thickness_mm": 0.05}, 0.04, 1.0),
-    ],
-)
-def test_a_loop_is_followed_far_from_the_paper_s_section(
-    changed: dict[str, float], friction: float, normal_n: float
-) -> None:
-    """In the first two a guess leads round in a circle, and only another start leads out of it."""
-    skin = condense(replace(SECTION, **changed, friction=friction))
-    for state in states_along(skin, normal_n, loop(1.0)[:13]):
+@pytest.mark.parametrize(("thickness_mm", "friction"), [(0.05, 0.04), (0.7, 1.0)])
+def test_a_loop_is_followed_far_from_the_paper_s_section(thickness_mm: float, friction: float) -> None:
+    skin = condense(replace(SECTION, thickness_mm=thickness_mm, friction=friction))
+    for state in states_along(skin, 1.0, loop(1.0)[:13]):
         gap, pressing, along = gaps_and_forces(skin, state)
         free = skin.load_displacement @ (state.normal_n, state.shear_n)
         scale = abs(state.contact_force_n).max()
@@ -288,29 +276,16 @@ def test_numbers_that_are_none_are_refused_not_returned(skin_112: CondensedSkin)
         apply_load(skin_112, unloaded(skin_112), float("nan"), 0.0)
 
 
-def test_the_load_s_movement_converges_from_below_at_the_rate_of_the_clamps_corners() -> None:
-    """At a clamp's corner stress is singular; the work done converges between linearly and quadratically."""
-    moved = []
-    for times in (1, 2, 4):
-        skin = condense(SECTION, MeshSize(2, 3, 4, 1, 2).refined(times))
-        state = states_along(skin, 1.0, loading(1.0))[-1]
-        moved.append(skin.load_movement_mm(state.contact_force_n, 1.0, 1.0))
-    steps = np.diff(moved, axis=0)
-    assert (steps > 0).all(), "a coarser skin is a stiffer one"
-    rates = np.log2(steps[0] / steps[1])
-    assert ((rates > 1.3) & (rates < 2.5)).all(), rates
-
-
 def test_the_response_converges_long_before_the_corners_do(skin_112: CondensedSkin) -> None:
     fine = condense(SECTION, MeshSize(10, 18, 26, 4, 4))
     path = loading(1.0)[2::3]  # growing loads need no steps in between
-    found = [responses_of(skin, states_along(skin, 1.0, path)) for skin in (skin_112, fine)]
+    found = [gauge_responses(skin, states_along(skin, 1.0, path)) for skin in (skin_112, fine)]
     np.testing.assert_allclose(found[0], found[1], rtol=1e-3, atol=1e-5)
 
 
 def test_its_hysteresis_is_that_of_the_membrane(skin_112: CondensedSkin) -> None:
     path = loop(1.0)
-    two = responses_of(skin_112, states_along(skin_112, 1.0, path))
+    two = gauge_responses(skin_112, states_along(skin_112, 1.0, path))
     assert abs(responses(section_membrane(), path, 1.0) - two).max() < 0.03 * abs(two).max()
     # Unloading runs above loading: by the play, 2 μ F_n, and by the capstan's e^(2μφ).
     up, down = path.tolist().index(0.5), len(loading(1.0)) + 4

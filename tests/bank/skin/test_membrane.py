@@ -7,20 +7,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.bank.errors import CalibrationError, GeometryError
+from shearloop.bank.skin.characterisation import loading, origin_slope, responses
 from shearloop.bank.skin.membrane import (
+    EXCITATION_A,
+    GAUGE_RESISTANCE_OHM,
     UNSTRETCHED,
     Direction,
-    Gauge,
     Membrane,
     MembraneState,
     Section,
+    ShearInterval,
     direction_of,
+    joule_heating_k,
     measured_response,
     paper_membrane,
-    response_of_strains,
     section_membrane,
 )
-from shearloop.bank.skin.statistics import loading, origin_slope, responses
 
 MEMBRANE = paper_membrane()
 CAPSTAN = math.exp(-MEMBRANE.friction * MEMBRANE.gauge_angle_rad)
@@ -32,6 +34,11 @@ def walk(path: list[tuple[float, float]], membrane: Membrane = MEMBRANE) -> list
     for shear_n, normal_n in path:
         states.append(membrane.step(states[-1], shear_n, normal_n))
     return states[1:]
+
+
+def force(response: float, normal_n: float, direction: Direction = Direction.UNKNOWN) -> ShearInterval:
+    tension = response / 0.088
+    return MEMBRANE.shear_from_tensions(tension, tension, tension, normal_n, direction)
 
 
 def test_without_friction_it_is_the_paper_s_0_088_per_newton() -> None:
@@ -126,18 +133,18 @@ def test_the_inverse_is_exact_while_the_force_rises_and_while_it_falls_past_the_
     normal_n = 1.0
     up = walk([(s, normal_n) for s in (0.3, 0.9, 1.5)])
     for state, shear_n in zip(up, (0.3, 0.9, 1.5), strict=True):
-        found = MEMBRANE.shear_from_response(MEMBRANE.response(state), normal_n, Direction.LOADING)
+        found = force(MEMBRANE.response(state), normal_n, Direction.LOADING)
         assert found == pytest.approx((shear_n, shear_n, shear_n))
     for shear_n in (1.2, 0.5, 0.2):
         state = MEMBRANE.step(up[-1], shear_n, normal_n)
-        found = MEMBRANE.shear_from_response(MEMBRANE.response(state), normal_n, Direction.UNLOADING)
+        found = force(MEMBRANE.response(state), normal_n, Direction.UNLOADING)
         assert found == pytest.approx((shear_n, shear_n, shear_n))
 
 
 @given(forces)
 def test_the_interval_holds_the_force_whatever_came_before(path: list[tuple[float, float]]) -> None:
     for state, (shear_n, normal_n) in zip(walk(path), path, strict=True):
-        found = MEMBRANE.shear_from_response(MEMBRANE.response(state), normal_n)
+        found = force(MEMBRANE.response(state), normal_n)
         assert found.low_n - 1e-9 <= shear_n <= found.high_n + 1e-9
         assert found.low_n <= found.shear_n <= found.high_n
 
@@ -149,22 +156,22 @@ def test_a_change_of_response_tells_the_direction_and_with_it_the_force(path: li
         now = MEMBRANE.response(state)
         direction = direction_of(before, now, 1e-9)
         if direction is not Direction.UNKNOWN and now != 0:
-            found = MEMBRANE.shear_from_response(now, normal_n, direction)
+            found = force(now, normal_n, direction)
             assert found.shear_n == pytest.approx(shear_n, abs=1e-6)
         before = now
 
 
 def test_without_response_the_force_is_anything_within_the_deadband() -> None:
     for direction in Direction:
-        found = MEMBRANE.shear_from_response(0.0, 1.0, direction)
+        found = force(0.0, 1.0, direction)
         assert found == pytest.approx((0.0, -0.04, 0.04))
         assert found.in_deadband
-    assert not MEMBRANE.shear_from_response(0.05, 1.0).in_deadband
+    assert not force(0.05, 1.0).in_deadband
 
 
 def test_an_unknown_direction_costs_the_deadband_on_both_sides_and_the_capstan() -> None:
     response = 0.0462
-    found = MEMBRANE.shear_from_response(response, 1.0)
+    found = force(response, 1.0)
     tension = response / 0.088
     assert found.low_n == pytest.approx(tension * CAPSTAN - 0.04)
     assert found.high_n == pytest.approx(tension / CAPSTAN + 0.04)
@@ -177,17 +184,15 @@ def test_a_belt_that_cannot_be_is_refused() -> None:
 
 
 def test_the_paper_s_gauge_has_25_ohm_and_stays_within_5_kelvin() -> None:
-    channel = Gauge()
-    assert channel.resistance_ohm == pytest.approx(25.0, rel=0.02)
-    assert channel.power_at_current_w(5e-3) == pytest.approx(5e-3**2 * channel.resistance_ohm)
-    assert 0 < channel.joule_heating_k() < 5.0
+    assert pytest.approx(25.0, rel=0.02) == GAUGE_RESISTANCE_OHM
+    assert 0 < joule_heating_k(EXCITATION_A**2 * GAUGE_RESISTANCE_OHM) < 5.0
 
 
 def test_equation_1_takes_resistances_to_the_difference_of_strains() -> None:
     strain_1, strain_2 = np.array([0.03, 0.0]), np.array([-0.002, 0.01])
     r1, r2 = 24.0 * (1 + 2 * strain_1), 26.0 * (1 + 2 * strain_2)
     measured = measured_response(r1, r2, 24.0, 26.0)
-    np.testing.assert_allclose(measured, response_of_strains(strain_1, strain_2), atol=1e-15)
+    np.testing.assert_allclose(measured, 2 * (strain_1 - strain_2), atol=1e-15)
 
 
 @pytest.mark.parametrize("unloaded", [(0.0, 25.0), (25.0, -1.0), (float("nan"), 25.0)])

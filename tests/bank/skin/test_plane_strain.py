@@ -111,14 +111,6 @@ def test_condensation_only_leaves_out_what_was_eliminated(skin_112: CondensedSki
         assert abs(expected) > 1e-3
 
 
-def test_the_load_moves_as_the_work_it_does(skin_112: CondensedSkin) -> None:
-    nothing = np.zeros(2 * len(skin_112.contact_deg))
-    movement = skin_112.load_movement_mm(nothing, 0.0, 1.0)
-    assert movement[1] > 0
-    assert abs(movement[0]) < 1e-9 * movement[1], "by symmetry"
-    np.testing.assert_allclose(skin_112.load_compliance, skin_112.load_compliance.T, rtol=1e-9, atol=1e-9)
-
-
 @pytest.mark.parametrize("wrong", [(0, 1, 1, 1, 2), (1, 1, 1, 1, 1), (1, 1, 1, 1, 3)])
 def test_a_mesh_without_a_mid_line_is_refused(wrong: tuple[int, int, int, int, int]) -> None:
     with pytest.raises(GeometryError, match="even number of layers"):

@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.skin import statistics
+from shearloop.bank.skin.characterisation import (
+    SkinFigures,
+    estimated_figures,
+    fit_line,
+    loading,
+    loop,
+    noise_floor_n,
+    responses,
+)
 from shearloop.bank.skin.membrane import paper_membrane
-from shearloop.bank.skin.statistics import SkinFigures, estimated_figures, loading, loop, responses
 
 RNG_SEED = 20
 
@@ -18,29 +25,24 @@ def test_the_noise_floor_is_the_noise_put_in_and_not_the_wandering_between_windo
     time_s = np.arange(0, 600, 0.1)
     wandering = 0.05 * np.floor(time_s) / 600
     still = wandering + rng.normal(0, 2e-4, len(time_s))
-    assert statistics.noise_floor_n(time_s, still, 0.08) == pytest.approx(2e-4 / 0.08, rel=0.03)
+    assert noise_floor_n(time_s, still, 0.08) == pytest.approx(2e-4 / 0.08, rel=0.03)
     assert np.std(still) > 50 * 2e-4
     with pytest.raises(CalibrationError, match="at least two responses within"):
-        statistics.noise_floor_n(np.arange(0, 100, 5.0), np.zeros(20), 0.08)
+        noise_floor_n(np.arange(0, 100, 5.0), np.zeros(20), 0.08)
 
 
 def test_a_noise_floor_by_hand() -> None:
     time_s = np.array([0.0, 0.5, 1.0, 1.5])
     response = np.array([1.0, 3.0, 10.0, 10.0])
     # Variances 2 and 0, pooled 1.
-    assert statistics.noise_floor_n(time_s, response, 0.5) == pytest.approx(2.0)
-
-
-def test_the_paper_s_range_and_noise_floor_are_more_than_10_bits() -> None:
-    assert statistics.dynamic_range_bits(1024.0, 1.0) == 10
-    assert statistics.dynamic_range_bits(5.0, 0.0016) == pytest.approx(math.log2(3125))
+    assert noise_floor_n(time_s, response, 0.5) == pytest.approx(2.0)
 
 
 def test_the_prediction_interval_holds_95_percent_of_new_forces() -> None:
     rng = np.random.default_rng(RNG_SEED)
     shear_n, held, tried = np.linspace(-1, 1, 21), 0, 0
     for _ in range(400):
-        line = statistics.fit_line(shear_n, 0.02 + 0.08 * shear_n + rng.normal(0, 0.003, 21))
+        line = fit_line(shear_n, 0.02 + 0.08 * shear_n + rng.normal(0, 0.003, 21))
         force = rng.uniform(-1, 1)
         found = (0.02 + 0.08 * force + rng.normal(0, 0.003) - line.offset) / line.slope_per_n
         held += abs(found - force) <= line.prediction_half_width_n(force)
@@ -49,28 +51,14 @@ def test_the_prediction_interval_holds_95_percent_of_new_forces() -> None:
 
 
 def test_a_line_by_hand() -> None:
-    line = statistics.fit_line(np.array([0.0, 1.0, 2.0, 3.0]), np.array([1.0, 1.0, 3.0, 3.0]))
+    line = fit_line(np.array([0.0, 1.0, 2.0, 3.0]), np.array([1.0, 1.0, 3.0, 3.0]))
     assert (line.slope_per_n, line.offset) == pytest.approx((0.8, 0.8))
     assert line.scatter == pytest.approx(math.sqrt(0.8 / 2))
     # t(0.975, 2) = 4.3027
     assert line.prediction_half_width_n(1.5) == pytest.approx(4.3027 * math.sqrt(0.4) / 0.8 * math.sqrt(1.25), rel=1e-4)
     for shear_n in ([1.0, 2.0], [1.0, 1.0, 1.0]):
         with pytest.raises(CalibrationError, match="at least three"):
-            statistics.fit_line(np.array(shear_n), np.array(shear_n))
-
-
-def test_drift_by_hand() -> None:
-    assert statistics.drift_std(np.array([0.0, 1.0, 2.0, 3.0, 4.0]) * 1e-4) == pytest.approx(math.sqrt(2.5) * 1e-4)
-    with pytest.raises(CalibrationError, match="at least three"):
-        statistics.drift_std(np.zeros(2))
-
-
-def test_temperature_sensitivity_is_the_change_of_slope_and_not_of_offset() -> None:
-    shear_n = np.linspace(-1, 1, 9)
-    cold, hot = (shear_n, 0.08 * shear_n), (shear_n, 0.03 + 0.08 * 1.02 * shear_n)
-    assert statistics.temperature_sensitivity_per_k(cold, hot, 25.0, 40.0) == pytest.approx(0.02 / 15)
-    with pytest.raises(CalibrationError, match="different temperatures"):
-        statistics.temperature_sensitivity_per_k(cold, hot, 25.0, 25.0)
+            fit_line(np.array(shear_n), np.array(shear_n))
 
 
 @pytest.mark.parametrize("put_in", [SkinFigures(), SkinFigures(0.004, 0.05, 4e-4, 3e-4, -0.003)])
@@ -94,9 +82,9 @@ def test_friction_alone_makes_a_prediction_interval_of_the_paper_s_size() -> Non
     membrane = paper_membrane()
     up = loading(1.0)
     rising = responses(membrane, up, 1.0)
-    there = statistics.fit_line(np.concatenate([-up, up]), np.concatenate([-rising, rising]))
+    there = fit_line(np.concatenate([-up, up]), np.concatenate([-rising, rising]))
     path = loop(1.0)
-    round_trip = statistics.fit_line(path, responses(membrane, path, 1.0))
+    round_trip = fit_line(path, responses(membrane, path, 1.0))
     assert there.prediction_half_width_n(0.0) < 0.0802 < round_trip.prediction_half_width_n(0.0)
 
 

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shearloop.bank.skin.calibration import SkinCalibration
+from shearloop.bank.skin.calibration import MEMORY_S, DirectionFinder, ForceFollower, SkinCalibration
 from shearloop.bank.skin.membrane import UNSTRETCHED, Direction, paper_membrane
-from shearloop.bank.skin.tracking import MEMORY_S, DirectionFinder, ForceFollower
 
 MEMBRANE = paper_membrane()
 CALIBRATION = SkinCalibration(

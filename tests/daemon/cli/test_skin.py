@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from shearloop.bank.skin.calibration import load_calibration
-from shearloop.bank.skin.characterisation import FigureOfMerit
+from shearloop.bank.skin.characterisation import FigureOfMerit, loop, responses
 from shearloop.bank.skin.membrane import paper_membrane
-from shearloop.bank.skin.statistics import loop, responses
 from shearloop.daemon.cli import main
 from shearloop.daemon.cli.skin import _table
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from shearloop.bank.eit.polynomial import TWO_SIDED_95
+from shearloop.bank.polynomial import TWO_SIDED_95
 from shearloop.daemon.control import gripper_task
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.gripper_task import GripperTask

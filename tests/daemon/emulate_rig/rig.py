@@ -14,13 +14,12 @@ import pytest
 from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import CHANNELS, ZERO_SLOTS
-from shearloop.drivers.connection import LinkEvent, LinkObserver
+from shearloop.drivers.connection import LinkMonitor, LinkObserver
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.load_cell import LoadCalibration, LoadSample
-from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.messages import GripperCommand, GripperState
 from shearloop.drivers.robotiq.socket_client import SocketClient
-from shearloop.drivers.robotiq.width import WidthCalibration
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, RobotState, Stop, WristSpeed
 from shearloop.drivers.ur.settings import read_settings
@@ -69,17 +68,16 @@ async def open_gripper_at(rig: RigProcess) -> AsyncIterator[RobotiqGripper]:
         await gripper.close()
 
 
-def kit_at(rig: RigProcess, side: str, on_event: Callable[[LinkEvent], None] = lambda _: None) -> EitKit:
-    return EitKit(
-        zero_slots=ZERO_SLOTS, path=rig.run_dir / f"eit-{side}", frame_period_s=0.5408 / SPEED, on_event=on_event
-    )
+def kit_at(rig: RigProcess, side: str, observer: LinkObserver | None = None) -> EitKit:
+    path, monitor = rig.run_dir / f"eit-{side}", LinkMonitor(observer)
+    return EitKit(zero_slots=ZERO_SLOTS, path=path, frame_period_s=0.5408 / SPEED, monitor=monitor)
 
 
 @asynccontextmanager
 async def arm_at(rig: RigProcess, link: LinkObserver | None = None) -> AsyncIterator[UrRobot]:
     pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
     settings = read_settings(Path(__file__).parents[3] / "config" / "ur.yaml")
-    arm = UrRobot(dataclasses.replace(settings, host=rig.host), link)
+    arm = UrRobot(dataclasses.replace(settings, host=rig.host), LinkMonitor(link))
     task = asyncio.create_task(arm.run())
     try:
         await until(arm, lambda state: state.program_running and not state.recovering)

@@ -6,7 +6,7 @@ from contextlib import AsyncExitStack
 
 import pytest
 
-from shearloop.drivers.connection import LinkEvent
+from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.errors import DeviceLostError, DriverError
 from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
@@ -24,7 +24,7 @@ from tests.daemon.emulate_rig.rig import (
     torque_of,
     until,
 )
-from tests.drivers.ur.robots import Link
+from tests.running import LinkEvents
 
 pytestmark = pytest.mark.real_time
 
@@ -38,7 +38,7 @@ async def test_disturbances_reach_the_tool_and_robot_faults_the_robot(rig: RigPr
         truth = await rig.truth(lambda truth: bool(truth["torque_nm"]))
         assert truth["torque_nm"] == pytest.approx(0.05, rel=0.05)
         assert await torque_of(load) == pytest.approx(0.05, rel=0.08)
-        link = Link()
+        link = LinkEvents()
         async with arm_at(rig, link) as arm:
             await until(arm, lambda state: state.wrist_torque_nm < -0.04)
             await rig.fault("slip 0.01")
@@ -54,7 +54,7 @@ async def test_disturbances_reach_the_tool_and_robot_faults_the_robot(rig: RigPr
                 while not (await arm.send(Unlock())).accepted:
                     await arm.next_state()
             await rig.fault("drop-rtde")
-            await link.down(within_s=DEADLINE_S)
+            await link.down()
         await rig.fault("joint seized")
         assert (await rig.truth())["joint"] == "seized"
         await rig.fault("joint lever")
@@ -93,31 +93,27 @@ async def _read_on(gripper: RobotiqGripper) -> None:
 
 async def test_boards_fall_silent_vanish_and_come_back(rig: RigProcess) -> None:
     async with AsyncExitStack() as stack:
-        told: asyncio.Queue[LinkEvent] = asyncio.Queue()
-        losses: asyncio.Queue[LinkEvent] = asyncio.Queue()
-        kit, other = kit_at(rig, "right", told.put_nowait), kit_at(rig, "left")
-        cell = LoadCell(COUNTS, path=rig.run_dir / "load-cell", on_event=losses.put_nowait)
+        told, losses = LinkEvents(), LinkEvents()
+        kit, other = kit_at(rig, "right", told), kit_at(rig, "left")
+        cell = LoadCell(COUNTS, path=rig.run_dir / "load-cell", monitor=LinkMonitor(losses))
         right = await stack.enter_async_context(Reader(kit.readings()))
         left = await stack.enter_async_context(Reader(other.readings()))
         load = await stack.enter_async_context(Reader(cell.readings()))
         for each in (right, left, load):
             await each.take(1)
-        assert told.get_nowait().up
-        assert losses.get_nowait().up
+        assert [event.up for event in (*told.events, *losses.events)] == [True, True]
         for line in ("unplug right", "silence left", "silence load"):
             await rig.fault(line)
         async with asyncio.timeout(DEADLINE_S):
-            assert not (await told.get()).up
-            assert "has sent nothing" in (await losses.get()).sentence
+            await told.down()
+            assert "has sent nothing" in (await losses.down()).sentence
             # A silent board is started again by its driver, without being lost.
             while not other.diagnostics()["silences"]:
                 await left.take(1)
             await rig.fault("replug right")
             await rig.fault("normal")
-            while not (await told.get()).up:
-                continue
-            while not (await losses.get()).up:
-                continue
+            for link in (told, losses):
+                await link.until(lambda link=link: link.events[-1].up)
             for each in (right, left, load):
                 await each.take(2)
             await rig.fault("right cut-line")

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
-from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.messages import ObjectStatus
 from shearloop.drivers.robotiq.modbus_client import ModbusClient
-from shearloop.drivers.robotiq.width import WidthCalibration
 from tests.daemon.emulate_rig.rig import (
     CM_PER_NM,
     COUNTS,

@@ -1,16 +1,20 @@
 import json
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from shutil import copytree
 
 import numpy as np
 import pytest
 
+from shearloop.bank.arrays import FloatArray
+from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration, Estimate, FrameSeries, fit
-from shearloop.bank.estimation.calibration import OutputModel
+from shearloop.bank.estimation.estimator import Estimator, OutputModel, Reading
 from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
 from shearloop.bank.estimation.load_delay import LoadDelay, LoadTiming
 from shearloop.bank.estimation.regressors import Ridge
+from shearloop.bank.estimation.ridge_estimators import Regression
+from shearloop.bank.estimators import ESTIMATORS
 from shearloop.daemon.analysis.calibrate import CalibrationResult
 from shearloop.daemon.analysis.evaluate import EstimateTrack, InvalidReason, figures_of, invalid_reasons
 from shearloop.daemon.cli import main
@@ -48,6 +52,32 @@ def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_p
     assert "rmse_nm" in text
     assert re.search(r"^interval_nm +0\.\d+$", text, re.MULTILINE)
     assert "diameter" not in text
+
+
+@dataclass(frozen=True, eq=False)
+class BandMeans(Estimator):
+    """A toy: a ridge on the means of bands of channels."""
+
+    name = "bands"
+
+    bands: int = 8
+
+    def features(self, reading: Reading) -> tuple[FloatArray, None]:
+        return reading.difference.reshape(self.bands, -1).mean(axis=1), None
+
+
+@pytest.mark.usefixtures("few_mixtures")
+def test_an_estimator_is_one_class_and_one_line(slices_folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(ESTIMATORS, "bands", f"{__name__}:BandMeans")
+    calibration, slices = str(tmp_path / "a.cal"), str(slices_folder / "torque_slices")
+    assert main(["calibrate", slices, "--estimator", "bands", "--time-range", "0:0.6", "--out", calibration]) == 0
+    assert "Estimator bands, torque from" in capsys.readouterr().out
+    assert Calibration.load(calibration).estimator.bands == 8
+    assert main(["evaluate", calibration, slices, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["r"] > 0.9
+    monkeypatch.undo()
+    with pytest.raises(CalibrationError, match="the estimator is 'bands', which this version does not know"):
+        Calibration.load(calibration)
 
 
 @pytest.mark.usefixtures("few_mixtures")
@@ -268,7 +298,7 @@ def test_a_time_that_could_not_be_checked_is_told_as_probable(unsure_s):
     ramp = np.linspace(0.0, 1.0, 20)
     regressor = replace(fit_interval_regressor(ramp[:, None], ramp, Ridge.fit), timing_widening=1.9)
     model = OutputModel(regressor, None, np.zeros(0))
-    calibration = Calibration("regression", "raw", ("right",), "ramp", "", np.ones((1, 896)), torque=model)
+    calibration = Calibration(Regression(np.ones((1, 896))), "raw", ("right",), "ramp", "", torque=model)
     result = CalibrationResult(calibration, 4, LoadTiming([series], [found], [""], unsure_s))
     _, late, *sentences, _ = sentences_of(result)
     assert late == f"The load is {'probably ' if unsure_s else ''}stamped 0.16 s after the frames move."

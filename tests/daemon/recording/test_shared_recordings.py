@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import Calibration, FrameSeries, Name, fit, load_delay, measure_timing
+from shearloop.bank.estimation import Calibration, FrameSeries, fit, load_delay, measure_timing
 from shearloop.bank.estimation.bank_match import ElectrodeNumbering
 from shearloop.bank.estimation.load_delay import find_load_delay, is_filtered, load_delay_warning
 from shearloop.bank.estimation.novelty import NoveltyDetector
+from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.analysis.charts.fault_sweeps import balanced
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
@@ -58,7 +59,7 @@ def slices(shared) -> FrameSeries:
 
 
 @pytest.fixture(scope="module")
-def earlier(slices) -> Callable[[Name, int], Calibration]:
+def earlier(slices) -> Callable[[EstimatorName, int], Calibration]:
     """Return what an estimator is calibrated to by the first n torque slices, which several tests judge."""
     return cache(lambda name, n: fit(name, [slices.between(0, n)], "earlier"))
 

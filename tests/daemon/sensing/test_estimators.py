@@ -120,7 +120,7 @@ def test_a_bank_adds_k_sigma_and_heatmaps(calibration: Calibration, tiny_bank: P
 
 
 def test_the_calibration_decides_the_estimator(files: dict[str, Path]) -> None:
-    assert open_estimator(fingertip(calibration=files["right"]), "right").calibration.estimator == NAME
+    assert open_estimator(fingertip(calibration=files["right"]), "right").calibration.estimator.name == NAME
     tips = {"right": fingertip(), "left": fingertip()}
     combined = open_combined(CombinedConfig(calibration=files["combined"]), tips)
     assert combined.calibration.sides == ("right", "left")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from shearloop.bank.skin.calibration import CalibrationTable, SkinCalibration, fit_calibration, load_calibration
+from shearloop.bank.skin.characterisation import loop
 from shearloop.bank.skin.membrane import Direction
-from shearloop.bank.skin.statistics import loop
 from shearloop.daemon.sensing.skin_estimator import DRIFT_PER_HOUR, SkinEstimator, SkinReading
 from shearloop.daemon.synthetic_skin import CONTACT_N_PER_MM, REST_OHM, SyntheticSkin
 from shearloop.drivers.shear_skin import SkinFault, SkinSample
@@ -193,7 +193,7 @@ def test_a_zero_under_a_small_load_is_stated_in_the_interval(calibration: SkinCa
 def test_a_zero_under_load_that_nothing_gave_away_is_told_when_the_load_goes(calibration: SkinCalibration) -> None:
     """The calibration's rest is that of this very load, so that the zero itself cannot be refused."""
     stretched = REST_OHM[0] * (1 + 0.088 * 0.8), REST_OHM[1]
-    bench = Bench(replace(calibration, rest_ohm=stretched))
+    bench = Bench(calibration.model_copy(update={"rest_ohm": stretched}))
     bench.skin.normal_n = 1.0
     for _ in range(20):
         bench.at(0.84)

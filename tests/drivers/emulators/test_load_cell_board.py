@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
+from shearloop.drivers.connection import LinkEvent, LinkMonitor
 from shearloop.drivers.emulators.boards import PAPER_SKETCH, BoardFault, BoardFaultKind, Hx711Board, Sketch, parse_fault
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell, LoadSample
 from tests.running import Changes, pass_on, running
@@ -28,7 +28,7 @@ class Rig(Changes):
         self.samples.append(sample)
         self.note()
 
-    def on_event(self, event: LinkEvent) -> None:
+    def on_link_event(self, event: LinkEvent) -> None:
         self.events.append(event)
         self.note()
 
@@ -43,7 +43,7 @@ async def a_rig(
     link = tmp_path / "load"
     board = Hx711Board(torques_nm, sketch, period_s=0.002, link=link)
     rig = Rig(board)
-    rig.cell = cell = LoadCell(calibration, path=link, policy=ReconnectPolicy(0.001, 0.002), on_event=rig.on_event)
+    rig.cell = cell = LoadCell(calibration, path=link, monitor=LinkMonitor(rig, 0.001, 0.002))
 
     async with running(board.run()):
         await board.port.appearances.get()

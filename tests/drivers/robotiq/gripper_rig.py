@@ -9,17 +9,17 @@ import contextlib
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
-from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
+from shearloop.drivers.connection import LinkEvent, LinkMonitor
 from shearloop.drivers.emulators.gripper import Gripper, GripperMechanics, ModbusSlave, UrcapSession
 from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
-from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.modbus_client import ModbusClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
-from shearloop.drivers.robotiq.width import WidthCalibration
 
 STEP_S = 0.01
 # Between two looks of the driver at its clock.
@@ -40,11 +40,11 @@ class Rig:
     events: list[LinkEvent] = field(default_factory=list)
     lost: asyncio.Event = field(default_factory=asyncio.Event)
 
-    def clock_ns(self) -> int:
+    def monotonic_ns(self) -> int:
         self.steps_left = MOST_STEPS
         return round(self.t_s * 1e9)
 
-    def on_event(self, event: LinkEvent) -> None:
+    def on_link_event(self, event: LinkEvent) -> None:
         self.events.append(event)
         if not event.up:
             self.lost.set()
@@ -72,9 +72,7 @@ async def a_rig(way: str, tmp_path: Path) -> AsyncIterator[Rig]:
         client,
         CALIBRATION,
         poll_s=0.0,
-        policy=ReconnectPolicy(0.001, 0.002),
-        on_event=rig.on_event,
-        clock_ns=rig.clock_ns,
+        monitor=LinkMonitor(rig, 0.001, 0.002),
     )
 
     async def pass_time() -> None:
@@ -87,7 +85,8 @@ async def a_rig(way: str, tmp_path: Path) -> AsyncIterator[Rig]:
 
     tasks = [asyncio.create_task(pass_time()), asyncio.create_task(server.run())]
     try:
-        yield rig
+        with patch("shearloop.drivers.robotiq.gripper.time", rig):
+            yield rig
     finally:
         await driver.close()
         for task in tasks:

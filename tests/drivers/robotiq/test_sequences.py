@@ -1,11 +1,13 @@
 """Activation and motion with made-up readouts and times."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shearloop.drivers.robotiq import gripper as gripper_module
 from shearloop.drivers.robotiq import messages
 from shearloop.drivers.robotiq.gripper import PAUSE_NS, RobotiqGripper, object_status
 from tests.drivers.robotiq.gripper_rig import CALIBRATION
@@ -27,7 +29,7 @@ class Client:
         self.requests: list[tuple[messages.Request, int]] = []
         self.now_ns = 0
 
-    def clock_ns(self) -> int:
+    def monotonic_ns(self) -> int:
         self.now_ns += S // 10
         return self.now_ns
 
@@ -41,15 +43,25 @@ class Client:
     async def write(self, request: messages.Request) -> None:
         self.requests.append((request, self.now_ns))
 
-    @property
-    def gripper(self) -> RobotiqGripper:
-        return RobotiqGripper(self, CALIBRATION, poll_s=0.0, clock_ns=self.clock_ns)
+
+Connect = Callable[[Client], RobotiqGripper]
 
 
-async def test_activation_is_a_reset_a_pause_and_a_rising_edge() -> None:
+@pytest.fixture
+def connect(monkeypatch: pytest.MonkeyPatch) -> Connect:
+    """Return a gripper behind a client, in the client's time."""
+
+    def gripper(client: Client) -> RobotiqGripper:
+        monkeypatch.setattr(gripper_module, "time", client)
+        return RobotiqGripper(client, CALIBRATION, poll_s=0.0)
+
+    return gripper
+
+
+async def test_activation_is_a_reset_a_pause_and_a_rising_edge(connect: Connect) -> None:
     # Silent during the pause is no obstacle, and the old active state is not the new one.
     client = Client(ACTIVE, ACTIVE, *[RESET] * 6, replace(ACTIVATING, flt=9), ACTIVATING, ACTIVE)
-    state = await client.gripper.activate(operator_confirmed=True)
+    state = await connect(client).activate(operator_confirmed=True)
     assert state.activation is messages.ActivationStatus.ACTIVE
     (reset, reset_ns), (activate, activate_ns) = client.requests
     assert (reset, activate) == (messages.Reset(), messages.Activate())
@@ -65,9 +77,11 @@ async def test_activation_is_a_reset_a_pause_and_a_rising_edge() -> None:
         ((ACTIVE, *[RESET] * 6, ACTIVATING), "does not end"),
     ],
 )
-async def test_activation_that_hangs_or_fails_is_reported(readouts: tuple[messages.Readout, ...], failure: str) -> None:
+async def test_activation_that_hangs_or_fails_is_reported(
+    connect: Connect, readouts: tuple[messages.Readout, ...], failure: str
+) -> None:
     with pytest.raises(messages.GripperFaultError, match=failure):
-        await Client(*readouts).gripper.activate(operator_confirmed=True)
+        await connect(Client(*readouts)).activate(operator_confirmed=True)
 
 
 @given(st.sampled_from([status for status in messages.ObjectStatus if status >= 0]), st.integers(0, 255), st.booleans())
@@ -90,9 +104,9 @@ def test_inactive_gripper_holds_nothing(sta: messages.ActivationStatus) -> None:
 
 
 @pytest.mark.parametrize("obj", [messages.ObjectStatus.CONTACT_CLOSING, messages.ObjectStatus.AT_TARGET])
-async def test_motion_ends_at_its_target_or_on_an_object(obj: messages.ObjectStatus) -> None:
+async def test_motion_ends_at_its_target_or_on_an_object(connect: Connect, obj: messages.ObjectStatus) -> None:
     client = Client(ACTIVE)
-    gripper = client.gripper
+    gripper = connect(client)
     sent = await gripper.move(messages.GripperCommand(50.0))
     taken_up = replace(ACTIVE, pre=sent.request.position)
     client.readouts = [ACTIVE, replace(taken_up, obj=messages.ObjectStatus.MOVING), replace(taken_up, obj=obj), RESET]
@@ -110,9 +124,9 @@ async def test_motion_ends_at_its_target_or_on_an_object(obj: messages.ObjectSta
         (ACTIVATING, "still activating"),
     ],
 )
-async def test_motion_without_an_end_is_reported(readout: messages.Readout, failure: str) -> None:
+async def test_motion_without_an_end_is_reported(connect: Connect, readout: messages.Readout, failure: str) -> None:
     client = Client(ACTIVE)
-    gripper = client.gripper
+    gripper = connect(client)
     sent = await gripper.move(messages.GripperCommand(50.0))
     client.readouts = [readout]
     with pytest.raises(messages.GripperFaultError, match=failure):

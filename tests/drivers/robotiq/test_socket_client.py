@@ -75,7 +75,7 @@ async def test_requests_are_answered_in_order() -> None:
     ("answer", "error", "says"),
     [
         (lambda _: None, DeviceLostError, "closed the gripper's socket"),
-        (lambda _: b"POS 1\n", ProtocolError, "when asked for ACT"),
+        (lambda _: b"POS 1\n", ProtocolError, "to 'GET ACT'"),
         (lambda _: b"x" * 100, ProtocolError, "is this the URCap's port"),
         (lambda line: usual(line) * 2, ProtocolError, "without a request"),
     ],
@@ -120,7 +120,7 @@ async def test_late_answer_is_named() -> None:
 async def test_answer_at_the_deadline_counts() -> None:
     """After a pause of this process both the answer and the timer are due."""
     client, reader, now_s = SocketClient("127.0.0.1"), asyncio.StreamReader(), asyncio.get_running_loop().time()
-    receiving = asyncio.create_task(client._receive(reader, b"GET ACT\n", now_s + 0.01))
+    receiving = asyncio.create_task(client._receive(reader, "GET ACT", now_s + 0.01))
     await asyncio.sleep(0)
     time.sleep(0.05)  # noqa: ASYNC251 - the pause
     reader.feed_data(b"ACT 1\n")

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.drivers.connection import LinkEvent, ReconnectPolicy, SerialLink, TcpLink
+from shearloop.drivers.connection import LinkEvent, LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.drivers.emulators.skin import Circuit, EmulatedAdcBoard, EmulatedKeithley6430, EmulatedScanner
 from shearloop.drivers.shear_skin.instruments import OUTPUT, READ, SOURCE_BAUD, AdcBoard, Keithley6430, ScpiScanner
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
-from tests.running import DEADLINE_S, Changes, pass_on, running
+from tests.running import DEADLINE_S, Changes, LinkEvents, pass_on, running
 
 R1, R2 = 24.6, 25.3
 RATE_HZ = 500.0
@@ -34,7 +34,7 @@ class Bench(Changes):
         self.samples.append(sample)
         self.note()
 
-    def on_event(self, event: LinkEvent) -> None:
+    def on_link_event(self, event: LinkEvent) -> None:
         self.events.append(event)
         self.note()
 
@@ -82,18 +82,20 @@ async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: f
     board = EmulatedAdcBoard(circuit, period_s=1 / RATE_HZ, link=folder / "adc")
     reader = board if adc else scanner
     bench = Bench(circuit, played, source_server, reader.command)
-    options = {"policy": ReconnectPolicy(0.001, 0.005), "on_event": bench.on_event}
+    source_monitor, daq_monitor = LinkMonitor(bench, 0.001, 0.005), LinkMonitor(bench, 0.001, 0.005)
     async with running(source_server.run(), reader.run()):
         await source_server.appearances.get()
         await (board.port if adc else scanner).appearances.get()
         if serial_source:
-            source_link = SerialLink(path=folder / "source", baud=SOURCE_BAUD, **options)
+            source_link = SerialLink(path=folder / "source", baud=SOURCE_BAUD, monitor=source_monitor)
         else:
-            source_link = TcpLink("127.0.0.1", socket.port, **options)
+            source_link = TcpLink("127.0.0.1", socket.port, monitor=source_monitor)
         if adc:
-            daq = AdcBoard(SerialLink(path=folder / "adc", **options), RATE_HZ)
+            daq = AdcBoard(SerialLink(path=folder / "adc", monitor=daq_monitor), RATE_HZ)
         else:
-            daq = ScpiScanner(TcpLink("127.0.0.1", scanner.port, **options), rate_hz=RATE_HZ, timeout_s=deadline_s)
+            daq = ScpiScanner(
+                TcpLink("127.0.0.1", scanner.port, monitor=daq_monitor), rate_hz=RATE_HZ, timeout_s=deadline_s
+            )
         bench.skin = ShearSkin(Keithley6430(source_link, period_s=0.01, timeout_s=deadline_s), daq)
         async with running(bench.skin.watch_source(), pass_on(bench.skin.samples(), bench.on_sample)):
             yield bench
@@ -297,16 +299,11 @@ async def test_lines_of_the_board_that_are_missing_torn_or_garbage_are_counted(t
 
 async def test_an_instrument_that_is_no_source_is_refused_by_name() -> None:
     scanner = SocketServer(EmulatedScanner(Circuit(Unstrained())))
-    sentences: asyncio.Queue[str] = asyncio.Queue()
-
-    def on_event(event: LinkEvent) -> None:
-        if not event.up:
-            sentences.put_nowait(event.sentence)
-
+    told = LinkEvents()
     async with asyncio.timeout(DEADLINE_S):
         await scanner.restore()
-        source = Keithley6430(TcpLink("127.0.0.1", scanner.port, on_event=on_event))
+        source = Keithley6430(TcpLink("127.0.0.1", scanner.port, monitor=LinkMonitor(told)))
 
         async with running(pass_on(source.readings(), lambda _: None)):
-            assert "says it is 'Agilent Technologies,34972A" in await sentences.get()
+            assert "says it is 'Agilent Technologies,34972A" in (await told.down()).sentence
         await scanner.disconnect()

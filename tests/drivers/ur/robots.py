@@ -6,32 +6,12 @@ import dataclasses
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
-from shearloop.drivers.connection import LinkEvent
+from shearloop.drivers.connection import LinkMonitor, LinkObserver
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, RobotState
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 
 ROOT = Path(__file__).parents[3]
-
-
-class Link:
-    """A robot's link events."""
-
-    def __init__(self) -> None:
-        self.events: list[LinkEvent] = []
-        self._changed = asyncio.Event()
-
-    def on_link_event(self, event: LinkEvent) -> None:
-        self.events.append(event)
-        self._changed.set()
-
-    async def down(self, number: int = 1, within_s: float = 15.0) -> LinkEvent:
-        """Wait for the loss of this number and return it."""
-        async with asyncio.timeout(within_s):
-            while len(losses := [event for event in self.events if not event.up]) < number:
-                self._changed.clear()
-                await self._changed.wait()
-        return losses[number - 1]
 
 
 def settings_for(host: str, **changes: object) -> UrSettings:
@@ -40,8 +20,8 @@ def settings_for(host: str, **changes: object) -> UrSettings:
 
 
 @contextlib.asynccontextmanager
-async def running(settings: UrSettings, link: Link | None = None) -> AsyncIterator[UrRobot]:
-    robot = UrRobot(settings, link)
+async def running(settings: UrSettings, link: LinkObserver | None = None) -> AsyncIterator[UrRobot]:
+    robot = UrRobot(settings, LinkMonitor(link))
     task = asyncio.create_task(robot.run())
     try:
         yield robot

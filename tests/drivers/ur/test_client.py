@@ -10,10 +10,12 @@ from collections.abc import AsyncIterator
 
 import pytest
 
+from shearloop.drivers.connection import LinkObserver
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed, ZeroForceTorque
-from tests.drivers.ur.robots import ROOT, Link, enable, pid_of, running, settings_for, until
+from tests.drivers.ur.robots import ROOT, enable, pid_of, running, settings_for, until
 from tests.emulator_process import EmulatorProcess as ControllerProcess
+from tests.running import LinkEvents
 
 pytestmark = pytest.mark.real_time
 
@@ -33,7 +35,9 @@ async def turn(robot: UrRobot, controller: ControllerProcess, speed: float = 0.5
 
 
 @contextlib.asynccontextmanager
-async def turning(controller: ControllerProcess, link: Link | None = None, **changes: float) -> AsyncIterator[UrRobot]:
+async def turning(
+    controller: ControllerProcess, link: LinkObserver | None = None, **changes: float
+) -> AsyncIterator[UrRobot]:
     """Return a robot with a turning wrist."""
     async with running(settings_for(controller.host, **changes), link) as robot:
         await enable(robot)
@@ -104,7 +108,7 @@ async def test_state_comes_125_times_a_second_with_the_controllers_own_time(cont
 
 
 async def test_twist_stops_when_the_client_is_killed(controller: ControllerProcess) -> None:
-    link = Link()
+    link = LinkEvents()
     async with turning(controller, link) as robot:
         killed_ns = time.monotonic_ns()
         os.kill(pid_of(robot), signal.SIGKILL)
@@ -168,7 +172,7 @@ async def test_emergency_stop_is_reported_and_recovered_from(controller: Control
 
 
 async def test_lost_rtde_ends_the_worker_and_the_next_moves_nothing(controller: ControllerProcess) -> None:
-    link = Link()
+    link = LinkEvents()
     async with turning(controller, link) as robot:
         dropped_ns = await controller.fault("drop-rtde")
         stopped = await controller.event("motion-stopped", dropped_ns)
@@ -183,7 +187,7 @@ async def test_lost_rtde_ends_the_worker_and_the_next_moves_nothing(controller: 
 
 
 async def test_crash_of_the_client_is_named(controller: ControllerProcess) -> None:
-    link = Link()
+    link = LinkEvents()
     async with running(settings_for(controller.host), link) as robot:
         await enable(robot)
         os.kill(pid_of(robot), signal.SIGSEGV)
@@ -193,7 +197,7 @@ async def test_crash_of_the_client_is_named(controller: ControllerProcess) -> No
 
 
 async def test_hung_worker_is_replaced(controller: ControllerProcess) -> None:
-    link = Link()
+    link = LinkEvents()
     async with turning(controller, link, hang_timeout_s=0.3) as robot:
         hung_ns = time.monotonic_ns()
         os.kill(pid_of(robot), signal.SIGSTOP)
@@ -208,7 +212,7 @@ async def test_hung_worker_is_replaced(controller: ControllerProcess) -> None:
 
 
 async def test_silent_controller_is_reported_and_the_robot_stops(controller: ControllerProcess) -> None:
-    link = Link()
+    link = LinkEvents()
     async with turning(controller, link, connect_timeout_s=1.5) as robot:
         silent_ns = await controller.fault("silence 3600")
         stopped = await controller.event("motion-stopped", silent_ns)
@@ -235,7 +239,7 @@ async def test_connection_that_is_refused_is_explained(
     controller: ControllerProcess, fault: str, kind: str, said: str
 ) -> None:
     await controller.fault(fault)
-    link = Link()
+    link = LinkEvents()
     async with running(settings_for(controller.host), link) as robot:
         loss = await link.down()
         assert robot.losses[kind] == 1

@@ -14,12 +14,13 @@ from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import LAST_WORDS_BYTES, LostError, UrRobot, WorkerConnection
 from shearloop.drivers.ur.messages import CommandReply, Failed, Stop, encode
 from tests.drivers.ur.flight import SETTINGS, Flight, flying
-from tests.drivers.ur.robots import ROOT, Link, running, settings_for
+from tests.drivers.ur.robots import ROOT, running, settings_for
+from tests.running import LinkEvents
 
 
 async def test_absent_controller_is_explained() -> None:
     pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
-    link = Link()
+    link = LinkEvents()
     async with running(settings_for("127.0.0.254"), link) as robot:
         loss = await link.down()
         assert robot.losses == {"unreachable": 1}
@@ -49,7 +50,7 @@ def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Non
 
 async def test_error_output_of_a_worker_ended_by_its_alarm_is_quoted(play: Callable[[str], None]) -> None:
     play("echo 'waiting for the dashboard' >&2; kill -ALRM $$")
-    link = Link()
+    link = LinkEvents()
     async with running(settings_for("127.0.0.254"), link) as robot:
         loss = await link.down()
     assert [*robot.losses] == ["hung"]
@@ -58,7 +59,7 @@ async def test_error_output_of_a_worker_ended_by_its_alarm_is_quoted(play: Calla
 
 async def test_long_error_output_is_shortened(play: Callable[[str], None]) -> None:
     play("head -c 300000 /dev/zero | tr '\\0' x >&2; echo >&2; echo 'no memory' >&2; exit 3")
-    link = Link()
+    link = LinkEvents()
     async with running(settings_for("127.0.0.254"), link) as robot:
         loss = await link.down()
     assert [*robot.losses] == ["crashed"]
@@ -114,7 +115,7 @@ async def test_failing_reply_callback_does_not_prevent_disconnecting(
         raise ZeroDivisionError("nothing to divide")
 
     async with asyncio.timeout(60):
-        async with running(settings_for("127.0.0.254"), Link()) as robot:
+        async with running(settings_for("127.0.0.254")) as robot:
             await robot.next_state()
             robot.send_nowait(Stop(1.0), dies)
             robot.send_nowait(Stop(1.0), replies.append)
@@ -132,7 +133,7 @@ async def test_next_worker_may_stop_the_program_left_behind(
     told = tmp_path / "told"
     briefly = BRIEFLY.replace("CYCLES", str(cycles))
     play(f"cd '{ROOT}' && exec '{sys.executable}' -c '{briefly}' '{told}'")
-    link = Link()
+    link = LinkEvents()
     async with running(settings_for("127.0.0.254"), link):
         await link.down(2)
     assert told.read_text().split()[:2] == ["False", may_stop]

@@ -9,8 +9,9 @@ import pytest
 
 from shearloop.drivers.emulators.ur_controller import SCRIPT_PORT
 from shearloop.drivers.ur.client import UrRobot
-from tests.drivers.ur.robots import Link, enable, pid_of, running, settings_for, until
+from tests.drivers.ur.robots import enable, pid_of, running, settings_for, until
 from tests.emulator_process import EmulatorProcess as ControllerProcess
+from tests.running import LinkEvents
 
 pytestmark = pytest.mark.real_time
 
@@ -29,7 +30,7 @@ async def begin_foreign_program(controller: ControllerProcess) -> None:
     await writer.wait_closed()
 
 
-async def kill(robot: UrRobot, link: Link) -> None:
+async def kill(robot: UrRobot, link: LinkEvents) -> None:
     """Kill the worker and wait for the next one's first state."""
     os.kill(pid_of(robot), signal.SIGKILL)
     await link.down()
@@ -42,7 +43,7 @@ async def test_foreign_paused_program_outlives_a_lost_worker(
     """It was paused before we connected."""
     await begin_foreign_program(controller)
     since_ns = await controller.fault("protective-stop")
-    link = Link()
+    link = LinkEvents()
     async with running(settings_for(controller.host), link) as robot:
         await until(robot, lambda state: state.runtime_state == PAUSED and not state.recovering)
         await kill(robot, link)
@@ -57,7 +58,7 @@ async def test_foreign_paused_program_outlives_a_lost_worker(
 async def test_program_started_after_a_lost_worker_is_left_alone(
     controller: ControllerProcess,
 ) -> None:
-    link = Link()
+    link = LinkEvents()
     async with running(settings_for(controller.host), link) as robot:
         await enable(robot)
         since_ns = time.monotonic_ns()
@@ -83,7 +84,7 @@ async def test_our_paused_program_is_stopped_by_its_worker(controller: Controlle
 
 @pytest.mark.parametrize("hangs", [0, 1])
 async def test_our_paused_program_is_stopped_by_the_next_worker(controller: ControllerProcess, hangs: int) -> None:
-    link = Link()
+    link = LinkEvents()
     async with running(settings_for(controller.host), link) as robot:
         await enable(robot)
         os.kill(pid_of(robot), signal.SIGSTOP)

@@ -1,0 +1,246 @@
+"""What an estimator is: what it needs, its features of a frame, and its fit.
+
+An estimator is a subclass of `Estimator` in a file of its own, and a line in `bank/estimators.py`.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeAlias
+
+import numpy as np
+
+from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.estimation.bank_match import BankMatch, BankMatcher
+from shearloop.bank.estimation.fingertip_validator import FingertipValidator
+from shearloop.bank.estimation.interval_regressor import (
+    STRENGTHS,
+    IntervalRegressor,
+    PolynomialRegressor,
+    RegressorFit,
+    fit_interval_regressor,
+)
+from shearloop.bank.estimation.novelty import NoveltyDetector
+from shearloop.bank.estimation.regressors import ChannelImputer, Ridge, later_origins
+from shearloop.bank.estimation.session_state import Motion
+
+if TYPE_CHECKING:
+    from shearloop.bank.eit.mesh import Mesh
+
+Quantity = Literal["torque", "diameter"]
+# Least and largest torque (n,) that each frame may have.
+Bounds: TypeAlias = tuple[FloatArray, FloatArray]
+# Two cells of the paper's bank.
+_LEAST_MARGIN_K_CM = 0.05
+# A diameter is constant within a recording: more frames add nothing and take long.
+_MOST_FOR_DIAMETER = 240
+# Fewer diameters do not determine a line and its error.
+LEAST_DIAMETERS, LEAST_LEFT = 3, 2
+NO_ERRORS: FloatArray = np.zeros((0, 1, N_CHANNELS))
+
+
+@dataclass(frozen=True, slots=True)
+class Physics:
+    """Knowledge before calibration: the bank, and the mesh of the reconstruction."""
+
+    bank: Bank | None = None
+    mesh: "Mesh | None" = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OutputModel:
+    """How one quantity is predicted: its regressor, and for differences the detector of novel ones.
+
+    k_range holds the least and largest matched k in cm, or nothing without a bank.
+    """
+
+    regressor: IntervalRegressor | PolynomialRegressor
+    novelty: NoveltyDetector | None
+    k_range: FloatArray
+
+    def match_reasons(self, match: BankMatch | None) -> tuple[str, ...]:
+        """Return the reason against a bank match far from the calibrated ones, if there is one."""
+        if match is None or not len(self.k_range):
+            return ()
+        low, high = self.k_range.tolist()
+        margin = max(high - low, _LEAST_MARGIN_K_CM)
+        if low - margin <= match.k <= high + margin:
+            return ()
+        return (
+            f"the bank fits best at k = {match.k:.2f} cm, outside the calibrated {low:.2f} to {high:.2f} cm; "
+            "the match is on another ridge of the bank",
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    """What an estimator reads: a (m, 896) difference to the idle frame at t_s, and its mean over the grip.
+
+    motion holds the features of the last frames' motion. matcher is for estimators that search a bank.
+    """
+
+    difference: FloatArray
+    t_s: float
+    mean_difference: FloatArray
+    motion: FloatArray
+    matcher: BankMatcher | None
+
+    def match(self, layer: int = 0) -> BankMatch:
+        """Return the match of one side in the bank."""
+        if self.matcher is None:
+            raise ValueError("an estimator on a bank needs its matcher")
+        return self.matcher.match(self.difference[layer])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Material:
+    """What an estimator is prepared from: the scale (m, 896) of its differences, and knowledge before calibration.
+
+    Raw recordings have validators, and the (n, m, 896) frames of each grip.
+    """
+
+    scale: FloatArray
+    physics: Physics
+    validators: tuple[FingertipValidator, ...] = ()
+    grips: Sequence[FloatArray] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationRow:
+    """One calibration frame: its recording, number and age there, its features and the truth.
+
+    position and mean_position (d,) are the difference to the idle frame and its mean over the grip, in units of noise.
+    """
+
+    recording: int
+    frame: int
+    age_s: float
+    features: FloatArray
+    position: FloatArray
+    mean_position: FloatArray
+    torque_nm: float
+    diameter_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Estimator:
+    """An estimator of one calibration. The file keeps its fields, which are arrays, values, or dataclasses of these.
+
+    scale (m, 896) divides differences per channel and is infinite for dead ones. imputer serves raw frames.
+    """
+
+    name: ClassVar[str]
+    needs: ClassVar[Literal["bank", "mesh", ""]] = ""
+    # Features that a quantity is predicted from.
+    columns: ClassVar[Mapping[Quantity, slice]] = {"torque": slice(None), "diameter": slice(None)}
+    # Penalties to choose from.
+    strengths: ClassVar[tuple[float, ...]] = STRENGTHS
+    # Whether features further from their mean than any at calibration are refused.
+    limits_features: ClassVar[bool] = True
+    # Whether a slice's size matters, and whether the regressor ignores NaN.
+    uses_amplitude: ClassVar[bool] = True
+    ignores_nan: ClassVar[bool] = False
+    least_slices: ClassVar[int] = 10
+    # Longer recordings are thinned out for the fit.
+    most_frames: ClassVar[float] = math.inf
+
+    scale: FloatArray
+    imputer: ChannelImputer | None = None
+
+    @classmethod
+    def prepare(cls, material: Material) -> Self:
+        """Return the estimator before its fit."""
+        return cls(material.scale)
+
+    @property
+    def searches_bank(self) -> bool:
+        """Whether an estimate searches a bank, which takes many milliseconds; others take less than one."""
+        return self.needs == "bank"
+
+    @property
+    def motion(self) -> Motion:
+        """What a session remembers of the gel's motion."""
+        return Motion()
+
+    def with_imputer(self, positions: FloatArray, validators: tuple[FingertipValidator, ...]) -> Self:
+        """Return the estimator with the imputer of (n, m·896) gripped differences in units of noise."""
+        return replace(self, imputer=ChannelImputer.fit(positions, validators))
+
+    def matcher(self, _bank: Bank) -> BankMatcher | None:
+        """Return the matcher on the bank, None for an estimator without a bank."""
+        return None
+
+    def features(self, reading: Reading) -> tuple[FloatArray, BankMatch | None]:
+        """Return the (d,) features of a reading, and the bank match if there is one."""
+        raise NotImplementedError
+
+    def inputs(self, quantity: Quantity, features: FloatArray, _reading: Reading) -> FloatArray:
+        """Return the (d,) inputs of a quantity's regressor."""
+        return features[self.columns[quantity]]
+
+    def impute(
+        self, difference: FloatArray, usable: BoolArray, novelty: NoveltyDetector | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return a (m, 896) difference with unusable channels imputed, and their errors (k, m, 896)."""
+        if self.imputer is not None:
+            return self.imputer.impute(difference, usable)
+        if novelty is None:
+            return difference, NO_ERRORS
+        imputed = np.nan if self.ignores_nan else novelty.impute(difference[0], usable[0])
+        return np.where(usable, difference, imputed), NO_ERRORS
+
+    def position_noise_mm(self, _regressor: IntervalRegressor | PolynomialRegressor) -> float:
+        """Return the diameter's 95 % error from the noise of one frame."""
+        return 0.0
+
+    def ridge(self, features: FloatArray, values: FloatArray, strength: float) -> Ridge:
+        """Fit a ridge to (n, d) features and (n,) values."""
+        return Ridge.fit(features, values, strength)
+
+    def k_range(self, features: FloatArray) -> FloatArray:
+        """Return the least and the largest k of (n, d) features, empty for an estimator without a bank."""
+        return np.array([features[:, 0].min(), features[:, 0].max()]) if self.searches_bank else np.zeros(0)
+
+    def slices_fit(self, _quantity: Quantity, _values: FloatArray) -> RegressorFit:
+        """Return the fit to slices of (n,) values; raises CalibrationError where they do not determine it."""
+        return self.ridge
+
+    def fit_torque(
+        self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None
+    ) -> tuple[Self, IntervalRegressor, float]:
+        """Return the torque's regressor on raw frames, and the estimator with the features that it uses.
+
+        The third value is the share of the torque's variance that a tool's motion leaves unexplained on later frames,
+        0 where that is not tested.
+        """
+        # Without memory the gel's drift enters the torque, so validation uses later frames only.
+        regressor = fit_interval_regressor(
+            features[:, self.columns["torque"]],
+            torque_nm,
+            self.ridge,
+            strengths=self.strengths,
+            limit_features=self.limits_features,
+            left_out=later_origins(len(torque_nm)),
+            bounds=bounds,
+        )
+        return self, regressor, 0.0
+
+    def fit_diameter(self, rows: list[CalibrationRow]) -> OutputModel:
+        """Return the diameter's model from rows of known diameters, by age."""
+        rows = rows[:: 1 + len(rows) // _MOST_FOR_DIAMETER]
+        diameters = np.array([row.diameter_mm for row in rows])
+        features = np.array([row.features for row in rows])
+        # A new grip is another recording, not a later part of this one.
+        number = np.array([row.recording for row in rows])
+        each = [(np.flatnonzero(number != one), np.flatnonzero(number == one)) for one in np.unique(number)]
+        left_out = [pair for pair in each if len(np.unique(diameters[pair[0]])) >= LEAST_LEFT]
+        regressor = fit_interval_regressor(
+            features[:, self.columns["diameter"]],
+            diameters,
+            self.ridge,
+            strengths=self.strengths,
+            left_out=left_out,
+        )
+        return OutputModel(regressor, None, self.k_range(features))

@@ -1,0 +1,301 @@
+"""The estimator of motion, the default: the gel's motion over the last seconds; for slices a curve over the value.
+
+Its features are how far the frame has moved since each of the last frames, in a few directions per fingertip. The gel
+creeps for seconds under a held twist, so its speed shows torque that its position does not, and slow drift of the
+baseline leaves no trace. Where the gel holds its position, that position is a feature too and shows a long twist.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+import numpy as np
+
+from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.bank.eit.channels import N_CHANNELS, smoothed_along_channels
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation.bank_match import BankMatch
+from shearloop.bank.estimation.estimator import (
+    LEAST_LEFT,
+    Bounds,
+    CalibrationRow,
+    Estimator,
+    Material,
+    OutputModel,
+    Quantity,
+    Reading,
+)
+from shearloop.bank.estimation.fingertip_validator import FingertipValidator
+from shearloop.bank.estimation.interval_regressor import (
+    LEAST_HALF_WIDTH,
+    IntervalRegressor,
+    Intervals,
+    PolynomialRegressor,
+    RegressorFit,
+    best_strength,
+    fit_interval_regressor,
+    is_one_sided,
+)
+from shearloop.bank.estimation.novelty import fitted_parts, reciprocal_means
+from shearloop.bank.estimation.regressors import InverseCalibration, Ridge, TobitRidge
+from shearloop.bank.estimation.session_state import BASELINE_FRAMES, Motion
+from shearloop.bank.polynomial import TWO_SIDED_95
+
+# Directions of motion per fingertip, and frames back: 13 frames are 7 s, about twice the gel's creep.
+_N_DIRECTIONS, _N_LAGS = 4, 12
+# A hundred features of a few directions need little penalty.
+_MOTION_STRENGTHS = (1e-6, 1e-5, 1e-4)
+# Positions drift between recordings, motion does not. So motion alone is preferred unless it leaves more than the first
+# share of the torque's variance unexplained on later frames and the position lowers the error by the second.
+_MOTION_MAY_LEAVE, _POSITION_MUST_GAIN = 0.5, 0.5
+# Directions of motion within recordings that the diameter's line shrinks, and the most frames that they are fitted to.
+_N_NUISANCE, _MOST_FRAMES = 16, 500
+# The tools differ along a direction where the positions vary by this factor more than their noise. At least this share
+# of the variation along the clearest direction counts as the tools', at any noise.
+_CLEAR, _LEAST_SHARE = 2.0, 0.2
+# Centred positions have one direction less than their number; the last one is rounding.
+_ROUNDING = 1e-9
+# Inverse calibration over torque and over diameter: degree, directions of drift, trend. The torque's have the least
+# mean error over six origins (19 to 44 of 49 slices, evaluated on all later ones; docs/decisions/0042).
+_CURVES: dict[Quantity, tuple[int, int, bool]] = {"torque": (3, 3, True), "diameter": (1, 1, False)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TemporalFeatures(Motion):
+    """Directions (m, p, 896) along which each side's motion is measured, in units of noise, and how far back.
+
+    With uses_position the position relative to the idle frame is a feature too.
+    """
+
+    directions: FloatArray
+    n_lags: int
+    uses_position: bool = False
+
+    @classmethod
+    def fit(
+        cls, parts: Sequence[FloatArray], validators: tuple[FingertipValidator, ...], n_directions: int, n_lags: int
+    ) -> Self:
+        """Fit the main directions of motion to each recording's (n, m, 896) gripped frames."""
+        directions = []
+        for layer, one in enumerate(validators):
+            moved = np.vstack([(part[n_lags:, layer] - part[:-n_lags, layer]) / one.noise for part in parts])
+            rows = np.linalg.svd(moved, full_matrices=False)[2][:n_directions] / one.noise
+            directions.append(rows * np.sign(rows.sum(axis=1, keepdims=True)))
+        return cls(np.array(directions), n_lags)
+
+    def project(self, channels: FloatArray) -> FloatArray:
+        """Return the (…, m·p) positions of (…, m, 896) frames along the directions."""
+        found = np.einsum("...mc,mpc->...mp", channels, self.directions)
+        return np.asarray(found.reshape(*found.shape[:-2], -1))
+
+    def fill(self, moved: FloatArray, usable: BoolArray, sides: Sequence[FingertipValidator]) -> FloatArray:
+        """Return the motion (m, 896) since the last frame, unusable channels along the directions."""
+        imputed = [self._impute(layer, moved[layer], usable[layer], one.noise) for layer, one in enumerate(sides)]
+        return np.where(usable, moved, imputed)
+
+    def complete(self, difference: FloatArray, usable: BoolArray, sides: Sequence[FingertipValidator]) -> FloatArray:
+        """Return a (m, 896) difference to the idle frame, unusable channels along the directions and the grip."""
+        if usable.all():
+            return difference
+        imputed = [
+            self._impute(layer, difference[layer], usable[layer], one.noise, one.gripped - one.idle)
+            for layer, one in enumerate(sides)
+        ]
+        return np.where(usable, difference, imputed)
+
+    def _impute(
+        self, layer: int, moved: FloatArray, usable: BoolArray, noise: FloatArray, *grip: FloatArray
+    ) -> FloatArray:
+        alive = np.isfinite(noise)
+        modes = np.vstack([self.directions[layer] * np.where(alive, noise, 0.0) ** 2, *grip])
+        weights = np.where(usable & alive, 1.0 / noise, 0.0)
+        found = np.linalg.lstsq((modes * weights).T, moved * weights, rcond=None)[0]
+        return np.asarray(found @ modes)
+
+    def features(self, positions: Sequence[FloatArray], from_idle: FloatArray) -> FloatArray:
+        """Return n_lags · m·p features of motion, nearest lag first, and m·p of position where it is used.
+
+        positions are the last n_lags + 1 (m·p,) positions; from_idle (m·p,) is the newest one relative to idle.
+        """
+        rows = np.array(positions)
+        moved = (rows[-1] - rows[-2::-1]).ravel()
+        return np.concatenate([moved, from_idle]) if self.uses_position else moved
+
+
+@dataclass(frozen=True, eq=False)
+class MotionRegression(Estimator):
+    """A ridge on the gel's motion over the last frames; for slices a curve of frames over the value.
+
+    temporal is None for slices.
+    """
+
+    name: ClassVar[str] = "motion_regression"
+    strengths: ClassVar[tuple[float, ...]] = (0.0,)
+    # With a block left out, enough remain for the torque's curve.
+    least_slices: ClassVar[int] = 14
+    ignores_nan: ClassVar[bool] = True
+
+    temporal: TemporalFeatures | None = None
+
+    @classmethod
+    def prepare(cls, material: Material) -> Self:
+        """Return the estimator with the directions of the grips' motion."""
+        if not material.validators:
+            return cls(material.scale)
+        temporal = TemporalFeatures.fit(material.grips, material.validators, _N_DIRECTIONS, _N_LAGS)
+        return cls(material.scale, temporal=replace(temporal, uses_position=True))
+
+    @property
+    def motion(self) -> Motion:
+        """What a session remembers of the gel's motion."""
+        return self.temporal or Motion()
+
+    def with_imputer(self, _positions: FloatArray, _validators: tuple[FingertipValidator, ...]) -> Self:
+        """Return the estimator itself: its session imputes channels along the motion."""
+        return self
+
+    def features(self, reading: Reading) -> tuple[FloatArray, BankMatch | None]:
+        """Return the features of motion. A slice has its time as a feature, because the gel drifts."""
+        if self.temporal is not None:
+            return reading.motion, None
+        return np.append((reading.difference / self.scale).ravel(), reading.t_s), None
+
+    def inputs(self, quantity: Quantity, features: FloatArray, reading: Reading) -> FloatArray:
+        """Return the inputs of a quantity's regressor; the diameter's are the gel's mean position in this grip."""
+        if self.temporal is not None and quantity == "diameter":
+            return np.asarray((reading.mean_difference / self.scale).ravel())
+        return features
+
+    def position_noise_mm(self, regressor: IntervalRegressor | PolynomialRegressor) -> float:
+        """Return the diameter's 95 % error from the noise of one frame, where each feature has a noise of 1.
+
+        A mean of n frames has a root of n less. The calibrated interval lacks this noise: it comes from means of whole
+        grips, which have little noise left.
+        """
+        if not isinstance(regressor, IntervalRegressor) or not isinstance(regressor.point, Ridge):
+            return 0.0
+        weights = regressor.point.weights
+        return TWO_SIDED_95 * math.sqrt(weights @ weights)
+
+    def fit_torque(
+        self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None
+    ) -> tuple[Self, IntervalRegressor, float]:
+        """Return the torque's regressor, and the estimator with position where that does better on later frames."""
+        fit = TobitRidge.fit if is_one_sided(torque_nm) else Ridge.fit_scaled
+        if (temporal := self.temporal) is None:
+            raise ValueError("raw frames have motion")
+        n_motion = temporal.n_lags * temporal.directions.shape[0] * temporal.directions.shape[1]
+        choices = {False: features[:, :n_motion], True: features}
+        errors = {used: best_strength(one, torque_nm, fit, _MOTION_STRENGTHS)[1] for used, one in choices.items()}
+        unexplained = errors[False] / float(torque_nm.var())
+        used = unexplained > _MOTION_MAY_LEAVE and errors[True] < _POSITION_MUST_GAIN * errors[False]
+        regressor = fit_interval_regressor(
+            choices[used], torque_nm, fit, strengths=_MOTION_STRENGTHS, limit_features=True, bounds=bounds
+        )
+        chosen = replace(self, temporal=replace(temporal, uses_position=used))
+        return chosen, regressor, errors[used] / float(torque_nm.var())
+
+    def fit_diameter(self, rows: list[CalibrationRow]) -> OutputModel:
+        """Return the diameter's model from rows of known diameters, by age."""
+        return OutputModel(fit_cylinders(_cylinder_grips(rows)), None, np.zeros(0))
+
+    def slices_fit(self, quantity: Quantity, values: FloatArray) -> RegressorFit:
+        """Return the fit of a curve; raises CalibrationError where a part of (n,) values has too few distinct ones."""
+        degree, n_drift, trend = _CURVES[quantity]
+        for rows in fitted_parts(len(values)) if np.ptp(values) > 0 else ():
+            n_distinct = len(np.unique(values[rows]))
+            if n_distinct <= degree:
+                raise CalibrationError(
+                    f"{len(rows)} of the {len(values)} slices have too few different {quantity}s for the estimator "
+                    f"motion_regression, {n_distinct}; record more of them, in turn"
+                )
+        return lambda frames, known, _: InverseCalibration.fit(frames, known, degree, n_drift, trend=trend)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CylinderGrip:
+    """A recording of one tool: its diameter, (n, d) differences to the idle frame, and (n, d) means over the grip.
+
+    In units of noise; d runs over the channels of one side, then of the next.
+    """
+
+    diameter_mm: float
+    frames: FloatArray
+    means: FloatArray
+
+
+def fit_cylinders(grips: Sequence[CylinderGrip]) -> IntervalRegressor:
+    """Return the diameter's regressor on the mean of a grip, from grips of three diameters or more.
+
+    Its interval is the error on cylinders left out.
+    """
+    diameters = np.array([one.diameter_mm for one in grips])
+    line = fit_line(grips)
+    squares = []
+    for one in grips:
+        # Leave out all grips of this cylinder: another one would only confirm this diameter.
+        rest = [other for other in grips if other.diameter_mm != one.diameter_mm]
+        if len({other.diameter_mm for other in rest}) >= LEAST_LEFT:
+            squares.append(float(((fit_line(rest).predict(one.means) - one.diameter_mm) ** 2).mean()))
+    # Each recording counts once, which is too few for a quantile.
+    half_width = max(TWO_SIDED_95 * math.sqrt(np.mean(squares)), LEAST_HALF_WIDTH * float(np.ptp(diameters)))
+    low, high = float(diameters.min()), float(diameters.max())
+    half_span = 0.5 * (high - low)
+    return IntervalRegressor(
+        line, Intervals(np.zeros(0), np.array([half_width])), low, high, -np.inf, np.inf, misses_loads=False,
+        mean_feature=line.mean, largest_deviation=np.zeros(0), contamination_below=0.0, contamination_above=0.0,
+        timing_widening=1.0, lowest=low - half_span, highest=high + half_span,
+    )  # fmt: skip
+
+
+def fit_line(grips: Sequence[CylinderGrip]) -> Ridge:
+    """Return the line from a position to a diameter through grips of two diameters or more.
+
+    The noise of the idle frame is constant within a recording, like the diameter, so a regression on single frames
+    confuses the two. Here a recording counts as one position of known noise. Motion within recordings is shrunk, and
+    the line uses only directions where positions differ by more than their noise, by the amount that they would
+    differ without it (errors in variables, Fuller 1987). Averaging reciprocal channels and smoothing along neighbours,
+    as the paper did with its cylinders, lowers the noise.
+    """
+    diameters = np.array([one.diameter_mm for one in grips])
+    reduction = _noise_reduction(grips[0].frames.shape[1] // N_CHANNELS)
+    frames = [one.frames @ reduction for one in grips]
+    positions = np.array([one.mean(axis=0) for one in frames])
+    moved = np.concatenate([one - position for one, position in zip(frames, positions, strict=True)])
+    moved = moved[:: 1 + len(moved) // _MOST_FRAMES]
+    _, sizes, directions = np.linalg.svd(moved, full_matrices=False)
+    n = max(min(_N_NUISANCE, int(np.count_nonzero(sizes)) - 1), 0)
+    shrink = 1.0 - sizes[n] / sizes[:n]
+
+    def whitened(rows: FloatArray) -> FloatArray:
+        return np.asarray(rows - (rows @ directions[:n].T * shrink) @ directions[:n])
+
+    frame_noise = float((whitened(moved) ** 2).sum()) / max(len(moved) - len(grips), 1)
+    noise = frame_noise * (1.0 / BASELINE_FRAMES + float(np.mean([1.0 / len(one) for one in frames])))
+    centred = whitened(positions - positions.mean(axis=0))
+    squares, modes = np.linalg.eigh(centred @ centred.T)
+    clear: BoolArray = squares > max(_CLEAR * noise, _ROUNDING * float(squares[-1]))
+    clear[-1] = True
+    squares, modes = squares[clear], modes[:, clear]
+    # One recording under several diameters would give an infinitely steep line.
+    least = _ROUNDING * noise + math.sqrt(np.finfo(np.float64).tiny)
+    true = np.maximum(squares - noise, _LEAST_SHARE * squares) + least
+    along = centred.T @ (modes @ (modes.T @ (diameters - diameters.mean()) / true))
+    mean = np.mean([one.frames.mean(axis=0) for one in grips], axis=0)
+    return Ridge(mean, reduction @ whitened(along), float(diameters.mean()), 0.0)
+
+
+def _noise_reduction(n_sides: int) -> FloatArray:
+    """Return the (m·896, m·448) matrix that smooths m sides' channels and averages reciprocal ones."""
+    return np.asarray(np.kron(np.eye(n_sides), reciprocal_means(smoothed_along_channels(np.eye(N_CHANNELS)))))
+
+
+def _cylinder_grips(rows: list[CalibrationRow]) -> list[CylinderGrip]:
+    """Return each recording's grip of its tool."""
+    grips = []
+    for number in sorted({row.recording for row in rows}):
+        own = [row for row in rows if row.recording == number]
+        frames, means = (np.array([getattr(row, name) for row in own]) for name in ("position", "mean_position"))
+        grips.append(CylinderGrip(own[0].diameter_mm, frames, means))
+    return grips

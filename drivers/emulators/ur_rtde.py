@@ -67,7 +67,7 @@ def variable(robot: Robot, name: str) -> Value:
     """Return the present value of a known register or variable."""
     if name in _VARIABLES:
         return _VARIABLES[name][1](robot)
-    value = robot.registers.number(name)
+    value = robot.registers[name]
     return int(value) if "_int_" in name else value
 
 

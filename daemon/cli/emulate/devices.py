@@ -42,7 +42,7 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
 def _configure_eit_kit(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Prints the port's path, again each time it is plugged in. A fault's name on standard input applies to the "
-        "next frame: cut-line, wrong-count, nan, garbage, flood, repeat, silence [SECONDS], unplug [SECONDS]. A "
+        "next frame: cut-line, wrong-count, nan, garbage, silence [SECONDS], unplug [SECONDS]. A "
         "silence without a number lasts until the board is started again; `normal` ends every fault."
     )
     frames = parser.add_argument_group("frames")
@@ -152,7 +152,7 @@ def _configure_hx711(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Prints the port's path, again each time it is plugged in. A fault's name on standard input applies to the "
         "next line: garbage, spike, torn; or to what follows: silence [SECONDS], saturation [SECONDS], stuck "
-        "[SECONDS], unplug [SECONDS], jump NM; `normal` ends them. `torque NM` sets the torque, `mass G` that of a "
+        "[SECONDS], unplug [SECONDS]; `normal` ends them. `torque NM` sets the torque, `mass G` that of a "
         "mass on the lever."
     )
     parser.add_argument("--torque-nm", type=float, default=0.0, metavar="NM", help="the torque (default: %(default)s)")

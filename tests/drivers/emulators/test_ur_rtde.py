@@ -54,8 +54,8 @@ def test_conversation_of_a_client() -> None:
         (ord("I"), b"\x01INT32,DOUBLE"),
         (ord("S"), b"\x01"),
     ]
-    assert rtde.robot.registers.number("input_int_register_0") == 9
-    assert rtde.robot.registers.number("input_double_register_0") == 0.25
+    assert rtde.robot.registers["input_int_register_0"] == 9
+    assert rtde.robot.registers["input_double_register_0"] == 0.25
     ((kind, data),) = replies(rtde.data())
     assert kind == ord("U")
     assert data[:1] == b"\x01"
@@ -70,7 +70,7 @@ def test_bytes_may_arrive_in_any_pieces(cuts: list[int]) -> None:
     edges = [0, *sorted(cuts), len(CONVERSATION)]
     got = b"".join(pieces.receive(CONVERSATION[a:b]) for a, b in pairwise(edges))
     assert got == answer
-    assert pieces.robot.registers.number("input_double_register_0") == 0.25
+    assert pieces.robot.registers["input_double_register_0"] == 0.25
 
 
 any_packages = st.tuples(st.sampled_from(b"VvOISPUM"), st.binary(max_size=60)).map(lambda parts: package(*parts))
@@ -115,7 +115,7 @@ def test_short_vector_is_dropped() -> None:
     rtde = session()
     rtde.receive(CONVERSATION)
     rtde.receive(package(ord("U"), struct.pack(">Bi", 1, 11)))
-    assert rtde.robot.registers.number("input_int_register_0") == 9
+    assert rtde.robot.registers["input_int_register_0"] == 9
 
 
 @given(st.lists(st.floats(allow_nan=False), min_size=7, max_size=7), st.integers(-(2**31), 2**31 - 1))

@@ -84,14 +84,13 @@ class EmulatedBoard(ABC):
 
     def __init__(self, period_s: float, link: Path | None, seed: int) -> None:
         self.port = PtyPort(link)
-        self.finished = asyncio.Event()
         self._period_s = period_s
         self._random = Random(seed)
         self._injected: deque[BoardFault] = deque()
 
     @abstractmethod
     async def run(self) -> None:
-        """Play until cancelled; at the end of the data the board stays plugged in and `finished` is set."""
+        """Play until cancelled; at the end of the data the board stays plugged in."""
 
     @abstractmethod
     def recover(self) -> None:
@@ -149,7 +148,7 @@ class EitKitBoard(EmulatedBoard):
             self.port.received.put_nowait(b"y")
 
     async def run(self) -> None:
-        """Play until cancelled; at the end of the frames the board stays plugged in and `finished` is set."""
+        """Play until cancelled; at the end of the frames the board stays plugged in."""
         loop = asyncio.get_running_loop()
         with self.port:
             await self._wait_for_start()
@@ -170,7 +169,6 @@ class EitKitBoard(EmulatedBoard):
                 if loop.time() - due_s > CATCH_UP_S:
                     # Held up by the reader or a fault: the next frame takes a whole period from here.
                     due_s = loop.time()
-            self.finished.set()
             await loop.create_future()
 
     async def _send(self, line: bytes, fault: BoardFault | None) -> None:
@@ -229,7 +227,7 @@ class ConverterBoard(EmulatedBoard):
         self._end_lasting()
 
     async def run(self) -> None:
-        """Play until cancelled; at the end of the data the board stays plugged in and `finished` is set."""
+        """Play until cancelled; at the end of the data the board stays plugged in."""
         loop = asyncio.get_running_loop()
         due_s = loop.time()
         with self.port:
@@ -243,7 +241,6 @@ class ConverterBoard(EmulatedBoard):
                 line = self._with_faults(line, loop.time())
                 with contextlib.suppress(ConnectionError):  # unplugged while the line waited for a reader
                     await self.port.write(line)
-            self.finished.set()
             await loop.create_future()
 
     def _with_faults(self, line: bytes, now_s: float) -> bytes:

@@ -48,7 +48,6 @@ class WristPlant(Protocol):
 class ControllerSpec:
     """The kind of controller."""
 
-    version: tuple[int, ...] = (5, 17, 3, 0)
     unlock_wait_s: float = 5.0
     power_on_s: float = 1.0
     # Elbow up, the tool pointing straight down.

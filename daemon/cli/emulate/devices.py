@@ -205,13 +205,12 @@ def add_robot(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--power-on-s", type=float, default=1.0, help="time of each power-on step (default: 1)")
 
 
-def robot_make(args: argparse.Namespace, version: tuple[int, ...] | None = None) -> "ControllerSpec":
+def robot_make(args: argparse.Namespace) -> "ControllerSpec":
     """Return the controller's make; UserError for a wrong rate."""
     from shearloop.drivers.emulators.ur_robot import ControllerSpec
 
     console.check_range(args, "rate_hz", 50, 1000)
-    times = {name: getattr(args, name) for name in ("unlock_wait_s", "power_on_s")}
-    return ControllerSpec(**times) if version is None else ControllerSpec(version=version, **times)
+    return ControllerSpec(unlock_wait_s=args.unlock_wait_s, power_on_s=args.power_on_s)
 
 
 def print_robot_event(event: "RobotEvent") -> None:
@@ -231,7 +230,6 @@ def _configure_ur(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--host", default="127.0.0.1", help="address to listen on; its ports 29999, 30003 and 30004 are the client's"
     )
-    parser.add_argument("--version", default="5.17.3.0", help="PolyScope version to give (default: %(default)s)")
     add_robot(parser)
 
 
@@ -239,11 +237,7 @@ def _run_ur(args: argparse.Namespace) -> int:
     from shearloop.drivers.emulators.ur_controller import Controller
     from shearloop.drivers.emulators.ur_robot import Robot
 
-    try:
-        version = tuple(int(part) for part in args.version.split("."))
-    except ValueError:
-        raise UserError(f"--version {args.version} is no version; write for instance 5.17.3.0") from None
-    controller = Controller(Robot(robot_make(args, version)), host=args.host, rate_hz=args.rate_hz)
+    controller = Controller(Robot(robot_make(args)), host=args.host, rate_hz=args.rate_hz)
 
     def on_command(line: str) -> None:
         controller.command(line)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.emulators import ur_controller
-from shearloop.drivers.emulators.ur_robot import ControllerSpec, Robot
+from shearloop.drivers.emulators.ur_robot import Robot
 from shearloop.drivers.emulators.ur_rtde import (
     ConnectionFaults,
     NotRtdeError,
@@ -32,8 +32,8 @@ CONVERSATION = (
 )
 
 
-def session(**make: object) -> RtdeSession:
-    return RtdeSession(Robot(ControllerSpec(**make)), 500.0, ConnectionFaults())  # type: ignore[arg-type]
+def session() -> RtdeSession:
+    return RtdeSession(Robot(), 500.0, ConnectionFaults())
 
 
 def replies(data: bytes) -> list[tuple[int, bytes]]:
@@ -46,7 +46,7 @@ def replies(data: bytes) -> list[tuple[int, bytes]]:
 
 
 def test_conversation_of_a_client() -> None:
-    rtde = session(version=(5, 17, 3, 0))
+    rtde = session()
     assert replies(rtde.receive(CONVERSATION)) == [
         (ord("V"), b"\x01"),
         (ord("v"), struct.pack(">4I", 5, 17, 3, 0)),
@@ -104,7 +104,7 @@ def test_data_comes_at_the_rate_asked_for_and_not_before_the_start() -> None:
 
 
 def test_registers_in_use_and_unknown_variables_are_refused_by_name() -> None:
-    rtde = RtdeSession(Robot(ControllerSpec(version=(5, 5, 1, 0))), 500.0, ConnectionFaults(registers_in_use=True))
+    rtde = RtdeSession(Robot(), 500.0, ConnectionFaults(registers_in_use=True))
     ((_, answer),) = replies(rtde.receive(package(ord("I"), COMMAND)))
     assert answer == b"\x00IN_USE,IN_USE"
     ((_, answer),) = replies(rtde.receive(package(ord("O"), struct.pack(">d", 125.0) + b"timestamp,ft_raw_wrench")))

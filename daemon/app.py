@@ -114,7 +114,7 @@ class Daemon:
         config, publisher, clock = self._config, self.publisher, self._clock
         diameters = FingertipDiameters(COMBINED)
         if config.robot is not None:
-            dead_tasks = self.supervisor.deaths
+            dead_tasks = self.supervisor.dead
             self._rig = Rig(config, publisher, clock, sources, self._tare, dead_tasks, diameters.latest)
         on_torque = self._rig.control_loop.on_torque if self._rig is not None else lambda _: None
 

@@ -8,7 +8,6 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.experiment_schema import (
     ExperimentFile,
     GripStep,
@@ -19,7 +18,8 @@ from shearloop.daemon.control.experiment_schema import (
     check_limits,
 )
 from shearloop.daemon.control.gripper_task import GripperTask
-from shearloop.daemon.control.loop_inputs import GripperStatus, TorqueSource
+from shearloop.daemon.control.identification import Creep
+from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.logs import LinkLog
@@ -73,13 +73,13 @@ class Rig:
         clock: Clock,
         sources: Mapping[str, TorqueSource],
         tare: Callable[[], Awaitable[str]],
-        dead_tasks: Callable[[], Mapping[str, str]],
+        dead_tasks: Mapping[str, str],
         fingertip_diameter: Callable[[int], Measured | None] = lambda _: None,
     ) -> None:
         """Read the settings of every device; none is opened yet.
 
         `sources` are all torques but the robot's. `tare` zeroes every torque sensor and returns the errors,
-        `dead_tasks` returns the error of each dead task of the daemon.
+        `dead_tasks` has the error of each dead task of the daemon.
         """
         if config.robot is None:
             raise ValueError("a rig needs a robot")
@@ -100,7 +100,7 @@ class Rig:
             self.gripper = GripperTask(
                 RobotiqGripper(make_gripper_client(config.gripper), calibration, monitor=self.monitor("gripper")),
                 publisher,
-                self._on_gripper_state,
+                self.control_loop,
                 fingertip_diameter=fingertip_diameter,
                 measures_diameters=config.gripper.calibration is not None,
             )
@@ -148,16 +148,9 @@ class Rig:
 
     def set_link(self, device: str, event: LinkEvent) -> None:
         """Let the control loop react to a device's loss or return at once."""
-        if event.up:
-            self.control_loop.inputs.lost.pop(device, None)
-        else:
-            self.control_loop.inputs.lost[device] = event.sentence
+        self.control_loop.on_link(device, event.sentence, up=event.up)
+        if not event.up:
             self.runner.decide_now()
-
-    def _on_gripper_state(self, state: GripperStatus) -> None:
-        known = self.control_loop.inputs.gripper
-        if known is None or state.t_ns >= known.t_ns:
-            self.control_loop.inputs.gripper = state
 
 
 class DeviceLink(LinkLog):

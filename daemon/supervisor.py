@@ -35,15 +35,8 @@ class Supervisor:
     """Runs coroutines, so that no crash ends the daemon."""
 
     records: dict[str, TaskRecord] = field(default_factory=dict)
-
-    @property
-    def dead(self) -> tuple[str, ...]:
-        """Names of crashed tasks that wait for their restart."""
-        return tuple(self.deaths())
-
-    def deaths(self) -> dict[str, str]:
-        """Return the error of each dead task."""
-        return {name: record.last_error for name, record in self.records.items() if not (record.alive or record.done)}
+    # Crashed tasks that wait for their restart, with their errors.
+    dead: dict[str, str] = field(default_factory=dict)
 
     async def keep_running(self, name: str, run: Callable[[], Awaitable[None]]) -> None:
         """Run `run()` until it returns; if it raises, log the error and restart it."""
@@ -53,6 +46,7 @@ class Supervisor:
         deaths = 0
         while True:
             record.alive, started_s = True, loop.time()
+            self.dead.pop(name, None)
             try:
                 await run()
             except Exception as error:  # an error of one task must not end the others
@@ -64,7 +58,7 @@ class Supervisor:
                 deaths = 1 if loop.time() - started_s > RECOVERED_AFTER_S else deaths + 1
                 pause_s = restart_pause_s(deaths)
                 record.restarts += 1
-                record.last_error = f"{type(error).__name__}: {error}"[:MAX_ERROR_LENGTH]
+                record.last_error = self.dead[name] = f"{type(error).__name__}: {error}"[:MAX_ERROR_LENGTH]
                 log.exception("the task crashed and restarts", pause_s=pause_s)
             else:
                 record.done = True

@@ -12,7 +12,7 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, TactileFrame
-from shearloop.daemon.control.creep import Stretch
+from shearloop.daemon.control.identification import Stretch
 
 # A longer time without a torque ends a grip; single invalid frames do not.
 LONGEST_GAP_S = 5.0

@@ -21,7 +21,7 @@ def run(args: argparse.Namespace) -> int:
     from mcap.writer import MCAP0_MAGIC
 
     from shearloop.daemon.cli.options import check_overwrite
-    from shearloop.daemon.recording.importing import import_mat
+    from shearloop.daemon.recording.matlab import import_mat
 
     check_overwrite(args.out, "a recording", MCAP0_MAGIC)
     imported = import_mat(args.sources, args.out)

@@ -95,10 +95,7 @@ def _run(
                 devices=[emulator.device for emulator in config.emulators],
             )
         if args.show:
-            summary = RunSummary(
-                lambda lines: out.write("\n".join(("", *lines, "", ""))), emulated.torques, lambda: emulated.sent
-            )
-            listeners += [EstimatePrinter(out), summary]
+            listeners += [EstimatePrinter(out), RunSummary(out, emulated, emulated)]
         finished = asyncio.run(run_daemon(config, tuple(listeners), diagnostics, on_ready))
     if slices is not None:
         out.write(f"{args.slices}: {slices.summary}\n")

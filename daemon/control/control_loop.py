@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from shearloop.daemon.control.controller import TwistController, WristCommand
-from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.experiment_schema import (
     ExperimentFile,
     ExperimentLimits,
@@ -17,20 +16,10 @@ from shearloop.daemon.control.experiment_schema import (
     first_turn_before_grip,
 )
 from shearloop.daemon.control.fault_detection import LoopInputs, MonitorInputs, compared_for_s, detect_faults
-from shearloop.daemon.control.identification import ToolModel
-from shearloop.daemon.control.loop_inputs import GripperStatus, LoopConfig, TorqueSample, TorqueSource
+from shearloop.daemon.control.identification import Creep, ToolModel
+from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDecision, SafetyMonitor
-from shearloop.daemon.control.step_runner import (
-    Action,
-    ActionState,
-    Experiment,
-    ExperimentPhase,
-    GripTo,
-    Hold,
-    StepCommand,
-    StepContext,
-    TrackTorque,
-)
+from shearloop.daemon.control.step_runner import ACTIVE, Action, Experiment, ExperimentPhase, GripTo, Hold, TrackTorque
 from shearloop.daemon.control.wrist_controller import WristController
 
 
@@ -58,6 +47,19 @@ class LoopStatus:
     decision: SafetyDecision
 
 
+@dataclass(slots=True)
+class _Grip:
+    """What the loop knows of the tool between the fingers."""
+
+    # The wrist's angle at the grip.
+    origin_rad: float | None = None
+    # Whether a tool should be between the fingers.
+    expected: bool = False
+    # A stop has opened the gripper, or why it did not open, until the operator acknowledges it.
+    released: bool = False
+    release_error: str = ""
+
+
 class ControlLoop:
     """One closed loop: one arm, one gripper, and one of several torques that drives."""
 
@@ -76,26 +78,18 @@ class ControlLoop:
         self.safety = SafetyMonitor()
         self.experiment: Experiment | None = None
         self.status = LoopStatus("idle", "", WristCommand(), SafetyDecision(Response.NOTE))
+        self._config = config
+        self._sources = sources
+        self._creep = creep
         self._wrists = {
             name: WristController(source, config) for name, source in sources.items() if source.measures_torque
         }
-        self._config = config
-        self._sources = sources
-        self._required = required
-        self._creep = creep
-        self._command = StepCommand()
-        # The step whose action has begun.
-        self._begun = -1
-        self._action_state = ActionState.IDLE
-        self._action_error = ""
-        # The wrist's angle at the grip.
-        self._origin_rad: float | None = None
-        # Whether a tool should be between the fingers.
-        self._grips = False
-        self._released = False
-        # Why the gripper did not open after a stop, until the operator acknowledges it.
-        self._release_error = ""
-        self._refusals: list[Fault] = []
+        # The wrist's controller for the driving torque, and the faults to watch for.
+        self._wrist = next(iter(self._wrists.values()))
+        self._watched = self._watch(self._wrist.source, ExperimentLimits(), required)
+        self._grip = _Grip()
+        # Faults that were reported since the latest tick.
+        self._reported: list[Fault] = []
 
     def on_torque(self, torque: TorqueSample) -> None:
         """Take a torque of any source."""
@@ -103,8 +97,70 @@ class ControlLoop:
         if creep is not None and torque.torque_nm is not None:
             torque = replace(torque, torque_nm=creep.torque_nm(torque.torque_nm, torque.t_mid_ns))
         self.inputs.add_torque(torque)
-        for wrist in self._wrists.values():
+        if (wrist := self._wrists.get(torque.source)) is not None:
             wrist.on_torque(torque)
+
+    def on_arm(self, arm: ArmStatus) -> None:
+        """Take a state of the robot."""
+        self.inputs.arm = arm
+
+    def on_gripper(self, gripper: GripperStatus) -> None:
+        """Take a state of the gripper, unless it is older than the latest one."""
+        known = self.inputs.gripper
+        if known is None or gripper.t_ns >= known.t_ns:
+            self.inputs.gripper = gripper
+
+    def on_link(self, device: str, sentence: str, *, up: bool) -> None:
+        """Take the return or the loss of a device, with a sentence."""
+        if up:
+            self.inputs.lost.pop(device, None)
+        else:
+            self.inputs.lost[device] = sentence
+
+    def on_recording_error(self, error: str) -> None:
+        """Take the present error of the recording; an empty string ends it."""
+        self.inputs.recording_error = error
+
+    def on_command_refused(self, sentence: str) -> None:
+        """Note a command that a device refused."""
+        self._reported.append(Fault(FaultCode.COMMAND_REFUSED, sentence))
+
+    def on_command_unanswered(self, sentence: str) -> None:
+        """Note a command that the robot's process did not answer before its end."""
+        self._reported.append(Fault(FaultCode.COMMAND_UNANSWERED, sentence))
+
+    def on_crash(self, error: str) -> None:
+        """Note an error of the loop's own task or of its commands; it ends the experiment."""
+        self._reported.append(Fault(FaultCode.TASK_DIED, f"loop: {error}"))
+
+    def on_speed_sent(self, wrist_rad_per_s: float) -> None:
+        """Take the wrist speed that was sent, after all clipping."""
+        self._wrist.on_speed_sent(wrist_rad_per_s)
+
+    def on_action_ended(self, error: str = "") -> None:
+        """Take the end of the present action, with its error if it failed."""
+        experiment = self.experiment
+        if experiment is None:
+            return
+        experiment.end_action(error)
+        if error:
+            return
+        match experiment.command.action:
+            case TareStep():
+                # The tool was identified with another zero.
+                self._forget_tool()
+            case GripTo(expect_object=expected):
+                arm, gripper = self.inputs.arm, self.inputs.gripper
+                self._grip.origin_rad = arm.wrist_rad if arm is not None else None
+                # An unexpected object is watched as well.
+                self._grip.expected = expected or (gripper is not None and gripper.holding)
+                self._forget_tool()
+            case _:
+                pass
+
+    def on_release_ended(self, error: str = "") -> None:
+        """Take the end of the release after a stop, with its error if the gripper did not open."""
+        self._grip.release_error = error
 
     def start(self, file: ExperimentFile, t_ns: int) -> str | None:
         """Begin an experiment; return None, or why it cannot begin."""
@@ -115,24 +171,20 @@ class ControlLoop:
             return f"`torque_source: {file.torque_source}` is not a measured torque; choose one of {known}"
         if self.safety.stopped:
             return f"a stop has not been acknowledged: {' '.join(self.status.decision.reasons)}"
-        refusals = [
-            fault.sentence
-            for fault in self._faults(file.limits, file.torque_source, t_ns)
-            if fault.rule.response >= Response.REFUSE_START
-        ]
+        watched = self._watch(self._sources[file.torque_source], file.limits, self._watched.required)
+        faults = detect_faults(self.inputs, watched, self._config, t_ns)
+        refusals = [fault.sentence for fault in faults if fault.rule.response >= Response.REFUSE_START]
         if refusals:
             return " ".join(refusals)
-        number, hand = first_turn_before_grip(file), self._uncertain_gripper()
-        if number is not None and hand is not None:
+        number, uncertain = first_turn_before_grip(file), self._why_uncertain()
+        if number is not None and uncertain:
             turning = f"step {number} ({file.steps[number - 1].do}), which turns the wrist"
-            return f"{_uncertain(hand)}; put a `grip` or a `release` before {turning}"
-        self.experiment = Experiment(file, t_ns)
-        self._begun, self._action_state, self._released = -1, ActionState.IDLE, False
+            return f"{uncertain}; put a `grip` or a `release` before {turning}"
+        self.experiment, self._watched, self._wrist = Experiment(file, t_ns), watched, self._wrists[file.torque_source]
         # Without a gripper of ours the tool is held by other means; with one, it may hold a tool already.
         gripper = self.inputs.gripper
-        self._grips = "gripper" not in self._required or (gripper is not None and gripper.holding)
-        self._origin_rad = None
-        self._command = StepCommand()
+        expected = "gripper" not in watched.required or (gripper is not None and gripper.holding)
+        self._grip = _Grip(expected=expected, release_error=self._grip.release_error)
         return None
 
     def pause(self) -> str | None:
@@ -158,157 +210,101 @@ class ControlLoop:
 
     def acknowledge(self) -> None:
         """Clear a stop on the operator's command."""
-        self._release_error = ""
+        self._grip.release_error = ""
         self.safety.acknowledge()
 
-    def on_command_refused(self, sentence: str) -> None:
-        """Note a command that a device refused."""
-        self._refusals.append(Fault(FaultCode.COMMAND_REFUSED, sentence))
-
-    def on_command_unanswered(self, sentence: str) -> None:
-        """Note a command that the robot's process did not answer before its end."""
-        self._refusals.append(Fault(FaultCode.COMMAND_UNANSWERED, sentence))
-
-    def on_action_ended(self, error: str = "") -> None:
-        """Take the end of the present action, with its error if it failed."""
-        self._action_state = ActionState.FAILED if error else ActionState.DONE
-        self._action_error = error
-        match self._command.action:
-            case TareStep() if not error:
-                # The tool was identified with another zero.
-                self._forget_tool()
-            case GripTo() as grip if not error:
-                self._on_gripped(grip)
-            case _:
-                pass
-
-    def on_release_ended(self, error: str = "") -> None:
-        """Take the end of the release after a stop, with its error if the gripper did not open."""
-        self._release_error = error
-
-    def on_speed_sent(self, wrist_rad_per_s: float) -> None:
-        """Take the wrist speed that was sent, after all clipping."""
-        if self.experiment is not None:
-            self._driving_wrist.on_speed_sent(wrist_rad_per_s)
-
-    def tick(self, t_ns: int) -> ControlOutput:
-        """Return the commands for now."""
-        experiment, arm = self.experiment, self.inputs.arm
-        limits = experiment.limits if experiment is not None else ExperimentLimits()
-        drive = experiment.file.torque_source if experiment is not None else next(iter(self._wrists))
-        found = [*self._faults(limits, drive, t_ns), *self._refusals]
-        self._refusals.clear()
-        if self._release_error:
-            found.append(Fault(FaultCode.NOT_RELEASED, self._release_error))
-        if experiment is None or not experiment.running:
+    def tick(self, t_ns: int, late_s: float = 0.0, died: Mapping[str, str] = MappingProxyType({})) -> ControlOutput:
+        """Return the commands for now; the loop is `late_s` late, and `died` has the error of each dead task."""
+        experiment, arm, grip = self.experiment, self.inputs.arm, self._grip
+        active = experiment is not None and experiment.phase in ACTIVE
+        watched = replace(self._watched, late_s=late_s, died=died)
+        if experiment is not None:
+            watched = replace(watched, limits=experiment.limits)
+        if experiment is not None and active:
+            command, controller = experiment.command, self._wrist.controller
+            gripped = grip.expected and not isinstance(command.action, GripTo)
+            turns = not isinstance(command.wrist, Hold) or isinstance(command.action, IdentifyStep)
+            watched = replace(
+                watched,
+                gripped=gripped,
+                torque_needed=gripped and turns and experiment.phase is ExperimentPhase.RUNNING,
+                twisted_rad=0.0 if arm is None or grip.origin_rad is None else arm.wrist_rad - grip.origin_rad,
+                expected_nm=controller.torque_nm if controller is not None else None,
+                overdue=experiment.overdue,
+            )
+        found = [*detect_faults(self.inputs, watched, self._config, t_ns), *self._reported]
+        self._reported.clear()
+        if grip.release_error:
+            found.append(Fault(FaultCode.NOT_RELEASED, grip.release_error))
+        if experiment is None or not active:
             # Nothing moves: faults are reported, and only a stop of an experiment waits for the operator.
             return self._ended(self.safety.report(found))
         decision = self.safety.judge(found, t_ns)
         if decision.response >= Response.STOP_AND_KEEP_GRIP:
             experiment.stop(" ".join(decision.reasons))
-            return self._ended(decision)
-        if arm is None:
+        if arm is None or decision.response >= Response.STOP_AND_KEEP_GRIP:
             return self._ended(decision)
         return self._run_step(experiment, decision, arm.wrist_rad, t_ns)
 
     @property
     def controller(self) -> TwistController | None:
         """The torque controller while the loop is closed."""
-        return self._driving_wrist.controller
+        return self._wrist.controller
 
     @property
     def tool(self) -> ToolModel | None:
         """The identified tool."""
-        return self._driving_wrist.tool
+        return self._wrist.tool
 
-    @property
-    def _driving_wrist(self) -> WristController:
-        if self.experiment is None:
-            return next(iter(self._wrists.values()))
-        return self._wrists[self.experiment.file.torque_source]
+    def _watch(self, driving: TorqueSource, limits: ExperimentLimits, required: tuple[str, ...]) -> MonitorInputs:
+        supervising = tuple(source for source in self._sources.values() if source is not driving)
+        return MonitorInputs(driving=driving, supervising=supervising, limits=limits, required=required)
 
-    def _uncertain_gripper(self) -> GripperStatus | None:
-        """Return the gripper's state if it cannot say whether it holds a tool, else None."""
+    def _why_uncertain(self) -> str:
+        """Return why the gripper cannot say whether it holds a tool, or an empty string."""
         hand = self.inputs.gripper
-        uncertain = "gripper" in self._required and hand is not None and (hand.uncertain or hand.moving)
-        return hand if uncertain else None
+        if "gripper" not in self._watched.required or hand is None or not (hand.uncertain or hand.moving):
+            return ""
+        doubt = "are moving" if hand.moving else "stand where a stop, an activation or a lack of power has left them"
+        return f"the gripper does not say whether it holds a tool: its fingers, {hand.width_mm:.1f} mm apart, {doubt}"
 
     def _run_step(self, experiment: Experiment, decision: SafetyDecision, wrist_rad: float, t_ns: int) -> ControlOutput:
-        held = decision.response is Response.HOLD
-        if self._origin_rad is None:
-            self._origin_rad = wrist_rad
+        """Let the experiment choose its command, and the wrist's controller a speed."""
+        wrist, grip, held = self._wrist, self._grip, decision.response is Response.HOLD
+        if grip.origin_rad is None:
+            grip.origin_rad = wrist_rad
         latest = self.inputs.torques.get(experiment.file.torque_source)
-        context = StepContext(
-            wrist_rad - self._origin_rad,
-            latest.torque_nm if latest is not None and not held else None,
-            gripped_at_rad=self._origin_rad,
-            action=self._action_state,
-            action_error=self._action_error,
-        )
-        experiment.update(context, t_ns, held=held)
-        # While the wrist is held, faults still depend on the step's own command.
-        self._command = experiment.command
-        if not experiment.running:
-            return self._ended(decision)
-        still = held or experiment.phase is ExperimentPhase.PAUSED
+        torque_nm = latest.torque_nm if latest is not None and not held else None
+        experiment.update(t_ns, wrist_rad - grip.origin_rad, torque_nm, gripped_at_rad=grip.origin_rad, held=held)
+        command = experiment.command
+        turns = not isinstance(command.wrist, Hold) or isinstance(command.action, IdentifyStep)
         # A tool that the gripper holds is watched. After a stop, the gripper's doubt may arrive only now.
-        if self._turns and not self._grips and (hand := self._uncertain_gripper()) is not None:
-            step = f"step {experiment.step_number} ({experiment.step.do}) cannot be done"
-            experiment.stop(f"{step}: {_uncertain(hand)}; put a `grip` or a `release` before it")
+        if turns and not grip.expected and (uncertain := self._why_uncertain()):
+            experiment.fail(f"{uncertain}; put a `grip` or a `release` before it")
+        still = held or experiment.phase is ExperimentPhase.PAUSED
+        if isinstance(command.wrist, TrackTorque) and wrist.tracked != command.wrist and not still:
+            reason = wrist.close_loop(command.wrist, t_ns, wrist_rad, experiment.limits.torque_nm)
+            if reason:
+                experiment.fail(reason)
+        if experiment.phase not in ACTIVE:
             return self._ended(decision)
-        action = None if still else self._begin(experiment, t_ns, wrist_rad)
-        if not experiment.running:
-            return self._ended(decision)
-        velocity = self._velocity(t_ns, wrist_rad, self._origin_rad, still=still)
-        phase = "held" if held else experiment.phase.value
-        self.status = LoopStatus(phase, experiment.activity, velocity, decision)
-        return ControlOutput(velocity.speed_rad_per_s, hold=still, action=action)
-
-    @property
-    def _turns(self) -> bool:
-        return not isinstance(self._command.wrist, Hold) or isinstance(self._command.action, IdentifyStep)
-
-    def _begin(self, experiment: Experiment, t_ns: int, wrist_rad: float) -> Action | None:
-        """Close the loop or start the identification of a new command; return its action for the devices."""
-        command, wrist = self._command, self._driving_wrist
-        match command.wrist:
-            case TrackTorque() as track if wrist.tracked != track:
-                if reason := wrist.close_loop(track, t_ns, wrist_rad, experiment.limits.torque_nm):
-                    experiment.stop(f"step {command.step_index + 1} ({experiment.step.do}) cannot be done: {reason}")
-                    return None
-            case _:
-                pass
-        if command.action is None:
-            self._action_state = ActionState.IDLE
-            return None
-        if command.step_index == self._begun:
-            return None
-        self._begun, self._action_state, self._action_error = command.step_index, ActionState.RUNNING, ""
-        if isinstance(command.action, IdentifyStep):
-            wrist.begin_identification(command.action, experiment.limits.torque_nm)
-            return None
-        return command.action
-
-    def _velocity(self, t_ns: int, wrist_rad: float, origin_rad: float, *, still: bool) -> WristCommand:
-        wrist = self._driving_wrist
+        action = command.action if command.action is not None and not still and experiment.begin_action() else None
+        if isinstance(action, IdentifyStep):
+            wrist.begin_identification(action, experiment.limits.torque_nm)
+            action = None
         if still:
-            return wrist.hold()
-        if isinstance(self._command.action, IdentifyStep) and self._action_state is ActionState.RUNNING:
-            velocity, ended = wrist.identify(t_ns, wrist_rad)
+            velocity = wrist.hold()
+        elif isinstance(command.action, IdentifyStep) and wrist.excitation is not None:
+            velocity, ended = wrist.identify(wrist.excitation, t_ns, wrist_rad)
             if ended is not None:
                 self.on_action_ended(ended)
-            return velocity
-        return wrist.turn(self._command.wrist, t_ns, wrist_rad, origin_rad)
-
-    def _on_gripped(self, grip: GripTo) -> None:
-        arm, gripper = self.inputs.arm, self.inputs.gripper
-        self._origin_rad = arm.wrist_rad if arm is not None else None
-        # An unexpected object is watched as well.
-        self._grips = grip.expect_object or (gripper is not None and gripper.holding)
-        self._forget_tool()
+        else:
+            velocity = wrist.turn(command.wrist, t_ns, wrist_rad, grip.origin_rad)
+        self.status = LoopStatus("held" if held else experiment.phase.value, command.activity, velocity, decision)
+        return ControlOutput(velocity.speed_rad_per_s, hold=still, action=action)
 
     def _forget_tool(self) -> None:
-        self._driving_wrist.reset()
+        self._wrist.reset()
         for creep in self._creep.values():
             creep.reset()
 
@@ -317,36 +313,6 @@ class ControlLoop:
         phase = experiment.phase.value if experiment is not None else "idle"
         reason = experiment.stop_reason if experiment is not None else ""
         self.status = LoopStatus(phase, reason, WristCommand(), decision)
-        self._command = StepCommand()
-        release = decision.response is Response.STOP_AND_RELEASE and not self._released
-        self._released |= release
+        release = decision.response is Response.STOP_AND_RELEASE and not self._grip.released
+        self._grip.released |= release
         return ControlOutput(stop=True, release=release)
-
-    def _faults(self, limits: ExperimentLimits, drive: str, t_ns: int) -> list[Fault]:
-        experiment, arm = self.experiment, self.inputs.arm
-        running = experiment is not None and experiment.running
-        paused = experiment is not None and experiment.phase is ExperimentPhase.PAUSED
-        twisted_rad = 0.0
-        if arm is not None and self._origin_rad is not None:
-            twisted_rad = arm.wrist_rad - self._origin_rad
-        gripped = running and self._grips and not isinstance(self._command.action, GripTo)
-        controller = self.controller
-        watched = MonitorInputs(
-            driving=self._sources[drive],
-            supervising=tuple(source for name, source in self._sources.items() if name != drive),
-            limits=limits,
-            torque_needed=gripped and self._turns and not paused,
-            gripped=gripped,
-            twisted_rad=twisted_rad,
-            expected_nm=controller.torque_nm if running and controller is not None else None,
-            overdue=experiment.overdue if running and experiment is not None else "",
-            required=self._required,
-        )
-        return detect_faults(self.inputs, watched, self._config, t_ns)
-
-
-def _uncertain(gripper: GripperStatus) -> str:
-    return (
-        "the gripper does not say whether it holds a tool: its fingers, "
-        f"{gripper.width_mm:.1f} mm apart, {gripper.uncertainty}"
-    )

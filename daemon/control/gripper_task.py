@@ -6,6 +6,7 @@ from collections.abc import Awaitable, Callable, Mapping
 
 from shearloop.bank.estimation import Measured, combine
 from shearloop.bank.polynomial import TWO_SIDED_95
+from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.loop_inputs import GripperStatus
 from shearloop.daemon.control.step_runner import GripTo
@@ -27,7 +28,7 @@ class GripperTask:
         self,
         gripper: RobotiqGripper,
         publisher: Publisher,
-        on_state: Callable[[GripperStatus], None],
+        control_loop: ControlLoop,
         *,
         fingertip_diameter: Callable[[int], Measured | None] = lambda _: None,
         measures_diameters: bool = True,
@@ -39,7 +40,7 @@ class GripperTask:
         self._measures_diameters = measures_diameters
         self._gripper = gripper
         self._publisher = publisher
-        self._on_state = on_state
+        self._control_loop = control_loop
         self._fingertip_diameter = fingertip_diameter
 
     async def read(self) -> None:
@@ -47,7 +48,7 @@ class GripperTask:
         async with contextlib.aclosing(self._gripper.states()) as states:
             async for state in states:
                 self._publish(state)
-                self._on_state(_status(state))
+                self._control_loop.on_gripper(_status(state))
 
     async def grip(self, target: GripTo) -> str:
         """Move to a width and wait for the end; return an error, or an empty string."""
@@ -58,7 +59,7 @@ class GripperTask:
         except DriverError as error:
             return str(error)
         # The loop needs the state before the end of the action.
-        self._on_state(_status(state))
+        self._control_loop.on_gripper(_status(state))
         if target.expect_object and state.diameter_mm is None:
             return (
                 f"the fingers closed to {state.width_mm:.1f} mm and met nothing; "

@@ -86,11 +86,6 @@ class GripperStatus:
     fault: str = ""
     uncertain: bool = False
 
-    @property
-    def uncertainty(self) -> str:
-        """Why the gripper does not know whether it holds an object; completes "its fingers …"."""
-        return "are moving" if self.moving else "stand where a stop, an activation or a lack of power has left them"
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TorqueSource:

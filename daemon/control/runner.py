@@ -9,17 +9,28 @@ import structlog
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
-from shearloop.daemon.control.device_commands import ActionExecutor, VelocityCommandSender
-from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, TareStep
 from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
-from shearloop.daemon.control.step_runner import Experiment
+from shearloop.daemon.control.step_runner import Action, Experiment, GripTo
 from shearloop.daemon.messaging.messages import LoopState, RobotStateMessage, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH
 from shearloop.drivers.ur.client import UrRobot
-from shearloop.drivers.ur.messages import Enable, RobotState, Stop, Unlock
+from shearloop.drivers.ur.messages import (
+    ARRIVED,
+    STOPPED_ON_COMMAND,
+    CommandReply,
+    Enable,
+    MoveLinear,
+    RobotState,
+    Stop,
+    Unlock,
+    WristSpeed,
+    ZeroForceTorque,
+    tool_axis,
+)
 
 WRENCH = "wrench"
 # Without a new state the loop decides after this time, half of the time after which the arm's state is stale.
@@ -35,6 +46,9 @@ BRAKE_S = 0.5
 ENABLED_WITHIN_S = 0.5
 # A release is tried for 5 s and takes up to 2 s; systemd kills a service 10 s after it asked for the end.
 RELEASED_WITHIN_S = 7.0
+LINEAR_ACCELERATION_M_PER_S2 = 0.3
+# The arm rests within this time after a stop, unless something else moves it.
+COMES_TO_REST_S = 2.0
 
 
 def wrench_source(rate_hz: float) -> TorqueSource:
@@ -53,31 +67,20 @@ class ControlLoopRunner:
         tare: Callable[[], Awaitable[str]],
         publisher: Publisher,
         clock: Clock,
-        dead_tasks: Callable[[], Mapping[str, str]],
+        dead_tasks: Mapping[str, str],
         acceleration_rad_per_s2: float,
     ) -> None:
-        """`tare` zeroes every sensor; `dead_tasks` returns the error of each dead task."""
+        """`tare` zeroes every sensor; `dead_tasks` has the error of each dead task."""
         self._control_loop = control_loop
         self._robot = robot
-        self._gripper = gripper
-        self._publisher = publisher
         self._clock = clock
         self._dead_tasks = dead_tasks
-        self._acceleration_rad_per_s2 = acceleration_rad_per_s2
-        self._velocity = VelocityCommandSender(robot, control_loop, acceleration_rad_per_s2, self._on_command_error)
-        self._actions = ActionExecutor(robot, gripper, tare, self._velocity)
-        self._action: asyncio.Task[None] | None = None
-        # The last action of a stop: to open the gripper, or to halt its fingers.
-        self._final_action: asyncio.Task[None] | None = None
-        # An error of the loop or of its commands, until the control loop has judged it.
-        self._own_error = ""
+        self._velocity = VelocityCommandSender(robot, control_loop, acceleration_rad_per_s2)
+        self._actions = ActionExecutor(robot, gripper, tare, self._velocity, control_loop)
+        self._states = StatePublisher(publisher, control_loop)
         self._crash: Exception | None = None
         self._running = False
         self._stopped = True
-        self._published_block = -1
-        self._published_key: tuple[object, ...] = ()
-        self._published_hold = self._published_ns = 0
-        self._status_changed = asyncio.Event()
         self._decided_ns = 0
 
     async def run(self) -> None:
@@ -88,27 +91,28 @@ class ControlLoopRunner:
         self._decided_ns, self._crash, self._running = self._clock.now_ns(), None, True
         try:
             while True:
-                state = await self._next_state()
+                # Without a state the loop decides all the same.
+                with suppress(TimeoutError):
+                    longest_s = LONGEST_REST_S if self._stopped else LONGEST_TICK_S
+                    async with asyncio.timeout(max(longest_s, LONGEST_SILENCE_S)):
+                        await self._robot.next_state()
+                    # After a pause of this process several states arrive at once; only the newest one counts.
+                    if self._robot.state is not None:
+                        self._take_state(self._robot.state)
                 if self._crash is not None:
                     raise self._crash
-                if state is not None:
-                    self._take_state(state)
                 self._decide()
         except Exception as error:
             self._running = False
-            self._own_error = _text(error)
-            if self._action is not self._final_action:
-                # Before the stop: the action may be about to start a straight move.
-                self._cancel_motion()
+            self._control_loop.on_crash(error_text(error))
+            self._actions.abort()
             await self._brake()
             # Without this wait the gripper might not receive its final command.
             await self.released()
             raise
         finally:
             self._running = False
-            if self._action is not None:
-                self._action.cancel()
-                await asyncio.gather(self._action, return_exceptions=True)
+            await self._actions.close()
 
     def decide_now(self) -> None:
         """Decide without a new state, after a loss of a device or for the daemon's end; `run` raises its errors."""
@@ -121,7 +125,8 @@ class ControlLoopRunner:
 
     async def start(self, file: ExperimentFile) -> str | None:
         """Begin an experiment; return None, or why it cannot begin."""
-        if self._experiment_runs:
+        experiment = self._control_loop.experiment
+        if experiment is not None and experiment.running:
             # The control loop refuses it; a stopped arm must not be enabled on the way.
             return self._control_loop.start(file, self._clock.now_ns())
         reply = await self._robot.send(Enable())
@@ -137,24 +142,23 @@ class ControlLoopRunner:
     async def experiment_ended(self) -> Experiment:
         """Return the present or the next experiment once it has ended."""
         while (experiment := self._control_loop.experiment) is None:
-            await self._status_changed.wait()
+            await self._states.changed.wait()
         while experiment.running:
-            await self._status_changed.wait()
+            await self._states.changed.wait()
         return experiment
 
     async def released(self) -> None:
         """Halt moving fingers, and wait for the end of the last release or halt."""
         if self._actions.fingers_move:
-            self._cancel_motion()
-        if self._final_action is not None:
-            await asyncio.wait({self._final_action}, timeout=RELEASED_WITHIN_S)
+            self._actions.cancel()
+        await self._actions.released()
 
     async def unlock(self) -> str | None:
         """Enable robot and gripper after a stop, on the operator's command; return None, or why not."""
         reply = await self._robot.send(Unlock())
         if not reply.accepted:
             return reply.refusal
-        if self._gripper is not None and (error := await self._gripper.unlock()):
+        if self._actions.gripper is not None and (error := await self._actions.gripper.unlock()):
             return error
         self._control_loop.acknowledge()
         return None
@@ -171,121 +175,300 @@ class ControlLoopRunner:
             "error": "" if self._robot.link.latest.up else self._robot.link.latest.sentence,
         }
 
-    @property
-    def _experiment_runs(self) -> bool:
-        experiment = self._control_loop.experiment
-        return experiment is not None and experiment.running
-
-    @property
-    def _longest_interval_s(self) -> float:
-        return LONGEST_REST_S if self._stopped and not self._experiment_runs else LONGEST_TICK_S
-
-    async def _next_state(self) -> RobotState | None:
-        """Return the newest state once one arrives, or None if none arrives in time."""
-        try:
-            async with asyncio.timeout(max(self._longest_interval_s, LONGEST_SILENCE_S)):
-                await self._robot.next_state()
-        except TimeoutError:
-            return None
-        # After a pause of this process several states arrive at once; only the newest one counts.
-        return self._robot.state
-
     def _take_state(self, state: RobotState) -> None:
         # The controller's own time: a state that is repeated becomes stale.
         t_ns = state.t_mono_ns - state.age_ns
-        self._control_loop.inputs.arm = ArmStatus(
-            wrist_rad=state.wrist_rad,
-            t_ns=t_ns,
-            protective_stop=state.protective_stop,
-            emergency_stop=state.emergency_stop,
-            blocked=state.blocked,
+        self._control_loop.on_arm(
+            ArmStatus(
+                wrist_rad=state.wrist_rad,
+                t_ns=t_ns,
+                protective_stop=state.protective_stop,
+                emergency_stop=state.emergency_stop,
+                blocked=state.blocked,
+            )
         )
-        if (block := state.cycle // PUBLISH_EVERY) != self._published_block:
-            self._published_block = block
+        if self._states.publish_robot(state):
             # The torque on the tool is opposite to the wrench on the wrist.
             torque = TorqueSample(WRENCH, -state.wrist_torque_nm, "", t_ns, self._clock.now_ns())
             self._control_loop.on_torque(torque)
-            self._publisher.publish(robot_state(state))
 
     def _decide(self) -> None:
         now_ns = self._clock.now_ns()
         # From decision to decision, so that a slow decision is late as well.
-        interval_s = (now_ns - self._decided_ns) / 1e9
-        inputs = self._control_loop.inputs
-        inputs.late_s = max(0.0, interval_s - self._longest_interval_s)
-        inputs.died = {**self._dead_tasks(), **({"loop": self._own_error} if self._own_error else {})}
-        self._own_error = ""
+        late_s = (now_ns - self._decided_ns) / 1e9 - (LONGEST_REST_S if self._stopped else LONGEST_TICK_S)
         self._decided_ns = now_ns
-        self._execute(self._control_loop.tick(now_ns))
-        self._publish_status(now_ns)
-
-    def _execute(self, output: ControlOutput) -> None:
+        output = self._control_loop.tick(now_ns, max(0.0, late_s), self._dead_tasks)
         if output.stop:
-            if not self._stopped:
-                self._stopped = True
-                self._cancel_motion()
+            self._stop(output)
+        else:
+            self._stopped = False
+            if not output.hold:
+                self._actions.may_move.set()
+            elif self._actions.interrupt():
                 self._velocity.stop()
-            if output.release and self._gripper is not None:
-                self._start_action(self._gripper.release, self._on_released)
-                self._final_action = self._action
-            return
-        self._stopped = False
-        if not output.hold:
-            self._actions.resume()
-        elif self._actions.interrupt():
+            if output.action is not None:
+                self._actions.begin(output.action)
+            self._velocity.turn(output.wrist_rad_per_s)
+        self._states.publish_loop(self._velocity.sent_rad_per_s, now_ns)
+
+    def _stop(self, output: ControlOutput) -> None:
+        if not self._stopped:
+            self._stopped = True
+            self._actions.cancel()
             self._velocity.stop()
-        if output.action is not None:
-            self._start_action(partial(self._actions.run, output.action), self._control_loop.on_action_ended)
-        self._velocity.turn(output.wrist_rad_per_s)
-
-    def _on_command_error(self, error: Exception) -> None:
-        structlog.get_logger().exception("a command to the robot failed")
-        self._own_error = _text(error)
-
-    def _start_action(self, act: Callable[[], Awaitable[str]], on_ended: Callable[[str], None]) -> None:
-        """Run an action in a task; `on_ended` receives its error, or an empty string."""
-        if self._action is not None:
-            self._action.cancel()
-
-        async def run_action() -> None:
-            try:
-                error = await act()
-            except Exception as exception:  # noqa: BLE001 - any error fails the step
-                structlog.get_logger().exception("an action of the devices crashed")
-                error = f"it crashed with {_text(exception)}; the log has more"
-            on_ended(error)
-
-        self._action = asyncio.create_task(run_action(), name="action")
-
-    def _on_released(self, error: str) -> None:
-        if error:
-            structlog.get_logger().error("the gripper did not open", reason=error)
-        self._control_loop.on_release_ended(error)
-
-    def _cancel_motion(self) -> None:
-        """Cancel the present action; moving fingers are halted."""
-        fingers_move, self._actions.fingers_move = self._actions.fingers_move, False
-        if fingers_move and self._gripper is not None:
-            self._start_action(self._gripper.halt, self._on_halted)
-            self._final_action = self._action
-        elif self._action is not None:
-            self._action.cancel()
-
-    def _on_halted(self, error: str) -> None:
-        if error:
-            structlog.get_logger().error("the fingers did not stop", reason=error)
-            self._control_loop.on_command_refused(f"the fingers did not stop: {error}")
+        if output.release:
+            self._actions.release()
 
     async def _brake(self) -> None:
         """Stop the arm, including a straight move."""
         self._stopped = False
         try:
             async with asyncio.timeout(BRAKE_S):
-                await self._robot.send(Stop(self._acceleration_rad_per_s2))
+                await self._robot.send(Stop(self._velocity.acceleration_rad_per_s2))
         except Exception:  # noqa: BLE001 - the loop's own error is raised
             structlog.get_logger().exception("the arm could not be stopped")
 
-    def _publish_status(self, now_ns: int) -> None:
+
+class VelocityCommandSender:
+    """Sends wrist velocities and stops to the robot's process, and reports the results to the control loop."""
+
+    def __init__(self, robot: UrRobot, control_loop: ControlLoop, acceleration_rad_per_s2: float) -> None:
+        # The speed that the robot's process accepted last.
+        self.sent_rad_per_s = 0.0
+        self.acceleration_rad_per_s2 = acceleration_rad_per_s2
+        # Commands that wait for their replies.
+        self.unanswered = 0
+        self._robot = robot
+        self._control_loop = control_loop
+
+    def turn(self, rad_per_s: float) -> None:
+        """Send a wrist speed, unless the wrist stands still already or a command waits for its reply."""
+        if (rad_per_s or self.sent_rad_per_s) and not self.unanswered:
+            self._send(WristSpeed(rad_per_s, self.acceleration_rad_per_s2))
+
+    def stop(self) -> None:
+        """Stop the whole arm."""
+        self._send(Stop(self.acceleration_rad_per_s2))
+
+    def _send(self, command: WristSpeed | Stop) -> None:
+        self.unanswered += 1
+        try:
+            self._robot.send_nowait(command, self._on_reply)
+        except Exception as error:  # noqa: BLE001 - the next decision ends the experiment
+            structlog.get_logger().exception("a command to the robot failed")
+            self.unanswered -= 1
+            self._control_loop.on_crash(error_text(error))
+
+    def _on_reply(self, reply: CommandReply) -> None:
+        self.unanswered -= 1
+        if not reply.accepted and self._robot.state is None:
+            self._control_loop.on_command_unanswered(reply.refusal)
+        elif not reply.accepted:
+            self._control_loop.on_command_refused(reply.refusal)
+        self.sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
+        self._control_loop.on_speed_sent(self.sent_rad_per_s)
+
+
+class ActionExecutor:
+    """Carries out one action at a time; a straight move that is interrupted continues to its end afterwards."""
+
+    def __init__(
+        self,
+        robot: UrRobot,
+        gripper: GripperTask | None,
+        tare: Callable[[], Awaitable[str]],
+        velocity: VelocityCommandSender,
+        control_loop: ControlLoop,
+    ) -> None:
+        self.gripper = gripper
+        # The fingers may be on their way; cleared by a stop of the fingers.
+        self.fingers_move = False
+        # Set while straight moves may go on.
+        self.may_move = asyncio.Event()
+        self.may_move.set()
+        self._robot = robot
+        self._tare = tare
+        self._velocity = velocity
+        self._control_loop = control_loop
+        self._moving = self._interrupted = False
+        self._task: asyncio.Task[None] | None = None
+        # The last action of a stop: to open the gripper, or to halt its fingers.
+        self._final_task: asyncio.Task[None] | None = None
+
+    def begin(self, action: Action) -> None:
+        """Carry out an action, and report its end to the control loop."""
+        self._start(partial(self._run, action), self._control_loop.on_action_ended)
+
+    def release(self) -> None:
+        """Open the gripper after a stop."""
+        if self.gripper is not None:
+            self._start(self.gripper.release, self._on_released)
+            self._final_task = self._task
+
+    def cancel(self) -> None:
+        """Cancel the present action; moving fingers are halted."""
+        fingers_move, self.fingers_move = self.fingers_move, False
+        if fingers_move and self.gripper is not None:
+            self._start(self.gripper.halt, self._on_halted)
+            self._final_task = self._task
+        elif self._task is not None:
+            self._task.cancel()
+
+    def abort(self) -> None:
+        """Cancel the present action unless it is the last one of a stop.
+
+        Before the stop: the action may be about to start a straight move.
+        """
+        if self._task is not self._final_task:
+            self.cancel()
+
+    async def released(self) -> None:
+        """Wait for the end of the last release or halt."""
+        if self._final_task is not None:
+            await asyncio.wait({self._final_task}, timeout=RELEASED_WITHIN_S)
+
+    async def close(self) -> None:
+        """Cancel the present action and wait for its end."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+
+    def interrupt(self) -> bool:
+        """Delay straight moves until `may_move` is set; return whether one is under way and must be stopped now."""
+        self.may_move.clear()
+        stop = self._moving and not self._interrupted
+        self._interrupted = self._interrupted or stop
+        return stop
+
+    def _start(self, act: Callable[[], Awaitable[str]], on_ended: Callable[[str], None]) -> None:
+        """Run an action in a task; `on_ended` receives its error, or an empty string."""
+        if self._task is not None:
+            self._task.cancel()
+
+        async def run_action() -> None:
+            try:
+                error = await act()
+            except Exception as exception:  # noqa: BLE001 - any error fails the step
+                structlog.get_logger().exception("an action of the devices crashed")
+                error = f"it crashed with {error_text(exception)}; the log has more"
+            on_ended(error)
+
+        self._task = asyncio.create_task(run_action(), name="action")
+
+    def _on_released(self, error: str) -> None:
+        if error:
+            structlog.get_logger().error("the gripper did not open", reason=error)
+        self._control_loop.on_release_ended(error)
+
+    def _on_halted(self, error: str) -> None:
+        if error:
+            structlog.get_logger().error("the fingers did not stop", reason=error)
+            self._control_loop.on_command_refused(f"the fingers did not stop: {error}")
+
+    async def _run(self, action: Action) -> str:
+        """Carry out an action; return an error, or an empty string."""
+        match action:
+            case ApproachStep():
+                return await self._move(action)
+            case GripTo():
+                if self.gripper is None:
+                    return "no gripper is configured; add a `gripper` section to the configuration"
+                self.fingers_move = True
+                # After a failure, such as a lost connection, the fingers may still move.
+                error = await self.gripper.grip(action)
+                self.fingers_move = bool(error)
+                return error
+            case TareStep():
+                if error := await self._rest():
+                    return error
+                reply = await self._robot.send(ZeroForceTorque())
+                return reply.refusal if not reply.accepted else await self._tare()
+            case _:
+                raise TypeError(f"{action} is not an action of the devices")
+
+    async def _rest(self) -> str:
+        """Wait until no motion is under way; return an error, or an empty string.
+
+        Resting joints are not enough: after a stop the robot's process is busy a little longer, and refuses a move.
+        """
+        velocity = self._velocity
+        try:
+            async with asyncio.timeout(COMES_TO_REST_S):
+                state = await self._robot.next_state()
+                while velocity.sent_rad_per_s or velocity.unanswered or state.motion != "idle" or not state.rests:
+                    state = await self._robot.next_state()
+        except TimeoutError:
+            return f"the arm did not come to rest within {COMES_TO_REST_S:g} s; check what moves it"
+        return ""
+
+    async def _move(self, action: ApproachStep) -> str:
+        pose: tuple[float, ...] | None = action.pose_m_rad
+        while True:
+            await self.may_move.wait()
+            if error := await self._rest():
+                return error
+            # The loop may have interrupted the move during the wait.
+            if not self.may_move.is_set():
+                continue
+            here = self._robot.state
+            if here is None:
+                return "the robot is not connected"
+            # The goal is fixed at the first start, so that an interruption does not lengthen the move.
+            pose = pose or along_tool(here.tcp_pose, action.along_tool_m or 0.0)
+            x, y, z, rx, ry, rz = pose
+            command = MoveLinear((x, y, z, rx, ry, rz), action.speed_m_per_s, LINEAR_ACCELERATION_M_PER_S2)
+            self._moving, self._interrupted = True, False
+            try:
+                error = await self._move_once(command, here.motion_id)
+            finally:
+                self._moving = False
+            if not (error and self._interrupted):
+                return error
+
+    async def _move_once(self, command: MoveLinear, previous_id: int) -> str:
+        """Send a straight move and wait for its end; return an error, or an empty string."""
+        reply = await self._robot.send(command)
+        if not reply.accepted:
+            return reply.refusal
+        for reason in reply.clipped:
+            structlog.get_logger().warning("the move was clipped", reason=reason)
+        while True:
+            state = await self._robot.next_state()
+            if state.motion_id != previous_id and state.end_reason:
+                if state.end_reason not in (ARRIVED, STOPPED_ON_COMMAND):
+                    # It ended by itself, just before an interruption; do not repeat it.
+                    self._interrupted = False
+                return "" if state.end_reason == ARRIVED else f"the move ended early: {state.end_reason}"
+
+
+def along_tool(pose: tuple[float, ...], distance_m: float) -> tuple[float, ...]:
+    """Return the pose (x, y, z in m, rotation vector in rad) at a distance along the tool's axis."""
+    x, y, z, *turned = pose
+    dx, dy, dz = tool_axis(pose)
+    return (x + dx * distance_m, y + dy * distance_m, z + dz * distance_m, *turned)
+
+
+class StatePublisher:
+    """Publishes the states of robot and loop, and wakes those who wait for a change of the loop's."""
+
+    def __init__(self, publisher: Publisher, control_loop: ControlLoop) -> None:
+        self.changed = asyncio.Event()
+        self._publisher = publisher
+        self._control_loop = control_loop
+        self._block = -1
+        self._key: tuple[object, ...] = ()
+        self._hold = self._published_ns = 0
+
+    def publish_robot(self, state: RobotState) -> bool:
+        """Publish every fifth state; return whether it was this one."""
+        if (block := state.cycle // PUBLISH_EVERY) == self._block:
+            return False
+        self._block = block
+        self._publisher.publish(robot_state(state))
+        return True
+
+    def publish_loop(self, sent_rad_per_s: float, now_ns: int) -> None:
+        """Publish the loop's state at a change and once a second."""
         status, experiment = self._control_loop.status, self._control_loop.experiment
         key = (
             status.phase,
@@ -294,18 +477,18 @@ class ControlLoopRunner:
             experiment and experiment.step_number,
         )
         hold = experiment.command.hold_number if experiment is not None else 0
-        unchanged = (key, hold) == (self._published_key, self._published_hold)
+        unchanged = (key, hold) == (self._key, self._hold)
         if unchanged and now_ns - self._published_ns < LOOP_STATE_PERIOD_S * 1e9:
             return
-        if key != self._published_key:
+        if key != self._key:
             structlog.get_logger().info(
                 "loop", phase=status.phase, activity=status.activity, reasons=" ".join(status.decision.reasons)
             )
-        self._published_key, self._published_hold, self._published_ns = key, hold, now_ns
-        self._publisher.publish(loop_state(self._control_loop, self._velocity.sent_rad_per_s, now_ns))
+        self._key, self._hold, self._published_ns = key, hold, now_ns
+        self._publisher.publish(loop_state(self._control_loop, sent_rad_per_s, now_ns))
         # Wake the present waiters only.
-        self._status_changed.set()
-        self._status_changed.clear()
+        self.changed.set()
+        self.changed.clear()
 
 
 def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) -> LoopState:
@@ -366,5 +549,6 @@ def robot_state(state: RobotState) -> RobotStateMessage:
     )
 
 
-def _text(error: Exception) -> str:
+def error_text(error: Exception) -> str:
+    """Return an error's type and message, shortened for messages."""
     return f"{type(error).__name__}: {error}"[:MAX_ERROR_LENGTH]

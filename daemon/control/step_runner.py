@@ -4,13 +4,13 @@ Each step is a generator that receives a `StepContext`, yields a `StepCommand`, 
 clock stands while it is paused or held.
 """
 
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TypeAlias
 
 from shearloop.daemon.control import experiment_schema as steps
-from shearloop.daemon.control.experiment_schema import ExperimentFile, ExperimentLimits, Step
+from shearloop.daemon.control.experiment_schema import ExperimentFile, Step
 
 # An angle counts as reached within this; the wrist's resolution is ten times finer.
 ANGLE_TOLERANCE_RAD = 0.002
@@ -77,13 +77,15 @@ class StepContext:
     """Input of a step: wrist angle since the grip, driving torque, state of its action.
 
     `gripped_at_rad` is the wrist joint's angle at the grip. `torque_nm` is None without a fresh valid estimate.
+    `elapsed_s` is the experiment's time.
     """
 
     wrist_rad: float
     torque_nm: float | None
-    gripped_at_rad: float = 0.0
-    action: ActionState = ActionState.IDLE
-    action_error: str = ""
+    gripped_at_rad: float
+    elapsed_s: float
+    action: ActionState
+    action_error: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +112,10 @@ class ExperimentPhase(Enum):
     STOPPED = "stopped"  # before its end: by the operator, by safety, or by a step that failed
 
 
+# Phases in which the experiment may still move something.
+ACTIVE = (ExperimentPhase.RUNNING, ExperimentPhase.PAUSED)
+
+
 class StepFailedError(Exception):
     """A step cannot continue; the message says why."""
 
@@ -126,67 +132,85 @@ class Experiment:
         self.stop_reason = ""
         # The step's command, also while the wrist is paused or held.
         self.command = StepCommand()
-        self._expected_s = [expected_s(step) for step in file.steps]
+        # The tighter of the experiment's limits and the step's.
+        self.limits = file.limits
+        # A sentence when the step has exceeded its timeout.
+        self.overdue = ""
         self._t_ns = t_ns
-        self._elapsed_s = 0.0
+        self._elapsed_s = self._step_began_s = 0.0
         self._index = -1
-        self._step_began_s = 0.0
         self._program: StepProgram
+        # State and error of the step's action.
+        self._action = ActionState.IDLE, ""
         self._begin_next()
 
     @property
     def running(self) -> bool:
         """Whether it may still move something."""
-        return self.phase in (ExperimentPhase.RUNNING, ExperimentPhase.PAUSED)
-
-    @property
-    def step(self) -> Step:
-        """The present step, or the last one."""
-        return self.file.steps[self.step_number - 1]
+        return self.phase in ACTIVE
 
     @property
     def step_number(self) -> int:
-        """The number of that step, from 1."""
+        """The number of the present step, or of the last one, from 1."""
         return min(self._index + 1, len(self.file.steps))
 
     @property
-    def limits(self) -> ExperimentLimits:
-        """The tighter of the experiment's limits and the step's."""
-        return self.file.limits_of(self.step)
+    def step(self) -> Step:
+        """That step."""
+        return self.file.steps[self.step_number - 1]
 
     @property
-    def activity(self) -> str:
-        """The present activity, or the reason of the stop."""
-        return self.command.activity if self.running else self.stop_reason
+    def remaining_s(self) -> float:
+        """The approximate remaining time."""
+        if not self.running:
+            return 0.0
+        here_s = max(0.0, expected_s(self.step) - self._elapsed_s + self._step_began_s)
+        return here_s + sum(map(expected_s, self.file.steps[self._index + 1 :]))
 
     @property
-    def overdue(self) -> str:
-        """A sentence when the step has exceeded its timeout, else an empty string."""
-        longest_s = self.step.timeout_s
-        if not self.running or longest_s is None or self._spent_s <= longest_s:
-            return ""
-        return f"step {self._index + 1} ({self.step.do}) has taken {self._spent_s:.1f} s of at most {longest_s:g} s"
+    def progress(self) -> float:
+        """The completed share, 0 to 1."""
+        if self.phase is ExperimentPhase.DONE:
+            return 1.0
+        return max(0.0, 1.0 - self.remaining_s / max(sum(map(expected_s, self.file.steps)), 1e-9))
 
-    @property
-    def _spent_s(self) -> float:
-        return self._elapsed_s - self._step_began_s
+    def update(
+        self, t_ns: int, wrist_rad: float, torque_nm: float | None, *, gripped_at_rad: float = 0.0, held: bool = False
+    ) -> StepCommand:
+        """Return the command for now; while paused or held the wrist and the experiment's clock stand still.
 
-    def update(self, view: StepContext, t_ns: int, *, held: bool = False) -> StepCommand:
-        """Return the command for now; while paused or held the wrist and the experiment's clock stand still."""
+        `wrist_rad` counts from the angle at the grip, `gripped_at_rad`.
+        """
         passed_s = max(0, t_ns - self._t_ns) / 1e9
         self._t_ns = max(t_ns, self._t_ns)
-        if not self.running:
+        if self.phase not in ACTIVE:
             return StepCommand()
         if self.phase is ExperimentPhase.PAUSED or held:
             return replace(self.command, wrist=Hold())
         self._elapsed_s += passed_s
+        view = StepContext(wrist_rad, torque_nm, gripped_at_rad, self._elapsed_s, *self._action)
         try:
             self.command = replace(self._program.send(view), step_index=self._index)
         except StopIteration:
             self._begin_next()
         except StepFailedError as failure:
             self.stop(f"step {self._index + 1} ({self.step.do}) failed: {failure}")
+        longest_s, spent_s = self.file.steps[self.command.step_index].timeout_s, self._elapsed_s - self._step_began_s
+        if longest_s is not None and spent_s > longest_s:
+            step = f"step {self._index + 1} ({self.step.do})"
+            self.overdue = f"{step} has taken {spent_s:.1f} s of at most {longest_s:g} s"
         return self.command
+
+    def begin_action(self) -> bool:
+        """Return whether the command's action has to begin now; it counts as begun."""
+        begins = self._action[0] is ActionState.IDLE
+        if begins:
+            self._action = ActionState.RUNNING, ""
+        return begins
+
+    def end_action(self, error: str = "") -> None:
+        """Note the end of the step's action, with its error if it failed."""
+        self._action = ActionState.FAILED if error else ActionState.DONE, error
 
     def pause(self) -> None:
         """Stand still until `resume`."""
@@ -203,26 +227,17 @@ class Experiment:
         if self.running:
             self.phase, self.stop_reason, self.command = ExperimentPhase.STOPPED, reason, StepCommand()
 
-    @property
-    def remaining_s(self) -> float:
-        """The approximate remaining time."""
-        if not self.running:
-            return 0.0
-        here_s = max(0.0, self._expected_s[self.step_number - 1] - self._spent_s)
-        return here_s + sum(self._expected_s[self._index + 1 :])
-
-    @property
-    def progress(self) -> float:
-        """The completed share, 0 to 1."""
-        if self.phase is ExperimentPhase.DONE:
-            return 1.0
-        return max(0.0, 1.0 - self.remaining_s / max(sum(self._expected_s), 1e-9))
+    def fail(self, reason: str) -> None:
+        """End because the step cannot be done."""
+        self.stop(f"step {self._index + 1} ({self.step.do}) cannot be done: {reason}")
 
     def _begin_next(self) -> None:
+        self.overdue, self._action = "", (ActionState.IDLE, "")
         while self._index + 1 < len(self.file.steps):
             self._index += 1
             self._step_began_s = self._elapsed_s
-            self._program = _program(self.step, lambda: self._elapsed_s)
+            self.limits = self.file.limits_of(self.step)
+            self._program = _program(self.step, self._elapsed_s)
             try:
                 self.command = replace(next(self._program), step_index=self._index)
             except StopIteration:  # nothing to do, such as a wait of 0 s
@@ -253,8 +268,8 @@ def expected_s(step: Step) -> float:
             return 3.0
 
 
-def _program(step: Step, elapsed_s: Callable[[], float]) -> StepProgram:
-    """Return the generator of one step; `elapsed_s()` is the experiment's time in seconds."""
+def _program(step: Step, now_s: float) -> StepProgram:
+    """Return the generator of one step that begins at the experiment's time `now_s`."""
     match step:
         case steps.ApproachStep():
             return _act(step, "moving in a straight line")
@@ -270,13 +285,13 @@ def _program(step: Step, elapsed_s: Callable[[], float]) -> StepProgram:
         case steps.TurnToStep():
             return _turn_to(step)
         case steps.TwistStep():
-            return _twist(step, elapsed_s)
+            return _twist(step)
         case steps.HoldTorqueStep():
-            return _hold_torque(step, elapsed_s)
+            return _hold_torque(step)
         case steps.TightenStep():
             return _tighten(step)
         case steps.WaitStep():
-            return _wait(Hold(), step.wait_s, elapsed_s, "waiting")
+            return _wait(Hold(), step.wait_s, now_s, "waiting")
 
 
 def _act(action: Action, activity: str) -> StepProgram:
@@ -288,19 +303,19 @@ def _act(action: Action, activity: str) -> StepProgram:
             return
 
 
-def _wait(
-    wrist: WristSetpoint, wait_s: float, elapsed_s: Callable[[], float], activity: str, hold_number: int = 0
-) -> StepProgram:
-    end_s = elapsed_s() + wait_s
-    while (left_s := end_s - elapsed_s()) > 0:
-        yield StepCommand(wrist, activity=f"{activity}, {left_s:.1f} s left", hold_number=hold_number)
+def _wait(wrist: WristSetpoint, wait_s: float, now_s: float, activity: str, hold_number: int = 0) -> StepProgram:
+    end_s = now_s + wait_s
+    while (left_s := end_s - now_s) > 0:
+        view = yield StepCommand(wrist, activity=f"{activity}, {left_s:.1f} s left", hold_number=hold_number)
+        now_s = view.elapsed_s
 
 
-def _go_to(angle_rad: float, speed_rad_per_s: float, activity: str) -> StepProgram:
+def _go_to(angle_rad: float, speed_rad_per_s: float, activity: str) -> Generator[StepCommand, StepContext, StepContext]:
+    """Turn to an angle; return the view of the arrival."""
     while True:
         view = yield StepCommand(MoveToAngle(angle_rad, speed_rad_per_s), activity=activity)
         if abs(view.wrist_rad - angle_rad) <= ANGLE_TOLERANCE_RAD:
-            return
+            return view
 
 
 def _turn_to(step: steps.TurnToStep) -> StepProgram:
@@ -309,30 +324,29 @@ def _turn_to(step: steps.TurnToStep) -> StepProgram:
     yield from _go_to(step.angle_rad - view.gripped_at_rad, step.speed_rad_per_s, activity)
 
 
-def _twist(step: steps.TwistStep, elapsed_s: Callable[[], float]) -> StepProgram:
+def _twist(step: steps.TwistStep) -> StepProgram:
     view = yield StepCommand(activity="reading the wrist's angle")
-    start_rad = view.wrist_rad
+    start_rad, speed_rad_per_s = view.wrist_rad, step.speed_rad_per_s
     origin_rad = view.gripped_at_rad if step.absolute else 0.0
     angles_rad = [angle_rad - origin_rad for angle_rad in step.angles_rad]
     for repeat in range(1, step.repeats + 1):
         for number, angle_rad in enumerate(angles_rad, start=1):
             where = f"angle {number} of {len(angles_rad)}, repeat {repeat} of {step.repeats}"
-            yield from _go_to(angle_rad, step.speed_rad_per_s, f"twisting to {angle_rad:.3f} rad: {where}")
-            hold = MoveToAngle(angle_rad, step.speed_rad_per_s)
-            hold_number = (repeat - 1) * len(angles_rad) + number
-            yield from _wait(hold, step.hold_s, elapsed_s, f"holding {angle_rad:.3f} rad: {where}", hold_number)
+            view = yield from _go_to(angle_rad, speed_rad_per_s, f"twisting to {angle_rad:.3f} rad: {where}")
+            hold, hold_number = MoveToAngle(angle_rad, speed_rad_per_s), (repeat - 1) * len(angles_rad) + number
+            yield from _wait(hold, step.hold_s, view.elapsed_s, f"holding {angle_rad:.3f} rad: {where}", hold_number)
             if step.return_to_start:
-                yield from _go_to(start_rad, step.speed_rad_per_s, f"returning: {where}")
+                yield from _go_to(start_rad, speed_rad_per_s, f"returning: {where}")
 
 
-def _hold_torque(step: steps.HoldTorqueStep, elapsed_s: Callable[[], float]) -> StepProgram:
+def _hold_torque(step: steps.HoldTorqueStep) -> StepProgram:
     track = TrackTorque(step.torque_nm, step.ramp_nm_per_s)
     tolerance_nm = max(TORQUE_TOLERANCE * abs(step.torque_nm), 1e-3)
     while True:
         view = yield StepCommand(track, activity=f"bringing the torque to {step.torque_nm:+.3f} N·m")
         if view.torque_nm is not None and abs(view.torque_nm - step.torque_nm) <= tolerance_nm:
             break
-    yield from _wait(track, step.hold_s, elapsed_s, f"holding {step.torque_nm:+.3f} N·m", 1)
+    yield from _wait(track, step.hold_s, view.elapsed_s, f"holding {step.torque_nm:+.3f} N·m", 1)
 
 
 def _tighten(step: steps.TightenStep) -> StepProgram:

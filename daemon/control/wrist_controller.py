@@ -41,18 +41,16 @@ class WristController:
         self._held = False
         # Torques wait for the next angle.
         self._pending: deque[TorqueSample] = deque(maxlen=MOST_PENDING)
-        self._excitation: StiffnessExcitation | None = None
+        self.excitation: StiffnessExcitation | None = None
         # Speeds sent in the last `actuation_s`: time, speed, duration.
         self._under_way: deque[tuple[int, float, float]] = deque()
         self._sent_rad_per_s = 0.0
         self._turned_ns = 0
 
     def on_torque(self, torque: TorqueSample) -> None:
-        """Pass a driving torque on to controller and identification."""
-        if torque.source != self.source.name:
-            return
-        if self._excitation is not None:
-            self._excitation.measure(torque.torque_nm, torque.t_mid_ns, torque.t_ns)
+        """Pass a torque on to controller and identification."""
+        if self.excitation is not None:
+            self.excitation.measure(torque.torque_nm, torque.t_mid_ns, torque.t_ns)
         if self.controller is not None:
             self._pending.append(torque)
 
@@ -61,8 +59,8 @@ class WristController:
         self._sent_rad_per_s = speed_rad_per_s
         if self.controller is not None:
             self.controller.sent(speed_rad_per_s)
-        if self._excitation is not None:
-            self._excitation.sent(speed_rad_per_s)
+        if self.excitation is not None:
+            self.excitation.sent(speed_rad_per_s)
 
     def turn(self, setpoint: WristSetpoint, t_ns: int, wrist_rad: float, origin_rad: float) -> WristCommand:
         """Return the speed for a set point; its angles count from origin_rad."""
@@ -106,7 +104,7 @@ class WristController:
     def begin_identification(self, action: IdentifyStep, torque_limit_nm: float) -> None:
         """Begin the small twists that identify the tool."""
         self.reset()
-        self._excitation = StiffnessExcitation(
+        self.excitation = StiffnessExcitation(
             ExciteSettings(
                 amplitude_rad=action.amplitude_rad,
                 sample_period_s=self.source.period_s,
@@ -118,16 +116,13 @@ class WristController:
             )
         )
 
-    def identify(self, t_ns: int, wrist_rad: float) -> tuple[WristCommand, str | None]:
+    def identify(self, excitation: StiffnessExcitation, t_ns: int, wrist_rad: float) -> tuple[WristCommand, str | None]:
         """Return the identification's speed, and at its end "" or an error."""
-        step = self._excitation
-        if step is None:
-            return WristCommand(), "the identification was not started"
-        speed_rad_per_s = step.command(t_ns, wrist_rad)
-        if not step.done:
+        speed_rad_per_s = excitation.command(t_ns, wrist_rad)
+        if not excitation.done:
             return WristCommand(speed_rad_per_s), None
-        self.tool, self._excitation = step.result, None
-        return WristCommand(), step.failure or ""
+        self.tool, self.excitation = excitation.result, None
+        return WristCommand(), excitation.failure or ""
 
     def hold(self) -> WristCommand:
         """Stand still; the next `turn` continues without a jump."""
@@ -138,7 +133,7 @@ class WristController:
 
     def reset(self) -> None:
         """Forget the tool, after a new grip or a new zero."""
-        self.tool = self.controller = self.tracked = self._excitation = None
+        self.tool = self.controller = self.tracked = self.excitation = None
 
     def _on_the_way_rad(self, t_ns: int) -> float:
         """Return the turn that was sent and does not show in the angle yet."""

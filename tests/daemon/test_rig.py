@@ -23,7 +23,7 @@ async def a_rig() -> AsyncIterator[Rig]:
     async def no_tare() -> str:
         return ""
 
-    rig = Rig(config, Published(), Clock(), SOURCES, no_tare, dict)  # type: ignore[arg-type]
+    rig = Rig(config, Published(), Clock(), SOURCES, no_tare, {})  # type: ignore[arg-type]
     driving = asyncio.create_task(rig.runner.run())
     await asyncio.sleep(0)
     try:

@@ -27,7 +27,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.analysis.evaluate import estimate_series, grips_of
     from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, read_series
     from shearloop.daemon.cli.options import check_kind
-    from shearloop.daemon.control.creep import fit_creep
+    from shearloop.daemon.control.identification import fit_creep
 
     check_paths_differ(args.recordings)
     calibration = Calibration.load(args.calibration)

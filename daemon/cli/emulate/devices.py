@@ -116,7 +116,7 @@ def _frames(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.f
         return _synthetic(args, period_s)
     from shearloop.daemon.recording.matlab import read_stream
 
-    lines = read_stream(args.recording, args.side).lines
+    lines = read_stream(args.recording, args.side).values
     return iter(lines) if args.once else cycle(lines)
 
 

@@ -170,7 +170,7 @@ class Cell:
         self.robot, self.gripper, self.published = Robot(), Gripper(), Published()
         source = wrench_source(SETTINGS.rate_hz)
         self.control_loop = ControlLoop(LoopConfig(), {WRENCH: source}, ("robot",))
-        self.died: Mapping[str, str] = {}
+        self.died: dict[str, str] = {}
 
         async def no_zero() -> str:
             return ""
@@ -182,7 +182,7 @@ class Cell:
             no_zero,
             self.published,  # type: ignore[arg-type]
             StepClock(self.robot.flight),
-            lambda: self.died,
+            self.died,
             4.0,
         )
         self.task: asyncio.Task[None] | None = None
@@ -198,7 +198,7 @@ class Cell:
 
     async def cycles(self, count: int) -> None:
         for _ in range(count):
-            self.control_loop.inputs.gripper = GripperStatus(self.robot.flight.now_ns, 30.0, holding=True, moving=False)
+            self.control_loop.on_gripper(GripperStatus(self.robot.flight.now_ns, 30.0, holding=True, moving=False))
             self.robot.cycle()
             # A state is sensed, decided upon and answered within a few turns of the event loop.
             for _ in range(8):
@@ -233,7 +233,7 @@ class Cell:
         return self.robot.flight.state
 
 
-def no_tick(_t_ns: int) -> ControlOutput:
+def no_tick(*_: object) -> ControlOutput:
     """Die, in place of the brain's `tick`."""
     raise ZeroDivisionError("a tick went wrong")
 

@@ -46,6 +46,7 @@ class Rig:
         self.begun: list[Action] = []
         self.orders = ControlOutput()
         self.true_nm: list[float] = []
+        self.late_s, self.died = 0.0, dict[str, str]()
 
     @property
     def t_ns(self) -> int:
@@ -62,7 +63,7 @@ class Rig:
             if self.tick >= due:
                 self.pending.remove((due, action))
                 self._finish(action)
-        orders = self.orders = self.control_loop.tick(self.t_ns)
+        orders = self.orders = self.control_loop.tick(self.t_ns, self.late_s, self.died)
         self.speed = 0.0 if orders.stop else orders.wrist_rad_per_s
         self.control_loop.on_speed_sent(self.speed)
         if orders.release:
@@ -74,11 +75,10 @@ class Rig:
     def _sense(self, torque_nm: float) -> None:
         now = self.t_ns
         if "arm" not in self.silent:
-            self.control_loop.inputs.arm = replace(self.arm, wrist_rad=self.wrist_rad, t_ns=now)
+            self.control_loop.on_arm(replace(self.arm, wrist_rad=self.wrist_rad, t_ns=now))
         if "hand" not in self.silent:
-            self.control_loop.inputs.gripper = replace(
-                self.hand, t_ns=now, holding=self.force_n > 0, width_mm=self.width_mm
-            )
+            hand = replace(self.hand, t_ns=now, holding=self.force_n > 0, width_mm=self.width_mm)
+            self.control_loop.on_gripper(hand)
         if self.tick % 68 == 0 and "right" not in self.silent:
             middle = now - round(EIT.window_s * 0.5e9)
             value = float(np.mean(self.window) + self.random.normal(0.0, self.noise_nm))
@@ -95,7 +95,7 @@ class Rig:
             self.force_n = action.force_n if holds else 0.0
             self.width_mm = 30.0 if holds else action.width_mm
             # As the gripper's task does, before it says that the fingers have closed.
-            self.control_loop.inputs.gripper = replace(self.hand, t_ns=self.t_ns, holding=holds, width_mm=self.width_mm)
+            self.control_loop.on_gripper(replace(self.hand, t_ns=self.t_ns, holding=holds, width_mm=self.width_mm))
         self.control_loop.on_action_ended()
 
     def run(self, most_s: float) -> None:

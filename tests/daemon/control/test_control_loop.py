@@ -200,11 +200,11 @@ def test_what_the_robot_reports_ends_a_running_experiment_at_once(sense: dict[st
 def test_a_supervising_sensor_that_is_gone_holds_the_wrist_at_once_and_says_which() -> None:
     rig = started(Rig(new_loop()), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
     rig.run(5)
-    rig.control_loop.inputs.lost["load_cell"] = "/dev/ttyUSB3 was unplugged."
+    rig.control_loop.on_link("load_cell", "/dev/ttyUSB3 was unplugged.", up=False)
     rig.step()
     assert rig.speed == 0.0
     assert "load_cell is gone: /dev/ttyUSB3 was unplugged." in rig.control_loop.status.decision.reasons[0]
-    rig.control_loop.inputs.lost.clear()
+    rig.control_loop.on_link("load_cell", "", up=True)
     rig.run(1)
     assert rig.speed > 0.0, "it goes on by itself"
 
@@ -212,7 +212,7 @@ def test_a_supervising_sensor_that_is_gone_holds_the_wrist_at_once_and_says_whic
 def test_a_task_that_died_stops_the_wrist_and_says_of_what() -> None:
     rig = started(Rig(new_loop()), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
     rig.run(5)
-    rig.control_loop.inputs.died = {"right": "ValueError: no number"}
+    rig.died = {"right": "ValueError: no number"}
     rig.step()
     assert phase(rig) is ExperimentPhase.STOPPED
     assert "right: ValueError: no number" in rig.control_loop.status.decision.reasons[0]

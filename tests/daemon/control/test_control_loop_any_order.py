@@ -65,7 +65,7 @@ def test_whatever_holds_the_wrist_however_it_takes_turns_it_is_stopped_in_time(
         rig.silent = {*wrong} & {"right", "load_cell", "arm", "hand"}
         rig.offset_nm = 0.2 if "apart" in wrong else 0.0
         rig.void = "void" in wrong
-        rig.control_loop.inputs.late_s = 0.15 if "late" in wrong else 0.0
+        rig.late_s = 0.15 if "late" in wrong else 0.0
         for _ in range(ticks):
             rig.step()
             if phase(rig) is not ExperimentPhase.RUNNING:

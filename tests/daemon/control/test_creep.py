@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from shearloop.daemon.control.creep import Creep, Stretch, fit_creep
+from shearloop.daemon.control.identification import Creep, Stretch, fit_creep
 from shearloop.daemon.errors import UserError
 from shearloop.drivers.emulators.scene import Twin, TwinSettings
 

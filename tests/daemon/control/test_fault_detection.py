@@ -44,7 +44,7 @@ def watched(driving: TorqueSource, supervising: tuple[TorqueSource, ...]) -> Mon
 def found(
     *torques: TorqueSample, driving: TorqueSource = EIT, supervising: tuple[TorqueSource, ...] = (LOAD, WRENCH)
 ) -> dict[FaultCode, str]:
-    senses = LoopInputs(arm=ArmStatus(0.0, NOW_NS))
+    senses = LoopInputs(10.0, arm=ArmStatus(0.0, NOW_NS))
     for each in torques:
         senses.add_torque(each)
     events = detect_faults(senses, watched(driving, supervising), LoopConfig(), NOW_NS)
@@ -116,7 +116,7 @@ def test_torques_are_compared_for_as_long_as_the_slower_one_counts_as_new(rate_h
         senses.add_torque(torque(quick, 0.3, came_s=(number - 1) / rate_hz))
     (trouble,) = detect_faults(senses, watched(EIT, (quick,)), LoopConfig(), NOW_NS)
     assert trouble.code is FaultCode.TORQUES_DISAGREE
-    assert len(senses.history[LOAD.name].torque_nm) <= 10 * rate_hz, "and the rest is forgotten"
+    assert len(senses.history[LOAD.name][0]) <= 10 * rate_hz, "and the rest is forgotten"
 
 
 LOST = {"robot": "No UR controller at 10.0.0.1. Check that it is on.", "gripper": "There is no gripper socket."}
@@ -126,7 +126,7 @@ def devices(
     lost: dict[str, str], *, arm: ArmStatus | None = None, hand: GripperStatus | None = None
 ) -> list[tuple[FaultCode, str]]:
     """Return what is said of the devices while nothing moves."""
-    senses = LoopInputs(arm=arm, gripper=hand, lost=lost)
+    senses = LoopInputs(10.0, arm=arm, gripper=hand, lost=lost)
     idle = replace(watched(EIT, ()), torque_needed=False, gripped=False, required=("robot", "gripper"))
     return [(each.code, each.detail) for each in detect_faults(senses, idle, LoopConfig(), NOW_NS)]
 
@@ -153,7 +153,7 @@ def test_a_robot_that_is_gone_or_does_not_move_is_not_plugged_in_again() -> None
     """Its process, killed, was "gone" and to be plugged in; what comes back is blocked until it is unlocked."""
     died = "The robot's process died of SIGKILL while controlling. The process is started again with motion disabled."
     blocked = ArmStatus(0.0, NOW_NS, blocked="Motion has not been enabled since the robot's process was started.")
-    for senses in (LoopInputs(arm=ArmStatus(0.0, NOW_NS), lost={"robot": died}), LoopInputs(arm=blocked)):
+    for senses in (LoopInputs(10.0, arm=ArmStatus(0.0, NOW_NS), lost={"robot": died}), LoopInputs(10.0, arm=blocked)):
         (trouble,) = detect_faults(
             senses, replace(watched(EIT, ()), torque_needed=False, required=("robot",)), LoopConfig(), NOW_NS
         )
@@ -164,7 +164,7 @@ def test_a_robot_that_is_gone_or_does_not_move_is_not_plugged_in_again() -> None
 
 
 def test_a_sensor_that_was_never_there_is_not_gone() -> None:
-    senses = LoopInputs(arm=ArmStatus(0.0, NOW_NS), lost={"right": "There is no port."})
+    senses = LoopInputs(10.0, arm=ArmStatus(0.0, NOW_NS), lost={"right": "There is no port."})
     (trouble,) = detect_faults(senses, watched(EIT, ()), LoopConfig(), NOW_NS)
     assert trouble.detail == "right is not connected yet: There is no port."
     senses.add_torque(torque(EIT, 0.1))
@@ -176,10 +176,10 @@ def test_a_sensor_that_was_never_there_is_not_gone() -> None:
 
 
 def test_a_loop_that_was_away_for_long_was_not_too_slow() -> None:
-    senses = LoopInputs(arm=ArmStatus(0.0, NOW_NS))
+    senses = LoopInputs(10.0, arm=ArmStatus(0.0, NOW_NS))
     for late_s, event in ((0.2, FaultCode.LOOP_LATE), (3.0, FaultCode.DAEMON_PAUSED)):
-        senses.late_s = late_s
-        (trouble,) = detect_faults(senses, replace(watched(EIT, ()), torque_needed=False), LoopConfig(), NOW_NS)
+        away = replace(watched(EIT, ()), torque_needed=False, late_s=late_s)
+        (trouble,) = detect_faults(senses, away, LoopConfig(), NOW_NS)
         assert trouble.code is event
     assert "the daemon itself was not running: it stood still for 3.0 s" in trouble.sentence
     assert "overload" in trouble.rule.cure, "what follows from it is not told, and may be all that would say so"
@@ -201,7 +201,7 @@ def test_states_that_come_late_for_good_are_stale_for_long_enough_to_stop_the_wr
 def test_each_sample_is_compared_with_a_wrench(rate_hz: float, slow_hz: float) -> None:
     """A slower sensor that disagrees does so at each of its samples: else the wrist would turn on until the next."""
     wrench, slow = wrench_source(rate_hz), TorqueSource(name="load_cell", period_s=1 / slow_hz)
-    senses, sample = LoopInputs(), 0.5
+    senses, sample = LoopInputs(10.0), 0.5
     compared = []
     for cycle in range(round(20.0 * rate_hz)):
         t_ns = NOW_NS + round(cycle / rate_hz * 1e9)

@@ -25,9 +25,15 @@ class Silent:
         """Send nothing."""
 
 
+class Felt(list[GripperStatus]):
+    """A control loop that keeps the states of the gripper."""
+
+    on_gripper = list.append
+
+
 def task_of(rig: Rig, *, measures_diameters: bool = True) -> GripperTask:
     publisher: Any = Silent()
-    return GripperTask(rig.driver, publisher, lambda _: None, measures_diameters=measures_diameters)
+    return GripperTask(rig.driver, publisher, Felt(), measures_diameters=measures_diameters)  # type: ignore[arg-type]
 
 
 @WAYS
@@ -52,9 +58,9 @@ async def test_cancelled_grip_can_be_released(way: str, tmp_path: Path) -> None:
 @WAYS
 async def test_cancelled_grip_is_halted_and_stays_connected(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
-        felt: list[GripperStatus] = []
+        felt = Felt()
         publisher: Any = Silent()
-        task = GripperTask(rig.driver, publisher, felt.append)
+        task = GripperTask(rig.driver, publisher, felt)  # type: ignore[arg-type]
         read = tasks.create_task(task.read())
         while rig.driver.latest is None:  # noqa: ASYNC110 - the driver is asked, as the loop is
             await asyncio.sleep(0)

@@ -7,9 +7,9 @@ from typing import Any
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from shearloop.daemon.control.device_commands import along_tool
 from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, TorqueSample
+from shearloop.daemon.control.runner import along_tool
 from shearloop.daemon.control.safety import Response
 from shearloop.daemon.control.step_runner import Action, ExperimentPhase, GripTo
 from shearloop.drivers.emulators.scene import Twin, TwinSettings
@@ -165,13 +165,11 @@ class WholeRig:
 
     def _sense(self, torque_nm: float) -> None:
         state = self.handler.state(self.arm.reading, self.number)
-        self.control_loop.inputs.arm = ArmStatus(
-            state.wrist_rad, self.now_ns, state.protective_stop, state.emergency_stop, state.blocked
+        self.control_loop.on_arm(
+            ArmStatus(state.wrist_rad, self.now_ns, state.protective_stop, state.emergency_stop, state.blocked)
         )
         holding = self.force_n > 0
-        self.control_loop.inputs.gripper = GripperStatus(
-            self.now_ns, 20.0, holding=holding, moving=False, fault=self.fault
-        )
+        self.control_loop.on_gripper(GripperStatus(self.now_ns, 20.0, holding=holding, moving=False, fault=self.fault))
         said = 1e30 if self.absurd else torque_nm
         if not self.silent and self.number % 11 == 0:
             self.control_loop.on_torque(TorqueSample("load_cell", said, "", self.now_ns - CYCLE_NS, self.now_ns))
@@ -193,8 +191,8 @@ class WholeRig:
         if isinstance(action, GripTo):
             self.force_n = action.force_n if action.expect_object else 0.0
             if self.control_loop.inputs.gripper is not None:
-                self.control_loop.inputs.gripper = dataclasses.replace(
-                    self.control_loop.inputs.gripper, holding=action.expect_object
+                self.control_loop.on_gripper(
+                    dataclasses.replace(self.control_loop.inputs.gripper, holding=action.expect_object)
                 )
         self.control_loop.on_action_ended()
 

@@ -6,10 +6,9 @@ from typing import Any
 
 import pytest
 
-from shearloop.daemon.control.device_commands import along_tool
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.daemon.control.runner import WRENCH
+from shearloop.daemon.control.runner import WRENCH, along_tool
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.control.step_runner import ExperimentPhase
 from shearloop.drivers.ur.messages import MoveLinear, Stop, WristSpeed
@@ -166,7 +165,7 @@ async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch
         await heard.wait()
         tick = cell.control_loop.tick
 
-        def dies_once(_t_ns: int) -> Any:
+        def dies_once(*_: object) -> Any:
             monkeypatch.setattr(cell.control_loop, "tick", tick)
             raise ZeroDivisionError("a tick went wrong")
 
@@ -190,10 +189,10 @@ async def test_a_loop_that_dies_as_a_straight_move_is_to_begin_leaves_the_arm_at
         async with driven() as cell:
             tick, running = cell.control_loop.tick, iter(range(2))
 
-            def dies_at_the_second(t_ns: int, tick: Any = tick, running: Any = running) -> Any:
+            def dies_at_the_second(*given: Any, tick: Any = tick, running: Any = running) -> Any:
                 if cell.control_loop.experiment is not None and next(running):
                     raise ZeroDivisionError("a tick went wrong")
-                return tick(t_ns)
+                return tick(*given)
 
             monkeypatch.setattr(cell.control_loop, "tick", dies_at_the_second)
             await cell.start(MOVE)
@@ -221,7 +220,7 @@ async def test_each_state_is_decided_upon_and_every_fifth_published(
             await cell.start({"do": "wait", "wait_s": 60})
         decided: list[int] = []
         tick = cell.control_loop.tick
-        monkeypatch.setattr(cell.control_loop, "tick", lambda now_ns: decided.append(cell.state.cycle) or tick(now_ns))
+        monkeypatch.setattr(cell.control_loop, "tick", lambda *given: decided.append(cell.state.cycle) or tick(*given))
         cell.published.messages.clear()
         await cell.cycles(50)
         assert len(decided) == 50
@@ -263,7 +262,7 @@ async def test_a_straight_move_that_met_something_is_not_begun_again_after_a_pau
         cell.runner._actions.interrupt()
         arm.be(wrench=(0.0,) * 6)
         await cell.cycles(1)
-        cell.runner._actions.resume()
+        cell.runner._actions.may_move.set()
         await cell.until_ended()
         assert "the move ended early: force" in cell.why
         assert sum(isinstance(command, MoveLinear) for command in cell.robot.commands) == 1
@@ -299,7 +298,7 @@ async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none()
         # What is clipped is told in each cycle, so that one is unanswered whenever the process dies.
         cell.robot.flight.arm.be(wrench=(0.0, 0.0, 0.9 * SETTINGS.limits.force_n.hard, 0.0, 0.0, 0.0))
         await cell.cycles(20)
-        cell.control_loop.inputs.lost["robot"] = "The robot's process died of SIGKILL."
+        cell.control_loop.on_link("robot", "The robot's process died of SIGKILL.", up=False)
         cell.robot.die(50)
         cell.runner.decide_now()
         assert cell.phase is ExperimentPhase.STOPPED

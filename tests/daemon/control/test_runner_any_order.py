@@ -67,14 +67,15 @@ class Story:
 
     async def mend(self) -> None:
         self.arm.be(age_ns=0, wrench=(0.0,) * 6, safety_mode=1)
-        self.arm.stoppable, self.cell.died = True, {}
+        self.arm.stoppable = True
+        self.cell.died.clear()
         await self.go(5)
         await self.within(self.cell.runner.unlock(), 300)
 
     def tick_dies(self) -> None:
         tick = self.cell.control_loop.tick
 
-        def once(_t_ns: int) -> Any:
+        def once(*_: object) -> Any:
             self.cell.control_loop.tick = tick  # type: ignore[method-assign]
             raise ZeroDivisionError("a tick went wrong")
 
@@ -123,7 +124,7 @@ HAPPENINGS: dict[str, Callable[[Story], Any]] = {
     "states are new": lambda story: story.arm.be(age_ns=0),
     "states are not read": lambda story: story.unread(),
     "the robot's process dies": lambda story: story.process_dies(),
-    "a task dies": lambda story: setattr(story.cell, "died", {"right": "it died"}),
+    "a task dies": lambda story: story.cell.died.update(right="it died"),
     "the loop dies": lambda story: story.tick_dies(),
     "torque beyond its limit": lambda story: story.beyond(),
     "pushed": lambda story: story.arm.be(wrench=(100.0, 0.0, 0.0, 0.0, 0.0, 0.0)),

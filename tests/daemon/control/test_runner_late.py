@@ -16,9 +16,9 @@ async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch: pytes
         await cell.cycles(50)
         decide = cell.control_loop.tick
 
-        def at_length(t_ns: int) -> Any:
+        def at_length(*given: Any) -> Any:
             monkeypatch.undo()
-            orders = decide(t_ns)
+            orders = decide(*given)
             cell.robot.flight.now_ns += 200_000_000
             return orders
 
@@ -69,10 +69,10 @@ async def test_of_states_that_are_read_at_once_the_newest_is_decided_upon(monkey
         decided: list[int] = []
         decide = cell.control_loop.tick
 
-        def tick(t_ns: int) -> Any:
+        def tick(*given: Any) -> Any:
             assert cell.control_loop.inputs.arm is not None
             decided.append(cell.control_loop.inputs.arm.t_ns)
-            return decide(t_ns)
+            return decide(*given)
 
         monkeypatch.setattr(cell.control_loop, "tick", tick)
         for _ in range(5):

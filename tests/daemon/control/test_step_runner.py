@@ -9,14 +9,12 @@ from pydantic import ValidationError
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.step_runner import (
-    ActionState,
     ConstantVelocity,
     Experiment,
     ExperimentPhase,
     Hold,
     MoveToAngle,
     StepCommand,
-    StepContext,
     TrackTorque,
 )
 
@@ -37,14 +35,13 @@ class Bench:
         self.wish = StepCommand()
         self.seen: list[StepCommand] = []
 
-    def view(self) -> StepContext:
-        done = ActionState.DONE if self.wish.action else ActionState.IDLE
-        return StepContext(self.wrist_rad, STIFFNESS_NM_PER_RAD * self.wrist_rad, action=done)
-
     def tick(self, *, held: bool = False) -> StepCommand:
         self.t_ns += self.tick_ns
-        wish = self.machine.update(self.view(), self.t_ns, held=held)
-        if wish.action is not None and wish.step_index != self.wish.step_index:
+        if self.wish.action:
+            self.machine.end_action()
+        torque_nm = STIFFNESS_NM_PER_RAD * self.wrist_rad
+        wish = self.machine.update(self.t_ns, self.wrist_rad, torque_nm, held=held)
+        if wish.action is not None and self.machine.begin_action():
             self.begun.append(type(wish.action).__name__)
         step_s = self.tick_ns / 1e9
         match wish.wrist:
@@ -90,8 +87,8 @@ def test_the_steps_are_carried_out_in_order_to_the_end() -> None:
 
 def test_absolute_angles_are_the_wrists_own() -> None:
     machine = experiment({"do": "twist", "angles_rad": [1.5], "absolute": True})
-    machine.update(StepContext(0.0, 0.0, gripped_at_rad=1.4), TICK_NS)
-    wish = machine.update(StepContext(0.0, 0.0, gripped_at_rad=1.4), 2 * TICK_NS)
+    machine.update(TICK_NS, 0.0, 0.0, gripped_at_rad=1.4)
+    wish = machine.update(2 * TICK_NS, 0.0, 0.0, gripped_at_rad=1.4)
     assert isinstance(wish.wrist, MoveToAngle)
     assert wish.wrist.angle_rad == pytest.approx(0.1)
 
@@ -106,10 +103,11 @@ def test_tighten_ends_at_the_torque_or_at_the_angle_whichever_comes_first() -> N
 
 def test_a_failed_action_stops_the_experiment_with_its_reason() -> None:
     machine = experiment({"do": "grip"}, {"do": "release"})
-    machine.update(StepContext(0.0, None, action=ActionState.RUNNING), TICK_NS)
-    wish = machine.update(
-        StepContext(0.0, None, action=ActionState.FAILED, action_error="nothing was between the fingers"), TICK_NS
-    )
+    assert machine.begin_action()
+    machine.update(TICK_NS, 0.0, None)
+    assert not machine.begin_action(), "it is under way"
+    machine.end_action("nothing was between the fingers")
+    wish = machine.update(TICK_NS, 0.0, None)
     assert (machine.phase, wish) == (ExperimentPhase.STOPPED, StepCommand())
     assert machine.stop_reason == "step 1 (grip) failed: nothing was between the fingers"
 
@@ -133,10 +131,9 @@ def test_while_paused_or_held_the_wrist_stands_and_no_time_passes() -> None:
 
 def test_a_step_that_takes_too_long_is_said_to_be_overdue() -> None:
     machine = experiment({"do": "grip", "timeout_s": 2.0})
-    view = StepContext(0.0, None, action=ActionState.RUNNING)
-    machine.update(view, 2_000_000_000)
+    machine.update(2_000_000_000, 0.0, None)
     assert not machine.overdue
-    machine.update(view, 2_100_000_000)
+    machine.update(2_100_000_000, 0.0, None)
     assert machine.overdue == "step 1 (grip) has taken 2.1 s of at most 2 s"
 
 

@@ -7,8 +7,8 @@ from typing import cast
 import pytest
 
 from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.device_commands import VelocityCommandSender
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
+from shearloop.daemon.control.runner import VelocityCommandSender
 from shearloop.daemon.control.step_runner import MoveToAngle
 from shearloop.daemon.control.wrist_controller import WristController
 from shearloop.drivers.ur.client import UrRobot
@@ -81,8 +81,8 @@ def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> l
         replies.append(lambda: answered(reply))
 
     robot = SimpleNamespace(settings=SETTINGS, state=None, send_nowait=send_nowait)
-    brain = SimpleNamespace(on_speed_sent=wrist.on_speed_sent, on_command_refused=pytest.fail)
-    commands = VelocityCommandSender(cast(UrRobot, robot), cast(ControlLoop, brain), 4.0, pytest.fail)
+    brain = SimpleNamespace(on_speed_sent=wrist.on_speed_sent, on_command_refused=pytest.fail, on_crash=pytest.fail)
+    commands = VelocityCommandSender(cast(UrRobot, robot), cast(ControlLoop, brain), 4.0)
     origin_rad, errors = flight.state.wrist_rad, []
     for _ in range(cycles):
         flight.fly(1)

@@ -24,7 +24,7 @@ async def record(config: Path) -> list[dict[str, Any]]:
     async with recording_daemon(config) as (daemon, published, until):
         recorder, right = daemon._recorder, daemon._estimates["right"]
         assert recorder is not None
-        right._gripper = cast(GripperTask, Gripper(right, OTHER_TOOL, range(HELD, ENOUGH)))
+        right._gripper = cast(GripperTask, Gripper(right, OTHER_TOOL, range(HELD, 10 * ENOUGH)))
         recorder.record_experiment("first")
         await until(BEGUN)
         recorder.record_experiment("second")

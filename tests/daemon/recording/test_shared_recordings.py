@@ -25,7 +25,7 @@ from shearloop.daemon.analysis.charts.fault_sweeps import balanced
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.cli import main
-from shearloop.daemon.recording.importing import import_mat
+from shearloop.daemon.recording.matlab import import_mat
 from shearloop.daemon.recording.reader import read_recording
 
 # Five of the ten twists come before this share of the recording.

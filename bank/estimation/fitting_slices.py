@@ -70,8 +70,7 @@ def fit_slices(
             estimator.slices_fit(quantity, values[known]),
             strengths=estimator.strengths,
             left_out=later_origins(n) if quantity == "torque" else (),
-            growth=test.growth if test is not None else None,
-            mixtures=test.accepted if test is not None else None,
+            test=test,
             full_range=full_range,
         )
         models[quantity] = OutputModel(regressor, novelty, estimator.k_range(features))

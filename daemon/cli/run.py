@@ -66,6 +66,7 @@ def _run(
     from shearloop.daemon.cli import EXIT_OK, EXIT_UNFINISHED
     from shearloop.daemon.cli.emulated_devices import EmulatedDevices
     from shearloop.daemon.cli.terminal import EstimatePrinter
+    from shearloop.daemon.health import Reporter
     from shearloop.daemon.realtime import high_priority, lock_memory
     from shearloop.daemon.run_summary import RunSummary
 
@@ -73,7 +74,7 @@ def _run(
     if config.lock_memory:
         lock_memory()
     listeners: list[Listener] = []
-    diagnostics = {"log": log.diagnostics, "shown": out.diagnostics}
+    reporters: dict[str, Reporter] = {"log": log, "shown": out}
     with ExitStack() as stack:
         slices = None
         if args.slices is not None:
@@ -83,7 +84,7 @@ def _run(
             slices = SliceRecorder(args.slices)
             stack.callback(slices.close)
             listeners.append(slices)
-            diagnostics["slices"] = slices.diagnostics
+            reporters["slices"] = slices
         # Without permission the loop still detects late commands and holds the wrist.
         stack.enter_context(high_priority() if config.robot is not None else nullcontext())
         emulated = stack.enter_context(EmulatedDevices(config.emulators, args.config.parent, args.recording))
@@ -96,7 +97,7 @@ def _run(
             )
         if args.show:
             listeners += [EstimatePrinter(out), RunSummary(out, emulated, emulated)]
-        finished = asyncio.run(run_daemon(config, tuple(listeners), diagnostics, on_ready))
+        finished = asyncio.run(run_daemon(config, tuple(listeners), reporters, on_ready))
     if slices is not None:
         out.write(f"{args.slices}: {slices.summary}\n")
     return EXIT_OK if finished else EXIT_UNFINISHED

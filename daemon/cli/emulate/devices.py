@@ -14,13 +14,10 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from shearloop.bank.eit.mesh import Mesh
-    from shearloop.daemon.synthetic_frames import Signals
     from shearloop.drivers.emulators.boards import BoardFault
     from shearloop.drivers.emulators.ur_controller import Controller
     from shearloop.drivers.emulators.ur_robot import ControllerSpec, RobotEvent
 
-DEMO_BANK = Path(__file__).resolve().parents[3] / "config" / "banks" / "demo.yaml"
 # The paper's screwdriver: σ at rest and at the largest torque of its peak samples, in N·m.
 K_CM = 3.25
 SIGMA_AT_REST_CM, SIGMA_AT_LARGEST_CM, LARGEST_TORQUE_NM = 1.85, 1.25, 0.14
@@ -48,12 +45,7 @@ def _configure_eit_kit(parser: argparse.ArgumentParser) -> None:
     frames = parser.add_argument_group("frames")
     frames.add_argument("--recording", type=Path, metavar="FILE", help="a recorded stream (.mat)")
     frames.add_argument("--side", choices=("left", "right"), help="which fingertip, if the file holds both")
-    frames.add_argument(
-        "--bank",
-        type=Path,
-        metavar="FILE",
-        help="synthesise twists from this bank's signals (default, without --recording: the demo's fingertip, solved)",
-    )
+    frames.add_argument("--bank", type=Path, metavar="FILE", help="synthesise twists from this bank's signals")
     frames.add_argument(
         "--sigma",
         type=float,
@@ -108,7 +100,7 @@ def _numbered_fault(argument: str) -> "tuple[int, BoardFault]":
 
 
 def _frames(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.float64]"]:
-    if args.recording is not None and args.bank is not None:
+    if (args.recording is None) == (args.bank is None):
         raise UserError("give either --recording FILE to play a recording or --bank FILE to synthesise frames")
     if args.recording is None:
         if args.once:
@@ -122,30 +114,18 @@ def _frames(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.f
 
 def _synthetic(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.float64]"]:
     from shearloop.bank.eit.bank_file import Bank
-    from shearloop.daemon.synthetic_frames import Synthesiser, TwistProgramme, solve_signals, twist_frames
+    from shearloop.daemon.synthetic_frames import Synthesiser, TwistProgramme, twist_frames
 
     rest, largest = args.sigma
 
     def sigma_of_torque(torque_nm: float) -> float:
         return float(rest + (largest - rest) * torque_nm / LARGEST_TORQUE_NM)
 
-    if args.bank is not None:
-        signals: Signals = Bank.open(args.bank)
-    else:
-        signals = solve_signals(_demo_mesh(), K_CM, min(rest, largest), max(rest, largest))
-    synthesiser = Synthesiser(signals, seed=args.seed)
+    synthesiser = Synthesiser(Bank.open(args.bank), seed=args.seed)
     # Report a wrong sigma before a port appears.
     for torque_nm in (0.0, LARGEST_TORQUE_NM):
         synthesiser.signal(K_CM, sigma_of_torque(torque_nm))
     return twist_frames(synthesiser, TwistProgramme(), k=K_CM, sigma_of_torque=sigma_of_torque, period_s=period_s)
-
-
-def _demo_mesh() -> "Mesh":
-    from shearloop.daemon.bank_config import load_bank_plan
-
-    if not DEMO_BANK.is_file():
-        raise UserError(f"{DEMO_BANK} is not there; give --recording FILE to play, or --bank FILE to synthesise from")
-    return load_bank_plan(DEMO_BANK).mesh
 
 
 def _configure_hx711(parser: argparse.ArgumentParser) -> None:

@@ -15,10 +15,20 @@ from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
 from shearloop.daemon.waiters import Waiters
-from shearloop.drivers import shear_skin
 from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
-from shearloop.drivers.shear_skin import SOURCE_PERIOD_S, Keithley6430, PairParser, SkinSample, Voltages
+from shearloop.drivers.shear_skin.instruments import (
+    SOURCE_PERIOD_S,
+    AdcBoard,
+    Daq,
+    Keithley6430,
+    PairParser,
+    RecordedInstrument,
+    ScpiScanner,
+    SourceReading,
+    Voltages,
+)
+from shearloop.drivers.shear_skin.skin import SampleValidator, ShearSkin, SkinSample
 
 SKIN = "skin"
 # The instruments' names in health and in recordings.
@@ -46,7 +56,7 @@ class SkinTask:
         """
         calibration = load_calibration(config.calibration)
         check_circuit(config, calibration)
-        self._skin = shear_skin.ShearSkin(
+        self._skin = ShearSkin(
             _current_source(config, inputs.get(SKIN_SOURCE)),
             _daq(config, inputs.get(SKIN_DAQ)),
             _gauge_ohm(calibration),
@@ -130,14 +140,14 @@ class RecordedSkin:
         self._estimator = _estimator(config, calibration)
         current_a = config.source.current_ma * 1e-3
         daq_period_s = 1.0 / config.daq.rate_hz
-        self._validator = shear_skin.SampleValidator(current_a, SOURCE_PERIOD_S, daq_period_s, _gauge_ohm(calibration))
+        self._validator = SampleValidator(current_a, SOURCE_PERIOD_S, daq_period_s, _gauge_ohm(calibration))
         self._radius_m = _radius_m(config)
-        self._source = shear_skin.recorded_source()
+        self._source = RecordedInstrument(Keithley6430)
         adc = config.daq.adc
-        self._daq: shear_skin.RecordedInstrument[Voltages] | PairParser = (
-            shear_skin.recorded_scanner() if adc is None else PairParser(config.daq.rate_hz, adc.full_scale_v)
+        self._daq: RecordedInstrument[Voltages] | PairParser = (
+            RecordedInstrument(ScpiScanner) if adc is None else PairParser(config.daq.rate_hz, adc.full_scale_v)
         )
-        self._latest: shear_skin.SourceReading | None = None
+        self._latest: SourceReading | None = None
 
     def handle(self, source: str, event: RawEvent) -> list[SkinShear]:
         """Return the messages that a source's event leads to, without processing time."""
@@ -247,14 +257,14 @@ def _current_source(config: SkinConfig, inputs: InputRecorder | None) -> Keithle
     return Keithley6430(link, source.current_ma * 1e-3, source.compliance_v, SOURCE_PERIOD_S, inputs=inputs)
 
 
-def _daq(config: SkinConfig, inputs: InputRecorder | None) -> shear_skin.Daq:
+def _daq(config: SkinConfig, inputs: InputRecorder | None) -> Daq:
     rate_hz, scanner, adc = config.daq.rate_hz, config.daq.scanner, config.daq.adc
     monitor = LinkMonitor(LinkLog("skin daq"))
     if scanner is not None:
         link = _link(scanner.socket, None, DEFAULT_BAUD, monitor)
-        return shear_skin.ScpiScanner(link, scanner.channels, rate_hz, scanner.range_v, inputs=inputs)
+        return ScpiScanner(link, scanner.channels, rate_hz, scanner.range_v, inputs=inputs)
     if adc is not None:
-        return shear_skin.AdcBoard(_link(None, adc.device, DEFAULT_BAUD, monitor), rate_hz, adc.full_scale_v, inputs)
+        return AdcBoard(_link(None, adc.device, DEFAULT_BAUD, monitor), rate_hz, adc.full_scale_v, inputs)
     raise ValueError("a skin needs an instrument that reads its voltages")
 
 

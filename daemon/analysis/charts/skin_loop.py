@@ -26,7 +26,7 @@ from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
 from shearloop.daemon.synthetic_skin import SyntheticSkin
 from shearloop.daemon.workers import Executor, in_order
-from shearloop.drivers.shear_skin import SkinSample
+from shearloop.drivers.shear_skin.skin import SkinSample
 
 TICK_S, SAMPLE_TICKS = 0.008, 12.5
 # From the middle of a conversion to the controller; and from a speed command to the wrist.

@@ -6,7 +6,7 @@ A frame passes the timer, the checks of its channels, the idle frames, the grips
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Self
 
@@ -41,7 +41,6 @@ _LEAST_IDLE, _OUTRIGHT = 5, 0.5
 _LARGEST_BRIDGED = 3
 # The paper's method refuses frames with more unusable channels than this.
 _PAPER_UNUSABLE_SHARE = 0.10
-_NOTHING: FloatArray = np.zeros(0)
 # Degrees of freedom of the mean variance of all channels in each channel's own.
 _POOLED_FREEDOM = 30
 
@@ -58,8 +57,8 @@ class ProcessedFrame:
     difference: FloatArray
     reasons: tuple[str, ...]
     usable: BoolArray
-    mean_difference: FloatArray = _NOTHING
-    motion: FloatArray = _NOTHING
+    mean_difference: FloatArray = field(default_factory=lambda: np.zeros(0))
+    motion: FloatArray = field(default_factory=lambda: np.zeros(0))
     held_frames: int = 1
     has_baseline: bool = True
     lag_s: float = 0.0

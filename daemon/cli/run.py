@@ -73,6 +73,7 @@ def _run(
     from shearloop.daemon.cli.output import EstimatePrinter
     from shearloop.daemon.config import RecordingConfig, load_daemon_config
     from shearloop.daemon.errors import UserError
+    from shearloop.daemon.health import Reporter
     from shearloop.daemon.realtime import high_priority, lock_memory
     from shearloop.daemon.run_summary import RunSummary
 
@@ -93,7 +94,7 @@ def _run(
                 # Without its frames the daemon would wait forever.
                 read_stream(args.recording, given.side)
     listeners: list[Listener] = []
-    diagnostics = {"log": log.diagnostics, "shown": out.diagnostics}
+    reporters: dict[str, Reporter] = {"log": log, "shown": out}
     with ExitStack() as stack:
         slices = None
         if args.slices is not None:
@@ -103,7 +104,7 @@ def _run(
             slices = SliceRecorder(args.slices)
             stack.callback(slices.close)
             listeners.append(slices)
-            diagnostics["slices"] = slices.diagnostics
+            reporters["slices"] = slices
         truth = stack.enter_context(closing(TruthFile(emulators)))
         # Without permission the loop still detects late commands and holds the wrist.
         stack.enter_context(high_priority() if config.robot is not None else nullcontext())
@@ -118,7 +119,7 @@ def _run(
             )
         if args.show:
             listeners += [EstimatePrinter(out), RunSummary(out, truth, events)]
-        finished = asyncio.run(run_daemon(config, tuple(listeners), diagnostics, on_ready))
+        finished = asyncio.run(run_daemon(config, tuple(listeners), reporters, on_ready))
     if slices is not None:
         out.write(f"{args.slices}: {slices.summary}\n")
     return EXIT_OK if finished else EXIT_UNFINISHED

@@ -1,20 +1,22 @@
 """The shear skin's task: builds instruments and estimator, publishes the shear force, takes the zero, replays."""
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 
 from shearloop.bank.skin.calibration import SkinCalibration, load_calibration
 from shearloop.bank.skin.membrane import joule_heating_k
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import InstrumentSocket, SerialDevice, SkinConfig
+from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.logs import LinkLog
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
-from shearloop.daemon.waiters import Waiters
+from shearloop.daemon.taring import Waiters
 from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.drivers.shear_skin.instruments import (
@@ -39,6 +41,21 @@ ZERO_TIMEOUT_S = 15.0
 MAX_WARMING_K = 5.0
 
 
+@dataclass(frozen=True, slots=True)
+class SkinSourceTask:
+    """Keeps the current source set up and read."""
+
+    skin: ShearSkin
+
+    async def run(self) -> None:
+        """Read until cancelled."""
+        await self.skin.watch_source()
+
+    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+        """Return the values of the current source for `health`."""
+        return self.skin.source_diagnostics()
+
+
 class SkinTask:
     """Connects the skin's instruments and its estimator to the publisher and the control loop."""
 
@@ -47,7 +64,7 @@ class SkinTask:
         config: SkinConfig,
         publisher: Publisher,
         clock: Clock,
-        on_torque: Callable[[TorqueSample], None] = lambda _: None,
+        loop: ControlLoop | None = None,
         inputs: Mapping[str, InputRecorder | None] = MappingProxyType({}),
     ) -> None:
         """Build everything, not yet open; `inputs` keeps the inputs of each source, by its name.
@@ -61,21 +78,18 @@ class SkinTask:
             _daq(config, inputs.get(SKIN_DAQ)),
             _gauge_ohm(calibration),
         )
+        self.source = SkinSourceTask(self._skin)
         self._estimator = _estimator(config, calibration)
         self._publisher = publisher
         self._clock = clock
-        self._on_torque = on_torque
+        self._loop = loop
         self._inputs = inputs.get(SKIN)
         self._radius_m = _radius_m(config)
         self._zero_waiters = Waiters()
         self._reason = ""
         self._valid = 0
 
-    async def watch_source(self) -> None:
-        """Keep the current source set up and read, until cancelled."""
-        await self._skin.watch_source()
-
-    async def read(self) -> None:
+    async def run(self) -> None:
         """Publish every sample's force and pass its torque on, until cancelled."""
         async with contextlib.aclosing(self._skin.samples()) as samples:
             async for sample in samples:
@@ -93,7 +107,7 @@ class SkinTask:
             self._inputs.record(RawEvent(InputKind.TARE, now_ns))
         self._estimator.tare(now_ns)
 
-    async def zero(self) -> str:
+    async def tare_and_wait(self) -> str:
         """Take a new zero and wait until it is done; return the reason of a failure, else an empty text."""
         self.tare()
         try:
@@ -115,17 +129,13 @@ class SkinTask:
             "drift_per_hour": self._estimator.drift_per_hour,
         }
 
-    def source_diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
-        """Return the values of the current source for `health`."""
-        return self._skin.source_diagnostics()
-
     def _publish(self, sample: SkinSample, reading: SkinReading) -> None:
         now_ns = self._clock.now_ns()
         message = shear_message(sample, reading, self._radius_m, now_ns)
         self._reason = message.reason
         self._valid += reading.valid
-        if self._radius_m is not None:
-            self._on_torque(skin_torque(reading, self._radius_m, sample.t_mid_ns, now_ns))
+        if self._radius_m is not None and self._loop is not None:
+            self._loop.on_torque(skin_torque(reading, self._radius_m, sample.t_mid_ns, now_ns))
         self._publisher.publish(message)
 
 

@@ -23,6 +23,7 @@ from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer
+from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import EitHeatmap, LoadTorque
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.web import bridge as bridge_module
@@ -65,7 +66,7 @@ async def served(tmp_path: Path, **other: Any) -> AsyncIterator[Served]:
     handlers = {name: handler(name) for name in (*NEEDS_TOKEN, "stop", "set")} | other
     with zmq.asyncio.Context() as context:
         publisher = Publisher(context, publish, Clock())
-        daemon = CommandServer(context, commands, handlers)
+        daemon = CommandServer(context, commands, handlers, Refusals())
         bridge = Bridge(context, DaemonAddress(publish, commands), LatestMessages(3.6))
         tasks = [asyncio.create_task(run()) for run in (daemon.run, bridge.run)]
         runner = web.AppRunner(make_app(bridge, TOKEN, {"width_cm": 4.4}, publish), access_log=None)

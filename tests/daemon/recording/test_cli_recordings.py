@@ -62,7 +62,7 @@ class BandMeans(Estimator):
     bands: int = 8
 
     def features(self, reading: Reading) -> tuple[FloatArray, None]:
-        return reading.difference.reshape(self.bands, -1).mean(axis=1), None
+        return reading.frame.difference.reshape(self.bands, -1).mean(axis=1), None
 
 
 @pytest.mark.usefixtures("few_mixtures")

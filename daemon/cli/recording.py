@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_json
-from shearloop.daemon.cli.output import print_result, progress_bar
+from shearloop.daemon.cli.terminal import print_result, progress_bar
 
 if TYPE_CHECKING:
     from shearloop.daemon.recording.reader import RecordingSummary

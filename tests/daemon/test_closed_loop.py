@@ -21,7 +21,7 @@ from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.web.bridge import Bridge, DaemonAddress
-from shearloop.daemon.web.latest import LatestMessages
+from shearloop.daemon.web.message_store import MessageStore
 from shearloop.daemon.web.server import make_app
 from tests.daemon.conftest import DEADLINE_S, Log, shearloop
 from tests.emulator_process import own_address
@@ -171,7 +171,7 @@ async def served_page(folder: Path) -> AsyncIterator[str]:
     """Serve the live view's page before the daemon of this folder, and yield its address."""
     place = DaemonAddress(f"ipc://{folder}/publish", f"ipc://{folder}/commands")
     with zmq.asyncio.Context() as context:
-        bridge = Bridge(context, place, LatestMessages(3.6))
+        bridge = Bridge(context, place, MessageStore(3.6))
         runner = web.AppRunner(make_app(bridge, "secret", {}, place.publish), access_log=None)
         await runner.setup()
         await web.TCPSite(runner, "127.0.0.1", 0).start()

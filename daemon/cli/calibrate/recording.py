@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.bank.estimators import DEFAULT, ESTIMATORS
 from shearloop.daemon.cli.options import add_json, check_overwrite
-from shearloop.daemon.cli.output import print_result
+from shearloop.daemon.cli.terminal import print_result
 
 if TYPE_CHECKING:
     from shearloop.bank.estimation import Calibration

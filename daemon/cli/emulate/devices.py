@@ -29,9 +29,9 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
   drop-rtde               close the RTDE connections, but not the dashboard's
   silence SECONDS         send nothing on any port
   stop-hangs N            ignore the dashboard's next N stop commands, without an answer
-  registers-in-use [off]  refuse input registers as if a fieldbus had them
-  local-control [off]     leave remote control
-  refuse-protocol [off]   refuse the RTDE protocol version
+  registers-in-use        refuse input registers as if a fieldbus had them
+  local-control           leave remote control
+  refuse-protocol         refuse the RTDE protocol version
   normal                  end all of them
 """
 

@@ -21,10 +21,9 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatcher
-from shearloop.bank.estimation.estimator import Estimator, OutputModel
+from shearloop.bank.estimation.estimator import Estimator, OutputModel, PaperEstimator
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.interval_regressor import PolynomialRegressor
-from shearloop.bank.estimation.ridge_estimators import PaperEstimator
 from shearloop.bank.estimation.values import INLINE, Kind
 from shearloop.bank.estimators import estimator_class
 from shearloop.bank.polynomial import Polynomial

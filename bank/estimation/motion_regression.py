@@ -159,13 +159,13 @@ class MotionRegression(Estimator):
     def features(self, reading: Reading) -> tuple[FloatArray, BankMatch | None]:
         """Return the features of motion. A slice has its time as a feature, because the gel drifts."""
         if self.temporal is not None:
-            return reading.motion, None
-        return np.append((reading.difference / self.scale).ravel(), reading.t_s), None
+            return reading.frame.motion, None
+        return np.append((reading.frame.difference / self.scale).ravel(), reading.t_s), None
 
     def inputs(self, quantity: Quantity, features: FloatArray, reading: Reading) -> FloatArray:
         """Return the inputs of a quantity's regressor; the diameter's are the gel's mean position in this grip."""
         if self.temporal is not None and quantity == "diameter":
-            return np.asarray((reading.mean_difference / self.scale).ravel())
+            return np.asarray((reading.frame.mean_difference / self.scale).ravel())
         return features
 
     def position_noise_mm(self, regressor: IntervalRegressor | PolynomialRegressor) -> float:

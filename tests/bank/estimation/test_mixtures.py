@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.estimation import Calibration, FrameSeries, fit
-from shearloop.bank.estimation.fitting_slices import ContaminationTest, Mixtures, SliceReader
+from shearloop.bank.estimation.fitting import ContaminationTest, Mixtures, SliceReader
 from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
 from shearloop.bank.estimation.motion_regression import MotionRegression
 from shearloop.bank.estimation.novelty import NoveltyDetector

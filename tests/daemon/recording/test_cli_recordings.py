@@ -9,11 +9,10 @@ import pytest
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration, Estimate, FrameSeries, fit
-from shearloop.bank.estimation.estimator import Estimator, OutputModel, Reading
+from shearloop.bank.estimation.estimator import Estimator, OutputModel, Reading, Regression
 from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
 from shearloop.bank.estimation.load_delay import LoadDelay, LoadTiming
 from shearloop.bank.estimation.regressors import Ridge
-from shearloop.bank.estimation.ridge_estimators import Regression
 from shearloop.bank.estimators import ESTIMATORS
 from shearloop.daemon.analysis.calibrate import CalibrationResult
 from shearloop.daemon.analysis.evaluate import EstimateTrack, InvalidReason, figures_of, invalid_reasons
@@ -63,7 +62,7 @@ class BandMeans(Estimator):
     bands: int = 8
 
     def features(self, reading: Reading) -> tuple[FloatArray, None]:
-        return reading.difference.reshape(self.bands, -1).mean(axis=1), None
+        return reading.frame.difference.reshape(self.bands, -1).mean(axis=1), None
 
 
 @pytest.mark.usefixtures("few_mixtures")

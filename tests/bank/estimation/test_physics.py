@@ -6,7 +6,7 @@ import pytest
 from shearloop.bank.eit.channels import CHANNELS
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import EstimatorSession, FrameSeries, Physics, TactileFrame, fit
+from shearloop.bank.estimation import EstimatorSession, Physics, TactileFrame, fit
 from shearloop.bank.estimation.bank_match import (
     NOT_TURNED,
     ElectrodeNumbering,
@@ -15,6 +15,7 @@ from shearloop.bank.estimation.bank_match import (
     image_matrix,
     resolve_half_turn,
 )
+from tests.bank.estimation.conftest import slices_of
 
 
 @pytest.mark.parametrize("reflected", [False, True])
@@ -72,12 +73,11 @@ def test_torque_by_the_place_in_the_bank(bank, name):
     channel = np.linspace(0, 4, 896)
     sigma = 1.8 - 7 * torque
     frames = np.exp(-0.5 * ((channel - 2.0) / (0.3 * sigma[:, None])) ** 2) + np.abs(rng.normal(0, 0.01, (32, 896)))
-    t = np.arange(32.0)
-    whole = FrameSeries("difference", ("right",), t, frames[:, None], t, torque, np.full(32, np.nan))
+    whole = slices_of(frames, torque)
     calibration = fit(name, [whole.between(0, 24)], "earlier", Physics(bank=bank))
     tracker = EstimatorSession(calibration, bank)
     for i in range(24, 32):
-        estimate = tracker.estimate(TactileFrame.of(t[i], frames[i][None]))
+        estimate = tracker.estimate(TactileFrame.of(float(i), frames[i][None]))
         assert estimate.torque_nm == pytest.approx(torque[i], abs=0.015)
         assert estimate.sigma == pytest.approx(sigma[i], abs=0.15)
         assert estimate.score is not None
@@ -88,9 +88,7 @@ def test_torque_by_the_place_in_the_bank(bank, name):
 
 def test_another_bank_is_refused(bank):
     rng = np.random.default_rng(5)
-    frames = np.abs(rng.normal(1, 0.1, (20, 1, 896)))
-    t = np.arange(20.0)
-    series = FrameSeries("difference", ("right",), t, frames, t, rng.uniform(0, 1, 20), np.full(20, np.nan))
+    series = slices_of(rng.normal(1, 0.1, (20, 896)), rng.uniform(0, 1, 20))
     calibration = fit("bank", [series], "x", Physics(bank=bank))
     with pytest.raises(CalibrationError, match="name the bank it was made with"):
         EstimatorSession(calibration, dataclasses.replace(bank, identity="0" * 64))

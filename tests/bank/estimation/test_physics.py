@@ -23,13 +23,13 @@ from tests.bank.estimation.conftest import slices_of
 def test_the_numbering_of_the_electrodes_is_found(rotation, reflected):
     rng = np.random.default_rng(1)
     homogeneous = rng.normal(size=896)
-    turned = ElectrodeNumbering(rotation, reflected, 0, 0).model_channels()
+    turned = ElectrodeNumbering(rotation, reflected).model_channels()
     found = find_numbering(np.abs(homogeneous[turned]) + 0.2 * np.abs(rng.normal(size=896)), homogeneous)
     assert (found.rotation, found.reflected) == (rotation, reflected)
     assert found.score > found.runner_up + 0.3
 
 
-@pytest.mark.parametrize("turned", [ElectrodeNumbering(5, False, 0, 0), ElectrodeNumbering(9, True, 0, 0)])
+@pytest.mark.parametrize("turned", [ElectrodeNumbering(5, False), ElectrodeNumbering(9, True)])
 def test_a_turned_channel_measures_between_the_turned_electrodes(turned):
     electrode = (turned.rotation + (-1 if turned.reflected else 1) * CHANNELS) % 32
     model = CHANNELS[turned.model_channels()]
@@ -40,9 +40,9 @@ def test_a_turned_channel_measures_between_the_turned_electrodes(turned):
 
 @pytest.mark.parametrize("rotation", [5, 21])
 def test_a_touch_settles_the_half_turn(bank, rotation):
-    true = ElectrodeNumbering(rotation, False, 0.9, 0.5)
+    true = ElectrodeNumbering(rotation, False)
     touch = np.abs(bank.signals[4, 7].astype(np.float64))[true.model_channels()]
-    for found in (true, ElectrodeNumbering((rotation + 16) % 32, False, 0.9, 0.5)):
+    for found in (true, ElectrodeNumbering((rotation + 16) % 32, False)):
         assert resolve_half_turn(found, touch, bank).rotation == rotation
 
 

@@ -177,22 +177,6 @@ def test_two_builds_of_one_target_do_not_mix(fingertip, interrupted):
         build(fingertip, interrupted)
 
 
-def test_a_build_that_fails_leaves_the_old_bank_as_it_was(finished, fingertip, tmp_path, monkeypatch):
-    path = tmp_path / "old.bank"
-    path.write_bytes(finished.read_bytes())
-
-    def full(_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(
-        BankFileError,
-        match="cannot be written: No space left on device, and the rows solved so far are kept; make room",
-    ):
-        build(fingertip, path, sigma=SIGMA + 0.1)
-    assert path.read_bytes() == finished.read_bytes()
-
-
 def test_a_bank_that_the_disk_has_no_room_for_is_written_from_its_journal_when_there_is(
     finished, fingertip, tmp_path, monkeypatch
 ):

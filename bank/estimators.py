@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 # The first is the default.
 ESTIMATORS = {
     "motion_regression": "shearloop.bank.estimation.motion_regression:MotionRegression",
-    "regression": "shearloop.bank.estimation.ridge_estimators:Regression",
-    "bank": "shearloop.bank.estimation.ridge_estimators:BankEstimator",
-    "paper": "shearloop.bank.estimation.ridge_estimators:PaperEstimator",
-    "reconstruction": "shearloop.bank.estimation.ridge_estimators:Reconstruction",
+    "regression": "shearloop.bank.estimation.estimator:Regression",
+    "bank": "shearloop.bank.estimation.estimator:BankEstimator",
+    "paper": "shearloop.bank.estimation.estimator:PaperEstimator",
+    "reconstruction": "shearloop.bank.estimation.estimator:Reconstruction",
 }
 DEFAULT = next(iter(ESTIMATORS))
 if not TYPE_CHECKING:

@@ -92,7 +92,7 @@ class TwinPlant(Plant):
 
     def _update_reading(self) -> None:
         state = self.twin.state
-        self._read_nm = state.shear_torque_nm if self.sees_gel else state.torque_nm
+        self._reading.torque_nm = state.shear_torque_nm if self.sees_gel else state.torque_nm
 
 
 @dataclass(slots=True)
@@ -130,9 +130,9 @@ class RigPlant(Plant):
 
     def _measure(self) -> None:
         self.t_s += self.period_s
-        if self.t_s < self._next_end_s:
+        if self.t_s < self._reading.ends_s:
             return
-        self._next_end_s += FRAME_PERIOD_S
+        self._reading.ends_s += FRAME_PERIOD_S
         lines, t_mid_s = lines_of(self.scene, self.frames), self.t_s - FRAME_PERIOD_S / 2
         true_nm = self.scene.conversion_nm(FRAME_PERIOD_S)
         estimate = self.tracker.estimate(TactileFrame.of(t_mid_s, np.array([channels_of_line(one) for one in lines])))

@@ -3,41 +3,49 @@
 import asyncio
 import contextlib
 import signal
-from collections.abc import Awaitable, Callable, Mapping
-from functools import partial
-from pathlib import Path
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import structlog
 import zmq
 import zmq.asyncio
 
-from shearloop.bank.eit.channels import ZERO_SLOTS
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.commands import Commands, required_rig
+from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
-from shearloop.daemon.control.loop_inputs import TorqueSource
-from shearloop.daemon.health import HealthReporter, TaskFacts
-from shearloop.daemon.logs import LinkLog
+from shearloop.daemon.configured_experiment import ConfiguredExperiment
+from shearloop.daemon.health import HealthReporter, Reporter, TaskFacts
 from shearloop.daemon.messaging.addresses import local_stop_address
 from shearloop.daemon.messaging.command_server import CommandServer
-from shearloop.daemon.messaging.keys import CurveAuthenticator, load_server_keys
+from shearloop.daemon.messaging.keys import CurveAuthenticator, Refusals, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
-from shearloop.daemon.recording.recorder import AttachedFile, Recorder, daemon_identity, experiment_notes
-from shearloop.daemon.rig import Rig, check_experiment, load_cell_calibration
-from shearloop.daemon.sensing.estimators import COMBINED, LiveEstimator, open_combined, open_estimator, torque_sources
-from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipEstimates, FingertipTask
-from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
-from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, RecordedSkin, SkinTask
+from shearloop.daemon.recording.recorder import Recorder, daemon_identity
+from shearloop.daemon.rig import Rig, check_experiment, make_gripper, make_loop
+from shearloop.daemon.sensing.estimators import COMBINED, open_combined, open_estimator, torque_sources
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
+from shearloop.daemon.sensors import SensorBuilder, Sensors
 from shearloop.daemon.service import notify
 from shearloop.daemon.signals import ending_signals
-from shearloop.daemon.supervisor import Supervisor
-from shearloop.drivers.connection import LinkMonitor
-from shearloop.drivers.eit_kit import EitKit
-from shearloop.drivers.load_cell import LoadCell
-from shearloop.drivers.serial_sensor import InputRecorder
+from shearloop.daemon.supervisor import Supervisor, Task
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingTask:
+    """Writes the recording, and hands its errors to the control loop."""
+
+    recorder: Recorder
+    rig: Rig | None
+
+    async def run(self) -> None:
+        """Write until cancelled."""
+        async for failure in self.recorder.flushes():
+            if self.rig is not None:
+                self.rig.control_loop.on_recording_error(failure)
+
+    def diagnostics(self) -> TaskFacts:
+        """Return the recorder's state for `health`."""
+        return self.recorder.diagnostics()
 
 
 class Daemon:
@@ -45,158 +53,51 @@ class Daemon:
 
     def __init__(self, config: DaemonConfig, context: zmq.asyncio.Context) -> None:
         """Open every file of the configuration and bind the sockets; devices may connect later."""
-        self._config = config
-        self._clock = Clock()
+        clock = Clock()
         self.supervisor = Supervisor()
         self._stop = asyncio.Event()
-        self._tasks: dict[str, Callable[[], Awaitable[None]]] = {}
-        self._tares: dict[str, Callable[[], None]] = {}
-        self._rig: Rig | None = None
-        self._experiment: ConfiguredExperiment | None = None
-        estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
-        combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
-        sources = torque_sources(config, estimators, combined)
-        check_experiment(config, sources)
+        self._stop_when_done = config.stop_when_done
         with contextlib.ExitStack() as opened:
             keys = load_server_keys(config.curve.server_key) if config.curve is not None else None
-            self._authenticator: CurveAuthenticator | None = None
+            refusals = Refusals()
+            # It must exist before a socket is bound.
+            authenticator: CurveAuthenticator | None = None
             if config.curve is not None and config.network_addresses:
-                self._authenticator = CurveAuthenticator(context, config.curve.clients)
-                opened.callback(self._authenticator.close)
-            self.publisher = Publisher(context, config.publish, self._clock, keys)
-            opened.callback(self.publisher.close)
-            self.health = HealthReporter(self.publisher, self.supervisor, self._clock)
-            self._recorder = self._open_recorder()
-            if self._recorder is not None:
-                opened.callback(self._recorder.close)
-            self._connect(estimators, combined, sources)
-            self.commands = Commands(
-                rig=self._rig,
-                tares=self._tares,
-                fingertips=self._fingertips,
-                experiment=config.experiment,
-                start=self.start_experiment,
-                call_off_experiment=self._call_off_experiment,
-                tasks=self.health.tasks,
-                stop=self.stop,
-            )
-            self._commands = CommandServer(context, config.commands, self.commands.handlers(), keys)
-            opened.callback(self._commands.close)
-            self._open_stop: CommandServer | None = None
+                authenticator = CurveAuthenticator(context, config.curve.clients, refusals)
+                opened.callback(authenticator.close)
+            self.publisher = opened.enter_context(contextlib.closing(Publisher(context, config.publish, clock, keys)))
+            self.recorder = _open_recorder(config, clock, self.publisher)
+            if self.recorder is not None:
+                opened.callback(self.recorder.close)
+            self.health = HealthReporter(self.publisher, self.supervisor, clock)
+            self.sensors, self._rig = _build_rig(config, self.publisher, clock, self.recorder, self.supervisor)
+            self._experiment: ConfiguredExperiment | None = None
+            if config.experiment is not None and self._rig is not None:
+                stop = self._stop if config.stop_when_done else None
+                self._experiment = ConfiguredExperiment(config.experiment, self._rig, stop)
+            self.commands = Commands(self._rig, self.sensors, self._experiment, self.health, self._stop)
+            server = CommandServer(context, config.commands, self.commands.handlers(), refusals, keys)
+            opened.callback(server.close)
+            open_stop: CommandServer | None = None
             if "commands" in config.network_addresses:
                 address = local_stop_address(config.commands)
-                self._open_stop = CommandServer(context, address, self.commands.open_handlers())
-                opened.callback(self._open_stop.close)
+                open_stop = CommandServer(context, address, self.commands.open_handlers(), refusals)
+                opened.callback(open_stop.close)
             self._close = opened.pop_all().close
-        self._add_service_tasks()
-
-    def _add(
-        self,
-        name: str,
-        run: Callable[[], Awaitable[None]],
-        diagnostics: Callable[[], TaskFacts] | None = None,
-        tare: Callable[[], None] | None = None,
-    ) -> None:
-        """Add a task with its diagnostics for `health` and its tare for the command."""
-        self._tasks[name] = run
-        if diagnostics is not None:
-            self.health.add(name, diagnostics)
-        if tare is not None:
-            self._tares[name] = tare
-
-    def _connect(
-        self,
-        estimators: Mapping[str, LiveEstimator],
-        combined: LiveEstimator | None,
-        sources: Mapping[str, TorqueSource],
-    ) -> None:
-        """Create and connect the tasks of devices and estimators; no device is opened yet."""
-        config, publisher, clock = self._config, self.publisher, self._clock
-        diameters = FingertipDiameters(COMBINED)
-        if config.robot is not None:
-            dead_tasks = self.supervisor.dead
-            self._rig = Rig(config, publisher, clock, sources, self._tare, dead_tasks, diameters.latest)
-        on_torque = self._rig.control_loop.on_torque if self._rig is not None else lambda _: None
-
-        gripper = self._rig.gripper if self._rig is not None else None
-
-        def estimates(name: str, estimator: LiveEstimator) -> FingertipEstimates:
-            return FingertipEstimates(
-                name,
-                estimator,
-                publisher,
-                clock,
-                loop=self._rig.control_loop if self._rig is not None else None,
-                gripper=gripper,
-                diameters=diameters,
-                inputs=self._inputs(name),
-            )
-
-        pairs: CombinedFingertips | None = None
-        if combined is not None:
-            period_s = config.fingertips[combined.calibration.sides[0]].frame_period_s
-            pairs = CombinedFingertips(estimates(COMBINED, combined), period_s)
-
-        def fingertip_task(name: str, estimator: LiveEstimator) -> FingertipTask:
-            own = config.fingertips[name]
-            board = EitKit(
-                path=own.device.path,
-                serial_number=own.device.serial_number,
-                zero_slots=ZERO_SLOTS,
-                frame_period_s=own.frame_period_s,
-                monitor=self._link_monitor(name),
-                inputs=self._inputs(name),
-            )
-            return FingertipTask(
-                board, estimates(name, estimator), publisher, pairs, always_heatmap=own.heatmap == "always"
-            )
-
-        self._fingertips = {name: fingertip_task(name, estimator) for name, estimator in estimators.items()}
-        self._estimates = {name: task.estimates for name, task in self._fingertips.items()}
-        for name, task in self._fingertips.items():
-            self._add(name, task.run, task.diagnostics, task.estimates.tare)
-        if pairs is not None:
-            self._estimates[COMBINED] = pairs.estimates
-            self.health.add(COMBINED, pairs.diagnostics)
-            self._tares[COMBINED] = pairs.estimates.tare
-        self._skin: SkinTask | None = None
-        if config.skin is not None:
-            inputs = {name: self._inputs(name) for name in RecordedSkin.sources}
-            self._skin = SkinTask(config.skin, publisher, clock, on_torque, inputs)
-            self._add(SKIN, self._skin.read, self._skin.diagnostics, self._skin.tare)
-            self._add(SKIN_SOURCE, self._skin.watch_source, self._skin.source_diagnostics)
-        self._load_cell: LoadCellTask | None = None
-        if config.load_cell is not None:
-            port, rate_hz = config.load_cell.device, config.load_cell.rate_hz
-            board = LoadCell(
-                load_cell_calibration(config.load_cell),
-                serial_number=port.serial_number,
-                path=port.path,
-                rate_hz=rate_hz,
-                monitor=self._link_monitor(LOAD_CELL),
-                inputs=self._inputs(LOAD_CELL),
-            )
-            self._load_cell = LoadCellTask(board, publisher, clock, on_torque, rate_hz)
-            self._add(LOAD_CELL, self._load_cell.read, self._load_cell.diagnostics, self._load_cell.tare)
-        if self._rig is not None:
-            if self._rig.gripper is not None:
-                self._add("gripper", self._rig.gripper.read, self._rig.gripper.diagnostics)
-            self._add("robot", self._rig.robot.run, self._rig.runner.diagnostics)
-            self._add("loop", self._rig.runner.run)
-
-    def _add_service_tasks(self) -> None:
-        if self._rig is not None and self._config.experiment is not None:
-            ended = self._rig.runner.experiment_ended
-            self._experiment = ConfiguredExperiment(self._config.experiment, self.start_experiment, ended)
-            self._add("experiment", partial(self._run_experiment, self._experiment))
-        if self._recorder is not None:
-            self._add("recording", partial(self._record, self._recorder), self._recorder.diagnostics)
-        self._add("commands", self._commands.run, self._command_diagnostics)
-        if self._authenticator is not None:
-            self._add("keys", self._authenticator.run)
-        if self._open_stop is not None:
-            self._add("open_stop", self._open_stop.run)
-        self._add("health", self.health.run)
+        tasks: dict[str, Task | None] = {
+            **self.sensors.tasks(),
+            **(self._rig.tasks() if self._rig is not None else {}),
+            "experiment": self._experiment,
+            "recording": RecordingTask(self.recorder, self._rig) if self.recorder is not None else None,
+            "keys": authenticator,
+            "commands": server,
+            "open_stop": open_stop,
+            "health": self.health,
+        }
+        self._tasks = {name: task for name, task in tasks.items() if task is not None}
+        for name, part in {**self._tasks, COMBINED: self.sensors.combined, "commands": refusals}.items():
+            if isinstance(part, Reporter):
+                self.health.add(name, part)
 
     async def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
         """Run until `stop`, then end every task and close the sockets; `on_ready` is called once the tasks run."""
@@ -206,9 +107,9 @@ class Daemon:
                 self._experiment.close()
         finally:
             try:
-                if self._recorder is not None:
+                if self.recorder is not None:
                     # It may wait for the disk.
-                    await asyncio.to_thread(self._recorder.close)
+                    await asyncio.to_thread(self.recorder.close)
             finally:
                 # Each part, even if another one fails to close.
                 self._close()
@@ -218,10 +119,10 @@ class Daemon:
     async def _run_tasks(self, on_ready: Callable[[], None]) -> None:
         async with asyncio.TaskGroup() as group:
             running = [
-                group.create_task(self.supervisor.keep_running(name, run), name=name)
-                for name, run in self._tasks.items()
+                group.create_task(self.supervisor.keep_running(name, task), name=name)
+                for name, task in self._tasks.items()
             ]
-            structlog.get_logger().info("running", fingertips=list(self._fingertips))
+            structlog.get_logger().info("running", fingertips=list(self.sensors.fingertips))
             on_ready()
             notify("READY=1")
             await self._stop.wait()
@@ -238,94 +139,58 @@ class Daemon:
         """End `run` as soon as the tasks have ended."""
         self._stop.set()
 
+    def _log_recordings(self) -> None:
+        if self.recorder is None:
+            return
+        for path in self.recorder.finished:
+            structlog.get_logger().info("recorded", file=str(path))
+        if self.recorder.failure:
+            structlog.get_logger().error("the recording could not be finished", reason=self.recorder.failure)
+
     @property
     def finished(self) -> bool:
         """Whether the experiment that ends the daemon is done; True without one."""
-        return self._experiment is None or self._experiment.done or not self._config.stop_when_done
+        return self._experiment is None or self._experiment.done or not self._stop_when_done
 
-    async def stopped(self) -> None:
-        """Wait for a call of `stop`."""
-        await self._stop.wait()
 
-    async def _run_experiment(self, experiment: ConfiguredExperiment) -> None:
-        await experiment.run()
-        if self._config.stop_when_done:
-            if experiment.left_to_operator:
-                await experiment.wait_for_end()
-            self.stop()
+def _open_recorder(config: DaemonConfig, clock: Clock, publisher: Publisher) -> Recorder | None:
+    """Return the recorder of all messages, if one is configured; raises UserError if it cannot write."""
+    if config.recording is None:
+        return None
+    recorder = Recorder(config.recording.folder, daemon_identity(config), clock)
+    publisher.add_listener(recorder.record_message)
+    return recorder
 
-    async def start_experiment(self, path: Path) -> str | None:
-        """Start and record an experiment; return None, or why not. Raises UserError for an invalid file."""
-        rig, recorder = required_rig(self._rig), self._recorder
-        attached = AttachedFile.read(path) if recorder is not None else ()
-        reason = await rig.start(path)
-        if reason is None and self._experiment is not None:
-            self._experiment.on_begun(path)
-        if reason is None and recorder is not None and rig.control_loop.experiment is not None:
-            file = rig.control_loop.experiment.file
-            recorder.record_experiment(file.name, attached, experiment_notes(file))
-        return reason
 
-    def _call_off_experiment(self) -> Path | None:
-        """Cancel the automatic start of the configured experiment; return it, or None if it was not awaited."""
-        return self._experiment.call_off() if self._experiment is not None else None
-
-    def _open_recorder(self) -> Recorder | None:
-        """Return the recorder, if one is configured; raises UserError if it cannot write."""
-        if self._config.recording is None:
-            return None
-        recorder = Recorder(self._config.recording.folder, daemon_identity(self._config), self._clock)
-        self.publisher.add_listener(recorder.record_message)
-        return recorder
-
-    def _inputs(self, source: str) -> InputRecorder | None:
-        return self._recorder.input_recorder(source) if self._recorder is not None else None
-
-    def _link_monitor(self, device: str) -> LinkMonitor:
-        return self._rig.monitor(device) if self._rig is not None else LinkMonitor(LinkLog(device))
-
-    async def _record(self, recorder: Recorder) -> None:
-        async for failure in recorder.flushes():
-            if self._rig is not None:
-                self._rig.control_loop.inputs.recording_error = failure
-
-    def _log_recordings(self) -> None:
-        if self._recorder is None:
-            return
-        for path in self._recorder.finished:
-            structlog.get_logger().info("recorded", file=str(path))
-        if self._recorder.failure:
-            structlog.get_logger().error("the recording could not be finished", reason=self._recorder.failure)
-
-    def _command_diagnostics(self) -> TaskFacts:
-        """Return the numbers of refused commands and clients, by kind."""
-        refused = self._commands.refused.copy()
-        for other in (self._authenticator, self._open_stop):
-            if other is not None:
-                refused.update(other.refused)
-        return {"errors": dict(refused)}
-
-    async def _tare(self) -> str:
-        """Zero every torque sensor; return the errors, or an empty string."""
-        tares = [each.tare_and_wait() for each in self._estimates.values()]
-        if self._skin is not None:
-            tares.append(self._skin.zero())
-        if self._load_cell is not None:
-            tares.append(self._load_cell.zero())
-        return " ".join(filter(None, await asyncio.gather(*tares)))
+def _build_rig(
+    config: DaemonConfig, publisher: Publisher, clock: Clock, recorder: Recorder | None, supervisor: Supervisor
+) -> tuple[Sensors, Rig | None]:
+    """Return all sensors, and robot, gripper and control loop, if there is a robot."""
+    estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
+    combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
+    sources = torque_sources(config, estimators, combined)
+    check_experiment(config, sources)
+    loop = make_loop(config, sources)
+    diameters = FingertipDiameters(COMBINED)
+    gripper = make_gripper(config, loop, publisher, diameters) if loop is not None else None
+    builder = SensorBuilder(config, publisher, clock, recorder, loop)
+    sensors = builder.build(estimators, combined, gripper, diameters)
+    if loop is None:
+        return sensors, None
+    return sensors, Rig(config, loop, gripper, sensors.tareable(), publisher, clock, supervisor, recorder)
 
 
 async def run_daemon(
     config: DaemonConfig,
     listeners: tuple[Listener, ...] = (),
-    facts: Mapping[str, Callable[[], TaskFacts]] = MappingProxyType({}),
+    reporters: Mapping[str, Reporter] = MappingProxyType({}),
     on_ready: Callable[[], None] = lambda: None,
 ) -> bool:
     """Run a daemon until SIGINT, SIGTERM, SIGHUP or the command `stop`; return whether it ended as planned.
 
-    It ended as planned if its experiment is done, or by SIGTERM or SIGHUP. `listeners` receive every message; `facts`
-    are their parts of `health`, by name; `on_ready` is called once all tasks run. SIGTERM and SIGHUP are ignored
-    afterwards.
+    It ended as planned if its experiment is done, or by SIGTERM or SIGHUP. `listeners` receive every message;
+    `reporters` add their parts to `health`, by name; `on_ready` is called once all tasks run. SIGTERM and SIGHUP are
+    ignored afterwards.
     """
     loop, terminated = asyncio.get_running_loop(), False
 
@@ -338,8 +203,8 @@ async def run_daemon(
         daemon = Daemon(config, context)
         for listener in listeners:
             daemon.publisher.add_listener(listener)
-        for name, diagnostics in facts.items():
-            daemon.health.add(name, diagnostics)
+        for name, reporter in reporters.items():
+            daemon.health.add(name, reporter)
         ending = ending_signals()
         for number in ending:
             loop.add_signal_handler(number, daemon.stop if number == signal.SIGINT else terminate)

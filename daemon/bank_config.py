@@ -159,30 +159,23 @@ class BankPlan(NamedTuple):
     definition: BankDefinition
 
 
-def load_bank_plan(
-    path: Path, model: str | None = None, k: GridConfig | None = None, sigma: GridConfig | None = None
-) -> BankPlan:
-    """Read a bank's configuration and its mesh; the other arguments override the file.
+def load_bank_plan(path: Path) -> BankPlan:
+    """Read a bank's configuration and its mesh.
 
     Raises UserError and GeometryError with the file and the key to mend, also for a configuration of several banks.
     """
-    plans = load_bank_plans(path, model, k, sigma)
+    plans = load_bank_plans(path)
     if set(plans) != {""}:
         raise UserError(f"{path}: `over` makes {len(plans)} banks, and here one is wanted; leave it out")
     return plans[""]
 
 
-def load_bank_plans(
-    path: Path, model: str | None = None, k: GridConfig | None = None, sigma: GridConfig | None = None
-) -> dict[str, BankPlan]:
+def load_bank_plans(path: Path) -> dict[str, BankPlan]:
     """Read a configuration as `load_bank_plan` does, and return its banks by name.
 
     With `over`, a name lists the parameters, `amplitude=0.5,tilt_deg=2`; a single bank has an empty name.
     """
     config = load_yaml_model(path, BankConfig)
-    model, k, sigma = model or config.model, k or config.k, sigma or config.sigma
-    if sigma.low <= 0 and model != "step":
-        raise UserError(f"{path}: sigma must begin above 0 for the model {model}, not at {sigma.low:g}")
     meshes: dict[tuple[tuple[str, float], ...], Mesh] = {}
     plans = {}
     for chosen in config.over.values() if config.over is not None else [{}]:
@@ -194,7 +187,9 @@ def load_bank_plans(
         if (name := _shown(chosen)) in plans:
             raise UserError(f"{path}: two banks of `over` would be named {name}; take fewer values, or further apart")
         mesh = meshes[key]
-        definition = BankDefinition(mesh.digest, model, k.values(), sigma.values(), Variation(**varied))
+        definition = BankDefinition(
+            mesh.digest, config.model, config.k.values(), config.sigma.values(), Variation(**varied)
+        )
         plans[name] = BankPlan(mesh, definition)
     return plans
 

@@ -1,36 +1,32 @@
 """The daemon's commands: one handler each, which executes the command or refuses it with a reason."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from shearloop.daemon.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.health import HealthReporter
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
 from shearloop.daemon.rig import Rig
-from shearloop.daemon.sensing.fingertip_task import FingertipTask
+from shearloop.daemon.sensors import Sensors
 
 STOP_DELAY_S = 0.05
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Commands:
     """Executes the commands of the command socket.
 
-    `tares` sets the zero of each sensor, `experiment` is the configured one, `tasks` returns their health. `start`
-    starts an experiment or returns the reason of its refusal. `call_off_experiment` cancels an experiment that waits to
-    start and returns it. `stop` stops the daemon.
+    `experiment` is the configured one; setting `stop` ends the daemon.
     """
 
     rig: Rig | None
-    tares: Mapping[str, Callable[[], None]]
-    fingertips: Mapping[str, FingertipTask]
-    experiment: Path | None
-    start: Callable[[Path], Awaitable[str | None]]
-    call_off_experiment: Callable[[], Path | None]
-    tasks: Callable[[], Any]
-    stop: Callable[[], None]
+    sensors: Sensors
+    experiment: ConfiguredExperiment | None
+    health: HealthReporter
+    stop: asyncio.Event
 
     def handlers(self) -> Mapping[str, Handler]:
         """Return the handler of every command."""
@@ -56,14 +52,15 @@ class Commands:
         return {name: own if name in (STOP, STATUS) else refuse for name, own in self.handlers().items()}
 
     async def _start(self, request: Request) -> Reply:
-        path = request.get("experiment") or self.experiment
+        path = request.get("experiment") or (self.experiment.path if self.experiment is not None else None)
         if not isinstance(path, str | Path):
             raise CommandRefusedError("no experiment is given: name its file, or one in the configuration")
         try:
-            reason = await self.start(Path(path))
+            _refuse_if(await required_rig(self.rig).start(Path(path)))
         except UserError as error:
             raise CommandRefusedError(str(error)) from error
-        _refuse_if(reason)
+        if self.experiment is not None:
+            self.experiment.on_begun(Path(path))
         return {"experiment": str(path)}
 
     async def _pause(self, _request: Request) -> Reply:
@@ -79,7 +76,8 @@ class Commands:
         return {}
 
     async def _tare(self, request: Request) -> Reply:
-        names = _requested(request, self.tares, "sensor {source!r} to tare")
+        sensors = self.sensors.tareable()
+        names = _requested(request, sensors, "sensor {source!r} to tare")
         experiment = self.rig.control_loop.experiment if self.rig is not None else None
         if experiment is not None and experiment.running:
             raise CommandRefusedError(
@@ -87,7 +85,7 @@ class Commands:
                 "torques; stop it first, or give it a step `tare`"
             )
         for name in names:
-            self.tares[name]()
+            sensors[name].tare()
         return {"tared": names}
 
     async def _set(self, request: Request) -> Reply:
@@ -95,24 +93,24 @@ class Commands:
         heatmap = request.get("heatmap")
         if heatmap not in ("always", "on_request"):
             raise CommandRefusedError("only `heatmap` can be set while the daemon runs, to always or on_request")
-        names = _requested(request, self.fingertips, "fingertip {source!r}")
+        names = _requested(request, self.sensors.fingertips, "fingertip {source!r}")
         for name in names:
-            self.fingertips[name].show_heatmap(always=heatmap == "always")
+            self.sensors.fingertips[name].show_heatmap(always=heatmap == "always")
         return {"set": names, "heatmap": heatmap}
 
     async def _status(self, _request: Request) -> Reply:
-        return {"tasks": self.tasks()}
+        return {"tasks": self.health.tasks()}
 
     async def _stop(self, request: Request) -> Reply:
         stopped = self.rig.stop() if self.rig is not None else ""
-        waiting = self.call_off_experiment()
+        waiting = self.experiment.call_off() if self.experiment is not None else None
         if stopped:
             return {"stopped": stopped}
         if request.get("spare_daemon"):
             # The live page's stop button stops motion, but not the daemon.
             return {"stopped": f"the start of {waiting.name}" if waiting is not None else ""}
         # Nothing moves, so the daemon itself stops, once the reply is sent.
-        asyncio.get_running_loop().call_later(STOP_DELAY_S, self.stop)
+        asyncio.get_running_loop().call_later(STOP_DELAY_S, self.stop.set)
         return {}
 
 

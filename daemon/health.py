@@ -3,9 +3,10 @@
 import asyncio
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import Health, Scalar
@@ -17,6 +18,14 @@ HEALTH_PERIOD_S = 1.0
 TaskFacts = Mapping[str, Scalar | Mapping[str, int]]
 
 
+@runtime_checkable
+class Reporter(Protocol):
+    """A part of the daemon with values for `health`."""
+
+    def diagnostics(self) -> TaskFacts:
+        """Return the present counters: frames, errors by kind, rate."""
+
+
 class HealthReporter:
     """Collects the supervisor's records and the tasks' own counters, and publishes them."""
 
@@ -24,17 +33,17 @@ class HealthReporter:
         self._publisher = publisher
         self._supervisor = supervisor
         self._clock = clock
-        self._facts: dict[str, Callable[[], TaskFacts]] = {}
+        self._reporters: dict[str, Reporter] = {}
 
-    def add(self, name: str, facts: Callable[[], TaskFacts]) -> None:
-        """Add a function that returns a task's counters (frames, errors by kind, rate); called for every message."""
-        self._facts[name] = facts
+    def add(self, name: str, reporter: Reporter) -> None:
+        """Add a part of the daemon; it is asked for every message."""
+        self._reporters[name] = reporter
 
     def tasks(self) -> dict[str, TaskFacts]:
         """Return the present state of each task."""
         gathered: dict[str, TaskFacts] = {name: asdict(record) for name, record in self._supervisor.records.items()}
-        for name, facts in self._facts.items():
-            gathered[name] = {**gathered.get(name, {}), **facts()}
+        for name, reporter in self._reporters.items():
+            gathered[name] = {**gathered.get(name, {}), **reporter.diagnostics()}
         return gathered
 
     async def run(self) -> None:

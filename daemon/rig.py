@@ -1,9 +1,9 @@
 """The rig: builds gripper, robot and control loop from the configuration, and checks its experiment."""
 
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
-from shearloop.bank.estimation import Measured
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig
 from shearloop.daemon.config_file import load_yaml_model
@@ -24,8 +24,12 @@ from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_so
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.logs import LinkLog
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.recording.recorder import AttachedFile, Recorder, experiment_notes
 from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
+from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
+from shearloop.daemon.supervisor import Supervisor, Task
+from shearloop.daemon.taring import Sensor, tare_all
 from shearloop.drivers.calibration_files import load_calibration
 from shearloop.drivers.connection import LinkEvent, LinkMonitor
 from shearloop.drivers.load_cell import LoadCalibration
@@ -63,70 +67,99 @@ def gripper_calibration(config: GripperConfig) -> WidthCalibration:
     return load_calibration(config.calibration, WidthCalibration)
 
 
+class DeviceLink(LinkLog):
+    """Logs the losses and returns of one device, and hands them to the control loop, where there is one."""
+
+    def __init__(self, device: str, loop: ControlLoop | None) -> None:
+        super().__init__(device)
+        self._loop = loop
+
+    def on_link_event(self, event: LinkEvent) -> None:
+        """Take a loss or a return."""
+        super().on_link_event(event)
+        if self._loop is not None:
+            self._loop.on_link(self.device, event.sentence, up=event.up)
+
+
+def make_loop(config: DaemonConfig, sources: Mapping[str, TorqueSource]) -> ControlLoop | None:
+    """Return the control loop of the configured robot, if there is one; `sources` are all torques but the robot's."""
+    if config.robot is None:
+        return None
+    sources = {**sources, WRENCH: wrench_source(read_settings(config.robot).rate_hz)}
+    required = ("robot", "gripper") if config.gripper is not None else ("robot",)
+    gels = {
+        name: Creep(fingertip.creep.share, fingertip.creep.time_s)
+        for name, fingertip in (*config.fingertips.items(), (COMBINED, config.combined))
+        if fingertip is not None and fingertip.creep is not None
+    }
+    return ControlLoop(config.loop, sources, required, gels)
+
+
+def make_gripper(
+    config: DaemonConfig, loop: ControlLoop, publisher: Publisher, diameters: FingertipDiameters
+) -> GripperTask | None:
+    """Return the gripper's task, if a gripper is configured; `diameters` are the fingertips'."""
+    if config.gripper is None:
+        return None
+    client, calibration = make_gripper_client(config.gripper), gripper_calibration(config.gripper)
+    return GripperTask(
+        RobotiqGripper(client, calibration, monitor=LinkMonitor(DeviceLink("gripper", loop))),
+        publisher,
+        loop,
+        fingertip_diameter=diameters.latest,
+        measures_diameters=config.gripper.calibration is not None,
+    )
+
+
 class Rig:
-    """Robot, gripper and the control loop between them."""
+    """Robot, gripper and the control loop between them, for the operator's experiments."""
 
     def __init__(
         self,
         config: DaemonConfig,
+        loop: ControlLoop,
+        gripper: GripperTask | None,
+        sensors: Mapping[str, Sensor],
         publisher: Publisher,
         clock: Clock,
-        sources: Mapping[str, TorqueSource],
-        tare: Callable[[], Awaitable[str]],
-        dead_tasks: Mapping[str, str],
-        fingertip_diameter: Callable[[int], Measured | None] = lambda _: None,
+        supervisor: Supervisor,
+        recorder: Recorder | None = None,
     ) -> None:
-        """Read the settings of every device; none is opened yet.
-
-        `sources` are all torques but the robot's. `tare` zeroes every torque sensor and returns the errors,
-        `dead_tasks` has the error of each dead task of the daemon.
-        """
+        """Read the robot's settings; it is not connected yet. `sensors` are those that an experiment tares."""
         if config.robot is None:
             raise ValueError("a rig needs a robot")
-        # Counts the operator's stops, also while an experiment starts.
-        self._stops = 0
-        robot = read_settings(config.robot)
-        sources = {**sources, WRENCH: wrench_source(robot.rate_hz)}
-        required = ("robot", "gripper") if config.gripper is not None else ("robot",)
-        gels = {
-            name: Creep(fingertip.creep.share, fingertip.creep.time_s)
-            for name, fingertip in (*config.fingertips.items(), (COMBINED, config.combined))
-            if fingertip is not None and fingertip.creep is not None
-        }
-        self.control_loop = ControlLoop(config.loop, sources, required, gels)
-        self.gripper: GripperTask | None = None
-        if config.gripper is not None:
-            calibration = gripper_calibration(config.gripper)
-            self.gripper = GripperTask(
-                RobotiqGripper(make_gripper_client(config.gripper), calibration, monitor=self.monitor("gripper")),
-                publisher,
-                self.control_loop,
-                fingertip_diameter=fingertip_diameter,
-                measures_diameters=config.gripper.calibration is not None,
-            )
-        self.robot = UrRobot(robot, self.monitor("robot"))
+        self.control_loop = loop
+        self.gripper = gripper
+        self.robot = UrRobot(read_settings(config.robot), LinkMonitor(DeviceLink("robot", loop)))
         self.runner = ControlLoopRunner(
-            self.control_loop,
+            loop,
             self.robot,
-            self.gripper,
-            tare,
+            gripper,
+            partial(tare_all, sensors.values()),
             publisher,
             clock,
-            dead_tasks,
+            supervisor.dead,
             config.loop.wrist_acceleration_rad_per_s2,
         )
+        self._recorder = recorder
+        # Counts the operator's stops, also while an experiment starts.
+        self._stops = 0
 
-    def monitor(self, device: str) -> LinkMonitor:
-        """Return the monitor of a device's link: it logs the events, and the control loop reacts at once."""
-        return LinkMonitor(DeviceLink(self, device))
+    def tasks(self) -> dict[str, Task]:
+        """Return the tasks to run, by their names in `health`."""
+        gripper: dict[str, Task] = {"gripper": self.gripper} if self.gripper is not None else {}
+        return {**gripper, "robot": self.robot, "loop": self.runner}
 
     async def start(self, path: Path) -> str | None:
-        """Begin the experiment of a file; return None, or why not. Raises UserError for an invalid file."""
-        stops_before = self._stops
-        reason = await self.runner.start(read_experiment(path))
+        """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file."""
+        attached = AttachedFile.read(path) if self._recorder is not None else ()
+        stops_before, file = self._stops, read_experiment(path)
+        reason = await self.runner.start(file)
         if reason is None and self._stops != stops_before:
             self.control_loop.stop("the operator stopped it")
             return "it was stopped during its start"
+        if reason is None and self._recorder is not None:
+            self._recorder.record_experiment(file.name, attached, experiment_notes(file))
         return reason
 
     def stop(self) -> str:
@@ -145,25 +178,6 @@ class Rig:
             self.control_loop.stop("the daemon ended: the wrist is stopped, a gripped tool stays gripped")
             # The loop is cancelled before the next state.
             self.runner.decide_now()
-
-    def set_link(self, device: str, event: LinkEvent) -> None:
-        """Let the control loop react to a device's loss or return at once."""
-        self.control_loop.on_link(device, event.sentence, up=event.up)
-        if not event.up:
-            self.runner.decide_now()
-
-
-class DeviceLink(LinkLog):
-    """Logs the link events of a device, and passes them to the control loop."""
-
-    def __init__(self, rig: Rig, device: str) -> None:
-        super().__init__(device)
-        self._rig = rig
-
-    def on_link_event(self, event: LinkEvent) -> None:
-        """Handle a loss or a return."""
-        super().on_link_event(event)
-        self._rig.set_link(self.device, event)
 
 
 def read_experiment(path: Path) -> ExperimentFile:

@@ -4,14 +4,17 @@ An emulated rig adds the true torque and the disturbances.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
+
+if TYPE_CHECKING:
+    from shearloop.daemon.logs import NonBlockingWriter
 
 # A torque within this share of the set point counts as held.
 BAND = 0.10
@@ -19,7 +22,7 @@ BAND = 0.10
 STAYS_S = 1.0
 # Topics with a torque.
 TORQUES = ("eit.estimate", "load.torque", "skin.shear")
-_MOVING, _ENDS = "running", ("done", "stopped")
+_ENDS = ("done", "stopped")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,13 +52,21 @@ class _StepSummary:
     wrist_to_rad: float | None = None
 
 
+class _Truth(Protocol):
+    # The true torque so far, None if it is unknown.
+    def torques(self) -> TorqueSeries | None: ...
+
+
+class _Disturbances(Protocol):
+    # Time in ns and description.
+    sent: list[tuple[int, str]]
+
+
 @dataclass(slots=True)
 class _Run:
-    name: str
-    driving: str
-    steps_planned: int
-    from_ns: int
-    tool_mm: float | None
+    # The first and the latest `loop.state` of the experiment.
+    first: Mapping[str, Any]
+    last: Mapping[str, Any]
     steps: list[_StepSummary] = field(default_factory=list)
     identified: tuple[float, float, float] | None = None
     held_s: float = 0.0
@@ -64,21 +75,17 @@ class _Run:
     invalid: Counter[str] = field(default_factory=Counter)
     torques: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
     diameters: dict[str, list[float]] = field(default_factory=dict)
-    last: Mapping[str, Any] | None = None
 
 
 class RunSummary:
-    """Collects every message of a daemon and passes the summary's lines to `on_summary` when an experiment ends."""
+    """Collects every message of a daemon and writes the summary when an experiment ends."""
 
     def __init__(
-        self,
-        on_summary: Callable[[Sequence[str]], object],
-        true_torque: Callable[[], TorqueSeries | None] = lambda: None,
-        disturbances: Callable[[], Sequence[tuple[int, str]]] = tuple,
+        self, out: "TextIO | NonBlockingWriter", truth: _Truth | None = None, disturbances: _Disturbances | None = None
     ) -> None:
-        """Take sources of the true torque and of disturbances (time in ns, description), for an emulated rig."""
-        self._on_summary = on_summary
-        self._true_torque = true_torque
+        """Write to `out`; an emulated rig has a true torque and disturbances."""
+        self._out = out
+        self._truth = truth
         self._disturbances = disturbances
         self._run: _Run | None = None
 
@@ -87,54 +94,54 @@ class RunSummary:
         if topic == "loop.state":
             self._on_loop_state(content)
         elif self._run is not None:
-            self._on_sample(self._run, topic, content)
+            _on_sample(self._run, topic, content)
 
     def _on_loop_state(self, content: Mapping[str, Any]) -> None:
         run, phase = self._run, content["phase"]
         if phase == "idle" or (run is None and phase in _ENDS):
             return
         if run is None:
-            named = content["experiment"], content["torque_source"], content["steps"]
-            run = self._run = _Run(*named, content["t_mono_ns"], content["tool_mm"])
+            run = self._run = _Run(content, {**content, "phase": "", "response": ""})
         _update(run, content)
         if phase in _ENDS:
             self._run = None
-            self._on_summary(tuple(_lines(run, phase, self._true_torque(), self._disturbances())))
+            truth = self._truth.torques() if self._truth is not None else None
+            events = self._disturbances.sent if self._disturbances is not None else ()
+            self._out.write("\n".join(("", *_lines(run, truth, events), "", "")))
 
-    def _on_sample(self, run: _Run, topic: str, content: Mapping[str, Any]) -> None:
-        source, gripped = content["source"], run.steps and run.steps[-1].holds
-        if topic == "robot.state" and run.steps:
-            step = run.steps[-1]
-            step.wrist_to_rad = content["wrist_rad"]
-            step.wrist_from_rad = step.wrist_to_rad if step.wrist_from_rad is None else step.wrist_from_rad
-        if topic in TORQUES and content.get("torque_nm") is not None and content.get("valid", True):
-            run.torques.setdefault(source, []).append((content["t_mono_ns"], content["torque_nm"]))
-        elif topic in TORQUES and not content.get("valid", True):
-            run.invalid[source] += 1
-        if topic in ("eit.estimate", "gripper.state") and gripped and content.get("diameter_mm") is not None:
-            run.diameters.setdefault(source, []).append(content["diameter_mm"])
+
+def _on_sample(run: _Run, topic: str, content: Mapping[str, Any]) -> None:
+    source, step = content["source"], run.steps[-1] if run.steps else None
+    if topic == "robot.state" and step is not None:
+        step.wrist_to_rad = content["wrist_rad"]
+        step.wrist_from_rad = step.wrist_to_rad if step.wrist_from_rad is None else step.wrist_from_rad
+    if topic in TORQUES and content.get("torque_nm") is not None and content.get("valid", True):
+        run.torques.setdefault(source, []).append((content["t_mono_ns"], content["torque_nm"]))
+    elif topic in TORQUES and not content.get("valid", True):
+        run.invalid[source] += 1
+    gripped = topic in ("eit.estimate", "gripper.state") and step is not None and step.holds
+    if gripped and content.get("diameter_mm") is not None:
+        run.diameters.setdefault(source, []).append(content["diameter_mm"])
 
 
 def _update(run: _Run, content: Mapping[str, Any]) -> None:
     now_ns = content["t_mono_ns"]
-    if run.last is not None and run.last["phase"] == "held":
-        run.held_s += (now_ns - run.last["t_mono_ns"]) / 1e9
-    if content["response"] == "hold" and (run.last is None or run.last["response"] != "hold"):
+    if run.last["phase"] == "held":
+        run.held_s += _elapsed_s(run.last, content)
+    if content["response"] == "hold" and run.last["response"] != "hold":
         # The reason without its numbers.
         run.hold_reasons[content["reasons"].split(":")[0].rstrip(".")] += 1
     if "a command was refused" in content["reasons"]:
         run.refused[content["reasons"]] += 1
     run.last = content
+    if run.steps:
+        run.steps[-1].to_ns = now_ns
     if content["phase"] in _ENDS:
-        if run.steps:
-            run.steps[-1].to_ns = now_ns
         return
     if not run.steps or run.steps[-1].number != content["step"]:
-        if run.steps:
-            run.steps[-1].to_ns = now_ns
         run.steps.append(_StepSummary(content["step"], content["step_name"], now_ns, now_ns))
     step = run.steps[-1]
-    step.to_ns, step.holds = now_ns, max(step.holds, content["hold"])
+    step.holds = max(step.holds, content["hold"])
     if content["set_point_nm"] is not None and content["step_name"] == "hold_torque":
         step.set_point_nm = content["set_point_nm"]
         if content["hold"] and step.held_from_ns is None:
@@ -143,21 +150,25 @@ def _update(run: _Run, content: Mapping[str, Any]) -> None:
         run.identified = (content["stiffness_nm_per_rad"], content["delay_s"], content["noise_nm"])
 
 
-def _lines(run: _Run, phase: str, truth: TorqueSeries | None, disturbances: Sequence[tuple[int, str]]) -> Iterator[str]:
-    end_ns = run.last["t_mono_ns"] if run.last is not None else run.from_ns
-    ended = "done" if phase == "done" else "STOPPED before its end"
-    yield f"What happened: {run.name!r} was {ended}, after {(end_ns - run.from_ns) / 1e9:.0f} s."
-    if run.last is not None and phase != "done":
+def _lines(run: _Run, truth: TorqueSeries | None, disturbances: Sequence[tuple[int, str]]) -> Iterator[str]:
+    done = run.last["phase"] == "done"
+    ended, took_s = "done" if done else "STOPPED before its end", _elapsed_s(run.first, run.last)
+    yield f"What happened: {run.first['experiment']!r} was {ended}, after {took_s:.0f} s."
+    if not done:
         yield f"  {run.last['activity']}"
     for step in run.steps:
         took_s = (step.to_ns - step.from_ns) / 1e9
-        yield f"  step {step.number} of {run.steps_planned}  {step.name:<12} {took_s:6.1f} s{_details(step, run)}"
+        yield f"  step {step.number} of {run.first['steps']}  {step.name:<12} {took_s:6.1f} s{_details(step, run)}"
         if step.set_point_nm is not None and step.held_from_ns is not None:
             here = [event for event in disturbances if step.from_ns <= event[0] <= step.to_ns]
             yield from _held(step, step.set_point_nm, step.held_from_ns, run, truth, here)
         if step.name == "tighten":
             yield from _turned(step, run, truth)
     yield from _counted(run)
+
+
+def _elapsed_s(first: Mapping[str, Any], last: Mapping[str, Any]) -> float:
+    return float(last["t_mono_ns"] - first["t_mono_ns"]) / 1e9
 
 
 def _details(step: _StepSummary, run: _Run) -> str:
@@ -170,11 +181,12 @@ def _details(step: _StepSummary, run: _Run) -> str:
 
 
 def _turned(step: _StepSummary, run: _Run, truth: TorqueSeries | None) -> Iterator[str]:
+    driving = run.first["torque_source"]
     if step.wrist_from_rad is not None and step.wrist_to_rad is not None:
-        yield f"    turned by {step.wrist_to_rad - step.wrist_from_rad:+.3f} rad; torque source: {run.driving}"
+        yield f"    turned by {step.wrist_to_rad - step.wrist_from_rad:+.3f} rad; torque source: {driving}"
     for name, series in _all_torques(run, truth).items():
         turning = series.between(step.from_ns, step.to_ns).torque_nm
-        if turning.size and name in ("true", run.driving):
+        if turning.size and name in ("true", driving):
             largest_nm = turning[np.abs(turning).argmax()]
             yield f"    {name:<10} {turning[-1]:+.4f} N·m at the end, {largest_nm:+.4f} at most"
 
@@ -192,8 +204,8 @@ def _held(
     truth: TorqueSeries | None,
     disturbances: list[tuple[int, str]],
 ) -> Iterator[str]:
-    held_s = (step.to_ns - from_ns) / 1e9
-    yield f"    set point {set_nm:+.3f} N·m, held for {held_s:.0f} s; torque source: {run.driving}"
+    driving, held_s = run.first["torque_source"], (step.to_ns - from_ns) / 1e9
+    yield f"    set point {set_nm:+.3f} N·m, held for {held_s:.0f} s; torque source: {driving}"
     sources = _all_torques(run, truth)
     for name, series in sources.items():
         held = series.between(from_ns, step.to_ns).torque_nm
@@ -204,7 +216,7 @@ def _held(
                 f"within ± {BAND:.0%} for {share:.0%} of the time"
             )
     # Judge by the true torque, the load cell or another source, never by the one that drove the loop.
-    names = sorted(set(sources) - {run.driving}, key=lambda name: (name != "true", name != LOAD_CELL, name))
+    names = sorted(set(sources) - {driving}, key=lambda name: (name != "true", name != LOAD_CELL, name))
     if not names:
         return
     judge = sources[names[0]]
@@ -234,8 +246,8 @@ def _recovery_s(series: TorqueSeries, since_ns: float, set_nm: float) -> float |
 
 
 def _counted(run: _Run) -> Iterator[str]:
-    if run.tool_mm is not None:
-        yield f"  tool diameter {run.tool_mm:g} mm, from the experiment"
+    if run.first["tool_mm"] is not None:
+        yield f"  tool diameter {run.first['tool_mm']:g} mm, from the experiment"
     for source, values in run.diameters.items():
         yield f"  diameter by {source}: {np.mean(values):.1f} mm ± {np.std(values):.1f} of one reading"
     total = sum(run.hold_reasons.values())

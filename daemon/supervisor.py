@@ -1,8 +1,8 @@
 """Restarts crashed tasks after a growing pause, and counts and reports the crashes."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import structlog
 
@@ -17,6 +17,13 @@ MAX_ERROR_LENGTH = 300
 def restart_pause_s(deaths_in_a_row: int) -> float:
     """Return the pause before the next start: it doubles from 0.5 s to 30 s."""
     return float(min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0 ** (deaths_in_a_row - 1)))
+
+
+class Task(Protocol):
+    """A part of the daemon that runs until it is cancelled, or until its work is done."""
+
+    async def run(self) -> None:
+        """Do the task's work."""
 
 
 @dataclass(slots=True)
@@ -38,8 +45,8 @@ class Supervisor:
     # Crashed tasks that wait for their restart, with their errors.
     dead: dict[str, str] = field(default_factory=dict)
 
-    async def keep_running(self, name: str, run: Callable[[], Awaitable[None]]) -> None:
-        """Run `run()` until it returns; if it raises, log the error and restart it."""
+    async def keep_running(self, name: str, task: Task) -> None:
+        """Run a task until it returns; if it raises, log the error and restart it."""
         record = self.records.setdefault(name, TaskRecord())
         log = structlog.get_logger().bind(task=name)
         loop = asyncio.get_running_loop()
@@ -48,11 +55,11 @@ class Supervisor:
             record.alive, started_s = True, loop.time()
             self.dead.pop(name, None)
             try:
-                await run()
+                await task.run()
             except Exception as error:  # an error of one task must not end the others
                 # Before Python 3.13 a task group that fails while it is cancelled raises only the failure.
-                task = asyncio.current_task()
-                if task is not None and task.cancelling():
+                own = asyncio.current_task()
+                if own is not None and own.cancelling():
                     log.exception("the task crashed while it was cancelled")
                     raise asyncio.CancelledError from error
                 deaths = 1 if loop.time() - started_s > RECOVERED_AFTER_S else deaths + 1

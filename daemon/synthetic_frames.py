@@ -4,16 +4,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.bank.arrays import BoolArray, FloatArray
-from shearloop.bank.eit.bank_file import Bank, BankDefinition
-from shearloop.bank.eit.build import RowSolver
+from shearloop.bank.arrays import FloatArray
+from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import LINE_SLOTS, N_ELECTRODES, line_of_channels
-from shearloop.bank.eit.mesh import Mesh
 from shearloop.daemon.errors import UserError
 from shearloop.drivers.eit_kit import ADC_STEP_V
 
@@ -23,39 +20,12 @@ NOISE_V = 0.002
 # With this share of the modelled conductivity change, difference frames have an RMS of 5 mV, as the 49 torque peak
 # samples (Gaussian derivative, k = 3.25 cm, σ from 1.25 to 1.85 cm).
 AMPLITUDE = 0.17
-# Linear interpolation between 13 values of σ from 1.25 to 1.85 cm errs by less than a hundredth of the noise.
-N_SIGMAS = 13
 # (896,) the injection, 0…31 in order of time, of each channel.
 INJECTIONS: NDArray[np.int64] = LINE_SLOTS // N_ELECTRODES
 # σ at rest and at the largest torque of the peak samples, in N·m; k of the thinnest and thickest recorded cylinder.
 SIGMA_CM, LARGEST_TORQUE_NM = (1.85, 1.25), 0.14
 K_CM, DIAMETER_MM = (3.78, 3.47), (10.0, 40.0)
 MAX_WIDTH_MM = 140.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SolvedSignals:
-    """Signals of one k over some σ, in memory: a bank's arrays without its file."""
-
-    k_grid: FloatArray
-    sigma_grid: FloatArray
-    homogeneous: FloatArray
-    signals: NDArray[np.float32]
-    valid: BoolArray
-
-
-Signals: TypeAlias = Bank | SolvedSignals
-
-
-def solve_signals(mesh: Mesh, k: float, sigma_low: float, sigma_high: float) -> SolvedSignals:
-    """Return signals of the Gaussian derivative at one k and N_SIGMAS σ, for twists without a bank.
-
-    Raises ModelError for a k or σ that the model does not have.
-    """
-    k_grid, sigma_grid = np.array([k]), np.linspace(sigma_low, sigma_high, N_SIGMAS)
-    solver = RowSolver(mesh, BankDefinition(mesh.digest, "gaussian_derivative", k_grid, sigma_grid))
-    row = solver.solve(0)
-    return SolvedSignals(k_grid, sigma_grid, solver.homogeneous, row.signals[None], row.valid[None])
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +59,7 @@ class TwistProgramme:
 class Synthesiser:
     """Makes lines of RMS magnitudes, as the board's ADC reads them, at and between a bank's cells."""
 
-    def __init__(self, bank: Signals, *, seed: int = 0, amplitude: float = AMPLITUDE, noise_v: float = NOISE_V) -> None:
+    def __init__(self, bank: Bank, *, seed: int = 0, amplitude: float = AMPLITUDE, noise_v: float = NOISE_V) -> None:
         self._bank = bank
         self._gain = MEAN_V / float(np.abs(bank.homogeneous).mean())
         self._amplitude = amplitude

@@ -75,7 +75,9 @@ class SyntheticSkin:
         """Return R₁ and R₂ now, without measurement noise."""
         factor = self.membrane.gauge_factor
         crosstalk = CROSSTALK_PER_N * self.normal_n
-        changes = (factor * self._state.strain_1 + crosstalk, factor * self._state.strain_2)
+        tensions = self._state.gauge_tension_1_n, self._state.gauge_tension_2_n
+        strain_1, strain_2 = (tension / self.membrane.axial_stiffness_n for tension in tensions)
+        changes = (factor * strain_1 + crosstalk, factor * strain_2)
         r1, r2 = (
             rest * (1.0 + change + wander) for rest, change, wander in zip(REST_OHM, changes, self._wander, strict=True)
         )

@@ -30,8 +30,6 @@ STUCK_AFTER = 20
 CAPACITY_NM = 1.75
 # More than twice the fastest change in the paper's recordings (0.76 N·m/s, a 10 mm cylinder slipping free).
 SLEW_NM_PER_S = 2.0
-# Values in a row that agree with each other and become the new level.
-SETTLE_SAMPLES = 3
 
 _DECIMAL = re.compile(rb"[+-]?[0-9]{1,15}(\.[0-9]{1,15})?")
 
@@ -106,35 +104,21 @@ class LoadSample:
 
 
 class SpikeFilter:
-    """Separates corrupted values from loads, causally.
-
-    A spike lies beyond the cell's capacity, or further from the last good value than the rig can move in between. A
-    real step looks alike, so SETTLE_SAMPLES values in a row that agree with each other become the new level.
-    """
+    """Flags values beyond the cell's capacity, and further from the last good value than the rig can move."""
 
     def __init__(self, period_ns: int = PERIOD_NS) -> None:
         """Trust the first value within the capacity; the board sends one every `period_ns`."""
         self._period_ns = period_ns
-        self._good: tuple[float, int] | None = None
-        self._candidates: list[tuple[float, int]] = []
+        self._steps = serial_sensor.StepFilter[tuple[float, int]]()
 
     def is_spike(self, torque_nm: float, t_ns: int) -> bool:
         """Judge the next value; calls are in order of time."""
         if abs(torque_nm) > CAPACITY_NM:
-            self._candidates.clear()
+            self._steps.restart_step()
             return True
-        value = (torque_nm, t_ns)
-        if self._good is not None and not self._reachable(self._good, value):
-            if self._candidates and not self._reachable(self._candidates[-1], value):
-                self._candidates.clear()
-            self._candidates.append(value)
-            if len(self._candidates) < SETTLE_SAMPLES:
-                return True
-        self._good = value
-        self._candidates.clear()
-        return False
+        return self._steps.is_spike((torque_nm, t_ns), self._is_reachable)
 
-    def _reachable(self, before: tuple[float, int], after: tuple[float, int]) -> bool:
+    def _is_reachable(self, before: tuple[float, int], after: tuple[float, int]) -> bool:
         # Arrival stamps bunch on a busy host: no interval counts as shorter than a period.
         elapsed_s = max(after[1] - before[1], self._period_ns) * 1e-9
         return abs(after[0] - before[0]) <= SLEW_NM_PER_S * elapsed_s
@@ -146,10 +130,9 @@ class LoadParser:
     def __init__(self, calibration: LoadCalibration, rate_hz: float = RATE_HZ) -> None:
         self._period_ns = round(1e9 / rate_hz)
         self._stuck_after = max(STUCK_AFTER, round(STUCK_AFTER * rate_hz / RATE_HZ))
-        self._lines = serial_sensor.LineSplitter(MAX_LINE_BYTES)
+        self._lines = serial_sensor.TimedLines(MAX_LINE_BYTES, BAUD_RATE, rate_hz)
         self._errors: Counter[str] = Counter()
         self._seq = 0
-        self._last_mid_ns: int | None = None
         self.calibration = calibration
         self.restart()
 
@@ -168,7 +151,6 @@ class LoadParser:
     def restart(self) -> None:
         """Forget everything but counters and calibration: the port was (re)opened."""
         self._lines.restart()
-        self._first_line = True
         self._last_raw: float | None = None
         self._repeats = 0
         self._spikes = SpikeFilter(self._period_ns)
@@ -180,44 +162,31 @@ class LoadParser:
 
     def feed(self, data: bytes, t_arrival_ns: int) -> list[LoadSample]:
         """Return the samples that `data` completes; of several lines each is a period older than the next."""
-        lines = self._lines.feed(data)
         samples = []
-        for age, line in zip(range(len(lines) - 1, -1, -1), lines, strict=True):
-            value = None if line is None else self._value(line)
-            partial, self._first_line = self._first_line, False
-            if line is not None and value is not None:
-                t_ns = t_arrival_ns - age * self._period_ns
-                samples.append(self._sample(value, len(line) + 1, t_ns, partial=partial))
+        for line in self._lines.timed(data, t_arrival_ns):
+            if _DECIMAL.fullmatch(line.text):
+                samples.append(self._sample(float(line.text), line))
+            else:
+                self._errors["not_decimal" if line.text else "empty"] += 1
         return samples
 
-    def _value(self, line: bytes) -> float | None:
-        text = line.strip(b"\r")
-        if not _DECIMAL.fullmatch(text):
-            self._errors["not_decimal" if text else "empty"] += 1
-            return None
-        return float(text)
-
-    def _sample(self, raw: float, n_bytes: int, t_arrival_ns: int, *, partial: bool) -> LoadSample:
+    def _sample(self, raw: float, line: serial_sensor.TimedLine) -> LoadSample:
         torque_nm = self.calibration.torque_nm(raw)
-        t_mid_ns = t_arrival_ns - serial_sensor.transfer_ns(n_bytes, BAUD_RATE) - self._period_ns // 2
-        if self._last_mid_ns is not None:
-            t_mid_ns = max(t_mid_ns, self._last_mid_ns + 1)
-        self._last_mid_ns = t_mid_ns
         self._repeats = self._repeats + 1 if raw == self._last_raw else 1
         self._last_raw = raw
         saturated = raw in (COUNTS_MAX, COUNTS_MIN)
         # An unreliable value is not a level to judge the next one by.
-        unreliable = saturated or partial
+        unreliable = saturated or line.partial
         sample = LoadSample(
             raw=raw,
             torque_nm=torque_nm,
-            t_mid_ns=t_mid_ns,
-            t_arrival_ns=t_arrival_ns,
+            t_mid_ns=line.t_mid_ns,
+            t_arrival_ns=line.t_arrival_ns,
             seq=self._seq,
             saturated=saturated,
-            spike=abs(torque_nm) > CAPACITY_NM if unreliable else self._spikes.is_spike(torque_nm, t_mid_ns),
+            spike=abs(torque_nm) > CAPACITY_NM if unreliable else self._spikes.is_spike(torque_nm, line.t_mid_ns),
             stuck=self._repeats >= self._stuck_after,
-            partial=partial,
+            partial=line.partial,
         )
         self._seq += 1
         return sample

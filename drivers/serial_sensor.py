@@ -3,7 +3,7 @@
 import contextlib
 import time
 from abc import ABC, abstractmethod
-from collections.abc import AsyncGenerator, Sequence
+from collections.abc import AsyncGenerator, Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Generic, Protocol, TypeVar
@@ -14,6 +14,8 @@ from shearloop.drivers.errors import DeviceLostError, DriverError
 # Opening the port resets an Uno; its boot loader waits before it starts the sketch.
 BOOT_S = 4.0
 SILENT_PERIODS = 8
+# Values in a row that agree with each other and become the new level.
+SETTLE_VALUES = 3
 
 ValueT = TypeVar("ValueT")
 
@@ -43,11 +45,6 @@ class InputRecorder(Protocol):
 
     def record(self, event: RawEvent) -> None:
         """Keep the next input; never blocks."""
-
-
-def transfer_ns(n_bytes: int, baud: int) -> int:
-    """Return the time of `n_bytes` on a serial line: ten bits each, with start and stop."""
-    return n_bytes * (10 * 10**9 // baud)
 
 
 class LineSplitter:
@@ -100,6 +97,76 @@ class LineSplitter:
         self.too_long += 1
         self.too_long_start = line[:60]
         return None
+
+
+@dataclass(frozen=True, slots=True)
+class TimedLine:
+    """A line without its end, and when it arrived and the middle of its conversion was (monotonic, ns).
+
+    `partial`: the first one after opening, which may lack its beginning.
+    """
+
+    text: bytes
+    t_arrival_ns: int
+    t_mid_ns: int
+    partial: bool
+
+
+class TimedLines(LineSplitter):
+    """Splits and stamps the lines of a board that sends one per conversion. No I/O."""
+
+    def __init__(self, max_bytes: int, baud: int, rate_hz: float) -> None:
+        super().__init__(max_bytes)
+        self._byte_ns = 10 * 10**9 // baud  # with start and stop bit
+        self._period_ns = round(1e9 / rate_hz)
+        self._last_mid_ns = -(2**63)
+        self._first = True
+
+    def restart(self) -> None:
+        """Drop a half-received line: the port was opened, perhaps in the middle of one."""
+        super().restart()
+        self._first = True
+
+    def timed(self, data: bytes, t_arrival_ns: int) -> list[TimedLine]:
+        """Return the lines that `data` completes; of several each is a period older than the next."""
+        lines = self.feed(data)
+        found = []
+        for age, line in zip(range(len(lines) - 1, -1, -1), lines, strict=True):
+            partial, self._first = self._first, False
+            if line is not None:
+                arrived_ns = t_arrival_ns - age * self._period_ns
+                t_mid_ns = arrived_ns - (len(line) + 1) * self._byte_ns - self._period_ns // 2
+                # Time stays in order when lines arrive in bursts.
+                self._last_mid_ns = max(t_mid_ns, self._last_mid_ns + 1)
+                found.append(TimedLine(line.strip(b"\r"), arrived_ns, self._last_mid_ns, partial))
+        return found
+
+
+class StepFilter(Generic[ValueT]):
+    """Separates disturbances from real steps, causally.
+
+    Both jump further than the device can. A few values in a row that agree with each other become the new level.
+    """
+
+    def __init__(self) -> None:
+        """Trust the first value."""
+        self._good: ValueT | None = None
+        self._candidates: list[ValueT] = []
+
+    def is_spike(self, value: ValueT, is_reachable: Callable[[ValueT, ValueT], bool]) -> bool:
+        """Judge the next value; `is_reachable` compares an earlier value with it."""
+        if self._good is not None and not is_reachable(self._good, value):
+            if self._candidates and not is_reachable(self._candidates[-1], value):
+                self._candidates.clear()
+            self._candidates.append(value)
+            if len(self._candidates) < SETTLE_VALUES:
+                return True
+        self._good, self._candidates = value, []
+        return False
+
+    def restart_step(self) -> None:
+        """Forget the beginning of a step."""
+        self._candidates.clear()
 
 
 class SerialSensor(ABC, Generic[ValueT]):

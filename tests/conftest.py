@@ -68,9 +68,9 @@ def fonts() -> None:
 @pytest.fixture
 def few_mixtures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have slices mixed with two foreign frames in place of fifteen: most of a fit, where no interval is judged."""
-    from shearloop.bank.estimation import fitting_slices
+    from shearloop.bank.estimation import fitting
 
-    monkeypatch.setattr(fitting_slices, "_NUMBERINGS", fitting_slices._NUMBERINGS[:2])
+    monkeypatch.setattr(fitting, "_NUMBERINGS", fitting._NUMBERINGS[:2])
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

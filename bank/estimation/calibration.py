@@ -8,7 +8,7 @@ import hashlib
 import io
 import types
 import zipfile
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, Self, Union, get_args, get_origin, get_type_hints
 
@@ -21,11 +21,10 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatcher
-from shearloop.bank.estimation.estimator import Estimator, OutputModel
+from shearloop.bank.estimation.estimator import Estimator, OutputModel, PaperEstimator
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.interval_regressor import PolynomialRegressor
-from shearloop.bank.estimation.ridge_estimators import PaperEstimator
-from shearloop.bank.estimation.values import Kind
+from shearloop.bank.estimation.values import INLINE, Kind
 from shearloop.bank.estimators import estimator_class
 from shearloop.bank.polynomial import Polynomial
 from shearloop.files import replace_file
@@ -57,7 +56,7 @@ class Calibration:
     recordings, else NaN.
     """
 
-    estimator: Estimator
+    estimator: Estimator = field(metadata=INLINE)
     kind: Kind
     sides: tuple[str, ...]
     source: str
@@ -109,11 +108,7 @@ class Calibration:
         """Write the file, the same bytes for the same calibration; CalibrationError where that fails."""
         path = Path(path)
         arrays: dict[str, NDArray[Any]] = {}
-        content = {
-            "estimator": self.estimator.name,
-            **_to_plain(self, "", arrays),
-            **_to_plain(self.estimator, "", arrays),
-        }
+        content = _to_plain(self, "", arrays)
         members = {f"{name}.npy": _npy_bytes(array) for name, array in sorted(arrays.items())}
         header = {
             "kind": _FILE_KIND,
@@ -154,9 +149,7 @@ class Calibration:
                 f"{CHANNEL_TABLE_HASH[:12]}…; calibrate again"
             )
         try:
-            content = header["content"]
-            estimator = _from_plain(estimator_class(content["estimator"]), content, "", arrays)
-            restored: Self = _from_plain(cls, {**content, "estimator": estimator}, "", arrays)
+            restored: Self = _from_plain(cls, header["content"], "", arrays)
         except (KeyError, TypeError, ValueError, IndexError, StopIteration, CalibrationError) as error:
             raise CalibrationError(
                 f"{path}: the file does not describe a calibration of this version ({error}); use the version that "
@@ -217,13 +210,14 @@ def _npy_bytes(array: NDArray[Any]) -> bytes:
 def _to_plain(value: Any, path: str, arrays: dict[str, NDArray[Any]]) -> Any:
     """Return YAML's view of a value; its arrays go into `arrays` by their path."""
     if is_dataclass(value):
-        parts = {one.name: getattr(value, one.name) for one in fields(value)}
-        # An estimator's fields stand beside its calibration's.
-        return {
-            name: _to_plain(part, f"{path}/{name}", arrays)
-            for name, part in parts.items()
-            if not isinstance(part, Estimator)
-        }
+        plain = {"estimator": value.name} if isinstance(value, Estimator) else {}
+        for one in fields(value):
+            part = getattr(value, one.name)
+            if one.metadata == INLINE:
+                plain |= _to_plain(part, path, arrays)
+            else:
+                plain[one.name] = _to_plain(part, f"{path}/{one.name}", arrays)
+        return plain
     if isinstance(value, np.ndarray):
         name = path.strip("/").replace("/", ".")
         arrays[name] = value
@@ -238,14 +232,12 @@ def _to_plain(value: Any, path: str, arrays: dict[str, NDArray[Any]]) -> Any:
 def _from_plain(kind: Any, plain: Any, path: str, arrays: dict[str, NDArray[Any]]) -> Any:
     """Return the value of type `kind` that `_to_plain` made plain."""
     origin, name = get_origin(kind), path.strip("/")
-    if isinstance(plain, Estimator):
-        return plain
     if origin in (Union, types.UnionType):
         choices = [choice for choice in get_args(kind) if choice is not type(None)]
         if plain is None:
             return None
         if len(choices) > 1:  # several dataclasses: the one with these fields
-            choices = [choice for choice in choices if {one.name for one in fields(choice)} == set(plain)]
+            choices = [choice for choice in choices if _names(choice) == set(plain)]
         return _from_plain(choices[0], plain, path, arrays)
     if origin is Literal and plain not in get_args(kind):
         raise ValueError(f"{name} is {plain!r}, which this version does not know")
@@ -258,16 +250,22 @@ def _from_plain(kind: Any, plain: Any, path: str, arrays: dict[str, NDArray[Any]
         array.setflags(write=False)
         return array
     if is_dataclass(kind):
-        hints = get_type_hints(kind)
-        return kind(  # type: ignore[operator]  # a dataclass is its own constructor
-            **{
-                one.name: _from_plain(hints[one.name], plain[one.name], f"{path}/{one.name}", arrays)
-                for one in fields(kind)
-                if one.name in plain or one.default is MISSING
-            }
-        )
+        kind = estimator_class(plain["estimator"]) if kind is Estimator else kind
+        hints, values = get_type_hints(kind), {}
+        for one in fields(kind):
+            if one.metadata == INLINE:
+                values[one.name] = _from_plain(hints[one.name], plain, path, arrays)
+            elif one.name in plain or one.default is MISSING:
+                values[one.name] = _from_plain(hints[one.name], plain[one.name], f"{path}/{one.name}", arrays)
+        return kind(**values)
     if kind is float:
         return float(plain)
     if not isinstance(plain, str | bool | int | float | list) and plain is not None:
         raise TypeError(f"{name} is a {type(plain).__name__}")
     return plain
+
+
+def _names(kind: Any) -> set[str]:
+    """Return the names of a dataclass's values in the file."""
+    found = [_names(one.type) if one.metadata == INLINE else {one.name} for one in fields(kind)]
+    return set().union(*found)

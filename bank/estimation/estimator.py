@@ -1,11 +1,11 @@
-"""What an estimator is: what it needs, its features of a frame, and its fit.
+"""What an estimator is: what it needs, its features of a frame, and its fit; and the estimators that read one frame.
 
 An estimator is a subclass of `Estimator` in a file of its own, and a line in `bank/estimators.py`.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
@@ -13,7 +13,17 @@ import numpy as np
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.estimation.bank_match import BankMatch, BankMatcher
+from shearloop.bank.estimation.bank_match import (
+    NOT_TURNED,
+    BankMatch,
+    BankMatcher,
+    ElectrodeNumbering,
+    PaperMatcher,
+    RefinedMatcher,
+    find_numbering,
+    image_matrix,
+    resolve_half_turn,
+)
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.interval_regressor import (
     STRENGTHS,
@@ -24,7 +34,7 @@ from shearloop.bank.estimation.interval_regressor import (
 )
 from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.bank.estimation.regressors import ChannelImputer, Ridge, later_origins
-from shearloop.bank.estimation.session_state import Motion
+from shearloop.bank.estimation.session_state import Motion, ProcessedFrame
 
 if TYPE_CHECKING:
     from shearloop.bank.eit.mesh import Mesh
@@ -76,22 +86,20 @@ class OutputModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """What an estimator reads: a (m, 896) difference to the idle frame at t_s, and its mean over the grip.
+    """What an estimator reads: a frame after the session's checks, at t_s.
 
-    motion holds the features of the last frames' motion. matcher is for estimators that search a bank.
+    matcher is for estimators that search a bank.
     """
 
-    difference: FloatArray
+    frame: ProcessedFrame
     t_s: float
-    mean_difference: FloatArray
-    motion: FloatArray
     matcher: BankMatcher | None
 
     def match(self, layer: int = 0) -> BankMatch:
         """Return the match of one side in the bank."""
         if self.matcher is None:
             raise ValueError("an estimator on a bank needs its matcher")
-        return self.matcher.match(self.difference[layer])
+        return self.matcher.match(self.frame.difference[layer])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -244,3 +252,93 @@ class Estimator:
             left_out=left_out,
         )
         return OutputModel(regressor, None, self.k_range(features))
+
+
+class Regression(Estimator):
+    """A ridge on the difference of each channel."""
+
+    name: ClassVar[str] = "regression"
+
+    def features(self, reading: Reading) -> tuple[FloatArray, BankMatch | None]:
+        """Return the channels' differences."""
+        return (reading.frame.difference / self.scale).ravel(), None
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction(Estimator):
+    """A ridge on an image of the conductivity; image (p, 896) maps a difference to pixels."""
+
+    name: ClassVar[str] = "reconstruction"
+    needs: ClassVar[Literal["bank", "mesh", ""]] = "mesh"
+
+    image: FloatArray = field(kw_only=True)
+
+    @classmethod
+    def prepare(cls, material: Material) -> Self:
+        """Return the estimator with the mesh's image."""
+        if material.physics.mesh is None:
+            raise ValueError("a reconstruction needs a mesh")
+        return cls(material.scale, image=image_matrix(material.physics.mesh))
+
+    def features(self, reading: Reading) -> tuple[FloatArray, BankMatch | None]:
+        """Return the pixels of each side."""
+        return (reading.frame.difference @ self.image.T).ravel(), None
+
+
+class _OnBank(Estimator):
+    """A ridge on a match in the bank, which lies within the bank's grid: its features need no limit."""
+
+    needs: ClassVar[Literal["bank", "mesh", ""]] = "bank"
+    limits_features: ClassVar[bool] = False
+
+    def ridge(self, features: FloatArray, values: FloatArray, strength: float) -> Ridge:
+        """Fit a ridge; the features of a match have different units and are scaled."""
+        return Ridge.fit_scaled(features, values, strength)
+
+
+@dataclass(frozen=True, eq=False)
+class BankEstimator(_OnBank):
+    """A ridge on a refined match of each side."""
+
+    name: ClassVar[str] = "bank"
+
+    numbering: ElectrodeNumbering = NOT_TURNED
+
+    @classmethod
+    def prepare(cls, material: Material) -> Self:
+        """Return the estimator with the numbering of the first side's electrodes."""
+        bank = material.physics.bank
+        if not material.validators or bank is None:
+            return cls(material.scale)
+        first = material.validators[0]
+        found = find_numbering(first.idle, bank.homogeneous)
+        return cls(material.scale, numbering=resolve_half_turn(found, first.gripped - first.idle, bank))
+
+    def matcher(self, bank: Bank) -> BankMatcher:
+        """Return the refined match on the bank."""
+        return RefinedMatcher(bank, self.numbering)
+
+    def features(self, reading: Reading) -> tuple[FloatArray, BankMatch | None]:
+        """Return each side's match, and the first one."""
+        matches = [reading.match(layer) for layer in range(len(reading.frame.difference))]
+        return np.concatenate([one.features for one in matches]), matches[0]
+
+
+class PaperEstimator(_OnBank):
+    """The paper's curves on one fingertip: torque over σ and σ², diameter over k; the amplitude is ignored."""
+
+    name: ClassVar[str] = "paper"
+    columns: ClassVar[Mapping[Quantity, slice]] = {"torque": slice(1, 3), "diameter": slice(0, 1)}
+    strengths: ClassVar[tuple[float, ...]] = (1e-9,)
+    uses_amplitude: ClassVar[bool] = False
+    # A heatmap over all lags takes most of a second.
+    most_frames: ClassVar[float] = 120
+
+    def matcher(self, bank: Bank) -> BankMatcher:
+        """Return the paper's match on the bank."""
+        return PaperMatcher(bank)
+
+    def features(self, reading: Reading) -> tuple[FloatArray, BankMatch | None]:
+        """Return k, σ and σ² of the first side, and its match."""
+        match = reading.match()
+        return np.array([match.k, match.sigma, match.sigma**2]), match

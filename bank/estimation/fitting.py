@@ -5,33 +5,46 @@ be evaluated on.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.arrays import FloatArray, IntArray
+from shearloop.bank.eit.channels import N_CHANNELS, N_ELECTRODES
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.bank_match import BankMatcher
-from shearloop.bank.estimation.calibration import Calibration
+from shearloop.bank.estimation.bank_match import BankMatcher, ElectrodeNumbering
+from shearloop.bank.estimation.calibration import Assumption, Calibration
 from shearloop.bank.estimation.estimator import (
     LEAST_DIAMETERS,
     Bounds,
     CalibrationRow,
+    Estimator,
     Material,
     OutputModel,
     Physics,
+    Quantity,
     Reading,
 )
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
-from shearloop.bank.estimation.fitting_slices import fit_slices
 from shearloop.bank.estimation.grip_segmentation import segment_grip
+from shearloop.bank.estimation.interval_regressor import Mixtures, fit_interval_regressor
 from shearloop.bank.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
-from shearloop.bank.estimation.session_state import SessionState
+from shearloop.bank.estimation.novelty import NoveltyDetector
+from shearloop.bank.estimation.regressors import later_origins
+from shearloop.bank.estimation.session_state import ProcessedFrame, SessionState
 from shearloop.bank.estimation.values import FrameSeries, Measured, TactileFrame, check_finite, distinct
 from shearloop.bank.estimators import EstimatorName, estimator_class
 
 # With more variance left on a tool of another diameter, the tools have no torque in common.
 _TOOLS_MAY_LEAVE = 0.75
+# Foreign frames: every eighth of a turn, plain and mirrored, except the own numbering. Of a few numberings alone the
+# result depends on the choice: single ones give half to twice the median.
+_NUMBERINGS = [(turn, mirrored) for turn in range(0, N_ELECTRODES, N_ELECTRODES // 8) for mirrored in (False, True)][1:]
+# Hardly any mixture with a larger share is accepted.
+_SHARES = (0.1, 0.2, 0.3)
+# Later slices of each origin that are mixed; twice as many give the same result.
+_MOST_LATER = 10
+_ALL = np.ones(N_CHANNELS, dtype=np.bool_)
 
 
 def fit(
@@ -69,7 +82,7 @@ def fit(
         validators=material.validators,
     )
     if timing is None or not is_raw:
-        return fit_slices(blank, chosen, physics, full_range=full_range)
+        return _fit_slices(blank, chosen, physics, full_range=full_range)
     fitted = _fit_raw(blank, chosen, physics, timing.uncertainty_s)
     return fitted if timing.references else replace(fitted, assumptions=("load timing",))
 
@@ -156,14 +169,148 @@ def _replay(
         processed = state.process(TactileFrame.of(t_s, channels))
         if processed.reasons or not np.isfinite(torque) or i % every:
             continue
-        reading = Reading(processed.difference, t_s, state.mean_difference, state.motion, matcher)
+        features, _ = estimator.features(Reading(processed, t_s, matcher))
         position, mean_position = (
-            (one / estimator.scale).ravel() for one in (reading.difference, reading.mean_difference)
+            (one / estimator.scale).ravel() for one in (processed.difference, processed.mean_difference)
         )
         rows.append(
             CalibrationRow(
-                recording, i, t_s - float(series.t_s[0]), estimator.features(reading)[0], position, mean_position,
+                recording, i, t_s - float(series.t_s[0]), features, position, mean_position,
                 float(torque), float(diameter),
             )
         )  # fmt: skip
     return rows
+
+
+def _fit_slices(
+    blank: Calibration, recordings: list[FrameSeries], physics: Physics, *, full_range: bool = False
+) -> Calibration:
+    """Return a blank calibration with torque and diameter fitted to slices in time order.
+
+    With `full_range` no torque beyond theirs will occur. Raises CalibrationError for slices of several fingertips, and
+    for too few.
+    """
+    if len(blank.sides) > 1:
+        raise CalibrationError(
+            f"slices of {len(blank.sides)} fingertips ({', '.join(blank.sides)}) do not fit into one calibration; make "
+            "one for each"
+        )
+    estimator = blank.estimator
+    frames = np.concatenate([one.channels for one in recordings])
+    times = _consecutive([one.t_s for one in recordings])
+    torque = np.concatenate([one.torque_at_frames() for one in recordings])
+    diameter = np.concatenate([one.diameter_mm for one in recordings])
+    matcher = blank.matcher(physics.bank)
+    models: dict[Quantity, OutputModel] = {}
+    # Cylinders were twisted too, but at one torque each, which determines no torque.
+    torque = np.where(np.isfinite(diameter), np.nan, torque)
+    truths: dict[Quantity, FloatArray] = {"torque": torque, "diameter": diameter}
+    for quantity, values in truths.items():
+        known = np.isfinite(values)
+        if not known.any():
+            continue
+        n = int(known.sum())
+        if quantity == "torque" and n < estimator.least_slices:
+            raise CalibrationError(
+                f"{n} slices with a torque are too few for the estimator {estimator.name}; record "
+                f"{estimator.least_slices} or more"
+            )
+        differences = np.abs(frames[known])
+        # First, because it checks that a board sent the slices.
+        novelty = NoveltyDetector.fit(differences[:, 0])
+        reader = SliceReader(estimator, matcher, times[known])
+        features = np.array([reader.features(one, row) for row, one in enumerate(differences[:, 0])])
+        test = ContaminationTest(differences[:, 0], reader) if quantity == "torque" else None
+        regressor = fit_interval_regressor(
+            features[:, estimator.columns[quantity]],
+            values[known],
+            estimator.slices_fit(quantity, values[known]),
+            strengths=estimator.strengths,
+            left_out=later_origins(n) if quantity == "torque" else (),
+            test=test,
+            full_range=full_range,
+        )
+        models[quantity] = OutputModel(regressor, novelty, estimator.k_range(features))
+    if not models:
+        raise CalibrationError("the slices come with neither torque nor diameter")
+    assumptions: tuple[Assumption, ...] = ("full range",) if full_range and "torque" in models else ()
+    return replace(blank, torque=models.get("torque"), diameter=models.get("diameter"), assumptions=assumptions)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SliceReader:
+    """Makes features of slices at the times t_s (n,)."""
+
+    estimator: Estimator
+    matcher: BankMatcher | None
+    t_s: FloatArray
+
+    def features(self, difference: FloatArray, row: int) -> FloatArray:
+        """Return the (d,) features of a (896,) difference at the time of a row."""
+        frame = ProcessedFrame(difference[None], (), _ALL[None])
+        return self.estimator.features(Reading(frame, float(self.t_s[row]), self.matcher))[0]
+
+    def torque_inputs(self, difference: FloatArray, row: int) -> FloatArray:
+        """Return those features that the torque is predicted from."""
+        return self.features(difference, row)[self.estimator.columns["torque"]]
+
+
+class ContaminationTest:
+    """Slices mixed with foreign ones, as detectors of novelty fitted to earlier slices assess them.
+
+    A tenth of a foreign frame moves a slice no further than its own drift, so no detector can refuse it
+    (docs/charts.md), and the interval has to cover it. Stand-ins for foreign frames are the mean slice with the
+    electrodes renumbered.
+    """
+
+    def __init__(self, differences: FloatArray, reader: SliceReader) -> None:
+        """Take (n, 896) differences in time order, and their reader."""
+        self._differences = differences
+        self._reader = reader
+        mean = differences.mean(axis=0)
+        self._foreign = [
+            mean[ElectrodeNumbering(turn, mirrored, score=1.0, runner_up=0.0).model_channels()]
+            for turn, mirrored in _NUMBERINGS
+        ]
+        self._detectors: dict[bytes, NoveltyDetector] = {}
+        self._features: dict[tuple[int, int, float], FloatArray] = {}
+
+    def growth(self, past: IntArray, future: IntArray) -> FloatArray:
+        """Return the growth of the intervals of (q,) later slices, by a detector fitted to the earlier ones."""
+        detector = self._detector(past)
+        return np.array([detector.widening(one, _ALL) for one in self._differences[future]])
+
+    def accepted(self, past: IntArray, future: IntArray) -> Mixtures:
+        """Return the mixtures of later slices that a detector fitted to the earlier ones accepts."""
+        detector = self._detector(past)
+        chosen = future[np.unique(np.linspace(0, len(future) - 1, min(len(future), _MOST_LATER)).astype(int))]
+        rows, features, limit_shares = [], [], []
+        for row in chosen.tolist():
+            for number, foreign in enumerate(self._foreign):
+                for share in _SHARES:
+                    mixed = (1 - share) * self._differences[row] + share * foreign
+                    novelty = detector.assess(mixed, _ALL)
+                    if novelty.reasons:
+                        break
+                    rows.append(row)
+                    limit_shares.append(novelty.limit_share)
+                    key = row, number, share
+                    if key not in self._features:
+                        self._features[key] = self._reader.torque_inputs(mixed, row)
+                    features.append(self._features[key])
+        return Mixtures(np.array(rows, dtype=np.int64), np.array(features), np.array(limit_shares))
+
+    def _detector(self, past: IntArray) -> NoveltyDetector:
+        key = past.tobytes()
+        if key not in self._detectors:
+            self._detectors[key] = NoveltyDetector.fit(self._differences[past])
+        return self._detectors[key]
+
+
+def _consecutive(times: list[FloatArray]) -> FloatArray:
+    """Return the times of several series one after another; each starts one after the end of the last, or later."""
+    shifted: list[FloatArray] = []
+    for one in times:
+        begins_early = bool(shifted) and one[0] <= shifted[-1][-1]
+        shifted.append(one - one[0] + shifted[-1][-1] + 1.0 if begins_early else one)
+    return np.concatenate(shifted)

@@ -8,8 +8,8 @@ ones.
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from typing import Self, TypeAlias
+from dataclasses import dataclass, field
+from typing import Protocol, Self, TypeAlias
 
 import numpy as np
 from scipy.special import stdtrit
@@ -23,6 +23,7 @@ from shearloop.bank.estimation.regressors import (
     later_splits,
     left_out_blocks,
 )
+from shearloop.bank.estimation.values import INLINE
 from shearloop.bank.polynomial import TWO_SIDED_95, Polynomial
 
 LEVEL = 0.95
@@ -63,10 +64,16 @@ class Mixtures:
 
 
 RegressorFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Regressor]
-# From (earlier, later) rows to the growth of each later row's interval, by a detector fitted to the earlier ones.
-Growth: TypeAlias = Callable[[IntArray, IntArray], FloatArray]
-# From the same rows to accepted mixtures of the later ones.
-MixtureTest: TypeAlias = Callable[[IntArray, IntArray], Mixtures]
+
+
+class SlicesTest(Protocol):
+    """A test of later slices by detectors fitted to earlier ones."""
+
+    def growth(self, past: IntArray, future: IntArray) -> FloatArray:
+        """Return the growth of each later row's interval."""
+
+    def accepted(self, past: IntArray, future: IntArray) -> Mixtures:
+        """Return the accepted mixtures of later rows with foreign signals."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,31 +129,42 @@ def _conformal_quantile(absolute: FloatArray) -> float:
     return float(np.quantile(absolute, min(LEVEL * (n + 1) / n, 1.0), method="higher"))
 
 
+@dataclass(frozen=True, slots=True)
+class ValueRange:
+    """The calibrated values, low to high, and what predictions at their ends may hide.
+
+    Predictions at or below low_end may hide any lower value, those at or above high_end any higher one (−∞ and ∞ where
+    that was not tested); lowest and highest are the furthest such values.
+    """
+
+    low: float
+    high: float
+    lowest: float
+    highest: float
+    low_end: float = -math.inf
+    high_end: float = math.inf
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class IntervalRegressor:
     """A point regressor with intervals, the range of values, and the range of features that it was calibrated on.
 
-    Predictions at or below low_end may hide any lower value, those at or above high_end any higher one (−∞ and ∞ where
-    that was not tested); lowest and highest are the furthest such values. With misses_loads, too many left-out loads
-    lay outside their intervals, so every interval spans the calibrated range. contamination_below and _above are how
-    far the truth may lie below and above a prediction because of foreign signals, at the limit of detection (0 where
-    that was not tested). timing_widening is the factor on the loads' intervals for unknown load timing.
+    Features are limited to largest_deviation from mean_feature unless that is empty. With misses_loads, too many
+    left-out loads lay outside their intervals, so every interval spans the calibrated range. contamination_below and
+    _above are how far the truth may lie below and above a prediction because of foreign signals, at the limit of
+    detection (0 where that was not tested). timing_widening is the factor on the loads' intervals for unknown load
+    timing.
     """
 
     point: Regressor
     intervals: Intervals
-    low: float
-    high: float
-    low_end: float
-    high_end: float
-    misses_loads: bool
+    range: ValueRange = field(metadata=INLINE)
     mean_feature: FloatArray
     largest_deviation: FloatArray
-    contamination_below: float
-    contamination_above: float
-    timing_widening: float
-    lowest: float
-    highest: float
+    misses_loads: bool = False
+    contamination_below: float = 0.0
+    contamination_above: float = 0.0
+    timing_widening: float = 1.0
 
     def predict(
         self,
@@ -172,23 +190,23 @@ class IntervalRegressor:
         below = max(half + max(-moved, 0.0), limit_share * self.contamination_below)
         above = max(half + max(moved, 0.0), limit_share * self.contamination_above)
         if self.misses_loads:
-            below, above = below + max(value - self.low, 0.0), above + max(self.high - value, 0.0)
+            below, above = below + max(value - self.range.low, 0.0), above + max(self.range.high - value, 0.0)
         if isinstance(self.point, TobitRidge) and raw < 0:
             other_way = widening * TWO_SIDED_95 * self.point.sigma - raw
             below, above = (max(below, other_way), above) if self.point.sign > 0 else (below, max(above, other_way))
-        if value <= self.low_end:
-            below = max(below, value - self.lowest)
-        if value >= self.high_end:
-            above = max(above, self.highest - value)
+        if value <= self.range.low_end:
+            below = max(below, value - self.range.lowest)
+        if value >= self.range.high_end:
+            above = max(above, self.range.highest - value)
         return value, below, above
 
     def range_reasons(self, value: float, features: FloatArray, quantity: str, unit: str) -> tuple[str, ...]:
         """Return the reason against a value or features beyond the calibration, if there is one."""
-        beyond = _LARGEST_BEYOND * (self.high - self.low)
-        if not self.low - beyond <= value <= self.high + beyond:
+        beyond = _LARGEST_BEYOND * (self.range.high - self.range.low)
+        if not self.range.low - beyond <= value <= self.range.high + beyond:
             return (
-                f"the {quantity} would be {value:.3g} {unit}, beyond the calibrated {self.low:.3g} to "
-                f"{self.high:.3g} {unit}",
+                f"the {quantity} would be {value:.3g} {unit}, beyond the calibrated {self.range.low:.3g} to "
+                f"{self.range.high:.3g} {unit}",
             )
         limits = _LARGEST_DEVIATION * self.largest_deviation
         if len(limits) and (np.abs(features - self.mean_feature) > limits).any():
@@ -233,19 +251,17 @@ def fit_interval_regressor(
     strengths: tuple[float, ...] = STRENGTHS,
     limit_features: bool = False,
     left_out: Sequence[tuple[IntArray, IntArray]] = (),
-    growth: Growth | None = None,
-    mixtures: MixtureTest | None = None,
+    test: SlicesTest | None = None,
     bounds: tuple[FloatArray, FloatArray] | None = None,
     full_range: bool = False,
 ) -> IntervalRegressor:
     """Fit to (n, d) features and (n,) values in time order.
 
-    `left_out` are pairs of rows to fit to and rows to validate on; by default blocks of time in turn. With `growth`
-    residuals are in units of it (normalised conformal prediction, Papadopoulos et al. 2002), and extrapolation beyond
-    the range is tested, unless the values cover the `full_range` that will ever occur. With `mixtures` intervals cover
-    the error of accepted mixtures with foreign signals. `bounds` are the least and largest value (n,) that each frame
-    may have: intervals extend to the further one.
-    Raises CalibrationError where the data does not determine the fit.
+    `left_out` are pairs of rows to fit to and rows to validate on; by default blocks of time in turn. With a `test`
+    residuals are in units of its growth (normalised conformal prediction, Papadopoulos et al. 2002), intervals cover
+    the error of accepted mixtures, and extrapolation beyond the range is tested, unless the values cover the
+    `full_range` that will ever occur. `bounds` are the least and largest value (n,) that each frame may have: intervals
+    extend to the further one. Raises CalibrationError where the data does not determine the fit.
     """
     if len(values) < _LEAST_FRAMES or np.ptp(values) == 0:
         raise CalibrationError(
@@ -254,14 +270,13 @@ def fit_interval_regressor(
         )
     strength = strengths[0] if len(strengths) == 1 else best_strength(features, values, fit, strengths)[0]
     blocks = list(left_out or left_out_blocks(len(values)))
-    validated = [_validate(features, values, fit, strength, past, future) for past, future in blocks]
-    predicted, residuals = (np.concatenate([pair[i] for pair in validated]) for i in (0, 1))
-    rows = np.concatenate([future for _, future in blocks])
-    truth = values[rows]
-    scale = np.ones_like(truth)
-    if growth is not None:
-        scale = np.concatenate([growth(past, future) for past, future in blocks])
-    point = fit(features, values, strength)
+    parts = [fit(features[past], values[past], strength) for past, _ in blocks]
+    raw = [part.predict(features[future]) for part, (_, future) in zip(parts, blocks, strict=True)]
+    reported = np.concatenate([_reported(part, one) for part, one in zip(parts, raw, strict=True)])
+    predicted, rows = np.concatenate(raw), np.concatenate([future for _, future in blocks])
+    point, truth = fit(features, values, strength), values[rows]
+    residuals = reported - truth
+    scale = 1.0 if test is None else np.concatenate([test.growth(*block) for block in blocks])
     edges = (-point.sigma, 0.0, 0.4 * float(np.abs(values).max())) if isinstance(point, TobitRidge) else ()
     inflation = 1.0 if isinstance(point, InverseCalibration) else _INFLATION
     if left_out:
@@ -272,7 +287,7 @@ def fit_interval_regressor(
     intervals, widening = Intervals.fit(predicted, residuals / scale, edges, inflation, least), 1.0
     # Before widening for unknown times: a load that is not seen is not seen at any time.
     half = np.array([intervals.half_width(one) for one in predicted])
-    misses_loads = growth is None and _misses_loads(truth, np.abs(residuals) <= half)
+    misses_loads = test is None and _misses_loads(truth, np.abs(residuals) <= half)
     if bounds is not None:
         if not left_out:
             # Unknown times mean few loads, in a block or two each.
@@ -281,22 +296,19 @@ def fit_interval_regressor(
         known = intervals.half_widths[-1]
         intervals = Intervals.fit(predicted, errors / scale, edges, inflation, least)
         widening = float(intervals.half_widths[-1] / known)
-    low_end, high_end = -np.inf, np.inf
-    if growth is not None and not full_range:
-        low_end, high_end = (
-            _range_end(point, features, values, lambda rows: fit(features[rows], values[rows], strength), sign)
-            for sign in (1, -1)
-        )
-    contamination = (0.0, 0.0)
-    if mixtures is not None:
-        tested = ((fit(features[past], values[past], strength), mixtures(past, future)) for past, future in blocks)
-        contamination = _contamination(features, values, tested, inflation)
     low, high, beyond = float(values.min()), float(values.max()), _UNSEEN * float(np.ptp(values))
-    return IntervalRegressor(
-        point, intervals, low, high, low_end, high_end, misses_loads, centre, deviation, *contamination, widening,
-        # No load is always possible, at any distance from the range.
-        min(low - beyond, 0.0), max(high + beyond, 0.0),
-    )  # fmt: skip
+    # No load is always possible, at any distance from the range.
+    span, contamination = ValueRange(low, high, min(low - beyond, 0.0), max(high + beyond, 0.0)), (0.0, 0.0)
+    if test is not None:
+        tested = ((part, test.accepted(*block)) for part, block in zip(parts, blocks, strict=True))
+        contamination = _contamination(features, values, tested, inflation)
+        if not full_range:
+            ends = (
+                _range_end(point, features, values, lambda rows: fit(features[rows], values[rows], strength), sign)
+                for sign in (1, -1)
+            )
+            span = ValueRange(low, high, span.lowest, span.highest, *ends)
+    return IntervalRegressor(point, intervals, span, centre, deviation, misses_loads, *contamination, widening)
 
 
 def _contamination(
@@ -373,21 +385,14 @@ def best_strength(
     splits = [(past, future) for past, future in later_splits(len(values)) if np.ptp(values[past]) > 0]
     if not splits:
         raise CalibrationError("the values do not change within the earlier part; begin with the calibration's loads")
-    errors = {
-        strength: float(np.mean([(_validate(features, values, fit, strength, *one)[1] ** 2).mean() for one in splits]))
-        for strength in strengths
-    }
+
+    def squared_error(strength: float, past: IntArray, future: IntArray) -> float:
+        point = fit(features[past], values[past], strength)
+        return float(((_reported(point, point.predict(features[future])) - values[future]) ** 2).mean())
+
+    errors = {one: float(np.mean([squared_error(one, *split) for split in splits])) for one in strengths}
     best = max(strength for strength, error in errors.items() if error <= min(errors.values()) * 1.001)
     return best, errors[best]
-
-
-def _validate(
-    features: FloatArray, values: FloatArray, fit: RegressorFit, strength: float, past: IntArray, future: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the raw predictions of the future by a fit to the past, and their errors."""
-    point = fit(features[past], values[past], strength)
-    raw = point.predict(features[future])
-    return raw, _reported(point, raw) - values[future]
 
 
 def is_one_sided(torque_nm: FloatArray) -> bool:

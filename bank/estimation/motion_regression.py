@@ -33,6 +33,7 @@ from shearloop.bank.estimation.interval_regressor import (
     Intervals,
     PolynomialRegressor,
     RegressorFit,
+    ValueRange,
     best_strength,
     fit_interval_regressor,
     is_one_sided,
@@ -158,13 +159,13 @@ class MotionRegression(Estimator):
     def features(self, reading: Reading) -> tuple[FloatArray, BankMatch | None]:
         """Return the features of motion. A slice has its time as a feature, because the gel drifts."""
         if self.temporal is not None:
-            return reading.motion, None
-        return np.append((reading.difference / self.scale).ravel(), reading.t_s), None
+            return reading.frame.motion, None
+        return np.append((reading.frame.difference / self.scale).ravel(), reading.t_s), None
 
     def inputs(self, quantity: Quantity, features: FloatArray, reading: Reading) -> FloatArray:
         """Return the inputs of a quantity's regressor; the diameter's are the gel's mean position in this grip."""
         if self.temporal is not None and quantity == "diameter":
-            return np.asarray((reading.mean_difference / self.scale).ravel())
+            return np.asarray((reading.frame.mean_difference / self.scale).ravel())
         return features
 
     def position_noise_mm(self, regressor: IntervalRegressor | PolynomialRegressor) -> float:
@@ -242,11 +243,9 @@ def fit_cylinders(grips: Sequence[CylinderGrip]) -> IntervalRegressor:
     half_width = max(TWO_SIDED_95 * math.sqrt(np.mean(squares)), LEAST_HALF_WIDTH * float(np.ptp(diameters)))
     low, high = float(diameters.min()), float(diameters.max())
     half_span = 0.5 * (high - low)
-    return IntervalRegressor(
-        line, Intervals(np.zeros(0), np.array([half_width])), low, high, -np.inf, np.inf, misses_loads=False,
-        mean_feature=line.mean, largest_deviation=np.zeros(0), contamination_below=0.0, contamination_above=0.0,
-        timing_widening=1.0, lowest=low - half_span, highest=high + half_span,
-    )  # fmt: skip
+    intervals = Intervals(np.zeros(0), np.array([half_width]))
+    span = ValueRange(low, high, low - half_span, high + half_span)
+    return IntervalRegressor(line, intervals, span, line.mean, np.zeros(0))
 
 
 def fit_line(grips: Sequence[CylinderGrip]) -> Ridge:

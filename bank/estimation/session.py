@@ -14,7 +14,13 @@ from shearloop.bank.estimation.calibration import LARGEST_TOOL_SHARE, Calibratio
 from shearloop.bank.estimation.estimator import NO_ERRORS, OutputModel, Quantity, Reading
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.novelty import FAMILIAR, Novelty
-from shearloop.bank.estimation.session_state import BASELINE_FRAMES, PaperState, SessionState, SliceState
+from shearloop.bank.estimation.session_state import (
+    BASELINE_FRAMES,
+    PaperState,
+    ProcessedFrame,
+    SessionState,
+    SliceState,
+)
 from shearloop.bank.estimation.values import Estimate, Measured, TactileFrame
 from shearloop.bank.polynomial import TWO_SIDED_95
 
@@ -30,15 +36,11 @@ _Interval = tuple[float, float, float]
 
 @dataclass(slots=True)
 class _Inputs:
-    """Inputs of the regressors: a reading, its features, and which (m, 896) channels are usable.
-
-    Imputed channels have the (k, m, 896) errors, one standard deviation each.
-    """
+    """Inputs of the regressors: a reading, its features and match, and the (k, m, 896) errors of imputed channels."""
 
     reading: Reading
     features: FloatArray
     match: BankMatch | None
-    usable: BoolArray
     errors: FloatArray
 
 
@@ -139,23 +141,23 @@ class EstimatorSession:
         if processed.reasons:
             return Estimate(valid=False, reasons=processed.reasons)
         self._difference = processed.difference
-        return replace(self._predict(processed.difference, processed.usable, frame.t_s), lag_s=processed.lag_s)
+        return replace(self._predict(processed, frame.t_s), lag_s=processed.lag_s)
 
-    def _predict(self, difference: FloatArray, usable: BoolArray, t_s: float) -> Estimate:
-        calibration, state = self.calibration, self._state
-        outputs, reasons = self._select_outputs(difference, usable)
-        if not outputs and not state.curves_only:
+    def _predict(self, frame: ProcessedFrame, t_s: float) -> Estimate:
+        calibration, curves_only = self.calibration, self._state.curves_only
+        outputs, reasons = self._select_outputs(frame)
+        if not outputs and not curves_only:
             return Estimate(valid=False, reasons=tuple(reasons))
         errors = NO_ERRORS
-        if not usable.all():
+        if not frame.usable.all():
             novelty = next((one.novelty for one, _ in outputs.values() if one.novelty is not None), None)
-            difference, errors = calibration.estimator.impute(difference, usable, novelty)
-            self._difference = difference
-        reading = Reading(difference, t_s, state.mean_difference, state.motion, self._matcher)
+            difference, errors = calibration.estimator.impute(frame.difference, frame.usable, novelty)
+            self._difference, frame = difference, replace(frame, difference=difference)
+        reading = Reading(frame, t_s, self._matcher)
         features, match = calibration.estimator.features(reading)
         if match is not None and match.ambiguous:
             return _estimate({}, _AMBIGUOUS, match)
-        inputs = _Inputs(reading, features, match, usable, errors)
+        inputs = _Inputs(reading, features, match, errors)
         values: dict[Quantity, _Interval] = {}
         for quantity, (model, novelty_result) in outputs.items():
             value, against = self._predict_quantity(quantity, model, novelty_result, inputs)
@@ -163,17 +165,15 @@ class EstimatorSession:
             if not against:
                 values[quantity] = value
         torque_missing = calibration.torque is not None and "torque" not in values
-        if calibration.kind == "raw" and (torque_missing or (state.curves_only and reasons)):
+        if calibration.kind == "raw" and (torque_missing or (curves_only and reasons)):
             # A frame beyond the calibrated torques is beyond the calibrated diameters too.
             values.clear()
         return _estimate(values, reasons, match)
 
-    def _select_outputs(
-        self, difference: FloatArray, usable: BoolArray
-    ) -> tuple[dict[Quantity, tuple[OutputModel, Novelty]], list[str]]:
+    def _select_outputs(self, frame: ProcessedFrame) -> tuple[dict[Quantity, tuple[OutputModel, Novelty]], list[str]]:
         """Return the models to apply to a frame with its novelty, and the reasons against the others."""
-        calibration, state = self.calibration, self._state
-        if state.curves_only and calibration.torque is None:
+        calibration = self.calibration
+        if self._state.curves_only and calibration.torque is None:
             fitted = calibration.diameter is not None
             return {}, [
                 "the calibration was made without torques: sigma has no torque"
@@ -189,9 +189,11 @@ class EstimatorSession:
         for quantity, model in models:
             if model is None:
                 continue
-            novelty = model.novelty.assess(difference[0], usable[0]) if model.novelty is not None else FAMILIAR
+            novelty = FAMILIAR
+            if model.novelty is not None:
+                novelty = model.novelty.assess(frame.difference[0], frame.usable[0])
             against = (*novelty.reasons, *(self._tool_reasons if quantity == "torque" else ()))
-            if quantity == "diameter" and not state.has_baseline:
+            if quantity == "diameter" and not frame.has_baseline:
                 # The gel's position means nothing without its idle position.
                 if calibration.torque is None:
                     reasons.append("the fingertip was gripped from the first frame on: its idle frame is not known")
@@ -206,27 +208,28 @@ class EstimatorSession:
     ) -> tuple[_Interval, tuple[str, ...]]:
         """Return one quantity with its interval, and the reasons against it."""
         reading, estimator = inputs.reading, self.calibration.estimator
+        frame = reading.frame
         features, complete = estimator.inputs(quantity, inputs.features, reading), None
         if quantity == "torque" and novelty.missing_share and estimator.uses_amplitude:
-            complete = self._regressor_inputs(quantity, reading, reading.difference / (1.0 - novelty.missing_share))
-        usable_share = np.count_nonzero(inputs.usable) / inputs.usable.size
+            complete = self._regressor_inputs(quantity, reading, frame.difference / (1.0 - novelty.missing_share))
+        usable_share = np.count_nonzero(frame.usable) / frame.usable.size
         value = model.regressor.predict(features, usable_share, novelty.widening, novelty.limit_share, complete)
         dead: tuple[str, ...] = ()
         if len(inputs.errors):
-            changed = [self._regressor_inputs(quantity, reading, reading.difference + one) for one in inputs.errors]
+            changed = [self._regressor_inputs(quantity, reading, frame.difference + one) for one in inputs.errors]
             error = TWO_SIDED_95 * math.hypot(*(model.regressor.predict(one)[0] - value[0] for one in changed))
             if 2 * error > value[1] + value[2]:
                 # The dead channels carried the value; the imputed ones are a guess.
-                dead = _dead_channel_reasons(self.calibration.validators, inputs.usable)
+                dead = _dead_channel_reasons(self.calibration.validators, frame.usable)
             value = _widened(value, error)
         if quantity == "diameter":
-            value = _widened(value, estimator.position_noise_mm(model.regressor) / math.sqrt(self._state.held_frames))
+            value = _widened(value, estimator.position_noise_mm(model.regressor) / math.sqrt(frame.held_frames))
         against = dead or model.match_reasons(inputs.match)
         return value, against or model.regressor.range_reasons(value[0], features, quantity, _UNITS[quantity])
 
     def _regressor_inputs(self, quantity: Quantity, reading: Reading, difference: FloatArray) -> FloatArray:
         """Return the regressor's inputs if this were the frame's difference."""
-        changed = replace(reading, difference=difference)
+        changed = replace(reading, frame=replace(reading.frame, difference=difference))
         estimator = self.calibration.estimator
         return estimator.inputs(quantity, estimator.features(changed)[0], changed)
 

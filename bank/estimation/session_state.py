@@ -6,7 +6,7 @@ A frame passes the timer, the checks of its channels, the idle frames, the grips
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Self
 
@@ -49,13 +49,18 @@ _POOLED_FREEDOM = 30
 class ProcessedFrame:
     """A frame after the session's checks, with the reasons against it.
 
-    difference (m, 896) is to the idle frame. usable (m, 896) excludes channels that the board or the frame itself
-    shows to be lost or saturated. lag_s is the lag of an average.
+    difference (m, 896) is to the idle frame, mean_difference its mean over the grip's last held_frames. motion holds
+    features of the last frames' motion. usable (m, 896) excludes channels that the board or the frame itself shows to
+    be lost or saturated. has_baseline is whether every fingertip was seen idle, lag_s the lag of an average.
     """
 
     difference: FloatArray
     reasons: tuple[str, ...]
     usable: BoolArray
+    mean_difference: FloatArray = field(default_factory=lambda: np.zeros(0))
+    motion: FloatArray = field(default_factory=lambda: np.zeros(0))
+    held_frames: int = 1
+    has_baseline: bool = True
     lag_s: float = 0.0
 
     @classmethod
@@ -320,26 +325,6 @@ class SessionState:
         """Whether frames are being averaged into the idle frame."""
         return self._idle.taring
 
-    @property
-    def has_baseline(self) -> bool:
-        """Whether this session has seen every fingertip idle."""
-        return self._idle.complete
-
-    @property
-    def motion(self) -> FloatArray:
-        """Features of the last frames' motion."""
-        return self._memory.features
-
-    @property
-    def mean_difference(self) -> FloatArray:
-        """Mean (m, 896) difference to the idle frame over this grip's last valid frames."""
-        return self._memory.mean_difference
-
-    @property
-    def held_frames(self) -> int:
-        """The number of frames in the mean difference."""
-        return self._memory.held_frames
-
     def process(self, frame: TactileFrame) -> ProcessedFrame:
         """Take the next frame and return it with the reasons against it."""
         missing = self._timer.missing_before(frame.t_s)
@@ -430,10 +415,13 @@ class SessionState:
         difference = self._motion.complete(difference, usable, self._fingertips.sides) / self._idle.gains
         if loose := self._grips.loose_sides(channels, self._idle):
             self._memory.forget()
-            reason = f"no grip at the {' and '.join(loose)} fingertip"
-        else:
-            reason = self._memory.remember(channels / self._idle.gains, difference, missing)
-        return ProcessedFrame(difference, (reason,) if reason else (), usable)
+            return ProcessedFrame(difference, (f"no grip at the {' and '.join(loose)} fingertip",), usable)
+        memory = self._memory
+        if reason := memory.remember(channels / self._idle.gains, difference, missing):
+            return ProcessedFrame(difference, (reason,), usable)
+        return ProcessedFrame(
+            difference, (), usable, memory.mean_difference, memory.features, memory.held_frames, self._idle.complete
+        )
 
 
 class PaperState:
@@ -442,9 +430,7 @@ class PaperState:
     Trehan et al. 2025, section 2. Without a validator nothing is known of the fingertip but its first frames.
     """
 
-    curves_only, refuses_repeats, has_baseline = True, False, True
-    held_frames = 1
-    motion: FloatArray = np.zeros(0)
+    curves_only, refuses_repeats = True, False
 
     def __init__(self, baseline_frames: int, average_frames: int, max_gap_s: float) -> None:
         """Begin a session with `baseline_frames` untouched frames; a longer gap restarts the average."""
@@ -452,7 +438,6 @@ class PaperState:
         self._max_gap_s = max_gap_s
         self._tare_frames: list[FloatArray] = []
         self._latest: deque[tuple[float, FloatArray]] = deque(maxlen=average_frames)
-        self.mean_difference: FloatArray = np.zeros((1, N_CHANNELS))
 
     @property
     def taring(self) -> bool:
@@ -483,7 +468,7 @@ class PaperState:
         if (reason := signal_above_noise(difference, noise)) is not None:
             return ProcessedFrame.refused(frame.usable, reason)
         lag_s = frame.t_s - sum(t_s for t_s, _ in self._latest) / n
-        return ProcessedFrame(difference[None], (), frame.usable, lag_s)
+        return ProcessedFrame(difference[None], (), frame.usable, lag_s=lag_s)
 
     @cached_property
     def _homogeneous(self) -> FloatArray:
@@ -504,14 +489,10 @@ class PaperState:
 
 
 class SliceState:
-    """State of slices, which are differences already: nothing but the last one."""
+    """State of slices, which are differences already: none."""
 
-    curves_only, refuses_repeats, has_baseline, taring = False, False, True, False
-    held_frames = 1
-    motion: FloatArray = np.zeros(0)
-    mean_difference: FloatArray = np.zeros((1, N_CHANNELS))
+    curves_only, refuses_repeats, taring = False, False, False
 
     def process(self, frame: TactileFrame) -> ProcessedFrame:
         """Take the next slice and return its magnitudes."""
-        self.mean_difference = np.abs(frame.channels)
-        return ProcessedFrame(self.mean_difference, (), frame.usable)
+        return ProcessedFrame(np.abs(frame.channels), (), frame.usable)

@@ -15,6 +15,8 @@ from shearloop.bank.polynomial import TWO_SIDED_95
 # "raw": volts as the board sends them. "difference": |frame − homogeneous frame|, smoothed over time.
 Kind = Literal["raw", "difference"]
 
+# Metadata of a dataclass's field: in the calibration's file its fields stand beside the others of the dataclass.
+INLINE = {"inline": True}
 # Load cells on a lever bear some N·m; larger readings come from a damaged line.
 LARGEST_TORQUE_NM = 20.0
 # Recorded loads change by up to 0.76 N·m/s, so older readings say nothing.

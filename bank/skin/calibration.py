@@ -3,8 +3,8 @@
 The curve is a straight line through the origin up to 1.2 N. Beyond, to 5 N and more, it has as many straight pieces as
 the recorded data support. Rising straight pieces invert without iteration. The fit reads a table of recorded
 resistances and forces: the membrane's two plays turn the forces into the tension at the gauges, friction included, and
-leave the coefficient of friction and the curve to be fitted. The daemon loads calibrations, so scipy.optimize is
-imported only to fit.
+leave the coefficient of friction and the curve to be fitted. scipy.optimize is imported only to fit: the
+daemon loads calibrations.
 
 Friction gives one response a band of forces. A rising or falling response proves slip, and the force is at an end of
 the band. A constant one leaves it anywhere within: it is then taken to be at its last known place, moved no further
@@ -31,7 +31,6 @@ from shearloop.bank.skin.membrane import (
     Membrane,
     ShearInterval,
     direction_of,
-    measured_response,
 )
 from shearloop.yaml_files import read_yaml, save_yaml, validated
 
@@ -113,7 +112,7 @@ class SkinCalibration(BaseModel):
         capstan = math.exp(self.friction * math.radians(self.gauge_angle_deg))
         return self.response_half_width / self.slope_per_n * capstan
 
-    def band(self, response: float, normal_n: float, direction: Direction = Direction.UNKNOWN) -> ShearInterval:
+    def band(self, response: float, normal_n: float, direction: Direction) -> ShearInterval:
         """Return the shear forces (N) that friction leaves open for an exact response.
 
         Beyond the calibrated curve it is the band of the curve's end.
@@ -129,14 +128,10 @@ class SkinCalibration(BaseModel):
         A known direction of loading takes the deadband out; an unknown one adds it to the interval. An end beyond the
         calibrated curve is infinite. `wider` is a further uncertainty of the response, either way.
         """
-        half = self.response_half_width + wider
-        low, high = response - half, response + half
-        tension_low, tension, tension_high = np.interp([low, response, high], self.response, self.tension_n).tolist()
-        if low < self.response[0]:
-            tension_low = -math.inf
-        if high > self.response[-1]:
-            tension_high = math.inf
-        return self._membrane.shear_from_tensions(tension_low, tension, tension_high, normal_n, direction)
+        half, curve = self.response_half_width + wider, (self.response, self.tension_n)
+        low = float(np.interp(response - half, *curve, left=-math.inf))
+        high = float(np.interp(response + half, *curve, right=math.inf))
+        return self._membrane.shear_from_tensions(low, float(np.interp(response, *curve)), high, normal_n, direction)
 
     @property
     def _membrane(self) -> Membrane:
@@ -144,10 +139,7 @@ class SkinCalibration(BaseModel):
 
 
 def read_table(path: Path) -> CalibrationTable:
-    """Return the rows of a CSV file with the columns r1_ohm, r2_ohm, shear_n, normal_n, in the order of recording.
-
-    Raises CalibrationError with the file, and the line and column at fault.
-    """
+    """Return the rows of a CSV file with these columns; raises CalibrationError with the line and column at fault."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
@@ -170,16 +162,15 @@ def _numbers(path: Path, line: int, row: dict[str | None, str]) -> list[float]:
     numbers = []
     for column in COLUMNS:
         try:
-            number = float(row[column] or "")
+            numbers.append(float(row[column] or ""))
         except ValueError:
-            number = math.nan
-        if not math.isfinite(number) or (column.endswith("_ohm") and number <= 0):
+            numbers.append(math.nan)
+        if not math.isfinite(numbers[-1]) or (column.endswith("_ohm") and numbers[-1] <= 0):
             raise CalibrationError(f"{path}, line {line}: {column} is {row[column]!r}, not a usable number.")
-        if column == "normal_n" and number < -MAX_PULL_N:
-            raise CalibrationError(
-                f"{path}, line {line}: normal_n is {row[column]}; a force that presses on the skin is positive."
-            )
-        numbers.append(number)
+    if numbers[-1] < -MAX_PULL_N:
+        raise CalibrationError(
+            f"{path}, line {line}: normal_n is {row['normal_n']}; a force that presses on the skin is positive."
+        )
     return numbers
 
 
@@ -251,8 +242,9 @@ def _responses(table: CalibrationTable) -> tuple[FloatArray, IntArray]:
     response = np.empty(len(idle))
     for number in range(1, loading[-1] + 1):
         rows = loading == number
-        at_rest = [float(ohm[rows & idle].mean()) for ohm in (table.r1_ohm, table.r2_ohm)]
-        response[rows] = measured_response(table.r1_ohm[rows], table.r2_ohm[rows], *at_rest)
+        # Equation (1): ΔR₁/R₁₀ − ΔR₂/R₂₀.
+        relative = (ohm[rows] / ohm[rows & idle].mean() for ohm in (table.r1_ohm, table.r2_ohm))
+        response[rows] = np.subtract(*relative)
     return response, np.where(idle, 0, loading)
 
 

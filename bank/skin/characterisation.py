@@ -5,7 +5,7 @@ the table shows estimates from synthetic recordings with the paper's figure as t
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,8 +35,8 @@ from shearloop.bank.skin.plane_strain import (
     unloaded,
 )
 
-NORMAL_FORCES_N = (0.5, 1.0, 1.5, 2.0)
 FULL_RANGE_N = 5.0
+# By the normal force in N.
 PAPER_MEASURED_SENSITIVITY = {0.5: "0.078", 1.0: "0.076", 1.5: "0.080", 2.0: "0.080"}
 
 
@@ -52,16 +52,16 @@ def origin_slope(shear_n: FloatArray, response: FloatArray) -> float:
     return float(shear_n @ response) / squares
 
 
-def noise_floor_n(time_s: FloatArray, response: FloatArray, sensitivity_per_n: float, window_s: float = 1.0) -> float:
+def noise_floor_n(time_s: FloatArray, response: FloatArray, sensitivity_per_n: float) -> float:
     """Return the standard deviation within windows of 1 s at constant load, in N; variances are pooled over windows.
 
     A last window that is not full is left out. Raises CalibrationError where no window holds two values.
     """
-    window = np.floor((time_s - time_s[0]) / window_s + 1e-9).astype(np.int64)
+    window = np.floor(time_s - time_s[0] + 1e-9).astype(np.int64)
     counts = np.bincount(window)
     full = np.flatnonzero((counts >= 2) & (counts >= 0.9 * np.median(counts)))
     if not full.size:
-        raise CalibrationError(f"The noise floor needs at least two responses within {window_s} s; record faster.")
+        raise CalibrationError("The noise floor needs at least two responses within 1 s; record faster.")
     squares = sum(float(np.var(response[window == i]) * counts[i]) for i in full)
     return math.sqrt(squares / float((counts[full] - 1).sum())) / sensitivity_per_n
 
@@ -77,12 +77,17 @@ class LineFit:
     mean_n: float
     spread_n2: float
 
-    def prediction_half_width_n(self, shear_n: float, confidence: float = 0.95) -> float:
-        """Return ± the interval (N) of a new single force read off the line near `shear_n`.
+    @property
+    def kink_n(self) -> float:
+        """The force where the line crosses zero."""
+        return -self.offset / self.slope_per_n
+
+    def prediction_half_width_n(self, shear_n: float) -> float:
+        """Return ± the 95 % interval (N) of a new single force read off the line near `shear_n`.
 
         t(n−2) · s / slope · √(1 + 1/n + (x − x̄)² / Σ(x − x̄)²).
         """
-        quantile = float(stdtrit(self.n - 2, (1 + confidence) / 2))
+        quantile = float(stdtrit(self.n - 2, 0.975))
         widening = 1 + 1 / self.n + (shear_n - self.mean_n) ** 2 / self.spread_n2
         return quantile * self.scatter / abs(self.slope_per_n) * math.sqrt(widening)
 
@@ -145,17 +150,13 @@ def estimated_figures(membrane: Membrane, true: SkinFigures, rng: np.random.Gene
     noise = true.noise_floor_n * sensitivity
 
     time_s = np.arange(6000) / 10
-    still = 0.5 * sensitivity + rng.normal(0, noise, len(time_s))
-
+    still = rng.normal(0, noise, len(time_s))
     shear_n = np.tile(np.concatenate([-loading(1.0)[::-1], [0.0], loading(1.0)]), 20)
     scatter = true.prediction_half_width_n / float(ndtri(0.975)) * sensitivity
     line = fit_line(shear_n, shear_n * sensitivity + rng.normal(0, scatter, len(shear_n)))
-
-    wandering = 0.15 * sensitivity + rng.normal(0, true.drift_std, 36)
-
+    wandering = rng.normal(0, true.drift_std, 36)
     normal_n = np.array([0.5, 1.0, 1.5, 2.0])
     pressed = true.crosstalk * normal_n / 2 + rng.normal(0, noise / np.sqrt(600), len(normal_n))
-
     warm_k = 15.0
     cold, hot = (
         fit_line(shear_n, shear_n * factor + rng.normal(0, noise / np.sqrt(10), len(shear_n))).slope_per_n
@@ -221,7 +222,7 @@ def characterise(rng: np.random.Generator) -> Characterisation:
         strain_profiles=np.array([midline_strain(models.skin, state) for state in profiles]),
         near_zero=models.curve(loading(0.15, 0.005), 1.0),
         wide=models.curve(loading(1.0, 0.02), 1.0),
-        wide_by_normal={normal_n: models.curve(loading(1.6), normal_n) for normal_n in NORMAL_FORCES_N},
+        wide_by_normal={normal_n: models.curve(loading(1.6), normal_n) for normal_n in PAPER_MEASURED_SENSITIVITY},
     )
 
 
@@ -253,22 +254,21 @@ class _Models:
 def _model_rows(models: _Models, fully_loaded: ContactState) -> list[FigureOfMerit]:
     skin = models.skin
 
-    def each(estimate: Callable[[FloatArray, FloatArray], float], normal_n: float) -> list[float]:
+    def lines(normal_n: float) -> list[tuple[FloatArray, FloatArray]]:
         shear_n = loading(normal_n)
-        return [
-            estimate(shear_n, model(shear_n, normal_n)) for model in (models.in_closed_form, models.in_1d, models.in_2d)
-        ]
+        return [(shear_n, model(shear_n, normal_n)) for model in (models.in_closed_form, models.in_1d, models.in_2d)]
 
     rows = [
         FigureOfMerit(
             f"sensitivity, fit through origin, Fn = {normal_n} N",
             "1/N",
             "0.078",
-            PAPER_MEASURED_SENSITIVITY[normal_n],
-            *each(origin_slope, normal_n),
+            measured,
+            *(origin_slope(*line) for line in lines(normal_n)),
         )
-        for normal_n in NORMAL_FORCES_N
+        for normal_n, measured in PAPER_MEASURED_SENSITIVITY.items()
     ]
+    fitted = [fit_line(*line) for line in lines(1.0)]
     strain = midline_strain(skin, fully_loaded)
     flank = strain[(skin.midline_deg > 15) & (skin.midline_deg < 75)]
     falls = 100 * (1 - float(np.exp(-PAPER_SECTION.friction * np.radians(60))))
@@ -279,9 +279,9 @@ def _model_rows(models: _Models, fully_loaded: ContactState) -> list[FigureOfMer
     power_w = EXCITATION_A**2 * GAUGE_RESISTANCE_OHM
     return [
         *rows,
-        FigureOfMerit("slope beyond the deadband, Fn = 1 N", "1/N", "", "", *each(_slope, 1.0)),
+        FigureOfMerit("slope beyond the deadband, Fn = 1 N", "1/N", "", "", *(line.slope_per_n for line in fitted)),
         FigureOfMerit("slope without friction", "1/N", "0.088", "", without, PAPER_SENSITIVITY_PER_N, no_friction),
-        FigureOfMerit("deadband, Fn = 1 N", "N", "0.04", "0.04", *each(_kink, 1.0)),
+        FigureOfMerit("deadband, Fn = 1 N", "N", "0.04", "0.04", *(line.kink_n for line in fitted)),
         FigureOfMerit(
             "fall of tension between 75° and 15°", "%", "< 4", "", falls, falls, 100 * np.ptp(flank) / flank.max()
         ),
@@ -291,15 +291,6 @@ def _model_rows(models: _Models, fully_loaded: ContactState) -> list[FigureOfMer
         FigureOfMerit("power of a gauge at 5 mA", "mW", "", "", 1e3 * power_w),
         FigureOfMerit("Joule heating at 5 mA", "K", "< 5", "", joule_heating_k(power_w)),
     ]
-
-
-def _slope(shear_n: FloatArray, response: FloatArray) -> float:
-    return fit_line(shear_n, response).slope_per_n
-
-
-def _kink(shear_n: FloatArray, response: FloatArray) -> float:
-    line = fit_line(shear_n, response)
-    return -line.offset / line.slope_per_n
 
 
 def _estimator_rows(models: _Models, rng: np.random.Generator) -> list[FigureOfMerit]:

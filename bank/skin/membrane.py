@@ -10,9 +10,6 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import NamedTuple
 
-import numpy as np
-
-from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError, GeometryError
 
 EXCITATION_A = 5e-3
@@ -94,22 +91,6 @@ def joule_heating_k(power_w: float) -> float:
     return power_w / (CONVECTION_W_M2_K * SENSOR_AREA_M2)
 
 
-def measured_response(
-    r1_ohm: FloatArray, r2_ohm: FloatArray, r1_unloaded_ohm: float, r2_unloaded_ohm: float
-) -> FloatArray:
-    """Return the normalised response ΔR₁/R₁₀ − ΔR₂/R₂₀ = F (ε₁ − ε₂), the measured side of equation (1).
-
-    Raises CalibrationError where an unloaded resistance is not a positive number.
-    """
-    for name, unloaded in (("R1", r1_unloaded_ohm), ("R2", r2_unloaded_ohm)):
-        if not (np.isfinite(unloaded) and unloaded > 0):
-            raise CalibrationError(
-                f"The unloaded resistance of {name} is {unloaded} Ω; measure it again with the skin at rest."
-            )
-    ratio: FloatArray = r1_ohm / r1_unloaded_ohm - r2_ohm / r2_unloaded_ohm
-    return ratio
-
-
 # The closed form balances moments about the core's centre. The tension at mid-thickness, N = F_t R_out/R, is shared by
 # the two sides, and ε₁ − ε₂ does not depend on how. Plane strain and the core's pressure, −σ_r ≈ N/(2 R w) at
 # mid-thickness, turn N into strain. Friction takes e^(−μφ) on the way to the gauge and μ F_n R_in/R_out at the load.
@@ -125,14 +106,10 @@ def sensitivity_per_n(section: Section) -> float:
     return GAUGE_FACTOR * flat * pressed * lever * capstan
 
 
-def deadband_n(section: Section, normal_n: float) -> float:
-    """Return the shear force at which the skin under the load begins to slip, μ F_n R_in/R_out."""
-    return section.friction * normal_n * section.inner_radius_mm / section.outer_radius_mm
-
-
 def loading_response(section: Section, normal_n: float, shear_n: float) -> float:
-    """Return the closed-form response while a shear force rises from zero."""
-    beyond = max(abs(shear_n) - deadband_n(section, normal_n), 0.0)
+    """Return the closed-form response while a shear force rises from zero; the skin slips beyond μ F_n R_in/R_out."""
+    deadband_n = section.friction * normal_n * section.inner_radius_mm / section.outer_radius_mm
+    beyond = max(abs(shear_n) - deadband_n, 0.0)
     return math.copysign(sensitivity_per_n(section) * beyond, shear_n)
 
 
@@ -159,13 +136,11 @@ class ShearInterval(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MembraneState:
-    """The membrane at rest: net tension at the load (positive: side 1) and tension at both gauges, in N; strains."""
+    """The membrane at rest: net tension at the load (positive: side 1) and tension at both gauges, in N."""
 
     net_tension_n: float = 0.0
     gauge_tension_1_n: float = 0.0
     gauge_tension_2_n: float = 0.0
-    strain_1: float = 0.0
-    strain_2: float = 0.0
 
 
 UNSTRETCHED = MembraneState()
@@ -198,12 +173,11 @@ class Membrane:
         up = math.exp(self.friction * self.gauge_angle_rad)
         tension_1 = _clip(state.gauge_tension_1_n, max(net, 0.0) / up, max(net, 0.0) * up)
         tension_2 = _clip(state.gauge_tension_2_n, max(-net, 0.0) / up, max(-net, 0.0) * up)
-        stiffness = self.axial_stiffness_n
-        return MembraneState(net, tension_1, tension_2, tension_1 / stiffness, tension_2 / stiffness)
+        return MembraneState(net, tension_1, tension_2)
 
     def response(self, state: MembraneState) -> float:
         """Return F (ε₁ − ε₂), equation (1) of the paper."""
-        return self.gauge_factor * (state.strain_1 - state.strain_2)
+        return self.gauge_factor * (state.gauge_tension_1_n - state.gauge_tension_2_n) / self.axial_stiffness_n
 
     def shear_from_tensions(
         self, low_n: float, tension_n: float, high_n: float, normal_n: float, direction: Direction
@@ -245,15 +219,16 @@ def direction_of(before: float, now: float, noise: float) -> Direction:
     return Direction.LOADING if change > 0 else Direction.UNLOADING
 
 
-def paper_membrane(section: Section = PAPER_SECTION) -> Membrane:
+def paper_membrane() -> Membrane:
     """Return the membrane with the paper's own F/(EA) = 0.088 1/N."""
-    return Membrane(GAUGE_FACTOR / PAPER_SENSITIVITY_PER_N, section.friction, section.gauge_angle_rad)
+    return Membrane(GAUGE_FACTOR / PAPER_SENSITIVITY_PER_N, PAPER_SECTION.friction, PAPER_SECTION.gauge_angle_rad)
 
 
-def section_membrane(section: Section = PAPER_SECTION) -> Membrane:
+def section_membrane() -> Membrane:
     """Return the membrane with the stiffness that modulus and cross-section give in plane strain."""
-    stiffness = GAUGE_FACTOR / sensitivity_per_n(replace(section, friction=0.0))
-    return Membrane(stiffness, section.friction, section.gauge_angle_rad)
+    return replace(
+        paper_membrane(), axial_stiffness_n=GAUGE_FACTOR / sensitivity_per_n(replace(PAPER_SECTION, friction=0.0))
+    )
 
 
 def _clip(value: float, low: float, high: float) -> float:

@@ -61,16 +61,8 @@ class MeshSize:
         """Return the size with every element cut into times × times."""
         return MeshSize(*(times * n for n in astuple(self)))
 
-    @property
-    def elements(self) -> int:
-        """Number of quadrilaterals."""
-        return (2 * (self.bracket + self.gauge + self.flank) + self.load) * self.layers
 
-
-MESH_56 = MeshSize(3, 4, 6, 2, 2)
 MESH_112 = MeshSize()
-MESH_448 = MESH_112.refined(2)
-MESH_1792 = MESH_112.refined(4)
 
 
 def annulus_mesh(section: Section, size: MeshSize = MESH_112) -> skfem.MeshQuad2:
@@ -120,7 +112,25 @@ class CondensedSkin:
 
 def condense(section: Section, size: MeshSize = MESH_112) -> CondensedSkin:
     """Return the skin condensed to its contact nodes: clamped at both brackets, loaded evenly on the load's arc."""
-    return _Assembly(section, size).condensed()
+    whole = _Assembly(section, size)
+    contact, contact_deg = whole.contact_rotation()
+    strain, midline_deg, weights = whole.midline_strain()
+    clamped = whole.mesh.facets_satisfying(lambda x: abs(x[1]) < 1e-9, boundaries_only=True)
+    free = whole.basis.complement_dofs(whole.basis.get_dofs(clamped).flatten())
+    stiffness = section.width_mm * plane_strain_stiffness(whole.basis, section.young_mpa, section.poisson_ratio)
+    factor = splu(stiffness[free][:, free].tocsc())
+    contact, strain = contact[:, free], strain[:, free]
+    by_load, by_contact = factor.solve(whole.load()[free]), factor.solve(contact.T.toarray())
+    return CondensedSkin(
+        section=section,
+        contact_deg=contact_deg,
+        compliance=contact @ by_contact,
+        load_displacement=contact @ by_load,
+        midline_deg=midline_deg,
+        strain_of_contact=strain @ by_contact,
+        load_strain=strain @ by_load,
+        gauge_weights=weights,
+    )
 
 
 class _Assembly:
@@ -130,40 +140,13 @@ class _Assembly:
         self.element = skfem.ElementVector(skfem.ElementQuad2())
         self.basis = skfem.Basis(self.mesh, self.element, intorder=4)
 
-    def condensed(self) -> CondensedSkin:
-        contact, contact_deg = self._contact_rotation()
-        strain, midline_deg, weights = self._midline_strain()
-        load = self._load()
-        free = self.basis.complement_dofs(self._clamped())
-        stiffness = self.section.width_mm * plane_strain_stiffness(
-            self.basis, self.section.young_mpa, self.section.poisson_ratio
-        )
-        factor = splu(stiffness[free][:, free].tocsc())
-        contact, strain, load = contact[:, free], strain[:, free], load[free]
-        by_load, by_contact = factor.solve(load), factor.solve(contact.T.toarray())
-        return CondensedSkin(
-            section=self.section,
-            contact_deg=contact_deg,
-            compliance=contact @ by_contact,
-            load_displacement=contact @ by_load,
-            midline_deg=midline_deg,
-            strain_of_contact=strain @ by_contact,
-            load_strain=strain @ by_load,
-            gauge_weights=weights,
-        )
-
     def _facets_at(self, radius_mm: float) -> IntArray:
         """Return the facets along a circle; all three nodes of such a curved facet lie on it."""
         r = np.hypot(*self.mesh.p[:, self.mesh.facets])
         on_circle = (abs(r - radius_mm) < 1e-9 * radius_mm).all(axis=0)
         return np.flatnonzero(on_circle)
 
-    def _clamped(self) -> IntArray:
-        facets = self.mesh.facets_satisfying(lambda x: abs(x[1]) < 1e-9, boundaries_only=True)
-        clamped: IntArray = self.basis.get_dofs(facets).flatten()
-        return clamped
-
-    def _contact_rotation(self) -> tuple[csc_matrix, FloatArray]:
+    def contact_rotation(self) -> tuple[csc_matrix, FloatArray]:
         """Return the (2n, dofs) matrix of radial and circumferential displacement of the contact nodes, and their θ."""
         facets = self._facets_at(self.section.inner_radius_mm)
         nodes = np.unique(self.mesh.facets[:, facets])
@@ -179,7 +162,7 @@ class _Assembly:
         values = np.concatenate([*radial, *along])
         return csc_matrix((values, (rows, columns)), shape=(2 * n, self.basis.N)), np.degrees(theta)
 
-    def _midline_strain(self) -> tuple[csc_matrix, FloatArray, FloatArray]:
+    def midline_strain(self) -> tuple[csc_matrix, FloatArray, FloatArray]:
         """Return the (m, dofs) matrix of facet means of ε_θθ, the facets' angles, and the gauges' weights on them."""
         facets = self._facets_at(self.section.mid_radius_mm)
         theta = _angle(self.mesh.p[:, self.mesh.facets[:, facets]].mean(axis=1))
@@ -189,8 +172,7 @@ class _Assembly:
         lengths = basis.dx.sum(axis=1)
         along = _along(_angle(np.asarray(basis.global_coordinates())))
         for i in range(basis.Nbfun):
-            gradient = grad(basis.basis[i][0])
-            strain = np.einsum("i...,ij...,j...->...", along, gradient, along)
+            strain = np.einsum("i...,ij...,j...->...", along, grad(basis.basis[i][0]), along)
             values.append((strain * basis.dx).sum(axis=1) / lengths)
             dofs.append(basis.element_dofs[i])
         m = len(facets)
@@ -201,7 +183,7 @@ class _Assembly:
         weights = np.array([in_gauge * lengths, in_gauge[::-1] * lengths])
         return matrix, degrees, weights / weights.sum(axis=1, keepdims=True)
 
-    def _load(self) -> FloatArray:
+    def load(self) -> FloatArray:
         """Return the (dofs, 2) nodal forces of 1 N towards the core and of 1 N of shear, even over the loaded arc."""
         facets = self._facets_at(self.section.outer_radius_mm)
         theta = _angle(self.mesh.p[:, self.mesh.facets[:, facets]].mean(axis=1))
@@ -325,24 +307,20 @@ class _Guess(NamedTuple):
     slipping: FloatArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    def __init__(
-        self, compliance: FloatArray, displacement: FloatArray, along_before: FloatArray, friction: float
-    ) -> None:
-        self.n = len(along_before)
-        self.compliance = compliance
-        self.displacement = displacement
-        self.along_before = along_before
-        self.friction = friction
-        # Scales displacements to forces; any positive number gives the same solution.
-        self.stiffness = 1 / np.diag(compliance)
+    compliance: FloatArray
+    displacement: FloatArray
+    along_before: FloatArray
+    friction: float
 
     def residual(self, force: FloatArray, weight: float) -> tuple[FloatArray, _Guess]:
         """Return Φ (2n,) in N, and the piece of Φ that contains the forces."""
-        n = self.n
+        n = len(self.along_before)
         moved = self.compliance @ force + self.displacement
         moved[n:] -= self.along_before
-        trial = force - weight * self.stiffness * moved
+        # The stiffness scales displacements to forces; any positive number gives the same solution.
+        trial = force - weight / np.diag(self.compliance) * moved
         pressing = np.maximum(trial[:n], 0.0)
         bound = self.friction * pressing
         wanted = np.concatenate([pressing, np.clip(trial[n:], -bound, bound)])
@@ -351,7 +329,7 @@ class _Problem:
 
     def solve(self, guess: _Guess) -> FloatArray:
         """Return the forces of a guess: u_n = 0 where touching; there u_t as before or λ_t = ±μ λ_n."""
-        n, nodes = self.n, np.flatnonzero(guess.touching)
+        n, nodes = len(self.along_before), np.flatnonzero(guess.touching)
         sticking = n + nodes[guess.slipping[nodes] == 0]
         slip = self.friction * guess.slipping[nodes]
         rows = np.concatenate([nodes, sticking])

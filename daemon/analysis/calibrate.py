@@ -54,7 +54,7 @@ class CalibrationResult:
         one, calibration = self.regressor, self.calibration
         if one is None or calibration.kind == "raw" or "full range" in calibration.assumptions:
             return None
-        return not (one.low_end > one.low or one.high_end < one.high)
+        return not (one.range.low_end > one.range.low or one.range.high_end < one.range.high)
 
     @property
     def tool_mm(self) -> float | None:

@@ -11,7 +11,7 @@ from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.estimation import FrameSeries, Measured
 from shearloop.bank.estimation.calibration import LARGEST_TOOL_SHARE
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.matlab import read_diameter_slices, read_torque_slices
+from shearloop.daemon.recording.matlab import DIAMETER_FOLDER, TORQUE_FOLDER, read_diameter_slices, read_torque_slices
 from shearloop.daemon.recording.reader import Recording, read_recording
 from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, SIDES
 
@@ -19,7 +19,6 @@ from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM
 SLICE_SIDE = "right"
 # Largest distance in time of a pair of frames, as a share of the period.
 _LARGEST_APART = 0.75
-_TORQUE_FOLDER, _DIAMETER_FOLDER = "torque_slices", "diameter_slices"
 # Share of the time with another grip that does not count as another tool: the fingers met something or gripped again.
 _MOMENTARY = 0.05
 
@@ -32,7 +31,7 @@ def read_series(path: Path, sides: tuple[str, ...] | None = None, tool_mm: float
     """
     if not path.is_dir():
         return [series_of(read_recording(path), sides, tool_mm)]
-    inside = [path / name for name in (_TORQUE_FOLDER, _DIAMETER_FOLDER) if (path / name).is_dir()]
+    inside = [path / name for name in (TORQUE_FOLDER, DIAMETER_FOLDER) if (path / name).is_dir()]
     if inside:
         return [series for folder in inside for series in read_series(folder)]
     names = [one.name for one in path.iterdir()]

@@ -46,7 +46,7 @@ COMMANDS = {
         ("keys", "cli.keys", "make the keys for daemon and clients on a network"),
         ("completion", "cli.completion", "print the completion script for bash, zsh or tcsh"),
         ("install", "cli.install", "install the daemon as a service of this computer"),
-        ("uninstall", "cli.uninstall", "remove the service"),
+        ("uninstall", "cli.install", "remove the service"),
         ("skin", "cli.skin", "compare the shear skin's models with its paper, and calibrate a skin"),
         ("reproduce", "cli.reproduce", "compute the paper's numbers and figures from recorded slices"),
     )

@@ -43,32 +43,30 @@ def run(args: argparse.Namespace) -> int:
         import matplotlib as _  # noqa: F401 - its absence is reported before anything is measured
     except ModuleNotFoundError as error:
         raise UserError("charts need matplotlib: `pip install 'shearloop[plot]'`") from error
-    from shearloop.daemon.analysis.charts.drawing import check_takes_pictures, remove_empty_folders
+    from shearloop.daemon.analysis.charts.drawing import check_takes_pictures
     from shearloop.daemon.analysis.charts.sources import bank_of, mesh_of, splits
     from shearloop.daemon.workers import open_executor
 
     check_takes_pictures(args.out)
     scratch = args.out / "banks"
-    with remove_empty_folders(scratch):
-        parts = splits(args.recordings, args.split, scratch)
-        if args.name == "scene":
-            from shearloop.daemon.analysis.charts import scene
+    parts = splits(args.recordings, args.split, scratch)
+    if args.name == "scene":
+        from shearloop.daemon.analysis.charts import scene
+
+        with open_executor(args.cluster, args.jobs) as executor:
+            paths = scene.chart(parts, args.out, executor)
+    else:
+        mesh = mesh_of(args.mesh)
+        bank = bank_of(args.bank, mesh, scratch)
+        if args.name == "speed-accuracy":
+            from shearloop.daemon.analysis.charts import speed_accuracy
+
+            paths = speed_accuracy.chart(parts, bank, mesh, mesh if args.mesh else None, args.out, args.rounds)
+        else:
+            from shearloop.daemon.analysis.charts import stability
 
             with open_executor(args.cluster, args.jobs) as executor:
-                paths = scene.chart(parts, args.out, executor)
-        else:
-            mesh = mesh_of(args.mesh)
-            bank = bank_of(args.bank, mesh, scratch)
-            if args.name == "speed-accuracy":
-                from shearloop.daemon.analysis.charts import speed_accuracy
-
-                own_mesh = mesh if args.mesh else None
-                paths = speed_accuracy.chart(parts, bank, mesh, own_mesh, args.out, args.rounds)
-            else:
-                from shearloop.daemon.analysis.charts import stability
-
-                with open_executor(args.cluster, args.jobs) as executor:
-                    paths = stability.chart(parts, bank, mesh, scratch, args.out, executor)
+                paths = stability.chart(parts, bank, mesh, scratch, args.out, executor)
     for path in paths:
         print(path)
     return 0

@@ -20,7 +20,7 @@ def run(args: argparse.Namespace) -> int:
     """Load everything that `run` loads, without opening a device."""
     import json
 
-    from shearloop.daemon.cli.run import check_emulators
+    from shearloop.daemon.cli.emulated_devices import check_emulators
     from shearloop.daemon.config import load_daemon_config
     from shearloop.daemon.rig import check_experiment
     from shearloop.daemon.sensing.estimators import open_combined, open_estimator, torque_sources

@@ -4,7 +4,7 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from shearloop.daemon.cli.output import print_result
+from shearloop.daemon.cli.terminal import print_result
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -21,7 +21,7 @@ def run(args: argparse.Namespace) -> int:
     from mcap.writer import MCAP0_MAGIC
 
     from shearloop.daemon.cli.options import check_overwrite
-    from shearloop.daemon.recording.importing import import_mat
+    from shearloop.daemon.recording.matlab import import_mat
 
     check_overwrite(args.out, "a recording", MCAP0_MAGIC)
     imported = import_mat(args.sources, args.out)

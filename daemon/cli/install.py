@@ -1,4 +1,4 @@
-"""`shearloop install`: install the daemon as a service of this computer."""
+"""`shearloop install` and `shearloop uninstall`: the daemon as a service of this computer."""
 
 import argparse
 import json
@@ -12,43 +12,40 @@ if TYPE_CHECKING:
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `install`."""
-    add_common_arguments(parser)
-    parser.add_argument("--program", type=Path, metavar="PATH", help="what the service runs; by default this program")
-    parser.add_argument("--real-time", action="store_true", help="with the real-time options of docs/service.md")
-    parser.epilog = (
-        "Installs unit, user, udev rules, folders and an example configuration, with sudo (docs/service.md)."
-    )
-
-
-def add_common_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that `install` and `uninstall` share."""
+    """Add the arguments of `install` or `uninstall`, whichever the parser is for."""
+    installs = not parser.prog.endswith(" uninstall")
+    parser.set_defaults(installs=installs)
     parser.add_argument("--dry-run", action="store_true", help="say what would be done, and do nothing")
     parser.add_argument(
         "--root", type=Path, default=Path("/"), metavar="DIR", help="the root of another system, such as an image"
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON, and nothing else, on stdout")
+    if installs:
+        parser.add_argument(
+            "--program", type=Path, metavar="PATH", help="what the service runs; by default this program"
+        )
+        parser.add_argument("--real-time", action="store_true", help="with the real-time options of docs/service.md")
+        parser.epilog = (
+            "Installs unit, user, udev rules, folders and an example configuration, with sudo (docs/service.md)."
+        )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Install the service and print each step."""
+    """Install the service, or remove all that `install` added, and print each step."""
     from shearloop.daemon.errors import UserError
-    from shearloop.daemon.service import find_program, install_steps
+    from shearloop.daemon.service import find_program, install_steps, uninstall_steps
 
+    root = args.root.absolute()
+    running = root == Path("/") and Path("/run/systemd/system").is_dir()
+    if not args.installs:
+        return _run_steps(uninstall_steps(root, running=running), root, args)
     program = find_program() if args.program is None else args.program.absolute()
     if not program.is_file():
         raise UserError(f"--program {args.program} is not a file; give the path of the installed `shearloop`")
-    root = args.root.absolute()
-    steps = install_steps(root, program, real_time=args.real_time, running=systemd_runs(root))
-    return run_steps(steps, root, args)
+    return _run_steps(install_steps(root, program, real_time=args.real_time, running=running), root, args)
 
 
-def systemd_runs(root: Path) -> bool:
-    """Return whether `root` is the running system, and systemd runs on it."""
-    return root == Path("/") and Path("/run/systemd/system").is_dir()
-
-
-def run_steps(steps: "Iterable[Step]", root: Path, args: argparse.Namespace) -> int:
+def _run_steps(steps: "Iterable[Step]", root: Path, args: argparse.Namespace) -> int:
     """Print and run each step, or only print it with --dry-run."""
     from shearloop.daemon.errors import UserError
 

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from shearloop.daemon.cli.options import add_json, user_key_folder
-from shearloop.daemon.cli.output import print_result
+from shearloop.daemon.cli.terminal import print_result
 
 SERVER_FOLDER = Path("/etc/shearloop/keys")
 

@@ -33,7 +33,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print messages until Ctrl-C, or up to `--count`."""
-    from shearloop.daemon.cli.output import message_json, message_line
+    from shearloop.daemon.cli.terminal import message_json, message_line
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.messaging.client import QUIET_S, check_timeout_s, receive_messages
     from shearloop.daemon.messaging.messages import TOPICS

@@ -2,11 +2,12 @@
 
 import argparse
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_json
-from shearloop.daemon.cli.output import print_result, progress_bar
+from shearloop.daemon.cli.terminal import print_result, progress_bar
 
 if TYPE_CHECKING:
     from shearloop.daemon.recording.reader import RecordingSummary
@@ -55,7 +56,7 @@ def _info(args: argparse.Namespace) -> int:
     for path in args.recordings:
         with progress_bar(path.name, path.stat().st_size if path.is_file() else 0, "B") as progress:
             found = summarise(path, progress)
-        print(json.dumps(found.as_map(), ensure_ascii=False) if args.json else _summary_text(found))
+        print(json.dumps(asdict(found), ensure_ascii=False) if args.json else _summary_text(found))
     return 0
 
 
@@ -64,46 +65,42 @@ def _summary_text(found: "RecordingSummary") -> str:
 
     from shearloop.daemon.recording.schema import software_version
 
-    lines = [str(found.path)]
-    if found.first_ns is not None:
-        began = datetime.fromtimestamp(found.first_ns / 1e9).astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")
-        lines.append(f"  from     {began}, {found.duration_s:.1f} s, {found.condition.size / 1e6:.2f} MB")
+    lines = [found.path]
+    if found.first_unix_ns is not None:
+        began = datetime.fromtimestamp(found.first_unix_ns / 1e9).astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")
+        lines.append(f"  from     {began}, {found.duration_s:.1f} s, {found.size_bytes / 1e6:.2f} MB")
     lines.append(f"  source   {found.metadata.get('source', 'unknown: not a recording of shearloop')}")
     lines += [f"  ran      {name}" for name in found.experiments]
     lines += [f"  tool     {found.tool_mm} mm"] if found.tool_mm is not None else []
     if software := found.metadata.get("software"):
         here = "the same code as here" if found.same_code else f"different code from here ({software_version()})"
         lines.append(f"  made by  shearloop {software}, {here}")
-    for name, topic in sorted(found.topics.items()):
+    for name, topic in found.topics.items():
         rate = "" if topic.rate_hz is None else f"{topic.rate_hz:8.2f} Hz"
         lines.append(f"  {name:<20} {topic.messages:>8} messages {rate}")
     lines += [f"  attached {name}" for name in found.attachments]
-    if not found.condition.closed:
+    if not found.closed:
         lines.append(
-            f"  It was not closed, or is still being written; {found.condition.torn_bytes} bytes are incomplete. "
+            f"  It was not closed, or is still being written; {found.torn_bytes} bytes are incomplete. "
             f"`shearloop recording repair {found.path}` makes an indexed copy."
         )
-    if found.condition.damaged_chunks:
-        lines.append(f"  {found.condition.damaged_chunks} chunks are damaged and left out.")
+    if found.damaged_chunks:
+        lines.append(f"  {found.damaged_chunks} chunks are damaged and left out.")
     if found.dropped:
         lines.append(f"  {found.dropped} messages were dropped because the disk was too slow.")
     return "\n".join(lines)
 
 
 def _repair(args: argparse.Namespace) -> int:
-    from shearloop.daemon.recording.reader import FileCondition, repair
+    from shearloop.daemon.recording.reader import repair
 
-    size = FileCondition.of_file(args.recording).size
-    with progress_bar(args.recording.name, size, "B") as progress:
-        result = repair(args.recording, args.out, progress)
-    condition = result.condition
-    torn_bytes, damaged_chunks = condition.torn_bytes, condition.damaged_chunks
-    lost = [f"{torn_bytes} incomplete bytes at the end"] if torn_bytes else []
-    lost += [f"{damaged_chunks} damaged chunks"] if damaged_chunks else []
-    content = {"path": str(result.path), "messages": result.messages}
-    content |= {"torn_bytes": torn_bytes, "damaged_chunks": damaged_chunks}
+    path = args.recording
+    with progress_bar(path.name, path.stat().st_size if path.is_file() else 0, "B") as progress:
+        result = repair(path, args.out, progress)
+    lost = [f"{result.torn_bytes} incomplete bytes at the end"] if result.torn_bytes else []
+    lost += [f"{result.damaged_chunks} damaged chunks"] if result.damaged_chunks else []
     sentence = f"{result.path}: {result.messages} messages are saved; left out: {' and '.join(lost) or 'nothing'}."
-    print_result(content, [sentence], as_json=args.json)
+    print_result({**asdict(result), "path": str(result.path)}, [sentence], as_json=args.json)
     return 0
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_json
-from shearloop.daemon.cli.output import print_result
+from shearloop.daemon.cli.terminal import print_result
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ async def _replay(
 ) -> "ReplayComparison":
     import zmq.asyncio
 
-    from shearloop.daemon.cli.output import EstimatePrinter, progress_bar
+    from shearloop.daemon.cli.terminal import EstimatePrinter, progress_bar
     from shearloop.daemon.messaging.publisher import Publisher
     from shearloop.daemon.recording.replay import Replay, ReplayClock, ReplayPipeline
 

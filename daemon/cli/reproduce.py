@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.output import progress_bar
+from shearloop.daemon.cli.terminal import progress_bar
 from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:

@@ -3,21 +3,16 @@
 import argparse
 import asyncio
 import signal
-import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
+from collections.abc import Callable
+from contextlib import ExitStack, closing, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from shearloop.daemon.cli.demonstration import TruthFile
-    from shearloop.daemon.config import EmulatorConfig
+    from shearloop.daemon.config import DaemonConfig
     from shearloop.daemon.logs import NonBlockingWriter
     from shearloop.daemon.messaging.publisher import Listener
-
-# An emulator needs some of it to remove its port's link; a clean stop takes less than a second in all.
-EMULATOR_STOP_S = 0.5
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -69,31 +64,17 @@ def _run(
 
     from shearloop.daemon.app import run_daemon
     from shearloop.daemon.cli import EXIT_OK, EXIT_UNFINISHED
-    from shearloop.daemon.cli.demonstration import EmulatorMonitor, EventInjector, TruthFile
-    from shearloop.daemon.cli.output import EstimatePrinter
-    from shearloop.daemon.config import RecordingConfig, load_daemon_config
-    from shearloop.daemon.errors import UserError
+    from shearloop.daemon.cli.emulated_devices import EmulatedDevices
+    from shearloop.daemon.cli.terminal import EstimatePrinter
+    from shearloop.daemon.health import Reporter
     from shearloop.daemon.realtime import high_priority, lock_memory
     from shearloop.daemon.run_summary import RunSummary
 
-    config = load_daemon_config(args.config)
-    emulators = config.emulators
-    if args.recording is not None and not any(emulator.device == "eit-kit" for emulator in emulators):
-        raise UserError(f"{args.config} has no eit-kit among its `emulators` to play --recording {args.recording}")
-    if args.record is not None:
-        config = config.model_copy(update={"recording": RecordingConfig(folder=args.record)})
+    config = _config(args)
     if config.lock_memory:
         lock_memory()
-    options = check_emulators(emulators, args.config)
-    if args.recording is not None:
-        from shearloop.daemon.recording.matlab import read_stream
-
-        for emulator, given in zip(emulators, options, strict=True):
-            if emulator.device == "eit-kit":
-                # Without its frames the daemon would wait forever.
-                read_stream(args.recording, given.side)
     listeners: list[Listener] = []
-    diagnostics = {"log": log.diagnostics, "shown": out.diagnostics}
+    reporters: dict[str, Reporter] = {"log": log, "shown": out}
     with ExitStack() as stack:
         slices = None
         if args.slices is not None:
@@ -103,77 +84,42 @@ def _run(
             slices = SliceRecorder(args.slices)
             stack.callback(slices.close)
             listeners.append(slices)
-            diagnostics["slices"] = slices.diagnostics
-        truth = stack.enter_context(closing(TruthFile(emulators)))
+            reporters["slices"] = slices
         # Without permission the loop still detects late commands and holds the wrist.
         stack.enter_context(high_priority() if config.robot is not None else nullcontext())
-        processes = stack.enter_context(_run_emulators(emulators, args.config.parent, args.recording, truth))
-        events = EventInjector(emulators, processes)
-        listeners += [EmulatorMonitor(emulators, processes), events]
-        if processes:
+        emulated = stack.enter_context(EmulatedDevices(config.emulators, args.config.parent, args.recording))
+        listeners.append(emulated)
+        if config.emulators:
             # The daemon does not know about emulation and will report missing devices.
             structlog.get_logger().info(
                 "emulated devices are starting; the daemon misses them for a second",
-                devices=[emulator.device for emulator in emulators],
+                devices=[emulator.device for emulator in config.emulators],
             )
         if args.show:
-            summary = RunSummary(
-                lambda lines: out.write("\n".join(("", *lines, "", ""))), truth.torques, lambda: events.sent
-            )
-            listeners += [EstimatePrinter(out), summary]
-        finished = asyncio.run(run_daemon(config, tuple(listeners), diagnostics, on_ready))
+            listeners += [EstimatePrinter(out), RunSummary(out, emulated, emulated)]
+        finished = asyncio.run(run_daemon(config, tuple(listeners), reporters, on_ready))
     if slices is not None:
         out.write(f"{args.slices}: {slices.summary}\n")
     return EXIT_OK if finished else EXIT_UNFINISHED
 
 
-def check_emulators(emulators: "tuple[EmulatorConfig, ...]", config: Path) -> list[argparse.Namespace]:
-    """Return the parsed arguments of each emulator; raise UserError for an unknown device or invalid arguments."""
-    from shearloop.daemon.cli.emulate import DEVICES, checked_arguments
+def _config(args: argparse.Namespace) -> "DaemonConfig":
+    """Return the configuration with the arguments' changes, after checking its emulators."""
+    from shearloop.daemon.cli.emulated_devices import check_emulators
+    from shearloop.daemon.config import RecordingConfig, load_daemon_config
     from shearloop.daemon.errors import UserError
 
-    options = []
-    for number, emulator in enumerate(emulators):
-        if emulator.device not in DEVICES:
-            raise UserError(
-                f"{config}: `emulators[{number}].device` is {emulator.device!r}; there are {', '.join(DEVICES)}"
-            )
-        try:
-            options.append(
-                checked_arguments(emulator.device, (*emulator.arguments, *emulator.synthetic), config.parent)
-            )
-        except UserError as error:
-            raise UserError(f"{config}: `emulators[{number}].arguments`: {emulator.device}: {error}") from error
-    return options
+    config = load_daemon_config(args.config)
+    options = check_emulators(config.emulators, args.config)
+    if args.recording is not None:
+        from shearloop.daemon.recording.matlab import read_stream
 
-
-@contextmanager
-def _run_emulators(
-    emulators: "tuple[EmulatorConfig, ...]", folder: Path, recording: Path | None, truth: "TruthFile"
-) -> Iterator[list["subprocess.Popen[bytes]"]]:
-    """Run the configuration's emulated devices, each in a process."""
-    processes: list[subprocess.Popen[bytes]] = []
-    try:
-        for emulator in emulators:
-            source = emulator.synthetic
-            if recording is not None and emulator.device == "eit-kit":
-                source = ("--recording", str(recording.resolve()))
-            if emulator.device == "rig":
-                source = (*source, *truth.arguments)
-            command = [sys.executable, "-m", "shearloop", "emulate", emulator.device, *emulator.arguments, *source]
-            # An emulator ends when its standard input is closed.
-            processes.append(subprocess.Popen(command, cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL))
-        yield processes
-    finally:
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            try:
-                process.wait(EMULATOR_STOP_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-            if process.stdin is not None:
-                # Closing flushes unread input to a process that has ended.
-                with suppress(BrokenPipeError):
-                    process.stdin.close()
+        boards = [given for given in options if given.device == "eit-kit"]
+        if not boards:
+            raise UserError(f"{args.config} has no eit-kit among its `emulators` to play --recording {args.recording}")
+        for given in boards:
+            # Without its frames the daemon would wait forever.
+            read_stream(args.recording, given.side)
+    if args.record is not None:
+        config = config.model_copy(update={"recording": RecordingConfig(folder=args.record)})
+    return config

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_json
-from shearloop.daemon.cli.output import print_result
+from shearloop.daemon.cli.terminal import print_result
 
 if TYPE_CHECKING:
     from shearloop.bank.skin.characterisation import FigureOfMerit

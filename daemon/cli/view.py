@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from shearloop.daemon.cli.options import add_connection, client_keys
-from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS, needs_keys, stop_address
+from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS
 
 PORT = 7760
 
@@ -54,13 +54,10 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.bank_config import FingertipGeometryConfig
     from shearloop.daemon.config_file import load_yaml_model
     from shearloop.daemon.logs import logging_to_stderr
-    from shearloop.daemon.web.access import default_token_path, load_token
     from shearloop.daemon.web.bridge import DaemonAddress
-    from shearloop.daemon.web.server import serve
+    from shearloop.daemon.web.server import default_token_path, load_token, serve
 
-    # A local daemon accepts a stop even without valid keys.
-    stop = None if needs_keys(args.commands) else lambda: stop_address(args.commands)
-    address = DaemonAddress(args.connect, args.commands, client_keys(args), stop)
+    address = DaemonAddress(args.connect, args.commands, client_keys(args))
     path = args.token_file or default_token_path()
     token = load_token(path, new=args.new_token)
     with resources.as_file(resources.files("shearloop.daemon.web") / "assets" / "fingertip.yaml") as paper:

@@ -43,7 +43,7 @@ class GripperTask:
         self._control_loop = control_loop
         self._fingertip_diameter = fingertip_diameter
 
-    async def read(self) -> None:
+    async def run(self) -> None:
         """Publish every state and pass it on, until cancelled."""
         async with contextlib.aclosing(self._gripper.states()) as states:
             async for state in states:

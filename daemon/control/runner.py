@@ -14,7 +14,7 @@ from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
 from shearloop.daemon.control.step_runner import Action, Experiment, GripTo
-from shearloop.daemon.messaging.messages import LoopState, RobotStateMessage, Scalar
+from shearloop.daemon.messaging.messages import LoopState, RobotStateMessage
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH
 from shearloop.drivers.ur.client import UrRobot
@@ -163,18 +163,6 @@ class ControlLoopRunner:
             return error
         self._control_loop.acknowledge()
         return None
-
-    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
-        """Return the robot's part of `health`."""
-        errors = dict(self._robot.losses)
-        if self._robot.failed_program_stops:
-            errors["paused program not stopped"] = self._robot.failed_program_stops
-        return {
-            "connected": self._robot.state is not None,
-            "states": self._robot.states,
-            "errors": errors,
-            "error": "" if self._robot.link.latest.up else self._robot.link.latest.sentence,
-        }
 
     def _take_state(self, state: RobotState) -> None:
         # The controller's own time: a state that is repeated becomes stale.

@@ -1,25 +1,51 @@
 """`shearloop doctor`: checks the computer, files and devices, and names the next step for each fault."""
 
 import asyncio
-from collections.abc import Iterator
+import ctypes
+import importlib.util
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
-from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.doctor.checks import (
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS
+from shearloop.bank.errors import BankError
+from shearloop.bank.skin.calibration import load_calibration
+from shearloop.daemon.config import CombinedConfig, CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
+from shearloop.daemon.config_file import load_yaml_model
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.doctor.devices import (
     Finding,
-    check_computer,
-    check_disk,
-    check_files,
-    check_ports,
+    check_daemon,
+    check_devices,
+    daemon_tasks,
+    from_error,
     from_file,
     good,
+    listen,
     note,
+    trouble,
 )
-from shearloop.daemon.doctor.devices import check_daemon, check_devices, daemon_tasks, listen
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import stop_address
+from shearloop.daemon.sensing.estimators import open_combined, open_estimator
+from shearloop.daemon.serial_ports import list_serial_ports
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.ur.settings import read_settings
 
 __all__ = ["Finding", "examine"]
+
+# An hour of recording takes some 80 MB.
+LOW_DISK_BYTES, NO_DISK_BYTES = 2e9, 2e8
+LOW_MEMORY_BYTES = 5e8
+# An earlier time means that the clock was never set.
+FIRST_SANE_UNIX_S = 1_704_067_200
+# adjtimex(2): the clock is not synchronised.
+_TIME_ERROR = 5
 
 
 def examine(config_path: Path | None, seconds: float, geometry: Path | None = None) -> Iterator[Finding]:
@@ -54,3 +80,197 @@ def examine(config_path: Path | None, seconds: float, geometry: Path | None = No
     else:
         yield good("daemon", "not running with this configuration: the devices are free")
         yield from asyncio.run(check_devices(config, seconds))
+
+
+def check_computer() -> Iterator[Finding]:
+    """Check clock, memory and the robot's library."""
+    yield check_clock(time.time(), clock_state())
+    meminfo = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
+    available = int(meminfo["MemAvailable"].split()[0]) * 1024
+    found = f"{available / 1e9:.1f} GB are available, {len(os.sched_getaffinity(0))} processors"
+    if available < LOW_MEMORY_BYTES:
+        yield note("memory", found, "the bank may be read from disk again and again", "close other programs")
+    else:
+        yield good("memory", found)
+    version = ".".join(map(str, sys.version_info[:2]))
+    if importlib.util.find_spec("rtde_control") is None:
+        yield note(
+            "robot's library",
+            f"ur-rtde is not installed for Python {version}",
+            "everything but the robot works",
+            "use Python 3.11 or 3.12 on x86-64, then `pip install ur-rtde`",
+        )
+    else:
+        yield good("robot's library", f"ur-rtde is installed, Python {version}")
+
+
+def clock_state() -> int:
+    """Return adjtimex(2)'s answer: 5 when the clock is not synchronised, -1 when it cannot be asked."""
+    # struct timex takes 208 bytes on 64-bit Linux; `modes` 0 changes nothing.
+    try:
+        return int(ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(512)))
+    except (OSError, AttributeError):
+        return -1
+
+
+def check_clock(unix_s: float, state: int) -> Finding:
+    """Check the system clock's time and adjtimex's answer."""
+    today = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(unix_s))
+    if unix_s < FIRST_SANE_UNIX_S:
+        cure = "set it: `sudo timedatectl set-ntp true`"
+        return trouble("clock", f"it says {today}", "recordings and messages carry a wrong time", cure)
+    if state == _TIME_ERROR:
+        return note(
+            "clock",
+            f"it says {today} and is not synchronised",
+            "times in messages and recordings drift against other computers; the loop uses another clock",
+            "`sudo timedatectl set-ntp true`, if the network allows it",
+        )
+    return good("clock", f"it says {today}" + (" and is synchronised" if state >= 0 else ""))
+
+
+def check_disk(folder: Path) -> Finding:
+    """Check the space for recordings in a folder, or in its nearest existing parent."""
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.is_dir())
+    free = shutil.disk_usage(existing).free
+    found = f"{free / 1e9:.1f} GB are free in {existing}"
+    if not os.access(existing, os.W_OK):
+        return note("disk", f"you may not write in {existing}", "recordings fail there", "choose another folder")
+    if free < NO_DISK_BYTES:
+        return trouble("disk", found, "recordings fail and experiments do not start", "free some space")
+    if free < LOW_DISK_BYTES:
+        return note("disk", found, "enough for a day of recordings at most", "free some space before a long experiment")
+    return good("disk", found)
+
+
+def check_ports() -> Finding:
+    """List the USB serial ports with their serial numbers."""
+    ports = list_serial_ports()
+    if not ports:
+        means = "no board is plugged in, or the system has not noticed it"
+        return note("USB serial ports", "none", means, "plug the boards in; look at `sudo dmesg | tail`")
+    shown = ", ".join(f"{port.path} ({port.serial_number or 'without a serial number'})" for port in ports)
+    denied = "; ".join(f"{port.path}: {port.error}" for port in ports if port.error)
+    if denied:
+        return note("USB serial ports", shown, denied, "see `shearloop ports`")
+    return good("USB serial ports", shown)
+
+
+def check_files(config: DaemonConfig, geometry: Path | None) -> Iterator[Finding]:
+    """Check every file; `geometry` is the fingertip (YAML or mesh) that its bank must match."""
+    for name, fingertip in config.fingertips.items():
+        yield check_bank(name, fingertip, geometry)
+        if fingertip.calibration is None:
+            means = "k and sigma are published, but no torque"
+            yield note(f"calibration of {name}", "not configured", means, "see docs/first-calibration.md")
+        else:
+            yield _opened(f"calibration of {name}", "there is no torque", partial(_calibration, name, fingertip))
+    if config.combined is not None:
+        yield _opened(
+            "combined calibration",
+            "there is no combined estimate",
+            partial(_combined, config.combined, config.fingertips),
+        )
+    if config.skin is not None:
+        yield _opened("calibration of the skin", "there is no shear force", partial(_skin, config.skin.calibration))
+    if config.robot is not None:
+        try:
+            host = read_settings(config.robot).host
+            yield good("robot's settings", f"{config.robot} is in order; the robot is {host}")
+        except DriverError as error:
+            yield from_file("robot's settings", str(error), "the daemon does not start")
+    if config.experiment is not None:
+        try:
+            one = load_yaml_model(config.experiment, ExperimentFile)
+            steps = f"{one.name}, {len(one.steps)} steps, driven by {one.torque_source}"
+            yield good("experiment", f"{config.experiment}: {steps}")
+        except UserError as error:
+            yield from_file("experiment", str(error), "it cannot start")
+    yield check_keys(config.curve, config.network_addresses)
+
+
+def check_bank(name: str, fingertip: FingertipConfig, geometry: Path | None = None) -> Finding:
+    """Check a bank's checksums and channel table, and its geometry if one is given."""
+    subject = f"bank of {name}"
+    if fingertip.bank is None:
+        return note(subject, "not configured", "there are no heatmaps, no k and no sigma", "add `bank:` to get them")
+    try:
+        bank = Bank.open(fingertip.bank, verify=True)
+    except BankError as error:
+        return from_error(subject, error, "no frame can be matched")
+    found = (
+        f"{fingertip.bank} is intact, {int(bank.valid.sum())} of {bank.valid.size} cells valid, channel table "
+        f"{CHANNEL_TABLE_HASH[:12]} with {N_CHANNELS} channels, geometry {bank.geometry_hash[:12]}"
+    )
+    if geometry is None:
+        return good(subject, found)
+    from shearloop.daemon.bank_config import load_geometry
+
+    try:
+        digest = load_geometry(geometry).digest
+    except (UserError, BankError) as error:
+        return from_error(subject, error, "the bank cannot be compared with it")
+    if digest != bank.geometry_hash:
+        return trouble(
+            subject,
+            f"{found}; {geometry} is {digest[:12]}",
+            "the bank belongs to another fingertip or another mesh; estimates are wrong",
+            "build it again with `shearloop bank build`, or give the geometry it was built from",
+        )
+    return good(subject, f"{found}, which is {geometry}")
+
+
+def _calibration(name: str, fingertip: FingertipConfig) -> str:
+    estimator = open_estimator(fingertip, name)
+    if not estimator.calibration.sides:
+        return f"{fingertip.calibration} belongs to this bank"
+    kind = estimator.calibration.estimator.name
+    return f"{fingertip.calibration} is for this fingertip, estimator {kind}{estimator.assumptions}"
+
+
+def _combined(combined: CombinedConfig, fingertips: dict[str, FingertipConfig]) -> str:
+    estimator = open_combined(combined, fingertips)
+    sides, kind = " and ".join(estimator.calibration.sides), estimator.calibration.estimator.name
+    return f"{combined.calibration} is for {sides}, estimator {kind}{estimator.assumptions}"
+
+
+def _skin(path: Path) -> str:
+    return f"{path}, ± {load_calibration(path).prediction_half_width_n:.3f} N"
+
+
+def _opened(subject: str, means: str, description: Callable[[], str]) -> Finding:
+    """Return the description of a file, or why it cannot be used."""
+    try:
+        return good(subject, description())
+    except (UserError, BankError) as error:
+        return from_error(subject, error, means)
+
+
+def check_keys(curve: CurveConfig | None, network: dict[str, str]) -> Finding:
+    """Say who may connect from the network, and check that the secret key is secret."""
+    from shearloop.daemon.messaging.keys import check_allowed_clients, load_server_keys, server_key_file
+
+    if curve is None:
+        return good("keys", "not needed: every address is on this computer")
+    try:
+        load_server_keys(curve.server_key)
+        clients = check_allowed_clients(curve.clients)
+    except UserError as error:
+        return from_error("keys", error, "the daemon does not start")
+    path = server_key_file(curve.server_key)
+    mode = path.stat().st_mode & 0o777
+    if mode & 0o077:
+        return trouble(
+            "keys",
+            f"others can read {path} (mode {mode:o})",
+            "a reader of this key can pose as the daemon",
+            f"`chmod 600 {path}`; make new keys if somebody may have read it",
+        )
+    if not network:
+        return note(
+            "keys",
+            "there are keys, but every address is on this computer",
+            "nobody else can connect",
+            "set `publish` and `commands` to tcp://0.0.0.0:PORT to let others connect",
+        )
+    return good("keys", f"{', '.join(sorted(clients.values()))} may connect to {' and '.join(network.values())}")

@@ -6,15 +6,15 @@ import os
 import time
 from collections import defaultdict
 from collections.abc import AsyncIterator, Awaitable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import zmq
 
 from shearloop.bank.eit.channels import ZERO_SLOTS
 from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig, LoadCellConfig, SerialDevice
-from shearloop.daemon.doctor.checks import Finding, from_error, good, note, trouble
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
@@ -32,6 +32,47 @@ from shearloop.drivers.ur.settings import read_settings
 RATE_TOLERANCE = 0.1
 ROBOT_TIMEOUT_S = 2.0
 DAEMON_TIMEOUT_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One check's result. `means` and `next_step` are empty when all is well."""
+
+    subject: str
+    state: Literal["good", "note", "trouble"]
+    found: str
+    means: str = ""
+    next_step: str = ""
+
+
+def good(subject: str, found: str) -> Finding:
+    """Return the finding that all is well."""
+    return Finding(subject, "good", found)
+
+
+def note(subject: str, found: str, means: str, next_step: str) -> Finding:
+    """Return the finding that something works, but not as well as it could."""
+    return Finding(subject, "note", found, means, next_step)
+
+
+def trouble(subject: str, found: str, means: str, next_step: str) -> Finding:
+    """Return the finding that something keeps the loop from working."""
+    return Finding(subject, "trouble", found, means, next_step)
+
+
+def from_error(subject: str, error: Exception | str, means: str) -> Finding:
+    """Return the finding for an error; the text after its last `;` or full stop is the cure."""
+    sentence = str(error)
+    for mark in ("; ", ". "):
+        what, found, cure = sentence.rpartition(mark)
+        if found:
+            return trouble(subject, what, means, cure.rstrip("."))
+    return from_file(subject, sentence, means)
+
+
+def from_file(subject: str, sentence: str, means: str) -> Finding:
+    """Return the finding for a file; the sentence names all of its mistakes."""
+    return trouble(subject, sentence, means, "correct the file, then run `shearloop doctor CONFIG` again")
 
 
 async def check_devices(config: DaemonConfig, seconds: float) -> list[Finding]:

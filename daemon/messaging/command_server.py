@@ -6,7 +6,7 @@ Requests and replies are msgpack maps. A request is `{"command": NAME, …}`, a 
 
 import asyncio
 import time
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, TypeAlias
 
@@ -14,7 +14,7 @@ import structlog
 import zmq
 import zmq.asyncio
 
-from shearloop.daemon.messaging.keys import KeyPair
+from shearloop.daemon.messaging.keys import KeyPair, Refusals
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import bind
 
@@ -83,12 +83,13 @@ class CommandServer:
         context: zmq.asyncio.Context,
         address: str,
         handlers: Mapping[str, Handler],
+        refusals: Refusals,
         keys: KeyPair | None = None,
     ) -> None:
         """Bind the socket; raises UserError if the address is in use, malformed, or needs keys."""
         self._handlers = handlers
         self._limit = RateLimit()
-        self.refused: Counter[str] = Counter()
+        self.refused = refusals.counts
         self._running: set[asyncio.Task[None]] = set()
         self._socket = context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 100)

@@ -7,6 +7,7 @@ folder of the allowed clients' `.key` files is read again for each new connectio
 import os
 import struct
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -133,17 +134,28 @@ def check_allowed_clients(folder: Path) -> dict[bytes, str]:
     return clients
 
 
+@dataclass(frozen=True, slots=True)
+class Refusals:
+    """Numbers of refused commands and clients, by kind."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+
+    def diagnostics(self) -> Mapping[str, Mapping[str, int]]:
+        """Return the counts for `health`."""
+        return {"errors": dict(self.counts)}
+
+
 class CurveAuthenticator:
     """Accepts clients with allowed keys and counts the others (ZAP, ZeroMQ RFC 27).
 
     It must exist before a socket is bound.
     """
 
-    def __init__(self, context: "zmq.Context[Any]", clients: Path) -> None:
+    def __init__(self, context: "zmq.Context[Any]", clients: Path, refusals: Refusals) -> None:
         """Raise UserError if the folder `clients` is unreadable or empty."""
         check_allowed_clients(clients)
         self._clients = clients
-        self.refused: Counter[str] = Counter()
+        self.refused = refusals.counts
         self._authenticator = Authenticator(context)
         self._authenticator.configure_curve_callback(_DOMAIN, self)
         self._authenticator.start()

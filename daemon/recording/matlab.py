@@ -1,4 +1,4 @@
-"""Reads the paper's MATLAB files (version 5 to 7.2) of slices, raw lines and streams as arrays with units.
+"""Reads the paper's MATLAB files (version 5 to 7.2) of slices, raw lines and streams; imports streams as a recording.
 
 The format is MathWorks' "MAT-File Format" (level 5). scipy's reader trusts sizes and types in the file, so some damaged
 files end its process with a segmentation fault (docs/decisions/0040).
@@ -14,20 +14,38 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
+from scipy.ndimage import minimum_filter1d
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.channels import N_CHANNELS, N_LINE_VALUES
+from shearloop.bank.estimation.values import LARGEST_TORQUE_NM
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, SIDES
+from shearloop.daemon.recording.writer import RecordingWriter
+from shearloop.drivers.frame_clock import slope_below
 
 # The recording scripts changed these names over time.
-_SIDES = {"right": ("Right_Data", "plotthis2", "plotthis_right"), "left": ("Left_Data", "plotthis1", "plotthis_left")}
-_LOADS = ("Load_Data", "plotthis3", "plotthis_truth")
+_STREAMS = {
+    "right": ("Right_Data", "plotthis2", "plotthis_right"),
+    "left": ("Left_Data", "plotthis1", "plotthis_left"),
+    "load": ("Load_Data", "plotthis3", "plotthis_truth"),
+}
+TORQUE_FOLDER, DIAMETER_FOLDER = "torque_slices", "diameter_slices"
+RAW_FRAME, RAW_HOMOGENEOUS = "TorqueSlice.mat", "TorqueSliceHom.mat"
 _LINES = ("clipped_data", "clipped_data_hom")
 # MATLAB counts days from the year 0; this is its number for 1970-01-01.
 _DATENUM_OF_UNIX_EPOCH = 719529
 _SECONDS_PER_DAY = 86400.0
 _TORQUE_SLICE = re.compile(r"Data_Slice_(\d+)\.mat")
 _DIAMETER_SLICE = re.compile(r"(\d+(?:\.\d+)?)mm_Data_(\d+)\.mat")
+NOMINAL_PERIOD_NS = 541_200_000
+# Among this many frames on either side, at least one should have been read without delay.
+_NEIGHBOURS = 12
+# The load cell's board sends a line every 91.6 ms.
+LOAD_PERIOD_S = 0.0916
+_CYLINDER = re.compile(r"(\d+(?:\.\d+)?)mm[_.]")
+# Stamps of frames and load that differ less than this, row by row, come from one loop.
+_ONE_LOOP_S = 0.02
 _HDF5_SIGNATURE = b"\x89HDF"
 
 _HEADER_BYTES = 128
@@ -47,100 +65,72 @@ Variable: TypeAlias = FloatArray | str
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
-    """One fingertip's lines: unix_s (n,) arrival times, lines (n, 1024) in volts.
+    """Arrival times unix_s (n,), and a fingertip's lines (n, 1024) in volts or the load cell's torques (n, 1) in N·m.
 
-    The file names no time zone, so its times are read as UTC.
+    The file names no time zone, so its times are read as UTC. Damaged torques are included.
     """
 
     unix_s: FloatArray
-    lines: FloatArray
+    values: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LoadStream:
-    """The load cell's values: unix_s (n,) arrival times as in `Stream`, torque_nm (n,), including damaged values."""
+class Slices:
+    """Differences (n, 896) |frame − homogeneous frame| in volts at torque_nm (n,), by the numbers in the files' names.
 
-    unix_s: FloatArray
-    torque_nm: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TorqueSlices:
-    """Differences (n, 896) |frame − homogeneous frame| in volts at torque_nm (n,), in time order."""
+    diameter_mm (n,) is of the cylinders, NaN for torque slices.
+    """
 
     differences: FloatArray
     torque_nm: FloatArray
     numbers: IntArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DiameterSlices:
-    """Differences (n, 896) in volts on cylinders of diameter_mm (n,) at torque_nm (n,), by rising diameter."""
-
-    differences: FloatArray
     diameter_mm: FloatArray
-    torque_nm: FloatArray
 
 
-def find_streams(path: str | Path) -> tuple[str, ...]:
+def find_streams(path: Path) -> tuple[str, ...]:
     """Return the streams of a file: "right", "left" or "load"; raises UserError if it cannot be read or has none."""
-    path = Path(path)
     variables = _load(path)
-    known = {**_SIDES, "load": _LOADS}
-    found = tuple(stream for stream, names in known.items() if any(name in variables for name in names))
+    found = tuple(stream for stream, names in _STREAMS.items() if any(name in variables for name in names))
     if not found:
-        wanted = ", ".join(name for names in known.values() for name in names)
+        wanted = ", ".join(name for names in _STREAMS.values() for name in names)
         raise UserError(f"{path} holds {', '.join(variables) or 'no variable'}, expected one of {wanted}")
     return found
 
 
-def read_stream(path: str | Path, side: str | None = None) -> Stream:
-    """Return a fingertip's stream; `side` ("right" or "left") is needed for a file with both.
+def read_stream(path: Path, name: str | None = None) -> Stream:
+    """Return the stream "right", "left" or "load", by default the only fingertip's.
 
     Raises UserError for a file that cannot be read or holds no such stream.
     """
-    path = Path(path)
-    variables = _load(path)
-    names = sum(_SIDES.values(), ()) if side is None else _SIDES[side]
-    return Stream(*_timed(path, _one_of(path, variables, names), N_LINE_VALUES))
+    names = _STREAMS[name] if name is not None else (*_STREAMS["right"], *_STREAMS["left"])
+    table, width = _one_of(path, _load(path), names), 1 if name == "load" else N_LINE_VALUES
+    if table.shape[1] != width + 1 or len(table) == 0:
+        value = "value" if width == 1 else "values"
+        raise UserError(f"{path}: expected rows of one time and {width} {value}, found {_size(table)}")
+    return Stream((table[:, 0] - _DATENUM_OF_UNIX_EPOCH) * _SECONDS_PER_DAY, np.ascontiguousarray(table[:, 1:]))
 
 
-def read_load_stream(path: str | Path) -> LoadStream:
-    """Return the load cell's stream; raises UserError for a file that cannot be read or holds none."""
-    path = Path(path)
-    unix_s, values = _timed(path, _one_of(path, _load(path), _LOADS), 1)
-    return LoadStream(unix_s, values[:, 0])
-
-
-def read_line(path: str | Path) -> FloatArray:
+def read_line(path: Path) -> FloatArray:
     """Return the (1024,) values in volts of a file with a single line; raises UserError as `read_stream` does."""
-    path = Path(path)
     return _row(path, _one_of(path, _load(path), _LINES), N_LINE_VALUES)
 
 
-def read_torque_slices(folder: str | Path) -> TorqueSlices:
+def read_torque_slices(folder: Path) -> Slices:
     """Return the slices Data_Slice_N.mat of a folder by rising N, which may have gaps.
 
     Raises UserError for a folder without any, and for a file that cannot be used.
     """
-    examples = "Data_Slice_1.mat, Data_Slice_2.mat"
-    numbers, differences, torque_nm = _read_slices(folder, "torque", _TORQUE_SLICE, "torque_value", examples)
-    return TorqueSlices(differences, torque_nm, numbers[:, 0].astype(int))
+    return _read_slices(folder, "torque", _TORQUE_SLICE, "torque_value", "Data_Slice_1.mat, Data_Slice_2.mat")
 
 
-def read_diameter_slices(folder: str | Path) -> DiameterSlices:
+def read_diameter_slices(folder: Path) -> Slices:
     """Return the slices DDmm_Data_N.mat of a folder by rising diameter, then N; raises as `read_torque_slices` does."""
-    examples = "10mm_Data_1.mat, 20mm_Data_1.mat"
-    numbers, differences, torque_nm = _read_slices(folder, "diameter", _DIAMETER_SLICE, "mean_torque", examples)
-    return DiameterSlices(differences, numbers[:, 0], torque_nm)
+    return _read_slices(folder, "diameter", _DIAMETER_SLICE, "mean_torque", "10mm_Data_1.mat, 20mm_Data_1.mat")
 
 
-def _read_slices(
-    folder: str | Path, kind: str, pattern: re.Pattern[str], torque_name: str, examples: str
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the numbers (n, m) in the files' names in rising order, the differences (n, 896) and torques (n,)."""
+def _read_slices(folder: Path, kind: str, pattern: re.Pattern[str], torque_name: str, examples: str) -> Slices:
     try:
-        found = [(pattern.fullmatch(path.name), path) for path in Path(folder).iterdir()]
+        found = [(pattern.fullmatch(path.name), path) for path in folder.iterdir()]
     except OSError as error:
         raise UserError(f"{folder}: the recordings cannot be listed: {error.strerror}") from error
     files = sorted((tuple(map(float, match.groups())), path) for match, path in found if match)
@@ -153,7 +143,9 @@ def _read_slices(
         if not differences[-1].any():
             raise UserError(f"{path}: data_diff is zero in all channels; leave this slice out")
         torques.append(_row(path, _one_of(path, variables, [torque_name]), 1)[0])
-    return np.array([numbers for numbers, _ in files]), np.array(differences), np.array(torques)
+    named = np.array([numbers for numbers, _ in files])
+    diameter_mm = named[:, 0] if kind == "diameter" else np.full(len(files), np.nan)
+    return Slices(np.array(differences), np.array(torques), named[:, -1].astype(int), diameter_mm)
 
 
 def _load(path: Path) -> dict[str, Variable]:
@@ -193,16 +185,109 @@ def _row(path: Path, values: FloatArray, length: int) -> FloatArray:
     return values.ravel()
 
 
-def _timed(path: Path, table: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
-    """Return the Unix times of a table's datenum column and its other columns."""
-    if table.shape[1] != width + 1 or len(table) == 0:
-        value = "value" if width == 1 else "values"
-        raise UserError(f"{path}: expected rows of one time and {width} {value}, found {_size(table)}")
-    return (table[:, 0] - _DATENUM_OF_UNIX_EPOCH) * _SECONDS_PER_DAY, np.ascontiguousarray(table[:, 1:])
-
-
 def _size(values: FloatArray) -> str:
     return " × ".join(map(str, values.shape))
+
+
+@dataclass(frozen=True, slots=True)
+class ImportResult:
+    """The imported frames by side, the number of torques, and remarks in sentences."""
+
+    frames: dict[str, int]
+    torques: int
+    remarks: tuple[str, ...]
+
+
+def import_mat(sources: Sequence[Path], out: Path) -> ImportResult:
+    """Write the streams of MATLAB files, or of folders of them, into one recording.
+
+    Time stamps are corrected, and damaged load values are left out. Raises UserError for a file without a stream, for
+    two streams of one side, and if there are no frames.
+    """
+    files = _mat_files(sources)
+    streams: dict[str, Stream] = {}
+    for path in files:
+        for name in find_streams(path):
+            if name in streams:
+                raise UserError(f"{path} is a second stream of {name}; import one recording at a time")
+            streams[name] = read_stream(path, name)
+    load = streams.pop("load", None)
+    if not streams:
+        raise UserError("the files hold no frames of a fingertip; name those of the right or left side as well")
+    remarks: list[str] = []
+    torque_t_s, torque_nm = _corrected_load(load, streams, remarks)
+    notes = {"remarks": " ".join(remarks)} if remarks else {}
+    if (diameter := _diameter_mm(files)) is not None:
+        notes[DIAMETER_NOTE] = diameter
+    with RecordingWriter(out, ", ".join(sorted(path.name for path in files)), notes) as writer:
+        for side in (side for side in SIDES if side in streams):
+            arrivals = [round(float(unix_s) * 1e9) for unix_s in streams[side].unix_s]
+            for middle_ns, arrival_ns, line in zip(
+                frame_middles(arrivals), arrivals, streams[side].values, strict=True
+            ):
+                writer.add_frame(side, middle_ns, arrival_ns, line)
+        for t_s, torque in zip(torque_t_s, torque_nm, strict=True):
+            writer.add_torque(round(float(t_s) * 1e9), float(torque))
+    return ImportResult({side: len(stream.unix_s) for side, stream in streams.items()}, len(torque_nm), tuple(remarks))
+
+
+def frame_middles(arrivals_ns: Sequence[int]) -> list[int]:
+    """Return the middle of each frame's acquisition from its arrival, in nanoseconds.
+
+    A frame is read when it is complete or later. The board's clock is therefore the line below the stamps
+    (`drivers.frame_clock`). The earliest stamp among the neighbours gives its height, so that it follows a
+    board that paused.
+    """
+    numbered = list(enumerate(arrivals_ns))
+    period = slope_below(numbered) if len(numbered) > 1 else float(NOMINAL_PERIOD_NS)
+    height = np.array([float(arrival - arrivals_ns[0]) - n * period for n, arrival in numbered])
+    lowest = minimum_filter1d(height, 2 * _NEIGHBOURS + 1, mode="nearest")
+    return [arrivals_ns[0] + round(low + (n - 0.5) * period) for n, low in enumerate(lowest)]
+
+
+def _corrected_load(
+    load: Stream | None, streams: dict[str, Stream], remarks: list[str]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the times in s and torques in N·m of the valid load values; appends to `remarks`."""
+    if load is None:
+        return np.zeros(0), np.zeros(0)
+    t_s, torque = load.unix_s, load.values[:, 0]
+    if any(_is_one_loop(t_s, stream.unix_s) for stream in streams.values()):
+        # The loop read one line per frame and the board sends six. The rest waited in the port's buffer.
+        t_s = t_s[0] + LOAD_PERIOD_S * np.arange(len(t_s))
+        remarks.append(
+            f"The load cell was read once per frame but sends a value every {1e3 * LOAD_PERIOD_S:.1f} ms, so its "
+            f"values waited in a buffer. They got the times at which they were sent, {t_s[-1] - t_s[0]:.0f} s in all."
+        )
+    valid = np.abs(torque) <= LARGEST_TORQUE_NM
+    if not valid.all():
+        remarks.append(
+            f"{np.count_nonzero(~valid)} load values beyond {LARGEST_TORQUE_NM:g} N·m are damaged and were left out."
+        )
+    order = np.argsort(t_s[valid], kind="stable")
+    return t_s[valid][order], torque[valid][order]
+
+
+def _is_one_loop(load_s: FloatArray, frame_s: FloatArray) -> bool:
+    return len(load_s) == len(frame_s) and float(np.median(np.abs(load_s - frame_s))) < _ONE_LOOP_S
+
+
+def _diameter_mm(files: Sequence[Path]) -> str | None:
+    """Return the diameter in mm that the files' names start with (10mm_1_right.mat); UserError if they differ."""
+    found = sorted({match[1] for path in files if (match := _CYLINDER.match(path.name))})
+    if len(found) > 1:
+        raise UserError(f"the files are of cylinders of {' and '.join(found)} mm; import one recording at a time")
+    return found[0] if found and 0 < float(found[0]) < LARGEST_DIAMETER_MM else None
+
+
+def _mat_files(sources: Sequence[Path]) -> list[Path]:
+    found: list[Path] = []
+    for source in sources:
+        inside = sorted(source.glob("*.mat")) if source.is_dir() else [source]
+        if not inside:
+            raise UserError(f"{source} holds no .mat files; name the folder of one recording")
+        found += inside
+    return found
 
 
 class MatFileError(ValueError):

@@ -10,9 +10,9 @@ import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 from mcap.exceptions import McapError
@@ -204,136 +204,154 @@ def _unusable(path: Path, reason: str) -> UserError:
     )
 
 
-@dataclass(slots=True)
-class FileCondition:
-    """Whether a file was closed, how many bytes of it are intact, and how many chunks are damaged."""
+class IntactRecords:
+    """The records of a file, chunks opened, up to its end or its first damaged record.
 
-    size: int
-    closed: bool = False
-    intact_bytes: int = 0
-    damaged_chunks: int = 0
+    While it is iterated, it counts the intact bytes and the damaged chunks. `progress` receives the bytes read.
+    """
 
-    @classmethod
-    def of_file(cls, path: Path) -> "FileCondition":
-        """Return the condition of an unread file; raises UserError if it does not exist."""
+    def __init__(self, path: Path, progress: Progress) -> None:
+        """Look at the file; raises UserError if it does not exist."""
+        self._path = path
+        self._progress = progress
+        self.closed = False
+        self.damaged_chunks = 0
+        self._intact_bytes = 0
         try:
-            return cls(path.stat().st_size)
+            self.size = path.stat().st_size
         except OSError as error:
             raise UserError(f"{path}: the recording cannot be read: {error.strerror}") from error
 
     @property
     def torn_bytes(self) -> int:
         """Bytes after the last intact record."""
-        return 0 if self.closed else self.size - self.intact_bytes
+        return 0 if self.closed else self.size - self._intact_bytes
 
+    def __iter__(self) -> Iterator[McapRecord]:
+        """Read the file; raises UserError if it is not MCAP."""
+        try:
+            with self._path.open("rb") as file:
+                check_magic(self._path, file)
+                file.seek(0)
+                yield from self._records(file)
+        except OSError as error:
+            raise UserError(f"{self._path}: the recording cannot be read: {error.strerror}") from error
 
-@dataclass(frozen=True, slots=True)
-class RepairResult:
-    """The repaired file, its number of messages, and the condition of the source."""
+    def _records(self, file: IO[bytes]) -> Iterator[McapRecord]:
+        reader = StreamReader(file, emit_chunks=True, record_size_limit=_LARGEST_RECORD_BYTES).records
+        while True:
+            try:
+                record = next(reader)
+                inside = self._opened(record) if isinstance(record, Chunk) else [record]
+            except OSError:
+                raise
+            # The library raises many types of exceptions for a damaged record.
+            except Exception:  # noqa: BLE001
+                return
+            self._intact_bytes = file.tell()
+            self._progress(self._intact_bytes)
+            if isinstance(record, Footer):
+                self.closed = True
+                return
+            yield from inside
 
-    path: Path
-    messages: int
-    condition: FileCondition
+    def _opened(self, chunk: Chunk) -> list[McapRecord]:
+        """Return the records of a chunk, or nothing if it does not match its checksum."""
+        try:
+            return breakup_chunk(chunk, validate_crc=True)
+        # zstandard raises a plain subclass of Exception.
+        except Exception:  # noqa: BLE001
+            self.damaged_chunks += 1
+            return []
 
 
 @dataclass(slots=True)
 class TopicSummary:
-    """One topic: its number of messages, their log times (Unix ns) and size."""
+    """One topic; the mean rate is None for fewer than two messages."""
 
     messages: int = 0
-    first_ns: int = 0
-    last_ns: int = 0
+    rate_hz: float | None = None
     json_bytes: int = 0
 
-    @property
-    def rate_hz(self) -> float | None:
-        """Mean rate, None for fewer than two messages."""
-        span_s = (self.last_ns - self.first_ns) / 1e9
-        return (self.messages - 1) / span_s if self.messages > 1 and span_s > 0 else None
 
-    def add(self, message: Message) -> None:
-        """Count a message."""
-        if not self.messages:
-            self.first_ns = self.last_ns = message.log_time
-        self.messages += 1
-        self.json_bytes += len(message.data)
-        self.first_ns, self.last_ns = min(self.first_ns, message.log_time), max(self.last_ns, message.log_time)
-
-
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingSummary:
-    """The content of a recording in numbers."""
+    """The content of a recording in numbers, times in Unix ns; the keys of `recording info --json`."""
 
-    path: Path
-    condition: FileCondition
-    dropped: int | None = None
-    metadata: dict[str, str] = field(default_factory=dict)
-    experiments: list[str] = field(default_factory=list)
+    path: str
+    size_bytes: int
+    closed: bool
+    torn_bytes: int
+    damaged_chunks: int
+    dropped: int | None
+    first_unix_ns: int | None
+    duration_s: float
+    # Whether the same code made it, so that a replay must be equal bit for bit.
+    same_code: bool
+    experiments: list[str]
     # The tool's diameter in mm as the recording names it.
-    tool_mm: str | None = None
-    attachments: list[str] = field(default_factory=list)
-    topics: dict[str, TopicSummary] = field(default_factory=dict)
-
-    @property
-    def first_ns(self) -> int | None:
-        """Log time of the first message."""
-        return min((topic.first_ns for topic in self.topics.values()), default=None)
-
-    @property
-    def duration_s(self) -> float:
-        """Time from the first message to the last."""
-        last_ns = max((topic.last_ns for topic in self.topics.values()), default=0)
-        return 0.0 if self.first_ns is None else (last_ns - self.first_ns) / 1e9
-
-    @property
-    def same_code(self) -> bool:
-        """Whether the same code made it, so that a replay must be equal bit for bit."""
-        return self.metadata.get("code_sha256") == schema.code_digest()
-
-    def as_map(self) -> dict[str, Any]:
-        """Return everything for JSON."""
-        return {
-            "path": str(self.path),
-            "size_bytes": self.condition.size,
-            "closed": self.condition.closed,
-            "torn_bytes": self.condition.torn_bytes,
-            "damaged_chunks": self.condition.damaged_chunks,
-            "dropped": self.dropped,
-            "first_unix_ns": self.first_ns,
-            "duration_s": self.duration_s,
-            "same_code": self.same_code,
-            "experiments": self.experiments,
-            "tool_mm": self.tool_mm,
-            "metadata": self.metadata,
-            "attachments": self.attachments,
-            "topics": {
-                name: {"messages": topic.messages, "rate_hz": topic.rate_hz, "json_bytes": topic.json_bytes}
-                for name, topic in sorted(self.topics.items())
-            },
-        }
+    tool_mm: str | None
+    metadata: dict[str, str]
+    attachments: list[str]
+    topics: dict[str, TopicSummary]
 
 
 def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSummary:
     """Return the summary of a recording, closed or not; raises UserError for another file."""
-    summary = RecordingSummary(path, FileCondition.of_file(path))
-    topics: dict[int, str] = {}
-    for record in intact_records(path, summary.condition, progress):
+    records = IntactRecords(path, progress)
+    channels: dict[int, str] = {}
+    topics: dict[str, TopicSummary] = {}
+    spans: dict[str, tuple[int, int]] = {}
+    named: dict[str, list[dict[str, str]]] = {}
+    attachments = []
+    for record in records:
         match record:
             case Channel():
-                topics[record.id] = record.topic
-            case Message() if record.channel_id in topics:
-                summary.topics.setdefault(topics[record.channel_id], TopicSummary()).add(record)
-            case Metadata(name=name) if name == schema.METADATA:
-                summary.metadata = dict(record.metadata)
-                summary.tool_mm = record.metadata.get(schema.DIAMETER_NOTE)
-            case Metadata(name=name) if name == schema.EXPERIMENT_METADATA:
-                summary.experiments.append(record.metadata.get("name", ""))
-                summary.tool_mm = record.metadata.get(schema.DIAMETER_NOTE)
-            case Metadata(name=name) if name == schema.END_METADATA:
-                summary.dropped = int(record.metadata.get("dropped", "0"))
+                channels[record.id] = record.topic
+            case Message() if record.channel_id in channels:
+                name, t_ns = channels[record.channel_id], record.log_time
+                topic = topics.setdefault(name, TopicSummary())
+                topic.messages += 1
+                topic.json_bytes += len(record.data)
+                first_ns, last_ns = spans.get(name, (t_ns, t_ns))
+                spans[name] = min(first_ns, t_ns), max(last_ns, t_ns)
+            case Metadata():
+                named.setdefault(record.name, []).append(dict(record.metadata))
             case Attachment():
-                summary.attachments.append(record.name)
-    return summary
+                attachments.append(record.name)
+    for name, (first_ns, last_ns) in spans.items():
+        if last_ns > first_ns:
+            topics[name].rate_hz = (topics[name].messages - 1) / ((last_ns - first_ns) / 1e9)
+    first_unix_ns = min((first_ns for first_ns, _ in spans.values()), default=None)
+    ends = named.get(schema.END_METADATA, [])
+    metadata = named.get(schema.METADATA, [{}])[-1]
+    experiments = named.get(schema.EXPERIMENT_METADATA, [])
+    return RecordingSummary(
+        path=str(path),
+        size_bytes=records.size,
+        closed=records.closed,
+        torn_bytes=records.torn_bytes,
+        damaged_chunks=records.damaged_chunks,
+        dropped=int(ends[-1].get("dropped", "0")) if ends else None,
+        first_unix_ns=first_unix_ns,
+        duration_s=0.0 if first_unix_ns is None else (max(last for _, last in spans.values()) - first_unix_ns) / 1e9,
+        same_code=metadata.get("code_sha256") == schema.code_digest(),
+        experiments=[one.get("name", "") for one in experiments],
+        tool_mm=(experiments or [metadata])[-1].get(schema.DIAMETER_NOTE),
+        metadata=metadata,
+        attachments=attachments,
+        topics=dict(sorted(topics.items())),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class RepairResult:
+    """The repaired file, its number of messages, and the losses; the keys of `recording repair --json`."""
+
+    path: Path
+    messages: int
+    torn_bytes: int
+    damaged_chunks: int
 
 
 def repair(source: Path, out: Path | None = None, progress: Progress = lambda _: None) -> RepairResult:
@@ -347,14 +365,14 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
         out = source.with_name(name if name != source.name else f"{source.stem}.repaired.mcap")
     if out.exists():
         raise UserError(f"{out} exists already; move it away, or name another file with --out")
-    condition = FileCondition.of_file(source)
+    records = IntactRecords(source, progress)
     schemas: dict[int, int] = {}
     channels: dict[int, int] = {}
     messages = 0
     try:
         with replace_file(out) as file:
             writer = new_writer(file)
-            for record in intact_records(source, condition, progress):
+            for record in records:
                 # The copy has its own header and index.
                 match record:
                     case Schema() if record.id not in schemas:
@@ -364,13 +382,8 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
                             record.topic, record.message_encoding, schemas.get(record.schema_id, 0), record.metadata
                         )
                     case Message() if record.channel_id in channels:
-                        writer.add_message(
-                            channels[record.channel_id],
-                            record.log_time,
-                            record.data,
-                            record.publish_time,
-                            record.sequence,
-                        )
+                        copied = channels[record.channel_id], record.log_time, record.data, record.publish_time
+                        writer.add_message(*copied, record.sequence)
                         messages += 1
                     case Metadata():
                         writer.add_metadata(record.name, record.metadata)
@@ -383,40 +396,4 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
                 raise UserError(f"{source}: it holds no intact message, so nothing can be saved")
     except OSError as error:
         raise UserError(f"{out}: the repaired recording cannot be written: {error.strerror}") from error
-    return RepairResult(out, messages, condition)
-
-
-def intact_records(path: Path, condition: FileCondition, progress: Progress = lambda _: None) -> Iterator[McapRecord]:
-    """Yield the records of a file, chunks opened, up to its end or its first damaged record; updates `condition`.
-
-    `progress` receives the number of bytes read. Raises UserError for a file that is not MCAP.
-    """
-    try:
-        with path.open("rb") as file:
-            check_magic(path, file)
-            file.seek(0)
-            reader = StreamReader(file, emit_chunks=True, record_size_limit=_LARGEST_RECORD_BYTES).records
-            # The library raises many types of exceptions for a damaged record, zstandard a plain subclass of Exception.
-            while True:
-                try:
-                    record = next(reader)
-                except OSError:
-                    raise
-                except Exception:  # noqa: BLE001
-                    return
-                condition.intact_bytes = file.tell()
-                progress(condition.intact_bytes)
-                if isinstance(record, Footer):
-                    condition.closed = True
-                    return
-                if not isinstance(record, Chunk):
-                    yield record
-                    continue
-                try:
-                    inside = breakup_chunk(record, validate_crc=True)
-                except Exception:  # noqa: BLE001
-                    condition.damaged_chunks += 1
-                else:
-                    yield from inside
-    except OSError as error:
-        raise UserError(f"{path}: the recording cannot be read: {error.strerror}") from error
+    return RepairResult(out, messages, records.torn_bytes, records.damaged_chunks)

@@ -1,15 +1,16 @@
 """The load cell's task: reads it, publishes its torque, takes its zero."""
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import structlog
 
 from shearloop.daemon.clock import Clock
+from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.waiters import Waiters
+from shearloop.daemon.taring import Waiters
 from shearloop.drivers.load_cell import LoadCell, LoadSample
 
 LOAD_CELL = "load_cell"
@@ -29,7 +30,7 @@ class LoadCellTask:
         board: LoadCell,
         publisher: Publisher,
         clock: Clock,
-        on_torque: Callable[[TorqueSample], None],
+        loop: ControlLoop | None,
         rate_hz: float,
     ) -> None:
         self._period_s = 1.0 / rate_hz
@@ -37,7 +38,7 @@ class LoadCellTask:
         self._board = board
         self._publisher = publisher
         self._clock = clock
-        self._on_torque = on_torque
+        self._loop = loop
         # The raw values of a zero in progress, and the times between which it is taken.
         self._zeroing: list[float] | None = None
         self._zero_from_ns = self._zero_until_ns = 0
@@ -45,7 +46,7 @@ class LoadCellTask:
         self._zero_waiters = Waiters()
         self._reason = ""
 
-    async def read(self) -> None:
+    async def run(self) -> None:
         """Publish every sample and pass it on, until cancelled."""
         async with contextlib.aclosing(self._board.readings()) as samples:
             async for sample in samples:
@@ -53,7 +54,8 @@ class LoadCellTask:
                 torque_nm = sample.torque_nm if sample.trusted else None
                 self._reason = _reason(sample)
                 now_ns = self._clock.now_ns()
-                self._on_torque(TorqueSample(LOAD_CELL, torque_nm, self._reason, sample.t_mid_ns, now_ns))
+                if self._loop is not None:
+                    self._loop.on_torque(TorqueSample(LOAD_CELL, torque_nm, self._reason, sample.t_mid_ns, now_ns))
                 self._take_zero(sample)
 
     def tare(self) -> None:
@@ -64,7 +66,7 @@ class LoadCellTask:
         self._zero_from_ns = now_ns + round((SETTLING_PERIODS - 0.5) * self._period_s * 1e9)
         self._zero_until_ns = now_ns + round(self._timeout_s * 1e9)
 
-    async def zero(self) -> str:
+    async def tare_and_wait(self) -> str:
         """Take a new zero and wait until it is done; return the reason of a failure, else an empty text."""
         self.tare()
         try:

@@ -16,7 +16,7 @@ from scipy.special import chdtri
 from shearloop.bank.polynomial import TWO_SIDED_95
 from shearloop.bank.skin.calibration import DirectionFinder, ForceFollower, SkinCalibration
 from shearloop.bank.skin.membrane import Direction, ShearInterval
-from shearloop.drivers.shear_skin import SkinSample
+from shearloop.drivers.shear_skin.skin import SkinSample
 
 # The slack gauge is compressed by at most this share of the other's stretch (0.125 in the 2-D reference, see
 # docs/skin-models.md).

@@ -1,24 +1,36 @@
 """The shear skin's task: builds instruments and estimator, publishes the shear force, takes the zero, replays."""
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 
 from shearloop.bank.skin.calibration import SkinCalibration, load_calibration
 from shearloop.bank.skin.membrane import joule_heating_k
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import InstrumentSocket, SerialDevice, SkinConfig
+from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.logs import LinkLog
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
-from shearloop.daemon.waiters import Waiters
-from shearloop.drivers import shear_skin
+from shearloop.daemon.taring import Waiters
 from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
-from shearloop.drivers.shear_skin import SOURCE_PERIOD_S, Keithley6430, PairParser, SkinSample, Voltages
+from shearloop.drivers.shear_skin.instruments import (
+    SOURCE_PERIOD_S,
+    AdcBoard,
+    Daq,
+    Keithley6430,
+    PairParser,
+    RecordedInstrument,
+    ScpiScanner,
+    SourceReading,
+    Voltages,
+)
+from shearloop.drivers.shear_skin.skin import SampleValidator, ShearSkin, SkinSample
 
 SKIN = "skin"
 # The instruments' names in health and in recordings.
@@ -29,6 +41,21 @@ ZERO_TIMEOUT_S = 15.0
 MAX_WARMING_K = 5.0
 
 
+@dataclass(frozen=True, slots=True)
+class SkinSourceTask:
+    """Keeps the current source set up and read."""
+
+    skin: ShearSkin
+
+    async def run(self) -> None:
+        """Read until cancelled."""
+        await self.skin.watch_source()
+
+    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+        """Return the values of the current source for `health`."""
+        return self.skin.source_diagnostics()
+
+
 class SkinTask:
     """Connects the skin's instruments and its estimator to the publisher and the control loop."""
 
@@ -37,7 +64,7 @@ class SkinTask:
         config: SkinConfig,
         publisher: Publisher,
         clock: Clock,
-        on_torque: Callable[[TorqueSample], None] = lambda _: None,
+        loop: ControlLoop | None = None,
         inputs: Mapping[str, InputRecorder | None] = MappingProxyType({}),
     ) -> None:
         """Build everything, not yet open; `inputs` keeps the inputs of each source, by its name.
@@ -46,26 +73,23 @@ class SkinTask:
         """
         calibration = load_calibration(config.calibration)
         check_circuit(config, calibration)
-        self._skin = shear_skin.ShearSkin(
+        self._skin = ShearSkin(
             _current_source(config, inputs.get(SKIN_SOURCE)),
             _daq(config, inputs.get(SKIN_DAQ)),
             _gauge_ohm(calibration),
         )
+        self.source = SkinSourceTask(self._skin)
         self._estimator = _estimator(config, calibration)
         self._publisher = publisher
         self._clock = clock
-        self._on_torque = on_torque
+        self._loop = loop
         self._inputs = inputs.get(SKIN)
         self._radius_m = _radius_m(config)
         self._zero_waiters = Waiters()
         self._reason = ""
         self._valid = 0
 
-    async def watch_source(self) -> None:
-        """Keep the current source set up and read, until cancelled."""
-        await self._skin.watch_source()
-
-    async def read(self) -> None:
+    async def run(self) -> None:
         """Publish every sample's force and pass its torque on, until cancelled."""
         async with contextlib.aclosing(self._skin.samples()) as samples:
             async for sample in samples:
@@ -83,7 +107,7 @@ class SkinTask:
             self._inputs.record(RawEvent(InputKind.TARE, now_ns))
         self._estimator.tare(now_ns)
 
-    async def zero(self) -> str:
+    async def tare_and_wait(self) -> str:
         """Take a new zero and wait until it is done; return the reason of a failure, else an empty text."""
         self.tare()
         try:
@@ -105,17 +129,13 @@ class SkinTask:
             "drift_per_hour": self._estimator.drift_per_hour,
         }
 
-    def source_diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
-        """Return the values of the current source for `health`."""
-        return self._skin.source_diagnostics()
-
     def _publish(self, sample: SkinSample, reading: SkinReading) -> None:
         now_ns = self._clock.now_ns()
         message = shear_message(sample, reading, self._radius_m, now_ns)
         self._reason = message.reason
         self._valid += reading.valid
-        if self._radius_m is not None:
-            self._on_torque(skin_torque(reading, self._radius_m, sample.t_mid_ns, now_ns))
+        if self._radius_m is not None and self._loop is not None:
+            self._loop.on_torque(skin_torque(reading, self._radius_m, sample.t_mid_ns, now_ns))
         self._publisher.publish(message)
 
 
@@ -130,14 +150,14 @@ class RecordedSkin:
         self._estimator = _estimator(config, calibration)
         current_a = config.source.current_ma * 1e-3
         daq_period_s = 1.0 / config.daq.rate_hz
-        self._validator = shear_skin.SampleValidator(current_a, SOURCE_PERIOD_S, daq_period_s, _gauge_ohm(calibration))
+        self._validator = SampleValidator(current_a, SOURCE_PERIOD_S, daq_period_s, _gauge_ohm(calibration))
         self._radius_m = _radius_m(config)
-        self._source = shear_skin.recorded_source()
+        self._source = RecordedInstrument(Keithley6430)
         adc = config.daq.adc
-        self._daq: shear_skin.RecordedInstrument[Voltages] | PairParser = (
-            shear_skin.recorded_scanner() if adc is None else PairParser(config.daq.rate_hz, adc.full_scale_v)
+        self._daq: RecordedInstrument[Voltages] | PairParser = (
+            RecordedInstrument(ScpiScanner) if adc is None else PairParser(config.daq.rate_hz, adc.full_scale_v)
         )
-        self._latest: shear_skin.SourceReading | None = None
+        self._latest: SourceReading | None = None
 
     def handle(self, source: str, event: RawEvent) -> list[SkinShear]:
         """Return the messages that a source's event leads to, without processing time."""
@@ -247,14 +267,14 @@ def _current_source(config: SkinConfig, inputs: InputRecorder | None) -> Keithle
     return Keithley6430(link, source.current_ma * 1e-3, source.compliance_v, SOURCE_PERIOD_S, inputs=inputs)
 
 
-def _daq(config: SkinConfig, inputs: InputRecorder | None) -> shear_skin.Daq:
+def _daq(config: SkinConfig, inputs: InputRecorder | None) -> Daq:
     rate_hz, scanner, adc = config.daq.rate_hz, config.daq.scanner, config.daq.adc
     monitor = LinkMonitor(LinkLog("skin daq"))
     if scanner is not None:
         link = _link(scanner.socket, None, DEFAULT_BAUD, monitor)
-        return shear_skin.ScpiScanner(link, scanner.channels, rate_hz, scanner.range_v, inputs=inputs)
+        return ScpiScanner(link, scanner.channels, rate_hz, scanner.range_v, inputs=inputs)
     if adc is not None:
-        return shear_skin.AdcBoard(_link(None, adc.device, DEFAULT_BAUD, monitor), rate_hz, adc.full_scale_v, inputs)
+        return AdcBoard(_link(None, adc.device, DEFAULT_BAUD, monitor), rate_hz, adc.full_scale_v, inputs)
     raise ValueError("a skin needs an instrument that reads its voltages")
 
 

@@ -2,7 +2,7 @@
 
 import asyncio
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -11,11 +11,11 @@ import zmq
 import zmq.asyncio
 
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S
+from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S, needs_keys, stop_address
 from shearloop.daemon.messaging.client import connect, decode_reply, no_reply
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.messages import TOPICS, EitFrame, EitHeatmap, decode, encode
-from shearloop.daemon.web.latest import LatestMessages
+from shearloop.daemon.web.message_store import MessageStore
 
 # The largest message is a heatmap of 200 × 200 float32.
 MAX_MESSAGE_BYTES = 1 << 20
@@ -30,8 +30,10 @@ class DaemonAddress:
     publish: str
     commands: str
     keys: ClientKeys | None = None
-    # Returns the local address that accepts a stop without a key.
-    stop_address: Callable[[], str] | None = None
+
+    def stop_address(self) -> str:
+        """Return where to send a stop: a local daemon accepts it even without valid keys."""
+        return self.commands if needs_keys(self.commands) else stop_address(self.commands)
 
 
 class BusyError(Exception):
@@ -41,7 +43,7 @@ class BusyError(Exception):
 class Bridge:
     """Receives the messages of one daemon and sends commands to it."""
 
-    def __init__(self, context: zmq.asyncio.Context, address: DaemonAddress, latest: LatestMessages) -> None:
+    def __init__(self, context: zmq.asyncio.Context, address: DaemonAddress, latest: MessageStore) -> None:
         """Subscribe to the daemon, whether or not it runs; raise UserError for a malformed address."""
         self.latest = latest
         self._context = context
@@ -108,14 +110,15 @@ class Bridge:
         Raises UserError without a reply.
         """
         if self._stopping is None or self._stopping.done():
-            local = self._address.stop_address
-            address = self._address.commands if local is None else local()
-            content = {"command": "stop", "spare_daemon": True}
-            self._stopping = asyncio.ensure_future(self._request(address, content, COMMAND_TIMEOUT_S))
+            request = self._request(self._address.stop_address(), {"command": "stop", "spare_daemon": True})
+            self._stopping = asyncio.ensure_future(request)
         # Shielded: a page that disappears has still requested the stop.
         return await asyncio.shield(self._stopping)
 
-    async def _request(self, address: str, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
+    async def _request(
+        self, address: str, content: Mapping[str, Any], timeout_s: float | None = None
+    ) -> dict[str, Any]:
+        timeout_s = timeout_s or COMMAND_TIMEOUT_S
         with self._command_socket(address) as socket:
             try:
                 async with asyncio.timeout(timeout_s):

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S, N_VALUES
+from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.ports import PtyPort
 from shearloop.drivers.load_cell import COUNTS_MAX, COUNTS_MIN
 
-FLOOD_BYTES = 100_000
 # Lateness of this process that is made up for, so that fast rates are kept on average.
 CATCH_UP_S = 0.05
 # The mean over 4882 lines of the paper's rig.
@@ -31,7 +31,7 @@ CORRUPTED = 38399996
 class BoardFaultKind(Enum):
     """Faults of boards; the value is the name on the command line."""
 
-    # The next line arrives broken.
+    # The next line arrives broken, or not at all.
     CUT_LINE = "cut-line"
     WRONG_COUNT = "wrong-count"
     NAN = "nan"
@@ -40,16 +40,11 @@ class BoardFaultKind(Enum):
     MISSING = "missing"
     # Bytes that are not a line.
     GARBAGE = "garbage"
-    FLOOD = "flood"
-    # The next line comes twice.
-    REPEAT = "repeat"
     # Lasts for a number of seconds.
     SILENCE = "silence"
     SATURATION = "saturation"
     STUCK = "stuck"
     UNPLUG = "unplug"
-    # Raises the torque by an offset in N·m.
-    JUMP = "jump"
 
 
 _K = BoardFaultKind
@@ -58,31 +53,24 @@ TIMED_FAULTS = (_K.SILENCE, _K.SATURATION, _K.STUCK, _K.UNPLUG)
 
 @dataclass(frozen=True, slots=True)
 class BoardFault:
-    """One fault, with its seconds or N·m."""
+    """One fault, with its seconds; None without an end."""
 
     kind: BoardFaultKind
-    amount: float | None = None
+    seconds: float | None = None
 
 
 def parse_fault(text: str, kinds: Collection[BoardFaultKind]) -> BoardFault:
-    """Return the fault `NAME`, `NAME:AMOUNT` or `NAME AMOUNT`; raises ValueError with a sentence."""
-    name, _, amount = text.strip().replace(" ", ":").partition(":")
+    """Return the fault `NAME`, `NAME:SECONDS` or `NAME SECONDS`; raises ValueError with a sentence."""
+    name, _, seconds = text.strip().replace(" ", ":").partition(":")
     kind = next((kind for kind in kinds if kind.value == name), None)
     if kind is None:
         raise ValueError(f"there is no fault {name!r}; there are {', '.join(kind.value for kind in kinds)}")
-    try:
-        value = float(amount) if amount else None
-    except ValueError:
-        value = math.nan
-    if kind is BoardFaultKind.JUMP:
-        if value is None or not math.isfinite(value):
-            raise ValueError("a jump needs its height in N·m; write for instance jump:0.05")
-    elif value is not None:
-        if kind not in TIMED_FAULTS:
-            raise ValueError(f"{name} has no duration; write {name} alone")
-        if not 0 <= value < math.inf:
-            raise ValueError(f"{amount!r} is no duration in seconds; write for instance {name}:3")
-    return BoardFault(kind, value)
+    if not seconds:
+        return BoardFault(kind)
+    if kind not in TIMED_FAULTS:
+        raise ValueError(f"{name} has no duration; write {name} alone")
+    no_duration = f"no duration in seconds; write for instance {name}:3"
+    return BoardFault(kind, number_between(seconds, 0.0, 1e9, no_duration))
 
 
 class EmulatedBoard(ABC):
@@ -96,14 +84,13 @@ class EmulatedBoard(ABC):
 
     def __init__(self, period_s: float, link: Path | None, seed: int) -> None:
         self.port = PtyPort(link)
-        self.finished = asyncio.Event()
         self._period_s = period_s
         self._random = Random(seed)
         self._injected: deque[BoardFault] = deque()
 
     @abstractmethod
     async def run(self) -> None:
-        """Play until cancelled; at the end of the data the board stays plugged in and `finished` is set."""
+        """Play until cancelled; at the end of the data the board stays plugged in."""
 
     @abstractmethod
     def recover(self) -> None:
@@ -136,10 +123,7 @@ class EitKitBoard(EmulatedBoard):
     faults. Only an unplugged board loses a frame; a silence without a duration lasts until the next `y`.
     """
 
-    faults = (
-        *(_K.CUT_LINE, _K.WRONG_COUNT, _K.NAN, _K.GARBAGE, _K.FLOOD, _K.REPEAT),
-        *(_K.SILENCE, _K.UNPLUG),
-    )
+    faults = (_K.CUT_LINE, _K.WRONG_COUNT, _K.NAN, _K.GARBAGE, _K.SILENCE, _K.UNPLUG)
 
     def __init__(
         self,
@@ -164,7 +148,7 @@ class EitKitBoard(EmulatedBoard):
             self.port.received.put_nowait(b"y")
 
     async def run(self) -> None:
-        """Play until cancelled; at the end of the frames the board stays plugged in and `finished` is set."""
+        """Play until cancelled; at the end of the frames the board stays plugged in."""
         loop = asyncio.get_running_loop()
         with self.port:
             await self._wait_for_start()
@@ -175,8 +159,8 @@ class EitKitBoard(EmulatedBoard):
                 await asyncio.sleep(due_s - loop.time())
                 fault = self._fault_at.pop(number, None) or (self._injected.popleft() if self._injected else None)
                 if fault is not None and fault.kind is _K.SILENCE:
-                    self._silent = fault.amount is None
-                    await (self._wait_for_start() if fault.amount is None else self._pause(fault.amount))
+                    self._silent = fault.seconds is None
+                    await (self._wait_for_start() if fault.seconds is None else self._pause(fault.seconds))
                     self._silent, fault = False, None
                 values = next(frames, None)
                 if values is None:
@@ -185,7 +169,6 @@ class EitKitBoard(EmulatedBoard):
                 if loop.time() - due_s > CATCH_UP_S:
                     # Held up by the reader or a fault: the next frame takes a whole period from here.
                     due_s = loop.time()
-            self.finished.set()
             await loop.create_future()
 
     async def _send(self, line: bytes, fault: BoardFault | None) -> None:
@@ -193,17 +176,13 @@ class EitKitBoard(EmulatedBoard):
             case _K.UNPLUG:
                 await self.port.write(line[: len(line) // 2])
                 await self.port.break_off()
-                await self._pause(None if fault is None else fault.amount)
+                await self._pause(None if fault is None else fault.seconds)
                 self.port.plug()
                 # Without power the board has forgotten its start.
                 await self._wait_for_start()
                 return
             case _K.GARBAGE:
                 await self.port.write(self._garbage(700) + b"\n")
-            case _K.FLOOD:
-                await self.port.write(bytes(self._random.choices(b"0123456789., ", k=FLOOD_BYTES)) + b"\n")
-            case _K.REPEAT:
-                await self.port.write(line)
             case _K.CUT_LINE:
                 line = line[: self._random.randrange(len(line) // 10, len(line) - 10)] + b"\n"
             case _K.WRONG_COUNT | _K.NAN as kind:
@@ -237,7 +216,6 @@ class ConverterBoard(EmulatedBoard):
         self._lasting: BoardFaultKind | None = None
         self._lasts_until_s = 0.0
         self._last_line = b""
-        self._offset = 0.0
 
     @abstractmethod
     def _convert(self) -> bytes:
@@ -246,11 +224,10 @@ class ConverterBoard(EmulatedBoard):
     def recover(self) -> None:
         """End every fault and plug the port in."""
         self._injected.clear()
-        self._offset = 0.0
         self._end_lasting()
 
     async def run(self) -> None:
-        """Play until cancelled; at the end of the data the board stays plugged in and `finished` is set."""
+        """Play until cancelled; at the end of the data the board stays plugged in."""
         loop = asyncio.get_running_loop()
         due_s = loop.time()
         with self.port:
@@ -264,7 +241,6 @@ class ConverterBoard(EmulatedBoard):
                 line = self._with_faults(line, loop.time())
                 with contextlib.suppress(ConnectionError):  # unplugged while the line waited for a reader
                     await self.port.write(line)
-            self.finished.set()
             await loop.create_future()
 
     def _with_faults(self, line: bytes, now_s: float) -> bytes:
@@ -292,12 +268,10 @@ class ConverterBoard(EmulatedBoard):
                 return line[len(line) // 2 :]
             case _K.MISSING:
                 return b""
-            case _K.JUMP:
-                self._offset += fault.amount or 0.0
             case kind:
                 self._end_lasting()
                 self._lasting = kind
-                self._lasts_until_s = math.inf if fault.amount is None else now_s + fault.amount
+                self._lasts_until_s = math.inf if fault.seconds is None else now_s + fault.seconds
                 if kind is _K.UNPLUG:
                     self.port.unplug()
         return line
@@ -328,7 +302,7 @@ PAPER_SKETCH = Sketch(counts_per_nm=1.0, tare_counts=0.0, noise_counts=2e-5, dec
 class Hx711Board(ConverterBoard):
     """The load cell's board: converts each of `torques_nm`, requested at the end of its conversion."""
 
-    faults = (_K.GARBAGE, _K.SPIKE, _K.TORN, _K.SILENCE, _K.SATURATION, _K.STUCK, _K.UNPLUG, _K.JUMP)
+    faults = (_K.GARBAGE, _K.SPIKE, _K.TORN, _K.SILENCE, _K.SATURATION, _K.STUCK, _K.UNPLUG)
 
     def __init__(
         self,
@@ -345,6 +319,6 @@ class Hx711Board(ConverterBoard):
 
     def _convert(self) -> bytes:
         sketch = self._sketch
-        counts = sketch.tare_counts + sketch.counts_per_nm * (next(self._torques_nm) + self._offset)
+        counts = sketch.tare_counts + sketch.counts_per_nm * next(self._torques_nm)
         counts += self._random.gauss(0.0, sketch.noise_counts)
         return f"{min(max(counts, COUNTS_MIN), COUNTS_MAX):.{sketch.decimals}f}\r\n".encode()

@@ -68,7 +68,6 @@ class RigSettings:
     run_dir: Path
     host: str = "127.0.0.1"
     gripper: Literal["socket", "modbus"] = "socket"
-    gripper_port: int = URCAP_PORT
     twin: TwinSettings = field(default_factory=TwinSettings)
     diameter_mm: float | None = 20.0
     pace: Pace = Pace()
@@ -110,7 +109,7 @@ class EmulatedRig:
             gripper,
             PtyServer(ModbusSlave(gripper), run_dir / "gripper")
             if settings.gripper == "modbus"
-            else SocketServer(UrcapSession(gripper), settings.host, settings.gripper_port),
+            else SocketServer(UrcapSession(gripper), settings.host, URCAP_PORT),
         )
         if settings.diameter_mm is not None:
             player.command(f"object {settings.diameter_mm}")

@@ -227,14 +227,6 @@ def accept_word(*words: str) -> Handler:
     return check
 
 
-def parse_boolean(text: str) -> bool:
-    """Return a command's truth value; ScpiError for other text."""
-    values = {"ON": True, "1": True, "OFF": False, "0": False}
-    if text.upper() not in values:
-        raise ScpiError(ILLEGAL_VALUE)
-    return values[text.upper()]
-
-
 def _pattern(header: str) -> re.Pattern[str]:
     """Return the pattern of a header: each word in long form or as its capitals, brackets optional."""
 
@@ -296,7 +288,8 @@ class EmulatedKeithley6430(ScpiInterpreter):
         self._elements = _parse_names(text, {*ELEMENTS})
 
     def _switch(self, text: str) -> None:
-        self.circuit.output_on = parse_boolean(text)
+        accept_word("ON", "1", "OFF", "0")(text)
+        self.circuit.output_on = text.upper() in ("ON", "1")
 
     def _read(self, _: str) -> str:
         if not self.circuit.output_on:

@@ -1,8 +1,7 @@
 """Kinematics of a UR5e, and the emulated arm with its motions, one control cycle at a time.
 
 The Denavit-Hartenberg table is Universal Robots' own ("DH Parameters for calculations of kinematics and dynamics").
-Poses are UR's: position and rotation vector. The tool is a point on the flange's z axis, so that wrist 3 turns the tool
-about its own axis.
+Poses are UR's: position and rotation vector of the flange.
 """
 
 import math
@@ -24,8 +23,8 @@ ALPHA_RAD = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
 JOINT_SPEED_LIMIT_RAD_PER_S = math.pi
 
 
-def link_frames(q_rad: Vector, tool_length_m: float) -> list[Matrix]:
-    """Return the seven frames (4, 4) from the base to the tool centre point, in base coordinates."""
+def link_frames(q_rad: Vector) -> list[Matrix]:
+    """Return the seven frames (4, 4) from the base to the flange, in base coordinates."""
     frames = [np.eye(4)]
     for theta, a, d, alpha in zip(q_rad, A_M, D_M, ALPHA_RAD, strict=True):
         c, s, ca, sa = math.cos(theta), math.sin(theta), math.cos(alpha), math.sin(alpha)
@@ -33,8 +32,6 @@ def link_frames(q_rad: Vector, tool_length_m: float) -> list[Matrix]:
             [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0.0, sa, ca, d], [0.0, 0.0, 0.0, 1.0]]
         )
         frames.append(frames[-1] @ link)
-    frames[-1] = frames[-1].copy()
-    frames[-1][:3, 3] += tool_length_m * frames[-1][:3, 2]
     return frames
 
 
@@ -98,7 +95,6 @@ class LinearMove:
     target: Matrix
     speed: float
     acceleration: float
-    tool_length_m: float
 
     def __post_init__(self) -> None:
         """Compute the length; a move that only turns is measured in radians."""
@@ -110,7 +106,7 @@ class LinearMove:
     def advance(self, q_rad: Vector, qd_rad_per_s: Vector, dt_s: float) -> Advanced:  # noqa: ARG002 - on its own rails
         """Return the arm one cycle later; `PathError` where the joints cannot follow within their limits."""
         share = self._advance_trapezoid(dt_s)
-        frames = link_frames(q_rad, self.tool_length_m)
+        frames = link_frames(q_rad)
         here = frames[-1]
         where = self.start[:3, 3] + share * (self.target[:3, 3] - self.start[:3, 3])
         turned = self.start[:3, :3] @ Rotation.from_rotvec(share * self._turn).as_matrix()
@@ -139,12 +135,11 @@ class LinearMove:
 class Arm:
     """The arm's joints, what moves them, and the wrench at the tool (6,) in base coordinates."""
 
-    def __init__(self, start_rad: tuple[float, ...], tool_length_m: float) -> None:
+    def __init__(self, start_rad: tuple[float, ...]) -> None:
         self.q_rad: Vector = np.array(start_rad)
         self.qd_rad_per_s: Vector = np.zeros(6)
         self.motion: Motion | None = None
-        self._tool_length_m = tool_length_m
-        self._frame = link_frames(self.q_rad, tool_length_m)[-1]
+        self._frame = link_frames(self.q_rad)[-1]
         self._wrench = np.zeros(6)
         self._wrench_zero = np.zeros(6)
 
@@ -171,7 +166,7 @@ class Arm:
         """Begin a linear move."""
         goal = np.eye(4)
         goal[:3, :3], goal[:3, 3] = Rotation.from_rotvec(pose[3:]).as_matrix(), pose[:3]
-        self.motion = LinearMove(self._frame, goal, speed, acceleration, self._tool_length_m)
+        self.motion = LinearMove(self._frame, goal, speed, acceleration)
 
     def halt(self, deceleration: float) -> None:
         """Slow every joint down to rest."""
@@ -182,7 +177,7 @@ class Arm:
         if self.motion is not None:
             self.q_rad, self.qd_rad_per_s, finished = self.motion.advance(self.q_rad, self.qd_rad_per_s, dt_s)
             self.motion = None if finished else self.motion
-            self._frame = link_frames(self.q_rad, self._tool_length_m)[-1]
+            self._frame = link_frames(self.q_rad)[-1]
 
     def load(self, torque_nm: float) -> None:
         """Take a torque about the tool's axis."""

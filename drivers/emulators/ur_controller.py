@@ -10,7 +10,7 @@ from typing import Any
 
 from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, Robot, RobotEvent, armed_hz
-from shearloop.drivers.emulators.ur_rtde import ConnectionFaults, NotRtdeError, RtdeSession
+from shearloop.drivers.emulators.ur_rtde import VERSION_NUMBERS, ConnectionFaults, NotRtdeError, RtdeSession
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 # A control script closes its outermost block in the first column.
@@ -168,8 +168,7 @@ class Controller:
         robot = self.robot
         match request:
             case "PolyscopeVersion":
-                major, minor, patch, build = (*robot.spec.version, 0, 0, 0)[:4]
-                return f"URSoftware {major}.{minor}.{patch}.{build} (Jun 01 2024)"
+                return f"URSoftware {'.'.join(map(str, VERSION_NUMBERS))} (Jun 01 2024)"
             case "get serial number":
                 return "20235500001"
             case "is in remote control":

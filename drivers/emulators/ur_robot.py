@@ -11,12 +11,13 @@ program, as in URScript. Commands that the driver never sends end the program.
 
 import math
 import re
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
-from shearloop.drivers.emulators.ur_arm import Arm, Motion, PathError, Vector
+from shearloop.drivers.emulators.ur_arm import Arm, Motion, PathError
 
 # An event's name and detail.
 Event = tuple[str, str]
@@ -47,10 +48,8 @@ class WristPlant(Protocol):
 class ControllerSpec:
     """The kind of controller."""
 
-    version: tuple[int, ...] = (5, 17, 3, 0)
     unlock_wait_s: float = 5.0
     power_on_s: float = 1.0
-    tool_length_m: float = 0.0
     # Elbow up, the tool pointing straight down.
     start_rad: tuple[float, ...] = (0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0)
 
@@ -72,35 +71,24 @@ def armed_hz(text: bytes | bytearray) -> float:
     return float(found[1]) if found is not None else 0.0
 
 
-class Registers:
+class Registers(defaultdict[str, float]):
     """The RTDE registers by name; they outlive programs and clients."""
 
     def __init__(self) -> None:
-        self._values: dict[str, float] = {}
+        """Set every register to 0."""
+        super().__init__(int)
         # The last write of the command register, which is the heartbeat too.
         self.commanded_s = 0.0
 
     def write(self, name: str, value: float, now_s: float) -> None:
         """Set an input register, as a client does over RTDE."""
-        self._values[name] = value
+        self[name] = value
         if name == COMMAND:
             self.commanded_s = now_s
 
-    def put(self, name: str, value: float) -> None:
-        """Set an output register."""
-        self._values[name] = value
-
-    def number(self, name: str) -> float:
-        """Return a register."""
-        return self._values.get(name, 0)
-
-    def double(self, number: int) -> float:
-        """Return an input register of the type double."""
-        return self.number(f"input_double_register_{number}")
-
-    def vector(self) -> Vector:
-        """Return the first six input registers of the type double."""
-        return np.array([self.double(number) for number in range(6)])
+    def doubles(self) -> list[float]:
+        """Return the first eight input registers of the type double."""
+        return [self[f"input_double_register_{number}"] for number in range(8)]
 
 
 class ProgramEndedError(Exception):
@@ -123,7 +111,7 @@ class ControlScript:
         self._thread = ""
         self._writes = self._operations = 0
         self._report_async(running=False)
-        registers.put("output_int_register_0", READY)
+        registers["output_int_register_0"] = READY
 
     def cycle(self, now_s: float) -> Event | None:
         """Run the main loop once and return what happened; ProgramEndedError where the program ends."""
@@ -136,45 +124,46 @@ class ControlScript:
             if self._arm.motion is self._blocked_on:
                 return None
             self._blocked_on = None
-            registers.put("output_int_register_0", DONE)
-        command = int(registers.number(COMMAND))
+            registers["output_int_register_0"] = DONE
+        command = int(registers[COMMAND])
         event = None
         if command == SPEED_J:
             self._claim_arm("speed")
-            self._arm.turn(registers.vector(), registers.double(6))
-            registers.put("output_int_register_0", READY)
+            doubles = registers.doubles()
+            self._arm.turn(np.array(doubles[:6]), doubles[6])
+            registers["output_int_register_0"] = READY
         elif command == 0:
             self._executing = False
-            registers.put("output_int_register_0", READY)
+            registers["output_int_register_0"] = READY
         elif not self._executing:
             self._executing = True
             event = self._run_once(command, now_s)
             if self._blocked_on is None:
-                registers.put("output_int_register_0", DONE)
+                registers["output_int_register_0"] = DONE
         return event
 
     def _run_once(self, command: int, now_s: float) -> Event | None:
-        registers = self._registers
-        asynchronous = registers.number("input_int_register_1") == 1
+        registers, doubles = self._registers, self._registers.doubles()
+        asynchronous = registers["input_int_register_1"] == 1
         if command == MOVE_L:
             self._end_move()
             self._claim_arm("move")
-            self._arm.move_to(registers.vector(), registers.double(6), registers.double(7))
+            self._arm.move_to(np.array(doubles[:6]), *doubles[6:])
             self._begin(asynchronous=asynchronous)
         elif command == SPEED_STOP:
-            self._arm.halt(registers.double(0))
+            self._arm.halt(doubles[0])
             self._begin(asynchronous=False)
         elif command == STOP_J:
             self._end_move()
             self._claim_arm("move")
-            self._arm.halt(registers.double(0))
+            self._arm.halt(doubles[0])
             self._begin(asynchronous=asynchronous)
         elif command == ZERO_FT:
             self._arm.zero_wrench()
             return "wrench-zeroed", ""
         elif command == SET_WATCHDOG:
-            self._watchdog_s, self._watched_since_s = 1.0 / registers.double(0), now_s
-            return "watchdog-armed", f"{registers.double(0):g} Hz"
+            self._watchdog_s, self._watched_since_s = 1.0 / doubles[0], now_s
+            return "watchdog-armed", f"{doubles[0]:g} Hz"
         elif command == END:
             raise ProgramEndedError("the client ended it")
         else:
@@ -203,7 +192,7 @@ class ControlScript:
     def _report_async(self, *, running: bool) -> None:
         self._writes = (self._writes + 1) % 128
         status = (self._writes << 16) | (self._operations << 24) | (ASYNC_RUNNING if running else 0)
-        self._registers.put("output_int_register_2", status)
+        self._registers["output_int_register_2"] = status
 
 
 class SafetyController:
@@ -272,7 +261,7 @@ class Robot:
     def __init__(self, spec: ControllerSpec | None = None, plant: WristPlant | None = None, pace: float = 1.0) -> None:
         """Be switched on, at rest, without a program."""
         self.spec = spec or ControllerSpec()
-        self.arm = Arm(self.spec.start_rad, self.spec.tool_length_m)
+        self.arm = Arm(self.spec.start_rad)
         self.safety = SafetyController(self.spec)
         self.registers = Registers()
         self.runtime_state = STOPPED

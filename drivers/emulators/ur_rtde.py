@@ -18,6 +18,8 @@ from shearloop.drivers.emulators.ur_robot import (
 
 Value = int | float | Sequence[float] | Vector
 
+# PolyScope's.
+VERSION_NUMBERS = (5, 17, 3, 0)
 VERSION, URCONTROL_VERSION, DATA, OUTPUTS, INPUTS, START, PAUSE = b"VvUOISP"
 _HEADER = struct.Struct(">HB")
 # The largest input recipe has 25 registers; a longer package than this is no RTDE.
@@ -49,25 +51,21 @@ _VARIABLES: dict[str, tuple[str, Callable[[Robot], Value]]] = {
     "speed_scaling": ("DOUBLE", lambda _: 1.0),
     "external_force_torque": ("VECTOR6D", lambda _: (0.0,) * 6),
 }
-# The version that introduced a variable; an older controller answers NOT_FOUND.
-SINCE = {"external_force_torque": (5, 4)}
 
 
-def known_type(name: str, version: tuple[int, ...]) -> str | None:
-    """Return the RTDE type of a variable, or None where a controller of this version does not have it."""
+def known_type(name: str) -> str | None:
+    """Return the RTDE type of a register or variable, or None for an unknown one."""
     register = _REGISTER.fullmatch(name)
     if register is not None and int(register[3]) < _REGISTERS:
         return "INT32" if register[2] == "int" else "DOUBLE"
-    if name not in _VARIABLES or version[:2] < SINCE.get(name, (0, 0)):
-        return None
-    return _VARIABLES[name][0]
+    return _VARIABLES[name][0] if name in _VARIABLES else None
 
 
 def variable(robot: Robot, name: str) -> Value:
     """Return the present value of a known register or variable."""
     if name in _VARIABLES:
         return _VARIABLES[name][1](robot)
-    value = robot.registers.number(name)
+    value = robot.registers[name]
     return int(value) if "_int_" in name else value
 
 
@@ -149,7 +147,7 @@ class RtdeSession:
         if kind == VERSION:
             return package(VERSION, bytes([payload == b"\x00\x02" and not self.faults.refuse_protocol]))
         if kind == URCONTROL_VERSION:
-            return package(URCONTROL_VERSION, struct.pack(">4I", *(*self.robot.spec.version, 0, 0, 0)[:4]))
+            return package(URCONTROL_VERSION, struct.pack(">4I", *VERSION_NUMBERS))
         if kind == OUTPUTS:
             return self._set_outputs(payload)
         if kind == INPUTS:
@@ -165,7 +163,7 @@ class RtdeSession:
             raise NotRtdeError(f"an output rate of {rate_hz:g} Hz")
         self._period_s = 1.0 / min(rate_hz, self.rate_hz)
         names = _names(payload[8:])
-        kinds = [(name, known_type(name, self.robot.spec.version)) for name in names]
+        kinds = [(name, known_type(name)) for name in names]
         self._outputs = [name for name, kind in kinds if kind is not None]
         self._kinds = [kind for _, kind in kinds if kind is not None]
         missing = len(self._kinds) < len(kinds)
@@ -174,7 +172,7 @@ class RtdeSession:
 
     def _set_inputs(self, payload: bytes) -> bytes:
         names = _names(payload)
-        kinds = [known_type(name, self.robot.spec.version) or "NOT_FOUND" for name in names]
+        kinds = [known_type(name) or "NOT_FOUND" for name in names]
         if self.faults.registers_in_use:
             kinds = ["IN_USE" if "_register_" in name else kind for name, kind in zip(names, kinds, strict=True)]
         if {"IN_USE", "NOT_FOUND"} & set(kinds):
@@ -186,7 +184,7 @@ class RtdeSession:
         if not payload or not 1 <= payload[0] <= len(self._inputs):
             raise NotRtdeError("data for an input recipe that was not agreed on")
         names = self._inputs[payload[0] - 1]
-        values = unpack([known_type(name, self.robot.spec.version) or "" for name in names], payload[1:])
+        values = unpack([known_type(name) or "" for name in names], payload[1:])
         if values is None:
             # The client sends a vector of a wrong length as a short package; a controller drops it.
             return

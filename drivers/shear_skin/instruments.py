@@ -1,15 +1,33 @@
-"""The skin's instruments: a Keithley 6430 feeds the gauges; a scanner or a converter board reads their voltages."""
+"""The skin's instruments: a Keithley 6430 feeds the gauges; a scanner or a converter board reads their voltages.
 
+SCPI instruments get one query at a time over a serial port or socket, at a steady rate, and are reconnected.
+"""
+
+import asyncio
 import re
+from abc import ABC, abstractmethod
 from collections import Counter
+from collections.abc import AsyncGenerator
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import TypeAlias
+from time import monotonic_ns
+from typing import Generic, TypeAlias, TypeVar
 
-from shearloop.drivers import serial_sensor
-from shearloop.drivers.connection import Diagnostics, Link
+from shearloop.drivers.connection import Diagnostics, Link, Port
 from shearloop.drivers.errors import DeviceLostError, DeviceSilentError, DriverError, ProtocolError
 from shearloop.drivers.load_cell import describe_errors
-from shearloop.drivers.shear_skin import scpi
+from shearloop.drivers.serial_sensor import InputKind, InputRecorder, LineSplitter, RawEvent, SerialSensor, TimedLines
+
+# A reading of five elements is 70 characters long.
+MAX_REPLY_BYTES = 512
+# Replies to earlier queries, skipped before the answer to *IDN?.
+MAX_STALE_REPLIES = 8
+REPLY_TIMEOUT_S = 2.0
+# Misunderstood replies in a row before the connection is reopened.
+MAX_STRIKES = 3
+# The values of an overload and of an unmeasured quantity (SCPI-1999, 7.2.1.4 and 7.2.1.5).
+OVERLOAD, NOT_A_NUMBER = 9.9e37, 9.91e37
+_NUMBER = re.compile(r" *[+-]?[0-9]{1,12}(\.[0-9]{0,12})?([Ee][+-]?[0-9]{1,2})? *")
 
 # The current source. Commands and status word: manual 6430-901-01, section 17; the 2400 series understands them too.
 MODELS = ("MODEL 6430", "MODEL 24")
@@ -46,6 +64,235 @@ _PAIR_ERRORS = {
     "unfinished": "The converter board broke off in the middle of a line; check its plug and its power.",
 }
 
+ReadingT = TypeVar("ReadingT")
+
+
+class ReplyLines(LineSplitter):
+    """Splits bytes into replies, however they are sliced; instruments end them with CR, LF or both. No I/O."""
+
+    def __init__(self) -> None:
+        super().__init__(MAX_REPLY_BYTES)
+        self._not_ascii = 0
+        self.unasked = 0
+
+    @property
+    def errors(self) -> Counter[str]:
+        """The number of rejected replies, by kind."""
+        return +Counter(
+            {
+                "too long": self.too_long,
+                "unfinished": self.unfinished,
+                "unasked": self.unasked,
+                "not ASCII": self._not_ascii,
+            }
+        )
+
+    def replies(self, data: bytes) -> list[str]:
+        """Return the replies that `data` completes, without line ends; empty lines are ignored."""
+        replies = []
+        for line in self.feed(data.replace(b"\r", b"\n")):
+            if line is None:
+                continue
+            if not line.isascii():
+                self._not_ascii += 1
+            elif text := line.decode().strip():
+                replies.append(text)
+        return replies
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """An instrument's answer, and the times of query and answer (monotonic, ns)."""
+
+    text: str
+    t_asked_ns: int
+    t_arrival_ns: int
+
+
+def parse_numbers(text: str, count: int, instrument: str) -> list[float]:
+    """Return the comma-separated numbers of a reply; ProtocolError unless there are exactly `count`."""
+    parts = text.split(",")
+    if len(parts) != count or not all(map(_NUMBER.fullmatch, parts)):
+        raise ProtocolError(f"{instrument} sent {text[:60]!r}, which is not {count} numbers; check the baud rate.")
+    return [float(part) for part in parts]
+
+
+class ScpiSession:
+    """Queries and commands over a link that may break; after an error call `link.lost`."""
+
+    def __init__(self, link: Link, instrument: str, timeout_s: float, inputs: InputRecorder | None) -> None:
+        """Use the link; `instrument` names it in messages, `inputs` keeps queries and their replies."""
+        self._inputs = inputs
+        self._link = link
+        self._instrument = instrument
+        self._timeout_s = timeout_s
+        self.lines = ReplyLines()
+        self._waiting: list[tuple[str, int]] = []
+
+    async def identify(self, *models: str) -> str:
+        """Return the reply to *IDN?, skipping stale replies; ProtocolError unless it names one of the models."""
+        self.lines.restart()
+        self._waiting.clear()
+        name = (await self.ask("*IDN?")).text
+        for _ in range(MAX_STALE_REPLIES):
+            # A name has four fields; the first is not a number.
+            if name.count(",") >= 3 and not name.lstrip("+-")[:1].isdigit():
+                break
+            name = (await self._next(0, "*IDN?")).text
+        if models and not any(model in name for model in models):
+            raise ProtocolError(
+                f"{self._instrument} says it is {name!r}, and not {' or '.join(models)}; see which instrument is there."
+            )
+        return name
+
+    async def send(self, *commands: str) -> None:
+        """Send commands; `check` reports errors."""
+        for command in commands:
+            await self._port.write(f"{command}\n".encode())
+
+    async def ask(self, query: str) -> Reply:
+        """Return the answer to a query; DeviceSilentError if none comes, DeviceLostError if the port is gone."""
+        # An unasked reply must not pass for the answer.
+        self.lines.unasked += len(self._waiting)
+        self._waiting.clear()
+        asked_ns = monotonic_ns()
+        await self.send(query)
+        reply = await self._next(asked_ns, query)
+        if self._inputs is not None:
+            self._inputs.record(RawEvent(InputKind.ASKED, asked_ns, query.encode()))
+            self._inputs.record(RawEvent(InputKind.DATA, reply.t_arrival_ns, reply.text.encode()))
+        return reply
+
+    async def ask_until(self, query: str, answer: str, timeout_s: float) -> None:
+        """Send a query and skip replies until `answer` comes; DeviceSilentError after `timeout_s`."""
+        await self.send(query)
+        deadline_ns = monotonic_ns() + int(timeout_s * 1e9)
+        while (await self._next(0, query, deadline_ns)).text != answer:
+            pass
+
+    async def check(self) -> None:
+        """Raise ProtocolError if the instrument rejected a command."""
+        reply = (await self.ask(":SYST:ERR?")).text
+        try:
+            accepted = int(reply.split(",")[0]) == 0
+        except ValueError:
+            accepted = False
+        if not accepted:
+            raise ProtocolError(
+                f"{self._instrument} refused its settings: {reply}; see whether it is the model that is meant."
+            )
+
+    @property
+    def _port(self) -> Port:
+        if self._link.port is None:
+            raise DeviceLostError(f"There is no connection to {self._instrument} at present.")
+        return self._link.port
+
+    async def _next(self, asked_ns: int, query: str, deadline_ns: int | None = None) -> Reply:
+        begin_ns = monotonic_ns()
+        if deadline_ns is None:
+            deadline_ns = begin_ns + int(self._timeout_s * 1e9)
+        while not self._waiting:
+            left_s = (deadline_ns - monotonic_ns()) / 1e9
+            try:
+                received = await self._port.read(left_s) if left_s > 0 else None
+            except DeviceLostError as error:
+                if not self.lines.in_line:
+                    raise
+                raise DeviceLostError(
+                    f"{self._instrument} broke off in the middle of its answer to {query!r}: {error}"
+                ) from error
+            if received is None:
+                waited_s = (deadline_ns - begin_ns) / 1e9
+                raise DeviceSilentError(
+                    f"{self._instrument} at {self._port.path} has not answered {query!r} within {waited_s:.2g} s; "
+                    "see that it is on, and that baud rate and line end are as configured."
+                )
+            self._waiting += [(text, received.t_arrival_ns) for text in self.lines.replies(received.data)]
+        text, arrival_ns = self._waiting.pop(0)
+        return Reply(text, asked_ns, arrival_ns)
+
+
+class PolledInstrument(ABC, Generic[ReadingT]):
+    """One SCPI instrument behind a link: set up once, then asked at a steady rate, and reconnected when lost."""
+
+    def __init__(
+        self, link: Link, instrument: str, period_s: float, timeout_s: float, inputs: InputRecorder | None
+    ) -> None:
+        self._link = link
+        self.period_s = period_s
+        self._session = ScpiSession(link, instrument, timeout_s, inputs)
+        self._strikes = 0
+        self._count = 0
+        self._errors: Counter[str] = Counter()
+        self._name = ""
+
+    @abstractmethod
+    async def _set_up(self) -> str:
+        """Configure a freshly opened instrument; return its name."""
+
+    @abstractmethod
+    async def _read(self) -> ReadingT:
+        """Ask for one reading."""
+
+    @staticmethod
+    @abstractmethod
+    def parse(query: str, reply: Reply) -> ReadingT | None:
+        """Return the reading in a reply to a query, if it has one; ProtocolError for a bad reply."""
+
+    async def _shut_down(self) -> None:
+        """Leave the instrument in a safe state; its port may be gone."""
+
+    async def readings(self) -> AsyncGenerator[ReadingT]:
+        """Yield a reading every period, without end; reconnects when the instrument disappears.
+
+        Iterate within `contextlib.aclosing`, which leaves the instrument in a safe state.
+        """
+        loop = asyncio.get_running_loop()
+        due_s = loop.time()
+        with self._link:
+            try:
+                while True:
+                    try:
+                        if self._link.port is None:
+                            await self._link.open()
+                            self._name = await self._set_up()
+                        # Late polls are skipped: the phase is kept.
+                        now_s = loop.time()
+                        if due_s < now_s:
+                            due_s += (now_s - due_s) // self.period_s * self.period_s
+                        await asyncio.sleep(max(due_s - now_s, 0.0))
+                        due_s += self.period_s
+                        reading = await self._read()
+                    except DriverError as error:
+                        await self._handle_error(error)
+                        continue
+                    self._strikes = 0
+                    self._count += 1
+                    yield reading
+            finally:
+                await self._shut_down()
+
+    def diagnostics(self) -> Diagnostics:
+        """Return the instrument's values for `health`; counts are since the process began."""
+        return {
+            **self._link.diagnostics(),
+            "instrument": self._name,
+            "readings": self._count,
+            "errors": dict(self._errors + self._session.lines.errors),
+        }
+
+    async def _handle_error(self, error: DriverError) -> None:
+        """Ignore a few misunderstood replies as line noise; otherwise reopen the connection."""
+        not_understood = isinstance(error, ProtocolError)
+        self._errors["not understood" if not_understood else "lost"] += 1
+        self._strikes += 1
+        if self._name and not_understood and self._strikes < MAX_STRIKES:
+            return
+        self._strikes, self._name = 0, ""
+        self._session.lines.restart()
+        await self._link.lost(error)
+
 
 @dataclass(frozen=True, slots=True)
 class SourceReading:
@@ -61,28 +308,43 @@ class SourceReading:
     compliance: bool = False
 
 
-def read_elements(reply: scpi.Reply) -> SourceReading:
+class RecordedInstrument(Generic[ReadingT]):
+    """Parses an instrument's recorded replies. No I/O."""
+
+    def __init__(self, instrument: type[PolledInstrument[ReadingT]]) -> None:
+        self._instrument = instrument
+        self._asked: RawEvent | None = None
+
+    def handle(self, event: RawEvent) -> list[ReadingT]:
+        """Return the readings that an event completes; invalid replies give none, as they did live."""
+        if event.kind is InputKind.ASKED:
+            self._asked = event
+        elif event.kind is InputKind.DATA and self._asked is not None:
+            asked, self._asked = self._asked, None
+            reply = Reply(event.data.decode("latin-1"), asked.t_ns, event.t_ns)
+            with suppress(ProtocolError):
+                reading = self._instrument.parse(asked.data.decode("latin-1"), reply)
+                return [] if reading is None else [reading]
+        return []
+
+
+def read_elements(reply: Reply) -> SourceReading:
     """Return the reading in a reply to READ with the elements VOLT, CURR, STAT; ProtocolError for a bad reply."""
-    voltage_v, current_a, status = scpi.parse_numbers(reply.text, 3, "The current source")
-    if not 0 <= status < 1 << 24 or max(abs(voltage_v), abs(current_a)) >= scpi.NOT_A_NUMBER:
+    voltage_v, current_a, status = parse_numbers(reply.text, 3, "The current source")
+    if not 0 <= status < 1 << 24 or max(abs(voltage_v), abs(current_a)) >= NOT_A_NUMBER:
         raise ProtocolError(f"The current source sent {reply.text[:60]!r}, which is not a reading; was it set by hand?")
     bad = _OVERFLOW | _COMPLIANCE | _OVERVOLTAGE | _RANGE_COMPLIANCE
     return SourceReading(reply.t_arrival_ns, True, voltage_v, current_a, compliance=bool(int(status) & bad))
 
 
-def read_output(reply: scpi.Reply) -> SourceReading | None:
+def read_output(reply: Reply) -> SourceReading | None:
     """Return a reading if a reply to OUTPUT says off, None if on; ProtocolError for a bad reply."""
     if reply.text not in ("0", "1"):
         raise ProtocolError(f"The current source sent {reply.text[:60]!r} instead of 0 or 1.")
     return SourceReading(reply.t_arrival_ns, output_on=False) if reply.text == "0" else None
 
 
-def recorded_source() -> scpi.RecordedInstrument[SourceReading]:
-    """Return a parser for the recorded replies of a source."""
-    return scpi.RecordedInstrument({OUTPUT: read_output, READ: read_elements})
-
-
-class Keithley6430(scpi.PolledInstrument[SourceReading]):
+class Keithley6430(PolledInstrument[SourceReading]):
     """The current source: set up, switched on, read until the iteration ends, then switched off."""
 
     def __init__(
@@ -91,8 +353,8 @@ class Keithley6430(scpi.PolledInstrument[SourceReading]):
         current_a: float = CURRENT_A,
         compliance_v: float = COMPLIANCE_V,
         period_s: float = SOURCE_PERIOD_S,
-        timeout_s: float = scpi.REPLY_TIMEOUT_S,
-        inputs: serial_sensor.InputRecorder | None = None,
+        timeout_s: float = REPLY_TIMEOUT_S,
+        inputs: InputRecorder | None = None,
     ) -> None:
         super().__init__(link, "The current source", period_s, timeout_s, inputs)
         self.current_a = current_a
@@ -139,6 +401,11 @@ class Keithley6430(scpi.PolledInstrument[SourceReading]):
             return off
         return read_elements(reply)
 
+    @staticmethod
+    def parse(query: str, reply: Reply) -> SourceReading | None:
+        """Return the reading in a reply to READ, or in one to OUTPUT that says off."""
+        return read_elements(reply) if query == READ else read_output(reply) if query == OUTPUT else None
+
     async def _shut_down(self) -> None:
         """Switch the output off and wait for the confirmation."""
         if not self._may_be_on:
@@ -173,20 +440,20 @@ class Voltages:
     over_2: bool = False
 
 
-def read_scan(reply: scpi.Reply) -> Voltages:
+def read_scan(reply: Reply) -> Voltages:
     """Return the voltages in a reply to SCAN, stamped between query and answer; ProtocolError for a bad reply."""
-    v1_v, v2_v = scpi.parse_numbers(reply.text, 2, "The scanner")
+    v1_v, v2_v = parse_numbers(reply.text, 2, "The scanner")
     return Voltages(
         v1_v,
         v2_v,
         t_mid_ns=(reply.t_asked_ns + reply.t_arrival_ns) // 2,
         t_arrival_ns=reply.t_arrival_ns,
-        over_1=abs(v1_v) >= scpi.OVERLOAD,
-        over_2=abs(v2_v) >= scpi.OVERLOAD,
+        over_1=abs(v1_v) >= OVERLOAD,
+        over_2=abs(v2_v) >= OVERLOAD,
     )
 
 
-class ScpiScanner(scpi.PolledInstrument[Voltages]):
+class ScpiScanner(PolledInstrument[Voltages]):
     """A scanning multimeter on a socket (Keysight 34970A/34972A/DAQ970A and compatible): two channels a scan."""
 
     def __init__(
@@ -195,8 +462,8 @@ class ScpiScanner(scpi.PolledInstrument[Voltages]):
         channels: tuple[int, int] = SCANNER_CHANNELS,
         rate_hz: float = DAQ_RATE_HZ,
         range_v: float = SCANNER_RANGE_V,
-        timeout_s: float = scpi.REPLY_TIMEOUT_S,
-        inputs: serial_sensor.InputRecorder | None = None,
+        timeout_s: float = REPLY_TIMEOUT_S,
+        inputs: InputRecorder | None = None,
     ) -> None:
         super().__init__(link, "The scanner", 1.0 / rate_hz, timeout_s, inputs)
         self._channels = f"(@{channels[0]},{channels[1]})"
@@ -217,10 +484,10 @@ class ScpiScanner(scpi.PolledInstrument[Voltages]):
     async def _read(self) -> Voltages:
         return read_scan(await self._session.ask(SCAN))
 
-
-def recorded_scanner() -> scpi.RecordedInstrument[Voltages]:
-    """Return a parser for the recorded replies of a scanner."""
-    return scpi.RecordedInstrument({SCAN: read_scan})
+    @staticmethod
+    def parse(query: str, reply: Reply) -> Voltages | None:
+        """Return the voltages in a reply to SCAN."""
+        return read_scan(reply) if query == SCAN else None
 
 
 class PairParser:
@@ -230,29 +497,21 @@ class PairParser:
     """
 
     def __init__(self, rate_hz: float = DAQ_RATE_HZ, full_scale_v: float = ADC_FULL_SCALE_V) -> None:
-        self._lines = serial_sensor.LineSplitter(MAX_PAIR_BYTES)
+        self._lines = TimedLines(MAX_PAIR_BYTES, ADC_BAUD, rate_hz)
         self._errors: Counter[str] = Counter()
         self.partial_lines = 0
-        self._period_ns = round(1e9 / rate_hz)
         self._end_v = _END_OF_RANGE * full_scale_v
-        self._last_mid_ns: int | None = None
-        self._first = True
 
     @property
     def errors(self) -> Counter[str]:
         """The number of rejected lines, by kind."""
         return self._errors + Counter({"too long": self._lines.too_long, "unfinished": self._lines.unfinished})
 
-    def restart(self) -> None:
-        """Drop a half-received line: the port was opened, perhaps in the middle of one."""
-        self._lines.restart()
-        self._first = True
-
-    def handle(self, event: serial_sensor.RawEvent) -> list[Voltages]:
+    def handle(self, event: RawEvent) -> list[Voltages]:
         """Process a live or recorded event; return the voltages that it completes."""
-        if event.kind is serial_sensor.InputKind.OPENED:
-            self.restart()
-        elif event.kind is serial_sensor.InputKind.DATA:
+        if event.kind is InputKind.OPENED:
+            self._lines.restart()
+        elif event.kind is InputKind.DATA:
             return self.feed(event.data, event.t_ns)
         return []
 
@@ -261,36 +520,20 @@ class PairParser:
 
         The first line after opening is dropped: the rest of a number may look like a number.
         """
-        lines = self._lines.feed(data)
         found = []
-        for age, line in zip(range(len(lines) - 1, -1, -1), lines, strict=True):
-            first, self._first = self._first, False
-            if first:
+        for line in self._lines.timed(data, t_arrival_ns):
+            if line.partial:
                 self.partial_lines += 1
-            elif line is not None:
-                text = line.strip(b"\r")
-                if match := _PAIR.fullmatch(text):
-                    sent_ns = t_arrival_ns - age * self._period_ns - serial_sensor.transfer_ns(len(line) + 1, ADC_BAUD)
-                    found.append(self._voltages(float(match[1]), float(match[2]), sent_ns, t_arrival_ns))
-                else:
-                    self._errors["not two decimals" if text else "empty"] += 1
+            elif match := _PAIR.fullmatch(line.text):
+                v1_v, v2_v = float(match[1]), float(match[2])
+                over_1, over_2 = abs(v1_v) >= self._end_v, abs(v2_v) >= self._end_v
+                found.append(Voltages(v1_v, v2_v, line.t_mid_ns, t_arrival_ns, over_1, over_2))
+            else:
+                self._errors["not two decimals" if line.text else "empty"] += 1
         return found
 
-    def _voltages(self, v1_v: float, v2_v: float, t_sent_ns: int, t_arrival_ns: int) -> Voltages:
-        t_mid_ns = t_sent_ns - self._period_ns // 2
-        # Time stays in order when lines arrive in bursts.
-        self._last_mid_ns = t_mid_ns if self._last_mid_ns is None else max(t_mid_ns, self._last_mid_ns + 1)
-        return Voltages(
-            v1_v,
-            v2_v,
-            t_mid_ns=self._last_mid_ns,
-            t_arrival_ns=t_arrival_ns,
-            over_1=abs(v1_v) >= self._end_v,
-            over_2=abs(v2_v) >= self._end_v,
-        )
 
-
-class AdcBoard(serial_sensor.SerialSensor[Voltages]):
+class AdcBoard(SerialSensor[Voltages]):
     """A cheap converter board on a serial port: sends a line `v1,v2` in volts for each pair of conversions."""
 
     silence_hint = "check that it is the skin's converter board and that it has power."
@@ -300,7 +543,7 @@ class AdcBoard(serial_sensor.SerialSensor[Voltages]):
         link: Link,
         rate_hz: float = DAQ_RATE_HZ,
         full_scale_v: float = ADC_FULL_SCALE_V,
-        inputs: serial_sensor.InputRecorder | None = None,
+        inputs: InputRecorder | None = None,
     ) -> None:
         super().__init__(link, 1.0 / rate_hz, inputs)
         self.period_s = 1.0 / rate_hz
@@ -318,7 +561,7 @@ class AdcBoard(serial_sensor.SerialSensor[Voltages]):
             "error_details": describe_errors(errors, _PAIR_ERRORS),
         }
 
-    def _parse(self, event: serial_sensor.RawEvent) -> list[Voltages]:
+    def _parse(self, event: RawEvent) -> list[Voltages]:
         found = self._parser.handle(event)
         self._count += len(found)
         return found

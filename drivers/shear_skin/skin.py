@@ -6,8 +6,10 @@ from collections import Counter
 from collections.abc import AsyncGenerator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 
 from shearloop.drivers.connection import Diagnostics
+from shearloop.drivers.serial_sensor import StepFilter
 from shearloop.drivers.shear_skin.instruments import Daq, Keithley6430, SourceReading, Voltages
 
 # The resistance of the paper's gauges.
@@ -25,7 +27,6 @@ SUM_TOLERANCE = 0.1
 SOURCE_STALE_PERIODS = 4.0
 # Relative change of a resistance between two readings: three newtons within a tenth of a second.
 MAX_CHANGE = 0.25
-SETTLE_READINGS = 3
 # A live converter's noise moves its last digit.
 STUCK_AFTER = 50
 
@@ -91,7 +92,6 @@ class SampleValidator:
         """Expect the current that was set, the periods of source and voltages, and gauges of `gauge_ohm` at rest."""
         self.faults: Counter[str] = Counter()
         self.missed = 0
-        self.expected_hz = 1.0 / daq_period_s
         self._current_a = current_a
         self._gauge_v = gauge_ohm * current_a
         self._stale_ns = round(SOURCE_STALE_PERIODS * source_period_s * 1e9)
@@ -99,8 +99,7 @@ class SampleValidator:
         self._seq = 0
         self._last: Voltages | None = None
         self._repeats = [1, 1]
-        self._good: tuple[float, float] | None = None
-        self._candidates: list[tuple[float, float]] = []
+        self._steps = StepFilter[tuple[float, float]]()
         # The last fault of the source, and the time since when it works.
         self._source_fault = SkinFault.SOURCE_LOST
         self._source_since_ns: int | None = None
@@ -112,7 +111,7 @@ class SampleValidator:
         r1_ohm = r2_ohm = None
         if not faults and source is not None:
             pair = voltages.v1_v / source.current_a, voltages.v2_v / source.current_a
-            if self._is_spike(pair, missed):
+            if self._steps.is_spike(pair, partial(_is_reachable, missed=missed)):
                 faults = [SkinFault.SPIKE]
             else:
                 r1_ohm, r2_ohm = pair
@@ -193,19 +192,8 @@ class SampleValidator:
                 found.append(SkinFault.of_gauge("IMPLAUSIBLE", i))
         return found
 
-    def _is_spike(self, pair: tuple[float, float], missed: int) -> bool:
-        """Detect a disturbance; a few readings that agree with each other become the new level."""
-        if self._good is not None and not _reachable(self._good, pair, missed):
-            if self._candidates and not _reachable(self._candidates[-1], pair, missed):
-                self._candidates.clear()
-            self._candidates.append(pair)
-            if len(self._candidates) < SETTLE_READINGS:
-                return True
-        self._good, self._candidates = pair, []
-        return False
 
-
-def _reachable(before: tuple[float, float], after: tuple[float, float], missed: int) -> bool:
+def _is_reachable(before: tuple[float, float], after: tuple[float, float], missed: int) -> bool:
     most = (1 + missed) * math.log1p(MAX_CHANGE)
     return all(abs(math.log(now / then)) <= most for then, now in zip(before, after, strict=True))
 
@@ -240,7 +228,7 @@ class ShearSkin:
         return {
             **found,
             "errors": {**(errors if isinstance(errors, Mapping) else {}), **self._validator.faults},
-            "expected_hz": self._validator.expected_hz,
+            "expected_hz": 1.0 / self._daq.period_s,
             "samples": self._samples,
             "missed": self._validator.missed,
         }

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Coroutine
 from typing import Any, Literal, Protocol, cast
 
-from shearloop.drivers.connection import LinkMonitor
+from shearloop.drivers.connection import Diagnostics, LinkMonitor
 from shearloop.drivers.errors import DeviceLostError, DriverError, ProtocolError
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.controller import silent_sentence
@@ -63,6 +63,18 @@ class UrRobot:
     def takes_over(self) -> bool:
         """Whether the connection was just lost, so that a program of ours may still be on the robot."""
         return time.monotonic() - self._lost_s < TAKES_OVER_S
+
+    def diagnostics(self) -> Diagnostics:
+        """Return the robot's values for `health`; counts are since the process began."""
+        errors = dict(self.losses)
+        if self.failed_program_stops:
+            errors["paused program not stopped"] = self.failed_program_stops
+        return {
+            "connected": self.state is not None,
+            "states": self.states,
+            "errors": errors,
+            "error": "" if self.link.latest.up else self.link.latest.sentence,
+        }
 
     async def next_state(self) -> messages.RobotState:
         """Return the next state; waits through losses of the connection."""

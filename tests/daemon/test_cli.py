@@ -22,9 +22,9 @@ from shearloop.bank.eit.models import MODELS
 from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import COMMANDS, main
-from shearloop.daemon.cli.bank.build import MODEL_NAMES
+from shearloop.daemon.cli.bank import MODEL_NAMES
 from shearloop.daemon.cli.completion import full_parser
-from shearloop.daemon.cli.output import message_json, message_line
+from shearloop.daemon.cli.terminal import message_json, message_line
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.runner import WRENCH
 from shearloop.daemon.messaging.messages import decode, encode

@@ -10,18 +10,19 @@ from typing import Any
 import pytest
 import yaml
 
+from shearloop.daemon import doctor
 from shearloop.daemon.cli import main
-from shearloop.daemon.doctor import Finding, checks, examine
-from shearloop.daemon.doctor.checks import (
+from shearloop.daemon.doctor import (
+    Finding,
     check_bank,
     check_clock,
     check_disk,
     check_keys,
     check_ports,
     clock_state,
-    from_error,
+    examine,
 )
-from shearloop.daemon.doctor.devices import check_channels, check_rate, check_task
+from shearloop.daemon.doctor.devices import check_channels, check_rate, check_task, from_error
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.keys import make_key_pair
 from shearloop.daemon.serial_ports import SerialPortInfo
@@ -116,7 +117,7 @@ def test_the_clock() -> None:
 
 def test_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for free, state in ((1e8, "trouble"), (1e9, "note"), (1e11, "good")):
-        monkeypatch.setattr(checks.shutil, "disk_usage", lambda _, free=free: SimpleNamespace(free=free))
+        monkeypatch.setattr(doctor.shutil, "disk_usage", lambda _, free=free: SimpleNamespace(free=free))
         assert check_disk(tmp_path / "not/yet/there").state == state
 
 
@@ -214,6 +215,6 @@ def test_each_denied_port_is_reported_with_its_reason(monkeypatch: pytest.Monkey
         port("/dev/ttyUSB0", "another program holds it"),
         port("/dev/ttyUSB1", "no right"),
     ]
-    monkeypatch.setattr("shearloop.daemon.doctor.checks.list_serial_ports", lambda: there)
+    monkeypatch.setattr("shearloop.daemon.doctor.list_serial_ports", lambda: there)
     found = check_ports()
     assert (found.state, found.means) == ("note", "/dev/ttyUSB0: another program holds it; /dev/ttyUSB1: no right")

@@ -13,7 +13,8 @@ from shearloop.daemon.synthetic_skin import SyntheticSkin
 from shearloop.drivers.connection import Link, SerialLink, TcpLink
 from shearloop.drivers.emulators.gripper import GripperRegisters
 from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings
-from shearloop.drivers.shear_skin import AdcBoard, Daq, Keithley6430, ScpiScanner, ShearSkin, SkinFault, SkinSample
+from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner
+from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.emulate_rig.test_mistakes import Blank
 from tests.running import pass_on, running

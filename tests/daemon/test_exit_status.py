@@ -2,9 +2,10 @@
 
 import asyncio
 import signal
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import cast
 
 import pytest
 import yaml
@@ -12,9 +13,10 @@ import zmq.asyncio
 
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.control.configured_experiment import ConfiguredExperiment, CrashMarker
+from shearloop.daemon.configured_experiment import ConfiguredExperiment, CrashMarker
 from shearloop.daemon.control.step_runner import ExperimentPhase
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.rig import Rig
 from tests.daemon.conftest import Log, deadline, shearloop
 from tests.emulator_process import own_address
 
@@ -64,6 +66,10 @@ async def done_experiment() -> SimpleNamespace:
     return SimpleNamespace(phase=ExperimentPhase.DONE, stop_reason="")
 
 
+def rig(start: Callable[[Path], Awaitable[str | None]]) -> Rig:
+    return cast("Rig", SimpleNamespace(start=start, runner=SimpleNamespace(experiment_ended=done_experiment)))
+
+
 async def test_no_experiment_starts_automatically_after_a_crash(
     waiting_config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: Log
 ) -> None:
@@ -93,14 +99,13 @@ async def test_a_manual_start_cancels_the_waiting_experiment(
         daemon = Daemon(load_daemon_config(waiting_config), context)
         assert daemon._rig is not None
         daemon._rig.start = start  # type: ignore[method-assign]
-        assert daemon._experiment is not None
-        daemon._experiment._ended = done_experiment  # type: ignore[assignment]
+        daemon._rig.runner.experiment_ended = done_experiment  # type: ignore[assignment,method-assign]
         async with asyncio.TaskGroup() as group:
             running = group.create_task(daemon.run())
             await log.says("waiting to start")
             ready.set()
             path = tmp_path / ("experiment.yaml" if own else "another.yaml")
-            assert await daemon.start_experiment(path) is None
+            await daemon.commands.handlers()["start"]({"experiment": path})
             if not own:
                 await log.says(LEFT_TO_OPERATOR)
                 daemon.stop()
@@ -123,7 +128,7 @@ async def test_a_manually_started_experiment_is_followed_to_its_end(
         experiment.call_off()
         return "the gripper is not ready"
 
-    experiment = ConfiguredExperiment(path, not_yet, done_experiment)  # type: ignore[arg-type]
+    experiment = ConfiguredExperiment(path, rig(not_yet))
     async with deadline("the experiment was not seen to its end"), asyncio.TaskGroup() as group:
         await experiment.run()
         assert experiment.left_to_operator
@@ -142,12 +147,11 @@ async def test_a_cancelled_experiment_stays_cancelled_after_a_crash_of_its_task(
 
     async def begin(path: Path) -> str | None:
         if begun:
-            experiment.on_begun(path)
             return None
         begun.append(path)
         raise UserError("the file is none")
 
-    experiment = ConfiguredExperiment(tmp_path / "experiment.yaml", begin, done_experiment)  # type: ignore[arg-type]
+    experiment = ConfiguredExperiment(tmp_path / "experiment.yaml", rig(begin))
     with pytest.raises(UserError):
         await experiment.run()
     if by == "stop":

@@ -60,13 +60,13 @@ async def reading(
     published: Published | None = None, rate_hz: float = 10.9
 ) -> AsyncIterator[tuple[LoadCellTask, Board]]:
     board = Board()
-    task = LoadCellTask(board, published or Published(), Clock(), lambda _: None, rate_hz)  # type: ignore[arg-type]
-    async with running(task.read()):
+    task = LoadCellTask(board, published or Published(), Clock(), None, rate_hz)  # type: ignore[arg-type]
+    async with running(task.run()):
         yield task, board
 
 
 async def asked(task: LoadCellTask) -> asyncio.Task[str]:
-    zero = asyncio.create_task(task.zero())
+    zero = asyncio.create_task(task.tare_and_wait())
     await asyncio.sleep(0)
     return zero
 

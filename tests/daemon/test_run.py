@@ -140,7 +140,7 @@ async def test_tare_status_and_stop_commands(config: Write, tmp_path: Path) -> N
             assert status["tasks"]["right"]["connected"]
             assert status["tasks"]["commands"]["errors"] == {"tare refused": 1}
         assert (await asyncio.to_thread(send_command, address, {"command": "stop"}, DEADLINE_S))["ok"]
-        await daemon.stopped()
+        await daemon._stop.wait()
 
 
 async def test_a_heatmap_is_computed_only_with_a_subscriber(config: Write, tmp_path: Path, subscriber: Connect) -> None:

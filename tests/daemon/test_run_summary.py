@@ -1,3 +1,5 @@
+from io import StringIO
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -32,8 +34,8 @@ def loop_state(t_s: float, **changes: Any) -> dict[str, Any]:
 
 
 def told(truth: TorqueSeries | None, happened: list[tuple[int, str]], *more: dict[str, Any]) -> str:
-    lines: list[str] = []
-    summary = RunSummary(lines.extend, lambda: truth, lambda: happened)
+    out = StringIO()
+    summary = RunSummary(out, SimpleNamespace(torques=lambda: truth), SimpleNamespace(sent=happened))
     first = {"step": 1, "step_name": "identify", "set_point_nm": None}
     for content in (loop_state(0, **first), loop_state(10), loop_state(14, hold=1), *more):
         summary("loop.state", content)
@@ -42,7 +44,7 @@ def told(truth: TorqueSeries | None, happened: list[tuple[int, str]], *more: dic
         summary("eit.estimate", reading)
     summary("eit.estimate", {"source": "right", "t_mono_ns": 44 * S, "torque_nm": None, "valid": False})
     summary("loop.state", loop_state(44, phase="done", hold=0))
-    return "\n".join(lines)
+    return out.getvalue()
 
 
 def truth_that_falls_at(t_s: float, for_s: float) -> TorqueSeries:
@@ -73,11 +75,11 @@ def test_without_a_truth_nothing_is_said_of_it() -> None:
 
 
 def test_a_tool_that_the_experiment_names_is_told() -> None:
-    lines: list[str] = []
-    summary = RunSummary(lines.extend)
+    out = StringIO()
+    summary = RunSummary(out)
     for phase in ("running", "done"):
         summary("loop.state", loop_state(0, tool_mm=20.0, phase=phase))
-    assert "  tool diameter 20 mm, from the experiment" in lines
+    assert "  tool diameter 20 mm, from the experiment\n" in out.getvalue()
     assert "tool diameter" not in told(None, [])
 
 
@@ -93,8 +95,8 @@ def test_a_last_moment_in_the_band_is_no_way_back() -> None:
     ("others", "judge"), [(("left", "load_cell"), "load_cell"), (("left", "combined"), "combined")]
 )
 def test_without_a_truth_who_judges_is_the_load_cell_and_is_named(others: tuple[str, ...], judge: str) -> None:
-    lines: list[str] = []
-    summary = RunSummary(lines.extend)
+    out = StringIO()
+    summary = RunSummary(out)
     for content in (loop_state(0), loop_state(4, hold=1)):
         summary("loop.state", content)
     for t_s in np.arange(0.0, 20.0, 0.5):
@@ -103,7 +105,7 @@ def test_without_a_truth_who_judges_is_the_load_cell_and_is_named(others: tuple[
             reading = {"source": source, "t_mono_ns": round(t_s * S), "torque_nm": torque_nm, "valid": True}
             summary("eit.estimate", reading)
     summary("loop.state", loop_state(20, phase="done"))
-    assert f"    within ± 10% 3.0 s after the set point changed, by {judge}" in lines
+    assert f"    within ± 10% 3.0 s after the set point changed, by {judge}\n" in out.getvalue()
 
 
 def test_holds_and_refusals_are_counted_by_their_kind() -> None:
@@ -121,31 +123,34 @@ def test_holds_and_refusals_are_counted_by_their_kind() -> None:
 
 
 def test_an_experiment_that_was_stopped_says_why() -> None:
-    lines: list[str] = []
-    summary = RunSummary(lines.extend)
+    out = StringIO()
+    summary = RunSummary(out)
     summary("loop.state", loop_state(0))
     summary("loop.state", loop_state(5, phase="stopped", activity="the operator said stop"))
-    assert lines[:2] == ["What happened: 'hold' was STOPPED before its end, after 5 s.", "  the operator said stop"]
+    assert out.getvalue().splitlines()[1:3] == [
+        "What happened: 'hold' was STOPPED before its end, after 5 s.",
+        "  the operator said stop",
+    ]
 
 
 @pytest.mark.parametrize("phase", ["done", "stopped", "idle"])
 def test_nothing_is_told_of_what_was_not_heard_from_its_beginning(phase: str) -> None:
-    lines: list[str] = []
-    RunSummary(lines.extend)("loop.state", loop_state(0, phase=phase))
-    assert not lines
+    out = StringIO()
+    RunSummary(out)("loop.state", loop_state(0, phase=phase))
+    assert not out.getvalue()
 
 
 def test_where_a_screw_ended_and_what_it_took_is_told() -> None:
-    lines: list[str] = []
+    out = StringIO()
     truth = TorqueSeries(np.array([10.0, 11.0, 12.0]) * S, np.array([-0.05, -0.18, -0.119]))
-    summary = RunSummary(lines.extend, lambda: truth)
+    summary = RunSummary(out, SimpleNamespace(torques=lambda: truth))
     turning = {"step_name": "tighten", "torque_source": "load_cell", "set_point_nm": None}
     summary("loop.state", loop_state(10, **turning))
     for t_s, wrist_rad, torque_nm in ((10.0, 0.4, -0.05), (11.0, 0.2, -0.176), (12.0, -0.1, -0.121)):
         summary("robot.state", {"source": "robot", "wrist_rad": wrist_rad})
         summary("load.torque", {"source": "load_cell", "t_mono_ns": round(t_s * S), "torque_nm": torque_nm})
     summary("loop.state", loop_state(12.1, phase="done", **turning))
-    told = "\n".join(lines)
+    told = out.getvalue()
     assert "    turned by -0.500 rad; torque source: load_cell" in told
     assert "    true       -0.1190 N·m at the end, -0.1800 at most" in told
     assert "    load_cell  -0.1210 N·m at the end, -0.1760 at most" in told

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from shearloop.daemon import gc_control
-from shearloop.daemon.cli import main, run
+from shearloop.daemon.cli import emulated_devices, main
 from shearloop.daemon.signals import ending_signals
 from tests.daemon.conftest import DEADLINE_S
 
@@ -52,13 +52,13 @@ def test_a_second_signal_does_not_kill_the_daemon(
     came = []
 
     @contextmanager
-    def emulators(*_: object) -> Iterator[list[object]]:
-        yield []
+    def emulators(*_: object) -> Iterator[Callable[..., None]]:
+        yield lambda *_: None
         assert signal.getsignal(number) is not signal.SIG_DFL, "this process would be killed"
         signal.raise_signal(number)
         came.append("again")
 
-    monkeypatch.setattr(run, "_run_emulators", emulators)
+    monkeypatch.setattr(emulated_devices, "EmulatedDevices", emulators)
     monkeypatch.setattr(
         gc_control, "without_long_collections", lambda: nullcontext(partial(os.kill, os.getpid(), number))
     )

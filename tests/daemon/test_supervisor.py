@@ -1,4 +1,5 @@
 import asyncio
+from types import SimpleNamespace
 
 import pytest
 from structlog.testing import capture_logs
@@ -23,7 +24,7 @@ async def test_a_task_that_dies_is_started_again_and_its_death_is_told(monkeypat
             raise RuntimeError(f"death {starts}")
 
     with capture_logs() as logs:
-        await watched.keep_running("reader", dies_twice)
+        await watched.keep_running("reader", SimpleNamespace(run=dies_twice))
     record = watched.records["reader"]
     assert (starts, record.restarts, record.alive) == (3, 2, False)
     assert record.last_error == "RuntimeError: death 2"
@@ -38,7 +39,7 @@ async def test_a_cancelled_task_stays_cancelled() -> None:
         started.set()
         await asyncio.Event().wait()
 
-    task = asyncio.create_task(watched.keep_running("waits", waits))
+    task = asyncio.create_task(watched.keep_running("waits", SimpleNamespace(run=waits)))
     await started.wait()
     assert watched.records["waits"].alive
     task.cancel()
@@ -60,7 +61,7 @@ async def test_a_task_that_dies_of_being_cancelled_is_not_started_again(monkeypa
         except asyncio.CancelledError:
             raise RuntimeError("the last words") from None
 
-    task = asyncio.create_task(watched.keep_running("stubborn", dies_of_it))
+    task = asyncio.create_task(watched.keep_running("stubborn", SimpleNamespace(run=dies_of_it)))
     await started.wait()
     task.cancel()
     with capture_logs() as logs, pytest.raises(asyncio.CancelledError):

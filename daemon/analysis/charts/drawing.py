@@ -1,8 +1,7 @@
 """Common parts of all charts: figures without a window, marks that differ in grey too, names of points, and files."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -149,27 +148,13 @@ def slug(title: str) -> str:
 
 
 def check_takes_pictures(directory: Path) -> None:
-    """Raise UserError where no chart can be written into a directory; leave no new directory behind."""
-    with remove_empty_folders(directory):
-        try:
-            directory.mkdir(parents=True, exist_ok=True)
-            with TemporaryFile(dir=directory):
-                pass
-        except OSError as error:
-            raise _unwritable(directory, error) from error
-
-
-@contextmanager
-def remove_empty_folders(directory: Path) -> Iterator[None]:
-    """Remove a directory and its parents at the end, where they are new and empty."""
-    absent = [one for one in (directory, *directory.parents) if not one.exists()]
+    """Raise UserError where no chart can be written into a directory; make it if it is new."""
     try:
-        yield
-    finally:
-        for one in absent:
-            # Another program may have used the folder meanwhile.
-            with suppress(OSError):
-                one.rmdir()
+        directory.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=directory):
+            pass
+    except OSError as error:
+        raise _unwritable(directory, error) from error
 
 
 def save(made: Figure, content: Mapping[str, Any], directory: Path, name: str) -> list[Path]:

@@ -71,6 +71,22 @@ class PlantSample:
 
 
 @dataclass(slots=True)
+class _Grip:
+    relaxed_nm: float = 0.0
+    slipped_rad: float = 0.0
+
+
+@dataclass(slots=True)
+class _Reading:
+    # With play, before relaxation.
+    torque_nm: float = 0.0
+    relaxed_nm: float = 0.0
+    # Of the open window, and its end.
+    integral: float = 0.0
+    ends_s: float = 0.0
+
+
+@dataclass(slots=True)
 class Plant:
     """Advances by one command period at a time and measures on the way."""
 
@@ -83,17 +99,13 @@ class Plant:
     angle_rad: float = 0.0
     torque_nm: float = 0.0
     _speeds: list[float] = field(default_factory=list)
-    _relaxed_nm: float = 0.0
-    _slipped_rad: float = 0.0
-    _read_relaxed_nm: float = 0.0
-    _read_nm: float = 0.0
-    _window_integral: float = 0.0
-    _next_end_s: float = 0.0
+    _grip: _Grip = field(default_factory=_Grip)
+    _reading: _Reading = field(default_factory=_Reading)
     _samples: list[PlantSample] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         """Start the sensor at a random moment of its period, and fill the actuation delay."""
-        self._next_end_s = self.sensor.window_s + self.rng.uniform(0.0, self.sensor.period_s)
+        self._reading.ends_s = self.sensor.window_s + self.rng.uniform(0.0, self.sensor.period_s)
         self._speeds = [0.0] * (int(self.tool.actuation_s / self.period_s) + 1)
 
     def step(self, speed_rad_per_s: float) -> None:
@@ -112,52 +124,43 @@ class Plant:
         return known
 
     def _update_torque(self) -> None:
-        tool = self.tool
-        elastic = tool.stiffness_nm_per_rad * (self.angle_rad - self._slipped_rad)
-        self._relaxed_nm += (tool.relaxing_share * elastic - self._relaxed_nm) * self.period_s / tool.relaxing_s
-        torque = elastic - self._relaxed_nm
+        tool, grip = self.tool, self._grip
+        elastic = tool.stiffness_nm_per_rad * (self.angle_rad - grip.slipped_rad)
+        grip.relaxed_nm += (tool.relaxing_share * elastic - grip.relaxed_nm) * self.period_s / tool.relaxing_s
+        torque = elastic - grip.relaxed_nm
         if abs(torque) > tool.slip_nm:
             excess = float(torque - np.sign(torque) * tool.slip_nm)
-            self._slipped_rad += excess / tool.stiffness_nm_per_rad
+            grip.slipped_rad += excess / tool.stiffness_nm_per_rad
             torque -= excess
         self.torque_nm = torque + self.disturbance_nm
 
     def _update_reading(self) -> None:
         """Apply the sensor's play and relaxation to the present torque."""
-        sensor, half_play = self.sensor, 0.5 * self.sensor.play_nm
-        self._read_nm = min(max(self._read_nm, self.torque_nm - half_play), self.torque_nm + half_play)
-        towards = sensor.relaxing_share * self._read_nm - self._read_relaxed_nm
-        self._read_relaxed_nm += towards * self.period_s / sensor.relaxing_s
+        sensor, reading, half_play = self.sensor, self._reading, 0.5 * self.sensor.play_nm
+        reading.torque_nm = min(max(reading.torque_nm, self.torque_nm - half_play), self.torque_nm + half_play)
+        towards = sensor.relaxing_share * reading.torque_nm - reading.relaxed_nm
+        reading.relaxed_nm += towards * self.period_s / sensor.relaxing_s
 
     def _measure(self) -> None:
-        before_nm = self._read_nm - self._read_relaxed_nm
+        sensor, reading = self.sensor, self._reading
+        before_nm = reading.torque_nm - reading.relaxed_nm
         self._update_reading()
-        after_nm = self._read_nm - self._read_relaxed_nm
+        after_nm = reading.torque_nm - reading.relaxed_nm
         start_s, self.t_s = self.t_s, self.t_s + self.period_s
         while True:
-            opens_s, ends_s = self._next_end_s - self.sensor.window_s, self._next_end_s
-            self._window_integral += _overlap(start_s, self.t_s, before_nm, after_nm, opens_s, ends_s)
-            if ends_s > self.t_s:
+            # The part of this step inside the window; the reading changes linearly over the step.
+            low, high = max(start_s, reading.ends_s - sensor.window_s), min(self.t_s, reading.ends_s)
+            if high > low:
+                middle = (0.5 * (low + high) - start_s) / (self.t_s - start_s)
+                reading.integral += (before_nm + (after_nm - before_nm) * middle) * (high - low)
+            if reading.ends_s > self.t_s:
                 return
-            self._finish_window(after_nm)
-
-    def _finish_window(self, latest_nm: float) -> None:
-        sensor, end_s = self.sensor, self._next_end_s
-        mean = self._window_integral / sensor.window_s if sensor.window_s else latest_nm
-        noise, late_s = self.rng.normal(0.0, 1.0) * sensor.noise_nm, self.rng.uniform(0.0, 1.0) * sensor.jitter_s
-        known_s = end_s + sensor.transfer_s + late_s
-        self._samples.append(PlantSample(mean + noise, end_s - 0.5 * sensor.window_s, known_s))
-        self._window_integral = 0.0
-        self._next_end_s += sensor.period_s
-
-
-def _overlap(start_s: float, end_s: float, first: float, last: float, low_s: float, high_s: float) -> float:
-    """Return the integral, over the part of a step inside a window, of a value that goes from `first` to `last`."""
-    low, high = max(start_s, low_s), min(end_s, high_s)
-    if high <= low:
-        return 0.0
-    middle = (0.5 * (low + high) - start_s) / (end_s - start_s)
-    return (first + (last - first) * middle) * (high - low)
+            mean = reading.integral / sensor.window_s if sensor.window_s else after_nm
+            noise, late_s = self.rng.normal(0.0, 1.0) * sensor.noise_nm, self.rng.uniform(0.0, 1.0) * sensor.jitter_s
+            known_s = reading.ends_s + sensor.transfer_s + late_s
+            self._samples.append(PlantSample(mean + noise, reading.ends_s - 0.5 * sensor.window_s, known_s))
+            reading.integral = 0.0
+            reading.ends_s += sensor.period_s
 
 
 class LoopController(Protocol):
@@ -372,10 +375,12 @@ def tracking_errors(noises_nm: Sequence[float], seeds: int, windows: Sequence[in
                     plant = copy.deepcopy(gripped)
                     loop = _averaged_loop(name, frames, plant, found, settings_for(found, scenario))
                     rms.setdefault((name, noise, frames), []).append(_rms_error(plant, loop))
-    return [
-        TrackingError(name, noise, frames, _delay_s(frames), float(np.median(errors)), min(errors), max(errors))
-        for (name, noise, frames), errors in rms.items()
-    ]
+    tracked = []
+    for (name, noise, frames), errors in rms.items():
+        # From the middle of the mean until it is known.
+        delay_s = 0.5 * EIT.window_s + 0.5 * (frames - 1) * EIT.period_s + EIT.transfer_s
+        tracked.append(TrackingError(name, noise, frames, delay_s, float(np.median(errors)), min(errors), max(errors)))
+    return tracked
 
 
 def _identified_plant(scenario: LoopScenario, seed: int) -> tuple[Plant, ToolModel]:
@@ -387,11 +392,6 @@ def _identified_plant(scenario: LoopScenario, seed: int) -> tuple[Plant, ToolMod
         with suppress(RuntimeError):
             return plant, identified(plant, scenario)
     raise RuntimeError(f"the tool cannot be identified at {scenario.sensor.noise_nm:g} N·m of noise")
-
-
-def _delay_s(frames: int) -> float:
-    """Return the time from the middle of a mean of EIT frames until it is known."""
-    return 0.5 * EIT.window_s + 0.5 * (frames - 1) * EIT.period_s + EIT.transfer_s
 
 
 def _averaged_loop(

@@ -7,7 +7,7 @@ time. The width of the true force over each hold's end is compared with 2 μFₙ
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
@@ -16,7 +16,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from shearloop.bank.arrays import FloatArray
 from shearloop.bank.skin.calibration import SkinCalibration, load_calibration
 from shearloop.daemon.analysis.charts.drawing import figure, look, save
 from shearloop.daemon.control.control_loop import ControlLoop
@@ -27,7 +26,7 @@ from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
 from shearloop.daemon.synthetic_skin import SyntheticSkin
 from shearloop.daemon.workers import Executor, in_order
-from shearloop.drivers.shear_skin import SkinSample
+from shearloop.drivers.shear_skin.skin import SkinSample
 
 TICK_S, SAMPLE_TICKS = 0.008, 12.5
 # From the middle of a conversion to the controller; and from a speed command to the wrist.
@@ -35,6 +34,8 @@ AGE_S, ACTUATION_TICKS = 0.06, 2
 # At 0.25 s a reading is stale and the loop holds.
 AGES_S = (0.02, 0.06, 0.1, 0.15, 0.2)
 RADIUS_MM, SET_POINTS_N = 15.0, (1.0, 0.6, 1.0)
+# The judged share of each hold, at its end.
+SETTLED_SHARE = 0.6
 # Noise of one resistance, as in the emulated DAQ: 1.6 mN of shear force over both gauges.
 RELATIVE_NOISE = 0.0016 * 0.088 / 2**0.5
 CALIBRATION = Path(str(resources.files("shearloop"))) / "config" / "calibrations" / "skin_demo.yaml"
@@ -55,7 +56,6 @@ class SkinLoopCase:
     band: bool = True
     age_s: float = AGE_S
     seed: int = 0
-    # The last three fifths of each hold are judged.
     hold_s: float = 20.0
 
 
@@ -68,6 +68,15 @@ class SkinHold:
     offset_n: float
     bound_n: float
     phase: str
+
+
+@dataclass(slots=True)
+class SkinTrace:
+    """Shear forces in N, a row per tick; the estimates end with the latest known one."""
+
+    truth_n: list[float] = field(default_factory=list)
+    estimate_n: list[float] = field(default_factory=list)
+    set_point_n: list[float] = field(default_factory=list)
 
 
 class SkinLoop:
@@ -93,9 +102,7 @@ class SkinLoop:
         self._tick = self._samples = 0
         self._due: list[tuple[int, TorqueSample]] = []
         self._zero_begun = False
-        self.truth_n: list[float] = []
-        self.estimate_n: list[float] = []
-        self.set_point_n: list[float] = []
+        self.trace = SkinTrace()
 
     @property
     def t_ns(self) -> int:
@@ -137,8 +144,8 @@ class SkinLoop:
             self._zero_begun = True
         controller = self.brain.controller
         wanted_nm = controller.state.set_point_nm if controller is not None else None
-        self.truth_n.append(self.skin.shear_n)
-        self.set_point_n.append(math.nan if wanted_nm is None else wanted_nm / RADIUS_MM * 1e3)
+        self.trace.truth_n.append(self.skin.shear_n)
+        self.trace.set_point_n.append(math.nan if wanted_nm is None else wanted_nm / RADIUS_MM * 1e3)
 
     def _measure(self) -> None:
         self.skin.rest(SOURCE.period_s)
@@ -151,7 +158,8 @@ class SkinLoop:
             torque = replace(torque, low_nm=None, high_nm=None)
         self._due.append((known_ns, torque))
         shear_n = math.nan if reading.shear_n is None else reading.shear_n
-        self.estimate_n += [shear_n] * (self._tick - len(self.estimate_n))
+        estimates = self.trace.estimate_n
+        estimates += [shear_n] * (self._tick - len(estimates))
 
 
 def _experiment(hold_s: float) -> ExperimentFile:
@@ -165,26 +173,21 @@ def _experiment(hold_s: float) -> ExperimentFile:
     )
 
 
-def holds_of(loop: SkinLoop, settled_s: float) -> list[FloatArray]:
-    """Return the true force over the settled end of each hold, in order."""
-    set_points, truth = np.round(loop.set_point_n, 6), np.array(loop.truth_n)
-    changes = np.flatnonzero(np.diff(np.nan_to_num(set_points, nan=-1.0))) + 1
-    ends = [*changes.tolist(), len(truth)]
-    settled = round(settled_s / TICK_S)
-    return [truth[end - settled : end] for begin, end in pairwise(ends) if np.isfinite(set_points[begin])]
-
-
-def judge(case: SkinLoopCase, calibration: SkinCalibration) -> tuple[SkinHold, SkinLoop]:
-    """Run one case."""
+def judge(case: SkinLoopCase, calibration: SkinCalibration) -> tuple[SkinHold, SkinTrace]:
+    """Run one case; the settled end of each hold is judged."""
     loop = SkinLoop(case, calibration)
     phase = loop.run(200.0)
     bound_n = 2.0 * loop.skin.membrane.friction * case.normal_n
-    found = holds_of(loop, 0.6 * case.hold_s)
+    set_points, truth_n = np.round(loop.trace.set_point_n, 6), np.array(loop.trace.truth_n)
+    changes = np.flatnonzero(np.diff(np.nan_to_num(set_points, nan=-1.0))) + 1
+    settled = round(SETTLED_SHARE * case.hold_s / TICK_S)
+    ends = pairwise([*changes.tolist(), len(truth_n)])
+    found = [truth_n[end - settled : end] for begin, end in ends if np.isfinite(set_points[begin])]
     if phase != ExperimentPhase.DONE.value or len(found) != len(SET_POINTS_N):
-        return SkinHold(case, math.nan, math.nan, bound_n, phase), loop
+        return SkinHold(case, math.nan, math.nan, bound_n, phase), loop.trace
     width_n = max(float(np.ptp(truth)) for truth in found)
     offset_n = max(abs(float(truth.mean()) - wanted) for truth, wanted in zip(found, SET_POINTS_N, strict=True))
-    return SkinHold(case, width_n, offset_n, bound_n, phase), loop
+    return SkinHold(case, width_n, offset_n, bound_n, phase), loop.trace
 
 
 # The range of the configuration; at 1 the loop believes each reading fully.
@@ -233,13 +236,13 @@ def chart(out: Path, executor: Executor) -> list[Path]:
     return save(made, {"held": [asdict(held) for held in found]}, out, "stability-skin")
 
 
-def limit_cycle_figure(gains: Sequence[SkinHold], delays: Sequence[SkinHold], loop: SkinLoop) -> Figure:
+def limit_cycle_figure(gains: Sequence[SkinHold], delays: Sequence[SkinHold], shown: SkinTrace) -> Figure:
     """Draw one run, then width and offset of all cases over the gain, and the width over the delay."""
     made = figure(12.0, 7.5)
     grid = made.add_gridspec(2, 3, height_ratios=(1.0, 1.3))
     over = made.add_subplot(grid[0, :])
     width, offset, delay = (made.add_subplot(grid[1, i]) for i in range(3))
-    _draw_run(over, loop)
+    _draw_run(over, shown)
     bound = "2 μFn"
     _draw_curves(width, gains, lambda case: case.kp, lambda held: held.width_n)
     width.set(title="Limit cycle over the gain", xlabel="gain kp", ylabel=f"peak to peak / {bound}")
@@ -266,11 +269,11 @@ def limit_cycle_figure(gains: Sequence[SkinHold], delays: Sequence[SkinHold], lo
     return made
 
 
-def _draw_run(axes: Axes, loop: SkinLoop) -> None:
-    time_s = np.arange(len(loop.truth_n)) * TICK_S
-    axes.plot(time_s, loop.truth_n, color="#1f4e79", lw=1.2, label="true shear force")
-    axes.plot(time_s[: len(loop.estimate_n)], loop.estimate_n, color="#c44e52", lw=0.9, label="estimate")
-    axes.plot(time_s, loop.set_point_n, color="#888888", lw=1, ls="--", label="set point")
+def _draw_run(axes: Axes, shown: SkinTrace) -> None:
+    time_s = np.arange(len(shown.truth_n)) * TICK_S
+    axes.plot(time_s, shown.truth_n, color="#1f4e79", lw=1.2, label="true shear force")
+    axes.plot(time_s[: len(shown.estimate_n)], shown.estimate_n, color="#c44e52", lw=0.9, label="estimate")
+    axes.plot(time_s, shown.set_point_n, color="#888888", lw=1, ls="--", label="set point")
     axes.set(
         title="Zero, identification, and three holds (Fn = 1 N, kp = 0.5)", xlabel="time, s", ylabel="shear force, N"
     )

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -71,30 +71,27 @@ class ContinuityWalk:
         return int(np.count_nonzero(np.nan_to_num(np.abs(np.diff(self.torque_nm))) > 10 * self.share_nm))
 
 
-def path_through(split: Split) -> tuple[FloatArray, float]:
-    """Return (n, 896) differences from the smallest to the largest later torque, and a step's fair share in N·m."""
-    torque = split.future.torque_at_frames()
-    frames = np.abs(split.future.channels[np.argsort(torque), 0])
-    shares = np.linspace(0.0, 1.0, STEPS, endpoint=False)[:, None]
-    steps = [(1 - shares) * one + shares * other for one, other in pairwise(frames)]
-    path = np.concatenate([*steps, frames[-1:]])
-    return path, float(np.ptp(torque)) / len(path)
-
-
 def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[ContinuityWalk]:
-    """Return the torques of each estimator along the path; the first three differ only in the cell they choose."""
-    path, share = path_through(split)
+    """Return the torques of each estimator along the straight lines between later frames, by rising torque.
+
+    The first three estimators differ only in the cell they choose.
+    """
+    torque_nm = split.future.torque_at_frames()
+    frames = np.abs(split.future.channels[np.argsort(torque_nm), 0])
+    shares = np.linspace(0.0, 1.0, STEPS, endpoint=False)[:, None]
+    path = np.concatenate([*((1 - shares) * one + shares * other for one, other in pairwise(frames)), frames[-1:]])
+    share_nm = float(np.ptp(torque_nm)) / len(path)
     locators: dict[str, bank_match.BankMatcher] = {
         "paper: the maximum of all lags": bank_match.PaperMatcher(bank),
         "zero lag: the maximum, refined": bank_match.RefinedMatcher(bank, NOT_TURNED, mean_of_alike=False),
         "zero lag: mean of the cells alike (the fix)": bank_match.RefinedMatcher(bank, NOT_TURNED),
     }
-    found = [ContinuityWalk(name, _read(split, locator, path), share) for name, locator in locators.items()]
+    found = [ContinuityWalk(name, _read(split, locator, path), share_nm) for name, locator in locators.items()]
     for calibration in calibrations:
         if not calibration.estimator.needs:
             tracker = EstimatorSession(calibration, bank)
             torque = [tracker.estimate(TactileFrame.of(0.0, one[None])).torque_nm for one in path]
-            found.append(ContinuityWalk(calibration.estimator.name, np.array(torque, dtype=float), share))
+            found.append(ContinuityWalk(calibration.estimator.name, np.array(torque, dtype=float), share_nm))
     return found
 
 
@@ -168,19 +165,21 @@ def extrapolate(
     """
     known = select_rows(split.whole, np.flatnonzero(np.isfinite(split.whole.torque_at_frames())))
     rows, n_earlier = np.arange(len(known.t_s)), int((known.t_s <= split.past.t_s[-1]).sum())
-    earlier = {
-        which: CalibrationPart(float(extreme(known.torque_nm[:n_earlier])), rows[:n_earlier], rows[n_earlier:])
-        for which, extreme in ((SMALLER, np.max), (LARGER, np.min))
-    }
-    shared, beyond = (known, str(bank.path.resolve()), mesh), calibration_parts(known.torque_nm)
-    tasks = [(name, part) for name in names for part in (earlier[SMALLER], *beyond[SMALLER], *beyond[LARGER])]
-    outcomes = dict(zip(tasks, in_order(executor.map(judge_others, shared, tasks)), strict=True))
+    beyond = calibration_parts(known.torque_nm)
+    for which, extreme in ((SMALLER, np.max), (LARGER, np.min)):
+        limit_nm = float(extreme(known.torque_nm[:n_earlier]))
+        beyond[which].insert(0, CalibrationPart(limit_nm, rows[:n_earlier], rows[n_earlier:]))
+    tasks = [(which, name, part) for which, parts in beyond.items() for name in names for part in parts]
+    judged = in_order(executor.map(judge_others, (known, str(bank.path.resolve()), mesh), tasks))
     found = []
-    for which, some in beyond.items():
-        for name in names:
-            steps = [(earlier[which], outcomes[name, earlier[SMALLER]])]
-            steps += [(part, outcomes[name, part]) for part in some]
-            found.append(_extrapolation(split.title, which, name, steps))
+    for (which, name), some in groupby(zip(tasks, judged, strict=True), key=lambda one: one[0][:2]):
+        steps = [(part, *outcome) for (_, _, part), outcome in some]
+        for part, _, _, refusal in steps:
+            if refusal:
+                print(f"{split.title}: {name}, {which} ({part.limit_nm:.3f} N·m), is left out: {refusal}")
+        curve = fault_curve(which, UNITS[which], name, [level for _, level, _, _ in steps])
+        slices, widths = tuple(len(part.fitted) for part, *_ in steps), tuple(width for _, _, width, _ in steps)
+        found.append(Extrapolation(curve, slices, widths))
     return found
 
 
@@ -193,13 +192,11 @@ def select_rows(series: FrameSeries, rows: Rows) -> FrameSeries:
     )  # fmt: skip
 
 
-# The reason of a refusal, or none.
-Outcome = tuple[FaultLevel, float | None, str]
-
-
-def judge_others(shared: tuple[FrameSeries, str, Mesh | None], task: tuple[EstimatorName, CalibrationPart]) -> Outcome:
+def judge_others(
+    shared: tuple[FrameSeries, str, Mesh | None], task: tuple[str, EstimatorName, CalibrationPart]
+) -> tuple[FaultLevel, float | None, str]:
     """Return the figures and the median width of a part's judged slices, and the reason of a refused calibration."""
-    (series, path, mesh), (name, part) = shared, task
+    (series, path, mesh), (_, name, part) = shared, task
     bank = Bank.open(path)
     try:
         calibration = fit(name, [select_rows(series, part.fitted)], "some torques", Physics(bank, mesh))
@@ -213,18 +210,6 @@ def judge_others(shared: tuple[FrameSeries, str, Mesh | None], task: tuple[Estim
         if one.torque_low_nm is not None and one.torque_high_nm is not None
     ]
     return judge_level(estimates, others.torque_nm, part.limit_nm), float(np.median(widths)) if widths else None, ""
-
-
-def _extrapolation(
-    title: str, which: str, name: EstimatorName, steps: Sequence[tuple[CalibrationPart, Outcome]]
-) -> Extrapolation:
-    for part, (_, _, refusal) in steps:
-        if refusal:
-            print(f"{title}: {name}, {which} ({part.limit_nm:.3f} N·m), is left out: {refusal}")
-    # The calibration on all earlier slices serves both directions.
-    levels = [replace(level, level=part.limit_nm) for part, (level, _, _) in steps]
-    slices, widths = zip(*((len(part.fitted), width) for part, (_, width, _) in steps), strict=True)
-    return Extrapolation(fault_curve(which, UNITS[which], name, levels), slices, widths)
 
 
 FOREIGN_SHARES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
@@ -291,33 +276,8 @@ def _misfits(twins: ReciprocityCheck, frames: FloatArray) -> FloatArray:
 MODEL = "gaussian_derivative"
 _K, _SIGMA = 3.2, 1.5
 _FRAMES = 6
+# The steepest fall of the Gaussian derivative is this over σ, below 1.
 _STEEPEST = float(np.exp(-0.5))
-
-
-@dataclass(frozen=True, slots=True)
-class BankRim:
-    """A path that leaves the bank's grid: the cells (k, σ) in cm of each level."""
-
-    name: str
-    unit: str
-    levels: tuple[float, ...]
-    places: tuple[tuple[float, float], ...]
-
-
-def rims(bank: Bank) -> list[BankRim]:
-    """Return the paths for this bank's grid."""
-    lowest = (0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05)
-    k_end, sigma_end = float(bank.k_grid[-1]), float(bank.sigma_grid[-1])
-    ks = (_K, *(round(k_end + step, 3) for step in (-0.3, -0.1, 0.0, 0.1, 0.2)))
-    sigmas = (_SIGMA, *(round(sigma_end + step, 3) for step in (-0.3, -0.1, 0.0, 0.2, 0.5, 1.0)))
-    return [
-        # The steepest fall of the Gaussian derivative is exp(−1/2)/σ below 1.
-        BankRim("conductivity near zero", "smallest conductivity (homogeneous = 1)", lowest,
-            tuple((_K, _STEEPEST / (1.0 - least)) for least in lowest)),
-        BankRim(f"k at the rim of the grid ({k_end:g} cm) and beyond", "k, cm", ks, tuple((k, _SIGMA) for k in ks)),
-        BankRim(f"σ at the rim of the grid ({sigma_end:g} cm) and beyond", "σ, cm", sigmas,
-            tuple((_K, sigma) for sigma in sigmas)),
-    ]  # fmt: skip
 
 
 class _SolvedFrames(Synthesiser):
@@ -339,19 +299,29 @@ class _SolvedFrames(Synthesiser):
 
 
 def sweep_rims(calibrations: Sequence[Calibration], bank: Bank, scratch: Path) -> Iterable[FaultCurve]:
-    """Return the curves of estimators calibrated on synthetic slices along the paths out of the bank."""
+    """Return the curves of estimators calibrated on synthetic slices along three paths of (k, σ) out of the bank."""
+    lowest = (0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05)
+    k_end, sigma_end = float(bank.k_grid[-1]), float(bank.sigma_grid[-1])
+    ks = (_K, *(round(k_end + step, 3) for step in (-0.3, -0.1, 0.0, 0.1, 0.2)))
+    sigmas = (_SIGMA, *(round(sigma_end + step, 3) for step in (-0.3, -0.1, 0.0, 0.2, 0.5, 1.0)))
+    rims = (
+        ("conductivity near zero", "smallest conductivity (homogeneous = 1)", lowest,
+            [(_K, _STEEPEST / (1.0 - least)) for least in lowest]),
+        (f"k at the rim of the grid ({k_end:g} cm) and beyond", "k, cm", ks, [(k, _SIGMA) for k in ks]),
+        (f"σ at the rim of the grid ({sigma_end:g} cm) and beyond", "σ, cm", sigmas, [(_K, sigma) for sigma in sigmas]),
+    )  # fmt: skip
     # The same homogeneous frame as the slices': its noise is in every difference.
     synthesiser = _SolvedFrames(played_bank(scratch), 0)
     homogeneous = homogeneous_of(synthesiser)
     trackers = [EstimatorSession(calibration, bank) for calibration in calibrations]
-    for rim in rims(bank):
-        series = [_series(synthesiser, homogeneous, k, sigma) for k, sigma in rim.places]
+    for name, unit, settings, places in rims:
+        series = [_series(synthesiser, homogeneous, k, sigma) for k, sigma in places]
         for tracker in trackers:
             levels = [
                 judge_level(estimate_frames(tracker, FaultyFrames(one)), one.torque_nm, level)
-                for level, one in zip(rim.levels, series, strict=True)
+                for level, one in zip(settings, series, strict=True)
             ]
-            yield fault_curve(rim.name, rim.unit, tracker.calibration.estimator.name, levels)
+            yield fault_curve(name, unit, tracker.calibration.estimator.name, levels)
 
 
 def _series(synthesiser: Synthesiser, homogeneous: FloatArray, k: float, sigma: float) -> FrameSeries:

@@ -121,19 +121,26 @@ def matchers(split: Split, bank: Bank) -> Iterator[TorqueMethod]:
         ("zero lag, reference", "zero lag", ZeroLagMatcher),
         ("zero lag, fast and exact", "zero lag", PrunedZeroLagMatcher),
     ):
-        yield _read_by(split, name, family, _sigma_by(kind.from_bank(bank)))
+        yield _read_by(split, name, family, partial(_best_sigma, kind.from_bank(bank)))
     nearest = RefinedMatcher(bank, NOT_TURNED)
     yield _read_by(split, "zero lag, smoothed, sub-grid", "zero lag", lambda x: nearest.match(x).sigma)
     cells = np.flatnonzero(bank.valid)
     shapes = np.abs(bank.signals.reshape(-1, bank.signals.shape[-1])[cells])
     shapes /= np.linalg.norm(shapes, axis=1, keepdims=True)
+    column = sigma[cells % len(sigma)]
 
     def best_of(scores: Callable[[Single], Single]) -> Callable[[FloatArray], float]:
-        column = sigma[cells % len(sigma)]
         return lambda x: float(column[np.argmax(scores((x / np.linalg.norm(x)).astype(np.float32)))])
 
+    half = shapes.astype(np.float16)
+
+    def half_scores(frame: Single) -> Single:
+        # The products are float32, for BLAS.
+        parts = [half[i : i + _CHUNK].astype(np.float32) @ frame for i in range(0, len(half), _CHUNK)]
+        return np.concatenate(parts)
+
     yield _read_by(split, "zero lag, float32", "precision", best_of(partial(np.matmul, shapes)))
-    yield _read_by(split, "zero lag, float16", "precision", best_of(partial(_half_scores, shapes.astype(np.float16))))
+    yield _read_by(split, "zero lag, float16", "precision", best_of(half_scores))
     basis = np.linalg.svd(shapes[:: max(1, len(shapes) // _ENOUGH_CELLS)], full_matrices=False)[2]
     for rank in RANKS:
         directions = np.ascontiguousarray(basis[:rank])
@@ -141,20 +148,14 @@ def matchers(split: Split, bank: Bank) -> Iterator[TorqueMethod]:
         yield _read_by(split, f"rank {rank}", "zero lag, bank of rank r", best_of(scores))
 
 
-def _sigma_by(matcher: Matcher) -> Callable[[FloatArray], float]:
+def _best_sigma(matcher: Matcher, frame: FloatArray) -> float:
     if isinstance(matcher, PrunedMatcher | PrunedZeroLagMatcher):
-        return lambda x: matcher.match(x, runner_up=False).sigma
-    return lambda x: matcher.match(x).sigma
+        return matcher.match(frame, runner_up=False).sigma
+    return matcher.match(frame).sigma
 
 
 def _compressed_scores(directions: Single, numbers: Single, frame: Single) -> Single:
     return numbers @ (directions @ frame)
-
-
-def _half_scores(shapes: NDArray[np.float16], frame: Single) -> Single:
-    """Return the scores of float16 signals; the products are float32, for BLAS."""
-    parts = [shapes[i : i + _CHUNK].astype(np.float32) @ frame for i in range(0, len(shapes), _CHUNK)]
-    return np.concatenate(parts)
 
 
 def fewer_channels(split: Split) -> Iterator[TorqueMethod]:

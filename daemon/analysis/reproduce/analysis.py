@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.cluster.vq import kmeans2
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
@@ -24,26 +25,25 @@ from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import CalibrationError, MatchingError
 from shearloop.bank.estimation.calibration import DIAMETER_DEGREE, TORQUE_DEGREE
 from shearloop.bank.polynomial import Polynomial
-from shearloop.daemon.analysis.reproduce.grouping import group_means, kmeans_groups, place_in_series
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.matlab import (
-    DiameterSlices,
-    TorqueSlices,
+    DIAMETER_FOLDER,
+    RAW_FRAME,
+    RAW_HOMOGENEOUS,
+    TORQUE_FOLDER,
+    Slices,
     read_diameter_slices,
     read_line,
     read_torque_slices,
 )
-
-TORQUE_FOLDER, DIAMETER_FOLDER = "torque_slices", "diameter_slices"
-RAW_FRAME, RAW_HOMOGENEOUS = "TorqueSlice.mat", "TorqueSliceHom.mat"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inputs:
     """The slices of a folder; `raw_difference` (896,) is of one raw frame, `notes` name missing files."""
 
-    torque: TorqueSlices | None
-    diameter: DiameterSlices | None
+    torque: Slices | None
+    diameter: Slices | None
     raw_difference: FloatArray | None
     notes: tuple[str, ...]
 
@@ -96,6 +96,12 @@ _GROUPS = 10
 # Without repeats, the held-out parts are stretches of time.
 _STRETCHES = 5
 _BATCH = 8
+# A fall by more than this share of the whole range begins a new series.
+_RESTART_SHARE = 0.5
+# This share of a series' steps must rise: noise may swap neighbouring levels.
+_RISING_SHARE = 0.8
+# k-means runs from this many starts, and the tightest groups are kept.
+_STARTS = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,7 +124,7 @@ class TorqueResult:
     `held_out` describe the groups and the parts.
     """
 
-    slices: TorqueSlices
+    slices: Slices
     focused: Matches
     wide: Matches
     r_focused: float | None
@@ -150,7 +156,7 @@ class DiameterResult:
     through its k.
     """
 
-    slices: DiameterSlices
+    slices: Slices
     single: Matches
     r_single: float | None
     diameters_mm: FloatArray
@@ -197,7 +203,7 @@ def _best_matches(heatmaps: FloatArray, bank: Bank) -> Matches:
     )
 
 
-def analyse_torque(slices: TorqueSlices, on_focused: Matches, on_wide: Matches) -> TorqueResult:
+def analyse_torque(slices: Slices, on_focused: Matches, on_wide: Matches) -> TorqueResult:
     """Relate sigma to torque, from the matches of at least three slices in both banks."""
     torque = slices.torque_nm
     sigma = on_focused.sigma
@@ -225,7 +231,7 @@ def analyse_torque(slices: TorqueSlices, on_focused: Matches, on_wide: Matches) 
     )
 
 
-def analyse_diameter(slices: DiameterSlices, wide: Bank, progress: Progress) -> DiameterResult:
+def analyse_diameter(slices: Slices, wide: Bank, progress: Progress) -> DiameterResult:
     """Match diameter slices, smoothed along the channels, in the wide bank and relate k to diameter."""
     single = match_slices(smoothed_along_channels(slices.differences), wide, progress)
     diameters = np.unique(slices.diameter_mm)
@@ -247,7 +253,7 @@ def analyse_diameter(slices: DiameterSlices, wide: Bank, progress: Progress) -> 
     )
 
 
-def score_models(slices: TorqueSlices, raw_difference: FloatArray | None, mesh: Mesh) -> ModelScores:
+def score_models(slices: Slices, raw_difference: FloatArray | None, mesh: Mesh) -> ModelScores:
     """Score the five basis models on a mesh against the slices and, if given, a raw (896,) difference."""
     forward = ForwardModel(mesh)
     middle = float(mesh.nodes[:, 1].min() + mesh.nodes[:, 1].max()) / 2
@@ -279,12 +285,13 @@ def _groups(torque: FloatArray) -> tuple[IntArray, str, IntArray, str]:
     """
     series = place_in_series(torque)
     if series is not None:
-        repeats = f"by place in {int(series.repeat.max()) + 1} repeated series"
-        return series.level, repeats, series.repeat, "one repeat of the series left out at a time"
+        level, repeat = series
+        repeats = f"by place in {int(repeat.max()) + 1} repeated series"
+        return level, repeats, repeat, "one repeat of the series left out at a time"
     n_levels = min(_GROUPS, max(FEWEST_SLICES, len(torque) // 3), len(np.unique(torque)))
     n_parts = min(_STRETCHES, len(torque))
     return (
-        kmeans_groups(torque[:, None], n_levels),
+        kmeans_groups(torque, n_levels),
         f"by k-means of the torques into {n_levels} (no repeated series found)",
         (np.arange(len(torque)) * n_parts // len(torque)).astype(np.int64),
         f"one of {n_parts} stretches of time left out at a time",
@@ -308,3 +315,66 @@ def _fit_or_note(x: FloatArray, y: FloatArray, degree: int, what: str, notes: li
     except CalibrationError as error:
         notes.append(f"no fit of {what}: {error}")
         return None
+
+
+def place_in_series(values: FloatArray) -> tuple[IntArray, IntArray] | None:
+    """Return the level and the repeat (n,) of values, in order of time, that repeat one rising series; else None.
+
+    A series restarts where the value falls by more than half of the whole range. The longest series have all levels.
+    The values of a shorter one go, in their order, to the levels with the nearest means over the longest, in the sum of
+    squares. There must be two series, of three levels or more.
+    """
+    falls = np.diff(values) < -_RESTART_SHARE * np.ptp(values)
+    repeat = np.concatenate([[0], np.cumsum(falls)]).astype(np.int64)
+    length = np.bincount(repeat)
+    steps = np.diff(values)[~falls]
+    if len(length) < 2 or length.max() < 3 or np.mean(steps > 0) < _RISING_SHARE:
+        return None
+    complete = [values[repeat == each] for each in np.flatnonzero(length == length.max())]
+    means = np.mean(complete, axis=0)
+    level = np.empty(len(values), dtype=np.int64)
+    for each in range(len(length)):
+        members = np.flatnonzero(repeat == each)
+        level[members] = _rising_levels((values[members, None] - means) ** 2)
+    return level, repeat
+
+
+def _rising_levels(cost: FloatArray) -> IntArray:
+    """Return the rising levels (n,) of n values with the least total of an (n, m) cost."""
+    n, m = cost.shape
+    # least[i, j] is the least cost of the first i values on the first j levels.
+    least = np.full((n + 1, m + 1), np.inf)
+    least[0] = 0.0
+    for i in range(1, n + 1):
+        for j in range(i, m + 1):
+            least[i, j] = min(least[i, j - 1], least[i - 1, j - 1] + cost[i - 1, j - 1])
+    levels, j = np.empty(n, dtype=np.int64), m
+    for i in range(n, 0, -1):
+        while least[i, j - 1] == least[i, j]:
+            j -= 1
+        j -= 1
+        levels[i - 1] = j
+    return levels
+
+
+def kmeans_groups(values: FloatArray, n_groups: int, seed: int = 0) -> IntArray:
+    """Return the group of each of (n,) values, numbered from 0 by rising mean; at most as many groups as values differ.
+
+    The same values and seed give the same groups.
+    """
+    points, generator = values[:, None], np.random.default_rng(seed)
+    distinct = np.unique(points, axis=0)
+    best, least = np.zeros(len(values), dtype=np.int64), np.inf
+    for _ in range(_STARTS):
+        start = distinct[generator.choice(len(distinct), n_groups, replace=False)]
+        centres, labels = kmeans2(points, start, iter=100, minit="matrix", missing="raise")
+        distance = float(((points - centres[labels]) ** 2).sum())
+        if distance < least:
+            best, least = labels.astype(np.int64), distance
+    return np.argsort(np.argsort(group_means(values, best)))[best]
+
+
+def group_means(values: FloatArray, groups: IntArray) -> FloatArray:
+    """Return the mean of (n,) values in each group, by rising number."""
+    means: FloatArray = np.bincount(groups, values) / np.bincount(groups)
+    return means

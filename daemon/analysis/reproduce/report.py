@@ -47,10 +47,10 @@ class Reproduction:
     notes: tuple[str, ...]
 
 
-def as_json(found: Reproduction) -> dict[str, Any]:
-    """Return the numbers by name; None where the recordings do not determine them."""
+def json_text(found: Reproduction) -> str:
+    """Return the numbers by name as JSON text; null where the recordings do not determine them."""
     torque, diameter, models = found.torque, found.diameter, found.models
-    return {
+    numbers = {
         "torque_sigma_r_focused": torque.r_focused if torque else None,
         "torque_sigma_r_wide": torque.r_wide if torque else None,
         "torque_sigma_r_clustered": torque.r_clustered if torque else None,
@@ -60,11 +60,7 @@ def as_json(found: Reproduction) -> dict[str, Any]:
         "torque_rmse_nm_cross_validated": torque.rmse_nm if torque else None,
         "bank_valid_cells": found.bank_valid_cells,
     }
-
-
-def json_text(found: Reproduction) -> str:
-    """Return the numbers as JSON text."""
-    return json.dumps(as_json(found), indent=2, allow_nan=False)
+    return json.dumps(numbers, indent=2, allow_nan=False)
 
 
 def table(found: Reproduction) -> str:
@@ -114,13 +110,12 @@ def explanations(found: Reproduction) -> list[str]:
         n_slices, n_diameters = len(found.diameter.slices.diameter_mm), len(found.diameter.diameters_mm)
         sentences.append(f"Diameter: {n_slices} slices of {n_diameters} diameters, smoothed along the channels.")
     if found.models:
-        sentences += model_explanations(found.models)
+        sentences += _model_explanations(found.models)
     results = (found.torque, found.diameter)
     return [*sentences, *found.notes, *(note for result in results if result for note in result.notes)]
 
 
-def model_explanations(models: ModelScores) -> list[str]:
-    """Return sentences about the model scores: their definition, their distance from the paper's, and the first."""
+def _model_explanations(models: ModelScores) -> list[str]:
     matching = (
         "Matching score: the largest normalised cross-correlation over lags and settings, averaged over the slices; "
         f"first is {_first(models.matching)}."
@@ -169,7 +164,7 @@ def _number(value: float | None, digits: int = 5) -> str:
 
 
 _GREY, _BLACK, _PINK, _BLUE, _TEAL, _ORANGE = "#8c8c8c", "#222222", "#d6338a", "#1f5f99", "#2a9d8f", "#d9822b"
-_HEAT = "viridis"
+_SLICES: dict[str, Any] = {"color": _GREY, "alpha": 0.6, "markeredgewidth": 0, "label": "slices"}
 _HEATMAPS_SHOWN = 4
 
 
@@ -229,11 +224,8 @@ def heatmap_figure(torque: TorqueResult, bank: Bank) -> Figure:
     measured.set_title(f"Measured: slice {number} at {torque.slices.torque_nm[index]:.3f} N·m", loc="left", fontsize=10)
     simulated.plot(np.abs(bank.signals[match.cell]), color=_BLUE, linewidth=0.6)
     simulated.set(ylabel="|signal| (model's voltage)", xlabel="channel")
-    simulated.set_title(
-        f"Best of the bank: k = {match.k:.2f} cm, σ = {match.sigma:.2f} cm, score {match.score:.3f}",
-        loc="left",
-        fontsize=10,
-    )
+    best = f"Best of the bank: k = {match.k:.2f} cm, σ = {match.sigma:.2f} cm, score {match.score:.3f}"
+    simulated.set_title(best, loc="left", fontsize=10)
     for axes in (measured, simulated):
         _plain(axes)
     axes = made.add_subplot(halves[1])
@@ -247,21 +239,16 @@ def heatmap_figure(torque: TorqueResult, bank: Bank) -> Figure:
 def torque_figure(torque: TorqueResult, bank: Bank) -> Figure:
     """Draw sigma against torque with four heatmaps, and the torque predicted from sigma."""
     measured, sigma = torque.slices.torque_nm, torque.focused.sigma
-    shown = _spread_over(measured)
+    means_nm, shown = torque.group_torque_nm, _spread_over(measured)
     made, scatter, lower = _relation_figure(
-        torque.fit, (sigma, measured), (torque.group_sigma, torque.group_torque_nm), "torque (N·m)",
+        torque.fit, (sigma, measured), (torque.group_sigma, means_nm), "torque (N·m)",
         "b  second-order polynomial of σ, fitted to the group means",
     )  # fmt: skip
-    scatter.plot(measured, sigma, "o", color=_GREY, alpha=0.6, markeredgewidth=0, label="slices")
+    scatter.plot(measured, sigma, "o", **_SLICES)
     scatter.plot(measured[shown], sigma[shown], "o", color=_PINK, label="heatmaps below")
-    scatter.plot(torque.group_torque_nm, torque.group_sigma, "x", color=_BLACK, markersize=9, label="group means")
-    scatter.set(xlabel="torque (N·m)", ylabel="σ of the best match (cm)")
-    scatter.set_title(
-        f"a  r = {_number(torque.r_focused, 3)} for slices, {_number(torque.r_clustered, 3)} for groups",
-        loc="left",
-        fontsize=10,
-    )
-    scatter.legend(frameon=False, fontsize=8)
+    scatter.plot(means_nm, torque.group_sigma, "x", color=_BLACK, markersize=9, label="group means")
+    title = f"a  r = {_number(torque.r_focused, 3)} for slices, {_number(torque.r_clustered, 3)} for groups"
+    _label(scatter, title, xlabel="torque (N·m)", ylabel="σ of the best match (cm)")
     titles = [f"{measured[index]:.3f} N·m, σ = {sigma[index]:.2f} cm" for index in shown]
     _heatmap_row(made, lower, torque.focused, shown, titles, bank)
     made.suptitle(f"Torque from σ (figure 8): {len(measured)} slices, {torque.grouping}, focused bank", fontsize=11)
@@ -277,15 +264,10 @@ def diameter_figure(diameter: DiameterResult, bank: Bank) -> Figure:
         diameter.fit, (k, measured), (means_k, diameters_mm), "diameter (mm)",
         "b  first-order polynomial of k, fitted to the accumulated matches",
     )  # fmt: skip
-    scatter.plot(k, measured, "o", color=_GREY, alpha=0.6, markeredgewidth=0, label="slices")
+    scatter.plot(k, measured, "o", **_SLICES)
     scatter.plot(means_k, diameters_mm, "x", color=_BLACK, markersize=9, label="heatmaps accumulated")
-    scatter.set(xlabel="k of the best match (cm)", ylabel="diameter (mm)")
-    scatter.set_title(
-        f"a  r = {_number(diameter.r_single, 3)} for slices, {_number(diameter.r_accumulated, 3)} accumulated",
-        loc="left",
-        fontsize=10,
-    )
-    scatter.legend(frameon=False, fontsize=8)
+    title = f"a  r = {_number(diameter.r_single, 3)} for slices, {_number(diameter.r_accumulated, 3)} accumulated"
+    _label(scatter, title, xlabel="k of the best match (cm)", ylabel="diameter (mm)")
     titles = [f"{diameters_mm[index]:g} mm, k = {means_k[index]:.2f} cm" for index in shown]
     _heatmap_row(made, lower, diameter.accumulated, shown, titles, bank)
     made.suptitle(
@@ -301,37 +283,32 @@ def _relation_figure(
     quantity: str,
     title: str,
 ) -> tuple[Figure, Axes, SubplotSpec]:
-    """Return a figure with drawn predictions, its empty axes for a scatter, and its lower half for heatmaps."""
+    """Return a figure with drawn predictions, its empty axes for a scatter, and its lower half for heatmaps.
+
+    `slices` and `means` are places of the matches and measured values.
+    """
     made = figure(13, 8.2)
     grid = made.add_gridspec(2, 1, height_ratios=[1.25, 1])
-    scatter, predicted = grid[0].subgridspec(1, 2).subplots(squeeze=False)[0]
-    _predictions(predicted, fit, slices, means)
-    predicted.set(xlabel=f"measured {quantity}", ylabel=f"predicted {quantity}")
-    predicted.set_title(title, loc="left", fontsize=10)
-    predicted.legend(frameon=False, fontsize=8)
-    for axes in (scatter, predicted):
-        _plain(axes)
+    scatter, axes = grid[0].subgridspec(1, 2).subplots(squeeze=False)[0]
+    (x, y), ends = slices, [min(*slices[1], *means[1]), max(*slices[1], *means[1])]
+    axes.plot(ends, ends, color=_ORANGE, linewidth=1, label="predicted = measured")
+    if fit is not None:
+        predicted, inside = np.array([fit(value) for value in x]), (x >= fit.x_low) & (x <= fit.x_high)
+        axes.plot(y[inside], predicted[inside], "o", **_SLICES)
+        if not inside.all():
+            beyond = "slices beyond the fit"
+            axes.plot(y[~inside], predicted[~inside], "o", color=_GREY, markerfacecolor="none", label=beyond)
+        fitted = [fit(value) for value in means[0]]
+        axes.plot(means[1], fitted, "x", color=_BLACK, markersize=9, label="fitted points")
+    _label(axes, title, xlabel=f"measured {quantity}", ylabel=f"predicted {quantity}")
     return made, scatter, grid[1]
 
 
-def _predictions(
-    axes: Axes, fit: Polynomial | None, slices: tuple[FloatArray, FloatArray], means: tuple[FloatArray, FloatArray]
-) -> None:
-    """Draw predicted against measured; each pair is (places of the matches, measured values)."""
-    everything = np.concatenate([slices[1], means[1]])
-    ends = np.array([everything.min(), everything.max()])
-    axes.plot(ends, ends, color=_ORANGE, linewidth=1, label="predicted = measured")
-    if fit is None:
-        return
-    x, y = slices
-    predicted = np.array([fit(value) for value in x])
-    inside = (x >= fit.x_low) & (x <= fit.x_high)
-    axes.plot(y[inside], predicted[inside], "o", color=_GREY, alpha=0.6, markeredgewidth=0, label="slices")
-    if not inside.all():
-        axes.plot(
-            y[~inside], predicted[~inside], "o", color=_GREY, markerfacecolor="none", label="slices beyond the fit"
-        )
-    axes.plot(means[1], [fit(value) for value in means[0]], "x", color=_BLACK, markersize=9, label="fitted points")
+def _label(axes: Axes, title: str, **labels: str) -> None:
+    axes.set(**labels)
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.legend(frameon=False, fontsize=8)
+    _plain(axes)
 
 
 def _heatmap_row(
@@ -357,7 +334,7 @@ def _heatmap(
     axes.patch.set(hatch="////", edgecolor="#c8c8c8", facecolor="white")
     low, high = limits or (None, None)
     image = axes.pcolormesh(
-        bank.sigma_grid, bank.k_grid, heatmap, cmap=_HEAT, vmin=low, vmax=high, shading="nearest", rasterized=True
+        bank.sigma_grid, bank.k_grid, heatmap, cmap="viridis", vmin=low, vmax=high, shading="nearest", rasterized=True
     )
     axes.plot(match.sigma, match.k, "o", markersize=8, markerfacecolor="none", markeredgecolor=_PINK, markeredgewidth=2)
     axes.set(xlabel="σ (cm)", ylabel="k (cm)")

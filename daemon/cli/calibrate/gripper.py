@@ -6,9 +6,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.operator_input import Operator
 from shearloop.daemon.cli.options import add_json
-from shearloop.daemon.cli.output import print_result
+from shearloop.daemon.cli.terminal import Operator, print_result
 
 if TYPE_CHECKING:
     from shearloop.drivers.robotiq.gripper import RobotiqGripper

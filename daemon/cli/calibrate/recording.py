@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.bank.estimators import DEFAULT, ESTIMATORS
 from shearloop.daemon.cli.options import add_json, check_overwrite
-from shearloop.daemon.cli.output import print_result
+from shearloop.daemon.cli.terminal import print_result
 
 if TYPE_CHECKING:
     from shearloop.bank.estimation import Calibration
@@ -126,7 +126,7 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
 
 
 def _misses_loads(regressor: "IntervalRegressor", calibration: "Calibration") -> str:
-    low_nm, high_nm = (round(limit, 3) + 0.0 for limit in (regressor.low, regressor.high))
+    low_nm, high_nm = (round(limit, 3) + 0.0 for limit in (regressor.range.low, regressor.range.high))
     others = [] if calibration.estimator.name == DEFAULT else [f"with --estimator {DEFAULT}"]
     others += ["on both fingertips"] if len(calibration.sides) == 1 else []
     cure = f"Calibrate {' or '.join(others)}, or record" if others else "Record"
@@ -138,7 +138,8 @@ def _misses_loads(regressor: "IntervalRegressor", calibration: "Calibration") ->
 
 
 def _range_ends(regressor: "IntervalRegressor") -> str:
-    limits = (regressor.low, regressor.high, regressor.low_end, regressor.high_end, regressor.lowest, regressor.highest)
+    span = regressor.range
+    limits = (span.low, span.high, span.low_end, span.high_end, span.lowest, span.highest)
     low_nm, high_nm, below_nm, above_nm, lowest_nm, highest_nm = (round(limit, 3) + 0.0 for limit in limits)
     where = (
         f"intervals of estimates below {below_nm:g} N·m reach to {lowest_nm:g} at least, of estimates above "

@@ -32,6 +32,7 @@ def checked_arguments(device: str, arguments: Sequence[str], folder: Path) -> ar
     """
     parser = _RaisingParser(prog=device, allow_abbrev=False, add_help=False)
     DEVICES[device].configure(parser)
+    parser.set_defaults(device=device)
     args = parser.parse_args(arguments)
     bank = getattr(args, "bank", None)
     if bank is not None and not (folder / bank).exists():

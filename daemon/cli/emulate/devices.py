@@ -14,13 +14,10 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from shearloop.bank.eit.mesh import Mesh
-    from shearloop.daemon.synthetic_frames import Signals
     from shearloop.drivers.emulators.boards import BoardFault
     from shearloop.drivers.emulators.ur_controller import Controller
     from shearloop.drivers.emulators.ur_robot import ControllerSpec, RobotEvent
 
-DEMO_BANK = Path(__file__).resolve().parents[3] / "config" / "banks" / "demo.yaml"
 # The paper's screwdriver: σ at rest and at the largest torque of its peak samples, in N·m.
 K_CM = 3.25
 SIGMA_AT_REST_CM, SIGMA_AT_LARGEST_CM, LARGEST_TORQUE_NM = 1.85, 1.25, 0.14
@@ -42,18 +39,13 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
 def _configure_eit_kit(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Prints the port's path, again each time it is plugged in. A fault's name on standard input applies to the "
-        "next frame: cut-line, wrong-count, nan, garbage, flood, repeat, silence [SECONDS], unplug [SECONDS]. A "
+        "next frame: cut-line, wrong-count, nan, garbage, silence [SECONDS], unplug [SECONDS]. A "
         "silence without a number lasts until the board is started again; `normal` ends every fault."
     )
     frames = parser.add_argument_group("frames")
     frames.add_argument("--recording", type=Path, metavar="FILE", help="a recorded stream (.mat)")
     frames.add_argument("--side", choices=("left", "right"), help="which fingertip, if the file holds both")
-    frames.add_argument(
-        "--bank",
-        type=Path,
-        metavar="FILE",
-        help="synthesise twists from this bank's signals (default, without --recording: the demo's fingertip, solved)",
-    )
+    frames.add_argument("--bank", type=Path, metavar="FILE", help="synthesise twists from this bank's signals")
     frames.add_argument(
         "--sigma",
         type=float,
@@ -108,7 +100,7 @@ def _numbered_fault(argument: str) -> "tuple[int, BoardFault]":
 
 
 def _frames(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.float64]"]:
-    if args.recording is not None and args.bank is not None:
+    if (args.recording is None) == (args.bank is None):
         raise UserError("give either --recording FILE to play a recording or --bank FILE to synthesise frames")
     if args.recording is None:
         if args.once:
@@ -116,43 +108,31 @@ def _frames(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.f
         return _synthetic(args, period_s)
     from shearloop.daemon.recording.matlab import read_stream
 
-    lines = read_stream(args.recording, args.side).lines
+    lines = read_stream(args.recording, args.side).values
     return iter(lines) if args.once else cycle(lines)
 
 
 def _synthetic(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.float64]"]:
     from shearloop.bank.eit.bank_file import Bank
-    from shearloop.daemon.synthetic_frames import Synthesiser, TwistProgramme, solve_signals, twist_frames
+    from shearloop.daemon.synthetic_frames import Synthesiser, TwistProgramme, twist_frames
 
     rest, largest = args.sigma
 
     def sigma_of_torque(torque_nm: float) -> float:
         return float(rest + (largest - rest) * torque_nm / LARGEST_TORQUE_NM)
 
-    if args.bank is not None:
-        signals: Signals = Bank.open(args.bank)
-    else:
-        signals = solve_signals(_demo_mesh(), K_CM, min(rest, largest), max(rest, largest))
-    synthesiser = Synthesiser(signals, seed=args.seed)
+    synthesiser = Synthesiser(Bank.open(args.bank), seed=args.seed)
     # Report a wrong sigma before a port appears.
     for torque_nm in (0.0, LARGEST_TORQUE_NM):
         synthesiser.signal(K_CM, sigma_of_torque(torque_nm))
     return twist_frames(synthesiser, TwistProgramme(), k=K_CM, sigma_of_torque=sigma_of_torque, period_s=period_s)
 
 
-def _demo_mesh() -> "Mesh":
-    from shearloop.daemon.bank_config import load_bank_plan
-
-    if not DEMO_BANK.is_file():
-        raise UserError(f"{DEMO_BANK} is not there; give --recording FILE to play, or --bank FILE to synthesise from")
-    return load_bank_plan(DEMO_BANK).mesh
-
-
 def _configure_hx711(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Prints the port's path, again each time it is plugged in. A fault's name on standard input applies to the "
         "next line: garbage, spike, torn; or to what follows: silence [SECONDS], saturation [SECONDS], stuck "
-        "[SECONDS], unplug [SECONDS], jump NM; `normal` ends them. `torque NM` sets the torque, `mass G` that of a "
+        "[SECONDS], unplug [SECONDS]; `normal` ends them. `torque NM` sets the torque, `mass G` that of a "
         "mass on the lever."
     )
     parser.add_argument("--torque-nm", type=float, default=0.0, metavar="NM", help="the torque (default: %(default)s)")
@@ -205,13 +185,12 @@ def add_robot(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--power-on-s", type=float, default=1.0, help="time of each power-on step (default: 1)")
 
 
-def robot_make(args: argparse.Namespace, version: tuple[int, ...] | None = None) -> "ControllerSpec":
+def robot_make(args: argparse.Namespace) -> "ControllerSpec":
     """Return the controller's make; UserError for a wrong rate."""
     from shearloop.drivers.emulators.ur_robot import ControllerSpec
 
     console.check_range(args, "rate_hz", 50, 1000)
-    times = {name: getattr(args, name) for name in ("unlock_wait_s", "power_on_s")}
-    return ControllerSpec(**times) if version is None else ControllerSpec(version=version, **times)
+    return ControllerSpec(unlock_wait_s=args.unlock_wait_s, power_on_s=args.power_on_s)
 
 
 def print_robot_event(event: "RobotEvent") -> None:
@@ -231,7 +210,6 @@ def _configure_ur(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--host", default="127.0.0.1", help="address to listen on; its ports 29999, 30003 and 30004 are the client's"
     )
-    parser.add_argument("--version", default="5.17.3.0", help="PolyScope version to give (default: %(default)s)")
     add_robot(parser)
 
 
@@ -239,11 +217,7 @@ def _run_ur(args: argparse.Namespace) -> int:
     from shearloop.drivers.emulators.ur_controller import Controller
     from shearloop.drivers.emulators.ur_robot import Robot
 
-    try:
-        version = tuple(int(part) for part in args.version.split("."))
-    except ValueError:
-        raise UserError(f"--version {args.version} is no version; write for instance 5.17.3.0") from None
-    controller = Controller(Robot(robot_make(args, version)), host=args.host, rate_hz=args.rate_hz)
+    controller = Controller(Robot(robot_make(args)), host=args.host, rate_hz=args.rate_hz)
 
     def on_command(line: str) -> None:
         controller.command(line)

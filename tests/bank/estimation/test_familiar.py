@@ -7,7 +7,7 @@ import pytest
 
 from shearloop.bank.estimation import EstimatorSession, FrameSeries, TactileFrame
 from shearloop.bank.estimation.bank_match import BankMatch
-from shearloop.bank.estimation.interval_regressor import IntervalRegressor, fit_interval_regressor
+from shearloop.bank.estimation.interval_regressor import IntervalRegressor, Mixtures, fit_interval_regressor
 from shearloop.bank.estimation.novelty import NoveltyDetector, ReciprocityCheck
 from shearloop.bank.estimation.regressors import Ridge
 
@@ -60,10 +60,18 @@ def saturating(value):
     return np.column_stack([np.maximum(value, 0.3), np.maximum(value, 0.3) ** 2])
 
 
+class Unmixed:
+    """A test in which every slice is familiar and no mixture is accepted."""
+
+    def growth(self, _, later):
+        return np.ones(len(later))
+
+    def accepted(self, *_):
+        return Mixtures(np.zeros(0, int), np.zeros((0, 1)), np.zeros(0))
+
+
 def reader_of(features, values) -> IntervalRegressor:
-    return fit_interval_regressor(
-        features, values, Ridge.fit, strengths=(1e-9,), growth=lambda _, later: np.ones(len(later))
-    )
+    return fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), test=Unmixed())
 
 
 def test_a_reading_at_the_end_of_what_is_told_apart_may_mean_anything_beyond_it():
@@ -87,15 +95,13 @@ def test_what_is_read_the_further_inside_the_further_it_lies_beyond_may_be_read_
 
     features = folded(values) + np.random.default_rng(6).normal(0, 1e-3, (200, 1))
     reader = reader_of(features, values)
-    assert reader.low_end == values.min(), "below nothing is folded"
-    assert reader.high_end == pytest.approx(0.5, abs=0.05)
+    assert reader.range.low_end == values.min(), "below nothing is folded"
+    assert reader.range.high_end == pytest.approx(0.5, abs=0.05)
     _, below, above = reader.predict(np.array([0.3]))
     assert max(below, above) < 0.5
     value, _, above = reader.predict(np.array([0.6]))
     assert value + above == pytest.approx(values.max() + 2 * np.ptp(values)), "as far beyond as is known to pass"
-    vouched = fit_interval_regressor(
-        features, values, Ridge.fit, strengths=(1e-9,), growth=lambda _, later: np.ones(len(later)), full_range=True
-    )
+    vouched = fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), test=Unmixed(), full_range=True)
     assert vouched.predict(np.array([0.6]))[2] < 0.5
     assert vouched.predict(np.array([0.6]))[0] == value
 
@@ -119,7 +125,7 @@ def test_equal_values_do_not_tell_where_the_outermost_of_them_are(steps):
     features = np.minimum(values, 1.4 - values)[:, None] + np.random.default_rng(6).normal(0, 0.1, (200, 1))
     reader = reader_of(features, values)
     assert (values == 1.0).mean() > 0.2
-    assert reader.high_end < 0.95
+    assert reader.range.high_end < 0.95
 
 
 def test_values_that_are_nearly_equal_say_nothing_of_how_it_goes_on_beyond_them():
@@ -128,15 +134,15 @@ def test_values_that_are_nearly_equal_say_nothing_of_how_it_goes_on_beyond_them(
         rng = np.random.default_rng(seed)
         values = np.resize([0.0, 0.3, 0.7, 1.0], 200) + 1e-6 * rng.normal(size=200)
         reader = reader_of(values[:, None] + rng.normal(0, 0.03, (200, 1)), values)
-        assert reader.low_end < 0.2
-        assert reader.high_end > 0.8
+        assert reader.range.low_end < 0.2
+        assert reader.range.high_end > 0.8
 
 
 def test_where_values_beyond_are_read_as_such_intervals_reach_no_further_than_the_range():
     rng = np.random.default_rng(2)
     values = rng.uniform(0.0, 1.0, 200)
     reader = reader_of(values[:, None] + rng.normal(0, 1e-3, (200, 1)), values)
-    assert (reader.low_end, reader.high_end) == (values.min(), values.max())
+    assert (reader.range.low_end, reader.range.high_end) == (values.min(), values.max())
     assert reader.predict(np.array([0.02]))[1] < 0.01
 
 

@@ -185,7 +185,7 @@ def test_what_is_valid_is_of_one_grip_and_hardly_made_up(motion_calibration):
                 assert len(last) == motion.n_lags + 1
                 assert last.count(None) <= 3
                 assert set(last) <= {True, None}
-                for found in (moment.difference, memory.mean_difference):
+                for found in (moment.difference, moment.mean_difference):
                     np.testing.assert_allclose(found, gripped - idle, atol=1e-9)
 
     holds()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.estimation import Calibration, FrameSeries, fit
-from shearloop.bank.estimation.fitting_slices import ContaminationTest, Mixtures, SliceReader
+from shearloop.bank.estimation.fitting import ContaminationTest, Mixtures, SliceReader
 from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
 from shearloop.bank.estimation.motion_regression import MotionRegression
 from shearloop.bank.estimation.novelty import NoveltyDetector
@@ -118,10 +118,14 @@ def test_the_interval_reaches_to_the_side_on_which_the_truth_is_hidden(sign):
     values = rng.uniform(0.0, 1.0, 100)
     features = values[:, None] + rng.normal(0, 1e-3, (100, 1))
 
-    def moved(_, later) -> Mixtures:
-        return Mixtures(later, features[later] + sign * 0.3, np.full(len(later), 0.5))
+    class Moved:
+        def growth(self, _, later):
+            return np.ones(len(later))
 
-    reader = fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), mixtures=moved)
+        def accepted(self, _, later):
+            return Mixtures(later, features[later] + sign * 0.3, np.full(len(later), 0.5))
+
+    reader = fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), test=Moved())
     _, *plain = reader.predict(np.array([0.5]))
     _, *at_limit = reader.predict(np.array([0.5]), limit_share=1.0)
     hidden, other = (0, 1) if sign > 0 else (1, 0)

@@ -61,9 +61,8 @@ def test_it_begins_to_respond_at_the_paper_s_0_04_newton(
     skin_112: CondensedSkin, loadings: dict[float, list[ContactState]]
 ) -> None:
     line = fit_line(shears(loadings[1.0]), gauge_responses(skin_112, loadings[1.0]))
-    kink_n = -line.offset / line.slope_per_n
-    assert kink_n == pytest.approx(0.040, abs=0.005)
-    assert kink_n == pytest.approx(membrane_model.deadband_n(SECTION, 1.0), rel=0.02)
+    assert line.kink_n == pytest.approx(0.040, abs=0.005)
+    assert line.kink_n == pytest.approx(SECTION.friction * SECTION.inner_radius_mm / SECTION.outer_radius_mm, rel=0.02)
     # And seen from near by: before it only the loaded patch itself gives way, behind it is the full slope.
     fine = np.arange(1, 13) * 0.01
     response = gauge_responses(skin_112, states_along(skin_112, 1.0, fine))

@@ -63,7 +63,7 @@ def test_a_gauge_that_drifts_while_a_force_is_held_ends_in_a_hold_and_not_in_a_p
     loop.skin.resistances_ohm = drifting  # type: ignore[method-assign]
     said = loop.run(60.0)
     assert said.startswith(ExperimentPhase.STOPPED.value)
-    assert max(loop.truth_n) < 2.0, "half of what the drift would have had it push by then"
+    assert max(loop.trace.truth_n) < 2.0, "half of what the drift would have had it push by then"
 
 
 @pytest.mark.usefixtures("fonts")

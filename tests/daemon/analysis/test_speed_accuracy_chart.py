@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import NoReturn
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.estimation import FrameSeries
 from shearloop.daemon.analysis.charts import scene
 from shearloop.daemon.analysis.charts.drawing import (
-    check_takes_pictures,
     figure,
     frontier,
     lay_out,
@@ -142,34 +140,13 @@ def test_the_speed_accuracy_chart_holds_every_method_with_its_ratio(scratch: Pat
     ],
 )
 @pytest.mark.parametrize("name", NAMES)
-def test_a_mistake_is_one_sentence_and_leaves_no_folder(
+def test_a_mistake_is_one_sentence(
     name: str, arguments: list[str], complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["chart", name, *arguments, "--out", str(tmp_path / "some" / "out")]) == 2
     said = capsys.readouterr().err
     assert complaint in said
     assert said.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_chart_that_is_interrupted_leaves_no_empty_folder(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(_: object, __: object, scratch: Path) -> NoReturn:
-        scratch.mkdir(parents=True)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("shearloop.daemon.analysis.charts.sources.splits", interrupted)
-    monkeypatch.setattr("shearloop.daemon.analysis.charts.sources.mesh_of", lambda _: None)
-    assert main(["chart", name, "--out", str(tmp_path / "some" / "out")]) == 130
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_that_was_there_is_left_as_it_was(tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    check_takes_pictures(tmp_path / "out")
-    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_an_unwritable_folder_is_reported_before_anything_is_measured(

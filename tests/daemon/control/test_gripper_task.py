@@ -41,7 +41,7 @@ async def test_cancelled_grip_can_be_released(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
         rig.model.put_between(40.0)
         task = task_of(rig)
-        read = tasks.create_task(task.read())
+        read = tasks.create_task(task.run())
         while rig.driver.latest is None:  # noqa: ASYNC110 - the driver is asked, as the loop is
             await asyncio.sleep(0)
         for turns in range(1, 30, 3):
@@ -61,7 +61,7 @@ async def test_cancelled_grip_is_halted_and_stays_connected(way: str, tmp_path: 
         felt = Felt()
         publisher: Any = Silent()
         task = GripperTask(rig.driver, publisher, felt)  # type: ignore[arg-type]
-        read = tasks.create_task(task.read())
+        read = tasks.create_task(task.run())
         while rig.driver.latest is None:  # noqa: ASYNC110 - the driver is asked, as the loop is
             await asyncio.sleep(0)
         assert felt[-1].uncertain, "a gripper without power may hold a tool"
@@ -90,7 +90,7 @@ async def test_cancelled_grip_is_halted_and_stays_connected(way: str, tmp_path: 
 async def test_halt_stops_the_fingers_after_a_reconnection(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
         task = task_of(rig)
-        read = tasks.create_task(task.read())
+        read = tasks.create_task(task.run())
         while rig.driver.latest is None:  # noqa: ASYNC110 - the driver is asked, as the loop is
             await asyncio.sleep(0)
         assert await task.release() == ""

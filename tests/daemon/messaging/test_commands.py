@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
-from unittest.mock import AsyncMock
 
 import pytest
 import zmq
@@ -19,11 +18,14 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.health import HealthReporter
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer, RateLimit
+from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.rig import Rig
+from shearloop.daemon.sensors import Sensors
 
 
 def handlers() -> Mapping[str, Any]:
@@ -66,7 +68,7 @@ async def test_each_request_gets_one_reply() -> None:
 
 async def test_req_and_dealer_clients_are_answered() -> None:
     with zmq.asyncio.Context() as context:
-        server = CommandServer(context, "tcp://127.0.0.1:*", handlers())
+        server = CommandServer(context, "tcp://127.0.0.1:*", handlers(), Refusals())
         address = server._socket.getsockopt_string(zmq.LAST_ENDPOINT)
         serving = asyncio.create_task(server.run())
         assert (await asyncio.to_thread(send_command, address, {"command": "tare"}, 5.0))["tared"] == ["right"]
@@ -138,11 +140,11 @@ async def test_only_heatmap_can_be_set(config: Callable[..., Path]) -> None:
     with zmq.asyncio.Context() as context:
         daemon = Daemon(load_daemon_config(config()), context)
         change = daemon.commands.handlers()["set"]
-        assert not daemon._fingertips["right"].always_heatmap
+        assert not daemon.sensors.fingertips["right"]._always_heatmap
         assert await change({"heatmap": "always"}) == {"set": ["right"], "heatmap": "always"}
-        assert daemon._fingertips["right"].always_heatmap
+        assert daemon.sensors.fingertips["right"]._always_heatmap
         await change({"heatmap": "on_request", "source": "right"})
-        assert not daemon._fingertips["right"].always_heatmap
+        assert not daemon.sensors.fingertips["right"]._always_heatmap
         for wrong, why in (
             ({}, "only `heatmap` can be set"),
             ({"heatmap": ["always"]}, "only `heatmap` can be set"),
@@ -157,15 +159,13 @@ async def test_only_heatmap_can_be_set(config: Callable[..., Path]) -> None:
 async def test_tare_is_refused_during_an_experiment() -> None:
     tared: list[str] = []
     experiment = SimpleNamespace(running=True, file=SimpleNamespace(name="hold"))
+    sensors = {name: SimpleNamespace(tare=partial(tared.append, name)) for name in ("right", "load_cell")}
     commands = Commands(
         rig=cast("Rig", SimpleNamespace(control_loop=SimpleNamespace(experiment=experiment))),
-        tares={name: partial(tared.append, name) for name in ("right", "load_cell")},
-        fingertips={},
+        sensors=cast("Sensors", SimpleNamespace(tareable=lambda: sensors)),
         experiment=None,
-        start=AsyncMock(),
-        call_off_experiment=lambda: None,
-        tasks=dict,
-        stop=lambda: None,
+        health=cast("HealthReporter", None),
+        stop=asyncio.Event(),
     )
     tare = commands.handlers()["tare"]
     for request_ in ({}, {"source": "load_cell"}):

@@ -115,24 +115,29 @@ async def test_a_flood_of_malformed_frames_and_requests(
         told.set()
 
     with zmq.asyncio.Context() as context:
-        daemon = Daemon(load_daemon_config(path), context)
+        configuration = load_daemon_config(path)
+        daemon = Daemon(configuration, context)
         daemon.publisher.add_listener(count)
         running = asyncio.create_task(daemon.run())
         try:
             async with asyncio.timeout(DEADLINE_S):
-                address = daemon._config.commands
+                address = configuration.commands
                 await asyncio.to_thread(exchange, address, malformed_requests(200))
                 before_mb, tasks = resident_memory_mb(), len(asyncio.all_tasks())
                 replies, _ = await asyncio.gather(
                     asyncio.to_thread(exchange, address, malformed_requests(REQUESTS)),
                     asyncio.to_thread(write_all, board, malformed_frames(FRAMES)),
                 )
-                while (refused := sum(daemon._fingertips["right"].diagnostics()["errors"].values())) < FRAMES - 1:
+                while (
+                    refused := sum(daemon.sensors.fingertips["right"].diagnostics()["errors"].values())
+                ) < FRAMES - 1:
                     told.clear()
                     await told.wait()
             assert replies == {False: REQUESTS}, "each is answered, and none is carried out"
-            assert sum(daemon._commands.refused.values()) == REQUESTS + 200
-            assert set(daemon._commands.refused) <= {"malformed request", "unknown command", "too many requests"}
+            refusals = daemon.health.tasks()["commands"]["errors"]
+            assert isinstance(refusals, dict)
+            assert sum(refusals.values()) == REQUESTS + 200
+            assert set(refusals) <= {"malformed request", "unknown command", "too many requests"}
             assert refused <= FRAMES
             assert published["eit.estimate"] == published["eit.frame"] == 0
             assert arm.told == [], "nothing was asked of the robot"
@@ -144,7 +149,7 @@ async def test_a_flood_of_malformed_frames_and_requests(
             assert len(asyncio.all_tasks()) <= tasks + command_server.MAX_CONCURRENT
             status = await asyncio.to_thread(exchange, address, iter([[encode({"command": "stop"})]]))
             assert status == {True: 1}, "stop is heard in the middle of it all"
-            await daemon.stopped()
+            await daemon._stop.wait()
         finally:
             daemon.stop()
             await running

@@ -15,6 +15,7 @@ from shearloop.daemon.cli import main
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import has_valid_port, is_local, local_stop_address, needs_keys
+from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import ClientKeys, KeyPair, load_key_pair, load_public_key, load_server_keys
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import bind
@@ -106,6 +107,12 @@ def address_of(socket: Any) -> str:
     return str(socket.getsockopt_string(zmq.LAST_ENDPOINT)).replace("//0.0.0.0:", "//127.0.0.1:")
 
 
+def server(daemon: Daemon, name: str) -> CommandServer:
+    task = daemon._tasks[name]
+    assert isinstance(task, CommandServer)
+    return task
+
+
 async def test_only_allowed_clients_connect_and_only_encrypted(
     config: Write, keys: Path, connect: Callable[..., Any]
 ) -> None:
@@ -114,7 +121,7 @@ async def test_only_allowed_clients_connect_and_only_encrypted(
         daemon = Daemon(load_daemon_config(path), context)
         running = asyncio.create_task(daemon.run())
         try:
-            commands, published = address_of(daemon._commands._socket), address_of(daemon.publisher._socket)
+            commands, published = address_of(server(daemon, "commands")._socket), address_of(daemon.publisher._socket)
             known = ada(keys)
             async with asyncio.timeout(60):
                 asking = connect(zmq.DEALER, commands, known)
@@ -132,7 +139,7 @@ async def test_only_allowed_clients_connect_and_only_encrypted(
                 await asking.send(encode({"command": "status"}))
                 assert not await asking.poll(SILENCE_MS), who
                 assert not await hearing.poll(0), who
-            assert daemon._command_diagnostics()["errors"]["key is not allowed"] >= 1
+            assert daemon.health.tasks()["commands"]["errors"]["key is not allowed"] >= 1
             await _stop_without_a_key(daemon, connect)
         finally:
             daemon.stop()
@@ -140,14 +147,13 @@ async def test_only_allowed_clients_connect_and_only_encrypted(
 
 
 async def _stop_without_a_key(daemon: Daemon, connect: Callable[..., Any]) -> None:
-    assert daemon._open_stop is not None
-    anyone = connect(zmq.DEALER, address_of(daemon._open_stop._socket), None)
+    anyone = connect(zmq.DEALER, address_of(server(daemon, "open_stop")._socket), None)
     for name in ("start", "resume", "unlock", "tare", "pause"):
         await anyone.send(encode({"command": name}))
         assert "this command needs a key" in decode(await anyone.recv())["reason"]
     await anyone.send(encode({"command": "stop"}))
     assert decode(await anyone.recv())["ok"]
-    await daemon.stopped()
+    await daemon._stop.wait()
 
 
 def test_the_local_stop_socket_is_named_by_the_port() -> None:

@@ -9,11 +9,10 @@ import pytest
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration, Estimate, FrameSeries, fit
-from shearloop.bank.estimation.estimator import Estimator, OutputModel, Reading
+from shearloop.bank.estimation.estimator import Estimator, OutputModel, Reading, Regression
 from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
 from shearloop.bank.estimation.load_delay import LoadDelay, LoadTiming
 from shearloop.bank.estimation.regressors import Ridge
-from shearloop.bank.estimation.ridge_estimators import Regression
 from shearloop.bank.estimators import ESTIMATORS
 from shearloop.daemon.analysis.calibrate import CalibrationResult
 from shearloop.daemon.analysis.evaluate import EstimateTrack, InvalidReason, figures_of, invalid_reasons
@@ -63,7 +62,7 @@ class BandMeans(Estimator):
     bands: int = 8
 
     def features(self, reading: Reading) -> tuple[FloatArray, None]:
-        return reading.difference.reshape(self.bands, -1).mean(axis=1), None
+        return reading.frame.difference.reshape(self.bands, -1).mean(axis=1), None
 
 
 @pytest.mark.usefixtures("few_mixtures")
@@ -111,7 +110,7 @@ def test_calibrate_says_which_torques_may_be_of_something_beyond(slices_folder, 
     calibrate = ["calibrate", str(slices_folder / "torque_slices"), "--out", str(tmp_path / "a.cal")]
     assert main(calibrate) == 0
     reader = fitted[-1].torque.regressor
-    low_end, lowest = (round(limit, 3) for limit in (reader.low_end, reader.lowest))
+    low_end, lowest = (round(limit, 3) for limit in (reader.range.low_end, reader.range.lowest))
     ends = f"of estimates below {low_end:g} N·m reach to {lowest:g} at least, of estimates above "
     assert ends in capsys.readouterr().out
     assert main([*calibrate, "--json"]) == 0
@@ -120,7 +119,7 @@ def test_calibrate_says_which_torques_may_be_of_something_beyond(slices_folder, 
     assert "assumes that" not in capsys.readouterr().err
     assert main([*calibrate, "--assume-full-range"]) == 0
     assert "beyond" not in capsys.readouterr().out
-    assert np.isinf(fitted[-1].torque.regressor.high_end)
+    assert np.isinf(fitted[-1].torque.regressor.range.high_end)
     assert main(["evaluate", str(tmp_path / "a.cal"), str(slices_folder / "torque_slices")]) == 0
     assert "a.cal assumes that no torque exceeds" in capsys.readouterr().err
     assert main([*calibrate, "--assume-full-range", "--json"]) == 0

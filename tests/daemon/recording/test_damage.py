@@ -61,7 +61,7 @@ def exported(path: Path) -> list[bytes]:
 def told(path: Path) -> list[tuple[str, int]]:
     found = summarise(path)
     # What is torn or damaged is said so here, and is no mistake.
-    if found.condition.closed and not found.condition.damaged_chunks:
+    if found.closed and not found.damaged_chunks:
         return sorted((name, topic.messages) for name, topic in found.topics.items())
     return []
 

@@ -71,7 +71,7 @@ def test_a_full_disk_keeps_all_flushed_data(tmp_path: Path, disks: Disks) -> Non
         if safe < 0:
             continue
         repaired = repair(partial)
-        assert repaired.condition.torn_bytes == 0, "the file ends with its last whole chunk"
+        assert repaired.torn_bytes == 0, "the file ends with its last whole chunk"
         numbers = [one["frame"] for one in topics(repaired.path)["eit.frame.right"]]
         assert numbers == list(range(safe + 1))
 

@@ -5,7 +5,7 @@ from scipy.io import savemat
 from shearloop.bank.eit.channels import N_LINE_VALUES
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.importing import import_mat
+from shearloop.daemon.recording.matlab import import_mat
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.writer import RecordingWriter
 

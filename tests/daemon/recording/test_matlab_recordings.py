@@ -1,6 +1,7 @@
 import contextlib
 import datetime
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,13 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording import matlab
-from shearloop.daemon.recording.matlab import read_line, read_load_stream, read_stream, read_torque_slices
+from shearloop.daemon.recording.matlab import read_diameter_slices, read_line, read_stream, read_torque_slices
 
 # 2024-12-03 16:09:38 on MATLAB's count of days.
 DATENUM = 739589 + (16 * 3600 + 9 * 60 + 38) / 86400
+
+
+read_load_stream = partial(read_stream, name="load")
 
 
 def stream_table(rows: int, width: int) -> np.ndarray:
@@ -28,8 +31,8 @@ def stream_table(rows: int, width: int) -> np.ndarray:
 def test_a_stream_has_several_names(tmp_path: Path, name: str) -> None:
     savemat(tmp_path / "device.mat", {name: stream_table(5, 1024)})
     stream = read_stream(tmp_path / "device.mat")
-    assert stream.lines.shape == (5, 1024)
-    assert stream.lines[1, 0] == 1.024
+    assert stream.values.shape == (5, 1024)
+    assert stream.values[1, 0] == 1.024
     first = datetime.datetime(2024, 12, 3, 16, 9, 38, tzinfo=datetime.UTC).timestamp()
     # A datenum of this size has steps of 10 µs.
     np.testing.assert_allclose(stream.unix_s, first + 0.54 * np.arange(5), atol=2e-5)
@@ -41,15 +44,15 @@ def test_a_load_stream_keeps_damaged_values(tmp_path: Path, name: str) -> None:
     table[2, 1] = 3.84e7
     savemat(tmp_path / "load.mat", {name: table})
     load = read_load_stream(tmp_path / "load.mat")
-    assert load.torque_nm.tolist() == [0.0, 0.001, 3.84e7, 0.003]
+    assert load.values[:, 0].tolist() == [0.0, 0.001, 3.84e7, 0.003]
     assert load.unix_s.shape == (4,)
 
 
 def test_a_file_with_two_fingertips_needs_a_side(tmp_path: Path) -> None:
     left, right = stream_table(2, 1024), stream_table(3, 1024)
     savemat(tmp_path / "both.mat", {"Left_Data": left, "Right_Data": right})
-    assert len(read_stream(tmp_path / "both.mat", side="left").lines) == 2
-    assert len(read_stream(tmp_path / "both.mat", side="right").lines) == 3
+    assert len(read_stream(tmp_path / "both.mat", name="left").values) == 2
+    assert len(read_stream(tmp_path / "both.mat", name="right").values) == 3
     with pytest.raises(UserError, match=r"both\.mat holds Right_Data and Left_Data; choose one"):
         read_stream(tmp_path / "both.mat")
 
@@ -68,7 +71,7 @@ def test_torque_slices_are_sorted_by_number(tmp_path: Path) -> None:
 def test_diameter_slices_are_sorted_by_diameter(tmp_path: Path) -> None:
     for name in ("40mm_Data_1", "9.5mm_Data_2", "9.5mm_Data_1", "100mm_Data_10"):
         savemat(tmp_path / f"{name}.mat", {"data_diff": np.ones((896, 1)), "mean_torque": [[0.1]]})
-    slices = matlab.read_diameter_slices(tmp_path)
+    slices = read_diameter_slices(tmp_path)
     assert slices.diameter_mm.tolist() == [9.5, 9.5, 40.0, 100.0]
     assert slices.differences.shape == (4, 896)
     assert slices.torque_nm.tolist() == [0.1] * 4
@@ -108,7 +111,7 @@ def test_unusable_slices_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"has no torque slices: expected files named Data_Slice_1\.mat"):
         read_torque_slices(tmp_path)
     with pytest.raises(UserError, match=r"has no diameter slices: expected files named 10mm_Data_1\.mat"):
-        matlab.read_diameter_slices(tmp_path)
+        read_diameter_slices(tmp_path)
     with pytest.raises(UserError, match="absent: the recordings cannot be listed: No such file"):
         read_torque_slices(tmp_path / "absent")
     savemat(tmp_path / "Data_Slice_1.mat", {"data_diff": np.zeros((1, 896)), "torque_value": 0.1})
@@ -179,7 +182,7 @@ def test_the_shared_recordings_are_read(shared: Path) -> None:
     folder = shared / "recordings"
     torque, diameter = (
         read_torque_slices(folder / "torque_slices"),
-        matlab.read_diameter_slices(folder / "diameter_slices"),
+        read_diameter_slices(folder / "diameter_slices"),
     )
     assert torque.numbers.tolist() == list(range(1, 50))
     assert torque.torque_nm[9] == pytest.approx(0.0085, abs=5e-5)
@@ -189,5 +192,5 @@ def test_the_shared_recordings_are_read(shared: Path) -> None:
     for name in ("2024-12-03_16-09/device1", "20241202_153632/left", "cylinders/10mm_1_right"):
         stream = read_stream(streams / f"{name}.mat")
         assert 0.4 < np.diff(stream.unix_s).mean() < 0.7
-        assert np.count_nonzero(stream.lines[0]) == 896
-    assert read_load_stream(streams / "glitch_20241202_173837" / "load.mat").torque_nm.max() == 38399996.0
+        assert np.count_nonzero(stream.values[0]) == 896
+    assert read_load_stream(streams / "glitch_20241202_173837" / "load.mat").values.max() == 38399996.0

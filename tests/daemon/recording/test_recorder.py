@@ -79,7 +79,7 @@ def test_messages_are_recorded_with_schema_and_time(tmp_path: Path) -> None:
         reader = make_reader(file)
         assert [one.name for one in reader.iter_attachments()] == ["configuration.json"]
     told = summarise(path)
-    assert (told.condition.closed, told.dropped, told.same_code) == (True, 0, True)
+    assert (told.closed, told.dropped, told.same_code) == (True, 0, True)
     assert told.topics["input.right"].messages == 2
     assert told.metadata["source"] == "a test"
 

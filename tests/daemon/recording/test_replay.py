@@ -20,7 +20,7 @@ from shearloop.daemon.cli import main
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.recording.importing import import_mat
+from shearloop.daemon.recording.matlab import import_mat
 from shearloop.daemon.recording.replay import (
     RecordedRun,
     Replay,

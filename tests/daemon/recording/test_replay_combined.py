@@ -90,7 +90,7 @@ async def record(config: Path, boards: dict[str, Path]) -> Messages:
         with zmq.asyncio.Context() as context:
             daemon = Daemon(load_daemon_config(config), context)
             daemon.publisher.add_listener(listen)
-            right = daemon._estimates["right"]
+            right = daemon.sensors.fingertips["right"].estimates
             right._gripper = cast(GripperTask, Gripper(right, Measured(OTHER_MM, 0.5), OTHER_TOOL))
             running = asyncio.create_task(daemon.run())
             try:

@@ -22,9 +22,9 @@ HELD, BEGUN, ZEROED, ENOUGH = 6, 12, 18, 40
 async def record(config: Path) -> list[dict[str, Any]]:
     """Run a daemon through two experiments; return what was published as estimates."""
     async with recording_daemon(config) as (daemon, published, until):
-        recorder, right = daemon._recorder, daemon._estimates["right"]
+        recorder, right = daemon.recorder, daemon.sensors.fingertips["right"].estimates
         assert recorder is not None
-        right._gripper = cast(GripperTask, Gripper(right, OTHER_TOOL, range(HELD, ENOUGH)))
+        right._gripper = cast(GripperTask, Gripper(right, OTHER_TOOL, range(HELD, 10 * ENOUGH)))
         recorder.record_experiment("first")
         await until(BEGUN)
         recorder.record_experiment("second")

@@ -25,7 +25,7 @@ from shearloop.daemon.analysis.charts.fault_sweeps import balanced
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.cli import main
-from shearloop.daemon.recording.importing import import_mat
+from shearloop.daemon.recording.matlab import import_mat
 from shearloop.daemon.recording.reader import read_recording
 
 # Five of the ten twists come before this share of the recording.
@@ -178,8 +178,12 @@ def test_later_torque_slices(slices, earlier):
     vouched = fit("motion_regression", [slices.between(0, 29)], "earlier", full_range=True)
     found = estimate_series(vouched, slices.between(29, 49)).estimates
     assert np.median([one.torque_high_nm - one.torque_low_nm for one in found]) <= 0.085
-    without_ends = replace(earlier("motion_regression", 29).torque.regressor, low_end=-np.inf, high_end=np.inf)
+    without_ends = _without_ends(earlier("motion_regression", 29).torque.regressor)
     assert pickle.dumps(vouched.torque.regressor) == pickle.dumps(without_ends), "nothing else is another"
+
+
+def _without_ends(regressor):
+    return replace(regressor, range=replace(regressor.range, low_end=-np.inf, high_end=np.inf))
 
 
 @pytest.mark.parametrize(
@@ -199,7 +203,7 @@ def test_torques_beyond_those_calibrated_on_lie_within_the_intervals(name, low_n
     assert figures["valid_fraction"] > 0.9, "or nothing would be tested"
     assert figures["coverage_95"] >= 0.9
     # As where somebody has vouched that no other will come, which changes nothing else (test_later_torque_slices).
-    reader = replace(calibration.torque.regressor, low_end=-np.inf, high_end=np.inf)
+    reader = _without_ends(calibration.torque.regressor)
     vouched = replace(calibration, torque=replace(calibration.torque, regressor=reader))
     vouched_for = figures_of([estimate_series(vouched, _some(slices, ~inside))])
     assert vouched_for["coverage_95"] < 0.8, "or there was nothing to hold"

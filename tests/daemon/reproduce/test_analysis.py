@@ -14,12 +14,12 @@ from shearloop.daemon.analysis.reproduce.analysis import (
     analyse_diameter,
     analyse_torque,
     correlation,
+    group_means,
     match_slices,
     score_models,
 )
 from shearloop.daemon.analysis.reproduce.banks import GRIDS, Grid, cached_bank, focused_grid
-from shearloop.daemon.analysis.reproduce.grouping import group_means
-from shearloop.daemon.recording.matlab import DiameterSlices, TorqueSlices, read_torque_slices
+from shearloop.daemon.recording.matlab import Slices, read_torque_slices
 
 
 @pytest.fixture(scope="module")
@@ -28,12 +28,15 @@ def bank(coarse_mesh: Mesh, tmp_path_factory: pytest.TempPathFactory):
     return cached_bank("small", grid, coarse_mesh, tmp_path_factory.mktemp("banks"))
 
 
-def slices_of(signals: NDArray, columns: list[int], torque: list[float]) -> TorqueSlices:
-    return TorqueSlices(np.abs(signals[3, columns]).astype(float), np.array(torque), np.arange(len(columns)))
+def slices_of(signals: NDArray, torque: list[float], diameter_mm: list[float] | None = None) -> Slices:
+    differences = np.abs(signals).astype(float)
+    return Slices(
+        differences, np.array(torque), np.arange(len(torque)), np.array(diameter_mm or [np.nan] * len(torque))
+    )
 
 
 def analysed(signals: NDArray, bank, columns: list[int], torque: list[float]) -> TorqueResult:
-    slices = slices_of(signals, columns, torque)
+    slices = slices_of(signals[3, columns], torque)
     matches = match_slices(slices.differences, bank, lambda _: None)
     return analyse_torque(slices, matches, matches)
 
@@ -81,9 +84,7 @@ def test_what_the_slices_do_not_determine_is_none_and_said(signals: NDArray, ban
 
 def test_diameter_is_related_to_the_k_of_the_best_match(signals: NDArray, bank) -> None:
     rows = [5, 5, 4, 2, 1]
-    slices = DiameterSlices(
-        np.abs(signals[rows, 4]).astype(float), np.array([10.0, 10.0, 20.0, 30.0, 30.0]), np.zeros(5)
-    )
+    slices = slices_of(signals[rows, 4], [0.0] * 5, [10.0, 10.0, 20.0, 30.0, 30.0])
     found = analyse_diameter(slices, bank, lambda _: None)
     smooth = smoothed_along_channels(slices.differences)
     expected = [best_match(heatmap, bank.k_grid, bank.sigma_grid).k for heatmap in found.single.heatmaps]
@@ -97,7 +98,7 @@ def test_diameter_is_related_to_the_k_of_the_best_match(signals: NDArray, bank) 
 
 
 def test_two_diameters_make_no_correlation(signals: NDArray, bank) -> None:
-    slices = DiameterSlices(np.abs(signals[[5, 1], 4]).astype(float), np.array([10.0, 30.0]), np.zeros(2))
+    slices = slices_of(signals[[5, 1], 4], [0.0] * 2, [10.0, 30.0])
     found = analyse_diameter(slices, bank, lambda _: None)
     assert (found.r_single, found.r_accumulated, found.fit) == (None, None, None)
     assert any("2 diameters" in note for note in found.notes)
@@ -110,7 +111,7 @@ def test_a_correlation_needs_three_points_that_differ() -> None:
 
 
 def test_without_a_raw_frame_models_are_scored_by_the_matching(signals: NDArray, coarse_mesh: Mesh) -> None:
-    slices = slices_of(signals, [4, 5], [0.01, 0.02])
+    slices = slices_of(signals[3, [4, 5]], [0.01, 0.02])
     scores = score_models(slices, None, coarse_mesh)
     assert scores.envelope is None
     assert scores.chosen is scores.matching

@@ -5,6 +5,7 @@ import signal
 import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import zmq
@@ -62,7 +63,7 @@ async def test_the_daemon_notifies_ready_alive_and_stopping(
     async with shearloop("run", str(config())) as daemon:
         assert await asyncio.to_thread(manager.recv, 4096) == b"READY=1"
         said = await asyncio.to_thread(manager.recv, 4096)
-        assert said.startswith(b"WATCHDOG=1\nSTATUS=4 tasks are alive")
+        assert said.startswith(b"WATCHDOG=1\nSTATUS=3 tasks are alive")
         daemon.send_signal(signal.SIGTERM)
         assert await daemon.wait() == 0
     while said != b"STOPPING=1":
@@ -96,7 +97,7 @@ async def test_a_finished_task_is_not_dead() -> None:
     async def ends() -> None:
         assert not supervisor.dead
 
-    await supervisor.keep_running("experiment", ends)
+    await supervisor.keep_running("experiment", SimpleNamespace(run=ends))
     assert not supervisor.dead
 
 

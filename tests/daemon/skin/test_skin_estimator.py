@@ -14,7 +14,7 @@ from shearloop.bank.skin.characterisation import loop
 from shearloop.bank.skin.membrane import Direction
 from shearloop.daemon.sensing.skin_estimator import DRIFT_PER_HOUR, SkinEstimator, SkinReading
 from shearloop.daemon.synthetic_skin import CONTACT_N_PER_MM, REST_OHM, SyntheticSkin
-from shearloop.drivers.shear_skin import SkinFault, SkinSample
+from shearloop.drivers.shear_skin.skin import SkinFault, SkinSample
 
 NOISE = 1e-4
 PERIOD_NS = 100_000_000

@@ -16,6 +16,7 @@ from shearloop.daemon.cli import main
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.synthetic_skin import SyntheticSkin
+from shearloop.daemon.taring import tare_all
 from shearloop.drivers.emulators.skin import SkinInstruments
 from tests.daemon.conftest import DEADLINE_S
 from tests.daemon.test_run import collector, running
@@ -33,7 +34,7 @@ class Played:
 
     @property
     def refused_lines(self) -> int:
-        skin = self.daemon._skin
+        skin = self.daemon.sensors.skin
         assert skin is not None
         errors = skin.diagnostics()["errors"]
         assert isinstance(errors, Mapping)
@@ -171,12 +172,12 @@ async def test_tare_takes_the_zero_anew_and_refuses_a_loaded_one(tmp_path: Path)
         bench.skin.push(0.8)
         assert await bench.command("tare", source="skin") == {"ok": True, "tared": ["skin"]}
         await bench.says("the zero was refused and is taken again")
-        why = await bench.daemon._tare()
+        why = await tare_all(bench.daemon.sensors.tareable().values())
         assert "the skin's zero was refused" in why
         bench.skin.push(0.0)
         bench.fresh()
         await bench.valid()
-        assert await bench.daemon._tare() == ""
+        assert await tare_all(bench.daemon.sensors.tareable().values()) == ""
         refused = await bench.command("tare", source="left")
         assert refused == {"ok": False, "reason": "there is no sensor 'left' to tare; there are skin"}
 
@@ -187,7 +188,7 @@ async def test_a_zero_that_cannot_be_taken_says_why_in_time(tmp_path: Path, monk
         await bench.valid()
         bench.instruments.command("open 2")
         await bench.says("gauge 2 is open")
-        assert "could not be taken within 0.3 s" in (why := await bench.daemon._tare())
+        assert "could not be taken within 0.3 s" in (why := await tare_all(bench.daemon.sensors.tareable().values()))
         assert "gauge 2 is open" in why
 
 

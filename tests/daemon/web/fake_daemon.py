@@ -20,6 +20,7 @@ import zmq.asyncio
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer
+from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import (
     EitEstimate,
     EitHeatmap,
@@ -238,7 +239,9 @@ async def serve(folder: Path) -> None:
         return handle
 
     with zmq.asyncio.Context() as context:
-        await CommandServer(context, f"ipc://{folder}/commands", {name: handler(name) for name in COMMANDS}).run()
+        await CommandServer(
+            context, f"ipc://{folder}/commands", {name: handler(name) for name in COMMANDS}, Refusals()
+        ).run()
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.web.access import default_token_path, host_allowed, load_token, origin_allowed, token_valid
+from shearloop.daemon.web.server import default_token_path, host_allowed, load_token, origin_allowed, token_valid
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.1:7760", "localhost:9000", "LOCALHOST:1", "[::1]:7760"])

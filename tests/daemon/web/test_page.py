@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from shearloop.daemon.web.latest import conductivity_profile
+from shearloop.daemon.web.message_store import conductivity_profile
 from tests.daemon.web.conftest import Browsed
 from tests.daemon.web.fake_daemon import MESSAGES, REASONS
 

@@ -23,12 +23,13 @@ from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer
+from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import EitHeatmap, LoadTorque
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.web import bridge as bridge_module
 from shearloop.daemon.web import server as server_module
 from shearloop.daemon.web.bridge import Bridge, DaemonAddress
-from shearloop.daemon.web.latest import LatestMessages
+from shearloop.daemon.web.message_store import MessageStore
 from shearloop.daemon.web.server import HEADERS, NEEDS_TOKEN, make_app, serve
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
@@ -65,8 +66,8 @@ async def served(tmp_path: Path, **other: Any) -> AsyncIterator[Served]:
     handlers = {name: handler(name) for name in (*NEEDS_TOKEN, "stop", "set")} | other
     with zmq.asyncio.Context() as context:
         publisher = Publisher(context, publish, Clock())
-        daemon = CommandServer(context, commands, handlers)
-        bridge = Bridge(context, DaemonAddress(publish, commands), LatestMessages(3.6))
+        daemon = CommandServer(context, commands, handlers, Refusals())
+        bridge = Bridge(context, DaemonAddress(publish, commands), MessageStore(3.6))
         tasks = [asyncio.create_task(run()) for run in (daemon.run, bridge.run)]
         runner = web.AppRunner(make_app(bridge, TOKEN, {"width_cm": 4.4}, publish), access_log=None)
         await runner.setup()

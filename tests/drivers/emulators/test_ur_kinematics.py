@@ -15,7 +15,7 @@ joints = st.tuples(*[angles] * 6).map(np.array)
 
 
 def test_stretched_arm_pose_follows_the_dimensions() -> None:
-    x, y, z = link_frames(np.zeros(6), 0.0)[-1][:3, 3]
+    x, y, z = link_frames(np.zeros(6))[-1][:3, 3]
     assert x == pytest.approx(-0.425 - 0.3922)
     assert y == pytest.approx(-0.1333 - 0.0996)
     assert z == pytest.approx(0.1625 - 0.0997)
@@ -24,7 +24,7 @@ def test_stretched_arm_pose_follows_the_dimensions() -> None:
 @given(joints, angles)
 def test_wrist_3_turns_the_tool_about_its_own_axis(q: np.ndarray, turn: float) -> None:
     turned = q + np.array([0, 0, 0, 0, 0, turn])
-    before, after = link_frames(q, 0.2)[-1], link_frames(turned, 0.2)[-1]
+    before, after = link_frames(q)[-1], link_frames(turned)[-1]
     assert after[:3, 3] == pytest.approx(before[:3, 3], abs=1e-12)
     about_z = Rotation.from_rotvec([0, 0, turn]).as_matrix()
     assert after[:3, :3] == pytest.approx(before[:3, :3] @ about_z, abs=1e-12)
@@ -33,9 +33,9 @@ def test_wrist_3_turns_the_tool_about_its_own_axis(q: np.ndarray, turn: float) -
 @given(joints)
 def test_jacobian_is_the_derivative_of_the_pose(q: np.ndarray) -> None:
     step = 1e-6
-    frames = link_frames(q, 0.1)
+    frames = link_frames(q)
     for joint, column in enumerate(jacobian(frames).T):
-        moved = link_frames(q + step * np.eye(6)[joint], 0.1)[-1]
+        moved = link_frames(q + step * np.eye(6)[joint])[-1]
         linear = (moved[:3, 3] - frames[-1][:3, 3]) / step
         angular = Rotation.from_matrix(moved[:3, :3] @ frames[-1][:3, :3].T).as_rotvec() / step
         assert column == pytest.approx(np.concatenate([linear, angular]), abs=1e-5)

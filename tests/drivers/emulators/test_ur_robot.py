@@ -28,14 +28,14 @@ def do(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) 
     """Carry out a command as the client does; return its duration in s."""
     send(robot, command, *numbers, asynchronous=asynchronous)
     begun_s = robot.time_s
-    while robot.registers.number("output_int_register_0") != 2:
+    while robot.registers["output_int_register_0"] != 2:
         robot.step(DT_S)
         assert robot.program_running, robot._events[-1]
         assert robot.time_s < begun_s + 20
     took_s = robot.time_s - begun_s
     robot.registers.write("input_int_register_0", 0, robot.time_s)
     wait(robot, DT_S)
-    assert robot.registers.number("output_int_register_0") == 1
+    assert robot.registers["output_int_register_0"] == 1
     return took_s
 
 
@@ -61,7 +61,7 @@ def happened(robot: Robot, name: str) -> list[float]:
 
 
 def moving_asynchronously(robot: Robot) -> bool:
-    return bool(int(robot.registers.number("output_int_register_2")) & 1 << 15)
+    return bool(int(robot.registers["output_int_register_2"]) & 1 << 15)
 
 
 def test_speed_is_reached_with_the_acceleration_and_held() -> None:
@@ -139,7 +139,7 @@ def test_new_program_obeys_old_registers() -> None:
 
 
 def test_linear_move_arrives_at_the_pose_on_a_straight_line() -> None:
-    robot = started(tool_length_m=0.2)
+    robot = started()
     begin = robot.arm.pose
     target = begin.copy()
     target[:3] += (0.05, -0.03, -0.1)

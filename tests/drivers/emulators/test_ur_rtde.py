@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.emulators import ur_controller
-from shearloop.drivers.emulators.ur_robot import ControllerSpec, Robot
+from shearloop.drivers.emulators.ur_robot import Robot
 from shearloop.drivers.emulators.ur_rtde import (
     ConnectionFaults,
     NotRtdeError,
@@ -32,8 +32,8 @@ CONVERSATION = (
 )
 
 
-def session(**make: object) -> RtdeSession:
-    return RtdeSession(Robot(ControllerSpec(**make)), 500.0, ConnectionFaults())  # type: ignore[arg-type]
+def session() -> RtdeSession:
+    return RtdeSession(Robot(), 500.0, ConnectionFaults())
 
 
 def replies(data: bytes) -> list[tuple[int, bytes]]:
@@ -46,7 +46,7 @@ def replies(data: bytes) -> list[tuple[int, bytes]]:
 
 
 def test_conversation_of_a_client() -> None:
-    rtde = session(version=(5, 17, 3, 0))
+    rtde = session()
     assert replies(rtde.receive(CONVERSATION)) == [
         (ord("V"), b"\x01"),
         (ord("v"), struct.pack(">4I", 5, 17, 3, 0)),
@@ -54,8 +54,8 @@ def test_conversation_of_a_client() -> None:
         (ord("I"), b"\x01INT32,DOUBLE"),
         (ord("S"), b"\x01"),
     ]
-    assert rtde.robot.registers.number("input_int_register_0") == 9
-    assert rtde.robot.registers.number("input_double_register_0") == 0.25
+    assert rtde.robot.registers["input_int_register_0"] == 9
+    assert rtde.robot.registers["input_double_register_0"] == 0.25
     ((kind, data),) = replies(rtde.data())
     assert kind == ord("U")
     assert data[:1] == b"\x01"
@@ -70,7 +70,7 @@ def test_bytes_may_arrive_in_any_pieces(cuts: list[int]) -> None:
     edges = [0, *sorted(cuts), len(CONVERSATION)]
     got = b"".join(pieces.receive(CONVERSATION[a:b]) for a, b in pairwise(edges))
     assert got == answer
-    assert pieces.robot.registers.number("input_double_register_0") == 0.25
+    assert pieces.robot.registers["input_double_register_0"] == 0.25
 
 
 any_packages = st.tuples(st.sampled_from(b"VvOISPUM"), st.binary(max_size=60)).map(lambda parts: package(*parts))
@@ -104,7 +104,7 @@ def test_data_comes_at_the_rate_asked_for_and_not_before_the_start() -> None:
 
 
 def test_registers_in_use_and_unknown_variables_are_refused_by_name() -> None:
-    rtde = RtdeSession(Robot(ControllerSpec(version=(5, 5, 1, 0))), 500.0, ConnectionFaults(registers_in_use=True))
+    rtde = RtdeSession(Robot(), 500.0, ConnectionFaults(registers_in_use=True))
     ((_, answer),) = replies(rtde.receive(package(ord("I"), COMMAND)))
     assert answer == b"\x00IN_USE,IN_USE"
     ((_, answer),) = replies(rtde.receive(package(ord("O"), struct.pack(">d", 125.0) + b"timestamp,ft_raw_wrench")))
@@ -115,7 +115,7 @@ def test_short_vector_is_dropped() -> None:
     rtde = session()
     rtde.receive(CONVERSATION)
     rtde.receive(package(ord("U"), struct.pack(">Bi", 1, 11)))
-    assert rtde.robot.registers.number("input_int_register_0") == 9
+    assert rtde.robot.registers["input_int_register_0"] == 9
 
 
 @given(st.lists(st.floats(allow_nan=False), min_size=7, max_size=7), st.integers(-(2**31), 2**31 - 1))

@@ -9,8 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.errors import ProtocolError
-from shearloop.drivers.shear_skin.instruments import ADC_BAUD, PairParser, read_elements, read_scan
-from shearloop.drivers.shear_skin.scpi import MAX_REPLY_BYTES, Reply, ReplyLines, parse_numbers
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.drivers.shear_skin.instruments import (
+    ADC_BAUD,
+    MAX_REPLY_BYTES,
+    PairParser,
+    Reply,
+    ReplyLines,
+    parse_numbers,
+    read_elements,
+    read_scan,
+)
 
 PERIOD_NS = 100_000_000
 VOLTS = st.floats(-0.6, 0.6).map(lambda volts: round(volts, 6))
@@ -56,8 +65,8 @@ def test_refused_lines_are_counted_by_kind() -> None:
 def test_a_line_that_breaks_off_is_counted_and_no_part_of_it_is_read() -> None:
     parser = PairParser()
     parser.feed(b"\n0.125000,0.1", 0)
-    parser.restart()
-    parser.restart()
+    parser.handle(RawEvent(InputKind.OPENED, 0))
+    parser.handle(RawEvent(InputKind.OPENED, 0))
     assert parser.feed(b"0.125000,0.126000\n", 1) == [], "after the opening a line may be under way"
     (found,) = parser.feed(b"0.127000,0.128000\n", 2)
     assert (found.v1_v, found.v2_v) == (0.127, 0.128)

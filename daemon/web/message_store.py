@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.bank.eit.matching import best_match
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import MatchingError
@@ -41,7 +40,7 @@ class StoredMessage(NamedTuple):
     json_tail: str
 
 
-class LatestMessages:
+class MessageStore:
     """Stores messages and returns the new ones for a page."""
 
     def __init__(self, height_cm: float) -> None:
@@ -130,16 +129,6 @@ def conductivity_profile(model: str, k: float, sigma: float, height_cm: float) -
     with np.errstate(over="ignore", invalid="ignore"):
         values = 1.0 + MODELS[model].function(y_cm, k, sigma, height_cm / 2)
     return values.tolist() if np.isfinite(values).all() else None
-
-
-def fingertip_outline(fingertip: Fingertip) -> dict[str, Any]:
-    """Return a fingertip's geometry for the page, in cm."""
-    return {
-        "width_cm": fingertip.width_cm,
-        "height_cm": fingertip.height_cm,
-        "electrode_width_cm": fingertip.electrode_width_cm,
-        "electrodes": [{"side": place.side, "centre_cm": place.centre_cm} for place in fingertip.electrodes],
-    }
 
 
 def json_value(value: Any) -> Any:

@@ -3,12 +3,13 @@
 import asyncio
 import contextlib
 import os
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import structlog
 
-from shearloop.daemon.control.step_runner import Experiment, ExperimentPhase
+from shearloop.daemon.control.step_runner import ExperimentPhase
+from shearloop.daemon.rig import Rig
 
 # Interval between attempts to start.
 START_RETRY_S = 0.5
@@ -19,17 +20,15 @@ ENDED_WITHIN_S = 0.2
 class ConfiguredExperiment:
     """Starts one experiment automatically and waits for its end."""
 
-    def __init__(
-        self, path: Path, start: Callable[[Path], Awaitable[str | None]], ended: Callable[[], Awaitable[Experiment]]
-    ) -> None:
-        """`start` begins an experiment or returns why not; `ended` returns the next experiment that has ended."""
+    def __init__(self, path: Path, rig: Rig, stop: asyncio.Event | None = None) -> None:
+        """Take the experiment's file; its end sets `stop`."""
         self.path = path
         self.done = False
         self.begun = False
         # Only the operator may start it.
         self.left_to_operator = False
-        self._start = start
-        self._ended = ended
+        self._rig = rig
+        self._stop = stop
         self._awaited = self._called_off = False
         self._has_begun = asyncio.Event()
         # Cleared while a running experiment has not reported its end.
@@ -38,7 +37,17 @@ class ConfiguredExperiment:
         self._crash_marker = CrashMarker()
 
     async def run(self) -> None:
-        """Start the experiment once, and return at its end, or if only the operator may start it."""
+        """Start the experiment once, and return at its end.
+
+        If only the operator may start it, return at once, or at its end where the daemon ends with it.
+        """
+        await self._start_once()
+        if self.begun or self._stop is not None:
+            await self.wait_for_end()
+        if self._stop is not None:
+            self._stop.set()
+
+    async def _start_once(self) -> None:
         log, logged = structlog.get_logger().bind(experiment=str(self.path)), ""
         if self._crash_marker.left_behind and not self._called_off:
             log.warning(
@@ -49,8 +58,10 @@ class ConfiguredExperiment:
         # After a crash of this task, an experiment that has begun or was called off is not started again.
         self._awaited = not (self.begun or self._called_off)
         while self._awaited:
-            reason = await self._start(self.path)
-            if reason is not None:
+            reason = await self._rig.start(self.path)
+            if reason is None:
+                self.on_begun(self.path)
+            else:
                 if reason != logged:
                     log.info("waiting to start", reason=reason)
                     logged = reason
@@ -58,15 +69,13 @@ class ConfiguredExperiment:
         self.left_to_operator = not self.begun
         if self.left_to_operator:
             log.info("it starts by `shearloop command start` only")
-            return
-        await self.wait_for_end()
 
     async def wait_for_end(self) -> None:
         """Wait until it has begun, automatically or by hand, and has ended."""
         await self._has_begun.wait()
         self._end_reported.clear()
         try:
-            experiment = await self._ended()
+            experiment = await self._rig.runner.experiment_ended()
             self.done = experiment.phase is ExperimentPhase.DONE
             structlog.get_logger().info(
                 "the experiment has ended",

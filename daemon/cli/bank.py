@@ -1,14 +1,27 @@
 """`shearloop bank`: solve, build, inspect and draw banks of simulated signals."""
 
 import argparse
+import json
+import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from shearloop.daemon.cli.bank import build
-from shearloop.daemon.cli.bank.build import MODEL_NAMES, add_overrides, overrides
-from shearloop.daemon.cli.options import add_json, check_overwrite
-from shearloop.daemon.cli.output import print_result
+from shearloop.daemon.cli.options import add_cluster, add_json, check_overwrite
+from shearloop.daemon.cli.terminal import print_result, progress_bar
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.signals import report_interrupt
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from shearloop.bank.eit.bank_file import BankDefinition
+    from shearloop.bank.eit.build import BankRow
+    from shearloop.bank.eit.mesh import Mesh
+    from shearloop.daemon.bank_config import BankPlan
+
+# As text: `--help` imports no large library.
+MODEL_NAMES = "step, linear, cut_linear, gaussian_derivative or modulated_gaussian"
 
 _ACTIONS = {
     "build": "build a bank, or resume an interrupted build",
@@ -23,7 +36,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the actions and their arguments."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     added = {name: actions.add_parser(name, help=text, description=text) for name, text in _ACTIONS.items()}
-    build.configure(added["build"])
+    build = added["build"]
+    build.add_argument("--config", type=Path, required=True, metavar="FILE", help="the bank's configuration (YAML)")
+    build.add_argument(
+        "--out", type=Path, required=True, metavar="PATH", help="the bank file to write; with `over`, the folder"
+    )
+    build.add_argument(
+        "--jobs",
+        type=int,
+        metavar="N",
+        help="threads that solve, or workers of a cluster of this machine (default: one per core)",
+    )
+    add_cluster(build)
+    add_json(build)
 
     design = added["design"]
     design.add_argument("recording", type=Path, metavar="RECORDING", help="a recording (.mcap) or a folder of slices")
@@ -39,14 +64,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
     plot = added["plot"]
     plot.add_argument("path", type=Path, nargs="?", metavar="PATH", help="a bank whose signals are drawn")
-    plot.add_argument(
-        "--config",
-        type=Path,
-        metavar="FILE",
-        help="a bank's configuration (YAML): its models are drawn, and without PATH its signals, solved for the plot",
-    )
+    plot.add_argument("--config", type=Path, metavar="FILE", help="a bank's configuration whose models are drawn")
     plot.add_argument("--out", type=Path, required=True, metavar="DIR", help="directory for the PNG and SVG files")
-    add_overrides(plot)
 
     solve = added["solve"]
     solve.add_argument(
@@ -61,8 +80,111 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run one action and return the exit status."""
-    actions = {"build": build.run, "design": _design, "info": _info, "plot": _plot, "solve": _solve}
+    actions = {"build": _build, "design": _design, "info": _info, "plot": _plot, "solve": _solve}
     return actions[args.action](args)
+
+
+def _build(args: argparse.Namespace) -> int:
+    """Build the bank, with progress on stderr."""
+    try:
+        return _build_all(args)
+    except KeyboardInterrupt as interrupt:
+        kept = args.out if args.out.is_dir() else f"{args.out}.part"
+        sentence = f"shearloop bank: interrupted: finished rows are in {kept}, and the same command resumes from there"
+        return report_interrupt(sentence, interrupt)
+
+
+def _build_all(args: argparse.Namespace) -> int:
+    from shearloop.bank.eit.bank_file import BANK_MAGIC
+    from shearloop.bank.eit.build import build_bank, solve_row
+    from shearloop.bank.errors import EmptyBankError
+    from shearloop.daemon.bank_config import load_bank_plans
+    from shearloop.daemon.workers import open_executor
+
+    jobs = len(os.sched_getaffinity(0)) if args.jobs is None else args.jobs
+    if jobs < 1:
+        raise UserError(f"--jobs must be 1 or more, not {jobs}")
+    plans = load_bank_plans(args.config)
+    paths = _paths(args.out, list(plans))
+    # In a folder the names are the banks' own, and an unusable bank is built again.
+    if paths == [args.out]:
+        check_overwrite(args.out, "a bank", BANK_MAGIC)
+    built = []
+    with open_executor(args.cluster, jobs) as pool:
+
+        def on_cluster(
+            mesh: "Mesh", definition: "BankDefinition", rows: "Sequence[int]"
+        ) -> "Iterator[tuple[int, BankRow]]":
+            for number, cells in pool.map(solve_row, (mesh, definition), rows):
+                yield rows[number], cells
+
+        for path, plan in zip(paths, plans.values(), strict=True):
+            if len(paths) > 1 and _is_built(path, plan):
+                built.append(path)
+                continue
+            try:
+                with progress_bar(path.name, len(plan.definition.k_grid), "row") as show:
+                    build_bank(
+                        *plan,
+                        path,
+                        jobs=jobs,
+                        elsewhere=on_cluster if args.cluster is not None else None,
+                        on_row=lambda done, _: show(done),
+                        on_notice=lambda sentence: print(sentence, file=sys.stderr),
+                    )
+                built.append(path)
+            except EmptyBankError as error:
+                # The other banks of a folder are usable; where all are empty, the last one fails.
+                if path == paths[-1] and not built:
+                    raise
+                print(f"{error}. It is left out", file=sys.stderr)
+    results = [_result(path) for path in built]
+    if args.json:
+        print(json.dumps(results[0] if args.out == paths[0] else {"banks": results}))
+    else:
+        for one in results:
+            print(f"{one['path']}: {one['valid_cells']} of {one['cells']} cells valid, identity {one['identity'][:12]}")
+    return 0
+
+
+def _paths(out: Path, names: list[str]) -> list[Path]:
+    """Return the banks' paths: `out` for a single one without a name, else files in the folder `out`."""
+    if names == [""]:
+        return [out]
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{out}: the banks need a folder there: {error.strerror}; choose another --out") from error
+    return [out / f"{name}.bank" for name in names]
+
+
+def _is_built(path: Path, plan: "BankPlan") -> bool:
+    """Return whether an earlier build of a folder has finished this bank."""
+    from shearloop.bank.eit.bank_file import Bank
+    from shearloop.bank.errors import BankFileError
+
+    if not path.exists():
+        return False
+    try:
+        return Bank.open(path, verify=True).identity == plan.definition.identity
+    except BankFileError:
+        print(f"{path}: it cannot be used, and is built again", file=sys.stderr)
+        return False
+
+
+def _result(path: Path) -> dict[str, Any]:
+    from shearloop.bank.eit.bank_file import Bank
+
+    bank = Bank.open(path)
+    return {
+        "path": str(path),
+        "identity": bank.identity,
+        "model": bank.model,
+        "shape": list(bank.signals.shape),
+        "valid_cells": int(bank.valid.sum()),
+        "cells": bank.valid.size,
+        "bytes": path.stat().st_size,
+    }
 
 
 def _design(args: argparse.Namespace) -> int:
@@ -133,25 +255,23 @@ def _plot(args: argparse.Namespace) -> int:
     if args.path is None and args.config is None:
         raise UserError("give a bank's PATH, or --config FILE, or both")
     try:
-        from shearloop.daemon.cli.bank import figures
+        from shearloop.daemon.analysis.charts import bank_figures
     except ModuleNotFoundError as error:
         raise UserError(f"drawing needs {error.name}: install shearloop with the extra `plot`") from error
     from shearloop.bank.eit.bank_file import Bank
     from shearloop.daemon.bank_config import load_bank_plan
 
     drawn = {}
-    replaced = overrides(args)
-    plan = load_bank_plan(args.config, *replaced) if args.config is not None else None
     if args.path is not None:
-        drawn["bank_signals"] = figures.signal_figure(figures.grid_of_bank(Bank.open(args.path)))
-    elif plan is not None:
-        drawn["bank_signals"] = figures.signal_figure(figures.grid_of_plan(plan))
-    if plan is not None:
-        drawn["models"] = figures.models_figure(plan.mesh)
+        drawn["bank_signals"] = bank_figures.signal_figure(Bank.open(args.path))
+    if args.config is not None:
+        drawn["models"] = bank_figures.models_figure(load_bank_plan(args.config).mesh)
     try:
+        args.out.mkdir(parents=True, exist_ok=True)
         for name, figure in drawn.items():
-            for path in figures.save_figure(figure, args.out, name):
-                print(path)
+            for suffix in ("png", "svg"):
+                figure.savefig(args.out / f"{name}.{suffix}", dpi=150)
+                print(args.out / f"{name}.{suffix}")
     except OSError as error:
         raise UserError(
             f"{args.out}: the pictures cannot be written: {error.strerror}; choose another --out"

@@ -1,52 +1,18 @@
 """Figures of a bank: its signals over the grid, and conductivity and signals of the five basis models."""
 
-from dataclasses import replace
-from pathlib import Path
-from typing import NamedTuple
-
 import numpy as np
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 
-from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from shearloop.bank.arrays import IntArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.build import RowSolver
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS, conductivity
-from shearloop.daemon.bank_config import BankPlan
 
 _PANELS = 10
 _BLUE, _GREY = "#1f5f99", "#8a8a8a"
-
-
-class SignalGrid(NamedTuple):
-    """Signals (K, S, 896) to draw over (K,) k and (S,) σ, where valid (K, S)."""
-
-    model: str
-    k: FloatArray
-    sigma: FloatArray
-    signals: Float32Array
-    valid: BoolArray
-
-
-def grid_of_bank(bank: Bank) -> SignalGrid:
-    """Return up to ten rows and columns, evenly spread over a bank."""
-    rows, columns = _spread(len(bank.k_grid)), _spread(len(bank.sigma_grid))
-    cells = rows[:, None], columns
-    return SignalGrid(bank.model, bank.k_grid[rows], bank.sigma_grid[columns], bank.signals[cells], bank.valid[cells])
-
-
-def grid_of_plan(plan: BankPlan) -> SignalGrid:
-    """Solve up to ten rows and columns, evenly spread over a planned bank."""
-    whole = plan.definition
-    k, sigma = whole.k_grid[_spread(len(whole.k_grid))], whole.sigma_grid[_spread(len(whole.sigma_grid))]
-    solver = RowSolver(plan.mesh, replace(whole, k_grid=k, sigma_grid=sigma))
-    rows = [solver.solve(row) for row in range(len(k))]
-    return SignalGrid(
-        whole.model, k, sigma, np.stack([cells.signals for cells in rows]), np.stack([cells.valid for cells in rows])
-    )
 
 
 def _spread(count: int) -> IntArray:
@@ -54,22 +20,23 @@ def _spread(count: int) -> IntArray:
     return np.unique(np.rint(np.linspace(0, count - 1, min(_PANELS, count))).astype(np.int64))
 
 
-def signal_figure(grid: SignalGrid) -> Figure:
-    """Draw every signal of a small grid in its own panel, as figure 6 of Trehan et al. 2025 does.
+def signal_figure(bank: Bank) -> Figure:
+    """Draw up to ten rows and columns of a bank's signals, as figure 6 of Trehan et al. 2025 does.
 
     Signals differ a hundredfold in size, so every panel is scaled to its peak and shows it.
     """
-    model = MODELS[grid.model]
-    rows, columns = len(grid.sigma), len(grid.k)
+    model = MODELS[bank.model]
+    of_k, of_sigma = _spread(len(bank.k_grid)), _spread(len(bank.sigma_grid))
+    rows, columns = len(of_sigma), len(of_k)
     figure = Figure(figsize=(1.35 * columns + 1.2, 0.85 * rows + 1.4), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, gridspec_kw={"wspace": 0.08, "hspace": 0.12})
-    for row, s in enumerate(reversed(range(rows))):
-        for column in range(columns):
+    for row, s in enumerate(reversed(of_sigma)):
+        for column, k in enumerate(of_k):
             panel = axes[row, column]
             panel.set_xticks([])
             panel.set_yticks([])
-            if grid.valid[column, s]:
-                signal = grid.signals[column, s]
+            if bank.valid[k, s]:
+                signal = bank.signals[k, s]
                 peak = float(np.abs(signal).max())
                 panel.plot(signal / peak, color=_BLUE, linewidth=0.35)
                 panel.set_ylim(-1.15, 1.6)
@@ -78,9 +45,9 @@ def signal_figure(grid: SignalGrid) -> Figure:
                 panel.set_facecolor("#eeeeee")
                 panel.text(0.5, 0.5, "not valid", transform=panel.transAxes, ha="center", va="center", fontsize=6)
             if row == rows - 1:
-                panel.set_xlabel(f"{grid.k[column]:.3g}", fontsize=8)
+                panel.set_xlabel(f"{bank.k_grid[k]:.3g}", fontsize=8)
             if column == 0:
-                panel.set_ylabel(f"{grid.sigma[s]:.3g}", fontsize=8, rotation=0, ha="right", va="center")
+                panel.set_ylabel(f"{bank.sigma_grid[s]:.3g}", fontsize=8, rotation=0, ha="right", va="center")
     figure.supxlabel(f"k ({model.k_unit})", fontsize=10)
     figure.supylabel(f"σ ({model.sigma_unit})", fontsize=10)
     figure.suptitle(
@@ -137,12 +104,3 @@ def models_figure(mesh: Mesh) -> Figure:
         "The five basis models: f, conductivity 1 + f with the electrodes, and the signal it makes", fontsize=11
     )
     return figure
-
-
-def save_figure(figure: Figure, directory: Path, name: str) -> list[Path]:
-    """Write a figure as PNG and as SVG and return the paths; raises OSError."""
-    directory.mkdir(parents=True, exist_ok=True)
-    paths = [directory / f"{name}.png", directory / f"{name}.svg"]
-    for path in paths:
-        figure.savefig(path, dpi=150)
-    return paths

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from shearloop.bank.eit.models import conductivity as conductivity_of_mesh
 from shearloop.daemon.messaging.messages import decode, encode
-from shearloop.daemon.web.latest import HEIGHTS, MAX_STREAMS, LatestMessages, conductivity_profile, json_value
+from shearloop.daemon.web.message_store import HEIGHTS, MAX_STREAMS, MessageStore, conductivity_profile, json_value
 from tests.bank.conftest import small_fingertip
 
 
@@ -17,12 +17,12 @@ def message(source: str = "right", **content: Any) -> dict[str, Any]:
     return {"timestamp": 1.5, "t_mono_ns": 5, "seq": 0, "source": source, **content}
 
 
-def batch(latest: LatestMessages, after: int = 0, now_s: float = 10.0) -> dict[str, Any]:
+def batch(latest: MessageStore, after: int = 0, now_s: float = 10.0) -> dict[str, Any]:
     return dict(json.loads(latest.batch(after, now_s, first=True)))
 
 
 def test_a_page_gets_the_latest_of_each_topic_and_source_with_its_age() -> None:
-    latest = LatestMessages(3.6)
+    latest = MessageStore(3.6)
     latest.add("load.torque", message("load_cell", torque_nm=0.1), 1.0)
     latest.add("load.torque", message("load_cell", torque_nm=0.2), 2.0)
     latest.add("eit.estimate", message("left", torque_nm=None, valid=False), 3.0)
@@ -39,7 +39,7 @@ def test_a_page_gets_the_latest_of_each_topic_and_source_with_its_age() -> None:
 
 
 def test_a_new_page_gets_the_last_minute() -> None:
-    latest = LatestMessages(3.6)
+    latest = MessageStore(3.6)
     for second in range(100):
         latest.add("load.torque", message("load_cell", torque_nm=0.01 * second, raw=1.0, valid=True), float(second))
     told = latest.history(99.0)
@@ -52,11 +52,11 @@ def test_a_new_page_gets_the_last_minute() -> None:
 
 
 def test_quiet_time_is_unknown_without_messages() -> None:
-    assert batch(LatestMessages(3.6))["quiet_s"] is None
+    assert batch(MessageStore(3.6))["quiet_s"] is None
 
 
 def test_invalid_messages_are_counted_by_kind_and_do_not_end_the_silence() -> None:
-    latest = LatestMessages(3.6)
+    latest = MessageStore(3.6)
     latest.add("weather", message(), 1.0)
     latest.add("health", {"source": "daemon"}, 1.0)
     latest.add("health", message(tasks=b"bytes"), 1.0)
@@ -86,7 +86,7 @@ VALUES: st.SearchStrategy[Any] = st.recursive(
 
 @given(st.dictionaries(st.text(), VALUES, max_size=4))
 def test_any_message_becomes_json_or_is_counted(content: dict[str, Any]) -> None:
-    latest = LatestMessages(3.6)
+    latest = MessageStore(3.6)
     latest.add("eit.estimate", message(**content) | {"source": "right"}, 1.0)
     told = batch(latest)
     assert len(told["messages"]) + sum(told["refused"].values()) == 1
@@ -106,7 +106,7 @@ def test_arrays_become_float32_and_nan_becomes_null() -> None:
 def test_a_heatmap_comes_with_its_maximum_and_runner_up() -> None:
     scores = np.full((20, 30), 0.1)
     scores[3, 4], scores[4, 5], scores[15, 20], scores[0, 0] = 0.9, 0.85, 0.7, np.nan
-    latest = LatestMessages(3.6)
+    latest = MessageStore(3.6)
     latest.add("eit.heatmap", message(scores=scores, model="gaussian_derivative"), 1.0)
     assert batch(latest)["messages"][0]["peaks"] == {"best": [3, 4], "runner_up": [15, 20]}
     for empty in (np.full((2, 2), np.nan), np.zeros(4), 0.5):
@@ -115,7 +115,7 @@ def test_a_heatmap_comes_with_its_maximum_and_runner_up() -> None:
 
 
 def test_an_estimate_comes_with_its_conductivity_profile() -> None:
-    latest = LatestMessages(3.6)
+    latest = MessageStore(3.6)
     latest.add("eit.estimate", message(k=1.8, sigma=0.9), 1.0)
     assert batch(latest)["messages"][0]["conductivity"] is None, "the model is not known yet"
     latest.add("eit.heatmap", message(scores=np.ones((3, 3)), model="gaussian_derivative"), 1.0)

@@ -1,6 +1,23 @@
-"""Tasks that wait for the same result, such as a sensor's new zero."""
+"""Zeros of the torque sensors: what every sensor offers, and tasks that wait for the same zero."""
 
 import asyncio
+from collections.abc import Iterable
+from typing import Protocol
+
+
+class Sensor(Protocol):
+    """A sensor with a zero."""
+
+    def tare(self) -> None:
+        """Take a new zero from what is measured from now on."""
+
+    async def tare_and_wait(self) -> str:
+        """Take a new zero and wait until it is done; return the reason of a failure, else an empty text."""
+
+
+async def tare_all(sensors: Iterable[Sensor]) -> str:
+    """Zero every sensor at the same time; return the reasons of failures, or an empty text."""
+    return " ".join(filter(None, await asyncio.gather(*(sensor.tare_and_wait() for sensor in sensors))))
 
 
 class Waiters:

@@ -1,15 +1,20 @@
-"""Output of commands: results and messages as text or JSON, and progress bars."""
+"""What commands print, as text or JSON, with progress bars, and the lines that an operator types."""
 
+import asyncio
 import dataclasses
 import json
+import os
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, Self, TextIO
 
 if TYPE_CHECKING:
     from shearloop.daemon.logs import NonBlockingWriter
 
+STDIN = 0
+READ_BYTES = 4096
 _ENVELOPE = ("timestamp", "t_mono_ns", "seq", "source", "topic")
 
 
@@ -47,6 +52,64 @@ class EstimatePrinter:
         if topic in ("eit.estimate", "skin.shear"):
             self._out.write(message_line(topic, content) + "\n")
             self._out.flush()
+
+
+class Operator:
+    """The person at the terminal, as an asynchronous context; a pipe or a file works too."""
+
+    def __init__(self, *, stdout_is_for_json: bool = False) -> None:
+        """Print to stdout, or to stderr if stdout is for a result in JSON."""
+        self._out = sys.stderr if stdout_is_for_json else sys.stdout
+        self._partial = b""
+        self._lines: asyncio.Queue[str | None] = asyncio.Queue()
+        self._watching = False
+
+    async def __aenter__(self) -> Self:
+        """Start reading."""
+        try:
+            asyncio.get_running_loop().add_reader(STDIN, self._read)
+            self._watching = True
+        except PermissionError:
+            # epoll refuses a file; reading a file never blocks.
+            while self._read():
+                pass
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Stop reading."""
+        self._stop()
+
+    async def ask(self, prompt: str) -> str:
+        """Print the prompt and return the next line; raise UserError at the end of the input."""
+        from shearloop.daemon.errors import UserError
+
+        self.say(prompt)
+        line = await self._lines.get()
+        if line is None:
+            self._lines.put_nowait(None)
+            raise UserError("the input ended before all was measured; press Enter after each step")
+        return line
+
+    def say(self, sentence: str) -> None:
+        """Print a sentence."""
+        print(sentence, file=self._out, flush=True)
+
+    def _read(self) -> bool:
+        data = os.read(STDIN, READ_BYTES)
+        *lines, self._partial = (self._partial + data).split(b"\n")
+        # An unfinished line must not grow without limit.
+        self._partial = self._partial[-READ_BYTES:]
+        for line in lines:
+            self._lines.put_nowait(line.decode(errors="replace").strip())
+        if not data:
+            self._lines.put_nowait(None)
+            self._stop()
+        return bool(data)
+
+    def _stop(self) -> None:
+        if self._watching:
+            asyncio.get_running_loop().remove_reader(STDIN)
+            self._watching = False
 
 
 def message_line(topic: str, content: Mapping[str, Any]) -> str:

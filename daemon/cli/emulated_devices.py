@@ -1,0 +1,147 @@
+"""The emulated devices of a configuration: their processes, the events of an experiment, and the true torque."""
+
+import argparse
+import contextlib
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+import structlog
+
+if TYPE_CHECKING:
+    from shearloop.daemon.config import EmulatorConfig, EventConfig
+    from shearloop.daemon.run_summary import TorqueSeries
+
+# An emulator needs some of it to remove its port's link; a clean stop takes less than a second in all.
+STOP_S = 0.5
+
+
+def check_emulators(emulators: "tuple[EmulatorConfig, ...]", config: Path) -> list[argparse.Namespace]:
+    """Return the parsed arguments of each emulator; raise UserError for an unknown device or invalid arguments."""
+    from shearloop.daemon.cli.emulate import DEVICES, checked_arguments
+    from shearloop.daemon.errors import UserError
+
+    options = []
+    for number, emulator in enumerate(emulators):
+        if emulator.device not in DEVICES:
+            raise UserError(
+                f"{config}: `emulators[{number}].device` is {emulator.device!r}; there are {', '.join(DEVICES)}"
+            )
+        try:
+            options.append(
+                checked_arguments(emulator.device, (*emulator.arguments, *emulator.synthetic), config.parent)
+            )
+        except UserError as error:
+            raise UserError(f"{config}: `emulators[{number}].arguments`: {emulator.device}: {error}") from error
+    return options
+
+
+class EmulatedDevices:
+    """Runs each device in a process, as a context, and listens to the daemon's messages.
+
+    At each `loop.state` it sends the events that are due, and at each `health` it reports devices that have ended.
+    """
+
+    def __init__(self, emulators: "tuple[EmulatorConfig, ...]", folder: Path, recording: Path | None = None) -> None:
+        """Take the configuration's folder, and a recording for the EIT boards to play."""
+        self.sent: list[tuple[int, str]] = []
+        self._emulators = emulators
+        self._folder = folder
+        self._recording = recording
+        self._alive: list[tuple[str, subprocess.Popen[bytes]]] = []
+        self._waiting: list[tuple[EventConfig, subprocess.Popen[bytes]]] = []
+        self._since_ns: dict[int, int] = {}
+        self._truth: Path | None = None
+        self._stack = contextlib.ExitStack()
+
+    def __enter__(self) -> Self:
+        """Start the devices."""
+        with contextlib.ExitStack() as stack:
+            if any(emulator.device == "rig" and "--truth" not in emulator.arguments for emulator in self._emulators):
+                folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="shearloop-"))
+                self._truth = Path(folder) / "truth.jsonl"
+            processes: list[subprocess.Popen[bytes]] = []
+            stack.callback(_stop, processes)
+            for emulator in self._emulators:
+                # An emulator ends when its standard input is closed.
+                process = subprocess.Popen(
+                    self._command(emulator), cwd=self._folder, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL
+                )
+                processes.append(process)
+                self._alive.append((emulator.device, process))
+                self._waiting += [(event, process) for event in emulator.events]
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop the devices."""
+        self._stack.close()
+
+    def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
+        """Take one of the daemon's messages."""
+        if topic == "health":
+            self._report_ended()
+        elif topic == "loop.state" and content["phase"] == "running" and content["hold"]:
+            self._send_events(content["t_mono_ns"], content["step"])
+
+    def torques(self) -> "TorqueSeries | None":
+        """Return the rig's true torque so far; None if it is unknown."""
+        from shearloop.daemon.run_summary import TorqueSeries
+
+        if self._truth is None or not self._truth.exists():
+            return None
+        # The last line may be incomplete.
+        lines = self._truth.read_text(encoding="utf-8").rpartition("\n")[0].splitlines()
+        rows = [(row["t_mono_ns"], row["torque_nm"]) for row in map(json.loads, lines)]
+        table = np.array(rows, dtype=float).reshape(-1, 2)
+        return TorqueSeries(table[:, 0], table[:, 1])
+
+    def _command(self, emulator: "EmulatorConfig") -> list[str]:
+        source = emulator.synthetic
+        if self._recording is not None and emulator.device == "eit-kit":
+            source = ("--recording", str(self._recording.resolve()))
+        if self._truth is not None and emulator.device == "rig":
+            source = (*source, "--truth", str(self._truth))
+        return [sys.executable, "-m", "shearloop", "emulate", emulator.device, *emulator.arguments, *source]
+
+    def _send_events(self, now_ns: int, step: int) -> None:
+        held_s = (now_ns - self._since_ns.setdefault(step, now_ns)) / 1e9
+        for entry in [entry for entry in self._waiting if entry[0].step == step and held_s >= entry[0].held_for_s]:
+            self._waiting.remove(entry)
+            event, process = entry
+            # A dead process is reported at the next `health`.
+            with contextlib.suppress(BrokenPipeError):
+                if process.stdin is not None and process.poll() is None:
+                    process.stdin.write(f"{event.command}\n".encode())
+                    process.stdin.flush()
+                    self.sent.append((time.monotonic_ns(), event.command))
+
+    def _report_ended(self) -> None:
+        for entry in [entry for entry in self._alive if entry[1].poll() is not None]:
+            self._alive.remove(entry)
+            structlog.get_logger().error(
+                "an emulated device has ended: restart the daemon to emulate it again",
+                device=entry[0],
+                status=entry[1].returncode,
+            )
+
+
+def _stop(processes: "list[subprocess.Popen[bytes]]") -> None:
+    for process in processes:
+        process.terminate()
+    for process in processes:
+        try:
+            process.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        if process.stdin is not None:
+            # Closing flushes unread input to a process that has ended.
+            with contextlib.suppress(BrokenPipeError):
+                process.stdin.close()

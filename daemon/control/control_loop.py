@@ -85,7 +85,7 @@ class ControlLoop:
         self.safety = SafetyMonitor()
         self.experiment: Experiment | None = None
         self.status = LoopStatus("idle", "", WristCommand(), SafetyDecision(Response.NOTE))
-        self._config = config
+        self.config = config
         self._sources = sources
         self._creep = creep
         self._wrists = {
@@ -186,7 +186,7 @@ class ControlLoop:
             return f"a stop has not been acknowledged: {' '.join(self.status.decision.reasons)}"
         driving = self._sources[file.torque_source]
         watched = replace(self._watched, driving=driving, supervising=self._others(driving), limits=file.limits)
-        faults = detect_faults(self.inputs, watched, self._config, t_ns)
+        faults = detect_faults(self.inputs, watched, self.config, t_ns)
         refusals = [fault.sentence for fault in faults if fault.rule.response >= Response.REFUSE_START]
         if refusals:
             return " ".join(refusals)
@@ -246,7 +246,7 @@ class ControlLoop:
                 expected_nm=controller.torque_nm if controller is not None else None,
                 overdue=experiment.overdue,
             )
-        found = [*detect_faults(self.inputs, watched, self._config, t_ns), *self._reported]
+        found = [*detect_faults(self.inputs, watched, self.config, t_ns), *self._reported]
         self._reported.clear()
         if grip.release_error:
             found.append(Fault(FaultCode.NOT_RELEASED, grip.release_error))

@@ -31,7 +31,7 @@ _SLIP_SHARE = 0.3
 # The residual beyond the noise, relative to the spring's part (relaxation gives about 0.1).
 _MISFIT_SHARE = 0.3
 # The expected drift over the record, relative to the spring's part: relaxation.
-_DRIFT_SHARE = 0.05
+_DRIFT_SHARE = 0.04
 _ARRIVED_RAD = 2e-3
 # Time constants of creep that are tried; with fewer readings the noise decides.
 _CREEP_TIMES_S = np.geomspace(2.0, 200.0, 60)
@@ -87,8 +87,8 @@ class ToolModel:
 
     @property
     def known_measurements(self) -> float:
-        """The number of measurements that would give the torque's accuracy; at most 12."""
-        return min((self.noise_nm / self.torque_std_nm) ** 2, 12.0) if self.torque_std_nm else 12.0
+        """The number of measurements that would give the torque's accuracy; at most 8."""
+        return min((self.noise_nm / self.torque_std_nm) ** 2, 8.0) if self.torque_std_nm else 8.0
 
     @property
     def significant_lag_s(self) -> float:

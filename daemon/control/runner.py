@@ -68,18 +68,16 @@ class ControlLoopRunner:
         publisher: Publisher,
         clock: Clock,
         dead_tasks: Mapping[str, str],
-        acceleration_rad_per_s2: float,
     ) -> None:
         """`tare` zeroes every sensor; `dead_tasks` has the error of each dead task."""
         self._control_loop = control_loop
         self._robot = robot
         self._clock = clock
         self._dead_tasks = dead_tasks
-        self._acceleration_rad_per_s2 = acceleration_rad_per_s2
+        self._acceleration_rad_per_s2 = control_loop.config.wrist_acceleration_rad_per_s2
         self._velocity = VelocityCommandSender(robot, control_loop)
         self._actions = ActionExecutor(robot, gripper, tare, self._velocity, control_loop)
         self._states = StatePublisher(publisher, control_loop)
-        self._crash: Exception | None = None
         self._running = False
         self._stopped = True
         self._decided_ns = 0
@@ -89,7 +87,7 @@ class ControlLoopRunner:
 
         After an unexpected error the arm is stopped and the error is raised; the next run stops the experiment.
         """
-        self._decided_ns, self._crash, self._running = self._clock.now_ns(), None, True
+        self._decided_ns, self._running = self._clock.now_ns(), True
         try:
             while True:
                 # Without a state the loop decides all the same.
@@ -100,8 +98,6 @@ class ControlLoopRunner:
                     # After a pause of this process several states arrive at once; only the newest one counts.
                     if self._robot.state is not None:
                         self._take_state(self._robot.state)
-                if self._crash is not None:
-                    raise self._crash
                 self._decide()
         except Exception as error:
             self._running = False
@@ -116,13 +112,13 @@ class ControlLoopRunner:
             await self._actions.close()
 
     def decide_now(self) -> None:
-        """Decide without a new state, after a loss of a device or for the daemon's end; `run` raises its errors."""
-        if not self._running or self._crash is not None:
+        """Decide without a new state, at the daemon's end."""
+        if not self._running:
             return
         try:
             self._decide()
-        except Exception as error:  # noqa: BLE001 - raised by `run`
-            self._crash = error
+        except Exception:  # noqa: BLE001 - the robot's process stops the arm as it ends
+            structlog.get_logger().exception("the loop crashed at its last decision")
 
     async def start(self, file: ExperimentFile) -> str | None:
         """Begin an experiment; return None, or why it cannot begin."""

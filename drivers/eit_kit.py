@@ -9,16 +9,18 @@ All values are below 10 V, so a valid line is 1024 cells of eight bytes.
 import os
 import re
 import time
-from collections import Counter
+from collections import Counter, deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
+from itertools import islice, pairwise
+from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.drivers.connection import Diagnostics, LinkMonitor, Port, SerialLink
 from shearloop.drivers.errors import DeviceLostError
-from shearloop.drivers.frame_clock import FrameClock
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, LineSplitter, RawEvent, SerialSensor
 
 N_VALUES = 1024
@@ -48,6 +50,21 @@ SILENT_PERIODS = 4
 MIN_SILENCE_S = 0.5
 # Unanswered starts before the port is reopened.
 STARTS_BEFORE_REOPENING = 5
+
+# FrameClock.
+# Frames behind the period: 35 s at 0.54 s, while a crystal drifts by microseconds.
+PERIOD_WINDOW = 64
+# Frames between updates of the period, which hardly moves.
+LEARN_EVERY = 4
+# Frames behind the phase: a board that paused is followed within 6 s.
+PHASE_WINDOW = 12
+# Spacings needed to learn a period. Each spans several frames, so that a burst of late ones does no harm.
+LEARN_FROM = 16
+SPACING_FRAMES = 4
+# A longer pause, in periods, means that the board stopped and has a new phase.
+LONGEST_GAP = 2.5
+# A period further from the usual spacing is a burst of late frames.
+PLAUSIBLE = 0.05
 
 _SEPARATOR = b", "
 _DECIMAL = re.compile(rb"-?\d+\.\d{4}")
@@ -148,6 +165,106 @@ class Frame:
     repeated: bool
 
 
+class FrameClock:
+    """Straightens the arrival times of frames, causally, and learns the board's period.
+
+    A board with a steady period sends each frame as soon as it is complete. A busy reader or bus sees it later, never
+    earlier. The board's clock is therefore the line closest below all (frame number, arrival) points. That line is the
+    edge of their lower convex hull that spans the middle (Moon, Skelly and Towsley 1999, "Estimation and removal of
+    clock skew from network delay measurements"). Its slope is the period; its height over the last few frames is the
+    phase. All times are integer nanoseconds of one monotonic clock. The nominal period applies until the real one is
+    `learned`.
+    """
+
+    def __init__(self, nominal_period_ns: int) -> None:
+        self._period_ns = float(nominal_period_ns)
+        self.learned = False
+        # (frame number, arrival) of the last frames across restarts, and the last spacings.
+        self._latest: deque[tuple[int, int]] = deque(maxlen=SPACING_FRAMES + 1)
+        self._spacings: deque[float] = deque(maxlen=LEARN_FROM)
+        # (frame number, arrival) since the last restart.
+        self._seen: deque[tuple[int, int]] = deque(maxlen=PERIOD_WINDOW)
+        self._straight_ns = 0
+
+    @property
+    def period_ns(self) -> int:
+        """The learned period, or the nominal one until it is learned."""
+        return round(self._period_ns)
+
+    def restart(self) -> None:
+        """Forget the phase and keep the period: the board was restarted."""
+        self._seen.clear()
+
+    def arrived(self, arrival_ns: int, missed: bool = False) -> int:
+        """Return when the next frame would have arrived at a reader that is never late.
+
+        After a rejected line (`missed`) the number of periods follows from the time; otherwise a late frame is the
+        next one.
+        """
+        number, steps = 0, 1
+        if self._seen:
+            number, last_ns = self._seen[-1]
+            elapsed = (arrival_ns - self._straight_ns) / self._period_ns
+            steps = max(1, round(elapsed)) if missed and self.learned else 1
+            number += steps
+            late = elapsed - steps
+            late_before = (last_ns - self._straight_ns) / self._period_ns
+            # Waiting frames come in a burst, each less late than the one before; a constant delay means a pause of the
+            # board. Half a period early means that the last one was counted as two.
+            paused = min(late, late_before) > 0.5 and late > late_before - 0.5
+            if elapsed > LONGEST_GAP or late < -0.5 or paused:
+                self.restart()
+        self._seen.append((number, arrival_ns))
+        self._latest.append((self._latest[-1][0] + steps if self._latest else 0, arrival_ns))
+        if len(self._latest) > SPACING_FRAMES:
+            (n, before_ns), (m, _) = self._latest[0], self._latest[-1]
+            self._spacings.append((arrival_ns - before_ns) / (m - n))
+        self._learn(number)
+        recent = islice(reversed(self._seen), PHASE_WINDOW)
+        self._straight_ns = round(min([arrival + (number - n) * self._period_ns for n, arrival in recent]))
+        return self._straight_ns
+
+    def _learn(self, number: int) -> None:
+        due = number % LEARN_EVERY == 0
+        if len(self._spacings) < LEARN_FROM or (self.learned and not due):
+            return
+        spacing = median(self._spacings)
+        if spacing <= 0:
+            return
+        if abs(self._period_ns - spacing) > PLAUSIBLE * spacing:
+            self._period_ns, self.learned = spacing, True
+        if due and len(self._seen) >= LEARN_FROM:
+            slope = slope_below(self._seen)
+            if abs(slope - spacing) <= PLAUSIBLE * spacing:
+                self._period_ns, self.learned = slope, True
+
+
+def slope_below(points: Iterable[tuple[int, int]]) -> float:
+    """Return the slope of the line closest below all points, which are in order of their abscissa."""
+    points = list(points)
+    hull: list[tuple[int, int]] = []
+    for n, t in points:
+        # Drop a corner on or above the chord past it.
+        while len(hull) > 1 and (hull[-1][1] - hull[-2][1]) * (n - hull[-2][0]) >= (t - hull[-2][1]) * (
+            hull[-1][0] - hull[-2][0]
+        ):
+            hull.pop()
+        hull.append((n, t))
+    middle = sum(n for n, _ in points) / len(points)
+    (n0, t0), (n1, t1) = next(edge for edge in pairwise(hull) if edge[1][0] >= middle)
+    return (t1 - t0) / (n1 - n0)
+
+
+@dataclass(slots=True)
+class _Opening:
+    """What holds since the port was opened: the first line may lack its beginning."""
+
+    first: bool = True
+    rejected_since_frame: bool = False
+    # The length of the line that was under way when the board was started again.
+    restarted_at: int = 0
+
+
 class FrameParser:
     """Turns bytes, however they are sliced, into frames; counts rejected lines by kind. No I/O.
 
@@ -155,12 +272,7 @@ class FrameParser:
     `partial_lines` were under way when the port was opened, `unfinished` were cut off by a reopening or restart.
     """
 
-    def __init__(
-        self,
-        zero_slots: NDArray[np.bool_],
-        *,
-        nominal_period_ns: int = NOMINAL_PERIOD_NS,
-    ) -> None:
+    def __init__(self, zero_slots: NDArray[np.bool_], *, nominal_period_ns: int = NOMINAL_PERIOD_NS) -> None:
         if zero_slots.shape != (N_VALUES,):
             raise ValueError(f"the mask of zero slots has the shape {zero_slots.shape} instead of ({N_VALUES},)")
         self.clock = FrameClock(nominal_period_ns)
@@ -169,16 +281,12 @@ class FrameParser:
         self.last_error: FrameError | None = None
         self.partial_lines = 0
         self._zero_slots = zero_slots
-        self._slots = np.flatnonzero(~zero_slots)
         self._lines = LineSplitter(MAX_LINE_BYTES)
-        self._first = True
-        self._rejected_since_frame = False
-        self._restarted_at = 0
+        self._opening = _Opening()
         self._restarted_lines = 0
         self._last_mid_ns = -(2**63)
-        self._last_line = b""
-        self._last_channels = np.full(len(self._slots), np.nan)
-        self._equal_readings = np.zeros(len(self._slots), np.int64)
+        self._last_channels = np.full(np.count_nonzero(~zero_slots), np.nan)
+        self._equal_readings = np.zeros(len(self._last_channels), np.int64)
 
     @property
     def unfinished(self) -> int:
@@ -189,15 +297,12 @@ class FrameParser:
         """Process a live or recorded event; return the frames that it completes."""
         match event.kind:
             case InputKind.OPENED:
-                # Drop a half-received line; the first line may lack its beginning.
                 self._lines.restart()
-                self._first = True
-                self._rejected_since_frame = False
-                self._restarted_at = 0
+                self._opening = _Opening()
                 self.clock.restart()
             case InputKind.STARTED:
                 # A restarted board continues its line or begins another.
-                self._restarted_at = len(self._lines.partial)
+                self._opening.restarted_at = len(self._lines.partial)
             case InputKind.DATA:
                 return self.feed(event.data, event.t_ns)
         return []
@@ -207,10 +312,10 @@ class FrameParser:
         complete = []
         for line in self._lines.feed(data):
             found = self._read(line)
-            self._first, self._restarted_at = False, 0
+            self._opening.first, self._opening.restarted_at = False, 0
             if found is not None:
-                complete.append((*found, self._rejected_since_frame))
-                self._rejected_since_frame = False
+                complete.append((*found, self._opening.rejected_since_frame))
+                self._opening.rejected_since_frame = False
         frames = []
         for number, (line, values, missed) in enumerate(complete, 1):
             # Frames that waited together were sent one period apart, the last one by now.
@@ -227,13 +332,13 @@ class FrameParser:
         values = read_line(line, self._zero_slots)
         if not isinstance(values, FrameError):
             return line, values
-        if self._restarted_at:
-            rest = line[self._restarted_at :]
+        if self._opening.restarted_at:
+            rest = line[self._opening.restarted_at :]
             rest_values = read_line(rest, self._zero_slots)
             if not isinstance(rest_values, FrameError):
                 self._restarted_lines += 1
                 return rest, rest_values
-        if self._first and values.kind in _PARTIAL_ERRORS and len(line) < LINE_BYTES:
+        if self._opening.first and values.kind in _PARTIAL_ERRORS and len(line) < LINE_BYTES:
             self.partial_lines += 1
         else:
             self._reject(values)
@@ -242,35 +347,34 @@ class FrameParser:
     def _reject(self, error: FrameError) -> None:
         self.errors[error.kind] += 1
         self.last_error = error
-        self._rejected_since_frame = True
+        self._opening.rejected_since_frame = True
 
     def _frame(self, line: bytes, values: NDArray[np.float64], sent_ns: int, t_arrival_ns: int) -> Frame:
-        channels = values[self._slots]
-        repeated = line == self._last_line
+        channels = values[~self._zero_slots]
+        repeated = np.array_equal(channels, self._last_channels)
         if not repeated:
             self._equal_readings = np.where(channels == self._last_channels, self._equal_readings + 1, 1)
-        self._last_line, self._last_channels = line, channels
+        self._last_channels = channels
         saturated = channels > FULL_SCALE_SINE_RMS_V
         dead = self._equal_readings >= DEAD_AFTER_FRAMES
         # Time stays in order when the clock learns a new period.
         self._last_mid_ns = max(sent_ns - TRANSFER_NS - self.clock.period_ns // 2, self._last_mid_ns + 1)
         for array in (channels, values, saturated, dead):
             array.setflags(write=False)
-        frame = Frame(
+        self.frames += 1
+        return Frame(
             channels=channels,
             raw=values,
             line=line,
             t_begin_ns=self._last_mid_ns - self.clock.period_ns // 2,
             t_mid_ns=self._last_mid_ns,
             t_arrival_ns=t_arrival_ns,
-            seq=self.frames,
+            seq=self.frames - 1,
             saturated=saturated,
             dead=dead,
             unusable=int(np.count_nonzero(saturated | dead)),
             repeated=repeated,
         )
-        self.frames += 1
-        return frame
 
 
 class EitKit(SerialSensor[Frame]):

@@ -11,7 +11,13 @@ from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.estimation import FrameSeries, Measured
 from shearloop.bank.estimation.calibration import LARGEST_TOOL_SHARE
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.matlab import DIAMETER_FOLDER, TORQUE_FOLDER, read_diameter_slices, read_torque_slices
+from shearloop.daemon.recording.matlab import (
+    DIAMETER_FOLDER,
+    TORQUE_FOLDER,
+    Slices,
+    read_diameter_slices,
+    read_torque_slices,
+)
 from shearloop.daemon.recording.reader import Recording, read_recording
 from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, SIDES
 
@@ -36,9 +42,9 @@ def read_series(path: Path, sides: tuple[str, ...] | None = None, tool_mm: float
         return [series for folder in inside for series in read_series(folder)]
     names = [one.name for one in path.iterdir()]
     if any(name.startswith("Data_Slice_") for name in names):
-        return [_torque_slices(path)]
+        return [_series_of_slices(read_torque_slices(path))]
     if any("mm_Data_" in name for name in names):
-        return [_diameter_slices(path)]
+        return [_series_of_slices(read_diameter_slices(path))]
     raise UserError(
         f"{path} is a folder without slices; name a recording (.mcap, from `shearloop run --record` or `shearloop "
         "import`), or a folder of slices"
@@ -94,21 +100,15 @@ def _nearest(wanted: IntArray, times: IntArray) -> IntArray:
     return np.where(nearer, after - 1, after)
 
 
-def _torque_slices(folder: Path) -> FrameSeries:
-    slices = read_torque_slices(folder)
-    t_s = slices.numbers.astype(np.float64)
-    unknown = np.full(len(t_s), np.nan)
-    return FrameSeries("difference", (SLICE_SIDE,), t_s, slices.differences[:, None], t_s, slices.torque_nm, unknown)
-
-
-def _diameter_slices(folder: Path) -> FrameSeries:
-    """Return the slices of all cylinders in turn, the first of each first, so that every part in time has all."""
-    slices = read_diameter_slices(folder)
-    numbers = np.concatenate([np.arange(count) for count in np.unique(slices.diameter_mm, return_counts=True)[1]])
-    order = np.lexsort((slices.diameter_mm, numbers))
-    t_s = np.arange(len(order), dtype=np.float64)
-    frames, torque_nm, diameter_mm = slices.differences[order], slices.torque_nm[order], slices.diameter_mm[order]
-    return FrameSeries("difference", (SLICE_SIDE,), t_s, frames[:, None], t_s, torque_nm, diameter_mm)
+def _series_of_slices(slices: Slices) -> FrameSeries:
+    """Return slices in time order; those of cylinders in turn, so that every part in time has all."""
+    diameter_mm, t_s = slices.diameter_mm, slices.numbers.astype(np.float64)
+    order = np.arange(len(t_s))
+    if np.isfinite(diameter_mm).all():
+        numbers = np.concatenate([np.arange(count) for count in np.unique(diameter_mm, return_counts=True)[1]])
+        order, t_s = np.lexsort((diameter_mm, numbers)), np.arange(len(t_s), dtype=np.float64)
+    frames, torque_nm = slices.differences[order, None], slices.torque_nm[order]
+    return FrameSeries("difference", (SLICE_SIDE,), t_s, frames, t_s, torque_nm, diameter_mm[order])
 
 
 def tool_of(recording: Recording, t_ns: IntArray, given_mm: float | None = None) -> tuple[float, Measured | None]:

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("recording", type=Path, metavar="REC", help="made by `shearloop run --record` or imported")
-    # A pattern such as `recordings/first/*.mcap` may name several.
-    parser.add_argument("more", nargs="*", type=Path, help=argparse.SUPPRESS)
     parser.add_argument(
         "--speed", default="1", metavar="N", help="factor, or max for no waiting (default: %(default)s)"
     )
@@ -43,15 +41,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Replay to the end and print the comparison with the recorded estimates."""
     from shearloop.daemon.config import load_daemon_config
-    from shearloop.daemon.errors import UserError
     from shearloop.daemon.recording.replay import RecordedRun
     from shearloop.daemon.recording.schema import code_digest
 
     speed = parse_speed(args.speed)
-    if args.more:
-        raise UserError(
-            f"one recording can be replayed at a time, not {1 + len(args.more)}; name one, such as {args.recording}"
-        )
     run = RecordedRun(args.recording)
     with nullcontext(load_daemon_config(args.config)) if args.config else run.configuration() as config:
         comparison = asyncio.run(_replay(run, config, speed, args))

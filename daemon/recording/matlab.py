@@ -22,7 +22,7 @@ from shearloop.bank.estimation.values import LARGEST_TORQUE_NM
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, SIDES
 from shearloop.daemon.recording.writer import RecordingWriter
-from shearloop.drivers.frame_clock import slope_below
+from shearloop.drivers.eit_kit import slope_below
 
 # The recording scripts changed these names over time.
 _STREAMS = {
@@ -235,7 +235,7 @@ def frame_middles(arrivals_ns: Sequence[int]) -> list[int]:
     """Return the middle of each frame's acquisition from its arrival, in nanoseconds.
 
     A frame is read when it is complete or later. The board's clock is therefore the line below the stamps
-    (`drivers.frame_clock`). The earliest stamp among the neighbours gives its height, so that it follows a
+    (`drivers.eit_kit`). The earliest stamp among the neighbours gives its height, so that it follows a
     board that paused.
     """
     numbered = list(enumerate(arrivals_ns))

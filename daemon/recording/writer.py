@@ -4,7 +4,8 @@ import io
 import json
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Self, cast
 
@@ -141,15 +142,16 @@ class McapFile:
 
 
 class RecordingWriter:
-    """Writes frames and torques in any order of time; a context manager that keeps NAME.partial after an error."""
+    """Writes frames and torques in any order of time; a context manager that keeps NAME.partial after an error.
+
+    Raises UserError where the file cannot be written.
+    """
 
     def __init__(self, path: str | Path, source: str, notes: Mapping[str, str] | None = None) -> None:
-        """Create `path`.partial; `source` describes the origin of the data. Raises UserError on failure."""
+        """Create `path`.partial; `source` describes the origin of the data."""
         self.path = Path(path)
-        try:
+        with self._errors():
             self._file = McapFile(io.FileIO(f"{self.path}{PARTIAL}", "wb"))
-        except OSError as error:
-            raise self._write_error(error) from error
         self._file.add_metadata(schema.METADATA, {**schema.basic_identity(source), **(notes or {})})
 
     def add_frame(self, side: str, t_mid_unix_ns: int, arrival_unix_ns: int, line: NDArray[np.float64]) -> None:
@@ -169,18 +171,19 @@ class RecordingWriter:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Close the file, as complete if there was no error."""
-        try:
+        with self._errors():
             self._file.close(self.path if kind is None else None)
-        except OSError as error:
-            raise self._write_error(error) from error
 
     def _add(self, topic: str, time_ns: int, content: dict[str, object]) -> None:
         self._file.add(topic, time_ns, time_ns, schema.as_json(content))
         if self._file.messages % _FLUSH_EVERY == 0:
-            try:
+            with self._errors():
                 self._file.flush()
-            except OSError as error:
-                raise self._write_error(error) from error
 
-    def _write_error(self, error: OSError) -> UserError:
-        return UserError(f"{self.path}: the recording cannot be written: {error.strerror}; choose another --out")
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            message = f"{self.path}: the recording cannot be written: {error.strerror}; choose another --out"
+            raise UserError(message) from error

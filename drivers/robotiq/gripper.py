@@ -3,8 +3,8 @@
 import asyncio
 import math
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import AsyncGenerator, Awaitable, Callable, Coroutine, Sequence
+from functools import partial
 from typing import Self, TypeVar
 
 import numpy as np
@@ -18,7 +18,6 @@ from shearloop.drivers.robotiq import messages
 T = TypeVar("T")
 
 COUNTS_MAX = 255
-COUNTS = 0, COUNTS_MAX
 STROKE_MM = 140.0
 POLL_S = 0.1
 # The pause between reset and activation that Robotiq's own clients keep.
@@ -154,7 +153,7 @@ class RobotiqGripper:
 
     async def read(self) -> messages.GripperState:
         """Return the gripper's present state."""
-        readout, t_ns = await self._read()
+        readout, t_ns = await self._exchange(self._client.read)
         self.latest = self._state(readout, t_ns)
         return self.latest
 
@@ -164,7 +163,7 @@ class RobotiqGripper:
         After a major fault the operator has to confirm that the fingers are clear. `operator_confirmed` activates in
         any state. Raises GripperFaultError when the activation is refused or fails.
         """
-        readout, t_ns = await _uninterrupted(self._read())
+        readout, t_ns = await self._read()
         fault = messages.fault_of(readout.flt)
         if not operator_confirmed:
             if fault.needs_activation:
@@ -174,7 +173,7 @@ class RobotiqGripper:
             if not blocking_fault(readout):
                 return self._state(readout, t_ns)
         self._last_move = None
-        await _uninterrupted(self._write(messages.Reset()))
+        await self._write(messages.Reset())
         not_reset = "The gripper does not take the reset; check that nothing else commands it."
         await self._wait_until(
             lambda now: not now.act and now.sta is messages.ActivationStatus.RESET, RESET_DEADLINE_NS, not_reset
@@ -182,37 +181,37 @@ class RobotiqGripper:
         resume_ns = time.monotonic_ns() + PAUSE_NS
         await self._wait_until(lambda _: time.monotonic_ns() >= resume_ns, RESET_DEADLINE_NS, not_reset)
         # A rising edge of ACT, which also ends every fault.
-        await _uninterrupted(self._write(messages.Activate()))
+        await self._write(messages.Activate())
         return await self._wait_until(
             _is_active,
             ACTIVATION_DEADLINE_NS,
             "The gripper's activation does not end; clear the fingers and activate it again.",
         )
 
-    async def move(self, command: messages.GripperCommand) -> messages.SentCommand:
-        """Start a motion and return the command as sent; `finish` waits for its end.
+    async def move(self, command: messages.GripperCommand) -> messages.GripperMove:
+        """Start a motion, clipped to the limits, and return it as sent; `finish` waits for its end.
 
         Raises GripperRefusedError for a command that is not finite, GripperFaultError when the gripper would not move.
         """
-        sent = self.clip(command)
-        readout, _ = await _uninterrupted(self._read())
+        sent = self.request_of(command)
+        readout, _ = await self._read()
         if blocking := blocking_fault(readout):
             raise messages.GripperFaultError(blocking)
-        self._last_move = sent.request
-        await _uninterrupted(self._write(sent.request))
+        self._last_move = sent
+        await self._write(sent)
         return sent
 
-    async def finish(self, sent: messages.SentCommand) -> messages.GripperState:
+    async def finish(self, sent: messages.GripperMove) -> messages.GripperState:
         """Return the state at the end of the motion: at its target, or on an object."""
 
         def has_finished(readout: messages.Readout) -> bool:
-            if self._last_move is not sent.request:
+            if self._last_move is not sent:
                 raise messages.GripperRefusedError(
                     "Another command took over before the gripper had finished its motion."
                 )
             if blocking := blocking_fault(readout):
                 raise messages.GripperFaultError(blocking)
-            return object_status(readout, sent.request) is not messages.ObjectStatus.MOVING
+            return object_status(readout, sent) is not messages.ObjectStatus.MOVING
 
         return await self._wait_until(
             has_finished,
@@ -226,7 +225,7 @@ class RobotiqGripper:
         """Return the first state that is `done`; GripperFaultError after the deadline."""
         since_ns = time.monotonic_ns()
         while True:
-            readout, t_ns = await _uninterrupted(self._read())
+            readout, t_ns = await self._read()
             if done(readout):
                 return self._state(readout, t_ns)
             if t_ns - since_ns > deadline_ns:
@@ -236,10 +235,10 @@ class RobotiqGripper:
     async def halt(self) -> None:
         """Stop the fingers where they are; they keep their grip. An activation is ended by a reset."""
         self._last_move = None
-        await _uninterrupted(self._write(messages.GripperHalt()))
-        readout, _ = await _uninterrupted(self._read())
+        await self._write(messages.GripperHalt())
+        readout, _ = await self._read()
         if readout.sta is messages.ActivationStatus.ACTIVATING:
-            await _uninterrupted(self._write(messages.Reset()))
+            await self._write(messages.Reset())
 
     async def states(self) -> AsyncGenerator[messages.GripperState]:
         """Yield a state every poll period and reconnect after losses, for ever.
@@ -255,7 +254,9 @@ class RobotiqGripper:
                 try:
                     state = await self._next_state()
                 except DriverError as error:
-                    await self._wait_after(error)
+                    await self.close()
+                    self._loss = None
+                    await asyncio.sleep(self._monitor.failed(error, time.monotonic_ns()))
                     continue
                 yield state
                 await asyncio.sleep(due_s - loop.time())
@@ -271,53 +272,32 @@ class RobotiqGripper:
         self._monitor.connected(f"The gripper answers at {self._client.name}.", time.monotonic_ns())
         return state
 
-    async def _wait_after(self, error: DriverError) -> None:
-        await self.close()
-        self._loss = None
-        await asyncio.sleep(self._monitor.failed(error, time.monotonic_ns()))
-
-    def clip(self, command: messages.GripperCommand) -> messages.SentCommand:
-        """Return the command clipped to this gripper's limits and rounded to counts."""
+    def request_of(self, command: messages.GripperCommand) -> messages.GripperMove:
+        """Return the request of a command, within this gripper's limits; GripperRefusedError if it is not finite."""
         if not all(map(math.isfinite, (command.width_mm, command.speed_mm_s, command.force_n))):
             raise messages.GripperRefusedError(
                 f"{command} is no command: width, speed and force must be finite numbers."
             )
-        clipped: list[str] = []
-        calibration = self._calibration
         speeds = messages.SPEED_MIN_MM_S, messages.SPEED_MAX_MM_S
         forces = messages.FORCE_MIN_N, messages.FORCE_MAX_N
-        narrowest_mm, widest_mm = calibration.width_mm(COUNTS_MAX), calibration.width_mm(0)
-        width_mm = _clip("width", command.width_mm, narrowest_mm, widest_mm, "mm", clipped)
-        speed_mm_s = _clip("speed", command.speed_mm_s, *speeds, "mm/s", clipped)
-        force_n = _clip("force", command.force_n, *forces, "N", clipped)
-        request = messages.GripperMove(
-            calibration.counts(width_mm),
-            round(float(np.interp(speed_mm_s, speeds, COUNTS))),
-            round(float(np.interp(force_n, forces, COUNTS))),
-        )
-        return messages.SentCommand(
-            width_mm=calibration.width_mm(request.position),
-            speed_mm_s=float(np.interp(request.speed, COUNTS, speeds)),
-            force_n=float(np.interp(request.force, COUNTS, forces)),
-            request=request,
-            clipped=tuple(clipped),
+        return messages.GripperMove(
+            self._calibration.counts(command.width_mm),
+            round(float(np.interp(command.speed_mm_s, speeds, (0, COUNTS_MAX)))),
+            round(float(np.interp(command.force_n, forces, (0, COUNTS_MAX)))),
         )
 
     async def _read(self) -> tuple[messages.Readout, int]:
-        async with self._exchange():
-            t_ns = time.monotonic_ns()
-            return await self._client.read(), t_ns
+        return await _uninterrupted(self._exchange(self._client.read))
 
     async def _write(self, request: messages.Request) -> None:
-        async with self._exchange():
-            await self._client.write(request)
+        await _uninterrupted(self._exchange(partial(self._client.write, request)))
 
-    @asynccontextmanager
-    async def _exchange(self) -> AsyncIterator[None]:
-        """Exclude other exchanges, and note a loss, which `states` reports."""
+    async def _exchange(self, exchange: Callable[[], Awaitable[T]]) -> tuple[T, int]:
+        """Return an exchange's result and its beginning; exclude others, and note a loss, which `states` reports."""
         async with self._lock:
+            t_ns = time.monotonic_ns()
             try:
-                yield
+                return await exchange(), t_ns
             except DriverError as error:
                 if self.connected:
                     self._loss = error
@@ -329,7 +309,6 @@ class RobotiqGripper:
             t_ns=t_ns,
             seq=self._seq,
             position_counts=readout.pos,
-            target_counts=readout.pre,
             width_mm=self._calibration.width_mm(readout.pos),
             width_std_mm=self._calibration.width_std_mm,
             object=object_status(readout, self._last_move),
@@ -378,10 +357,3 @@ async def _uninterrupted(exchange: Coroutine[object, object, T]) -> T:
     # `states` reports a failure that comes after its caller was cancelled.
     task.add_done_callback(lambda done: done.cancelled() or done.exception())
     return await asyncio.shield(task)
-
-
-def _clip(name: str, value: float, low: float, high: float, unit: str, clipped: list[str]) -> float:
-    inside = min(max(value, low), high)
-    if inside != value:
-        clipped.append(f"The {name} of {value:g} {unit} was limited to {inside:g} {unit}.")
-    return inside

@@ -6,7 +6,7 @@ from typing import Protocol
 
 from shearloop.drivers.errors import DriverError
 
-# The manual's specifications; speed and force are taken as linear in counts.
+# The manual's specifications.
 SPEED_MIN_MM_S, SPEED_MAX_MM_S = 30.0, 250.0
 FORCE_MIN_N, FORCE_MAX_N = 10.0, 125.0
 MA_PER_COUNT = 10.0
@@ -24,10 +24,9 @@ class GripperRefusedError(DriverError):
 
 @dataclass(frozen=True, slots=True)
 class GripperFault:
-    """A fault's code and name, and a sentence with its meaning and cure."""
+    """A fault's code, and a sentence with its meaning and cure."""
 
     code: int
-    name: str
     sentence: str
 
     @property
@@ -37,27 +36,25 @@ class GripperFault:
 
 
 _FAULTS = {
-    0: ("none", ""),
-    5: ("activation not finished", "The gripper is still activating; wait until it has opened and closed."),
-    7: ("not activated", "The gripper has to be activated before it moves."),
-    8: ("over-temperature", "The gripper is too hot; let it cool down, it takes commands again by itself."),
-    9: ("no communication", "The gripper received nothing for a second; check its cable and other programs using it."),
-    10: ("undervoltage", "The gripper's supply is too low; check its 24 V, then activate it again."),
-    11: ("automatic release running", "The gripper is releasing automatically; wait, then activate it again."),
-    12: ("internal fault", "The gripper reports an internal fault; activate it again, else ask its maker."),
-    13: ("activation fault", "The activation failed; clear what blocks the fingers, then activate it again."),
-    14: ("overcurrent", "The motor drew too much current; clear the fingers, then activate the gripper again."),
-    15: ("automatic release done", "The gripper has released automatically; activate it again."),
+    0: "",
+    5: "The gripper is still activating; wait until it has opened and closed.",
+    7: "The gripper has to be activated before it moves.",
+    8: "The gripper is too hot; let it cool down, it takes commands again by itself.",
+    9: "The gripper received nothing for a second; check its cable and other programs using it.",
+    10: "The gripper's supply is too low; check its 24 V, then activate it again.",
+    11: "The gripper is releasing automatically; wait, then activate it again.",
+    12: "The gripper reports an internal fault; activate it again, else ask its maker.",
+    13: "The activation failed; clear what blocks the fingers, then activate it again.",
+    14: "The motor drew too much current; clear the fingers, then activate the gripper again.",
+    15: "The gripper has released automatically; activate it again.",
 }
 
 
 def fault_of(code: int) -> GripperFault:
     """Return the fault with this code (gFLT, 0…15); a code that is not in the manual is called unknown."""
-    if code in _FAULTS:
-        return GripperFault(code, *_FAULTS[code])
     cure = "activate it again" if code >= FIRST_MAJOR_CODE else "wait or activate it again"
-    sentence = f"The gripper reports the fault {code}, which is not in its manual; {cure}."
-    return GripperFault(code, f"unknown fault {code}", sentence)
+    unknown = f"The gripper reports the fault {code}, which is not in its manual; {cure}."
+    return GripperFault(code, _FAULTS.get(code, unknown))
 
 
 class ObjectStatus(IntEnum):
@@ -115,7 +112,10 @@ class GripperHalt:
 
 @dataclass(frozen=True, slots=True)
 class GripperMove:
-    """Go to a position (0 open … 255 closed) with a speed and a force limit, in counts of 0…255."""
+    """Go to a position (0 open … 255 closed) with a speed and a force limit, in counts of 0…255.
+
+    The counts of speed and force are linear in mm/s and N.
+    """
 
     position: int
     speed: int
@@ -155,17 +155,6 @@ class GripperCommand:
 
 
 @dataclass(frozen=True, slots=True)
-class SentCommand:
-    """The command as sent, after clipping and rounding to counts; `clipped` has a sentence for each change."""
-
-    width_mm: float
-    speed_mm_s: float
-    force_n: float
-    request: GripperMove
-    clipped: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class GripperState:
     """The gripper at `t_ns` (CLOCK_MONOTONIC, when its registers were requested).
 
@@ -176,7 +165,6 @@ class GripperState:
     t_ns: int
     seq: int
     position_counts: int
-    target_counts: int
     width_mm: float
     width_std_mm: float
     object: ObjectStatus

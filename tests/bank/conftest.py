@@ -19,6 +19,11 @@ def rectangle(columns: int, rows: int, width_cm: float, height_cm: float) -> tup
     return nodes, np.vstack([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
 
 
+def relative(found: NDArray, expected: NDArray) -> float:
+    """Return the relative L2 error."""
+    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+
+
 def small_fingertip(impedance: float = 0.01) -> Mesh:
     """Return a square of 16 × 16 cells: the electrodes are every second edge around it."""
     nodes, triangles = rectangle(16, 16, 3.2, 3.2)

@@ -135,7 +135,7 @@ def interrupted(fingertip, tmp_path):
     path = tmp_path / "half.bank"
     definition = defined(fingertip)
     solver = RowSolver(fingertip, definition)
-    with RowJournal(path, definition, pytest.fail) as journal:
+    with RowJournal(path, definition) as journal:
         for row in (3, 0, 4):
             journal.append(row, solver.solve(row))
     return path
@@ -171,26 +171,10 @@ def test_a_foreign_file_in_the_journals_place_is_left_alone(fingertip, tmp_path,
 def test_two_builds_of_one_target_do_not_mix(fingertip, interrupted):
     definition = defined(fingertip)
     with (
-        RowJournal(interrupted, definition, lambda _: None),
+        RowJournal(interrupted, definition),
         pytest.raises(BankFileError, match=r"half\.bank: another build is at work"),
     ):
         build(fingertip, interrupted)
-
-
-def test_a_build_that_fails_leaves_the_old_bank_as_it_was(finished, fingertip, tmp_path, monkeypatch):
-    path = tmp_path / "old.bank"
-    path.write_bytes(finished.read_bytes())
-
-    def full(_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(
-        BankFileError,
-        match="cannot be written: No space left on device, and the rows solved so far are kept; make room",
-    ):
-        build(fingertip, path, sigma=SIGMA + 0.1)
-    assert path.read_bytes() == finished.read_bytes()
 
 
 def test_a_bank_that_the_disk_has_no_room_for_is_written_from_its_journal_when_there_is(

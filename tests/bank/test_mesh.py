@@ -9,7 +9,7 @@ import pytest
 from scipy.io import savemat
 
 from shearloop.bank.eit.forward import ForwardModel
-from shearloop.bank.eit.mesh import Mesh, doubled_areas, load_mesh
+from shearloop.bank.eit.mesh import doubled_areas, load_mesh
 from shearloop.bank.errors import GeometryError
 
 FIELDS = ("nodes", "triangles", "electrode_edges", "electrode_of_edge", "contact_impedance")
@@ -151,9 +151,3 @@ def test_a_file_cut_off_anywhere_is_refused_by_name(tmp_path, fingertip, save):
         cut.write_bytes(io.BytesIO(whole).read(length))
         with pytest.raises(GeometryError, match="cut"):
             load_mesh(cut)
-
-
-def test_a_mesh_may_have_its_triangles_in_any_orientation(fingertip):
-    turned = fingertip.triangles.copy()
-    turned[1::2] = turned[1::2, ::-1]
-    assert isinstance(replace(fingertip, triangles=turned), Mesh)

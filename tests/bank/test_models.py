@@ -16,15 +16,6 @@ def test_the_averaging_points_are_those_of_the_reference(shared):
     np.testing.assert_allclose(averaging_points(), expected, rtol=0, atol=1e-15)
 
 
-def test_the_averaging_points_are_symmetric_and_exact_for_linear_functions():
-    points = averaging_points()
-    assert points.shape == (15, 3)
-    np.testing.assert_allclose(points.sum(axis=1), 1, atol=1e-15)
-    np.testing.assert_allclose(points.mean(axis=0), 1 / 3, atol=1e-15)
-    for order in ([1, 0, 2], [2, 0, 1]):
-        assert {tuple(p) for p in points[:, order]} == {tuple(p) for p in points}
-
-
 @pytest.mark.parametrize("name", MODELS)
 def test_every_conductivity_has_the_smallest_value_that_the_reference_has(name, paper_mesh, eidors):
     for set_name in [n for n in eidors if n.startswith(name) and n.endswith("_min_conductivity")]:

@@ -26,13 +26,6 @@ def test_a_curve_without_noise_is_found_exactly() -> None:
         assert (low, high) == pytest.approx((value, value), abs=1e-13)
 
 
-def test_the_interval_of_a_mean_is_the_textbook_one() -> None:
-    # A polynomial of degree 0: mean ± t s √(1 + 1/n), t of 4 degrees of freedom being 2.7764.
-    fit = Polynomial.fit(np.arange(5.0), np.array([1.0, 2.0, 3.0, 4.0, 5.0]), 0)
-    half = 2.776445105 * np.sqrt(2.5) * np.sqrt(1.2)
-    assert fit.interval(100.0) == pytest.approx((3.0, 3.0 - half, 3.0 + half))
-
-
 def test_the_interval_of_a_line_is_the_textbook_one() -> None:
     x, y = np.array([1.0, 2.0, 4.0, 7.0]), np.array([2.0, 3.0, 3.0, 9.0])
     slope = ((x - 3.5) * (y - 4.25)).sum() / ((x - 3.5) ** 2).sum()

@@ -148,8 +148,6 @@ async def test_a_write_that_nobody_takes_ends(monkeypatch: pytest.MonkeyPatch) -
 
         with pytest.raises(DeviceLostError, match="takes no bytes"):
             await write_for_ever()
-        with pytest.raises(ValueError, match="at most 4096"):
-            await port.write(b"y" * 4097)
 
 
 async def test_a_link_opens_a_device_that_comes_late_and_again_after_it_went(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers.frame_clock import FrameClock, slope_below
+from shearloop.drivers.eit_kit import FrameClock, slope_below
 
 PERIOD_NS = 541_200_000
 

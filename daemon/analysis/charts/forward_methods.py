@@ -81,24 +81,25 @@ def forward_methods(
         solvers.append(_Solver("direct, --mesh", "direct, the given mesh", mesh, direct(mesh), given))
         solvers.append(_Solver("batch, --mesh", f"{BATCH}, the given mesh", mesh, batch(mesh), given, BATCHES))
     alike = min((one.mesh for one in solvers), key=lambda mesh: abs(len(mesh.triangles) - PAPER_TRIANGLES))
-    solve = pyeit(alike)
+    solve = pyeit_solver(alike)
     if solve is not None:
-        solvers.append(_Solver("pyEIT", "pyEIT", alike, solve, None))
+        of = ConductivityModel(alike)
+        cells = [of.conductivity(MODEL, k, s) for k, s in CELLS]
+        solvers.append(_Solver("pyEIT", "pyEIT", alike, lambda: [solve(cell) for cell in cells], None))
     times: dict[str, list[float]] = {one.name: [] for one in solvers}
-    found = []
-    for turn in range(rounds):
+    signals: dict[str, object] = {}
+    for _ in range(rounds):
         for one in solvers:
             begun = time.perf_counter()
-            signals = one.solve()
+            signals[one.name] = one.solve()
             times[one.name].append(1e3 * (time.perf_counter() - begun) / (len(CELLS) * one.repeats))
-            if turn == rounds - 1:
-                own_ms = times[one.name]
-                found.append(
-                    SolvedForward(
-                        one.name, one.family, len(one.mesh.triangles), float(np.median(own_ms)), min(own_ms),
-                        max(own_ms), None if one.truth is None else error_of(np.asarray(signals), one.truth),
-                    )
-                )  # fmt: skip
+    found = []
+    for one in solvers:
+        ms, error = times[one.name], None
+        if one.truth is not None:
+            error = error_of(np.asarray(signals[one.name]), one.truth)
+        triangles = len(one.mesh.triangles)
+        found.append(SolvedForward(one.name, one.family, triangles, float(np.median(ms)), min(ms), max(ms), error))
     # EIDORS' error is known only where the paper's mesh was given.
     error = next((one.error for one in found if one.triangles == PAPER_TRIANGLES), None)
     found.append(_cited("EIDORS 3.10", "EIDORS", EIDORS_CELL_S, error))
@@ -108,16 +109,6 @@ def forward_methods(
 def _cited(name: str, family: str, cell_s: float, error: float | None) -> SolvedForward:
     cell_ms = 1e3 * cell_s
     return SolvedForward(f"{name} (cited)", family, PAPER_TRIANGLES, cell_ms, cell_ms, cell_ms, error, cited=True)
-
-
-def pyeit(mesh: Mesh) -> Callable[[], object] | None:
-    """Return a function that solves the cells by pyEIT, with point electrodes; None where it is not installed."""
-    solve = pyeit_solver(mesh)
-    if solve is None:
-        return None
-    of = ConductivityModel(mesh)
-    cells = [of.conductivity(MODEL, k, s) for k, s in CELLS]
-    return lambda: [solve(cell) for cell in cells]
 
 
 def pyeit_solver(mesh: Mesh) -> Callable[[FloatArray], object] | None:

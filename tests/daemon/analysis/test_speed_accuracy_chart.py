@@ -45,12 +45,8 @@ def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_frontier_is_what_nothing_beats_in_both() -> None:
-    costs, errors = [1.0, 2.0, 3.0, 4.0, 2.5], [9.0, 5.0, 6.0, 1.0, 5.0]
-    assert frontier(costs, errors) == [0, 1, 3]
-
-
-def test_of_equally_fast_points_the_more_accurate_is_on_the_frontier() -> None:
-    assert frontier([1.0, 1.0], [2.0, 1.0]) == [1]
+    assert frontier([1.0, 2.0, 3.0, 4.0, 2.5], [9.0, 5.0, 6.0, 1.0, 5.0]) == [0, 1, 3]
+    assert frontier([1.0, 1.0], [2.0, 1.0]) == [1], "of equally fast ones the more accurate"
 
 
 def test_a_method_with_few_valid_frames_is_not_on_the_frontier(scratch: Path) -> None:

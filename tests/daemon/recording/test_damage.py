@@ -1,8 +1,6 @@
 """What becomes of a recording whose bytes are spoilt or cut off: a sentence, or all that was in it."""
 
-import asyncio
 import json
-import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +12,6 @@ from hypothesis import strategies as st
 
 from shearloop.daemon.cli import main
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.export import count_messages, export
 from shearloop.daemon.recording.reader import read_recording, repair, summarise
@@ -23,7 +20,6 @@ from shearloop.daemon.recording.replay import RecordedRun
 from shearloop.daemon.recording.schema import basic_identity
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.recording.test_recorder import frame, torque
-from tests.daemon.recording.test_replay import replayed
 
 CONFIGURATION = {"fingertips": {"right": {"device": {"path": "eit-right"}}}}
 
@@ -160,11 +156,3 @@ def test_a_check_without_a_comparison_fails(
     assert main(["replay", str(imported), *arguments]) == 0
     assert "Nothing was compared" in capsys.readouterr().err
     assert main(["replay", str(imported), *arguments, "--check"]) == 1
-
-
-def test_a_replay_without_comparison_stores_nothing(config: Callable[..., Path], imported: Path) -> None:
-    configured = load_daemon_config(config())
-    published, comparison = asyncio.run(replayed(imported, math.inf, configured))
-    assert sum(topic == "eit.estimate" for topic, _ in published) > 30
-    assert comparison.unrecorded == 0
-    assert comparison._computed == {}

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,11 +17,15 @@ import zmq.asyncio
 from shearloop.bank.estimation import Measured
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import main
+from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
+from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.messaging.client import send_command
+from shearloop.daemon.messaging.messages import EitEstimate, wire_map
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.matlab import import_mat
 from shearloop.daemon.recording.replay import (
+    RecordedEvent,
     RecordedRun,
     Replay,
     ReplayClock,
@@ -29,8 +33,11 @@ from shearloop.daemon.recording.replay import (
     ReplayPipeline,
     restored_wire_map,
 )
+from shearloop.daemon.recording.schema import message_json, with_missing_keys
+from shearloop.daemon.sensing.estimators import LiveEstimator
 from shearloop.daemon.sensing.fingertip_task import FingertipEstimates
 from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.daemon.sample_messages import sample
 from tests.daemon.test_run import recording
 
 Write = Callable[..., Path]
@@ -187,7 +194,6 @@ def test_a_real_recording_gives_the_stored_estimates(shared: Path, config: Write
     [
         (["nowhere.mcap"], "nowhere.mcap: the recording cannot be read: No such file"),
         (["{imported}"], "has no configuration because"),
-        (["{imported}", "{imported}", "a.mcap"], "one recording can be replayed at a time, not 3; name one"),
         (["{imported}", "--speed", "0"], "--speed must be a number above 0, or max, not '0'"),
         (["{imported}", "--speed", "fast"], "--speed must be a number above 0, or max, not 'fast'"),
     ],
@@ -204,3 +210,97 @@ def test_nan_is_restored() -> None:
     assert on_wire["joints_rad_shape"] == [3]
     np.testing.assert_array_equal(np.frombuffer(on_wire["joints_rad"], "<f4"), np.float32([1.5, np.nan, 2.5]))
     assert on_wire["seq"] == 3
+
+
+TOPIC = EitEstimate.topic
+
+
+def estimate(**changes: Any) -> dict[str, Any]:
+    content = wire_map(sample(EitEstimate), Clock().unix_s(0), 7)
+    return content | {"source": "right", "t_mono_ns": 5} | changes
+
+
+def recorded(content: dict[str, Any]) -> RecordedEvent:
+    """Return a message as it comes back from a recording, which leaves out what has no value."""
+    plain = json.loads(message_json(TOPIC, content, 0))
+    return RecordedEvent(TOPIC, content["t_mono_ns"], with_missing_keys(TOPIC, plain), content["source"])
+
+
+@pytest.mark.parametrize(
+    ("then", "now", "told"),
+    [
+        ({}, {}, ""),
+        ({"latency_s": 0.1, "timestamp": 1.0, "seq": 3}, {"latency_s": 0.7, "timestamp": 2.0, "seq": 4}, ""),
+        ({"torque_nm": 0.1}, {"torque_nm": 0.1 + 1e-16}, "torque_nm was 0.1, is 0.100000000000000"),
+        ({"k": None}, {"k": 1.5}, "k was None, is 1.5"),
+        ({"k": 1.5}, {"k": None}, "k was 1.5, is None"),
+        ({"reason": ""}, {"reason": "no grip"}, "reason was"),
+    ],
+)
+def test_a_difference_is_described(then: dict[str, Any], now: dict[str, Any], told: str) -> None:
+    comparison = ReplayComparison(("eit.estimate.right",))
+    comparison.add_computed(TOPIC, estimate(**now))
+    comparison.compare(recorded(estimate(**then)))
+    assert comparison.compared[TOPIC] == 1
+    assert comparison.different[TOPIC] == bool(told)
+    assert told in "".join(comparison.examples)
+    assert comparison.unrecorded == 0
+
+
+def test_a_missing_message_is_a_difference() -> None:
+    comparison = ReplayComparison(("eit.estimate.right", "eit.estimate.left"))
+    comparison.add_computed(TOPIC, estimate(source="left"))
+    comparison.compare(recorded(estimate()))
+    assert comparison.different[TOPIC] == 1
+    assert "the replay did not compute it" in comparison.examples[0]
+    assert comparison.unrecorded == 1, "the left one has no message beside it"
+
+
+def test_messages_of_unrecorded_topics_are_only_counted() -> None:
+    comparison = ReplayComparison(("eit.estimate.right",))
+    for _ in range(3):
+        comparison.add_computed(TOPIC, estimate(source="left"))
+        comparison.add_computed("health", {"source": "daemon"})
+    assert comparison.unrecorded == 3
+    assert comparison._computed == {}
+
+
+OTHER_TOOL = Measured(14.0, 0.5)
+# The frames after which another tool is held, a further experiment is begun, and a zero is taken.
+HELD, BEGUN, ZEROED, ENOUGH = 6, 12, 18, 40
+
+
+async def record_experiments(config: Path) -> list[dict[str, Any]]:
+    """Run a daemon through two experiments; return what was published as estimates."""
+    async with recording_daemon(config) as (daemon, published, until):
+        recorder, right = daemon.recorder, daemon.sensors.fingertips["right"].estimates
+        assert recorder is not None
+        right._gripper = cast(GripperTask, Gripper(right, OTHER_TOOL, range(HELD, 10 * ENOUGH)))
+        recorder.record_experiment("first")
+        await until(BEGUN)
+        recorder.record_experiment("second")
+        await until(ZEROED)
+        right.tare()
+        await until(ENOUGH)
+    return [content for topic, content in published if topic == "eit.estimate"]
+
+
+def test_a_later_file_replays_frame_numbers_tares_and_tools(
+    config: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    live = asyncio.run(record_experiments(config(recording={"folder": "recordings"})))
+    (later,) = (path for path in (tmp_path / "recordings").iterdir() if "second" in path.name)
+    ((zeroed,),) = RecordedRun(later).replay_events().tares.values()
+    assert zeroed >= ZEROED
+    held: list[object] = []
+    monkeypatch.setattr(LiveEstimator, "set_tool", lambda _self, tool: held.append(tool))
+    again, _ = asyncio.run(replayed(later, math.inf))
+    assert held == [OTHER_TOOL], "which was told before the file began"
+    estimates = {content["frame"]: content for topic, content in again if topic == "eit.estimate"}
+    assert min(estimates) >= BEGUN
+    said = ("reason", "valid", "k", "sigma", "score", "torque_nm")
+    after = [one for one in live if one["frame"] >= zeroed]
+    assert len(after) > ENOUGH - ZEROED - 10
+    for one in after:
+        assert [estimates[one["frame"]][key] for key in said] == [one[key] for key in said]
+    assert estimates[zeroed]["reason"].startswith("taking the homogeneous frame, 1 of")

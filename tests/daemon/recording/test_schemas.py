@@ -2,17 +2,31 @@
 
 import dataclasses
 import json
+import math
+import struct
 from collections.abc import Mapping
-from typing import Any, TypeVar, get_args, get_type_hints
+from types import MappingProxyType
+from typing import Any, NoReturn, TypeVar, get_args, get_type_hints
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 from numpy.typing import NDArray
 from typing_extensions import TypeAliasType
 
 from shearloop.daemon.messaging.messages import TOPICS, EitFrame, Message, wire_map
-from shearloop.daemon.recording.schema import INPUT, input_json, json_type, message_json, schemas, with_missing_keys
+from shearloop.daemon.recording.schema import (
+    INPUT,
+    as_json,
+    input_event,
+    input_json,
+    json_type,
+    message_json,
+    schemas,
+    with_missing_keys,
+)
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.sample_messages import sample
 
@@ -22,8 +36,8 @@ PLAIN = {"boolean", "string", "number", "integer"}
 def refused(schema: dict[str, Any], path: str = "") -> list[str]:
     """Return what Foxglove would refuse a topic for, by its packages/mcap-support/src/parseJsonSchema.ts (v1.87)."""
     found = [] if schema.get("type") == "object" and "properties" in schema else [f"{path}: no object with properties"]
-    for name, given in schema.get("properties", {}).items():
-        inner = given["items"] if given.get("type") == "array" else given
+    for name, declared in schema.get("properties", {}).items():
+        inner = declared["items"] if declared.get("type") == "array" else declared
         kind = inner.get("type")
         if kind == "object":
             found += refused(inner, f"{path}.{name}")
@@ -78,9 +92,11 @@ def test_each_message_matches_its_schema(topic: str) -> None:
                 assert restored[item.name] == (None if missing else value), item.name
 
 
-def test_raw_input_matches_its_schema() -> None:
-    written = json.loads(input_json(RawEvent(InputKind.DATA, 7, bytes(range(256)))))
+def test_raw_input_matches_its_schema_and_round_trips() -> None:
+    event = RawEvent(InputKind.DATA, 123456789012345678, bytes(range(256)))
+    written = json.loads(input_json(event))
     Draft202012Validator(schemas()[INPUT]).validate(written)
+    assert input_event(written) == event
 
 
 def test_array_elements_are_rounded_to_a_millionth_and_null_if_not_finite() -> None:
@@ -98,3 +114,37 @@ def test_an_alias_of_an_array_type_is_an_array() -> None:
     assert json_type(alias[np.float64]) == json_type(NDArray[np.float64]) == json_type(tuple[float, ...]) == array
     assert json_type(float | None) == {"type": "number"}
     assert json_type(Mapping[str, int]) == {"type": "object", "properties": {}}
+
+
+texts = st.text()
+scalars = st.none() | st.booleans() | st.integers(-(2**63), 2**63) | st.floats() | texts
+values = st.recursive(scalars, lambda inner: st.lists(inner) | st.dictionaries(texts, inner), max_leaves=20)
+
+
+def not_json(name: str) -> NoReturn:
+    raise AssertionError(f"{name} is not JSON, though Python reads it")
+
+
+def read(value: Any) -> Any:
+    """Return a value as JSON has it: null for what is no finite number."""
+    if isinstance(value, dict):
+        return {key: read(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [read(one) for one in value]
+    if isinstance(value, float):
+        # Of a float each bit counts: a replay is to be the same.
+        return struct.pack("<d", value) if math.isfinite(value) else None
+    return value
+
+
+@given(st.dictionaries(texts, values))
+@example({"torque_nm": math.nan})
+@example({"whole": [math.inf, -0.0, 5e-324, 0.1 + 0.2, 1e22]})
+def test_json_round_trips(content: dict[str, Any]) -> None:
+    assert read(json.loads(as_json(content), parse_constant=not_json)) == read(content)
+
+
+def test_other_mappings_are_written_like_a_dict() -> None:
+    assert as_json(MappingProxyType({"tasks": MappingProxyType({"loop": (1, math.nan)})})) == (
+        b'{"tasks":{"loop":[1,null]}}'
+    )

@@ -108,7 +108,7 @@ async def test_motion_ends_at_its_target_or_on_an_object(connect: Connect, obj: 
     client = Client(ACTIVE)
     gripper = connect(client)
     sent = await gripper.move(messages.GripperCommand(50.0))
-    taken_up = replace(ACTIVE, pre=sent.request.position)
+    taken_up = replace(ACTIVE, pre=sent.position)
     client.readouts = [ACTIVE, replace(taken_up, obj=messages.ObjectStatus.MOVING), replace(taken_up, obj=obj), RESET]
     assert (await gripper.finish(sent)).object is obj
     assert client.readouts == [RESET]

@@ -25,7 +25,7 @@ READ_BYTES = 65_536
 READS_PER_TURN = 8
 # A read shorter than one kernel buffer has emptied the port.
 SHORT_READ_BYTES = 4_000
-WRITE_TIMEOUT_S = 1.0
+WRITE_TIMEOUT_S, WRITE_PAUSE_S = 1.0, 0.01
 CONNECT_TIMEOUT_S = 2.0
 
 # The values that a device reports in `health`, by name.
@@ -149,20 +149,11 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
                     try:
                         data = data[os.write(self._descriptor, data) :]
                     except BlockingIOError:
-                        await self._writable()
+                        await asyncio.sleep(WRITE_PAUSE_S)
         except TimeoutError as error:
             raise DeviceLostError(f"{self.path} takes no bytes any more; unplug the device and plug it in.") from error
         except OSError as error:
             raise self._lost(error.strerror) from error
-
-    async def _writable(self) -> None:
-        loop = asyncio.get_running_loop()
-        done: asyncio.Future[None] = loop.create_future()
-        loop.add_writer(self._descriptor, _finish, done)
-        try:
-            await done
-        finally:
-            loop.remove_writer(self._descriptor)
 
     def _lost(self, reason: str | None) -> DeviceLostError:
         return DeviceLostError(f"{self.path} has gone ({reason}): unplugged, or without power.")

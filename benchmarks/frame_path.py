@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 import shearloop
 from benchmarks.daemon_speed import FIRST_FRAME, FIRST_VALID_FRAME, PAUSE_S, PlayedBoard, line_text, write_config
 from shearloop.daemon.app import Daemon
-from shearloop.daemon.cli.demo_calibration import calibrate, record
+from shearloop.daemon.cli.calibrate_demo import calibrate, record
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.runner import ControlLoopRunner

@@ -29,7 +29,7 @@ _SCORE_SCALE, _LEAST_WEIGHT = 0.0005, 1e-9
 # share of the drop to the next cell. On grids with a larger drop than _COARSE a parabola through the maximum is used.
 _RESOLVED, _COARSE = 0.7, 0.005
 _PIXELS_ALONG = 12
-_STEP = 1e-3
+_STEP, _SMOOTHING = 1e-3, 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +73,8 @@ class ElectrodeNumbering:
 
     rotation: int
     reflected: bool
-    score: float
-    runner_up: float
+    score: float = 1.0
+    runner_up: float = 0.0
 
     def model_channels(self) -> IntArray:
         """Return (896,) the number of the model's channel for each of the board's channels."""
@@ -91,7 +91,7 @@ class ElectrodeNumbering:
         return np.asarray(position[electrode(sink).astype(int), first.astype(int)])
 
 
-NOT_TURNED = ElectrodeNumbering(0, reflected=False, score=1.0, runner_up=0.0)
+NOT_TURNED = ElectrodeNumbering(0, reflected=False)
 
 
 def find_numbering(idle: FloatArray, homogeneous: FloatArray) -> ElectrodeNumbering:
@@ -100,7 +100,7 @@ def find_numbering(idle: FloatArray, homogeneous: FloatArray) -> ElectrodeNumber
     scores = {}
     for reflected in (False, True):
         for rotation in range(N_ELECTRODES):
-            turned = ElectrodeNumbering(rotation, reflected, 0.0, 0.0).model_channels()
+            turned = ElectrodeNumbering(rotation, reflected).model_channels()
             scores[rotation, reflected] = float(np.corrcoef(model[turned], measured)[0, 1])
     best = max(scores, key=lambda key: (round(scores[key], 9), -key[0]))
     # Half a turn swaps the two ends of every injection and changes no magnitude of a symmetric tip.
@@ -172,10 +172,10 @@ class RefinedMatcher:
 BankMatcher: TypeAlias = PaperMatcher | RefinedMatcher
 
 
-def image_matrix(mesh: "Mesh", smoothing: float = 0.05) -> FloatArray:
+def image_matrix(mesh: "Mesh") -> FloatArray:
     """Return the (p, 896) matrix from a difference of voltages to the change of p pixels' log conductivity.
 
-    One Gauss–Newton step, (JᵀJ + smoothing · diag(JᵀJ))⁻¹ Jᵀ, with J by central differences of whole pixels. Pixels are
+    One Gauss–Newton step, (JᵀJ + 0.05 · diag(JᵀJ))⁻¹ Jᵀ, with J by central differences of whole pixels. Pixels are
     squares of the mesh's bounding box with at least one triangle.
     """
     # Imported here because only fitting needs it: it would slow the daemon's start.
@@ -192,8 +192,7 @@ def image_matrix(mesh: "Mesh", smoothing: float = 0.05) -> FloatArray:
         columns.append((model.voltages(1.0 + step) - model.voltages(1.0 - step)) / (2 * _STEP))
     jacobian = np.array(columns).T
     normal = jacobian.T @ jacobian
-    prior = np.diag(np.diag(normal)) * smoothing
-    return np.asarray(np.linalg.solve(normal + prior, jacobian.T))
+    return np.asarray(np.linalg.solve(normal + _SMOOTHING * np.diag(np.diag(normal)), jacobian.T))
 
 
 def _drop(heatmap: FloatArray, row: int, column: int) -> float:

@@ -268,10 +268,7 @@ class ContaminationTest:
         self._differences = differences
         self._reader = reader
         mean = differences.mean(axis=0)
-        self._foreign = [
-            mean[ElectrodeNumbering(turn, mirrored, score=1.0, runner_up=0.0).model_channels()]
-            for turn, mirrored in _NUMBERINGS
-        ]
+        self._foreign = [mean[ElectrodeNumbering(turn, mirrored).model_channels()] for turn, mirrored in _NUMBERINGS]
         self._detectors: dict[bytes, NoveltyDetector] = {}
         self._features: dict[tuple[int, int, float], FloatArray] = {}
 

@@ -74,16 +74,14 @@ class TemporalFeatures(Motion):
     uses_position: bool = False
 
     @classmethod
-    def fit(
-        cls, parts: Sequence[FloatArray], validators: tuple[FingertipValidator, ...], n_directions: int, n_lags: int
-    ) -> Self:
+    def fit(cls, parts: Sequence[FloatArray], validators: tuple[FingertipValidator, ...]) -> Self:
         """Fit the main directions of motion to each recording's (n, m, 896) gripped frames."""
         directions = []
         for layer, one in enumerate(validators):
-            moved = np.vstack([(part[n_lags:, layer] - part[:-n_lags, layer]) / one.noise for part in parts])
-            rows = np.linalg.svd(moved, full_matrices=False)[2][:n_directions] / one.noise
+            moved = np.vstack([(part[_N_LAGS:, layer] - part[:-_N_LAGS, layer]) / one.noise for part in parts])
+            rows = np.linalg.svd(moved, full_matrices=False)[2][:_N_DIRECTIONS] / one.noise
             directions.append(rows * np.sign(rows.sum(axis=1, keepdims=True)))
-        return cls(np.array(directions), n_lags)
+        return cls(np.array(directions), _N_LAGS, uses_position=True)
 
     def project(self, channels: FloatArray) -> FloatArray:
         """Return the (…, m·p) positions of (…, m, 896) frames along the directions."""
@@ -144,8 +142,7 @@ class MotionRegression(Estimator):
         """Return the estimator with the directions of the grips' motion."""
         if not material.validators:
             return cls(material.scale)
-        temporal = TemporalFeatures.fit(material.grips, material.validators, _N_DIRECTIONS, _N_LAGS)
-        return cls(material.scale, temporal=replace(temporal, uses_position=True))
+        return cls(material.scale, temporal=TemporalFeatures.fit(material.grips, material.validators))
 
     @property
     def motion(self) -> Motion:

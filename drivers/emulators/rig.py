@@ -21,11 +21,13 @@ from shearloop.drivers.emulators.ur_controller import FAULTS, Controller
 from shearloop.drivers.emulators.ur_robot import ControllerSpec, Robot
 
 NOISE_NM = 0.0005
+JOINTS = {joint.value: joint for joint in Joint}
 # The pads face each other: a shear on the right has the opposite sign on the left.
 SIDES = {"right": 1.0, "left": -1.0}
 COMMANDS = (
-    "kick NM, slip [NM], joint KIND, object MM|none, silence DEVICE [SECONDS], unplug DEVICE [SECONDS], replug DEVICE, "
-    "right|left|load|skin FAULT, gripper drop|fault CODE|…, a fault of the robot, or normal"
+    f"kick NM, slip [NM], joint {'|'.join(JOINTS)}, object MM|none, silence DEVICE [SECONDS], "
+    "unplug DEVICE [SECONDS], replug DEVICE, right|left|load|skin FAULT, "
+    "gripper drop|fault CODE|…, a fault of the robot, or normal"
 )
 
 
@@ -157,8 +159,8 @@ class EmulatedRig:
                 self.scene.slip()
             case ["slip", left_nm]:
                 self.scene.slip(_torque(left_nm))
-            case ["joint", name]:
-                self.scene.put_on(Joint.named(name))
+            case ["joint", name] if name in JOINTS:
+                self.scene.put_on(JOINTS[name])
             case ["object", *_]:
                 self._commanded["gripper"].command(text)
             case ["normal"]:

@@ -35,15 +35,6 @@ class Joint(Enum):
     SEIZED = "seized"  # holds up to a torque, then turns at a lower one
     STRIPPING = "stripping"  # tightens, then gives way for good
 
-    @classmethod
-    def named(cls, name: str) -> "Joint":
-        """Return the joint of a name; ValueError, with a sentence, for an unknown one."""
-        try:
-            return cls(name)
-        except ValueError:
-            names = ", ".join(joint.value for joint in cls)
-            raise ValueError(f"there is no joint {name!r}; there are {names}") from None
-
 
 @dataclass(frozen=True, slots=True)
 class TwinSettings:

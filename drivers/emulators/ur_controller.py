@@ -6,7 +6,6 @@ import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import AsyncExitStack, contextmanager
 from dataclasses import replace
-from typing import Any
 
 from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, Robot, RobotEvent, armed_hz
@@ -27,8 +26,6 @@ FAULTS = (
     *("protective-stop", "emergency-stop", "release", "drop-rtde", "silence", "stop-hangs"),
     *("registers-in-use", "local-control", "refuse-protocol", "normal"),
 )
-# The words after a fault that is switched on and off.
-ONS: tuple[list[str], ...] = ([], ["on"], ["off"])
 
 log = logging.getLogger(__name__)
 
@@ -105,9 +102,12 @@ class Controller:
             case ["stop-hangs", count]:
                 hangs = int(number_between(count, 0, 1000, "not a number of requests from 0 to 1000"))
                 self.faults = replace(self.faults, stop_hangs=hangs)
-            case ["registers-in-use" | "local-control" | "refuse-protocol" as name, *words] if words in ONS:
-                changed: dict[str, Any] = {name.replace("-", "_"): words != ["off"]}
-                self.faults = replace(self.faults, **changed)
+            case ["registers-in-use"]:
+                self.faults = replace(self.faults, registers_in_use=True)
+            case ["local-control"]:
+                self.faults = replace(self.faults, local_control=True)
+            case ["refuse-protocol"]:
+                self.faults = replace(self.faults, refuse_protocol=True)
             case ["normal"]:
                 self.robot.clear_faults()
                 self.faults = ConnectionFaults()

@@ -202,7 +202,6 @@ class SafetyController:
         """Be switched on and safe."""
         self._spec = spec
         self.robot_mode, self.safety_mode = MODE_RUNNING, SAFETY_NORMAL
-        self._button_pressed = False
         self._stopped_s = 0.0
         self._power_step_s = math.inf
 
@@ -231,18 +230,16 @@ class SafetyController:
 
     def press_button(self) -> None:
         """Press the emergency stop button: the power goes off."""
-        self._button_pressed = True
         self.safety_mode, self.robot_mode = SAFETY_EMERGENCY_STOP, MODE_POWER_OFF
 
     def release_button(self) -> None:
         """Release the button; the power stays off."""
-        self._button_pressed = False
         if self.safety_mode == SAFETY_EMERGENCY_STOP:
             self.safety_mode = SAFETY_NORMAL
 
     def power_on(self, now_s: float) -> None:
         """Begin to power the arm."""
-        if self.robot_mode == MODE_POWER_OFF and not self._button_pressed:
+        if self.robot_mode == MODE_POWER_OFF and self.safety_mode != SAFETY_EMERGENCY_STOP:
             self._power_step_s = min(self._power_step_s, now_s + self._spec.power_on_s)
 
     def brake_release(self, now_s: float) -> None:

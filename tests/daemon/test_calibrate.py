@@ -198,7 +198,6 @@ def test_the_end_of_the_input_ends_the_calibration_with_a_sentence(tmp_path: Pat
         ("hx711 --speed 0", "--speed 0"),
         ("hx711 --torque-nm nan", "finite"),
         ("gripper-socket --port 70000", "no port"),
-        ("gripper-socket --object-mm 900", "width in mm"),
         ("gripper-socket --bind 192.0.2.1", "cannot be played"),
         ("gripper-modbus --link /nowhere/at/all", "/nowhere/at/all cannot be made"),
     ],

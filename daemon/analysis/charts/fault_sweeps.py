@@ -121,7 +121,7 @@ def _gain(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFram
 
 
 def _turned(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFrames:
-    order = ElectrodeNumbering(int(level), reflected=False, score=1.0, runner_up=0.0).model_channels()
+    order = ElectrodeNumbering(int(level), reflected=False).model_channels()
     return _faulty(scene, scene.series.channels[:, :, order])
 
 

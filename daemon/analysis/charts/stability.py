@@ -303,7 +303,7 @@ def detect_mixtures(series: FrameSeries, origins: Sequence[float] = ORIGINS, see
     """
     frames = np.abs(series.channels[:, 0])
     usable = np.ones(N_CHANNELS, dtype=np.bool_)
-    turned = bank_match.ElectrodeNumbering(_TURNED_ELECTRODES, reflected=False, score=1.0, runner_up=0.0)
+    turned = bank_match.ElectrodeNumbering(_TURNED_ELECTRODES, reflected=False)
     found = []
     for origin in origins:
         n = round(origin * len(frames))

@@ -29,9 +29,9 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
   drop-rtde               close the RTDE connections, but not the dashboard's
   silence SECONDS         send nothing on any port
   stop-hangs N            ignore the dashboard's next N stop commands, without an answer
-  registers-in-use [off]  refuse input registers as if a fieldbus had them
-  local-control [off]     leave remote control
-  refuse-protocol [off]   refuse the RTDE protocol version
+  registers-in-use        refuse input registers as if a fieldbus had them
+  local-control           leave remote control
+  refuse-protocol         refuse the RTDE protocol version
   normal                  end all of them
 """
 
@@ -243,7 +243,6 @@ def _configure_gripper(parser: argparse.ArgumentParser, printed: str) -> None:
         "half-way; `normal` ends them, and a fault below 10."
     )
     parser.add_argument("--speed", type=float, default=1.0, metavar="N", help="times the gripper's own pace")
-    parser.add_argument("--object-mm", type=float, metavar="MM", help="the width of an object between the fingers")
 
 
 def _configure_gripper_socket(parser: argparse.ArgumentParser) -> None:
@@ -271,11 +270,6 @@ def _run_gripper(args: argparse.Namespace) -> int:
     else:
         server = SocketServer(UrcapSession(gripper), args.bind, console.checked_port("port", args.port))
     player = GripperPlayer(gripper, server, args.speed)
-    if args.object_mm is not None:
-        try:
-            player.command(f"object {args.object_mm}")
-        except ValueError as error:
-            raise UserError(f"--object-mm: {error}") from None
     with console.report_busy_address("the gripper cannot be played", "choose another port or bind address"):
         console.play(player.run(), player.command, {"": server.appearances})
     return 0

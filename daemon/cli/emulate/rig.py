@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from shearloop.drivers.emulators.skin import Address, SkinInstruments
     from shearloop.drivers.emulators.ur_controller import Controller
 
-JOINTS = ("lever", "tightening", "seized", "stripping")
 TRUTH_PERIOD_S = 0.1
 # The gauges' drift advances in steps of this.
 REST_S = 1.0
@@ -106,7 +105,6 @@ def _configure_rig(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--gripper", choices=("socket", "modbus"), default="socket", help="its interface (default: %(default)s)"
     )
-    parser.add_argument("--joint", choices=JOINTS, default="lever", help="of the tool (default: %(default)s)")
     parser.add_argument("--diameter-mm", type=float, default=20.0, metavar="MM", help="of the tool (default: 20)")
     parser.add_argument(
         "--gel-stiffness", type=float, default=0.8, metavar="NM_PER_RAD", help="of both pads (default: %(default)s)"
@@ -176,7 +174,7 @@ async def _write_truths(rig: "EmulatedRig", file: TextIO, period_s: float) -> No
 def _rig_settings(args: argparse.Namespace) -> "RigSettings":
     from shearloop.drivers.emulators.boards import PAPER_SKETCH
     from shearloop.drivers.emulators.rig import NOISE_NM, Pace, RigSettings
-    from shearloop.drivers.emulators.scene import Joint, TwinSettings
+    from shearloop.drivers.emulators.scene import TwinSettings
 
     console.check_positive(args, "speed", "arm_speed", "gel_stiffness")
     make = robot_make(args)
@@ -186,7 +184,7 @@ def _rig_settings(args: argparse.Namespace) -> "RigSettings":
         run_dir=args.run_dir,
         host=args.host,
         gripper=args.gripper,
-        twin=TwinSettings(joint=Joint(args.joint), gel_stiffness_nm_per_rad=args.gel_stiffness),
+        twin=TwinSettings(gel_stiffness_nm_per_rad=args.gel_stiffness),
         diameter_mm=args.diameter_mm,
         pace=Pace(args.speed, args.arm_speed),
         rate_hz=args.rate_hz,

@@ -1,7 +1,8 @@
 """A rig that is played by formulas: fingertips with a pattern of their own, a gel that creeps, a one-sided lever."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -79,9 +80,49 @@ def slices(n_repeats: int = 5, seed: int = 0, noise_v: float = 0.0008) -> FrameS
     z = (torque - 0.075) / 0.04
     wandering = np.linspace(0, 1, len(torque)) + rng.normal(0, 0.1, len(torque))
     frames = base + z[:, None] * slope + (z**2)[:, None] * bend + wandering[:, None] * drift
-    frames = np.abs(frames + rng.normal(0, noise_v, frames.shape))
+    return slices_of(frames + rng.normal(0, noise_v, frames.shape), torque)
+
+
+def slices_of(frames: FloatArray, torque: FloatArray) -> FrameSeries:
+    """Return the magnitudes of (n, 896) differences as slices of one fingertip, one a second."""
     t = np.arange(len(torque), dtype=float)
-    return FrameSeries("difference", ("right",), t, frames[:, None], t, torque, np.full(len(t), np.nan))
+    return FrameSeries("difference", ("right",), t, np.abs(frames)[:, None], t, torque, np.full(len(t), np.nan))
+
+
+def kept(whole: FrameSeries, rows: BoolArray) -> FrameSeries:
+    """Return the frames of a series that are not lost."""
+    return replace(whole, t_s=whole.t_s[rows], channels=whole.channels[rows], diameter_mm=whole.diameter_mm[rows])
+
+
+def mixed(own: FrameSeries, share: float) -> FrameSeries:
+    """Return slices mixed with a share of a foreign one."""
+    foreign = own.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(N_CHANNELS)]
+    return replace(own, channels=(1 - share) * own.channels + share * foreign)
+
+
+class Judged(NamedTuple):
+    """Valid torques of known truth: how many, correlation, error in N·m, share within intervals, median width."""
+
+    n: int
+    r: float
+    rmse: float
+    coverage: float
+    width: float
+
+
+def judged(estimates: list[Estimate], played: FrameSeries) -> Judged:
+    """Return how estimates compare with the truth."""
+    rows = [
+        (one.torque_nm, one.torque_low_nm, one.torque_high_nm, truth)
+        for one, truth in zip(estimates, played.torque_at_frames(), strict=True)
+        if one.valid and np.isfinite(truth)
+    ]
+    if not rows:
+        return Judged(0, np.nan, np.nan, 1.0, np.nan)
+    value, low, high, truth = np.array(rows, dtype=np.float64).T
+    inside = (low <= truth) & (truth <= high)
+    r, rmse = np.corrcoef(value, truth)[0, 1], np.sqrt(((value - truth) ** 2).mean())
+    return Judged(len(rows), r, rmse, inside.mean(), float(np.median(high - low)))
 
 
 def follow(

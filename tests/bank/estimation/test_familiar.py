@@ -5,18 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shearloop.bank.estimation import EstimatorSession, FrameSeries, TactileFrame
+from shearloop.bank.estimation import FrameSeries
 from shearloop.bank.estimation.bank_match import BankMatch
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor, Mixtures, fit_interval_regressor
 from shearloop.bank.estimation.novelty import NoveltyDetector, ReciprocityCheck
 from shearloop.bank.estimation.regressors import Ridge
+from tests.bank.estimation.conftest import follow, mixed
 
 ALL = np.ones(896, dtype=np.bool_)
-
-
-def follow(calibration, frames):
-    tracker = EstimatorSession(calibration)
-    return [tracker.estimate(TactileFrame.of(100.0 + i, frame)) for i, frame in enumerate(frames)]
 
 
 def beyond(series: FrameSeries, below_nm: float) -> np.ndarray:
@@ -39,9 +35,8 @@ def test_a_frame_far_out_along_the_calibrations_own_directions_is_refused(sliced
 @pytest.mark.parametrize("share", [0.35, 0.5, 1.0])
 def test_a_foreign_frame_mixed_in_is_refused(sliced, sliced_calibration, share):
     calibration, later = sliced_calibration, sliced(seed=3)
-    foreign = later.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(896)]
-    assert not any(one.valid for one in follow(calibration, (1 - share) * later.channels + share * foreign))
-    assert all(one.valid for one in follow(calibration, later.channels))
+    assert not any(one.valid for one in follow(calibration, mixed(later, share)))
+    assert all(one.valid for one in follow(calibration, later))
 
 
 def test_channels_that_vary_much_do_not_drown_the_others():
@@ -185,7 +180,7 @@ def test_a_slice_is_measured_against_the_calibration_once(sliced, sliced_calibra
     for kind, name in ((NoveltyDetector, "q_residual"), (ReciprocityCheck, "residual")):
         found = getattr(kind, name)
         monkeypatch.setattr(kind, name, lambda *args, found=found: (looked.append(type(args[0])), found(*args))[1])
-    assert all(one.valid for one in follow(sliced_calibration, series.channels[20:23]))
+    assert all(one.valid for one in follow(sliced_calibration, series.between(20, 23)))
     assert looked == [NoveltyDetector, ReciprocityCheck] * 3
 
 

@@ -11,6 +11,7 @@ from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, Physics, TactileFrame, fit
 from shearloop.bank.estimation.regressors import ChannelImputer
 from tests.bank.estimation import conftest
+from tests.bank.estimation.conftest import judged
 
 # Some seconds into the first grip.
 DEATH = 60
@@ -34,18 +35,11 @@ def without(channels: np.ndarray, start: int, series: FrameSeries, tracker: Esti
     return conftest.follow(tracker, replace(series, channels=np.where(usable, series.channels, 0.0)), usable)
 
 
-def judged(found: list[Estimate], series: FrameSeries) -> tuple[int, float]:
-    """Return how many torques are valid, and which share of these is not within its interval."""
-    pairs = zip(found, series.torque_at_frames(), strict=True)
-    inside = [one.torque_low_nm <= truth <= one.torque_high_nm for one, truth in pairs if one.valid]
-    return len(inside), 1.0 - float(np.mean(inside)) if inside else 0.0
-
-
 @cache
 def _n_valid_of_whole(calibration: Calibration, bank: Bank) -> int:
     """Return how many torques of a session of which no channel dies are valid."""
     series = conftest.series(seed=3, cycles=3)
-    return judged(without(~ELECTRODE, len(series.t_s), series, EstimatorSession(calibration, bank)), series)[0]
+    return judged(without(~ELECTRODE, len(series.t_s), series, EstimatorSession(calibration, bank)), series).n
 
 
 @pytest.mark.parametrize("start", [0, DEATH])
@@ -54,10 +48,10 @@ def test_what_died_after_the_calibration_is_told_by_the_others(calibration, bank
     """It stayed what it was when it died: up to 62 % of the torques were false-valid."""
     series = twisting(seed=3, cycles=3)
     whole = _n_valid_of_whole(calibration, bank)
-    n, wrong = judged(without(DEAD[dead], start, series, EstimatorSession(calibration, bank)), series)
+    found = judged(without(DEAD[dead], start, series, EstimatorSession(calibration, bank)), series)
     assert whole > 120
-    assert n > 0.95 * whole
-    assert wrong < 0.12
+    assert found.n > 0.95 * whole
+    assert found.coverage > 0.88
 
 
 def test_what_an_estimate_was_made_from_holds_nothing_of_dead_channels(calibration, bank, twisting) -> None:
@@ -86,7 +80,7 @@ def test_torques_that_the_dead_channels_alone_told_of_are_refused(twisting, monk
     calibration = fit("regression", [twisting(tips=(1,))], "rig")
     series = twisting(seed=3, cycles=3, tips=(1,))
     found = without(ELECTRODE, start, series, EstimatorSession(calibration))
-    assert judged(found, series)[1] < 0.05
+    assert judged(found, series).coverage > 0.95
     assert not any(one.valid for one in found[DEATH:])
     refused = [one for one in found[DEATH:] if "dead or saturated" in one.reasons[0]]
     assert len(refused) > 100
@@ -97,9 +91,9 @@ def test_torques_that_the_dead_channels_alone_told_of_are_refused(twisting, monk
         )
     # Other channels told nothing of it, and some of those that did leave a guess: the interval holds it (else 11 %).
     for dead in (DEAD["a fifth"] & ~ELECTRODE, DEAD["an electrode that measures"]):
-        n, wrong = judged(without(dead, DEATH, series, EstimatorSession(calibration)), series)
-        assert n > 120
-        assert wrong < 0.08
+        found = judged(without(dead, DEATH, series, EstimatorSession(calibration)), series)
+        assert found.n > 120
+        assert found.coverage > 0.92
 
 
 def test_channels_that_were_dead_at_calibration_refuse_nothing_and_change_nothing(recorded, twisting) -> None:

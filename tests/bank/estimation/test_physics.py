@@ -6,7 +6,7 @@ import pytest
 from shearloop.bank.eit.channels import CHANNELS
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import EstimatorSession, FrameSeries, Physics, TactileFrame, fit
+from shearloop.bank.estimation import EstimatorSession, Physics, TactileFrame, fit
 from shearloop.bank.estimation.bank_match import (
     NOT_TURNED,
     ElectrodeNumbering,
@@ -15,6 +15,7 @@ from shearloop.bank.estimation.bank_match import (
     image_matrix,
     resolve_half_turn,
 )
+from tests.bank.estimation.conftest import slices_of
 
 
 @pytest.mark.parametrize("reflected", [False, True])
@@ -22,13 +23,13 @@ from shearloop.bank.estimation.bank_match import (
 def test_the_numbering_of_the_electrodes_is_found(rotation, reflected):
     rng = np.random.default_rng(1)
     homogeneous = rng.normal(size=896)
-    turned = ElectrodeNumbering(rotation, reflected, 0, 0).model_channels()
+    turned = ElectrodeNumbering(rotation, reflected).model_channels()
     found = find_numbering(np.abs(homogeneous[turned]) + 0.2 * np.abs(rng.normal(size=896)), homogeneous)
     assert (found.rotation, found.reflected) == (rotation, reflected)
     assert found.score > found.runner_up + 0.3
 
 
-@pytest.mark.parametrize("turned", [ElectrodeNumbering(5, False, 0, 0), ElectrodeNumbering(9, True, 0, 0)])
+@pytest.mark.parametrize("turned", [ElectrodeNumbering(5, False), ElectrodeNumbering(9, True)])
 def test_a_turned_channel_measures_between_the_turned_electrodes(turned):
     electrode = (turned.rotation + (-1 if turned.reflected else 1) * CHANNELS) % 32
     model = CHANNELS[turned.model_channels()]
@@ -39,9 +40,9 @@ def test_a_turned_channel_measures_between_the_turned_electrodes(turned):
 
 @pytest.mark.parametrize("rotation", [5, 21])
 def test_a_touch_settles_the_half_turn(bank, rotation):
-    true = ElectrodeNumbering(rotation, False, 0.9, 0.5)
+    true = ElectrodeNumbering(rotation, False)
     touch = np.abs(bank.signals[4, 7].astype(np.float64))[true.model_channels()]
-    for found in (true, ElectrodeNumbering((rotation + 16) % 32, False, 0.9, 0.5)):
+    for found in (true, ElectrodeNumbering((rotation + 16) % 32, False)):
         assert resolve_half_turn(found, touch, bank).rotation == rotation
 
 
@@ -72,12 +73,11 @@ def test_torque_by_the_place_in_the_bank(bank, name):
     channel = np.linspace(0, 4, 896)
     sigma = 1.8 - 7 * torque
     frames = np.exp(-0.5 * ((channel - 2.0) / (0.3 * sigma[:, None])) ** 2) + np.abs(rng.normal(0, 0.01, (32, 896)))
-    t = np.arange(32.0)
-    whole = FrameSeries("difference", ("right",), t, frames[:, None], t, torque, np.full(32, np.nan))
+    whole = slices_of(frames, torque)
     calibration = fit(name, [whole.between(0, 24)], "earlier", Physics(bank=bank))
     tracker = EstimatorSession(calibration, bank)
     for i in range(24, 32):
-        estimate = tracker.estimate(TactileFrame.of(t[i], frames[i][None]))
+        estimate = tracker.estimate(TactileFrame.of(float(i), frames[i][None]))
         assert estimate.torque_nm == pytest.approx(torque[i], abs=0.015)
         assert estimate.sigma == pytest.approx(sigma[i], abs=0.15)
         assert estimate.score is not None
@@ -88,9 +88,7 @@ def test_torque_by_the_place_in_the_bank(bank, name):
 
 def test_another_bank_is_refused(bank):
     rng = np.random.default_rng(5)
-    frames = np.abs(rng.normal(1, 0.1, (20, 1, 896)))
-    t = np.arange(20.0)
-    series = FrameSeries("difference", ("right",), t, frames, t, rng.uniform(0, 1, 20), np.full(20, np.nan))
+    series = slices_of(rng.normal(1, 0.1, (20, 896)), rng.uniform(0, 1, 20))
     calibration = fit("bank", [series], "x", Physics(bank=bank))
     with pytest.raises(CalibrationError, match="name the bank it was made with"):
         EstimatorSession(calibration, dataclasses.replace(bank, identity="0" * 64))

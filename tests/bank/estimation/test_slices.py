@@ -7,23 +7,17 @@ import pytest
 
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import FrameSeries, fit
-from tests.bank.estimation.conftest import follow
-
-
-def errors(estimates, series):
-    return np.array([one.torque_nm - y for one, y in zip(estimates, series.torque_at_frames(), strict=True)])
+from tests.bank.estimation.conftest import follow, judged
 
 
 @pytest.mark.parametrize("name", ["motion_regression", "regression"])
 def test_later_slices_are_read_through_the_drift(sliced, name):
     whole = sliced()
     later = whole.between(30, 50)
-    estimates = follow(fit(name, [whole.between(0, 30)], "earlier"), later)
-    assert np.sqrt((errors(estimates, later) ** 2).mean()) < 0.008
-    inside = [
-        one.torque_low_nm <= y <= one.torque_high_nm for one, y in zip(estimates, later.torque_at_frames(), strict=True)
-    ]
-    assert np.mean(inside) >= 0.85
+    found = judged(follow(fit(name, [whole.between(0, 30)], "earlier"), later), later)
+    assert found.n == 20
+    assert found.rmse < 0.008
+    assert found.coverage >= 0.85
 
 
 def test_what_is_not_familiar_is_not_valid(sliced, sliced_calibration):
@@ -49,8 +43,9 @@ def test_with_a_fifth_of_the_channels_dead_the_rest_say_nearly_as_much(sliced, s
     calibration = sliced_calibration if name == "motion_regression" else fit(name, [sliced()], "all")
     usable = np.random.default_rng(1).random((1, 896)) > 0.2
     dead = replace(later, channels=np.where(usable, later.channels, 1.0))
-    whole, left = (errors(follow(calibration, *one), later) for one in ((later,), (dead, usable)))
-    assert np.sqrt((left**2).mean()) < 1.25 * np.sqrt((whole**2).mean())
+    whole, left = (judged(follow(calibration, *one), later) for one in ((later,), (dead, usable)))
+    assert whole.n == left.n == len(later.t_s)
+    assert left.rmse < 1.25 * whole.rmse
 
 
 def test_slices_of_two_fingertips_are_not_judged_by_one_of_them(sliced):

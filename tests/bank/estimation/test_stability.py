@@ -9,14 +9,9 @@ from shearloop.bank.eit.channels import CHANNELS
 from shearloop.bank.estimation import FrameSeries, fit
 from shearloop.bank.estimation.fingertip_validator import mask_saturated
 from shearloop.bank.estimation.novelty import NoveltyDetector
-from tests.bank.estimation.conftest import follow
+from tests.bank.estimation.conftest import follow, judged
 
 STEP_V = 0.00215
-
-
-def rms_error(found, series: FrameSeries) -> float:
-    pairs = zip(found, series.torque_at_frames(), strict=True)
-    return float(np.sqrt(np.mean([(one.torque_nm - truth) ** 2 for one, truth in pairs if one.valid])))
 
 
 def without_electrodes(series: FrameSeries, electrodes: tuple[int, ...], start: int) -> FrameSeries:
@@ -33,7 +28,7 @@ def test_electrodes_that_are_lost_without_a_word_are_done_without(motion_calibra
     found = follow(motion_calibration, spoilt)
     before = follow(motion_calibration, whole)
     assert sum(one.valid for one in found) > 0.9 * sum(one.valid for one in before)
-    assert rms_error(found, spoilt) < 1.5 * rms_error(before, whole)
+    assert judged(found, spoilt).rmse < 1.5 * judged(before, whole).rmse
 
 
 def test_many_lost_electrodes_end_it(motion_calibration, twisting):
@@ -46,7 +41,7 @@ def test_channels_at_a_rail_are_found_and_done_without(motion_calibration, twist
     rail = np.quantile(whole.channels[5], 0.9)
     clipped = replace(whole, channels=np.minimum(whole.channels, rail))
     found = follow(motion_calibration, clipped)
-    assert rms_error(found, clipped) < 0.02 * 0.06
+    assert judged(found, clipped).rmse < 0.02 * 0.06
     # One side is clipped, the other is not.
     frame, usable = np.array([clipped.channels[100, 0], whole.channels[100, 0]]), np.ones((2, 896), dtype=np.bool_)
     left = mask_saturated(frame, usable)

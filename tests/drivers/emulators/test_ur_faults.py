@@ -11,14 +11,12 @@ def test_faults_are_carried_out_and_ended() -> None:
     controller = Controller(Robot())
     robot = controller.robot
     for line in (
-        "registers-in-use", "local-control", "refuse-protocol on", "stop-hangs 2", "protective-stop",
+        "registers-in-use", "local-control", "refuse-protocol", "stop-hangs 2", "protective-stop",
         "emergency-stop",
     ):  # fmt: skip
         controller.command(line)
     assert controller.faults == ConnectionFaults(True, True, True, 2)
     assert robot.safety.safety_mode == 7
-    controller.command("registers-in-use off")
-    assert not controller.faults.registers_in_use
     controller.command("normal")
     assert (controller.faults, robot.safety.safety_mode) == (ConnectionFaults(), 1)
 

@@ -95,7 +95,9 @@ def build_bank(
     if path.exists() and not path.is_file():
         raise BankFileError(f"{path} is no file, and cannot hold a bank; give the name of a file to --out")
     solver = RowSolver(mesh, definition)
-    with RowJournal(path, definition, on_notice) as journal:
+    with RowJournal(path, definition) as journal:
+        if journal.notice:
+            on_notice(journal.notice)
         total = len(definition.k_grid)
         missing = [row for row in range(total) if row not in journal.rows]
         on_row(total - len(missing), total)
@@ -157,16 +159,16 @@ class RowJournal:
 
     It holds a lock on the folder. A file begins with the checksum of the bank's identity, the row and its cells, so
     that damaged rows and those of another bank are solved again. `rows` are those of earlier builds of the same bank,
-    and those appended since.
+    and those appended since; `notice` says to the user what became of earlier ones.
     """
 
-    def __init__(self, target: Path, definition: BankDefinition, on_notice: Callable[[str], None]) -> None:
+    def __init__(self, target: Path, definition: BankDefinition) -> None:
         """Take the bank that the journal belongs to; nothing is opened yet."""
         self.path = target.with_name(f"{target.name}.part")
         self.rows: dict[int, BankRow] = {}
+        self.notice = ""
         self._target = target
         self._definition = definition
-        self._on_notice = on_notice
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -224,9 +226,9 @@ class RowJournal:
                     np.frombuffer(body, "<f4", n * N_CHANNELS, offset=9 * n).reshape(n, N_CHANNELS),
                 )
         if self.rows:
-            self._on_notice(f"{self.path}: resuming, {len(self.rows)} of {total} rows are already solved")
+            self.notice = f"{self.path}: resuming, {len(self.rows)} of {total} rows are already solved"
         elif found:
-            self._on_notice(f"{self.path}: its rows belong to another bank or are damaged, and are discarded")
+            self.notice = f"{self.path}: its rows belong to another bank or are damaged, and are discarded"
 
     def _checksum(self, row: int, body: bytes) -> bytes:
         return hashlib.sha256(f"{self._definition.identity} {row} ".encode() + body).digest()

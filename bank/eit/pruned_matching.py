@@ -73,8 +73,6 @@ MIN_PRUNED_CELLS = 300
 # Transform lengths: the shorter where only small lags can matter.
 _LENGTHS = (1280, 2 * N_CHANNELS)
 _CHANNELS = np.arange(N_CHANNELS)
-# Lags at which groups are searched for a cell with a high score.
-_SEED_LAGS = 8
 # The runner-up may be this much worse than the best cell at lag 0 before groups are bounded a second time.
 _SLACK = 0.01
 # More bounds than this (16 MB) are not computed: all cells and lags remain.
@@ -260,35 +258,28 @@ class AllLagsBounds:
         self._energies = np.zeros(2 * N_CHANNELS)
         np.cumsum((frame * frame)[:-1], out=self._energies[1:N_CHANNELS])
         self._energies[N_CHANNELS:] = np.maximum(1.0 - self._energies[:N_CHANNELS], 0.0)
-        centres = bank.groups[:, :-2]
         at_0 = bank.basis[:COARSE_RANK] @ frame.astype(np.float32)
-        cell = self._likeliest(bank.members[int((centres @ at_0).argmax())], at_0)
+        cell = self._likeliest(bank.members[int((bank.groups[:, :-2] @ at_0).argmax())], at_0)
         reached = cell, matcher.score(cell, frame[None])
         self._bound_groups(reached[1] - _SLACK)
-        # The likeliest lags (m,), the frame's numbers there (r, m), and the groups' estimates (m, n).
-        n_seeds = min(_SEED_LAGS, len(self._lags))
-        likeliest = np.argpartition(self._highest, -n_seeds)[-n_seeds:]
-        at_lags = self._columns[:-2, likeliest]
-        self._seeds = self._lags[likeliest], at_lags, at_lags.T @ centres.T
         self.reached = max(reached, self.seed() or reached, key=itemgetter(1))
 
     def seed(self, outside: BoolArray | None = None) -> tuple[int, float] | None:
         """Return a promising cell among those (n,) outside a neighbourhood, and a score that it reaches.
 
-        It has the highest estimate in the group of the highest estimate, at the likeliest lags. None where none is
-        found at once.
+        It has the highest estimate in the group of the highest bound. None where no group's centre lies outside.
         """
-        lags, at_lags, estimates = self._seeds
+        bank, bounds = self._matcher.compressed, self._group_bounds
         if outside is not None:
-            estimates = np.where(outside[self._matcher.compressed.centres], estimates, -np.inf)
-        lag, group = divmod(int(np.argmax(estimates)), estimates.shape[1])
-        if estimates[lag, group] == -np.inf:
+            bounds = np.where(outside[bank.centres, None], bounds, -np.inf)
+        group, lag = divmod(int(bounds.argmax()), bounds.shape[1])
+        if bounds[group, lag] == -np.inf:
             return None
-        cells = self._matcher.compressed.members[group]
+        cells = bank.members[group]
         if outside is not None:
             cells = cells[outside[cells]]
-        cell = self._likeliest(cells, at_lags[:, lag])
-        return cell, self._matcher.score(cell, self._frames(lags[lag, None]))
+        cell = self._likeliest(cells, self._columns[:-2, lag])
+        return cell, self._matcher.score(cell, self._frames(self._lags[lag, None]))
 
     def candidates(self, score: float) -> Candidates:
         """Return the cells that may reach a score: groups are bounded first, then cells."""

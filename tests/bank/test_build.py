@@ -135,7 +135,7 @@ def interrupted(fingertip, tmp_path):
     path = tmp_path / "half.bank"
     definition = defined(fingertip)
     solver = RowSolver(fingertip, definition)
-    with RowJournal(path, definition, pytest.fail) as journal:
+    with RowJournal(path, definition) as journal:
         for row in (3, 0, 4):
             journal.append(row, solver.solve(row))
     return path
@@ -171,7 +171,7 @@ def test_a_foreign_file_in_the_journals_place_is_left_alone(fingertip, tmp_path,
 def test_two_builds_of_one_target_do_not_mix(fingertip, interrupted):
     definition = defined(fingertip)
     with (
-        RowJournal(interrupted, definition, lambda _: None),
+        RowJournal(interrupted, definition),
         pytest.raises(BankFileError, match=r"half\.bank: another build is at work"),
     ):
         build(fingertip, interrupted)

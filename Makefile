@@ -35,8 +35,8 @@ demo: install run/demo.bank $(if $(RECORDING),,run/rig.cal)
 	$(BIN)/shearloop run $(DEMO) --show
 
 # Recordings of the emulated rig, and the calibrations made from them.
-run/rig.cal: run/demo.bank src/shearloop/daemon/cli/demo_calibration.py | install
-	$(BIN)/python -m shearloop.daemon.cli.demo_calibration --bank $< --out run
+run/rig.cal: run/demo.bank src/shearloop/daemon/cli/calibrate_demo.py | install
+	$(BIN)/python -m shearloop.daemon.cli.calibrate_demo --bank $< --out run
 
 run/demo.bank: config/banks/demo.yaml config/fingertips/paper.yaml | install
 	mkdir -p run

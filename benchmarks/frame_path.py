@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 import shearloop
 from benchmarks.daemon_speed import FIRST_FRAME, FIRST_VALID_FRAME, PAUSE_S, PlayedBoard, line_text, write_config
 from shearloop.daemon.app import Daemon
-from shearloop.daemon.cli.demo_calibration import calibrate, record
+from shearloop.daemon.cli.calibrate_demo import calibrate, record
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.runner import ControlLoopRunner
@@ -208,7 +208,7 @@ async def trace_command(folder: Path) -> list[CodeType]:
             while len(trace.ways) < TRACED:
                 state = msgpack.unpackb((await subscriber.recv_multipart())[1])
                 trace.recording = state["step_name"] == "hold_torque" and state["phase"] == "running"
-                if state["phase"] in ("stopped", "finished"):
+                if state["phase"] not in ("idle", "running", "held"):
                     raise RuntimeError(f"the experiment ended before it was traced: {state['activity']}")
             trace.remove()
     finally:

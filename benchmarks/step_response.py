@@ -36,7 +36,7 @@ from shearloop.daemon.analysis.charts.simulated_loop import (
     settings_for,
     started_controller,
 )
-from shearloop.daemon.cli.demo_calibration import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
+from shearloop.daemon.cli.calibrate_demo import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
 from shearloop.daemon.control.identification import Creep, Stretch, fit_creep
 from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.control.margins import margin_refusal

@@ -85,14 +85,23 @@ def make_loop(config: DaemonConfig, sources: Mapping[str, TorqueSource]) -> Cont
     """Return the control loop of the configured robot, if there is one; `sources` are all torques but the robot's."""
     if config.robot is None:
         return None
-    sources = {**sources, WRENCH: wrench_source(read_settings(config.robot).rate_hz)}
+    robot = read_settings(config.robot)
+    sources = {**sources, WRENCH: wrench_source(robot.rate_hz)}
+    # Controller, identification and commands plan with what the robot's process lets through.
+    top, most = robot.limits.wrist_speed_rad_per_s.inner, robot.limits.wrist_acceleration_rad_per_s2.inner
+    loop = config.loop.model_copy(
+        update={
+            "wrist_speed_rad_per_s": min(config.loop.wrist_speed_rad_per_s, top),
+            "wrist_acceleration_rad_per_s2": min(config.loop.wrist_acceleration_rad_per_s2, most),
+        }
+    )
     required = ("robot", "gripper") if config.gripper is not None else ("robot",)
     gels = {
         name: Creep(fingertip.creep.share, fingertip.creep.time_s)
         for name, fingertip in (*config.fingertips.items(), (COMBINED, config.combined))
         if fingertip is not None and fingertip.creep is not None
     }
-    return ControlLoop(config.loop, sources, required, gels)
+    return ControlLoop(loop, sources, required, gels)
 
 
 def make_gripper(
@@ -139,7 +148,6 @@ class Rig:
             publisher,
             clock,
             supervisor.dead,
-            config.loop.wrist_acceleration_rad_per_s2,
         )
         self._recorder = recorder
         # Counts the operator's stops, also while an experiment starts.

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from shearloop.drivers.errors import DeviceCalibrationError
-from shearloop.drivers.load_cell import LoadCalibration, LoadSample
+from shearloop.drivers.load_cell import LEVER_ARM_M, LoadCalibration, LoadSample
 
 STANDARD_GRAVITY = 9.80665
 # Before the scale is known, any value may be a load.
@@ -141,7 +141,7 @@ class LoadCalibrator:
     """
 
     masses_g: Sequence[float]
-    lever_arm_m: float = 0.035
+    lever_arm_m: float = LEVER_ARM_M
     sign: int = 1
     levels: list[Level] = field(default_factory=list, init=False)
     _samples: list[LoadSample] | None = field(default=None, init=False)

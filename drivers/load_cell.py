@@ -40,6 +40,9 @@ LINE_ERRORS = {
     "unfinished": "The load cell's board broke off in the middle of a line; check its plug and its power.",
 }
 
+# Of the paper's rig.
+LEVER_ARM_M = 0.035
+
 
 class LoadCalibration(CalibrationModel):
     """Converts a line's decimal to a torque: sign × lever_arm_m × scale_n_per_count × (raw − tare_counts).
@@ -51,13 +54,13 @@ class LoadCalibration(CalibrationModel):
     tare_counts: Finite
     # The sign of the wiring, measured with a mass. `sign` chooses the positive direction.
     scale_n_per_count: Finite
-    lever_arm_m: Positive = 0.035
+    lever_arm_m: Positive = LEVER_ARM_M
     sign: Literal[-1, 1] = 1
 
     @classmethod
     def of_torque_lines(cls) -> Self:
         """Return the calibration of a board that sends N·m, as in the paper's recordings."""
-        return cls(tare_counts=0.0, scale_n_per_count=1 / 0.035, lever_arm_m=0.035)
+        return cls(tare_counts=0.0, scale_n_per_count=1 / LEVER_ARM_M)
 
     @property
     def nm_per_count(self) -> float:

@@ -15,7 +15,13 @@ from shearloop.daemon.control.experiment_schema import (
     TareStep,
     first_turn_before_grip,
 )
-from shearloop.daemon.control.fault_detection import LoopInputs, MonitorInputs, compared_for_s, detect_faults
+from shearloop.daemon.control.fault_detection import (
+    LoopInputs,
+    MonitorInputs,
+    compared_for_s,
+    detect_faults,
+    fresh_for_s,
+)
 from shearloop.daemon.control.identification import Creep, ToolModel
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDecision, SafetyMonitor
@@ -74,11 +80,12 @@ class ControlLoop:
 
         Each source that measures torque may drive.
         """
-        self.inputs = LoopInputs(kept_s=compared_for_s(sources.values(), config))
+        fresh_s = fresh_for_s(sources.values(), config)
+        self.inputs = LoopInputs(kept_s=compared_for_s(sources.values(), fresh_s))
         self.safety = SafetyMonitor()
         self.experiment: Experiment | None = None
         self.status = LoopStatus("idle", "", WristCommand(), SafetyDecision(Response.NOTE))
-        self._config = config
+        self.config = config
         self._sources = sources
         self._creep = creep
         self._wrists = {
@@ -86,7 +93,13 @@ class ControlLoop:
         }
         # The wrist's controller for the driving torque, and the faults to watch for.
         self._wrist = next(iter(self._wrists.values()))
-        self._watched = self._watch(self._wrist.source, ExperimentLimits(), required)
+        self._watched = MonitorInputs(
+            driving=self._wrist.source,
+            supervising=self._others(self._wrist.source),
+            fresh_s=fresh_s,
+            limits=ExperimentLimits(),
+            required=required,
+        )
         self._grip = _Grip()
         # Faults that were reported since the latest tick.
         self._reported: list[Fault] = []
@@ -171,8 +184,9 @@ class ControlLoop:
             return f"`torque_source: {file.torque_source}` is not a measured torque; choose one of {known}"
         if self.safety.stopped:
             return f"a stop has not been acknowledged: {' '.join(self.status.decision.reasons)}"
-        watched = self._watch(self._sources[file.torque_source], file.limits, self._watched.required)
-        faults = detect_faults(self.inputs, watched, self._config, t_ns)
+        driving = self._sources[file.torque_source]
+        watched = replace(self._watched, driving=driving, supervising=self._others(driving), limits=file.limits)
+        faults = detect_faults(self.inputs, watched, self.config, t_ns)
         refusals = [fault.sentence for fault in faults if fault.rule.response >= Response.REFUSE_START]
         if refusals:
             return " ".join(refusals)
@@ -232,7 +246,7 @@ class ControlLoop:
                 expected_nm=controller.torque_nm if controller is not None else None,
                 overdue=experiment.overdue,
             )
-        found = [*detect_faults(self.inputs, watched, self._config, t_ns), *self._reported]
+        found = [*detect_faults(self.inputs, watched, self.config, t_ns), *self._reported]
         self._reported.clear()
         if grip.release_error:
             found.append(Fault(FaultCode.NOT_RELEASED, grip.release_error))
@@ -256,9 +270,8 @@ class ControlLoop:
         """The identified tool."""
         return self._wrist.tool
 
-    def _watch(self, driving: TorqueSource, limits: ExperimentLimits, required: tuple[str, ...]) -> MonitorInputs:
-        supervising = tuple(source for source in self._sources.values() if source is not driving)
-        return MonitorInputs(driving=driving, supervising=supervising, limits=limits, required=required)
+    def _others(self, driving: TorqueSource) -> tuple[TorqueSource, ...]:
+        return tuple(source for source in self._sources.values() if source is not driving)
 
     def _why_uncertain(self) -> str:
         """Return why the gripper cannot say whether it holds a tool, or an empty string."""

@@ -199,14 +199,14 @@ class OffsetEstimator:
         self.angles.add(t_ns, angle_rad)
         self._settings = settings
         self._reference_nm = torque_nm
-        self._origin_rad = angle_rad
+        self.origin_rad = angle_rad
         self._known = known_measurements
         self._sums = 0.0, 0.0
         self._t_mid_ns = t_ns
 
     def expected_nm(self, angle_rad: float) -> float:
         """Return the tool's torque at a wrist angle."""
-        return self._settings.stiffness_nm_per_rad * (angle_rad - self._origin_rad) + self.offset_nm
+        return self._settings.stiffness_nm_per_rad * (angle_rad - self.origin_rad) + self.offset_nm
 
     def restart(self) -> None:
         """Take the present offset as the reference: a grip that slipped may slip as far again before the next hold."""
@@ -284,9 +284,11 @@ class TwistController:
         self._held = self._moving = False
         self._set_point_nm: float | None = None
         self._ramp_nm: float | None = None
-        self._origin_rad = self._angle_rad = angle_rad
+        self._angle_rad = angle_rad
         self._t_ns = t_ns
         self._wanted = self._sent = 0.0
+        # Less was sent than was wanted; nothing is integrated then.
+        self._clipped = False
 
     @property
     def state(self) -> ControllerState:
@@ -324,9 +326,7 @@ class TwistController:
 
     def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> ControllerRefusal | None:
         """Use a torque of the time t_mid_ns that arrived at t_ns; return why it was rejected, or None."""
-        # Nothing is integrated while less was sent than was wanted.
-        clipped = abs(self._sent - self._wanted) > 1e-9 and abs(self._sent) < abs(self._wanted)
-        return self.estimator.measure(torque_nm, t_mid_ns, t_ns, integrates=not clipped)
+        return self.estimator.measure(torque_nm, t_mid_ns, t_ns, integrates=not self._clipped)
 
     def command(self, t_ns: int, wrist_angle_rad: float, torques: Iterable[TorqueSample] = ()) -> WristCommand:
         """Return the wrist speed for now, from the angle that the robot reports (NaN: unknown) and new torques.
@@ -348,7 +348,7 @@ class TwistController:
             if torque_nm is not None and torque.low_nm is not None and torque.high_nm is not None:
                 # The torque of the friction band that is nearest to the expected one.
                 torque_nm = min(max(tool.expected_nm(self._angle_rad), torque.low_nm), torque.high_nm)
-            self.measure(torque_nm, torque.t_mid_ns, torque.t_ns)
+            tool.measure(torque_nm, torque.t_mid_ns, torque.t_ns, integrates=not self._clipped)
         self.torque_nm = tool.expected_nm(self._angle_rad)
         if self._held:
             reasons.append(ControllerReason.HELD)
@@ -368,10 +368,11 @@ class TwistController:
     def sent(self, speed_rad_per_s: float) -> None:
         """Correct the speed that was sent for the last command, after clipping by driver and safety."""
         self._sent = speed_rad_per_s if math.isfinite(speed_rad_per_s) else 0.0
+        self._clipped = abs(self._sent - self._wanted) > 1e-9 and abs(self._sent) < abs(self._wanted)
 
     def _rest(self) -> None:
         """Stand still; the next ramp begins at the present torque."""
-        self._moving = False
+        self._moving = self._clipped = False
         self._wanted = self._sent = 0.0
         if self._set_point_nm is not None:
             self._ramp_nm = self.torque_nm
@@ -392,13 +393,13 @@ class TwistController:
         turning = abs(self._sent) if speed * self._sent > 0.0 else 0.0
         fastest = turning + own.acceleration_limit_rad_per_s2 * elapsed_s
         # Slow down towards the limit of the travel, so that one period does not overshoot it.
-        travel = self._angle_rad - self._origin_rad
+        travel = self._angle_rad - self.estimator.origin_rad
         room = max(own.travel_limit_rad - travel * math.copysign(1.0, speed), 0.0)
         brakeable = own.wrist_bandwidth_per_s * room
         if min(abs(speed), fastest) > brakeable:
             reasons.append(ControllerReason.TRAVEL)
         speed = math.copysign(min(abs(speed), fastest, brakeable), speed)
-        self._wanted, self._sent = wanted, speed
+        self._wanted, self._sent, self._clipped = wanted, speed, abs(wanted) - abs(speed) > 1e-9
         return WristCommand(speed, tuple(reasons))
 
     def _advance_ramp(self, ramp_nm: float, set_point_nm: float, elapsed_s: float) -> tuple[float, float]:

@@ -54,12 +54,6 @@ class LoopInputs:
             old = bisect_left(times_ns, torque.t_mid_ns - kept_ns)
             del times_ns[:old], torques_nm[:old]
 
-    def mean_torque_nm(self, source: str, from_ns: int, to_ns: int) -> float | None:
-        """Return the mean of a source's valid torques between two times, ends included, or None without any."""
-        times_ns, torques_nm = self.history.get(source, ([], []))
-        first, end = bisect_left(times_ns, from_ns), bisect_right(times_ns, to_ns)
-        return sum(torques_nm[first:end]) / (end - first) if end > first else None
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MonitorInputs:
@@ -67,6 +61,8 @@ class MonitorInputs:
 
     driving: TorqueSource
     supervising: tuple[TorqueSource, ...]
+    # How long after its arrival a torque of each source is fresh.
+    fresh_s: Mapping[str, float]
     limits: ExperimentLimits
     required: tuple[str, ...] = ()
     # The wrist is driven by the torque, or twists under its limit.
@@ -80,9 +76,14 @@ class MonitorInputs:
     died: Mapping[str, str] = field(default_factory=dict)
 
 
-def compared_for_s(sources: Iterable[TorqueSource], config: LoopConfig) -> float:
+def fresh_for_s(sources: Iterable[TorqueSource], config: LoopConfig) -> dict[str, float]:
+    """Return how long after its arrival a torque of each source is fresh."""
+    return {one.name: max(STALE_AFTER_PERIODS * one.period_s, config.stale_after_s) for one in sources}
+
+
+def compared_for_s(sources: Iterable[TorqueSource], fresh_s: Mapping[str, float]) -> float:
     """Return the history that comparing two sources takes: the oldest fresh torque with its acquisition."""
-    return max(_fresh_for_s(one, config) + 2.0 * max(one.window_s, one.period_s) for one in sources)
+    return max(fresh_s[one.name] + 2.0 * max(one.window_s, one.period_s) for one in sources)
 
 
 def detect_faults(inputs: LoopInputs, watched: MonitorInputs, config: LoopConfig, t_ns: int) -> list[Fault]:
@@ -95,7 +96,7 @@ def detect_faults(inputs: LoopInputs, watched: MonitorInputs, config: LoopConfig
         torque = inputs.torques.get(source.name)
         if torque is None or torque.torque_nm is None or abs(torque.torque_nm) <= limit_nm:
             continue
-        if t_ns - torque.t_ns <= _fresh_for_s(source, config) * 1e9:
+        if t_ns - torque.t_ns <= watched.fresh_s[source.name] * 1e9:
             beyond = f"{source.name} measured {torque.torque_nm:+.3f} N·m, the limit is {limit_nm:g} N·m"
             found.append(Fault(FaultCode.TORQUE_LIMIT, beyond))
     if watched.gripped and abs(watched.twisted_rad) > limit_rad:
@@ -115,17 +116,14 @@ def detect_faults(inputs: LoopInputs, watched: MonitorInputs, config: LoopConfig
     return found
 
 
-def _fresh_for_s(source: TorqueSource, config: LoopConfig) -> float:
-    """Return how long after its arrival a torque is fresh."""
-    return max(STALE_AFTER_PERIODS * source.period_s, config.stale_after_s)
-
-
 def _torque_faults(inputs: LoopInputs, watched: MonitorInputs, config: LoopConfig, t_ns: int) -> list[Fault]:
     source = watched.driving
     found: list[Fault] = []
     driving: Fault | None = None
     for one in (*watched.supervising, source):
-        driving = None if one.from_robot and one is not source else _unusable(inputs, one, config, t_ns)
+        driving = (
+            None if one.from_robot and one is not source else _unusable(inputs, one, watched.fresh_s[one.name], t_ns)
+        )
         if driving is not None:
             found.append(driving)
     latest = inputs.torques.get(source.name)
@@ -135,11 +133,11 @@ def _torque_faults(inputs: LoopInputs, watched: MonitorInputs, config: LoopConfi
         jumped = f"{source.name} measured {latest.torque_nm:+.3f} N·m where {watched.expected_nm:+.3f} N·m was expected"
         found.append(Fault(FaultCode.ESTIMATE_JUMPED, jumped))
     for other in watched.supervising:
-        found += _disagreement(inputs, source, other, config, t_ns)
+        found += _disagreement(inputs, other, watched, config, t_ns)
     return found
 
 
-def _unusable(inputs: LoopInputs, source: TorqueSource, config: LoopConfig, t_ns: int) -> Fault | None:
+def _unusable(inputs: LoopInputs, source: TorqueSource, allowed_s: float, t_ns: int) -> Fault | None:
     """Return the fault of a source that is gone, silent, late or invalid."""
     latest = inputs.torques.get(source.name)
     if source.name in inputs.lost:
@@ -148,7 +146,6 @@ def _unusable(inputs: LoopInputs, source: TorqueSource, config: LoopConfig, t_ns
     if latest is None:
         return Fault(FaultCode.ESTIMATE_STALE, f"{source.name} has not measured anything yet")
     came_s, measured_s = (t_ns - latest.t_ns) / 1e9, (t_ns - latest.t_mid_ns) / 1e9
-    allowed_s = _fresh_for_s(source, config)
     if came_s > allowed_s:
         silent = f"the last torque of {source.name} came {came_s:.1f} s ago, {allowed_s:.1f} s are allowed"
         return Fault(FaultCode.ESTIMATE_STALE, silent)
@@ -167,16 +164,23 @@ def _unusable(inputs: LoopInputs, source: TorqueSource, config: LoopConfig, t_ns
 
 
 def _disagreement(
-    inputs: LoopInputs, one: TorqueSource, other: TorqueSource, config: LoopConfig, t_ns: int
+    inputs: LoopInputs, other: TorqueSource, watched: MonitorInputs, config: LoopConfig, t_ns: int
 ) -> list[Fault]:
-    """Compare two torques over the window of the slower source's latest sample."""
-    slow, fast = (one, other) if one.period_s >= other.period_s else (other, one)
+    """Compare the driving torque with another, over the window of the slower source's latest sample."""
+    slow, fast = watched.driving, other
+    if slow.period_s < fast.period_s:
+        slow, fast = fast, slow
     latest = inputs.torques.get(slow.name)
-    if latest is None or latest.torque_nm is None or t_ns - latest.t_ns > _fresh_for_s(slow, config) * 1e9:
+    if latest is None or latest.torque_nm is None or t_ns - latest.t_ns > watched.fresh_s[slow.name] * 1e9:
         return []
     half_ns = round(max(slow.window_s, fast.period_s) * 0.5e9)
-    other_nm = inputs.mean_torque_nm(fast.name, latest.t_mid_ns - half_ns, latest.t_mid_ns + half_ns)
-    if other_nm is None or (apart_nm := abs(latest.torque_nm - other_nm)) <= config.disagreement_nm:
+    times_ns, torques_nm = inputs.history.get(fast.name, ([], []))
+    first, end = bisect_left(times_ns, latest.t_mid_ns - half_ns), bisect_right(times_ns, latest.t_mid_ns + half_ns)
+    if end == first:
+        return []
+    other_nm = sum(torques_nm[first:end]) / (end - first)
+    apart_nm = abs(latest.torque_nm - other_nm)
+    if apart_nm <= config.disagreement_nm:
         return []
     apart = (
         f"{slow.name} measured {latest.torque_nm:+.3f} N·m and {fast.name} {other_nm:+.3f} N·m, "

@@ -30,6 +30,8 @@ _REST_SHARE = 0.2
 _SLIP_SHARE = 0.3
 # The residual beyond the noise, relative to the spring's part (relaxation gives about 0.1).
 _MISFIT_SHARE = 0.3
+# The expected drift over the record, relative to the spring's part: relaxation.
+_DRIFT_SHARE = 0.04
 _ARRIVED_RAD = 2e-3
 # Time constants of creep that are tried; with fewer readings the noise decides.
 _CREEP_TIMES_S = np.geomspace(2.0, 200.0, 60)
@@ -96,7 +98,7 @@ class ToolModel:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Least squares of torque = stiffness·angle + offset + drift·time, with its residuals (m,) and covariance."""
+    """Least squares of torque = stiffness·angle + offset + drift·time (0 at the end), residuals (m,), covariance."""
 
     lag_s: float
     coefficients: FloatArray
@@ -113,7 +115,7 @@ def identify(record: Record, window_s: float, stiffness_share: float = 0.1) -> T
     """Return the tool model of a record whose torques are means over `window_s`.
 
     For every lag of a grid, the torques are fitted by least squares to the mean angles of their windows, with an offset
-    and a drift. The lag with the smallest residual wins, refined by a parabola; the curvature gives its standard
+    and a small drift. The lag with the smallest residual wins, refined by a parabola; the curvature gives its standard
     deviation. Raises IdentifyError if the record is too short, the wrist turned too little for a stiffness known to
     `stiffness_share`, the tool slipped, or the torque does not follow a spring.
     """
@@ -130,7 +132,7 @@ def identify(record: Record, window_s: float, stiffness_share: float = 0.1) -> T
     noise_nm = _noise(best.residuals)
     _refuse_bad(best, torque_nm, noise_nm, stiffness_share)
     lag_s, lag_std_s = _lag(fits, noise_nm)
-    now = np.array([record.angle_rad[-1], 1.0, 1.0])
+    now = np.array([record.angle_rad[-1], 1.0, 0.0])
     return ToolModel(
         stiffness_nm_per_rad=float(best.coefficients[0]),
         stiffness_std=math.sqrt(best.covariance[0, 0]),
@@ -149,12 +151,17 @@ def identify(record: Record, window_s: float, stiffness_share: float = 0.1) -> T
 
 def _fit(angles: "_Angles", t_mid_s: FloatArray, torque_nm: FloatArray, window_s: float, lag_s: float) -> _Fit:
     angle = angles.mean(t_mid_s - lag_s, window_s)
-    span = t_mid_s[-1] - t_mid_s[0]
-    design = np.column_stack([angle, np.ones_like(angle), (t_mid_s - t_mid_s[-1]) / span + 1.0])
-    coefficients = np.linalg.lstsq(design, torque_nm, rcond=None)[0]
+    since = (t_mid_s - t_mid_s[-1]) / (t_mid_s[-1] - t_mid_s[0])
+    design = np.column_stack([angle, np.ones_like(angle), since])
+    degrees = torque_nm.size - design.shape[1]
+    free = np.linalg.lstsq(design, torque_nm, rcond=None)[0]
+    std = float(np.linalg.norm(torque_nm - design @ free)) / math.sqrt(degrees)
+    # The expected size of the drift as one more equation: else noise passes for drift, and spoils the last torque.
+    drift_nm = max(_DRIFT_SHARE * abs(float(free[0])) * float(np.ptp(angle)), 1e-9)
+    bounded = np.vstack([design, [0.0, 0.0, std / drift_nm]])
+    coefficients = np.linalg.lstsq(bounded, np.append(torque_nm, 0.0), rcond=None)[0]
     residuals = torque_nm - design @ coefficients
-    variance = float(residuals @ residuals) / (torque_nm.size - design.shape[1])
-    covariance = variance * np.linalg.pinv(design.T @ design)
+    covariance = float(residuals @ residuals) / degrees * np.linalg.pinv(bounded.T @ bounded)
     return _Fit(lag_s, coefficients, covariance, residuals, angle)
 
 

@@ -68,17 +68,16 @@ class ControlLoopRunner:
         publisher: Publisher,
         clock: Clock,
         dead_tasks: Mapping[str, str],
-        acceleration_rad_per_s2: float,
     ) -> None:
         """`tare` zeroes every sensor; `dead_tasks` has the error of each dead task."""
         self._control_loop = control_loop
         self._robot = robot
         self._clock = clock
         self._dead_tasks = dead_tasks
-        self._velocity = VelocityCommandSender(robot, control_loop, acceleration_rad_per_s2)
+        self._acceleration_rad_per_s2 = control_loop.config.wrist_acceleration_rad_per_s2
+        self._velocity = VelocityCommandSender(robot, control_loop)
         self._actions = ActionExecutor(robot, gripper, tare, self._velocity, control_loop)
         self._states = StatePublisher(publisher, control_loop)
-        self._crash: Exception | None = None
         self._running = False
         self._stopped = True
         self._decided_ns = 0
@@ -88,7 +87,7 @@ class ControlLoopRunner:
 
         After an unexpected error the arm is stopped and the error is raised; the next run stops the experiment.
         """
-        self._decided_ns, self._crash, self._running = self._clock.now_ns(), None, True
+        self._decided_ns, self._running = self._clock.now_ns(), True
         try:
             while True:
                 # Without a state the loop decides all the same.
@@ -99,8 +98,6 @@ class ControlLoopRunner:
                     # After a pause of this process several states arrive at once; only the newest one counts.
                     if self._robot.state is not None:
                         self._take_state(self._robot.state)
-                if self._crash is not None:
-                    raise self._crash
                 self._decide()
         except Exception as error:
             self._running = False
@@ -115,13 +112,13 @@ class ControlLoopRunner:
             await self._actions.close()
 
     def decide_now(self) -> None:
-        """Decide without a new state, after a loss of a device or for the daemon's end; `run` raises its errors."""
-        if not self._running or self._crash is not None:
+        """Decide without a new state, at the daemon's end."""
+        if not self._running:
             return
         try:
             self._decide()
-        except Exception as error:  # noqa: BLE001 - raised by `run`
-            self._crash = error
+        except Exception:  # noqa: BLE001 - the robot's process stops the arm as it ends
+            structlog.get_logger().exception("the loop crashed at its last decision")
 
     async def start(self, file: ExperimentFile) -> str | None:
         """Begin an experiment; return None, or why it cannot begin."""
@@ -193,17 +190,17 @@ class ControlLoopRunner:
             if not output.hold:
                 self._actions.may_move.set()
             elif self._actions.interrupt():
-                self._velocity.stop()
+                self._velocity.send(Stop(self._acceleration_rad_per_s2))
             if output.action is not None:
                 self._actions.begin(output.action)
-            self._velocity.turn(output.wrist_rad_per_s)
+            self._velocity.send(WristSpeed(output.wrist_rad_per_s, self._acceleration_rad_per_s2))
         self._states.publish_loop(self._velocity.sent_rad_per_s, now_ns)
 
     def _stop(self, output: ControlOutput) -> None:
         if not self._stopped:
             self._stopped = True
             self._actions.cancel()
-            self._velocity.stop()
+            self._velocity.send(Stop(self._acceleration_rad_per_s2))
         if output.release:
             self._actions.release()
 
@@ -212,7 +209,7 @@ class ControlLoopRunner:
         self._stopped = False
         try:
             async with asyncio.timeout(BRAKE_S):
-                await self._robot.send(Stop(self._velocity.acceleration_rad_per_s2))
+                await self._robot.send(Stop(self._acceleration_rad_per_s2))
         except Exception:  # noqa: BLE001 - the loop's own error is raised
             structlog.get_logger().exception("the arm could not be stopped")
 
@@ -220,25 +217,21 @@ class ControlLoopRunner:
 class VelocityCommandSender:
     """Sends wrist velocities and stops to the robot's process, and reports the results to the control loop."""
 
-    def __init__(self, robot: UrRobot, control_loop: ControlLoop, acceleration_rad_per_s2: float) -> None:
+    def __init__(self, robot: UrRobot, control_loop: ControlLoop) -> None:
         # The speed that the robot's process accepted last.
         self.sent_rad_per_s = 0.0
-        self.acceleration_rad_per_s2 = acceleration_rad_per_s2
         # Commands that wait for their replies.
         self.unanswered = 0
         self._robot = robot
         self._control_loop = control_loop
 
-    def turn(self, rad_per_s: float) -> None:
-        """Send a wrist speed, unless the wrist stands still already or a command waits for its reply."""
-        if (rad_per_s or self.sent_rad_per_s) and not self.unanswered:
-            self._send(WristSpeed(rad_per_s, self.acceleration_rad_per_s2))
+    def send(self, command: WristSpeed | Stop) -> None:
+        """Send a stop of the arm, or a wrist speed.
 
-    def stop(self) -> None:
-        """Stop the whole arm."""
-        self._send(Stop(self.acceleration_rad_per_s2))
-
-    def _send(self, command: WristSpeed | Stop) -> None:
+        A speed is dropped if the wrist stands still already, or if a command waits for its reply.
+        """
+        if isinstance(command, WristSpeed) and (self.unanswered or not (command.rad_per_s or self.sent_rad_per_s)):
+            return
         self.unanswered += 1
         try:
             self._robot.send_nowait(command, self._on_reply)

@@ -71,12 +71,9 @@ def examine(config_path: Path | None, seconds: float, geometry: Path | None = No
         received = {} if "publish" in config.network_addresses else listen(config.publish, seconds)
         yield from check_daemon(config, tasks, received)
     elif config.emulators:
-        yield note(
-            "devices",
-            "the configuration emulates them",
-            "they exist only while the daemon runs",
-            f"`shearloop run {config_path}`, then run the doctor again",
-        )
+        means = "they exist only while the daemon runs"
+        cure = f"`shearloop run {config_path}`, then run the doctor again"
+        yield note("devices", "the configuration emulates them", means, cure)
     else:
         yield good("daemon", "not running with this configuration: the devices are free")
         yield from asyncio.run(check_devices(config, seconds))
@@ -94,12 +91,9 @@ def check_computer() -> Iterator[Finding]:
         yield good("memory", found)
     version = ".".join(map(str, sys.version_info[:2]))
     if importlib.util.find_spec("rtde_control") is None:
-        yield note(
-            "robot's library",
-            f"ur-rtde is not installed for Python {version}",
-            "everything but the robot works",
-            "use Python 3.11 or 3.12 on x86-64, then `pip install ur-rtde`",
-        )
+        means = "everything but the robot works"
+        cure = "use Python 3.11 or 3.12 on x86-64, then `pip install ur-rtde`"
+        yield note("robot's library", f"ur-rtde is not installed for Python {version}", means, cure)
     else:
         yield good("robot's library", f"ur-rtde is installed, Python {version}")
 
@@ -120,12 +114,9 @@ def check_clock(unix_s: float, state: int) -> Finding:
         cure = "set it: `sudo timedatectl set-ntp true`"
         return trouble("clock", f"it says {today}", "recordings and messages carry a wrong time", cure)
     if state == _TIME_ERROR:
-        return note(
-            "clock",
-            f"it says {today} and is not synchronised",
-            "times in messages and recordings drift against other computers; the loop uses another clock",
-            "`sudo timedatectl set-ntp true`, if the network allows it",
-        )
+        means = "times in messages and recordings drift against other computers; the loop uses another clock"
+        cure = "`sudo timedatectl set-ntp true`, if the network allows it"
+        return note("clock", f"it says {today} and is not synchronised", means, cure)
     return good("clock", f"it says {today}" + (" and is synchronised" if state >= 0 else ""))
 
 
@@ -211,12 +202,9 @@ def check_bank(name: str, fingertip: FingertipConfig, geometry: Path | None = No
     except (UserError, BankError) as error:
         return from_error(subject, error, "the bank cannot be compared with it")
     if digest != bank.geometry_hash:
-        return trouble(
-            subject,
-            f"{found}; {geometry} is {digest[:12]}",
-            "the bank belongs to another fingertip or another mesh; estimates are wrong",
-            "build it again with `shearloop bank build`, or give the geometry it was built from",
-        )
+        means = "the bank belongs to another fingertip or another mesh; estimates are wrong"
+        cure = "build it again with `shearloop bank build`, or give the geometry it was built from"
+        return trouble(subject, f"{found}; {geometry} is {digest[:12]}", means, cure)
     return good(subject, f"{found}, which is {geometry}")
 
 
@@ -260,17 +248,11 @@ def check_keys(curve: CurveConfig | None, network: dict[str, str]) -> Finding:
     path = server_key_file(curve.server_key)
     mode = path.stat().st_mode & 0o777
     if mode & 0o077:
-        return trouble(
-            "keys",
-            f"others can read {path} (mode {mode:o})",
-            "a reader of this key can pose as the daemon",
-            f"`chmod 600 {path}`; make new keys if somebody may have read it",
-        )
+        means = "a reader of this key can pose as the daemon"
+        cure = f"`chmod 600 {path}`; make new keys if somebody may have read it"
+        return trouble("keys", f"others can read {path} (mode {mode:o})", means, cure)
     if not network:
-        return note(
-            "keys",
-            "there are keys, but every address is on this computer",
-            "nobody else can connect",
-            "set `publish` and `commands` to tcp://0.0.0.0:PORT to let others connect",
-        )
+        means = "nobody else can connect"
+        cure = "set `publish` and `commands` to tcp://0.0.0.0:PORT to let others connect"
+        return note("keys", "there are keys, but every address is on this computer", means, cure)
     return good("keys", f"{', '.join(sorted(clients.values()))} may connect to {' and '.join(network.values())}")

@@ -91,7 +91,7 @@ async def check_devices(config: DaemonConfig, seconds: float) -> list[Finding]:
     if config.gripper is not None:
         checks.append(_check_gripper(config.gripper))
     if config.robot is not None:
-        checks.append(asyncio.to_thread(_check_robot, config.robot))
+        checks.append(asyncio.to_thread(lambda path: [*_check_robot(path)], config.robot))
     return [finding for findings in await asyncio.gather(*checks) for finding in findings]
 
 
@@ -113,20 +113,14 @@ def check_port(name: str, device: SerialDevice) -> Finding:
 def check_rate(subject: str, measured_hz: float | None, configured_hz: float) -> Finding:
     """Compare a measured rate with the configured one; None means that nothing came."""
     if measured_hz is None:
-        return trouble(
-            subject,
-            "nothing was received",
-            "the device is silent: no power, another program's port, or another board",
-            "check its power; unplug it and plug it in again",
-        )
+        means = "the device is silent: no power, another program's port, or another board"
+        cure = "check its power; unplug it and plug it in again"
+        return trouble(subject, "nothing was received", means, cure)
     found = f"{measured_hz:.3g} Hz measured, {configured_hz:.3g} Hz configured"
     if abs(measured_hz / configured_hz - 1.0) > RATE_TOLERANCE:
-        return note(
-            subject,
-            found,
-            "freshness is judged by the configured rate: the loop may hold needlessly, or too late",
-            f"configure {measured_hz:.3g} Hz (frame_period_s {1.0 / measured_hz:.4f})",
-        )
+        means = "freshness is judged by the configured rate: the loop may hold needlessly, or too late"
+        cure = f"configure {measured_hz:.3g} Hz (frame_period_s {1.0 / measured_hz:.4f})"
+        return note(subject, found, means, cure)
     return good(subject, found)
 
 
@@ -135,19 +129,13 @@ def check_channels(name: str, saturated: int, dead: int, frames: int) -> Finding
     subject = f"channels of {name}"
     found = f"{saturated} saturated and {dead} dead of 896 in {frames} frames"
     if saturated:
-        return trouble(
-            subject,
-            found,
-            "more signal than the converter can measure: a short, or too much current; every estimate lacks them",
-            "look for bridges at the electrodes' connector; wet the gel; lower the injected current",
-        )
+        means = "more signal than the converter can measure: a short, or too much current; every estimate lacks them"
+        cure = "look for bridges at the electrodes' connector; wet the gel; lower the injected current"
+        return trouble(subject, found, means, cure)
     if dead:
-        return trouble(
-            subject,
-            found,
-            "an electrode without contact, or a broken wire; every estimate lacks these channels",
-            "press the connector on; 28 or 56 dead channels that belong together point to one electrode",
-        )
+        means = "an electrode without contact, or a broken wire; every estimate lacks these channels"
+        cure = "press the connector on; 28 or 56 dead channels that belong together point to one electrode"
+        return trouble(subject, found, means, cure)
     return good(subject, found)
 
 
@@ -178,14 +166,9 @@ async def _check_fingertip(name: str, config: FingertipConfig, seconds: float) -
     findings = [port, check_rate(f"rate of {name}", measured_hz, 1 / config.frame_period_s)]
     refused = facts["errors"]
     if isinstance(refused, dict) and sum(refused.values()):
-        findings.append(
-            note(
-                f"lines of {name}",
-                f"{sum(refused.values())} refused; {facts['last_frame_error']}",
-                "a bad cable, or another program on the same board",
-                "replace the USB cable",
-            )
-        )
+        found = f"{sum(refused.values())} refused; {facts['last_frame_error']}"
+        means = "a bad cable, or another program on the same board"
+        findings.append(note(f"lines of {name}", found, means, "replace the USB cable"))
     if frames:
         channels = np.array([frame.channels for frame in frames])
         saturated = np.array([frame.saturated for frame in frames]).any(axis=0)
@@ -208,14 +191,9 @@ async def _check_load_cell(config: LoadCellConfig, seconds: float) -> list[Findi
     measured_hz = _rate_hz([sample.t_arrival_ns for sample in samples])
     findings = [port, check_rate("rate of load_cell", measured_hz, config.rate_hz)]
     if saturated := sum(sample.saturated for sample in samples):
-        findings.append(
-            trouble(
-                "signal of load_cell",
-                f"{saturated} of {len(samples)} readings are at the converter's limit",
-                "overload, or a loose wire of the bridge",
-                "take the load off; check the four wires of the cell",
-            )
-        )
+        found = f"{saturated} of {len(samples)} readings are at the converter's limit"
+        cure = "take the load off; check the four wires of the cell"
+        findings.append(trouble("signal of load_cell", found, "overload, or a loose wire of the bridge", cure))
     return findings
 
 
@@ -229,10 +207,8 @@ async def _check_gripper(config: GripperConfig) -> list[Finding]:
     finally:
         await client.close()
     if state.flt:
-        found, cure = (
-            f"{client.name} answers, with fault {state.flt}",
-            "clear the fault, then `shearloop command unlock`",
-        )
+        found = f"{client.name} answers, with fault {state.flt}"
+        cure = "clear the fault, then `shearloop command unlock`"
         return [trouble("gripper", found, "it does not move", cure)]
     if state.sta is not ActivationStatus.ACTIVE:
         cure = "keep fingers and tools away when the daemon starts"
@@ -240,42 +216,32 @@ async def _check_gripper(config: GripperConfig) -> list[Finding]:
     return [good("gripper", f"{client.name} answers and is activated")]
 
 
-def _check_robot(settings: Path) -> list[Finding]:
+def _check_robot(settings: Path) -> Iterator[Finding]:
     try:
         host = read_settings(settings).host
         seen = query_controller(host, ROBOT_TIMEOUT_S)
     except DriverError as error:
-        return [from_error("robot", error, "the robot cannot be driven")]
-    findings = [good("robot", f"{host} answers, PolyScope {seen.version}")]
+        yield from_error("robot", error, "the robot cannot be driven")
+        return
+    yield good("robot", f"{host} answers, PolyScope {seen.version}")
     if seen.remote is False:
-        findings.append(
-            trouble(
-                "remote control",
-                "the robot is in local control",
-                "it accepts no motion from the network",
-                "switch it to remote control, top right on the teach pendant",
-            )
-        )
+        means = "it accepts no motion from the network"
+        cure = "switch it to remote control, top right on the teach pendant"
+        yield trouble("remote control", "the robot is in local control", means, cure)
     else:
-        findings.append(good("remote control", "on" if seen.remote else "this controller has no such mode"))
+        yield good("remote control", "on" if seen.remote else "this controller has no such mode")
     mode = f"robot mode {seen.robot_mode}, safety mode {seen.safety_mode}"
     if seen.robot_mode == "RUNNING" and seen.safety_mode in ("NORMAL", "REDUCED"):
-        findings.append(good("robot's mode", mode))
+        yield good("robot's mode", mode)
     else:
         cure = "make the cell safe, start the daemon, then `shearloop command unlock`"
-        findings.append(note("robot's mode", mode, "the arm does not move in this mode", cure))
+        yield note("robot's mode", mode, "the arm does not move in this mode", cure)
     if seen.registers_free:
-        findings.append(good("robot's registers", "free"))
+        yield good("robot's registers", "free")
     else:
-        findings.append(
-            trouble(
-                "robot's registers",
-                "in use",
-                "another RTDE client, EtherNet/IP or PROFINET commands the robot",
-                "close the other program, or disable the adapter under Installation → Fieldbus",
-            )
-        )
-    return findings
+        means = "another RTDE client, EtherNet/IP or PROFINET commands the robot"
+        cure = "close the other program, or disable the adapter under Installation → Fieldbus"
+        yield trouble("robot's registers", "in use", means, cure)
 
 
 def _rate_hz(times_ns: list[int]) -> float | None:

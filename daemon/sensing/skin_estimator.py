@@ -157,7 +157,7 @@ class SkinEstimator:
         calibration: SkinCalibration,
         *,
         normal_n: float,
-        zero_samples: int = 20,
+        zero_samples: int,
         drift_per_hour: float = DRIFT_PER_HOUR,
     ) -> None:
         """Use the calibration, the normal force behind the friction (N), and the zero's samples and drift."""

@@ -48,8 +48,7 @@ class Bridge:
         self.latest = latest
         self._context = context
         self._address = address
-        self._watchers = 0
-        self._pending = 0
+        self._free = asyncio.Semaphore(MAX_PENDING_COMMANDS)
         self._stopping: asyncio.Future[dict[str, Any]] | None = None
         self._socket = context.socket(zmq.SUB)
         self._socket.setsockopt(zmq.LINGER, 0)
@@ -83,26 +82,20 @@ class Bridge:
     @contextmanager
     def watching(self) -> Iterator[None]:
         """Subscribe to heatmaps while a page is open."""
-        self._watchers += 1
-        if self._watchers == 1:
-            self._socket.subscribe(EitHeatmap.topic)
+        # ZeroMQ counts the subscriptions of several pages.
+        self._socket.subscribe(EitHeatmap.topic)
         try:
             yield
         finally:
-            self._watchers -= 1
-            if self._watchers == 0:
-                self._socket.unsubscribe(EitHeatmap.topic)
+            self._socket.unsubscribe(EitHeatmap.topic)
 
     async def command(self, name: str) -> dict[str, Any]:
         """Return the daemon's reply to a command; raise UserError without a reply, BusyError if too many wait."""
-        if self._pending >= MAX_PENDING_COMMANDS:
+        if self._free.locked():
             raise BusyError
-        self._pending += 1
-        try:
+        async with self._free:
             timeout_s = UNLOCK_TIMEOUT_S if name == "unlock" else COMMAND_TIMEOUT_S
             return await self._request(self._address.commands, {"command": name}, timeout_s)
-        finally:
-            self._pending -= 1
 
     async def stop(self) -> dict[str, Any]:
         """Return the daemon's reply to a stop of all motion; simultaneous calls share one request.
@@ -110,15 +103,13 @@ class Bridge:
         Raises UserError without a reply.
         """
         if self._stopping is None or self._stopping.done():
-            request = self._request(self._address.stop_address(), {"command": "stop", "spare_daemon": True})
+            content = {"command": "stop", "spare_daemon": True}
+            request = self._request(self._address.stop_address(), content, COMMAND_TIMEOUT_S)
             self._stopping = asyncio.ensure_future(request)
         # Shielded: a page that disappears has still requested the stop.
         return await asyncio.shield(self._stopping)
 
-    async def _request(
-        self, address: str, content: Mapping[str, Any], timeout_s: float | None = None
-    ) -> dict[str, Any]:
-        timeout_s = timeout_s or COMMAND_TIMEOUT_S
+    async def _request(self, address: str, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
         with self._command_socket(address) as socket:
             try:
                 async with asyncio.timeout(timeout_s):

@@ -6,6 +6,7 @@ computer may read and stop; commands that move something need the token.
 """
 
 import asyncio
+import contextlib
 import hmac
 import os
 import secrets
@@ -72,7 +73,7 @@ async def serve(
     Raises UserError for a port that is in use and for a malformed address.
     """
     loop = asyncio.get_running_loop()
-    signals, stopped = ending_signals(), asyncio.Event()
+    signals = ending_signals()
     with zmq.asyncio.Context() as context:
         bridge = Bridge(context, address, MessageStore(fingertip.height_cm))
         app = make_app(bridge, token, asdict(fingertip), address.publish)
@@ -87,14 +88,11 @@ async def serve(
                     f"the page cannot be served on {HOST}:{port} ({error.strerror}); give another --port"
                 ) from error
             for number in signals:
-                loop.add_signal_handler(number, stopped.set)
+                loop.add_signal_handler(number, receiving.cancel)
             on_ready(runner.addresses[0][1])
-            waiting = asyncio.create_task(stopped.wait())
             # Without its subscription the page would show stale data: an error there ends the server.
-            await asyncio.wait((waiting, receiving), return_when=asyncio.FIRST_COMPLETED)
-            waiting.cancel()
-            if receiving.done():
-                receiving.result()
+            with contextlib.suppress(asyncio.CancelledError):
+                await receiving
         finally:
             for number in signals:
                 loop.remove_signal_handler(number)

@@ -160,7 +160,10 @@ class ScpiError(Exception):
 
 
 class ScpiInterpreter:
-    """One instrument's command interpreter; refused commands go into the error queue and get no reply. No I/O."""
+    """One instrument's interpreter of one command a line, without I/O.
+
+    Refused commands go into the error queue and get no reply.
+    """
 
     def __init__(self, identity: str, commands: Mapping[str, Handler], no_error: str) -> None:
         """Map headers, as manuals write them (`SOURce:CURRent[:LEVel]`, a query with `?`), to handlers."""
@@ -168,7 +171,6 @@ class ScpiInterpreter:
         self._commands += [
             (_pattern("*IDN?"), lambda _: identity),
             (_pattern("*CLS"), lambda _: self.errors.clear()),
-            (_pattern("*OPC?"), lambda _: "1"),
             (_pattern("SYSTem:ERRor[:NEXT]?"), lambda _: self.errors.popleft() if self.errors else no_error),
         ]
         self._buffer = b""
@@ -178,14 +180,11 @@ class ScpiInterpreter:
         """Return the replies to the lines that `data` completes."""
         *lines, self._buffer = (self._buffer + data).replace(b"\r", b"\n").split(b"\n")
         self._buffer = self._buffer[-MAX_LINE_BYTES:]
-        return b"".join(self._line(line.decode("ascii", "replace").strip()) for line in lines)
+        answers = [self._answer(line.decode("ascii", "replace").strip()) for line in lines if line.strip()]
+        return b"".join(f"{answer}\n".encode() for answer in answers if answer is not None)
 
-    def _line(self, line: str) -> bytes:
-        answers = [answer for unit in filter(None, line.split(";")) if (answer := self._unit(unit.strip())) is not None]
-        return ";".join(answers).encode() + b"\n" if answers else b""
-
-    def _unit(self, unit: str) -> str | None:
-        header, _, argument = unit.partition(" ")
+    def _answer(self, line: str) -> str | None:
+        header, _, argument = line.partition(" ")
         for pattern, handler in self._commands:
             if pattern.fullmatch(header):
                 try:

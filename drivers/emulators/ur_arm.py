@@ -63,28 +63,17 @@ class Motion(Protocol):
 
 @dataclass
 class Speed:
-    """speedJ: turn towards `target_rad_per_s`, each joint within `acceleration`; it never finishes."""
+    """speedJ: turn towards `target_rad_per_s`, each joint within `acceleration`; `halts`: it is over at rest."""
 
     target_rad_per_s: Vector
     acceleration_rad_per_s2: float
+    halts: bool = False
 
     def advance(self, q_rad: Vector, qd_rad_per_s: Vector, dt_s: float) -> Advanced:
         """Return the arm one cycle later."""
         step = self.acceleration_rad_per_s2 * dt_s
         qd = qd_rad_per_s + np.clip(self.target_rad_per_s - qd_rad_per_s, -step, step)
-        return Advanced(q_rad + 0.5 * (qd + qd_rad_per_s) * dt_s, qd, finished=False)
-
-
-@dataclass
-class Halt:
-    """stopJ, speedStop and the end of a program: slow every joint down to rest."""
-
-    deceleration_rad_per_s2: float
-
-    def advance(self, q_rad: Vector, qd_rad_per_s: Vector, dt_s: float) -> Advanced:
-        """Return the arm one cycle later."""
-        slowed = Speed(np.zeros(6), self.deceleration_rad_per_s2).advance(q_rad, qd_rad_per_s, dt_s)
-        return slowed._replace(finished=not slowed.qd_rad_per_s.any())
+        return Advanced(q_rad + 0.5 * (qd + qd_rad_per_s) * dt_s, qd, self.halts and not qd.any())
 
 
 @dataclass
@@ -170,7 +159,7 @@ class Arm:
 
     def halt(self, deceleration: float) -> None:
         """Slow every joint down to rest."""
-        self.motion = Halt(deceleration) if self.moving else None
+        self.motion = Speed(np.zeros(6), deceleration, halts=True) if self.moving else None
 
     def advance(self, dt_s: float) -> None:
         """Move for one cycle; `PathError` where the motion leads nowhere."""

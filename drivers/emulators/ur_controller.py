@@ -4,7 +4,7 @@ import asyncio
 import logging
 import time
 from collections.abc import AsyncIterator, Iterator
-from contextlib import AsyncExitStack, contextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from dataclasses import replace
 
 from shearloop.drivers.emulators import number_between
@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 
 
 class Controller:
-    """A `Robot` that real clients can connect to; `async with` opens and closes the ports."""
+    """A `Robot` that real clients can connect to."""
 
     def __init__(self, robot: Robot, *, host: str = "127.0.0.1", rate_hz: float = 500.0) -> None:
         """Take a robot; nothing is opened yet."""
@@ -43,26 +43,21 @@ class Controller:
         self._rtde: dict[asyncio.StreamWriter, RtdeSession] = {}
         self._connections: set[asyncio.Task[None]] = set()
         self._writers: set[asyncio.StreamWriter] = set()
-        self._stack = AsyncExitStack()
 
-    async def __aenter__(self) -> "Controller":
-        """Open the ports."""
-        async with AsyncExitStack() as opened:
+    @asynccontextmanager
+    async def open(self) -> AsyncIterator[None]:
+        """Open the ports, and close them and every connection at the end."""
+        async with AsyncExitStack() as stack:
             for port, serve in (
                 (RTDE_PORT, self._serve_rtde),
                 (SCRIPT_PORT, self._serve_scripts),
                 (DASHBOARD_PORT, self._serve_dashboard),
             ):
                 server = await asyncio.start_server(serve, self._host, port)
-                opened.push_async_callback(server.wait_closed)
-                opened.callback(self._drop_all)
-                opened.callback(server.close)
-            self._stack = opened.pop_all()
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        """Close every port and connection."""
-        await self._stack.aclose()
+                stack.push_async_callback(server.wait_closed)
+                stack.callback(self._drop_all)
+                stack.callback(server.close)
+            yield
         if self._connections:
             await asyncio.wait(self._connections)
 

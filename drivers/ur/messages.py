@@ -245,7 +245,7 @@ def encode(message: Message, number: int = 0) -> bytes:
 
 
 def _packed(value: Any) -> msgpack.ExtType:
-    content = [getattr(value, name) for name in value.__dataclass_fields__]
+    content = list(map(value.__getattribute__, value.__dataclass_fields__))
     return msgpack.ExtType(_CODES[type(value)], msgpack.packb(content, default=_packed, buf_size=4096))
 
 

@@ -89,7 +89,7 @@ class SkinLoop:
         configured_n = case.normal_n if case.configured_n is None else case.configured_n
         if not case.knows_friction:
             calibration = calibration.model_copy(update={"friction": 0.0})
-        self.estimator = SkinEstimator(calibration, normal_n=configured_n)
+        self.estimator = SkinEstimator(calibration, normal_n=configured_n, zero_samples=20)
         # The chart looks for the boundary, so every margin is allowed.
         config = LoopConfig(
             kp=case.kp, deadband_nm=case.deadband_nm, max_innovation_nm=0.006, max_offset_drift_nm=0.006,

@@ -229,7 +229,7 @@ def _run_ur(args: argparse.Namespace) -> int:
 
 
 async def _play_ur(controller: "Controller", host: str) -> None:
-    async with controller:
+    async with controller.open():
         console.print_event("listening", detail=host)
         async for event in controller.run():
             print_robot_event(event)

@@ -149,7 +149,7 @@ def _run_rig(args: argparse.Namespace) -> int:
 
 
 async def _play_rig(rig: "EmulatedRig", args: argparse.Namespace, truth: TextIO | None) -> None:
-    async with rig.controller, asyncio.TaskGroup() as group:
+    async with rig.controller.open(), asyncio.TaskGroup() as group:
         group.create_task(rig.run())
         group.create_task(_print_ready(rig, args.host))
         if truth is not None:
@@ -281,7 +281,7 @@ async def _play_skin(instruments: "SkinInstruments", controller: "Controller | N
     if controller is None:
         await instruments.run()
         return
-    async with controller, asyncio.TaskGroup() as group:
+    async with controller.open(), asyncio.TaskGroup() as group:
         group.create_task(instruments.run())
         async for _ in controller.run():
             pass

@@ -183,7 +183,6 @@ class Cell:
             self.published,  # type: ignore[arg-type]
             StepClock(self.robot.flight),
             self.died,
-            4.0,
         )
         self.task: asyncio.Task[None] | None = None
 

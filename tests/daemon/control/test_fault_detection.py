@@ -9,6 +9,7 @@ from shearloop.daemon.control.fault_detection import (
     MonitorInputs,
     compared_for_s,
     detect_faults,
+    fresh_for_s,
 )
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.runner import PUBLISH_EVERY, wrench_source
@@ -34,6 +35,7 @@ def watched(driving: TorqueSource, supervising: tuple[TorqueSource, ...]) -> Mon
     return MonitorInputs(
         driving=driving,
         supervising=supervising,
+        fresh_s=fresh_for_s((driving, *supervising), LoopConfig()),
         limits=ExperimentLimits(),
         torque_needed=True,
         gripped=True,
@@ -109,7 +111,8 @@ def test_a_torque_that_counts_as_new_is_held_against_its_limit() -> None:
 def test_torques_are_compared_for_as_long_as_the_slower_one_counts_as_new(rate_hz: float) -> None:
     """Else a disagreement would come and go with every frame, and a hold would never become a stop."""
     quick = replace(LOAD, period_s=1.0 / rate_hz)
-    senses = LoopInputs(kept_s=compared_for_s((EIT, quick), LoopConfig()), arm=ArmStatus(0.0, NOW_NS))
+    kept_s = compared_for_s((EIT, quick), fresh_for_s((EIT, quick), LoopConfig()))
+    senses = LoopInputs(kept_s, arm=ArmStatus(0.0, NOW_NS))
     frame = torque(EIT, 0.1, came_s=2.4 * EIT.period_s)
     senses.add_torque(frame)
     for number in range(round(60 * rate_hz), 0, -1):

@@ -12,7 +12,7 @@ from shearloop.daemon.control.runner import VelocityCommandSender
 from shearloop.daemon.control.step_runner import MoveToAngle
 from shearloop.daemon.control.wrist_controller import WristController
 from shearloop.drivers.ur.client import UrRobot
-from shearloop.drivers.ur.messages import Command, CommandReply
+from shearloop.drivers.ur.messages import Command, CommandReply, WristSpeed
 from tests.drivers.ur.flight import SETTINGS, flying
 
 CYCLE_NS = 8_000_000
@@ -82,7 +82,7 @@ def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> l
 
     robot = SimpleNamespace(settings=SETTINGS, state=None, send_nowait=send_nowait)
     brain = SimpleNamespace(on_speed_sent=wrist.on_speed_sent, on_command_refused=pytest.fail, on_crash=pytest.fail)
-    commands = VelocityCommandSender(cast(UrRobot, robot), cast(ControlLoop, brain), 4.0)
+    commands = VelocityCommandSender(cast(UrRobot, robot), cast(ControlLoop, brain))
     origin_rad, errors = flight.state.wrist_rad, []
     for _ in range(cycles):
         flight.fly(1)
@@ -92,7 +92,7 @@ def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> l
         while replies:
             replies.pop()()
         turn = wrist.turn(MoveToAngle(angle_rad, 0.5), flight.now_ns, state.wrist_rad, origin_rad)
-        commands.turn(turn.speed_rad_per_s)
+        commands.send(WristSpeed(turn.speed_rad_per_s, 4.0))
     return errors
 
 

@@ -49,7 +49,7 @@ class Bench:
 
     def __init__(self, calibration: SkinCalibration, seed: int = 0) -> None:
         self.skin = SyntheticSkin(seed=seed)
-        self.estimator = SkinEstimator(calibration, normal_n=1.0)
+        self.estimator = SkinEstimator(calibration, normal_n=1.0, zero_samples=20)
         self.spoil: Callable[[float, float, float], tuple[float, float]] = lambda r1, r2, _: (r1, r2)
         self._random = Random(seed)
         self._number = 0

@@ -98,7 +98,7 @@ async def test_over_the_network_motion_needs_key_and_token_and_stop_neither(
                         status, reply = await page.post("commands/tare", token=True)
                         assert (status, reply["ok"]) == (503, False), who
                         assert await page.post("stop") == (200, {"ok": True, "stopped": ""}), who
-            assert daemon._command_diagnostics()["errors"]["key is not allowed"] >= 1
+            assert daemon.health.tasks()["commands"]["errors"]["key is not allowed"] >= 1
             assert not daemon._stop.is_set(), "a stop from a page ends what moves, and not the daemon"
         finally:
             daemon.stop()

@@ -1,4 +1,4 @@
-"""Records the emulated rig and calibrates its fingertips: `python -m shearloop.daemon.cli.demo_calibration`.
+"""Records the emulated rig and calibrates its fingertips: `python -m shearloop.daemon.cli.calibrate_demo`.
 
 As on a real rig, a recording holds idle frames, a grip, twists with the load cell's torque, and idle frames again, for
 several cylinders. It runs on the emulated rig's physics in simulated time, so that a seed always gives the same files:
@@ -75,7 +75,7 @@ class RecordedTwists:
     def write(self, path: Path, diameter_mm: float) -> None:
         """Write a recording that begins at the Unix time 0."""
         notes = {DIAMETER_NOTE: f"{diameter_mm:g}"}
-        with RecordingWriter(path, "the emulated rig, by shearloop.daemon.cli.demo_calibration", notes) as writer:
+        with RecordingWriter(path, "the emulated rig, by shearloop.daemon.cli.calibrate_demo", notes) as writer:
             for t_s, pair in zip(self.frame_s, self.lines, strict=True):
                 for side, line in zip(SIDES, pair, strict=True):
                     writer.add_frame(side, round(t_s * 1e9), round((t_s + FRAME_PERIOD_S / 2) * 1e9), line)
@@ -156,7 +156,7 @@ def record(
 def calibrate(recordings: list[FrameSeries], sides: Sides) -> Calibration:
     """Return the default estimator's calibration for these fingertips."""
     chosen = [one.select_sides(sides) for one in recordings]
-    source = "the emulated rig, by shearloop.daemon.cli.demo_calibration"
+    source = "the emulated rig, by shearloop.daemon.cli.calibrate_demo"
     return fit("motion_regression", chosen, source, timing=measure_timing(chosen, recordings))
 
 

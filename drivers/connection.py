@@ -97,11 +97,11 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
 
         Raises DeviceLostError if the port is gone.
         """
+        loop = asyncio.get_running_loop()
+        done: asyncio.Future[None] = loop.create_future()
         if self._result is None:
-            loop = asyncio.get_running_loop()
-            done: asyncio.Future[None] = loop.create_future()
             # Reading in the callback, before the task runs, gives the earliest time stamp.
-            loop.add_reader(self._descriptor, self._on_readable, done)
+            loop.add_reader(self._descriptor, self._drain, done)
             timer = loop.call_later(timeout_s, _finish, done)
             try:
                 await done
@@ -110,18 +110,16 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
                 loop.remove_reader(self._descriptor)
         if self._result is None:
             # The loop itself may have been late.
-            self._drain()
+            self._drain(done)
         result, self._result = self._result, None
         if isinstance(result, DeviceLostError):
             raise result
         return result
 
-    def _on_readable(self, done: asyncio.Future[None]) -> None:
-        if not done.done():
-            self._drain()
-            done.set_result(None)
-
-    def _drain(self) -> None:
+    def _drain(self, done: asyncio.Future[None]) -> None:
+        """Take what has arrived, unless an earlier call took something."""
+        if self._result is not None:
+            return
         parts: list[bytes] = []
         lost: DeviceLostError | None = None
         for _ in range(READS_PER_TURN):
@@ -140,6 +138,8 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
                 break
         # Bytes before a hang-up come first; the next read meets the hang-up again.
         self._result = Received(b"".join(parts), time.monotonic_ns()) if parts else lost
+        if self._result is not None and not done.done():
+            done.set_result(None)
 
     async def write(self, data: bytes) -> None:
         """Write all of `data`; DeviceLostError if the port is gone or accepts nothing for a second."""

@@ -311,6 +311,8 @@ class ControlLoop:
             velocity, ended = wrist.identify(wrist.excitation, t_ns, wrist_rad)
             if ended is not None:
                 self.on_action_ended(ended)
+                if experiment.phase not in ACTIVE:
+                    return self._ended(decision)
         else:
             velocity = wrist.turn(command.wrist, t_ns, wrist_rad, grip.origin_rad)
         self.status = LoopStatus("held" if held else experiment.phase.value, command.activity, velocity, decision)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from shearloop.bank.arrays import FloatArray
@@ -253,13 +253,13 @@ def _actuation(record: Record) -> float:
 
 @checked_dataclass(frozen=True, slots=True, kw_only=True, config=ConfigDict(allow_inf_nan=False))
 class ExciteSettings:
-    """The identification's swings: between the first angle and `amplitude_rad` away (the sign gives the direction).
+    """The identification's swings: between the first angle and `amplitude_rad` away.
 
     The first swing goes half as far. Ends when the stiffness is known to `stiffness_share`, and fails after
     `most_cycles` without that.
     """
 
-    amplitude_rad: float
+    amplitude_rad: Positive
     sample_period_s: Positive
     window_s: NotNegative
     torque_limit_nm: Positive
@@ -271,12 +271,6 @@ class ExciteSettings:
     dwell_s: Positive = 2.5
     fewest_cycles: Annotated[int, Field(gt=0)] = 2
     most_cycles: Annotated[int, Field(gt=0)] = 8
-
-    @model_validator(mode="after")
-    def _moves(self) -> "ExciteSettings":
-        if self.amplitude_rad == 0.0:
-            raise ValueError("amplitude_rad must not be 0")
-        return self
 
 
 class StiffnessExcitation:
@@ -379,14 +373,10 @@ class StiffnessExcitation:
 
     def record(self) -> Record:
         """Return the record so far."""
-        angles, sent = np.array(self._angles).reshape(-1, 2), np.array(self._sent).reshape(-1, 2)
-        torques = np.array(self._torques).reshape(-1, 3)
+        angle_t_s, angle_rad = np.array(self._angles).reshape(-1, 2).T
+        sent_t_s, sent_rad_per_s = np.array(self._sent).reshape(-1, 2).T
+        t_mid_s, t_s, torque_nm = np.array(self._torques).reshape(-1, 3).T
         return Record(
-            angle_t_s=angles[:, 0],
-            angle_rad=angles[:, 1],
-            sent_t_s=sent[:, 0],
-            sent_rad_per_s=sent[:, 1],
-            t_mid_s=torques[:, 0],
-            t_s=torques[:, 1],
-            torque_nm=torques[:, 2],
-        )
+            angle_t_s=angle_t_s, angle_rad=angle_rad, sent_t_s=sent_t_s, sent_rad_per_s=sent_rad_per_s,
+            t_mid_s=t_mid_s, t_s=t_s, torque_nm=torque_nm,
+        )  # fmt: skip

@@ -67,7 +67,7 @@ class Creep:
 
     Under a held twist the gel's shear stays and its torque falls; a fingertip measures the shear. With γ the shear, as
     the torque on a fresh gel, the torque is γ − share·c. Here c follows γ with a time constant: one Maxwell element in
-    parallel with a spring (the standard linear solid, e.g. Ferry, Viscoelastic Properties of Polymers, 1980, chapter 1).
+    parallel with a spring (the standard linear solid; Ferry, Viscoelastic Properties of Polymers, 1980, chapter 1).
     """
 
     share: float

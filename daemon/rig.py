@@ -114,7 +114,7 @@ def make_gripper(
         RobotiqGripper(client, calibration, monitor=LinkMonitor(DeviceLink("gripper", loop))),
         publisher,
         loop,
-        fingertip_diameter=diameters.latest,
+        diameters=diameters,
         measures_diameters=config.gripper.calibration is not None,
     )
 

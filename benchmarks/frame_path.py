@@ -208,7 +208,7 @@ async def trace_command(folder: Path) -> list[CodeType]:
             while len(trace.ways) < TRACED:
                 state = msgpack.unpackb((await subscriber.recv_multipart())[1])
                 trace.recording = state["step_name"] == "hold_torque" and state["phase"] == "running"
-                if state["phase"] in ("stopped", "finished"):
+                if state["phase"] not in ("idle", "running", "held"):
                     raise RuntimeError(f"the experiment ended before it was traced: {state['activity']}")
             trace.remove()
     finally:

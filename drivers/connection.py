@@ -25,7 +25,7 @@ READ_BYTES = 65_536
 READS_PER_TURN = 8
 # A read shorter than one kernel buffer has emptied the port.
 SHORT_READ_BYTES = 4_000
-WRITE_TIMEOUT_S = 1.0
+WRITE_TIMEOUT_S, WRITE_PAUSE_S = 1.0, 0.01
 CONNECT_TIMEOUT_S = 2.0
 
 # The values that a device reports in `health`, by name.
@@ -97,11 +97,11 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
 
         Raises DeviceLostError if the port is gone.
         """
+        loop = asyncio.get_running_loop()
+        done: asyncio.Future[None] = loop.create_future()
         if self._result is None:
-            loop = asyncio.get_running_loop()
-            done: asyncio.Future[None] = loop.create_future()
             # Reading in the callback, before the task runs, gives the earliest time stamp.
-            loop.add_reader(self._descriptor, self._on_readable, done)
+            loop.add_reader(self._descriptor, self._drain, done)
             timer = loop.call_later(timeout_s, _finish, done)
             try:
                 await done
@@ -110,18 +110,16 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
                 loop.remove_reader(self._descriptor)
         if self._result is None:
             # The loop itself may have been late.
-            self._drain()
+            self._drain(done)
         result, self._result = self._result, None
         if isinstance(result, DeviceLostError):
             raise result
         return result
 
-    def _on_readable(self, done: asyncio.Future[None]) -> None:
-        if not done.done():
-            self._drain()
-            done.set_result(None)
-
-    def _drain(self) -> None:
+    def _drain(self, done: asyncio.Future[None]) -> None:
+        """Take what has arrived, unless an earlier call took something."""
+        if self._result is not None:
+            return
         parts: list[bytes] = []
         lost: DeviceLostError | None = None
         for _ in range(READS_PER_TURN):
@@ -140,6 +138,8 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
                 break
         # Bytes before a hang-up come first; the next read meets the hang-up again.
         self._result = Received(b"".join(parts), time.monotonic_ns()) if parts else lost
+        if self._result is not None and not done.done():
+            done.set_result(None)
 
     async def write(self, data: bytes) -> None:
         """Write all of `data`; DeviceLostError if the port is gone or accepts nothing for a second."""
@@ -149,20 +149,11 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
                     try:
                         data = data[os.write(self._descriptor, data) :]
                     except BlockingIOError:
-                        await self._writable()
+                        await asyncio.sleep(WRITE_PAUSE_S)
         except TimeoutError as error:
             raise DeviceLostError(f"{self.path} takes no bytes any more; unplug the device and plug it in.") from error
         except OSError as error:
             raise self._lost(error.strerror) from error
-
-    async def _writable(self) -> None:
-        loop = asyncio.get_running_loop()
-        done: asyncio.Future[None] = loop.create_future()
-        loop.add_writer(self._descriptor, _finish, done)
-        try:
-            await done
-        finally:
-            loop.remove_writer(self._descriptor)
 
     def _lost(self, reason: str | None) -> DeviceLostError:
         return DeviceLostError(f"{self.path} has gone ({reason}): unplugged, or without power.")

@@ -6,6 +6,7 @@ open-source firmware), hence the steps of 2.2/1024 V. It writes 0 where the meas
 All values are below 10 V, so a valid line is 1024 cells of eight bytes.
 """
 
+import math
 import os
 import re
 import time
@@ -109,7 +110,7 @@ def read_line(line: bytes, zero_slots: NDArray[np.bool_]) -> NDArray[np.float64]
     """
     if not _LINE.fullmatch(line):
         return _find_error(line)
-    values = np.array([float(value) for value in line.split(_SEPARATOR)[:-1]])
+    values = np.array(list(map(float, line.split(_SEPARATOR)[:-1])))
     zeros = values == 0.0
     for kind, bad in (
         (FrameErrorKind.OUT_OF_RANGE, values > ADC_REFERENCE_V),
@@ -177,19 +178,16 @@ class FrameClock:
     """
 
     def __init__(self, nominal_period_ns: int) -> None:
-        self._period_ns = float(nominal_period_ns)
+        # The learned period, or the nominal one until it is learned.
+        self.period_ns = nominal_period_ns
         self.learned = False
+        self._period_ns = float(nominal_period_ns)
         # (frame number, arrival) of the last frames across restarts, and the last spacings.
         self._latest: deque[tuple[int, int]] = deque(maxlen=SPACING_FRAMES + 1)
         self._spacings: deque[float] = deque(maxlen=LEARN_FROM)
         # (frame number, arrival) since the last restart.
         self._seen: deque[tuple[int, int]] = deque(maxlen=PERIOD_WINDOW)
         self._straight_ns = 0
-
-    @property
-    def period_ns(self) -> int:
-        """The learned period, or the nominal one until it is learned."""
-        return round(self._period_ns)
 
     def restart(self) -> None:
         """Forget the phase and keep the period: the board was restarted."""
@@ -219,24 +217,27 @@ class FrameClock:
         if len(self._latest) > SPACING_FRAMES:
             (n, before_ns), (m, _) = self._latest[0], self._latest[-1]
             self._spacings.append((arrival_ns - before_ns) / (m - n))
-        self._learn(number)
-        recent = islice(reversed(self._seen), PHASE_WINDOW)
-        self._straight_ns = round(min([arrival + (number - n) * self._period_ns for n, arrival in recent]))
+        if not self.learned or number % LEARN_EVERY == 0:
+            self._learn(number)
+        straight_ns = math.inf
+        for n, arrival in islice(reversed(self._seen), PHASE_WINDOW):
+            straight_ns = min(straight_ns, arrival + (number - n) * self._period_ns)
+        self._straight_ns = round(straight_ns)
         return self._straight_ns
 
     def _learn(self, number: int) -> None:
-        due = number % LEARN_EVERY == 0
-        if len(self._spacings) < LEARN_FROM or (self.learned and not due):
+        if len(self._spacings) < LEARN_FROM:
             return
         spacing = median(self._spacings)
         if spacing <= 0:
             return
         if abs(self._period_ns - spacing) > PLAUSIBLE * spacing:
             self._period_ns, self.learned = spacing, True
-        if due and len(self._seen) >= LEARN_FROM:
+        if number % LEARN_EVERY == 0 and len(self._seen) >= LEARN_FROM:
             slope = slope_below(self._seen)
             if abs(slope - spacing) <= PLAUSIBLE * spacing:
                 self._period_ns, self.learned = slope, True
+        self.period_ns = round(self._period_ns)
 
 
 def slope_below(points: Iterable[tuple[int, int]]) -> float:
@@ -426,7 +427,7 @@ class EitKit(SerialSensor[Frame]):
         await port.write(START)
 
     def _timeout_s(self) -> float:
-        return max(SILENT_PERIODS * self.period_s, MIN_SILENCE_S)
+        return max(SILENT_PERIODS * self._parser.clock.period_ns / 1e9, MIN_SILENCE_S)
 
     async def _on_timeout(self, port: Port, _waited_s: float) -> None:
         if self._timeouts > STARTS_BEFORE_REOPENING:

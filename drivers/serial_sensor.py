@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Generic, Protocol, TypeVar
 
-from shearloop.drivers.connection import Diagnostics, Link, Port, Received
+from shearloop.drivers.connection import Diagnostics, Link, Port
 from shearloop.drivers.errors import DeviceLostError, DriverError
 
 # Opening the port resets an Uno; its boot loader waits before it starts the sketch.
@@ -80,20 +80,15 @@ class LineSplitter:
         lines: list[bytes | None] = []
         for end in ends:
             if not self._dropping:
-                lines.append(self._checked(end))
+                lines.append(end if len(end) <= self._max_bytes else self._drop(end))
             self._dropping = False
-        self.partial = b""
-        if not self._dropping:
-            if len(rest) > self._max_bytes:
-                lines.append(self._checked(rest))
-                self._dropping = True
-            else:
-                self.partial = rest
+        self.partial = b"" if self._dropping else rest
+        if len(self.partial) > self._max_bytes:
+            lines.append(self._drop(rest))
+            self.partial, self._dropping = b"", True
         return lines
 
-    def _checked(self, line: bytes) -> bytes | None:
-        if len(line) <= self._max_bytes:
-            return line
+    def _drop(self, line: bytes) -> bytes | None:
         self.too_long += 1
         self.too_long_start = line[:60]
         return None
@@ -199,12 +194,18 @@ class SerialSensor(ABC, Generic[ValueT]):
         with self._link:
             while True:
                 try:
-                    received = await self._receive()
+                    port = self._link.port or await self._open()
+                    timeout_s = self._timeout_s()
+                    received = await port.read(timeout_s)
+                    if received is None:
+                        self._timeouts += 1
+                        await self._on_timeout(port, timeout_s)
+                        continue
                 except DriverError as error:
                     await self._link.lost(error)
                     continue
-                if received is not None:
-                    yield self._dispatch(InputKind.DATA, received.t_arrival_ns, received.data)
+                self._has_sent, self._timeouts = True, 0
+                yield self._dispatch(InputKind.DATA, received.t_arrival_ns, received.data)
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
@@ -216,22 +217,12 @@ class SerialSensor(ABC, Generic[ValueT]):
             self._inputs.record(event)
         return self._parse(event)
 
-    async def _receive(self) -> Received | None:
-        """Return the next bytes, or None after a timeout that the board may recover from."""
-        port = self._link.port
-        if port is None:
-            port = await self._link.open()
-            self._dispatch(InputKind.OPENED, time.monotonic_ns())
-            self._has_sent, self._timeouts = False, 0
-            await self._on_open(port)
-        timeout_s = self._timeout_s()
-        received = await port.read(timeout_s)
-        if received is None:
-            self._timeouts += 1
-            await self._on_timeout(port, timeout_s)
-        else:
-            self._has_sent, self._timeouts = True, 0
-        return received
+    async def _open(self) -> Port:
+        port = await self._link.open()
+        self._dispatch(InputKind.OPENED, time.monotonic_ns())
+        self._has_sent, self._timeouts = False, 0
+        await self._on_open(port)
+        return port
 
     @abstractmethod
     def _parse(self, event: RawEvent) -> Sequence[ValueT]:

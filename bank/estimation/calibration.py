@@ -21,7 +21,7 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatcher
-from shearloop.bank.estimation.estimator import Estimator, OutputModel, PaperEstimator
+from shearloop.bank.estimation.estimator import Estimator, OutputModel, PaperEstimator, Quantity
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.interval_regressor import PolynomialRegressor
 from shearloop.bank.estimation.values import INLINE, Kind
@@ -98,6 +98,12 @@ class Calibration:
             PaperEstimator(np.ones((1, N_CHANNELS))), "raw", (), source, bank_identity,
             torque=model("sigma", TORQUE_DEGREE, torque), diameter=model("k", DIAMETER_DEGREE, diameter),
         )  # fmt: skip
+
+    @property
+    def outputs(self) -> dict[Quantity, OutputModel]:
+        """The model of each quantity that the estimator gives."""
+        models: dict[Quantity, OutputModel | None] = {"torque": self.torque, "diameter": self.diameter}
+        return {quantity: model for quantity, model in models.items() if model is not None}
 
     @property
     def assumption_text(self) -> str:

@@ -25,8 +25,7 @@ from shearloop.bank.estimation.estimator import (
     Quantity,
     Reading,
 )
-from shearloop.bank.estimation.fingertip_validator import FingertipValidator
-from shearloop.bank.estimation.grip_segmentation import segment_grip
+from shearloop.bank.estimation.fingertip_validator import FingertipValidator, segment_grip
 from shearloop.bank.estimation.interval_regressor import Mixtures, fit_interval_regressor
 from shearloop.bank.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
 from shearloop.bank.estimation.novelty import NoveltyDetector

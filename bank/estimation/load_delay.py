@@ -16,8 +16,7 @@ import numpy as np
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.fingertip_validator import channel_noise
-from shearloop.bank.estimation.grip_segmentation import segment_grip
+from shearloop.bank.estimation.fingertip_validator import channel_noise, segment_grip
 from shearloop.bank.estimation.regressors import left_out_blocks
 from shearloop.bank.estimation.values import FrameSeries, check_finite
 from shearloop.bank.polynomial import TWO_SIDED_95

@@ -182,13 +182,7 @@ class EstimatorSession:
             ]
         outputs: dict[Quantity, tuple[OutputModel, Novelty]] = {}
         reasons: list[str] = []
-        models: tuple[tuple[Quantity, OutputModel | None], ...] = (
-            ("torque", calibration.torque),
-            ("diameter", calibration.diameter),
-        )
-        for quantity, model in models:
-            if model is None:
-                continue
+        for quantity, model in calibration.outputs.items():
             novelty = FAMILIAR
             if model.novelty is not None:
                 novelty = model.novelty.assess(frame.difference[0], frame.usable[0])

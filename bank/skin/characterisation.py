@@ -258,16 +258,10 @@ def _model_rows(models: _Models, fully_loaded: ContactState) -> list[FigureOfMer
         shear_n = loading(normal_n)
         return [(shear_n, model(shear_n, normal_n)) for model in (models.in_closed_form, models.in_1d, models.in_2d)]
 
-    rows = [
-        FigureOfMerit(
-            f"sensitivity, fit through origin, Fn = {normal_n} N",
-            "1/N",
-            "0.078",
-            measured,
-            *(origin_slope(*line) for line in lines(normal_n)),
-        )
-        for normal_n, measured in PAPER_MEASURED_SENSITIVITY.items()
-    ]
+    rows = []
+    for normal_n, measured in PAPER_MEASURED_SENSITIVITY.items():
+        slopes, name = (origin_slope(*line) for line in lines(normal_n)), "sensitivity, fit through origin"
+        rows.append(FigureOfMerit(f"{name}, Fn = {normal_n} N", "1/N", "0.078", measured, *slopes))
     fitted = [fit_line(*line) for line in lines(1.0)]
     strain = midline_strain(skin, fully_loaded)
     flank = strain[(skin.midline_deg > 15) & (skin.midline_deg < 75)]

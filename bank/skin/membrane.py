@@ -226,9 +226,8 @@ def paper_membrane() -> Membrane:
 
 def section_membrane() -> Membrane:
     """Return the membrane with the stiffness that modulus and cross-section give in plane strain."""
-    return replace(
-        paper_membrane(), axial_stiffness_n=GAUGE_FACTOR / sensitivity_per_n(replace(PAPER_SECTION, friction=0.0))
-    )
+    stiffness = GAUGE_FACTOR / sensitivity_per_n(replace(PAPER_SECTION, friction=0.0))
+    return replace(paper_membrane(), axial_stiffness_n=stiffness)
 
 
 def _clip(value: float, low: float, high: float) -> float:

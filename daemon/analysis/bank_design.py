@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.eit.design import ALLOWED, Design, MeasuredFrames, design_bank
-from shearloop.bank.estimation.fingertip_validator import channel_noise
-from shearloop.bank.estimation.grip_segmentation import segment_grip
+from shearloop.bank.estimation.fingertip_validator import channel_noise, segment_grip
 from shearloop.bank.estimation.values import FrameSeries
 from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP
 from shearloop.daemon.analysis.series import read_series

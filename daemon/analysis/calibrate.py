@@ -38,11 +38,6 @@ class CalibrationResult:
     doubts: Sequence[str] = ()
 
     @property
-    def quantities(self) -> list[str]:
-        """The calibrated quantities."""
-        return [name for name in ("torque", "diameter") if getattr(self.calibration, name) is not None]
-
-    @property
     def regressor(self) -> IntervalRegressor | None:
         """The torque's regressor, None without a torque."""
         regressor = self.calibration.torque.regressor if self.calibration.torque is not None else None
@@ -72,7 +67,7 @@ class CalibrationResult:
         calibration, timing = self.calibration, self.timing
         found: dict[str, object] = {
             "estimator": calibration.estimator.name,
-            "quantities": self.quantities,
+            "quantities": list(calibration.outputs),
             "frames": self.frames,
             "sides": list(calibration.sides),
             "source": calibration.source,

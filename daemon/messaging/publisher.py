@@ -37,7 +37,7 @@ class Publisher:
         self._next_seq: Counter[tuple[str, str]] = Counter()
         self._listeners: list[Listener] = []
         # Topic beginnings that have subscribers.
-        self._prefixes: set[bytes] = set()
+        self._prefixes: tuple[bytes, ...] = ()
         # An XPUB socket is a PUB socket that also receives the subscriptions.
         self._socket: zmq.Socket[bytes] = zmq.Socket(context, zmq.XPUB)
         self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_SUBSCRIPTION_BYTES)
@@ -66,8 +66,9 @@ class Publisher:
 
     def has_subscriber(self, topic: str) -> bool:
         """Return whether there is a subscriber to this topic."""
-        self._read_subscriptions()
-        return any(topic.encode().startswith(prefix) for prefix in self._prefixes)
+        if int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            self._read_subscriptions()
+        return topic.encode().startswith(self._prefixes)
 
     def has_subscribers(self) -> bool:
         """Return whether there is a subscriber to any topic."""
@@ -86,9 +87,9 @@ class Publisher:
             kind, prefix = message[:1], message[1:]
             # Only beginnings of known topics are kept, which bounds the memory.
             if kind == b"\x01" and any(topic.encode().startswith(prefix) for topic in TOPICS):
-                self._prefixes.add(prefix)
+                self._prefixes = (*self._prefixes, prefix)
             elif kind == b"\x00":
-                self._prefixes.discard(prefix)
+                self._prefixes = tuple(one for one in self._prefixes if one != prefix)
 
 
 def bind(socket: "zmq.Socket[Any]", address: str, key: str, keys: KeyPair | None = None) -> None:

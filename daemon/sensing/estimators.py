@@ -95,14 +95,17 @@ class LiveEstimator:
 
         A search of the bank runs in a thread: it can take half a second.
         """
-        if any(frame.repeated for frame in frames):
-            return Estimate(valid=False, reasons=REPEATED_FRAME)
-        usable = np.array([~(frame.saturated | frame.dead) for frame in frames])
-        t_s = sum(frame.t_mid_ns for frame in frames) / len(frames) / 1e9
-        frame = TactileFrame.of(t_s, np.array([frame.channels for frame in frames]), usable)
+        channels, usable, t_ns = [], [], 0
+        for frame in frames:
+            if frame.repeated:
+                return Estimate(valid=False, reasons=REPEATED_FRAME)
+            channels.append(frame.channels)
+            usable.append(~(frame.saturated | frame.dead))
+            t_ns += frame.t_mid_ns
+        tactile = TactileFrame(t_ns / len(frames) / 1e9, np.array(channels), np.array(usable))
         if self._matcher is None:
-            return self._session.estimate(frame)
-        return await asyncio.to_thread(self._estimate_with_bank, frame)
+            return self._session.estimate(tactile)
+        return await asyncio.to_thread(self._estimate_with_bank, tactile)
 
     def _estimate_with_bank(self, frame: TactileFrame) -> Estimate:
         estimate = self._session.estimate(frame)

@@ -2,7 +2,10 @@
 
 import asyncio
 import contextlib
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import asdict
+from operator import attrgetter
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -139,7 +142,21 @@ class CombinedFingertips:
         self.estimates = estimates
         self.sides = estimates.estimator.calibration.sides
         self._period_s = period_s
-        self.pairing: FramePairing[Frame] = FramePairing(self.sides, round(period_s * 1e9))
+        self._pairing: FramePairing[Frame] = FramePairing(self.sides, round(period_s * 1e9))
+        self._pairs: deque[tuple[Frame, ...]] = deque()
+        self._in_order = asyncio.Lock()
+
+    def add(self, side: str, frames: Sequence[Frame]) -> None:
+        """Take the frames of one read; call this at once, because the order of arrival decides the pairs."""
+        for frame in frames:
+            if (pair := self._pairing.add(side, frame.t_mid_ns, frame)) is not None:
+                self._pairs.append(pair)
+
+    async def process_pairs(self) -> None:
+        """Estimate from the pairs that wait, in order."""
+        async with self._in_order:
+            while self._pairs:
+                await self.estimates.process(*self._pairs.popleft())
 
     def diagnostics(self) -> TaskFacts:
         """Return the values for the health message."""
@@ -170,19 +187,19 @@ class FingertipTask:
         """Process every frame until cancelled."""
         async with contextlib.aclosing(self._board.batches()) as batches:
             async for frames in batches:
-                # Before any estimate: the order of arrival decides the pairs, and a replay finds the same ones.
-                pairs = [self._pair(frame) for frame in frames]
-                for frame, pair in zip(frames, pairs, strict=True):
-                    await self.process_frame(frame, pair)
-                if frames:
-                    await self._publish_heatmap(frames[-1])
+                if self._combined is not None:
+                    self._combined.add(self.name, frames)
+                for frame in frames:
+                    await self.process_frame(frame)
 
-    async def process_frame(self, frame: Frame, pair: tuple[Frame, ...] | None) -> None:
-        """Estimate from a frame and from the pair that it completes; publish the estimates, then the frame."""
+    async def process_frame(self, frame: Frame) -> None:
+        """Estimate from a frame and from the pairs that wait; publish the estimates, then the frame."""
         await self.estimates.process(frame)
-        if pair is not None and self._combined is not None:
-            await self._combined.estimates.process(*pair)
+        if self._combined is not None:
+            await self._combined.process_pairs()
         self._publisher.publish(frame_message(self.name, frame))
+        if self._always_heatmap or self._publisher.has_subscriber(EitHeatmap.topic):
+            await self._publish_heatmap(frame)
 
     def show_heatmap(self, *, always: bool) -> None:
         """Publish a heatmap with every frame, or only while somebody subscribes to it."""
@@ -198,13 +215,8 @@ class FingertipTask:
             "estimates": self.estimates.count,
         }
 
-    def _pair(self, frame: Frame) -> tuple[Frame, ...] | None:
-        return self._combined.pairing.add(self.name, frame.t_mid_ns, frame) if self._combined is not None else None
-
     async def _publish_heatmap(self, frame: Frame) -> None:
         estimator = self.estimates.estimator
-        if not (self._always_heatmap or self._publisher.has_subscriber(EitHeatmap.topic)):
-            return
         scores = await asyncio.to_thread(estimator.heatmap)
         if scores is None or estimator.grids is None:
             return
@@ -245,9 +257,9 @@ def estimate_message(name: str, frames: tuple[Frame, ...], estimate: Estimate, n
     del values["reasons"], values["lag_s"]
     return EitEstimate(
         source=name,
-        t_mono_ns=sum(frame.t_mid_ns for frame in frames) // len(frames),
+        t_mono_ns=sum(map(attrgetter("t_mid_ns"), frames)) // len(frames),
         **values,
         reason="; ".join(estimate.reasons),
         frame=frames[0].seq,
-        latency_s=(now_ns - max(frame.t_arrival_ns for frame in frames)) / 1e9,
+        latency_s=(now_ns - max(map(attrgetter("t_arrival_ns"), frames))) / 1e9,
     )

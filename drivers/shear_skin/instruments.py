@@ -73,7 +73,6 @@ class ReplyLines(LineSplitter):
     def __init__(self) -> None:
         super().__init__(MAX_REPLY_BYTES)
         self._not_ascii = 0
-        self.unasked = 0
 
     @property
     def errors(self) -> Counter[str]:
@@ -82,7 +81,6 @@ class ReplyLines(LineSplitter):
             {
                 "too long": self.too_long,
                 "unfinished": self.unfinished,
-                "unasked": self.unasked,
                 "not ASCII": self._not_ascii,
             }
         )
@@ -117,111 +115,20 @@ def parse_numbers(text: str, count: int, instrument: str) -> list[float]:
     return [float(part) for part in parts]
 
 
-class ScpiSession:
-    """Queries and commands over a link that may break; after an error call `link.lost`."""
-
-    def __init__(self, link: Link, instrument: str, timeout_s: float, inputs: InputRecorder | None) -> None:
-        """Use the link; `instrument` names it in messages, `inputs` keeps queries and their replies."""
-        self._inputs = inputs
-        self._link = link
-        self._instrument = instrument
-        self._timeout_s = timeout_s
-        self.lines = ReplyLines()
-        self._waiting: list[tuple[str, int]] = []
-
-    async def identify(self, *models: str) -> str:
-        """Return the reply to *IDN?, skipping stale replies; ProtocolError unless it names one of the models."""
-        self.lines.restart()
-        self._waiting.clear()
-        name = (await self.ask("*IDN?")).text
-        for _ in range(MAX_STALE_REPLIES):
-            # A name has four fields; the first is not a number.
-            if name.count(",") >= 3 and not name.lstrip("+-")[:1].isdigit():
-                break
-            name = (await self._next(0, "*IDN?")).text
-        if models and not any(model in name for model in models):
-            raise ProtocolError(
-                f"{self._instrument} says it is {name!r}, and not {' or '.join(models)}; see which instrument is there."
-            )
-        return name
-
-    async def send(self, *commands: str) -> None:
-        """Send commands; `check` reports errors."""
-        for command in commands:
-            await self._port.write(f"{command}\n".encode())
-
-    async def ask(self, query: str) -> Reply:
-        """Return the answer to a query; DeviceSilentError if none comes, DeviceLostError if the port is gone."""
-        # An unasked reply must not pass for the answer.
-        self.lines.unasked += len(self._waiting)
-        self._waiting.clear()
-        asked_ns = monotonic_ns()
-        await self.send(query)
-        reply = await self._next(asked_ns, query)
-        if self._inputs is not None:
-            self._inputs.record(RawEvent(InputKind.ASKED, asked_ns, query.encode()))
-            self._inputs.record(RawEvent(InputKind.DATA, reply.t_arrival_ns, reply.text.encode()))
-        return reply
-
-    async def ask_until(self, query: str, answer: str, timeout_s: float) -> None:
-        """Send a query and skip replies until `answer` comes; DeviceSilentError after `timeout_s`."""
-        await self.send(query)
-        deadline_ns = monotonic_ns() + int(timeout_s * 1e9)
-        while (await self._next(0, query, deadline_ns)).text != answer:
-            pass
-
-    async def check(self) -> None:
-        """Raise ProtocolError if the instrument rejected a command."""
-        reply = (await self.ask(":SYST:ERR?")).text
-        try:
-            accepted = int(reply.split(",")[0]) == 0
-        except ValueError:
-            accepted = False
-        if not accepted:
-            raise ProtocolError(
-                f"{self._instrument} refused its settings: {reply}; see whether it is the model that is meant."
-            )
-
-    @property
-    def _port(self) -> Port:
-        if self._link.port is None:
-            raise DeviceLostError(f"There is no connection to {self._instrument} at present.")
-        return self._link.port
-
-    async def _next(self, asked_ns: int, query: str, deadline_ns: int | None = None) -> Reply:
-        begin_ns = monotonic_ns()
-        if deadline_ns is None:
-            deadline_ns = begin_ns + int(self._timeout_s * 1e9)
-        while not self._waiting:
-            left_s = (deadline_ns - monotonic_ns()) / 1e9
-            try:
-                received = await self._port.read(left_s) if left_s > 0 else None
-            except DeviceLostError as error:
-                if not self.lines.in_line:
-                    raise
-                raise DeviceLostError(
-                    f"{self._instrument} broke off in the middle of its answer to {query!r}: {error}"
-                ) from error
-            if received is None:
-                waited_s = (deadline_ns - begin_ns) / 1e9
-                raise DeviceSilentError(
-                    f"{self._instrument} at {self._port.path} has not answered {query!r} within {waited_s:.2g} s; "
-                    "see that it is on, and that baud rate and line end are as configured."
-                )
-            self._waiting += [(text, received.t_arrival_ns) for text in self.lines.replies(received.data)]
-        text, arrival_ns = self._waiting.pop(0)
-        return Reply(text, asked_ns, arrival_ns)
-
-
 class PolledInstrument(ABC, Generic[ReadingT]):
     """One SCPI instrument behind a link: set up once, then asked at a steady rate, and reconnected when lost."""
 
-    def __init__(
-        self, link: Link, instrument: str, period_s: float, timeout_s: float, inputs: InputRecorder | None
-    ) -> None:
-        self._link = link
+    # Its name in messages.
+    instrument = ""
+
+    def __init__(self, link: Link, period_s: float, timeout_s: float, inputs: InputRecorder | None) -> None:
+        """Use the link, not yet open; `inputs` keeps queries and their replies."""
         self.period_s = period_s
-        self._session = ScpiSession(link, instrument, timeout_s, inputs)
+        self._link = link
+        self._timeout_s = timeout_s
+        self._inputs = inputs
+        self._lines = ReplyLines()
+        self._waiting: list[tuple[str, int]] = []
         self._strikes = 0
         self._count = 0
         self._errors: Counter[str] = Counter()
@@ -279,7 +186,7 @@ class PolledInstrument(ABC, Generic[ReadingT]):
             **self._link.diagnostics(),
             "instrument": self._name,
             "readings": self._count,
-            "errors": dict(self._errors + self._session.lines.errors),
+            "errors": dict(self._errors + self._lines.errors),
         }
 
     async def _handle_error(self, error: DriverError) -> None:
@@ -290,8 +197,91 @@ class PolledInstrument(ABC, Generic[ReadingT]):
         if self._name and not_understood and self._strikes < MAX_STRIKES:
             return
         self._strikes, self._name = 0, ""
-        self._session.lines.restart()
+        self._lines.restart()
         await self._link.lost(error)
+
+    async def _identify(self, *models: str) -> str:
+        """Return the reply to *IDN?, skipping stale replies; ProtocolError unless it names one of the models."""
+        self._lines.restart()
+        self._waiting.clear()
+        name = (await self._ask("*IDN?")).text
+        for _ in range(MAX_STALE_REPLIES):
+            # A name has four fields; the first is not a number.
+            if name.count(",") >= 3 and not name.lstrip("+-")[:1].isdigit():
+                break
+            name = (await self._next(0, "*IDN?")).text
+        if models and not any(model in name for model in models):
+            raise ProtocolError(
+                f"{self.instrument} says it is {name!r}, and not {' or '.join(models)}; see which instrument is there."
+            )
+        return name
+
+    async def _send(self, *commands: str) -> None:
+        """Send commands; `check` reports errors."""
+        for command in commands:
+            await self._port.write(f"{command}\n".encode())
+
+    async def _ask(self, query: str) -> Reply:
+        """Return the answer to a query; DeviceSilentError if none comes, DeviceLostError if the port is gone."""
+        # An unasked reply must not pass for the answer.
+        self._errors["unasked"] += len(self._waiting)
+        self._waiting.clear()
+        asked_ns = monotonic_ns()
+        await self._send(query)
+        reply = await self._next(asked_ns, query)
+        if self._inputs is not None:
+            self._inputs.record(RawEvent(InputKind.ASKED, asked_ns, query.encode()))
+            self._inputs.record(RawEvent(InputKind.DATA, reply.t_arrival_ns, reply.text.encode()))
+        return reply
+
+    async def _ask_until(self, query: str, answer: str, timeout_s: float) -> None:
+        """Send a query and skip replies until `answer` comes; DeviceSilentError after `timeout_s`."""
+        await self._send(query)
+        deadline_ns = monotonic_ns() + int(timeout_s * 1e9)
+        while (await self._next(0, query, deadline_ns)).text != answer:
+            pass
+
+    async def _check(self) -> None:
+        """Raise ProtocolError if the instrument rejected a command."""
+        reply = (await self._ask(":SYST:ERR?")).text
+        try:
+            accepted = int(reply.split(",")[0]) == 0
+        except ValueError:
+            accepted = False
+        if not accepted:
+            raise ProtocolError(
+                f"{self.instrument} refused its settings: {reply}; see whether it is the model that is meant."
+            )
+
+    @property
+    def _port(self) -> Port:
+        if self._link.port is None:
+            raise DeviceLostError(f"There is no connection to {self.instrument} at present.")
+        return self._link.port
+
+    async def _next(self, asked_ns: int, query: str, deadline_ns: int | None = None) -> Reply:
+        begin_ns = monotonic_ns()
+        if deadline_ns is None:
+            deadline_ns = begin_ns + int(self._timeout_s * 1e9)
+        while not self._waiting:
+            left_s = (deadline_ns - monotonic_ns()) / 1e9
+            try:
+                received = await self._port.read(left_s) if left_s > 0 else None
+            except DeviceLostError as error:
+                if not self._lines.in_line:
+                    raise
+                raise DeviceLostError(
+                    f"{self.instrument} broke off in the middle of its answer to {query!r}: {error}"
+                ) from error
+            if received is None:
+                waited_s = (deadline_ns - begin_ns) / 1e9
+                raise DeviceSilentError(
+                    f"{self.instrument} at {self._port.path} has not answered {query!r} within {waited_s:.2g} s; "
+                    "see that it is on, and that baud rate and line end are as configured."
+                )
+            self._waiting += [(text, received.t_arrival_ns) for text in self._lines.replies(received.data)]
+        text, arrival_ns = self._waiting.pop(0)
+        return Reply(text, asked_ns, arrival_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -347,6 +337,8 @@ def read_output(reply: Reply) -> SourceReading | None:
 class Keithley6430(PolledInstrument[SourceReading]):
     """The current source: set up, switched on, read until the iteration ends, then switched off."""
 
+    instrument = "The current source"
+
     def __init__(
         self,
         link: Link,
@@ -356,19 +348,19 @@ class Keithley6430(PolledInstrument[SourceReading]):
         timeout_s: float = REPLY_TIMEOUT_S,
         inputs: InputRecorder | None = None,
     ) -> None:
-        super().__init__(link, "The current source", period_s, timeout_s, inputs)
+        super().__init__(link, period_s, timeout_s, inputs)
         self.current_a = current_a
         self.compliance_v = compliance_v
         self._was_reset = False
         self._may_be_on = False
 
     async def _set_up(self) -> str:
-        name = await self._session.identify(*MODELS)
+        name = await self._identify(*MODELS)
         if not self._was_reset:
-            await self._session.send("*RST")
+            await self._send("*RST")
         self._may_be_on = True
         # After a reconnection without the reset, which would interrupt the current.
-        await self._session.send(
+        await self._send(
             "*CLS",
             ":SOUR:FUNC CURR",
             ":SOUR:CURR:MODE FIX",
@@ -382,20 +374,20 @@ class Keithley6430(PolledInstrument[SourceReading]):
             f":SOUR:CURR {self.current_a:.6E}",
             ":OUTP ON",
         )
-        await self._session.check()
+        await self._check()
         self._was_reset = True
         return name
 
     async def _read(self) -> SourceReading:
-        off = read_output(await self._session.ask(OUTPUT))
+        off = read_output(await self._ask(OUTPUT))
         if off is not None:
             return off
         try:
-            reply = await self._session.ask(READ)
+            reply = await self._ask(READ)
         except DeviceSilentError:
             # The operator may have switched the output off in between: then READ has no reply. Reopening the
             # connection would switch it on again.
-            off = read_output(await self._session.ask(OUTPUT))
+            off = read_output(await self._ask(OUTPUT))
             if off is None:
                 raise
             return off
@@ -412,8 +404,8 @@ class Keithley6430(PolledInstrument[SourceReading]):
             return
         try:
             # Twice: an interrupted command may have left its beginning on the line.
-            await self._session.send(":OUTP OFF", ":OUTP OFF")
-            await self._session.ask_until(OUTPUT, "0", SWITCH_OFF_S)
+            await self._send(":OUTP OFF", ":OUTP OFF")
+            await self._ask_until(OUTPUT, "0", SWITCH_OFF_S)
             self._may_be_on = False
         except DriverError as error:
             self._errors["not switched off"] += 1
@@ -456,6 +448,8 @@ def read_scan(reply: Reply) -> Voltages:
 class ScpiScanner(PolledInstrument[Voltages]):
     """A scanning multimeter on a socket (Keysight 34970A/34972A/DAQ970A and compatible): two channels a scan."""
 
+    instrument = "The scanner"
+
     def __init__(
         self,
         link: Link,
@@ -465,24 +459,24 @@ class ScpiScanner(PolledInstrument[Voltages]):
         timeout_s: float = REPLY_TIMEOUT_S,
         inputs: InputRecorder | None = None,
     ) -> None:
-        super().__init__(link, "The scanner", 1.0 / rate_hz, timeout_s, inputs)
+        super().__init__(link, 1.0 / rate_hz, timeout_s, inputs)
         self._channels = f"(@{channels[0]},{channels[1]})"
         self._range_v = range_v
 
     async def _set_up(self) -> str:
-        name = await self._session.identify()
-        await self._session.send(
+        name = await self._identify()
+        await self._send(
             "*CLS",
             f"CONF:VOLT:DC {self._range_v:g},{self._channels}",
             # One mains period removes its hum.
             f"VOLT:DC:NPLC 1,{self._channels}",
             f"ROUT:SCAN {self._channels}",
         )
-        await self._session.check()
+        await self._check()
         return name
 
     async def _read(self) -> Voltages:
-        return read_scan(await self._session.ask(SCAN))
+        return read_scan(await self._ask(SCAN))
 
     @staticmethod
     def parse(query: str, reply: Reply) -> Voltages | None:

@@ -406,13 +406,10 @@ def violation(sample: RtdeSample, limits: UrLimits) -> str:
     for axis, value, low, high in zip("xyz", sample.tcp_pose[:3], box.lower_m, box.upper_m, strict=True):
         if not low <= value <= high:
             return f"The tool is at {axis} = {value:.3f} m, beyond the workspace's {low:g} to {high:g} m."
-    for name, value, bound, unit in (
-        ("Wrist speed", abs(sample.qd_rad_per_s[WRIST]), limits.wrist_speed_rad_per_s, "rad/s"),
-        ("Force", math.hypot(*sample.wrench[:3]), limits.force_n, "N"),
-        ("Torque", math.hypot(*sample.wrench[3:]), limits.torque_nm, "N m"),
-    ):
+    speed = ("wrist speed", abs(sample.qd_rad_per_s[WRIST]), limits.wrist_speed_rad_per_s, "rad/s")
+    for name, value, bound, unit in (speed, *_loads(sample, limits)):
         if value > bound.hard:
-            return f"{name} is {value:.2f} {unit}, beyond the hard limit of {bound.hard:g} {unit}."
+            return f"{name.capitalize()} is {value:.2f} {unit}, beyond the hard limit of {bound.hard:g} {unit}."
     return ""
 
 
@@ -460,11 +457,13 @@ def _room(direction: float, sample: RtdeSample, limits: UrLimits) -> float:
 def _fading(sample: RtdeSample, limits: UrLimits) -> list[tuple[float, str]]:
     """Return the share of the speed left, and the reason, for each of force and torque above its inner limit."""
     found = []
-    for name, value, bound, unit in (
-        ("force", math.hypot(*sample.wrench[:3]), limits.force_n, "N"),
-        ("torque", math.hypot(*sample.wrench[3:]), limits.torque_nm, "N m"),
-    ):
+    for name, value, bound, unit in _loads(sample, limits):
         if value > bound.inner:
             share = max(0.0, (bound.hard - value) / (bound.hard - bound.inner))
             found.append((share, f"{name} of {value:.2f} {unit} is above the inner limit of {bound.inner:g} {unit}"))
     return found
+
+
+def _loads(sample: RtdeSample, limits: UrLimits) -> tuple[tuple[str, float, Bound, str], ...]:
+    force_n, torque_nm = math.hypot(*sample.wrench[:3]), math.hypot(*sample.wrench[3:])
+    return ("force", force_n, limits.force_n, "N"), ("torque", torque_nm, limits.torque_nm, "N m")

@@ -8,7 +8,7 @@ from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS
 from shearloop.bank.eit.forward import CompleteElectrodeModel, ForwardModel
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS, conductivity
-from shearloop.bank.errors import ConductivityError, GeometryError
+from shearloop.bank.errors import ConductivityError
 from tests.bank.conftest import rectangle, relative, small_fingertip
 
 
@@ -103,12 +103,6 @@ def test_a_conductivity_that_is_not_positive_is_refused_before_solving(fingertip
         forward.voltages(values)
     with pytest.raises(ConductivityError, match=r"512 triangles, but conductivities of shape \(3,\)"):
         forward.voltages(np.ones(3))
-
-
-def test_a_mesh_without_32_electrodes_is_refused():
-    nodes, triangles = rectangle(2, 2, 1, 1)
-    with pytest.raises(GeometryError, match="2 electrodes, but the channel table needs 32"):
-        ForwardModel(Mesh(nodes, triangles, [[0, 1], [7, 8]], [0, 1], [1, 1]))
 
 
 def test_the_table_has_896_channels_and_128_zero_slots() -> None:

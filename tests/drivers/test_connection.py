@@ -112,8 +112,8 @@ async def test_silence_is_no_loss_and_a_cancelled_read_loses_nothing() -> None:
 
 async def test_bytes_wait_in_the_kernel_while_there_is_no_read(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
-    on_readable = SerialPort._on_readable
-    monkeypatch.setattr(SerialPort, "_on_readable", lambda port, done: (calls.append(port), on_readable(port, done)))
+    drain = SerialPort._drain
+    monkeypatch.setattr(SerialPort, "_drain", lambda port, done: (calls.append(port), drain(port, done)))
     with PtyPort() as peer, SerialPort(peer.path) as port:
         await peer.write(b"first")
         assert await read_exactly(port, 5) == b"first"

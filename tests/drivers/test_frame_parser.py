@@ -94,11 +94,6 @@ def test_a_cell_is_sound_with_digits_and_punctuation_in_their_places_alone() -> 
                 assert isinstance(found, eit_kit.FrameError)
 
 
-@given(st.one_of(st.binary(max_size=9000), st.sampled_from([line.rstrip(b"\r\n") for _, line in BROKEN])))
-def test_no_bytes_make_the_reader_fail(line: bytes) -> None:
-    eit_kit.read_line(line, ZERO_SLOTS)
-
-
 def test_a_line_is_read_to_the_last_digit() -> None:
     frame, other = FrameParser(ZERO_SLOTS).feed(GOOD + LINES[1], 5_000_000_000)
     expected = [float(value) for value in GOOD.decode().split(", ")[:-1]]
@@ -112,15 +107,6 @@ def test_a_line_is_read_to_the_last_digit() -> None:
     assert not frame.dead.any()
     with pytest.raises(ValueError, match="read-only"):
         frame.channels[0] = 1.0
-
-
-@given(st.lists(st.integers(0, 4 * eit_kit.LINE_BYTES + 4), max_size=40))
-def test_any_slicing_gives_the_same_frames(cuts: list[int]) -> None:
-    parser = FrameParser(ZERO_SLOTS)
-    frames = feed_all(parser, slices(b"".join(LINES), cuts))
-    assert [frame.line + b"\n" for frame in frames] == LINES
-    assert not parser.errors
-    assert parser.partial_lines == 0
 
 
 def test_carriage_returns_are_taken_as_part_of_the_line_end() -> None:
@@ -180,15 +166,6 @@ def test_garbage_never_yields_a_frame_nor_grows_the_parser(garbage: bytes, times
         assert len(parser._lines.partial) <= eit_kit.MAX_LINE_BYTES
     parser.feed(b"\n", 0)
     assert [frame.line + b"\n" for frame in parser.feed(GOOD, 0)] == [GOOD]
-
-
-def test_a_flood_without_newline_is_told_when_it_happens_and_only_once() -> None:
-    parser = FrameParser(ZERO_SLOTS)
-    for _ in range(100):
-        parser.feed(b"7" * 10_000, 0)
-    assert dict(parser.errors) == {FrameErrorKind.TOO_LONG: 1}
-    assert len(parser.feed(b"777\n" + GOOD, 0)) == 1
-    assert parser.errors.total() == 1
 
 
 @given(st.integers(1, eit_kit.LINE_BYTES))

@@ -100,23 +100,6 @@ def test_a_line_that_is_no_decimal_is_refused_by_kind_with_a_sentence(line: str,
     assert load_cell.describe_errors(parser.errors).count("(1 times)") == 1
 
 
-def test_a_line_that_breaks_off_is_counted_and_no_part_of_it_is_read() -> None:
-    parser = LoadParser(TORQUE_LINES)
-    parser.feed(b"0.010\r\n0.0", 0)
-    parser.restart()
-    assert [sample.raw for sample in parser.feed(b"20\r\n0.030\r\n", 1)] == [20.0, 0.03]
-    assert dict(parser.errors) == {"unfinished": 1}
-
-
-def test_line_that_never_seems_to_end_is_counted_once() -> None:
-    parser = LoadParser(TORQUE_LINES)
-    for _ in range(10):
-        assert parser.feed(b"7" * 1000, 0) == []
-    assert dict(parser.errors) == {"too_long": 1}
-    samples = parser.feed(b"7\n0.5\n", 0)
-    assert [(s.raw, s.partial) for s in samples] == [(0.5, False)]
-
-
 def test_the_ends_of_the_converters_range_are_flagged_and_their_neighbours_are_not() -> None:
     parser = LoadParser(LoadCalibration(tare_counts=0, scale_n_per_count=1e-6))
     samples = feed_lines(

@@ -95,10 +95,8 @@ def run(args: argparse.Namespace) -> int:
 def sentences_of(result: "CalibrationResult") -> list[str]:
     """Return what the user should know of a calibration."""
     calibration, regressor, timing = result.calibration, result.regressor, result.timing
-    sentences = [
-        f"Estimator {calibration.estimator.name}, {' and '.join(result.quantities)} from {result.frames} frames of the "
-        f"{' and '.join(calibration.sides)} side."
-    ]
+    outputs, sides = " and ".join(calibration.outputs), " and ".join(calibration.sides)
+    sentences = [f"Estimator {calibration.estimator.name}, {outputs} from {result.frames} frames of the {sides} side."]
     if regressor is not None and regressor.misses_loads:
         sentences.append(_misses_loads(regressor, calibration))
     if regressor is not None and result.reads_beyond is False:

@@ -14,8 +14,8 @@ from shearloop.bank.estimation.fingertip_validator import (
     FingertipValidator,
     ReferenceFrames,
     channel_noise,
+    segment_grip,
 )
-from shearloop.bank.estimation.grip_segmentation import segment_grip
 
 ALL = np.ones((1, 896), dtype=bool)
 

@@ -8,7 +8,7 @@ import pytest
 
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import TRUSTED, fit, load_delay
-from shearloop.bank.estimation.grip_segmentation import segment_grip
+from shearloop.bank.estimation.fingertip_validator import segment_grip
 from shearloop.bank.estimation.interval_regressor import student_inflation
 from shearloop.bank.estimation.load_delay import (
     LoadDelay,

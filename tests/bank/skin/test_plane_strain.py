@@ -36,6 +36,11 @@ ELEMENT = skfem.ElementVector(skfem.ElementQuad2())
 A, B = 0.01, 0.5
 
 
+@pytest.fixture(scope="session")
+def skin_112() -> CondensedSkin:
+    return condense(SECTION)
+
+
 def lame(x: NDArray[np.float64]) -> NDArray[np.float64]:
     r2 = x[0] ** 2 + x[1] ** 2
     return np.array([(A + B / r2) * x[0], (A + B / r2) * x[1]])

@@ -101,8 +101,7 @@ async def test_halt_stops_the_fingers_after_a_reconnection(way: str, tmp_path: P
         rig.stopped = True
         assert await grip, "the error"
         halt = asyncio.create_task(task.halt())
-        rig.lost.clear()
-        await rig.lost.wait()
+        await rig.link.down(len(rig.link.losses) + 1)
         rig.silence(False)
         assert await halt == ""
         rig.model.step(STEP_S)

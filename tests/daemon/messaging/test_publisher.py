@@ -74,7 +74,7 @@ def test_subscriptions_to_unknown_topics_are_not_kept(publisher: Publisher, conn
         stranger.send(b"no subscription")
         stranger.send(b"\x01health")
         until(lambda: publisher.has_subscriber("health"))
-        assert publisher._prefixes == {b"health"}
+        assert publisher._prefixes == (b"health",)
 
 
 def test_subscribers_come_and_go_while_messages_are_sent(publisher: Publisher, connect: Connect) -> None:

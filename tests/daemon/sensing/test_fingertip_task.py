@@ -178,14 +178,14 @@ async def test_an_error_of_the_estimator_ends_the_task() -> None:
             await task
 
 
-async def test_frames_that_arrive_together_are_paired_before_the_first_is_estimated() -> None:
+async def test_pairs_are_estimated_in_order_by_the_first_fingertip_that_is_free() -> None:
     publisher, slow = RecordingPublisher(), FakeEstimator(waits=0)
     combined = CombinedFingertips(estimates(COMBINED, publisher, FakeEstimator()), PERIOD_S)
-    task = fingertip(publisher, slow, combined, in_one_read=2)
-    async with running(task.run()):
+    async with running(fingertip(publisher, slow, combined, in_one_read=2).run()):
         await slow.begun.wait()
-        pair = combined.pairing.add("left", frame(1).t_mid_ns, frame(1))
-        assert pair is not None, "its partner has arrived before the estimate began"
+        combined.add("left", [frame(1)])
+        await combined.process_pairs()
+        assert publisher.numbers("eit.estimate", COMBINED) == [1], "its partner has arrived in the same read"
         slow.go_on.set()
 
 

@@ -7,29 +7,24 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.drivers.connection import LinkEvent, LinkMonitor
+from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.emulators.boards import PAPER_SKETCH, Hx711Board, Sketch
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell, LoadSample
-from tests.running import Changes, pass_on, running
+from tests.running import LinkEvents, pass_on, running
 
 SKETCH = Sketch()
 CALIBRATION = LoadCalibration(tare_counts=SKETCH.tare_counts, scale_n_per_count=1 / (0.035 * SKETCH.counts_per_nm))
 
 
-class Rig(Changes):
+class Rig(LinkEvents):
     def __init__(self, board: Hx711Board) -> None:
         super().__init__()
         self.board = board
         self.cell: LoadCell
         self.samples: list[LoadSample] = []
-        self.events: list[LinkEvent] = []
 
     def on_sample(self, sample: LoadSample) -> None:
         self.samples.append(sample)
-        self.note()
-
-    def on_link_event(self, event: LinkEvent) -> None:
-        self.events.append(event)
         self.note()
 
 
@@ -113,21 +108,21 @@ async def test_an_unplugged_board_is_lost_and_found_again(tmp_path: Path) -> Non
     async with a_rig(tmp_path) as rig:
         await rig.until(lambda: len(rig.samples) > 3)
         rig.board.command("unplug:0.05")
-        await rig.until(lambda: [event for event in rig.events if not event.up])
+        await rig.down()
         n = len(rig.samples)
         await rig.until(lambda: len(rig.samples) > n + 3)
         assert rig.samples[n].partial
         assert rig.samples[n].seq == rig.samples[n - 1].seq + 1
         assert rig.cell.diagnostics()["connections"] == 2
-        assert "gone" in next(event.sentence for event in rig.events if not event.up)
+        assert "gone" in rig.losses[0].sentence
 
 
 async def test_silence_is_reported_as_a_loss(tmp_path: Path) -> None:
     async with a_rig(tmp_path) as rig:
         await rig.until(lambda: len(rig.samples) > 3)
         rig.board.command("silence")
-        await rig.until(lambda: [event for event in rig.events if not event.up])
-        assert "sent nothing for 0.7 s" in next(event.sentence for event in rig.events if not event.up)
+        await rig.down()
+        assert "sent nothing for 0.7 s" in rig.losses[0].sentence
 
 
 async def test_a_tare_takes_effect_with_the_next_sample(tmp_path: Path) -> None:

@@ -13,13 +13,14 @@ from unittest.mock import patch
 
 import pytest
 
-from shearloop.drivers.connection import LinkEvent, LinkMonitor
+from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.emulators.gripper import Gripper, GripperMechanics, ModbusSlave, UrcapSession
 from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.modbus_client import ModbusClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
+from tests.running import LinkEvents
 
 STEP_S = 0.01
 # Between two looks of the driver at its clock.
@@ -37,17 +38,11 @@ class Rig:
     steps_left: int = MOST_STEPS
     stopped: bool = False
     driver: RobotiqGripper = field(init=False)
-    events: list[LinkEvent] = field(default_factory=list)
-    lost: asyncio.Event = field(default_factory=asyncio.Event)
+    link: LinkEvents = field(default_factory=LinkEvents)
 
     def monotonic_ns(self) -> int:
         self.steps_left = MOST_STEPS
         return round(self.t_s * 1e9)
-
-    def on_link_event(self, event: LinkEvent) -> None:
-        self.events.append(event)
-        if not event.up:
-            self.lost.set()
 
     def silence(self, silent: bool) -> None:
         self.server.command("silence" if silent else "normal")
@@ -72,7 +67,7 @@ async def a_rig(way: str, tmp_path: Path) -> AsyncIterator[Rig]:
         client,
         CALIBRATION,
         poll_s=0.0,
-        monitor=LinkMonitor(rig, 0.001, 0.002),
+        monitor=LinkMonitor(rig.link, 0.001, 0.002),
     )
 
     async def pass_time() -> None:

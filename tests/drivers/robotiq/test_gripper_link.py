@@ -69,7 +69,7 @@ async def test_lost_gripper_reconnects_and_reports_it(way: str, tmp_path: Path) 
         await rig.server.disconnect()
         # The next states are awaited, not made up.
         coming = asyncio.create_task(anext(states))
-        await rig.lost.wait()
+        await rig.link.down()
         assert rig.driver.latest is None
         assert not coming.done()
         lost_ns = round(rig.t_s * 1e9)
@@ -79,12 +79,12 @@ async def test_lost_gripper_reconnects_and_reports_it(way: str, tmp_path: Path) 
         assert second.seq > first.seq
         openings = rig.driver.diagnostics()["connections"]
         assert openings == 2
-        ups = [event.up for event in rig.events]
+        ups = [event.up for event in rig.link.events]
         assert ups[0]
         assert ups[-1]
         assert not all(ups)
         # A loss and its first failed attempt are news, the repetitions of that are not.
-        losses = [event for event in rig.events if not event.up]
+        losses = rig.link.losses
         assert not losses[0].repeated
         assert [event.repeated for event in losses[2:]] == [True] * len(losses[2:])
 
@@ -99,7 +99,7 @@ async def test_loss_during_a_command_is_reported(way: str, tmp_path: Path) -> No
             await rig.driver.move(GripperCommand(50.0))
         rig.silence(False)
         await anext(states)
-        assert [(event.up, event.sentence == str(met.value)) for event in rig.events] == [
+        assert [(event.up, event.sentence == str(met.value)) for event in rig.link.events] == [
             (True, False),
             (False, True),
             (True, False),

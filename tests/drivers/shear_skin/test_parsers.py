@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.errors import ProtocolError
-from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.drivers.shear_skin.instruments import (
     ADC_BAUD,
     MAX_REPLY_BYTES,
@@ -60,17 +59,6 @@ def test_refused_lines_are_counted_by_kind() -> None:
     parser = PairParser()
     parser.feed(b"cut\n0.1,0.2,0.3\n0.1\n0,1\nnan,0.1\n\r\n" + b"1" * 50 + b"\n0.100000,0.200000\n", 0)
     assert parser.errors == {"not two decimals": 4, "empty": 1, "too long": 1}
-
-
-def test_a_line_that_breaks_off_is_counted_and_no_part_of_it_is_read() -> None:
-    parser = PairParser()
-    parser.feed(b"\n0.125000,0.1", 0)
-    parser.handle(RawEvent(InputKind.OPENED, 0))
-    parser.handle(RawEvent(InputKind.OPENED, 0))
-    assert parser.feed(b"0.125000,0.126000\n", 1) == [], "after the opening a line may be under way"
-    (found,) = parser.feed(b"0.127000,0.128000\n", 2)
-    assert (found.v1_v, found.v2_v) == (0.127, 0.128)
-    assert parser.errors == {"unfinished": 1}
 
 
 def test_lines_that_arrive_together_are_a_period_apart() -> None:

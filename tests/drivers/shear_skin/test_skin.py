@@ -9,18 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.drivers.connection import LinkEvent, LinkMonitor, SerialLink, TcpLink
+from shearloop.drivers.connection import LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.drivers.emulators.skin import Circuit, EmulatedAdcBoard, EmulatedKeithley6430, EmulatedScanner
 from shearloop.drivers.shear_skin.instruments import OUTPUT, READ, SOURCE_BAUD, AdcBoard, Keithley6430, ScpiScanner
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
-from tests.running import DEADLINE_S, Changes, LinkEvents, pass_on, running
+from tests.running import DEADLINE_S, LinkEvents, pass_on, running
 
 R1, R2 = 24.6, 25.3
 RATE_HZ = 500.0
 
 
-class Bench(Changes):
+class Bench(LinkEvents):
     def __init__(
         self, circuit: Circuit, played: EmulatedKeithley6430, source: Server, reader: Callable[[str], None]
     ) -> None:
@@ -28,19 +28,10 @@ class Bench(Changes):
         self.circuit, self.played, self.source, self.reader = circuit, played, source, reader
         self.skin: ShearSkin
         self.samples: list[SkinSample] = []
-        self.events: list[LinkEvent] = []
 
     def on_sample(self, sample: SkinSample) -> None:
         self.samples.append(sample)
         self.note()
-
-    def on_link_event(self, event: LinkEvent) -> None:
-        self.events.append(event)
-        self.note()
-
-    @property
-    def losses(self) -> int:
-        return sum(not event.up for event in self.events)
 
     @property
     def source_errors(self) -> Mapping[str, int]:
@@ -167,10 +158,10 @@ async def test_a_source_that_is_silent_or_gone_is_named_and_set_up_again_without
     async with a_bench(tmp_path, serial_source=serial_source, adc=True, deadline_s=0.1) as bench:
         await bench.next_says()
         for outage in ("silence", "unplug"):
-            losses = bench.losses
+            losses = len(bench.losses)
             bench.source.command(outage)
             # A late reading of the source looks like a lost one for a while; the outage itself is what is awaited.
-            await bench.until(lambda n=losses: bench.losses > n)
+            await bench.until(lambda n=losses: len(bench.losses) > n)
             await bench.next_says(SkinFault.SOURCE_LOST)
             assert bench.circuit.output_on, "the current flows on while the cable is out"
             bench.source.command("normal")
@@ -225,9 +216,9 @@ async def test_voltages_that_stop_coming_are_awaited(tmp_path: Path, adc: bool) 
     async with a_bench(tmp_path, serial_source=False, adc=adc, deadline_s=0.1) as bench:
         for outage in ("unplug", "silence"):
             await bench.next_says()
-            losses = bench.losses
+            losses = len(bench.losses)
             bench.reader(outage)
-            await bench.until(lambda n=losses: bench.losses > n)
+            await bench.until(lambda n=losses: len(bench.losses) > n)
             bench.reader("normal")
         await bench.next_says()
         assert any(sample.missed for sample in bench.samples), "the gap is counted"

@@ -107,14 +107,17 @@ async def test_state_comes_125_times_a_second_with_the_controllers_own_time(cont
         assert sorted(states, key=lambda state: state.timestamp_s) == states
 
 
-async def test_twist_stops_when_the_client_is_killed(controller: ControllerProcess) -> None:
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSEGV])
+async def test_twist_stops_when_the_client_is_killed(controller: ControllerProcess, end: signal.Signals) -> None:
     link = LinkEvents()
     async with turning(controller, link) as robot:
         killed_ns = time.monotonic_ns()
-        os.kill(pid_of(robot), signal.SIGKILL)
+        os.kill(pid_of(robot), end)
         stopped = await controller.event("motion-stopped", killed_ns)
         assert stopped_after_s(stopped, killed_ns) <= STOPPED_WITHIN_S
-        assert "SIGKILL" in (await link.down()).sentence
+        loss = await link.down()
+        assert end.name in loss.sentence
+        assert "motion disabled" in loss.sentence
         assert robot.losses == {"crashed": 1}
 
         state = await until(robot, lambda state: state.program_running and not state.recovering)
@@ -184,16 +187,6 @@ async def test_lost_rtde_ends_the_worker_and_the_next_moves_nothing(controller: 
         assert "not been enabled" in (await robot.send(WristSpeed(0.5, 4.0))).refusal
         await enable(robot)
         assert not controller.happened("motion-started", dropped_ns)
-
-
-async def test_crash_of_the_client_is_named(controller: ControllerProcess) -> None:
-    link = LinkEvents()
-    async with running(settings_for(controller.host), link) as robot:
-        await enable(robot)
-        os.kill(pid_of(robot), signal.SIGSEGV)
-        loss = await link.down()
-        assert "SIGSEGV" in loss.sentence
-        assert "motion disabled" in loss.sentence
 
 
 async def test_hung_worker_is_replaced(controller: ControllerProcess) -> None:
@@ -283,9 +276,7 @@ asyncio.run(main())
 """
 
 
-async def test_killed_daemon_leaves_a_resting_robot_and_no_process(
-    controller: ControllerProcess,
-) -> None:
+async def test_killed_daemon_leaves_a_resting_robot_and_no_process(controller: ControllerProcess) -> None:
     daemon = await asyncio.create_subprocess_exec(
         sys.executable, "-c", DAEMON, controller.host, stdout=asyncio.subprocess.PIPE, cwd=ROOT
     )

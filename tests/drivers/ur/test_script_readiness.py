@@ -58,9 +58,7 @@ def test_ended_or_paused_program_is_not_awaited(monkeypatch: pytest.MonkeyPatch,
     assert not ready.wait()
 
 
-def test_wait_for_readiness_has_a_timeout(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_wait_for_readiness_has_a_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = Samples(monkeypatch, (DONE, PLAYING))
     ready = ScriptReadiness(samples, 0.1)
     ready.command_sent()

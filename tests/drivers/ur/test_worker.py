@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from shearloop.drivers.ur import worker
 from shearloop.drivers.ur.messages import CommandReply, Disconnect, Enable, Message, RtdeSample, Unlock, WristSpeed
 from tests.drivers.ur.flight import Flight, flying
@@ -87,14 +89,15 @@ def test_our_program_is_ended_on_exit(daemon: Daemon) -> None:
     ]
 
 
-def test_foreign_program_plays_on_after_exit(daemon: Daemon) -> None:
+@pytest.mark.parametrize("runtime_state", [2, 4], ids=["playing", "paused"])
+def test_foreign_program_is_left_alone_on_exit(daemon: Daemon, runtime_state: int) -> None:
     """For example the program of another daemon."""
     arm = CyclingArm()
-    arm.be(runtime_state=2)
+    arm.be(runtime_state=runtime_state)
     daemon.send(Disconnect())
     fly(daemon, arm)
     assert arm.calls == []
-    assert arm.reading.program_running
+    assert arm.reading.runtime_state == runtime_state
 
 
 def test_our_paused_program_is_stopped_on_exit(daemon: Daemon) -> None:
@@ -112,14 +115,6 @@ def test_our_paused_program_is_stopped_on_exit(daemon: Daemon) -> None:
     arm = Stopped()
     fly(daemon, arm)
     assert arm.calls[:4] == ["clear_command", "upload", "arm_watchdog", "stop"]
-
-
-def test_foreign_paused_program_is_not_stopped_on_exit(daemon: Daemon) -> None:
-    arm = CyclingArm()
-    arm.be(runtime_state=4)
-    daemon.send(Disconnect())
-    fly(daemon, arm)
-    assert arm.calls == []
 
 
 CRASHING = """

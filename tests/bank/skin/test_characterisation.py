@@ -17,11 +17,9 @@ from shearloop.bank.skin.characterisation import (
 )
 from shearloop.bank.skin.membrane import paper_membrane
 
-RNG_SEED = 20
-
 
 def test_the_noise_floor_is_the_noise_put_in_and_not_the_wandering_between_windows() -> None:
-    rng = np.random.default_rng(RNG_SEED)
+    rng = np.random.default_rng(20)
     time_s = np.arange(0, 600, 0.1)
     wandering = 0.05 * np.floor(time_s) / 600
     still = wandering + rng.normal(0, 2e-4, len(time_s))

@@ -291,7 +291,7 @@ class CommandHandler:
         return CommandReply(sent=self._executor.sent, clipped=self._executor.clipped)
 
     def _stop(self, number: int, command: Stop, sample: RtdeSample, now_ns: int) -> str:
-        """Stop on command, also an unlocking; return why not, or an empty string."""
+        """Stop on command; return why not, or an empty string."""
         if self._recovery is not None and self._unlock_number is not None:
             self._recovery.give_up("Unlocking was ended by a stop.")
         if command.deceleration_rad_per_s2 <= 0:

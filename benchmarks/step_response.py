@@ -36,9 +36,9 @@ from shearloop.daemon.analysis.charts.simulated_loop import (
     settings_for,
     started_controller,
 )
+from shearloop.daemon.analysis.creep import Stretch, fit_creep
 from shearloop.daemon.cli.calibrate_demo import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
-from shearloop.daemon.control.identification import Creep, Stretch, fit_creep
-from shearloop.daemon.control.loop_inputs import LoopConfig
+from shearloop.daemon.control.loop_inputs import Creep, LoopConfig
 from shearloop.daemon.control.margins import margin_refusal
 from shearloop.daemon.synthetic_frames import RigFrames
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S

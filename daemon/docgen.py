@@ -1,7 +1,6 @@
-"""Writes the generated pages: `docs/messages.md`, and the safety table in `docs/safety.md` (`make docs`)."""
+"""Writes the generated parts of `docs/messages.md` and `docs/safety.md` (`make docs`)."""
 
 import dataclasses
-import re
 import types
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -9,11 +8,10 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from shearloop.daemon.cli.command import COMMANDS
 from shearloop.daemon.control.safety import TABLE, Response
-from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS
-from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, TOPICS, Message
+from shearloop.daemon.messaging.messages import TOPICS, Message
 
-ROOT = Path(__file__).resolve().parents[1]
-EXAMPLES = Path("docs/examples")
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+EXAMPLES = DOCS / "examples"
 RESPONSES = {
     Response.NOTE: "reported only",
     Response.REFUSE_START: "no experiment starts; a running one continues",
@@ -29,54 +27,28 @@ _LANGUAGES = (
 )
 
 
-def messages_page(root: Path) -> str:
-    """Return the page, with the example programs below `root`."""
-    parts = [_introduction()]
+def topics() -> str:
+    """Return the topics of `daemon/messaging/messages.py` with their keys."""
+    parts = []
     for topic, kind in TOPICS.items():
         rate = "on change" if kind.rate_hz is None else f"{kind.rate_hz:g} a second"
-        parts.append(
-            f"### `{topic}`, {rate}\n\n{kind.__doc__}\n\n{table(('key', 'type', 'unit', 'meaning'), _keys(kind))}"
-        )
-    parts.append(_commands().rstrip())
-    parts.append("## Subscribers\n\nEach is a complete program from `docs/examples/`.")
+        keys = table(("key", "type", "unit", "meaning"), _keys(kind))
+        parts.append(f"### `{topic}`, {rate}\n\n{kind.__doc__}\n\n{keys}")
+    return "\n\n".join(parts)
+
+
+def commands() -> str:
+    """Return the table of commands."""
+    return table(("command", "what it does"), [(f"`{name}`", what) for name, what in COMMANDS.items()])
+
+
+def subscribers() -> str:
+    """Return the example programs of `docs/examples/`."""
+    parts = []
     for language, name, fence in _LANGUAGES:
-        text = (root / EXAMPLES / name).read_text(encoding="utf-8").strip()
+        text = (EXAMPLES / name).read_text(encoding="utf-8").strip()
         parts.append(f"### {language}\n\n```{fence}\n{text}\n```")
-    return "\n\n".join(parts) + "\n"
-
-
-def _introduction() -> str:
-    return f"""# Messages
-
-Written by `make docs` from `daemon/messaging/messages.py`; change it there.
-
-The daemon publishes on a ZeroMQ PUB socket (`publish`, by default `{PUBLISH_ADDRESS}`). A message has two frames:
-the topic, and a [msgpack](https://msgpack.org) map with text keys. Numbers, booleans and texts are plain keys. A
-missing value is nil. An array is msgpack `bin`: little-endian float32 in C order, with its shape in `NAME_shape`.
-Plotting tools ignore both. `shearloop listen TOPIC --json` prints one message per line as JSON.
-
-PlotJuggler: see [live-view.md](live-view.md#plotjuggler).
-
-A message is stale after {STALE_AFTER_PERIODS:g} periods of its topic. A slow subscriber loses messages: `seq` then has
-a gap. Connections from other computers need keys: [security.md](security.md).
-
-## Topics
-
-Every message has these keys:
-
-{table(("key", "type", "unit", "meaning"), _envelope())}"""
-
-
-def _envelope() -> Iterator[tuple[str, ...]]:
-    yield "`timestamp`", "number", "s", "Unix time of the measurement or event"
-    yield "`t_mono_ns`", "integer", "ns", "the same time on CLOCK_MONOTONIC of the daemon's computer"
-    yield "`seq`", "integer", "", "number of the message of this topic and source, without gaps"
-    yield (
-        "`source`",
-        "text",
-        "",
-        "a fingertip's name, `skin`, `load_cell`, `robot`, `gripper`, `loop` or `daemon`",
-    )
+    return "\n\n".join(parts)
 
 
 def _keys(kind: type[Message]) -> Iterator[tuple[str, ...]]:
@@ -97,26 +69,6 @@ def _type_name(hint: Any) -> str:
     return plain.get(hint, "map" if origin is Mapping else "array")
 
 
-def _commands() -> str:
-    rows = [(f"`{name}`", what) for name, what in COMMANDS.items()]
-    return f"""## Commands
-
-The daemon answers on a ZeroMQ ROUTER socket (`commands`, by default `{COMMAND_ADDRESS}`). Use a REQ or DEALER socket.
-A request is a msgpack map: `{{"command": NAME}}` and the command's arguments. Each gets one reply:
-`{{"ok": true, …}}` or `{{"ok": false, "reason": REASON}}`. Limits are in [security.md](security.md).
-`shearloop command NAME --json` sends a command from a shell.
-
-{table(("command", "what it does"), rows)}
-
-| argument | of | meaning |
-|---|---|---|
-| `experiment` | `start` | path of a file on the daemon's computer; default: the configured experiment |
-| `source` | `tare` | one sensor's name; default: all |
-| `heatmap` | `set` | `always` or `on_request` |
-| `source` | `set` | one fingertip's name; default: all |
-"""
-
-
 def safety_table() -> str:
     """Return the safety table as Markdown."""
     rows = []
@@ -128,18 +80,18 @@ def safety_table() -> str:
     return table(("fault", "response", "message", "what to do"), rows)
 
 
-def pages(root: Path) -> dict[Path, str]:
-    """Return the expected text of each page by its path."""
-    safety = root / "docs/safety.md"
-    return {
-        root / "docs/messages.md": messages_page(root),
-        safety: re.sub(
-            r"(<!-- generated: safety table -->\n).*?(<!-- end -->)",
-            lambda match: f"{match[1]}\n{safety_table()}\n\n{match[2]}",
-            safety.read_text(encoding="utf-8"),
-            flags=re.DOTALL,
-        ),
-    }
+def pages() -> dict[Path, str]:
+    """Return the expected text of each page by its path: generated parts stand between two comments."""
+    parts = {"topics": topics, "commands": commands, "subscribers": subscribers, "safety table": safety_table}
+    found = {}
+    for name in ("messages.md", "safety.md"):
+        text = (DOCS / name).read_text(encoding="utf-8")
+        for part, write in parts.items():
+            begin, end = f"<!-- generated: {part} -->\n", "<!-- end -->"
+            before, mark, rest = text.partition(begin)
+            text = before + mark + (f"\n{write()}\n\n{end}{rest.partition(end)[2]}" if mark else "")
+        found[DOCS / name] = text
+    return found
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -150,6 +102,6 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 if __name__ == "__main__":
-    for path, text in pages(ROOT).items():
+    for path, text in pages().items():
         path.write_text(text, encoding="utf-8")
-        print(path.relative_to(ROOT))
+        print(path.relative_to(DOCS.parent))

@@ -18,8 +18,7 @@ from shearloop.daemon.control.experiment_schema import (
     check_limits,
 )
 from shearloop.daemon.control.gripper_task import GripperTask
-from shearloop.daemon.control.identification import Creep
-from shearloop.daemon.control.loop_inputs import TorqueSource
+from shearloop.daemon.control.loop_inputs import Creep, TorqueSource
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.logs import LinkLog
@@ -115,7 +114,7 @@ def make_gripper(
         RobotiqGripper(client, calibration, monitor=LinkMonitor(DeviceLink("gripper", loop))),
         publisher,
         loop,
-        fingertip_diameter=diameters.latest,
+        diameters=diameters,
         measures_diameters=config.gripper.calibration is not None,
     )
 

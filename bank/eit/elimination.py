@@ -13,7 +13,7 @@ from numba import config, njit
 from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray, IntArray
-from shearloop.bank.eit.forward import Terms
+from shearloop.bank.eit.mesh import Terms
 
 # Matrices that are factorised together, each in its lane of a vector register.
 LANES: Final = 4

@@ -6,7 +6,7 @@ electrode e with contact impedance z_e, and I_e the current into it, for all tes
     ∫ s ∇u·∇v dx + Σ_e 1/z_e ∫_e (u − U_e)(v − V_e) ds = Σ_e I_e V_e
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -14,9 +14,9 @@ from scipy.sparse.linalg import splu
 from skfem import Basis, BilinearForm, ElementTriP1, FacetBasis, LinearForm, MeshTri
 from skfem.helpers import dot, grad
 
-from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES, STIMULATION_CURRENT
-from shearloop.bank.eit.mesh import Mesh, require_fingertip, rows_of_edges
+from shearloop.bank.eit.mesh import Mesh, Terms, require_fingertip, rows_of_edges
 from shearloop.bank.errors import ConductivityError
 
 # The node of zero potential; only differences of potentials leave this module.
@@ -169,26 +169,6 @@ def require_positive(conductivity: FloatArray, n_triangles: int) -> None:
             f"the conductivity is not positive everywhere: its smallest value is {conductivity.min():.6g}, "
             f"and {int((conductivity <= 0).sum())} of {n_triangles} triangles are at or below 0"
         )
-
-
-class Terms(NamedTuple):
-    """Terms that add up to a matrix: entry (rows, columns)[p] gets Σ values[p] · factors[source[p]]; all are (P,).
-
-    A factor is the conductivity of a triangle or, numbered after them, the contacts' constant 1.
-    """
-
-    rows: IntArray
-    columns: IntArray
-    values: FloatArray
-    source: IntArray
-
-    def where(self, keep: BoolArray) -> "Terms":
-        """Return some of the terms."""
-        return Terms(self.rows[keep], self.columns[keep], self.values[keep], self.source[keep])
-
-    def moved(self, place: IntArray) -> "Terms":
-        """Return the terms with each unknown at its place."""
-        return self._replace(rows=place[self.rows], columns=place[self.columns])
 
 
 @BilinearForm

@@ -5,14 +5,14 @@ import pickle
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.csgraph import connected_components
 
-from shearloop.bank.arrays import FloatArray, IntArray
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.eit.channels import N_ELECTRODES
 from shearloop.bank.errors import GeometryError
 
@@ -284,3 +284,23 @@ def rows_of_edges(edges: IntArray, among: IntArray, n_nodes: int) -> IntArray:
     keys, wanted = among @ [n_nodes, 1], edges @ [n_nodes, 1]
     at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
     return np.where(keys[at] == wanted, at, -1)
+
+
+class Terms(NamedTuple):
+    """Terms that add up to a matrix: entry (rows, columns)[p] gets Σ values[p] · factors[source[p]]; all are (P,).
+
+    A factor is the conductivity of a triangle or, numbered after them, the contacts' constant 1.
+    """
+
+    rows: IntArray
+    columns: IntArray
+    values: FloatArray
+    source: IntArray
+
+    def where(self, keep: BoolArray) -> "Terms":
+        """Return some of the terms."""
+        return Terms(self.rows[keep], self.columns[keep], self.values[keep], self.source[keep])
+
+    def moved(self, place: IntArray) -> "Terms":
+        """Return the terms with each unknown at its place."""
+        return self._replace(rows=place[self.rows], columns=place[self.columns])

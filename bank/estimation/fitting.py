@@ -5,7 +5,7 @@ be evaluated on.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from shearloop.bank.estimation.bank_match import BankMatcher, ElectrodeNumbering
 from shearloop.bank.estimation.calibration import Assumption, Calibration
 from shearloop.bank.estimation.estimator import (
     LEAST_DIAMETERS,
-    Bounds,
     CalibrationRow,
     Estimator,
     Material,
@@ -130,7 +129,11 @@ def _fit_raw(
     rows = [row for i, one in enumerate(recordings) for row in _replay(calibration, matcher, i, one, every)]
     if not rows:
         raise CalibrationError("no frame of the recordings is gripped and undisturbed for long enough to calibrate on")
-    bounds = _row_bounds(recordings, rows, timing_uncertainty_s) if timing_uncertainty_s else None
+    bounds = None
+    if timing_uncertainty_s:
+        each = [torque_bounds(one, timing_uncertainty_s) for one in recordings]
+        least_nm, largest_nm = np.array([[end[row.frame] for end in each[row.recording]] for row in rows]).T
+        bounds = least_nm, largest_nm
     estimator = calibration.estimator.with_imputer(np.array([row.position for row in rows]), calibration.validators)
     features, torque_nm = np.array([row.features for row in rows]), np.array([row.torque_nm for row in rows])
     estimator, regressor, unexplained = estimator.fit_torque(features, torque_nm, bounds)
@@ -147,13 +150,6 @@ def _fit_raw(
             )
         torque = None
     return replace(calibration, estimator=estimator, torque=torque, diameter=diameter)
-
-
-def _row_bounds(recordings: list[FrameSeries], rows: list[CalibrationRow], uncertainty_s: float) -> Bounds:
-    """Return the least and the largest torque that each row may have."""
-    found = [torque_bounds(one, uncertainty_s) for one in recordings]
-    least_nm, largest_nm = (np.array([found[row.recording][end][row.frame] for row in rows]) for end in (0, 1))
-    return least_nm, largest_nm
 
 
 def _replay(
@@ -214,19 +210,18 @@ def _fit_slices(
                 f"{n} slices with a torque are too few for the estimator {estimator.name}; record "
                 f"{estimator.least_slices} or more"
             )
-        differences = np.abs(frames[known])
+        differences = np.abs(frames[known, 0])
         # First, because it checks that a board sent the slices.
-        novelty = NoveltyDetector.fit(differences[:, 0])
-        reader = SliceReader(estimator, matcher, times[known])
-        features = np.array([reader.features(one, row) for row, one in enumerate(differences[:, 0])])
-        test = ContaminationTest(differences[:, 0], reader) if quantity == "torque" else None
+        novelty = NoveltyDetector.fit(differences)
+        test = ContaminationTest(differences, times[known], estimator, matcher)
+        features = np.array([test.features(one, row) for row, one in enumerate(differences)])
         regressor = fit_interval_regressor(
             features[:, estimator.columns[quantity]],
             values[known],
             estimator.slices_fit(quantity, values[known]),
             strengths=estimator.strengths,
             left_out=later_origins(n) if quantity == "torque" else (),
-            test=test,
+            test=test if quantity == "torque" else None,
             full_range=full_range,
         )
         models[quantity] = OutputModel(regressor, novelty, estimator.k_range(features))
@@ -234,24 +229,6 @@ def _fit_slices(
         raise CalibrationError("the slices come with neither torque nor diameter")
     assumptions: tuple[Assumption, ...] = ("full range",) if full_range and "torque" in models else ()
     return replace(blank, torque=models.get("torque"), diameter=models.get("diameter"), assumptions=assumptions)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SliceReader:
-    """Makes features of slices at the times t_s (n,)."""
-
-    estimator: Estimator
-    matcher: BankMatcher | None
-    t_s: FloatArray
-
-    def features(self, difference: FloatArray, row: int) -> FloatArray:
-        """Return the (d,) features of a (896,) difference at the time of a row."""
-        frame = ProcessedFrame(difference[None], (), _ALL[None])
-        return self.estimator.features(Reading(frame, float(self.t_s[row]), self.matcher))[0]
-
-    def torque_inputs(self, difference: FloatArray, row: int) -> FloatArray:
-        """Return those features that the torque is predicted from."""
-        return self.features(difference, row)[self.estimator.columns["torque"]]
 
 
 class ContaminationTest:
@@ -262,14 +239,21 @@ class ContaminationTest:
     electrodes renumbered.
     """
 
-    def __init__(self, differences: FloatArray, reader: SliceReader) -> None:
-        """Take (n, 896) differences in time order, and their reader."""
-        self._differences = differences
-        self._reader = reader
+    def __init__(
+        self, differences: FloatArray, t_s: FloatArray, estimator: Estimator, matcher: BankMatcher | None
+    ) -> None:
+        """Take (n, 896) differences at the times t_s (n,) in order, and their estimator."""
+        self._differences, self._t_s = differences, t_s
+        self._estimator, self._matcher = estimator, matcher
         mean = differences.mean(axis=0)
         self._foreign = [mean[ElectrodeNumbering(turn, mirrored).model_channels()] for turn, mirrored in _NUMBERINGS]
         self._detectors: dict[bytes, NoveltyDetector] = {}
         self._features: dict[tuple[int, int, float], FloatArray] = {}
+
+    def features(self, difference: FloatArray, row: int) -> FloatArray:
+        """Return the (d,) features of a (896,) difference at the time of a row."""
+        frame = ProcessedFrame(difference[None], (), _ALL[None])
+        return self._estimator.features(Reading(frame, float(self._t_s[row]), self._matcher))[0]
 
     def growth(self, past: IntArray, future: IntArray) -> FloatArray:
         """Return the growth of the intervals of (q,) later slices, by a detector fitted to the earlier ones."""
@@ -292,7 +276,7 @@ class ContaminationTest:
                     limit_shares.append(novelty.limit_share)
                     key = row, number, share
                     if key not in self._features:
-                        self._features[key] = self._reader.torque_inputs(mixed, row)
+                        self._features[key] = self.features(mixed, row)[self._estimator.columns["torque"]]
                     features.append(self._features[key])
         return Mixtures(np.array(rows, dtype=np.int64), np.array(features), np.array(limit_shares))
 

@@ -3,7 +3,7 @@
 import re
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +12,7 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, TactileFrame
-from shearloop.daemon.control.identification import Stretch
 
-# A longer time without a torque ends a grip; single invalid frames do not.
-LONGEST_GAP_S = 5.0
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 
 
@@ -45,17 +42,6 @@ def estimate_in_worker(shared: tuple[Calibration, str | None], series: FrameSeri
     """Return `estimate_series` for a calibration and the bank's path, which the worker opens."""
     calibration, path = shared
     return estimate_series(calibration, series, None if path is None else Bank.open(path))
-
-
-def grips_of(track: EstimateTrack) -> Iterator[Stretch]:
-    """Yield the grips of a series in order: valid torques with the load cell's torque."""
-    shear = np.array([np.nan if one.torque_nm is None else one.torque_nm for one in track.estimates])
-    torque = track.series.torque_at_frames()
-    known = np.isfinite(shear) & np.isfinite(torque)
-    t_s = track.series.t_s[known]
-    for rows in np.split(np.arange(t_s.size), np.flatnonzero(np.diff(t_s) > LONGEST_GAP_S) + 1):
-        if rows.size:
-            yield Stretch(t_s[rows], shear[known][rows], torque[known][rows])
 
 
 def figures_of(tracks: Sequence[EstimateTrack]) -> dict[str, float | int | None]:

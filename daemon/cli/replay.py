@@ -80,13 +80,13 @@ async def _replay(
 
     from shearloop.daemon.cli.terminal import EstimatePrinter, progress_bar
     from shearloop.daemon.messaging.publisher import Publisher
-    from shearloop.daemon.recording.replay import Replay, ReplayClock, ReplayPipeline
+    from shearloop.daemon.recording.replay import Replay, ReplayClock
 
     clock = ReplayClock()
     with ExitStack() as opened:
         publisher = Publisher(opened.enter_context(zmq.asyncio.Context()), args.publish, clock)
         opened.callback(publisher.close)
-        replay = Replay(run, ReplayPipeline(config, run.replay_events(), publisher), publisher, clock)
+        replay = Replay(run, config, publisher, clock)
         if args.show:
             publisher.add_listener(EstimatePrinter(sys.stdout))
         while args.wait and not publisher.has_subscribers():  # noqa: ASYNC110 - the publisher has no event

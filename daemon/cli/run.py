@@ -41,8 +41,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run until a signal, `shearloop command stop`, or the end of the experiment (`stop_when_done`)."""
-    from shearloop.daemon.gc_control import without_long_collections
     from shearloop.daemon.logs import NonBlockingWriter, logging_to_stderr
+    from shearloop.daemon.realtime import without_long_collections
     from shearloop.daemon.signals import ending_signals
 
     # Until the event loop handles the signals: stopping a service that is still starting is no failure.

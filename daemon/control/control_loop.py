@@ -22,8 +22,8 @@ from shearloop.daemon.control.fault_detection import (
     detect_faults,
     fresh_for_s,
 )
-from shearloop.daemon.control.identification import Creep, ToolModel
-from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopConfig, TorqueSample, TorqueSource
+from shearloop.daemon.control.identification import ToolModel
+from shearloop.daemon.control.loop_inputs import ArmStatus, Creep, GripperStatus, LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDecision, SafetyMonitor
 from shearloop.daemon.control.step_runner import ACTIVE, Action, Experiment, ExperimentPhase, GripTo, Hold, TrackTorque
 from shearloop.daemon.control.wrist_controller import WristController
@@ -311,6 +311,8 @@ class ControlLoop:
             velocity, ended = wrist.identify(wrist.excitation, t_ns, wrist_rad)
             if ended is not None:
                 self.on_action_ended(ended)
+                if experiment.phase not in ACTIVE:
+                    return self._ended(decision)
         else:
             velocity = wrist.turn(command.wrist, t_ns, wrist_rad, grip.origin_rad)
         self.status = LoopStatus("held" if held else experiment.phase.value, command.activity, velocity, decision)

@@ -12,6 +12,7 @@ from shearloop.daemon.control.loop_inputs import GripperStatus
 from shearloop.daemon.control.step_runner import GripTo
 from shearloop.daemon.messaging.messages import GripperStateMessage, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperCommand, GripperState, ObjectStatus
@@ -30,10 +31,10 @@ class GripperTask:
         publisher: Publisher,
         control_loop: ControlLoop,
         *,
-        fingertip_diameter: Callable[[int], Measured | None] = lambda _: None,
+        diameters: FingertipDiameters | None = None,
         measures_diameters: bool = True,
     ) -> None:
-        """`fingertip_diameter` returns the fingertips' diameter at a time in ns.
+        """Take the gripper and its consumers; `diameters` are the fingertips'.
 
         A gripper `measures_diameters` if its widths were calibrated with its fingertips on.
         """
@@ -41,7 +42,7 @@ class GripperTask:
         self._gripper = gripper
         self._publisher = publisher
         self._control_loop = control_loop
-        self._fingertip_diameter = fingertip_diameter
+        self._diameters = diameters
 
     async def run(self) -> None:
         """Publish every state and pass it on, until cancelled."""
@@ -107,7 +108,7 @@ class GripperTask:
         return self._gripper.diagnostics()
 
     def _publish(self, state: GripperState) -> None:
-        tool = tool_diameter(state, self._fingertip_diameter(state.t_ns))
+        tool = tool_diameter(state, self._diameters.latest(state.t_ns) if self._diameters is not None else None)
         self._publisher.publish(
             GripperStateMessage(
                 source="gripper",

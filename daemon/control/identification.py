@@ -1,19 +1,12 @@
-"""Identification: small twists excite the tool, and its stiffness, delay and noise are fitted to the record.
-
-Also the gel's creep: under a held twist its shear stays and its torque falls. A fingertip measures the shear. With γ
-the shear, expressed as the torque on a fresh gel, the torque is γ − share·c. Here c follows γ with a time constant: one
-Maxwell element in parallel with a spring (the standard linear solid, e.g. Ferry, Viscoelastic Properties of Polymers,
-1980, chapter 1). The parameters are fitted on held twists with a load cell.
-"""
+"""Identification: small twists excite the tool, and its stiffness, delay and noise are fitted to the record."""
 
 import math
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from shearloop.bank.arrays import FloatArray
@@ -33,9 +26,6 @@ _MISFIT_SHARE = 0.3
 # The expected drift over the record, relative to the spring's part: relaxation.
 _DRIFT_SHARE = 0.04
 _ARRIVED_RAD = 2e-3
-# Time constants of creep that are tried; with fewer readings the noise decides.
-_CREEP_TIMES_S = np.geomspace(2.0, 200.0, 60)
-_FEWEST_READINGS = 20
 
 
 class IdentifyError(UserError):
@@ -263,13 +253,13 @@ def _actuation(record: Record) -> float:
 
 @checked_dataclass(frozen=True, slots=True, kw_only=True, config=ConfigDict(allow_inf_nan=False))
 class ExciteSettings:
-    """The identification's swings: between the first angle and `amplitude_rad` away (the sign gives the direction).
+    """The identification's swings: between the first angle and `amplitude_rad` away.
 
     The first swing goes half as far. Ends when the stiffness is known to `stiffness_share`, and fails after
     `most_cycles` without that.
     """
 
-    amplitude_rad: float
+    amplitude_rad: Positive
     sample_period_s: Positive
     window_s: NotNegative
     torque_limit_nm: Positive
@@ -281,12 +271,6 @@ class ExciteSettings:
     dwell_s: Positive = 2.5
     fewest_cycles: Annotated[int, Field(gt=0)] = 2
     most_cycles: Annotated[int, Field(gt=0)] = 8
-
-    @model_validator(mode="after")
-    def _moves(self) -> "ExciteSettings":
-        if self.amplitude_rad == 0.0:
-            raise ValueError("amplitude_rad must not be 0")
-        return self
 
 
 class StiffnessExcitation:
@@ -389,120 +373,10 @@ class StiffnessExcitation:
 
     def record(self) -> Record:
         """Return the record so far."""
-        angles, sent = np.array(self._angles).reshape(-1, 2), np.array(self._sent).reshape(-1, 2)
-        torques = np.array(self._torques).reshape(-1, 3)
+        angle_t_s, angle_rad = np.array(self._angles).reshape(-1, 2).T
+        sent_t_s, sent_rad_per_s = np.array(self._sent).reshape(-1, 2).T
+        t_mid_s, t_s, torque_nm = np.array(self._torques).reshape(-1, 3).T
         return Record(
-            angle_t_s=angles[:, 0],
-            angle_rad=angles[:, 1],
-            sent_t_s=sent[:, 0],
-            sent_rad_per_s=sent[:, 1],
-            t_mid_s=torques[:, 0],
-            t_s=torques[:, 1],
-            torque_nm=torques[:, 2],
-        )
-
-
-@dataclass(slots=True)
-class Creep:
-    """Converts shear into torque, reading by reading; `share` is the final loss of a held torque."""
-
-    share: float
-    time_s: float
-    _crept_nm: float = 0.0
-    _t_ns: int | None = None
-    _shear_nm: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Raise UserError for parameters that no gel has."""
-        if not (0.0 <= self.share < 1.0 and 0.0 < self.time_s < math.inf):
-            raise UserError(f"creep: share {self.share:g} and time_s {self.time_s:g} are out of range; see docs/rig.md")
-
-    def torque_nm(self, shear_nm: float, t_ns: int) -> float:
-        """Return the torque of a reading at t_ns (monotonic clock)."""
-        if self._t_ns is not None and t_ns > self._t_ns:
-            decay = -math.expm1(-(t_ns - self._t_ns) / 1e9 / self.time_s)
-            self._crept_nm += (0.5 * (self._shear_nm + shear_nm) - self._crept_nm) * decay
-        self._t_ns, self._shear_nm = t_ns, shear_nm
-        return shear_nm - self.share * self._crept_nm
-
-    def reset(self) -> None:
-        """Restart with a gel at rest, after a release or a tare."""
-        self._crept_nm, self._t_ns, self._shear_nm = 0.0, None, 0.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Stretch:
-    """One grip: times of the readings (n,) in s, readings (n,) and measured torque (n,), in N·m."""
-
-    t_s: FloatArray
-    shear_nm: FloatArray
-    torque_nm: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
-class FittedCreep:
-    """A gel's creep, with the residual's standard deviation without and with it (N·m).
-
-    Torque is `scale` times a reading plus `offset_nm`, less the creep. Scale and offset are errors of the estimator and
-    of the zero; they are fitted but not corrected.
-    """
-
-    creep: Creep
-    scale: float
-    offset_nm: float
-    before_nm: float
-    after_nm: float
-
-
-def fit_creep(grips: Sequence[Stretch], *, scale_is_right: bool = False) -> FittedCreep:
-    """Return the creep of a gel, fitted to grips that each begin with the gel at rest.
-
-    The noisy readings are fitted to the load cell's torques, which have little noise. With c as above,
-    d = (1 − share)·c follows the torque with the time constant time_s / (1 − share), and γ is the torque plus
-    share / (1 − share)·d. For each time constant of a grid, share, scale and offset are a least-squares fit; the one
-    with the smallest residual wins. `scale_is_right` fixes the scale at 1.
-    Raises UserError for fewer than twenty readings, for torques that do not fall behind the readings, and for twists
-    that were held too briefly.
-    """
-    if sum(grip.t_s.size for grip in grips) < _FEWEST_READINGS:
-        count = sum(grip.t_s.size for grip in grips)
-        raise UserError(f"creep: {count} readings are too few for a fit; hold a twist for a minute")
-    shear, torque = (np.concatenate([getattr(grip, name) for grip in grips]) for name in ("shear_nm", "torque_nm"))
-    wanted = shear - torque if scale_is_right else shear
-    plain = np.column_stack([np.ones_like(torque), *([] if scale_is_right else [torque])])
-    before_nm = _least_squares(plain, wanted)[1]
-    best: FittedCreep | None = None
-    slowest = False
-    for time_s in _CREEP_TIMES_S:
-        followed = np.concatenate([_low_passed(grip, float(time_s)) for grip in grips])
-        (lag, offset_nm, *gains), after_nm = _least_squares(np.column_stack([followed, plain]), wanted)
-        gain = float(gains[0]) if gains else 1.0
-        # Negative gain or lag is unphysical: noise that happens to fit.
-        if gain > 0.0 <= lag and (best is None or after_nm < best.after_nm):
-            share = float(lag / (gain + lag))
-            creep = Creep(share, float(time_s) * (1.0 - share))
-            best = FittedCreep(creep, 1.0 / gain, -float(offset_nm) / gain, before_nm, after_nm)
-            slowest = time_s == _CREEP_TIMES_S[-1]
-    if best is None:
-        raise UserError("creep: the torque does not fall behind the readings; is the load cell's zero right?")
-    if slowest:
-        raise UserError(
-            "creep: the torque still fell behind the readings at the end of the recording, as it does when the "
-            "estimates themselves drift; hold some twists for a minute"
-        )
-    return best
-
-
-def _least_squares(columns: FloatArray, wanted: FloatArray) -> tuple[FloatArray, float]:
-    """Return the least-squares coefficients of columns (n, m), and the residual's standard deviation."""
-    coefficients: FloatArray = np.linalg.lstsq(columns, wanted, rcond=None)[0].astype(np.float64)
-    return coefficients, float((wanted - columns @ coefficients).std())
-
-
-def _low_passed(grip: Stretch, time_s: float) -> FloatArray:
-    """Return the torque, low-pass filtered with a time constant from rest (n,)."""
-    follower, followed = Creep(0.0, time_s), np.empty_like(grip.t_s)
-    for index, (at_s, torque_nm) in enumerate(zip(grip.t_s, grip.torque_nm, strict=True)):
-        follower.torque_nm(float(torque_nm), round(at_s * 1e9))
-        followed[index] = follower._crept_nm
-    return followed
+            angle_t_s=angle_t_s, angle_rad=angle_rad, sent_t_s=sent_t_s, sent_rad_per_s=sent_rad_per_s,
+            t_mid_s=t_mid_s, t_s=t_s, torque_nm=torque_nm,
+        )  # fmt: skip

@@ -69,7 +69,6 @@ class ActionState(Enum):
     IDLE = "idle"
     RUNNING = "running"
     DONE = "done"
-    FAILED = "failed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,21 +84,19 @@ class StepContext:
     gripped_at_rad: float
     elapsed_s: float
     action: ActionState
-    action_error: str
 
 
 @dataclass(frozen=True, slots=True)
 class StepCommand:
     """Output of a step.
 
-    An action starts with the first command that has it; `step_index` distinguishes equal actions of two steps.
-    `hold_number` counts the held angles or torques of a step, from 1; 0 while none is held.
+    An action starts with the first command that has it. `hold_number` counts the held angles or torques of a step, from
+    1; 0 while none is held.
     """
 
     wrist: WristSetpoint = Hold()
     action: Action | None = None
     activity: str = ""
-    step_index: int = -1
     hold_number: int = 0
 
 
@@ -116,10 +113,6 @@ class ExperimentPhase(Enum):
 ACTIVE = (ExperimentPhase.RUNNING, ExperimentPhase.PAUSED)
 
 
-class StepFailedError(Exception):
-    """A step cannot continue; the message says why."""
-
-
 StepProgram: TypeAlias = Generator[StepCommand, StepContext, None]
 
 
@@ -134,14 +127,14 @@ class Experiment:
         self.command = StepCommand()
         # The tighter of the experiment's limits and the step's.
         self.limits = file.limits
+        # The number of the present step, or of the last one, from 1.
+        self.step_number = 0
         # A sentence when the step has exceeded its timeout.
         self.overdue = ""
         self._t_ns = t_ns
         self._elapsed_s = self._step_began_s = 0.0
-        self._index = -1
         self._program: StepProgram
-        # State and error of the step's action.
-        self._action = ActionState.IDLE, ""
+        self._action = ActionState.IDLE
         self._begin_next()
 
     @property
@@ -150,13 +143,8 @@ class Experiment:
         return self.phase in ACTIVE
 
     @property
-    def step_number(self) -> int:
-        """The number of the present step, or of the last one, from 1."""
-        return min(self._index + 1, len(self.file.steps))
-
-    @property
     def step(self) -> Step:
-        """That step."""
+        """The present step, or the last one."""
         return self.file.steps[self.step_number - 1]
 
     @property
@@ -165,7 +153,7 @@ class Experiment:
         if not self.running:
             return 0.0
         here_s = max(0.0, expected_s(self.step) - self._elapsed_s + self._step_began_s)
-        return here_s + sum(map(expected_s, self.file.steps[self._index + 1 :]))
+        return here_s + sum(map(expected_s, self.file.steps[self.step_number :]))
 
     @property
     def progress(self) -> float:
@@ -188,29 +176,29 @@ class Experiment:
         if self.phase is ExperimentPhase.PAUSED or held:
             return replace(self.command, wrist=Hold())
         self._elapsed_s += passed_s
-        view = StepContext(wrist_rad, torque_nm, gripped_at_rad, self._elapsed_s, *self._action)
+        view = StepContext(wrist_rad, torque_nm, gripped_at_rad, self._elapsed_s, self._action)
         try:
-            self.command = replace(self._program.send(view), step_index=self._index)
+            self.command = self._program.send(view)
         except StopIteration:
             self._begin_next()
-        except StepFailedError as failure:
-            self.stop(f"step {self._index + 1} ({self.step.do}) failed: {failure}")
-        longest_s, spent_s = self.file.steps[self.command.step_index].timeout_s, self._elapsed_s - self._step_began_s
+        longest_s, spent_s = self.file.steps[self.step_number - 1].timeout_s, self._elapsed_s - self._step_began_s
         if longest_s is not None and spent_s > longest_s:
-            step = f"step {self._index + 1} ({self.step.do})"
+            step = f"step {self.step_number} ({self.step.do})"
             self.overdue = f"{step} has taken {spent_s:.1f} s of at most {longest_s:g} s"
         return self.command
 
     def begin_action(self) -> bool:
         """Return whether the command's action has to begin now; it counts as begun."""
-        begins = self._action[0] is ActionState.IDLE
+        begins = self._action is ActionState.IDLE
         if begins:
-            self._action = ActionState.RUNNING, ""
+            self._action = ActionState.RUNNING
         return begins
 
     def end_action(self, error: str = "") -> None:
-        """Note the end of the step's action, with its error if it failed."""
-        self._action = ActionState.FAILED if error else ActionState.DONE, error
+        """Note the end of the step's action; its error ends the experiment."""
+        self._action = ActionState.DONE
+        if error:
+            self.stop(f"step {self.step_number} ({self.step.do}) failed: {error}")
 
     def pause(self) -> None:
         """Stand still until `resume`."""
@@ -229,21 +217,20 @@ class Experiment:
 
     def fail(self, reason: str) -> None:
         """End because the step cannot be done."""
-        self.stop(f"step {self._index + 1} ({self.step.do}) cannot be done: {reason}")
+        self.stop(f"step {self.step_number} ({self.step.do}) cannot be done: {reason}")
 
     def _begin_next(self) -> None:
-        self.overdue, self._action = "", (ActionState.IDLE, "")
-        while self._index + 1 < len(self.file.steps):
-            self._index += 1
+        self.overdue, self._action = "", ActionState.IDLE
+        while self.step_number < len(self.file.steps):
+            self.step_number += 1
             self._step_began_s = self._elapsed_s
             self.limits = self.file.limits_of(self.step)
             self._program = _program(self.step, self._elapsed_s)
             try:
-                self.command = replace(next(self._program), step_index=self._index)
+                self.command = next(self._program)
             except StopIteration:  # nothing to do, such as a wait of 0 s
                 continue
             return
-        self._index = len(self.file.steps)
         self.phase, self.command = ExperimentPhase.DONE, StepCommand()
 
 
@@ -297,8 +284,6 @@ def _program(step: Step, now_s: float) -> StepProgram:
 def _act(action: Action, activity: str) -> StepProgram:
     while True:
         view = yield StepCommand(Hold(), action, activity)
-        if view.action is ActionState.FAILED:
-            raise StepFailedError(view.action_error)
         if view.action is ActionState.DONE:
             return
 

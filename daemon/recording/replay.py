@@ -7,7 +7,7 @@ estimates bit for bit.
 import asyncio
 import json
 import tempfile
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -61,22 +61,9 @@ class ReplayEvents:
     `frame_numbers` holds the frames' numbers by source and arrival; they continue from file to file.
     """
 
-    tares: dict[str, set[int]] = field(default_factory=dict)
-    tools: dict[str, dict[int, Measured | None]] = field(default_factory=dict)
-    frame_numbers: dict[str, dict[int, int]] = field(default_factory=dict)
-
-    def add(self, event: RecordedEvent) -> None:
-        """Store an event if it is a tare, a tool or a frame."""
-        if event.topic == EitFrame.topic:
-            arrival_ns = event.content["t_mono_ns"] + round(event.content["age_s"] * 1e9)
-            self.frame_numbers.setdefault(event.source, {})[arrival_ns] = event.content["frame"]
-        elif event.raw is None:
-            return
-        elif event.raw.kind is InputKind.TARE and event.raw.data.isdigit():
-            self.tares.setdefault(event.source, set()).add(int(event.raw.data))
-        elif event.raw.kind is InputKind.TOOL:
-            frame, tool = tool_from_bytes(event.raw.data)
-            self.tools.setdefault(event.source, {})[frame] = tool
+    tares: dict[str, set[int]]
+    tools: dict[str, dict[int, Measured | None]]
+    frame_numbers: dict[str, dict[int, int]]
 
 
 class RecordedRun:
@@ -130,11 +117,18 @@ class RecordedRun:
 
     def replay_events(self) -> ReplayEvents:
         """Return the events that the frames do not contain."""
-        found = ReplayEvents()
-        if self.has_inputs:
-            for event in self.events():
-                with reading(self.path):
-                    found.add(event)
+        found = ReplayEvents(defaultdict(set), defaultdict(dict), defaultdict(dict))
+        for event in self.events() if self.has_inputs else ():
+            raw, source = event.raw, event.source
+            with reading(self.path):
+                if event.topic == EitFrame.topic:
+                    arrival_ns = event.content["t_mono_ns"] + round(event.content["age_s"] * 1e9)
+                    found.frame_numbers[source][arrival_ns] = event.content["frame"]
+                elif raw is not None and raw.kind is InputKind.TARE and raw.data.isdigit():
+                    found.tares[source].add(int(raw.data))
+                elif raw is not None and raw.kind is InputKind.TOOL:
+                    frame, tool = tool_from_bytes(raw.data)
+                    found.tools[source][frame] = tool
         return found
 
 
@@ -279,11 +273,12 @@ class ReplayComparison:
 
 
 class Replay:
-    """Replays a recording through a pipeline; `clock` is the publisher's clock."""
+    """Replays a recording with a configuration; `clock` is the publisher's clock."""
 
-    def __init__(self, run: RecordedRun, pipeline: ReplayPipeline, publisher: Publisher, clock: ReplayClock) -> None:
+    def __init__(self, run: RecordedRun, config: DaemonConfig, publisher: Publisher, clock: ReplayClock) -> None:
+        """Open all files of the configuration; raises BankError or UserError."""
         self._run = run
-        self._pipeline = pipeline
+        self._pipeline = ReplayPipeline(config, run.replay_events(), publisher)
         self._publisher = publisher
         self._clock = clock
         self.comparison = ReplayComparison(run.counts)

@@ -18,6 +18,7 @@ from shearloop.drivers.ur.messages import (
     CommandReply,
     Disconnect,
     Enable,
+    Heartbeat,
     MoveLinear,
     RobotState,
     RtdeSample,
@@ -247,28 +248,25 @@ class CommandHandler:
         """
         return self._executor.take_rejection()
 
-    def note_daemon_alive(self, now_ns: int) -> None:
-        """Note that the daemon sent something."""
+    def request(
+        self, number: int, command: Command | Heartbeat, sample: RtdeSample, now_ns: int
+    ) -> CommandReply | None:
+        """Return the reply to a command; None for a heartbeat, and when `tick` returns it later (`Unlock`)."""
         self._daemon_alive_ns = now_ns
-
-    def request(self, number: int, command: Command, sample: RtdeSample, now_ns: int) -> CommandReply | None:
-        """Return the reply to a command; None when `tick` returns it later (`Unlock`)."""
         if isinstance(command, Stop) and self._recovery is not None and self._unlock_number is not None:
             self._recovery.give_up("Unlocking was ended by a stop.")
         unfit = self._why_unfit(sample)
         match command:
+            case Heartbeat():
+                return None
             case Disconnect():
                 self.leaving = True
                 if self._recovery is not None:
                     self._recovery.give_up(LEAVING)
                 self._executor.stop_now(sample, now_ns, "the daemon disconnects")
                 return CommandReply()
-            case Stop(deceleration) if deceleration <= 0:
-                refusal = f"A deceleration of {deceleration:g} rad/s² is not above 0."
-            case Stop() if unfit:
-                refusal = f"Nothing can be sent, and the arm stops by itself. {unfit}"
             case Stop():
-                refusal = self._executor.stop_on_command(number, command, sample, now_ns)
+                refusal = self._stop(number, command, sample, now_ns)
             case _ if self.leaving:
                 refusal = LEAVING
             case WristSpeed() | MoveLinear():
@@ -289,16 +287,27 @@ class CommandHandler:
                     self._held_reason = ""
                 return CommandReply(refusal=refusal)
             case ZeroForceTorque():
-                # A new zero would only hide a value beyond its limit.
-                refusal = unfit or violation(sample, self._settings.limits)
-                if not (refusal or (self.at_rest and sample.rests)):
-                    refusal = "The wrench is zeroed only at rest: stop the arm first."
-                if not (refusal or self._arm.zero_wrench()):
-                    refusal = "The robot did not zero its force-torque sensor."
-                return CommandReply(refusal=refusal)
+                return CommandReply(refusal=unfit or self._zero_wrench(sample))
         if refusal:
             return CommandReply(refusal=refusal)
         return CommandReply(sent=self._executor.sent, clipped=self._executor.clipped)
+
+    def _stop(self, number: int, command: Stop, sample: RtdeSample, now_ns: int) -> str:
+        """Stop on command; return why not, or an empty string."""
+        if command.deceleration_rad_per_s2 <= 0:
+            return f"A deceleration of {command.deceleration_rad_per_s2:g} rad/s² is not above 0."
+        if unfit := self._why_unfit(sample):
+            return f"Nothing can be sent, and the arm stops by itself. {unfit}"
+        return self._executor.stop_on_command(number, command, sample, now_ns)
+
+    def _zero_wrench(self, sample: RtdeSample) -> str:
+        """Zero the wrench; return why not, or an empty string."""
+        # A new zero would only hide a value beyond its limit.
+        if beyond := violation(sample, self._settings.limits):
+            return beyond
+        if not (self.at_rest and sample.rests):
+            return "The wrench is zeroed only at rest: stop the arm first."
+        return "" if self._arm.zero_wrench() else "The robot did not zero its force-torque sensor."
 
     def tick(self, sample: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
         """Run one cycle: check the sample and send what is due; return the reply to an `Unlock` that has ended."""

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shearloop.bank.eit.elimination import LANES, Elimination
-from shearloop.bank.eit.forward import MAX_LEAK, BatchForwardModel, Terms, rounding_leaks
-from shearloop.bank.eit.mesh import Mesh
+from shearloop.bank.eit.forward import MAX_LEAK, BatchForwardModel, rounding_leaks
+from shearloop.bank.eit.mesh import Mesh, Terms
 from shearloop.bank.eit.models import MODELS, conductivity
 from shearloop.bank.errors import ConductivityError
 from tests.bank.conftest import relative

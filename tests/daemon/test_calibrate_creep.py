@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from shearloop.bank.estimation import Estimate, FrameSeries
-from shearloop.daemon.analysis.evaluate import EstimateTrack, grips_of
+from shearloop.daemon.analysis.creep import grips_of
+from shearloop.daemon.analysis.evaluate import EstimateTrack
 from shearloop.daemon.cli import main
 from shearloop.daemon.config import CreepConfig
-from tests.daemon.control.test_creep import twisted
+from tests.daemon.analysis.test_creep import twisted
 
 
 def track(valid: np.ndarray | None = None) -> EstimateTrack:

@@ -12,7 +12,7 @@ import zmq
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.safety import TABLE
-from shearloop.daemon.docgen import ROOT, pages
+from shearloop.daemon.docgen import DOCS, pages
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitFrame
 from shearloop.daemon.messaging.publisher import Publisher
@@ -23,13 +23,13 @@ from tests.daemon.sample_messages import sample
 @pytest.fixture(scope="module")
 def written() -> dict[str, str]:
     """Return the generated pages by name."""
-    return {path.name: text for path, text in pages(ROOT).items()}
+    return {path.name: text for path, text in pages().items()}
 
 
 @pytest.mark.parametrize("name", ["messages.md", "safety.md"])
 def test_a_page_is_up_to_date(written: dict[str, str], name: str) -> None:
     assert len(written) == 2
-    found = (ROOT / "docs" / name).read_text(encoding="utf-8")
+    found = (DOCS / name).read_text(encoding="utf-8")
     assert found == written[name], f"docs/{name} is out of date: run `make docs` and commit it"
 
 
@@ -46,7 +46,7 @@ def test_every_row_of_the_safety_table_is_on_the_page(written: dict[str, str]) -
 
 
 async def test_the_python_subscriber_prints_estimates(tmp_path: Path) -> None:
-    program = (ROOT / "docs/examples/subscriber.py").read_text()
+    program = (DOCS / "examples/subscriber.py").read_text()
     address = f"ipc://{tmp_path}/publish"
     script = tmp_path / "subscriber.py"
     script.write_text(program.replace("tcp://127.0.0.1:7761", address))
@@ -76,7 +76,7 @@ async def test_the_python_subscriber_prints_estimates(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["subscriber.py", "subscriber.cpp", "subscriber.m"])
 def test_subscribers_use_existing_topics_and_keys(name: str) -> None:
     """MATLAB is on no machine of ours, so what its subscriber reads is held to the schema of the messages."""
-    program = (ROOT / "docs/examples" / name).read_text()
+    program = (DOCS / "examples" / name).read_text()
     topics = set(re.findall(r'"((?:eit|load|skin|robot|gripper|loop)\.[a-z]*)"', program))
     assert topics
     assert all(any(topic.startswith(beginning) for topic in TOPICS) for beginning in topics)
@@ -90,7 +90,7 @@ def test_subscribers_use_existing_topics_and_keys(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["subscriber.py", "subscriber.cpp", "subscriber.m"])
 def test_subscribers_are_short(name: str) -> None:
-    lines = (ROOT / "docs/examples" / name).read_text().splitlines()
+    lines = (DOCS / "examples" / name).read_text().splitlines()
     code = [line for line in lines if line.strip() and not line.lstrip().startswith(("//", "%", '"""', "#", "import"))]
     assert len(code) <= 15
     assert "eit." in "".join(code)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.daemon import gc_control
+from shearloop.daemon import realtime
 from shearloop.daemon.cli import emulated_devices, main
 from shearloop.daemon.signals import ending_signals
 from tests.daemon.conftest import DEADLINE_S
@@ -60,7 +60,7 @@ def test_a_second_signal_does_not_kill_the_daemon(
 
     monkeypatch.setattr(emulated_devices, "EmulatedDevices", emulators)
     monkeypatch.setattr(
-        gc_control, "without_long_collections", lambda: nullcontext(partial(os.kill, os.getpid(), number))
+        realtime, "without_long_collections", lambda: nullcontext(partial(os.kill, os.getpid(), number))
     )
     assert main(["run", str(config())]) == 0
     assert came == ["again"]
@@ -71,7 +71,7 @@ def test_commands_run_in_any_thread_without_signal_handlers(
     config: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ready = threading.Event()
-    monkeypatch.setattr(gc_control, "without_long_collections", lambda: nullcontext(ready.set))
+    monkeypatch.setattr(realtime, "without_long_collections", lambda: nullcontext(ready.set))
     with ThreadPoolExecutor() as pool:
         assert pool.submit(ending_signals).result() == ()
         daemon = pool.submit(main, ["run", str(config())])

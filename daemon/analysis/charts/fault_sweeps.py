@@ -1,9 +1,11 @@
-"""Sweeps: how each estimator behaves as a fault grows from mild to grave."""
+"""Sweeps: how each estimator behaves as a fault grows from mild to grave, and their figure."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
@@ -23,6 +25,7 @@ from shearloop.bank.estimation.bank_match import ElectrodeNumbering
 from shearloop.bank.estimation.fingertip_validator import channel_noise
 from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.analysis.bank_design import residual_noise
+from shearloop.daemon.analysis.charts.drawing import figure, look
 from shearloop.daemon.analysis.charts.sources import Split
 from shearloop.daemon.workers import Executor, in_order
 from shearloop.drivers.eit_kit import ADC_STEP_V
@@ -326,3 +329,65 @@ def sweep_estimator(shared: tuple[FaultScene, str], calibration: Calibration) ->
     scene, path = shared
     tracker = EstimatorSession(calibration, Bank.open(path))
     return [sweep(tracker, scene, fault) for fault in FAULTS]
+
+
+def sweeps_figure(title: str, curves: Sequence[FaultCurve]) -> Figure:
+    """Draw bias, valid and false-valid share of every estimator, one row per fault."""
+    faults = list(dict.fromkeys((one.fault, one.unit) for one in curves))
+    made = figure(15, 2.75 * len(faults) + 1.0)
+    axes = made.subplots(len(faults), 3, squeeze=False)
+    for row, fault in zip(axes, faults, strict=True):
+        draw_fault(row, *fault, curves)
+    axes[0, 2].legend(fontsize=8, loc="upper left", handlelength=3.5)
+    made.suptitle(
+        f"Estimators under faults: {title}\n× breaks silently: more than {BROKEN_SHARE:.0%} of the frames are "
+        "called valid and miss their 95 % interval",
+        fontsize=12,
+    )  # fmt: skip
+    return made
+
+
+def draw_fault(row: Sequence[Axes], fault: str, unit: str, curves: Sequence[FaultCurve]) -> None:
+    """Draw one fault's curves into three panels: bias, valid and false-valid share."""
+    for panel, heading in zip(row, ("bias, and spread as bars, mN·m", "valid share", "FALSE-VALID share"), strict=True):
+        label_panel(panel, unit, heading)
+    row[0].set_title(fault, fontsize=10.5, loc="left", fontweight="bold")
+    row[0].axhline(0, color="#999999", linewidth=0.8)
+    names = list(dict.fromkeys(one.estimator for one in curves))
+    for number, name in enumerate(names):
+        for one in curves:
+            if one.fault == fault and one.estimator == name:
+                _draw_curve(row, one, number, len(names))
+    row[2].axhline(BROKEN_SHARE, color="#999999", linewidth=1.2, linestyle=(0, (1, 2)))
+    for panel in row[1:]:
+        panel.set_ylim(-0.04, 1.04)
+
+
+def label_panel(panel: Axes, unit: str, heading: str) -> None:
+    """Label both axes and draw a grid."""
+    panel.set_ylabel(heading, fontsize=9)
+    panel.set_xlabel(unit, fontsize=9)
+    panel.grid(alpha=0.25)
+
+
+def offset_places(count: int, number: int, of: int) -> NDArray[np.float64]:
+    """Return the x places of one curve's marks, offset so that curves do not cover each other."""
+    return np.arange(float(count)) + 0.12 * (number - (of - 1) / 2)
+
+
+def _draw_curve(row: Sequence[Axes], one: FaultCurve, number: int, count: int) -> None:
+    style = look(number) | {"linewidth": 1.3, "markersize": 5}
+    labels = [f"{level.level:g}" for level in one.levels]
+    x = offset_places(len(labels), number, count)
+    # None becomes NaN.
+    bias_nm, spread_nm = np.array([(level.bias_nm, level.spread_nm) for level in one.levels], dtype=float).T
+    row[0].errorbar(x, 1e3 * bias_nm, yerr=1e3 * spread_nm, elinewidth=0.8, **style)
+    row[1].plot(x, [level.valid for level in one.levels], **style)
+    false = [level.false_valid for level in one.levels]
+    row[2].plot(x, false, label=one.estimator, **style)
+    for i, level in enumerate(one.levels):
+        if level.level == one.breaks_at:
+            row[2].plot(x[i], false[i], "x", color="black", markersize=13, markeredgewidth=2.5, zorder=5)
+    for panel in row:
+        panel.set_xticks(range(len(labels)), labels, fontsize=8)
+        panel.set_xlim(-0.6, len(labels) - 0.4)

@@ -1,27 +1,68 @@
 """`shearloop chart stability`: estimators under faults, checks of slices, the rim of the bank, the loop on the skin."""
 
-from collections.abc import Sequence
-from dataclasses import asdict
-from itertools import product
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import groupby, pairwise, product
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import Mesh
-from shearloop.bank.estimation import Physics
+from shearloop.bank.eit.models import conductivity
+from shearloop.bank.errors import BankError
+from shearloop.bank.estimation import (
+    Calibration,
+    EstimatorSession,
+    FrameSeries,
+    Physics,
+    TactileFrame,
+    bank_match,
+    fit,
+)
+from shearloop.bank.estimation.bank_match import NOT_TURNED
+from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
+from shearloop.bank.estimation.novelty import NoveltyDetector, ReciprocityCheck
+from shearloop.bank.estimation.regressors import Ridge
 from shearloop.bank.estimators import EstimatorName
-from shearloop.daemon.analysis.charts import skin_loop, slice_stability
+from shearloop.daemon.analysis.charts import skin_loop
 from shearloop.daemon.analysis.charts.drawing import SHADES, figure, look, save, slug
-from shearloop.daemon.analysis.charts.fault_sweeps import BROKEN_SHARE, FaultCurve, fitted, misaligned, sweeps
-from shearloop.daemon.analysis.charts.slice_stability import FOREIGN_SHARES, STEPS
-from shearloop.daemon.analysis.charts.sources import Split, splits
+from shearloop.daemon.analysis.charts.fault_sweeps import (
+    BROKEN_SHARE,
+    FaultCurve,
+    FaultLevel,
+    FaultyFrames,
+    draw_fault,
+    estimate_frames,
+    fault_curve,
+    fitted,
+    judge_level,
+    label_panel,
+    misaligned,
+    offset_places,
+    sweeps,
+    sweeps_figure,
+)
+from shearloop.daemon.analysis.charts.sources import (
+    PLAYED_MESH_SIZE_CM,
+    Split,
+    homogeneous_of,
+    mean_frame,
+    own_fingertip,
+    played_bank,
+    splits,
+    torque_of,
+)
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.workers import Executor
+from shearloop.daemon.synthetic_frames import Synthesiser
+from shearloop.daemon.workers import Executor, in_order
 
+STEPS = 25
 SLICE_NAMES: tuple[EstimatorName, ...] = ("paper", "bank", "regression", "reconstruction", "motion_regression")
 STREAM_NAMES: tuple[EstimatorName, ...] = ("bank", "regression", "motion_regression")
 SHIFTS_S = (-0.54, -0.27, -0.13, 0.0, 0.13, 0.27, 0.54, 1.08)
@@ -43,7 +84,7 @@ def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Pa
         if split.past.kind == "difference":
             written += _of_slices(split, bank, mesh, out, executor)
     synthetic = next(one for one in splits([], 0.6, scratch) if one.past.kind == "difference")
-    curves = list(slice_stability.sweep_rims(fitted(synthetic, SLICE_NAMES, physics), bank, scratch))
+    curves = list(sweep_rims(fitted(synthetic, SLICE_NAMES, physics), bank, scratch))
     written += _written("stability-rims", "the rim of the bank, on synthetic slices", curves, out)
     return written + skin_loop.chart(out, executor)
 
@@ -51,17 +92,17 @@ def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Pa
 def _of_slices(split: Split, bank: Bank, mesh: Mesh, out: Path, executor: Executor) -> list[Path]:
     """Write the charts of slices: continuity, torques beyond the calibrated ones, foreign frames."""
     name, physics = slug(split.title), Physics(bank, mesh)
-    found = slice_stability.walks(split, bank, fitted(split, ("regression", "motion_regression"), physics))
+    found = walks(split, bank, fitted(split, ("regression", "motion_regression"), physics))
     rows = [asdict(one) | {"largest_hop_nm": one.largest_hop_nm, "hops": one.hops} for one in found]
     written = save(continuity_figure(split.title, found), {"steps": STEPS, "walks": rows}, out, f"continuity-{name}")
-    beyond = slice_stability.extrapolate(split, SLICE_NAMES, bank, mesh, executor)
+    beyond = extrapolate(split, SLICE_NAMES, bank, mesh, executor)
     content = {
         "broken_share": BROKEN_SHARE,
         "title": split.title,
         "extrapolations": [asdict(one) | {"times_good": one.times_good} for one in beyond],
     }
     written += save(extrapolation_figure(split.title, beyond), content, out, f"extrapolation-{name}")
-    seen = slice_stability.detect_mixtures(split.whole)
+    seen = detect_mixtures(split.whole)
     return written + save(
         detectability_figure(split.title.split(",", maxsplit=1)[0], seen),
         {"mixtures": [asdict(one) for one in seen]}, out, f"detectability-{name}",
@@ -73,80 +114,299 @@ def _written(name: str, title: str, curves: Sequence[FaultCurve], out: Path) -> 
     return save(sweeps_figure(title, curves), content, out, name)
 
 
-def sweeps_figure(title: str, curves: Sequence[FaultCurve]) -> Figure:
-    """Draw bias, valid and false-valid share of every estimator, one row per fault."""
-    faults = list(dict.fromkeys((one.fault, one.unit) for one in curves))
-    made = figure(15, 2.75 * len(faults) + 1.0)
-    axes = made.subplots(len(faults), 3, squeeze=False)
-    for row, fault in zip(axes, faults, strict=True):
-        _draw_fault(row, *fault, curves)
-    axes[0, 2].legend(fontsize=8, loc="upper left", handlelength=3.5)
-    made.suptitle(
-        f"Estimators under faults: {title}\n× breaks silently: more than {BROKEN_SHARE:.0%} of the frames are "
-        "called valid and miss their 95 % interval",
-        fontsize=12,
+@dataclass(frozen=True, slots=True, eq=False)
+class ContinuityWalk:
+    """Torques (n,) in N·m along a path through frames, NaN where not valid; `share_nm` is the fair share of a step."""
+
+    name: str
+    torque_nm: FloatArray
+    share_nm: float
+
+    @property
+    def largest_hop_nm(self) -> float:
+        """The largest change within one step, 0 where nothing was valid."""
+        return float(np.nan_to_num(np.abs(np.diff(self.torque_nm))).max(initial=0.0))
+
+    @property
+    def hops(self) -> int:
+        """The number of steps that changed it by more than ten fair shares."""
+        return int(np.count_nonzero(np.nan_to_num(np.abs(np.diff(self.torque_nm))) > 10 * self.share_nm))
+
+
+def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[ContinuityWalk]:
+    """Return the torques of each estimator along the straight lines between later frames, by rising torque.
+
+    The first three estimators differ only in the cell they choose.
+    """
+    torque_nm = split.future.torque_at_frames()
+    frames = np.abs(split.future.channels[np.argsort(torque_nm), 0])
+    shares = np.linspace(0.0, 1.0, STEPS, endpoint=False)[:, None]
+    path = np.concatenate([*((1 - shares) * one + shares * other for one, other in pairwise(frames)), frames[-1:]])
+    share_nm = float(np.ptp(torque_nm)) / len(path)
+    locators: dict[str, bank_match.BankMatcher] = {
+        "paper: the maximum of all lags": bank_match.PaperMatcher(bank),
+        "zero lag: the maximum, refined": bank_match.RefinedMatcher(bank, NOT_TURNED, mean_of_alike=False),
+        "zero lag: mean of the cells alike (the fix)": bank_match.RefinedMatcher(bank, NOT_TURNED),
+    }
+    found = [ContinuityWalk(name, _read(split, locator, path), share_nm) for name, locator in locators.items()]
+    for calibration in calibrations:
+        if not calibration.estimator.needs:
+            tracker = EstimatorSession(calibration, bank)
+            torque = [tracker.estimate(TactileFrame.of(0.0, one[None])).torque_nm for one in path]
+            found.append(ContinuityWalk(calibration.estimator.name, np.array(torque, dtype=float), share_nm))
+    return found
+
+
+def _read(split: Split, locator: bank_match.BankMatcher, path: FloatArray) -> FloatArray:
+    def features(frames: FloatArray) -> FloatArray:
+        sigma = np.array([locator.match(one).sigma for one in frames])
+        return np.column_stack([sigma, sigma**2])
+
+    past = features(np.abs(split.past.channels[:, 0]))
+    reader = fit_interval_regressor(past, split.past.torque_at_frames(), Ridge.fit_scaled, strengths=(1e-9,))
+    return np.array([reader.predict(one)[0] for one in features(path)])
+
+
+Rows = NDArray[np.int64]
+# Shares of the slices to calibrate on, from the smallest torques or from the largest.
+CALIBRATED_SHARES = (0.8, 0.65, 0.5, 0.4, 0.3)
+SMALLER = "calibrated on the smaller torques alone"
+LARGER = "calibrated on the larger torques alone"
+UNITS = {SMALLER: "largest torque calibrated on, N·m", LARGER: "smallest torque calibrated on, N·m"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationPart:
+    """The slices to calibrate on, up to a torque or from one on, and the others to judge."""
+
+    limit_nm: float
+    fitted: Rows
+    others: Rows
+
+
+@dataclass(frozen=True, slots=True)
+class Extrapolation:
+    """One estimator calibrated on ever fewer of the torques; the first level has all, and judges later slices.
+
+    For each level `slices` counts those calibrated on, and `width_nm` is the median width of valid 95 % intervals.
+    """
+
+    curve: FaultCurve
+    slices: tuple[int, ...]
+    width_nm: tuple[float | None, ...]
+
+    @property
+    def times_good(self) -> tuple[float | None, ...]:
+        """The widths relative to the first level's, None where either is unknown."""
+        good = self.width_nm[0]
+        return tuple(None if good is None or width is None else width / good for width in self.width_nm)
+
+
+def calibration_parts(torque_nm: FloatArray) -> dict[str, list[CalibrationPart]]:
+    """Return the parts of (n,) torques by direction, with ever fewer torques; limits are quantiles.
+
+    A limit that leaves no slice to judge is left out.
+    """
+    found = {}
+    for which, beyond in ((SMALLER, np.greater), (LARGER, np.less)):
+        quantiles = np.array(CALIBRATED_SHARES) if which == SMALLER else 1.0 - np.array(CALIBRATED_SHARES)
+        limits = np.quantile(torque_nm, quantiles, method="nearest").tolist()
+        masks = [(limit, beyond(torque_nm, limit)) for limit in dict.fromkeys(limits)]
+        found[which] = [
+            CalibrationPart(limit, np.flatnonzero(~mask), np.flatnonzero(mask)) for limit, mask in masks if mask.any()
+        ]
+    return found
+
+
+def extrapolate(
+    split: Split, names: Sequence[EstimatorName], bank: Bank, mesh: Mesh | None, executor: Executor
+) -> list[Extrapolation]:
+    """Return each estimator beyond the torques it was calibrated on; each calibration is one task for the workers.
+
+    A refused calibration gives no valid estimate; its reason is printed.
+    """
+    known = select_rows(split.whole, np.flatnonzero(np.isfinite(split.whole.torque_at_frames())))
+    rows, n_earlier = np.arange(len(known.t_s)), int((known.t_s <= split.past.t_s[-1]).sum())
+    beyond = calibration_parts(known.torque_nm)
+    for which, extreme in ((SMALLER, np.max), (LARGER, np.min)):
+        limit_nm = float(extreme(known.torque_nm[:n_earlier]))
+        beyond[which].insert(0, CalibrationPart(limit_nm, rows[:n_earlier], rows[n_earlier:]))
+    tasks = [(which, name, part) for which, parts in beyond.items() for name in names for part in parts]
+    judged = in_order(executor.map(judge_others, (known, str(bank.path.resolve()), mesh), tasks))
+    found = []
+    for (which, name), some in groupby(zip(tasks, judged, strict=True), key=lambda one: one[0][:2]):
+        steps = [(part, *outcome) for (_, _, part), outcome in some]
+        for part, _, _, refusal in steps:
+            if refusal:
+                print(f"{split.title}: {name}, {which} ({part.limit_nm:.3f} N·m), is left out: {refusal}")
+        curve = fault_curve(which, UNITS[which], name, [level for _, level, _, _ in steps])
+        slices, widths = tuple(len(part.fitted) for part, *_ in steps), tuple(width for _, _, width, _ in steps)
+        found.append(Extrapolation(curve, slices, widths))
+    return found
+
+
+def select_rows(series: FrameSeries, rows: Rows) -> FrameSeries:
+    """Return these frames of a series with their own torques only."""
+    t_s = series.t_s[rows]
+    return replace(
+        series, t_s=t_s, channels=series.channels[rows], torque_t_s=t_s, torque_nm=series.torque_at_frames()[rows],
+        diameter_mm=series.diameter_mm[rows],
     )  # fmt: skip
-    return made
 
 
-def _draw_fault(row: Sequence[Axes], fault: str, unit: str, curves: Sequence[FaultCurve]) -> None:
-    """Draw one fault's curves into three panels: bias, valid and false-valid share."""
-    for panel, heading in zip(row, ("bias, and spread as bars, mN·m", "valid share", "FALSE-VALID share"), strict=True):
-        _label(panel, unit, heading)
-    row[0].set_title(fault, fontsize=10.5, loc="left", fontweight="bold")
-    row[0].axhline(0, color="#999999", linewidth=0.8)
-    names = list(dict.fromkeys(one.estimator for one in curves))
-    for number, name in enumerate(names):
-        for one in curves:
-            if one.fault == fault and one.estimator == name:
-                _draw_curve(row, one, number, len(names))
-    row[2].axhline(BROKEN_SHARE, color="#999999", linewidth=1.2, linestyle=(0, (1, 2)))
-    for panel in row[1:]:
-        panel.set_ylim(-0.04, 1.04)
+def judge_others(
+    shared: tuple[FrameSeries, str, Mesh | None], task: tuple[str, EstimatorName, CalibrationPart]
+) -> tuple[FaultLevel, float | None, str]:
+    """Return the figures and the median width of a part's judged slices, and the reason of a refused calibration."""
+    (series, path, mesh), (_, name, part) = shared, task
+    bank = Bank.open(path)
+    try:
+        calibration = fit(name, [select_rows(series, part.fitted)], "some torques", Physics(bank, mesh))
+    except BankError as error:
+        return FaultLevel(part.limit_nm, None, None, 0.0, 0.0), None, str(error)
+    others = select_rows(series, part.others)
+    estimates = estimate_frames(EstimatorSession(calibration, bank), FaultyFrames(others))
+    widths = [
+        one.torque_high_nm - one.torque_low_nm
+        for one in estimates
+        if one.torque_low_nm is not None and one.torque_high_nm is not None
+    ]
+    return judge_level(estimates, others.torque_nm, part.limit_nm), float(np.median(widths)) if widths else None, ""
 
 
-def _label(panel: Axes, unit: str, heading: str) -> None:
-    panel.set_ylabel(heading, fontsize=9)
-    panel.set_xlabel(unit, fontsize=9)
-    panel.grid(alpha=0.25)
+FOREIGN_SHARES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
+ORIGINS = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+_TURNED_ELECTRODES = 5
 
 
-def _offset_places(count: int, number: int, of: int) -> NDArray[np.float64]:
-    """Return the x places of one curve's marks, offset so that curves do not cover each other."""
-    return np.arange(float(count)) + 0.12 * (number - (of - 1) / 2)
+@dataclass(frozen=True, slots=True)
+class ForeignMixture:
+    """Misfits of later slices, in units of their limit, for one origin, kind and share of a foreign frame.
+
+    The misfit is from reciprocal channels. `passing` is the share that the validity check accepts, `passing_best`
+    the best limit's; `auc` is how often a mixed slice has a larger misfit than a good one.
+    """
+
+    origin: float
+    kind: str
+    share: float
+    misfits: tuple[float, ...]
+    passing: float
+    passing_best: float
+    auc: float
 
 
-def _draw_curve(row: Sequence[Axes], one: FaultCurve, number: int, count: int) -> None:
-    style = look(number) | {"linewidth": 1.3, "markersize": 5}
-    labels = [f"{level.level:g}" for level in one.levels]
-    x = _offset_places(len(labels), number, count)
-    # None becomes NaN.
-    bias_nm, spread_nm = np.array([(level.bias_nm, level.spread_nm) for level in one.levels], dtype=float).T
-    row[0].errorbar(x, 1e3 * bias_nm, yerr=1e3 * spread_nm, elinewidth=0.8, **style)
-    row[1].plot(x, [level.valid for level in one.levels], **style)
-    false = [level.false_valid for level in one.levels]
-    row[2].plot(x, false, label=one.estimator, **style)
-    for i, level in enumerate(one.levels):
-        if level.level == one.breaks_at:
-            row[2].plot(x[i], false[i], "x", color="black", markersize=13, markeredgewidth=2.5, zorder=5)
-    for panel in row:
-        panel.set_xticks(range(len(labels)), labels, fontsize=8)
-        panel.set_xlim(-0.6, len(labels) - 0.4)
+def detect_mixtures(series: FrameSeries, origins: Sequence[float] = ORIGINS, seed: int = 7) -> list[ForeignMixture]:
+    """Return how each share of a foreign frame looks to a validity check fitted to the slices before each origin.
+
+    The best limit is the lowest that refuses no good later slice; no rule on the misfit can refuse more mixtures.
+    """
+    frames = np.abs(series.channels[:, 0])
+    usable = np.ones(N_CHANNELS, dtype=np.bool_)
+    turned = bank_match.ElectrodeNumbering(_TURNED_ELECTRODES, reflected=False)
+    found = []
+    for origin in origins:
+        n = round(origin * len(frames))
+        guard, later = NoveltyDetector.fit(frames[:n]), frames[n:]
+        mean = later.mean(axis=0)
+        foreign = {
+            "another fingertip": mean[np.random.default_rng(seed).permutation(N_CHANNELS)],
+            f"turned by {_TURNED_ELECTRODES} electrodes": mean[turned.model_channels()],
+        }
+        twins = ReciprocityCheck.fit(frames[:n])
+        good = _misfits(twins, later)
+        for kind, one in foreign.items():
+            for share in FOREIGN_SHARES:
+                mixed = (1 - share) * later + share * one
+                misfits = _misfits(twins, mixed)
+                found.append(
+                    ForeignMixture(
+                        origin, kind, share, tuple(misfits),
+                        float(np.mean([not guard.assess(frame, usable).reasons for frame in mixed])),
+                        float((misfits <= good.max()).mean()),
+                        float((misfits[:, None] > good).mean() + 0.5 * (misfits[:, None] == good).mean()),
+                    )
+                )  # fmt: skip
+    return found
 
 
-def extrapolation_figure(title: str, found: Sequence[slice_stability.Extrapolation]) -> Figure:
+def _misfits(twins: ReciprocityCheck, frames: FloatArray) -> FloatArray:
+    usable = np.ones(N_CHANNELS, dtype=np.bool_)
+    return np.array([twins.residual(one, usable) for one in frames]) / twins.largest_residual
+
+
+MODEL = "gaussian_derivative"
+_K, _SIGMA = 3.2, 1.5
+_FRAMES = 6
+# The steepest fall of the Gaussian derivative is this over σ, below 1.
+_STEEPEST = float(np.exp(-0.5))
+
+
+class _SolvedFrames(Synthesiser):
+    """Makes frames of any k and σ by solving for them, inside and outside of the grid."""
+
+    def __init__(self, bank: Bank, seed: int) -> None:
+        super().__init__(bank, seed=seed)
+        self._forward = ForwardModel(own_fingertip(PLAYED_MESH_SIZE_CM).mesh())
+        self._homogeneous = self._forward.homogeneous()
+        self._solved: dict[tuple[float, float], FloatArray] = {}
+
+    def signal(self, k: float, sigma: float | FloatArray) -> FloatArray:
+        """Return the (896,) difference signal of one k and σ, solved once."""
+        place = k, float(np.mean(sigma))
+        if place not in self._solved:
+            cell = conductivity(self._forward.mesh, MODEL, *place)
+            self._solved[place] = self._forward.voltages(cell) - self._homogeneous
+        return self._solved[place]
+
+
+def sweep_rims(calibrations: Sequence[Calibration], bank: Bank, scratch: Path) -> Iterable[FaultCurve]:
+    """Return the curves of estimators calibrated on synthetic slices along three paths of (k, σ) out of the bank."""
+    lowest = (0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05)
+    k_end, sigma_end = float(bank.k_grid[-1]), float(bank.sigma_grid[-1])
+    ks = (_K, *(round(k_end + step, 3) for step in (-0.3, -0.1, 0.0, 0.1, 0.2)))
+    sigmas = (_SIGMA, *(round(sigma_end + step, 3) for step in (-0.3, -0.1, 0.0, 0.2, 0.5, 1.0)))
+    rims = (
+        ("conductivity near zero", "smallest conductivity (homogeneous = 1)", lowest,
+            [(_K, _STEEPEST / (1.0 - least)) for least in lowest]),
+        (f"k at the rim of the grid ({k_end:g} cm) and beyond", "k, cm", ks, [(k, _SIGMA) for k in ks]),
+        (f"σ at the rim of the grid ({sigma_end:g} cm) and beyond", "σ, cm", sigmas, [(_K, sigma) for sigma in sigmas]),
+    )  # fmt: skip
+    # The same homogeneous frame as the slices': its noise is in every difference.
+    synthesiser = _SolvedFrames(played_bank(scratch), 0)
+    homogeneous = homogeneous_of(synthesiser)
+    trackers = [EstimatorSession(calibration, bank) for calibration in calibrations]
+    for name, unit, settings, places in rims:
+        series = [_series(synthesiser, homogeneous, k, sigma) for k, sigma in places]
+        for tracker in trackers:
+            levels = [
+                judge_level(estimate_frames(tracker, FaultyFrames(one)), one.torque_nm, level)
+                for level, one in zip(settings, series, strict=True)
+            ]
+            yield fault_curve(name, unit, tracker.calibration.estimator.name, levels)
+
+
+def _series(synthesiser: Synthesiser, homogeneous: FloatArray, k: float, sigma: float) -> FrameSeries:
+    frames = np.array([np.abs(mean_frame(synthesiser, k, sigma, 1.0) - homogeneous) for _ in range(_FRAMES)])[:, None]
+    t_s = np.arange(float(_FRAMES))
+    return FrameSeries(
+        "difference", ("right",), t_s, frames, t_s, np.full(_FRAMES, torque_of(sigma)), np.full(_FRAMES, np.nan)
+    )
+
+
+def extrapolation_figure(title: str, found: Sequence[Extrapolation]) -> Figure:
     """Draw the estimators beyond the torques they were calibrated on, and the width of their intervals."""
     faults = list(dict.fromkeys((one.curve.fault, one.curve.unit) for one in found))
     made = figure(19, 4.2 * len(faults) + 1.0)
     axes = made.subplots(len(faults), 4, squeeze=False)
     for row, (fault, unit) in zip(axes, faults, strict=True):
         here = [one for one in found if one.curve.fault == fault]
-        _draw_fault(row[:3], fault, unit, [one.curve for one in here])
-        _label(row[3], unit, "median width, times that of good later slices")
+        draw_fault(row[:3], fault, unit, [one.curve for one in here])
+        label_panel(row[3], unit, "median width, times that of good later slices")
         row[3].axhline(1.0, color="#999999", linewidth=0.8)
         for number, one in enumerate(here):
             times = np.array(one.times_good, dtype=float)
-            x = _offset_places(len(times), number, len(here))
+            x = offset_places(len(times), number, len(here))
             row[3].plot(x, times, linewidth=1.3, markersize=5, **look(number))
         row[3].set_ylim(bottom=0.0)
         labels = [f"{level.level:.3f}\n{n}" for level, n in zip(here[0].curve.levels, here[0].slices, strict=True)]
@@ -164,7 +424,7 @@ def extrapolation_figure(title: str, found: Sequence[slice_stability.Extrapolati
     return made
 
 
-def continuity_figure(title: str, walks: Sequence[slice_stability.ContinuityWalk]) -> Figure:
+def continuity_figure(title: str, walks: Sequence[ContinuityWalk]) -> Figure:
     """Draw the estimates along a path through the frames, and the largest change of each within one small step."""
     made = figure(15, 6.2)
     way, bars = made.subplots(1, 2, gridspec_kw={"width_ratios": [2.3, 1]})
@@ -193,7 +453,7 @@ def continuity_figure(title: str, walks: Sequence[slice_stability.ContinuityWalk
     return made
 
 
-def detectability_figure(title: str, found: Sequence[slice_stability.ForeignMixture]) -> Figure:
+def detectability_figure(title: str, found: Sequence[ForeignMixture]) -> Figure:
     """Draw the misfits of one origin, and the share that passes at all origins."""
     made = figure(15, 6)
     clouds, passing = made.subplots(1, 2, gridspec_kw={"width_ratios": [1, 1.15]})

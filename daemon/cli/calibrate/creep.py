@@ -24,10 +24,10 @@ def run(args: argparse.Namespace) -> int:
     """Estimate every frame, fit, and print the line for the configuration."""
     from shearloop.bank.eit.bank_file import Bank
     from shearloop.bank.estimation import Calibration
-    from shearloop.daemon.analysis.evaluate import estimate_series, grips_of
+    from shearloop.daemon.analysis.creep import fit_creep, grips_of
+    from shearloop.daemon.analysis.evaluate import estimate_series
     from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, read_series
     from shearloop.daemon.cli.options import check_kind
-    from shearloop.daemon.control.identification import fit_creep
 
     check_paths_differ(args.recordings)
     calibration = Calibration.load(args.calibration)

@@ -83,7 +83,7 @@ class PushedSkin:
 
     def follow_grip(self, torque_nm: float, *, gripped: bool) -> None:
         """Shear the skin by a gripped tool's torque at the lever; an open grip does not touch it."""
-        self.skin.normal_n = self._normal_n if gripped else 0.0
+        self.skin.press(self._normal_n if gripped else 0.0)
         self.skin.push(torque_nm / self._lever_m if gripped else 0.0)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.estimation import FrameSeries, fit
-from shearloop.bank.estimation.fitting import ContaminationTest, Mixtures, SliceReader
+from shearloop.bank.estimation.fitting import ContaminationTest, Mixtures
 from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
 from shearloop.bank.estimation.motion_regression import MotionRegression
 from shearloop.bank.estimation.novelty import NoveltyDetector
@@ -80,7 +80,7 @@ def test_mixtures_are_those_that_the_guard_of_the_earlier_slices_lets_pass():
     past, future = np.arange(30), np.arange(30, 50)
     guard = NoveltyDetector.fit(differences[past])
     usable = np.ones(896, dtype=bool)
-    mixtures = ContaminationTest(differences, SliceReader(MotionRegression(np.ones((1, 896))), None, np.arange(50.0)))
+    mixtures = ContaminationTest(differences, np.arange(50.0), MotionRegression(np.ones((1, 896))), None)
     passing = mixtures.accepted(past, future)
     assert 0 < len(passing.rows) < 20 * 15 * 3
     for row, features, nearness in zip(passing.rows, passing.features, passing.limit_shares, strict=True):

@@ -12,7 +12,7 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNELS
 from shearloop.bank.estimation import Estimate, EstimatorSession, FrameSeries, Physics, fit
 from shearloop.bank.estimation.novelty import ReciprocityCheck
-from shearloop.daemon.analysis.charts import slice_stability
+from shearloop.daemon.analysis.charts import stability
 from shearloop.daemon.analysis.charts.fault_sweeps import (
     FAULTS,
     FaultLevel,
@@ -24,24 +24,22 @@ from shearloop.daemon.analysis.charts.fault_sweeps import (
     scene_for,
     sweep,
 )
-from shearloop.daemon.analysis.charts.slice_stability import (
+from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits
+from shearloop.daemon.analysis.charts.stability import (
     LARGER,
     SMALLER,
     Extrapolation,
     calibration_parts,
-    detect_mixtures,
-    extrapolate,
-    select_rows,
-    sweep_rims,
-    walks,
-)
-from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits
-from shearloop.daemon.analysis.charts.stability import (
     chart,
     continuity_figure,
+    detect_mixtures,
     detectability_figure,
+    extrapolate,
     extrapolation_figure,
+    select_rows,
+    sweep_rims,
     sweeps_figure,
+    walks,
 )
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.reproduce.banks import Grid
@@ -229,7 +227,7 @@ def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(
     slices: FrameSeries, bank: Bank, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # A twentieth is too few for an estimator.
-    monkeypatch.setattr(slice_stability, "CALIBRATED_SHARES", (0.5, 0.05))
+    monkeypatch.setattr(stability, "CALIBRATED_SHARES", (0.5, 0.05))
     some = slices.between(0, 40)
     # A slice of unknown torque is in neither part.
     torque_nm = some.torque_nm.copy()

@@ -173,12 +173,6 @@ def test_the_step_finds_the_tool_and_ends_where_it_began() -> None:
     assert gained.max() <= 2.0 * 0.008 + 1e-9
 
 
-def test_the_step_may_turn_the_other_way() -> None:
-    step, angles, _ = step_on(0.25, 0.002, amplitude_rad=-0.4)
-    assert step.result is not None
-    assert min(angles) == pytest.approx(0.6, abs=0.005)
-
-
 def test_the_first_swing_is_half_as_far_and_stops_at_the_torque_limit() -> None:
     step, angles, _ = step_on(2.0, 0.002)
     assert step.failure is not None

@@ -30,7 +30,6 @@ from shearloop.daemon.recording.replay import (
     Replay,
     ReplayClock,
     ReplayComparison,
-    ReplayPipeline,
     restored_wire_map,
 )
 from shearloop.daemon.recording.schema import message_json, with_missing_keys
@@ -65,7 +64,7 @@ async def replayed(path: Path, speed: float, config: DaemonConfig | None = None)
         publisher = Publisher(opened.enter_context(zmq.asyncio.Context()), "tcp://127.0.0.1:*", clock)
         opened.callback(publisher.close)
         publisher.add_listener(lambda topic, content: seen.append((topic, content)))
-        replay = Replay(run, ReplayPipeline(config, run.replay_events(), publisher), publisher, clock)
+        replay = Replay(run, config, publisher, clock)
         await replay.play(speed)
     return seen, replay.comparison
 

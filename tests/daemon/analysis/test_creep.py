@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from shearloop.daemon.control.identification import Creep, Stretch, fit_creep
+from shearloop.daemon.analysis.creep import Stretch, fit_creep
+from shearloop.daemon.control.loop_inputs import Creep
 from shearloop.daemon.errors import UserError
 from shearloop.drivers.emulators.scene import Twin, TwinSettings
 

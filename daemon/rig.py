@@ -30,12 +30,13 @@ from shearloop.daemon.supervisor import Supervisor, Task
 from shearloop.daemon.taring import Sensor
 from shearloop.drivers.calibration_files import load_calibration
 from shearloop.drivers.connection import LinkEvent, LinkMonitor
+from shearloop.drivers.errors import DriverError
 from shearloop.drivers.load_cell import LoadCalibration
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
-from shearloop.drivers.ur.client import UrRobot
-from shearloop.drivers.ur.settings import read_settings
+from shearloop.drivers.ur.client import UrRobot, missing_library
+from shearloop.drivers.ur.settings import UrSettings, read_settings
 
 
 def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
@@ -79,11 +80,19 @@ class DeviceLink(LinkLog):
             self._loop.on_link(self.device, event.sentence, up=event.up)
 
 
+def robot_settings(path: Path) -> UrSettings:
+    """Return the robot's settings; raises DriverError if they, or the library that drives it, cannot be used."""
+    settings = read_settings(path)
+    if reason := missing_library():
+        raise DriverError(f"{path}: {reason}")
+    return settings
+
+
 def make_loop(config: DaemonConfig, sources: Mapping[str, TorqueSource]) -> ControlLoop | None:
     """Return the control loop of the configured robot, if there is one; `sources` are all torques but the robot's."""
     if config.robot is None:
         return None
-    robot = read_settings(config.robot)
+    robot = robot_settings(config.robot)
     sources = {**sources, WRENCH: wrench_source(robot.rate_hz)}
     # Controller, identification and commands plan with what the robot's process lets through.
     top, most = robot.limits.wrist_speed_rad_per_s.inner, robot.limits.wrist_acceleration_rad_per_s2.inner
@@ -137,7 +146,7 @@ class Rig:
             raise ValueError("a rig needs a robot")
         self.control_loop = loop
         self.gripper = gripper
-        self.robot = UrRobot(read_settings(config.robot), LinkMonitor(DeviceLink("robot", loop)))
+        self.robot = UrRobot(robot_settings(config.robot), LinkMonitor(DeviceLink("robot", loop)))
         self.runner = ControlLoopRunner(
             loop,
             self.robot,

@@ -71,10 +71,6 @@ class LoadCalibration(CalibrationModel):
         """Return the torque of a line's decimal, N·m."""
         return (raw - self.tare_counts) * self.nm_per_count
 
-    def raw(self, torque_nm: float) -> float:
-        """Return the decimal of a torque: the inverse of `torque_nm`."""
-        return torque_nm / self.nm_per_count + self.tare_counts
-
     def tared(self, raw_at_rest: float) -> Self:
         """Return this calibration with its zero at the given raw value."""
         return self.model_copy(update={"tare_counts": raw_at_rest})
@@ -221,11 +217,6 @@ class LoadCell(serial_sensor.SerialSensor[LoadSample]):
         self._parser = LoadParser(calibration, rate_hz)
         self._samples = 0
         self._flagged = 0
-
-    @property
-    def calibration(self) -> LoadCalibration:
-        """The calibration of the samples to come; a tare replaces it."""
-        return self._parser.calibration
 
     def tare(self, raw_at_rest: float) -> None:
         """Make a raw value the zero of the samples to come."""

@@ -9,7 +9,6 @@ from shearloop.bank.estimation import TRUSTED, Calibration, FrameSeries, LoadTim
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor
 from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, part_of, read_series, series_of
-from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.reader import read_recording
 
 
@@ -17,8 +16,9 @@ from shearloop.daemon.recording.reader import read_recording
 class CalibrationOptions:
     """What the user says about the recordings.
 
-    time_range are shares (0 to 1) of each recording. load_cell_delay_s is subtracted from the load cell's times, and
-    then these are not checked. With assume_full_range no torque will exceed the slices.
+    time_range are shares (0 to 1) of each recording. Recordings have sides, load_cell_delay_s, which is subtracted from
+    the load cell's times, and then these are not checked, and tool_mm. With assume_full_range no torque will exceed the
+    slices.
     """
 
     sides: tuple[str, ...] | None = None
@@ -91,8 +91,7 @@ def calibrate(
 ) -> CalibrationResult:
     """Fit an estimator to recordings or folders of slices, oldest first.
 
-    Raises UserError for options that do not fit the recordings, and CalibrationError for recordings that determine no
-    calibration.
+    Raises UserError for recordings that are given twice, and CalibrationError for those that determine no calibration.
     """
     check_paths_differ(paths)
     delay_s = options.load_cell_delay_s
@@ -104,15 +103,12 @@ def calibrate(
         others += [(f"{path.name}, {one.sides[0]}", part_of(one, *options.time_range)) for one in beside]
     parts = [part for _, part in chosen]
     check_no_copies([(str(path), part) for path, part in chosen])
-    _check_options(options, parts)
     if delay_s:
         parts = [replace(one, torque_t_s=one.torque_t_s - delay_s) for one in parts]
     timing = TRUSTED if delay_s is not None else measure_timing(parts, [one for _, one in others])
     calibration = fit(
         estimator, parts, _source(paths, options), physics, timing=timing, full_range=options.assume_full_range
     )
-    if options.assume_full_range and calibration.torque is None:
-        raise UserError("--assume-full-range is about torques, and these slices have diameters only; leave it out")
     names = {id(one): name for name, one in (*((path.name, one) for path, one in chosen), *others)}
     warned = zip(timing.references, timing.warnings, strict=True)
     doubts = [f"{names[id(one)]}: {why}" for one, why in warned if why]
@@ -129,21 +125,6 @@ def _read(path: Path, options: CalibrationOptions) -> tuple[list[FrameSeries], l
         return [own], []
     others = [side for side in recording.sides if side not in sides]
     return [own], [series_of(recording, (side,), options.tool_mm) for side in others]
-
-
-def _check_options(options: CalibrationOptions, parts: Sequence[FrameSeries]) -> None:
-    """Raise UserError for an option that has no effect on these recordings."""
-    if options.assume_full_range and any(one.kind == "raw" for one in parts):
-        raise UserError("--assume-full-range is for slices; leave it out for recordings")
-    if all(one.kind == "raw" for one in parts):
-        return
-    for option, given, why in (
-        ("--load-cell-delay-s", options.load_cell_delay_s, "each slice holds its torque itself"),
-        ("--tool-mm", options.tool_mm, "a calibration of slices knows no tool"),
-        ("--sides", options.sides, "slices do not name their side"),
-    ):
-        if given is not None:
-            raise UserError(f"{option} is for recordings: {why}; leave it out")
 
 
 def _source(paths: Sequence[Path], options: CalibrationOptions) -> str:

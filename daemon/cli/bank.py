@@ -63,8 +63,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_json(info)
 
     plot = added["plot"]
-    plot.add_argument("path", type=Path, nargs="?", metavar="PATH", help="a bank whose signals are drawn")
-    plot.add_argument("--config", type=Path, metavar="FILE", help="a bank's configuration whose models are drawn")
+    plot.add_argument("path", type=Path, nargs="?", metavar="PATH", help="draw this bank's signals")
+    plot.add_argument("--config", type=Path, metavar="FILE", help="draw the models on this configuration's mesh")
     plot.add_argument("--out", type=Path, required=True, metavar="DIR", help="directory for the PNG and SVG files")
 
     solve = added["solve"]

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `install` or `uninstall`, whichever the parser is for."""
+    """Add the arguments of `install`, or of `uninstall` to its parser."""
     installs = not parser.prog.endswith(" uninstall")
     parser.set_defaults(installs=installs)
     parser.add_argument("--dry-run", action="store_true", help="say what would be done, and do nothing")

@@ -8,7 +8,6 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
 from random import Random
 
@@ -26,61 +25,37 @@ CATCH_UP_S = 0.05
 LOAD_PERIOD_S = 1 / 10.9
 # A line of the paper's board without its beginning, "0.0000": 38 µN·m became 38 MN·m.
 CORRUPTED = 38399996
-
-
-class BoardFaultKind(Enum):
-    """Faults of boards; the value is the name on the command line."""
-
-    # The next line arrives broken, or not at all.
-    CUT_LINE = "cut-line"
-    WRONG_COUNT = "wrong-count"
-    NAN = "nan"
-    SPIKE = "spike"
-    TORN = "torn"
-    MISSING = "missing"
-    # Bytes that are not a line.
-    GARBAGE = "garbage"
-    # Lasts for a number of seconds.
-    SILENCE = "silence"
-    SATURATION = "saturation"
-    STUCK = "stuck"
-    UNPLUG = "unplug"
-
-
-_K = BoardFaultKind
-TIMED_FAULTS = (_K.SILENCE, _K.SATURATION, _K.STUCK, _K.UNPLUG)
+TIMED_FAULTS = ("silence", "saturation", "stuck", "unplug")
 
 
 @dataclass(frozen=True, slots=True)
 class BoardFault:
-    """One fault, with its seconds; None without an end."""
+    """One fault of the next line, or one that lasts for some seconds; None without an end."""
 
-    kind: BoardFaultKind
+    name: str
     seconds: float | None = None
 
 
-def parse_fault(text: str, kinds: Collection[BoardFaultKind]) -> BoardFault:
+def parse_fault(text: str, names: Collection[str]) -> BoardFault:
     """Return the fault `NAME`, `NAME:SECONDS` or `NAME SECONDS`; raises ValueError with a sentence."""
     name, _, seconds = text.strip().replace(" ", ":").partition(":")
-    kind = next((kind for kind in kinds if kind.value == name), None)
-    if kind is None:
-        raise ValueError(f"there is no fault {name!r}; there are {', '.join(kind.value for kind in kinds)}")
+    if name not in names:
+        raise ValueError(f"there is no fault {name!r}; there are {', '.join(names)}")
     if not seconds:
-        return BoardFault(kind)
-    if kind not in TIMED_FAULTS:
+        return BoardFault(name)
+    if name not in TIMED_FAULTS:
         raise ValueError(f"{name} has no duration; write {name} alone")
     no_duration = f"no duration in seconds; write for instance {name}:3"
-    return BoardFault(kind, number_between(seconds, 0.0, 1e9, no_duration))
+    return BoardFault(name, number_between(seconds, 0.0, 1e9, no_duration))
 
 
 class EmulatedBoard(ABC):
     """An emulated board on a pseudo-terminal.
 
-    `inject` applies faults to the next lines, one each. Without a reader the terminal fills up; then the board waits
-    and `port.held_up` is set.
+    Without a reader the terminal fills up; then the board waits and `port.held_up` is set.
     """
 
-    faults: Collection[BoardFaultKind]
+    faults: Collection[str]
 
     def __init__(self, period_s: float, link: Path | None, seed: int) -> None:
         self.port = PtyPort(link)
@@ -96,16 +71,15 @@ class EmulatedBoard(ABC):
     def recover(self) -> None:
         """End every fault and plug the port in."""
 
-    def inject(self, fault: BoardFault) -> None:
-        """Apply a fault to the next line; several apply to one line each, in order."""
-        self._injected.append(fault)
-
     def command(self, text: str) -> None:
-        """Inject the fault in a command, or recover on `normal`; ValueError, with a sentence, for other text."""
+        """Apply a fault to the next line, or recover on `normal`; ValueError, with a sentence, for other text.
+
+        Several faults apply to one line each, in order.
+        """
         if text.strip() == "normal":
             self.recover()
         else:
-            self.inject(parse_fault(text, self.faults))
+            self._injected.append(parse_fault(text, self.faults))
 
     def _garbage(self, count: int) -> bytes:
         return bytes(self._random.choices(range(128, 256), k=count))
@@ -123,7 +97,7 @@ class EitKitBoard(EmulatedBoard):
     faults. Only an unplugged board loses a frame; a silence without a duration lasts until the next `y`.
     """
 
-    faults = (_K.CUT_LINE, _K.WRONG_COUNT, _K.NAN, _K.GARBAGE, _K.SILENCE, _K.UNPLUG)
+    faults = ("cut-line", "wrong-count", "nan", "garbage", "silence", "unplug")
 
     def __init__(
         self,
@@ -158,7 +132,7 @@ class EitKitBoard(EmulatedBoard):
                 due_s += self._period_s
                 await asyncio.sleep(due_s - loop.time())
                 fault = self._fault_at.pop(number, None) or (self._injected.popleft() if self._injected else None)
-                if fault is not None and fault.kind is _K.SILENCE:
+                if fault is not None and fault.name == "silence":
                     self._silent = fault.seconds is None
                     await (self._wait_for_start() if fault.seconds is None else self._pause(fault.seconds))
                     self._silent, fault = False, None
@@ -172,8 +146,8 @@ class EitKitBoard(EmulatedBoard):
             await loop.create_future()
 
     async def _send(self, line: bytes, fault: BoardFault | None) -> None:
-        match None if fault is None else fault.kind:
-            case _K.UNPLUG:
+        match None if fault is None else fault.name:
+            case "unplug":
                 await self.port.write(line[: len(line) // 2])
                 await self.port.break_off()
                 await self._pause(None if fault is None else fault.seconds)
@@ -181,14 +155,14 @@ class EitKitBoard(EmulatedBoard):
                 # Without power the board has forgotten its start.
                 await self._wait_for_start()
                 return
-            case _K.GARBAGE:
+            case "garbage":
                 await self.port.write(self._garbage(700) + b"\n")
-            case _K.CUT_LINE:
+            case "cut-line":
                 line = line[: self._random.randrange(len(line) // 10, len(line) - 10)] + b"\n"
-            case _K.WRONG_COUNT | _K.NAN as kind:
+            case "wrong-count" | "nan" as kind:
                 values = line.split(b", ")
                 position = self._random.choice([n for n, value in enumerate(values[:-1]) if float(value)])
-                values[position : position + 1] = [b"nan"] if kind is _K.NAN else []
+                values[position : position + 1] = [b"nan"] if kind == "nan" else []
                 line = b", ".join(values)
         await self.port.write(line)
 
@@ -213,7 +187,7 @@ class ConverterBoard(EmulatedBoard):
 
     def __init__(self, period_s: float, link: Path | None = None, seed: int = 0) -> None:
         super().__init__(period_s, link, seed)
-        self._lasting: BoardFaultKind | None = None
+        self._lasting: str | None = None
         self._lasts_until_s = 0.0
         self._last_line = b""
 
@@ -249,35 +223,35 @@ class ConverterBoard(EmulatedBoard):
         elif self._lasting is not None and now_s >= self._lasts_until_s:
             self._end_lasting()
         match self._lasting:
-            case _K.SILENCE | _K.UNPLUG:
+            case "silence" | "unplug":
                 return b""
-            case _K.STUCK:
+            case "stuck":
                 line = self._last_line or line
-            case _K.SATURATION:
+            case "saturation":
                 line = b"%d\r\n" % COUNTS_MAX
         self._last_line = line
         return line
 
     def _apply(self, fault: BoardFault, line: bytes, now_s: float) -> bytes:
-        match fault.kind:
-            case _K.GARBAGE:
+        match fault.name:
+            case "garbage":
                 return self._garbage(12) + b"\r\n"
-            case _K.SPIKE:
+            case "spike":
                 return b"%d\r\n" % CORRUPTED
-            case _K.TORN:
+            case "torn":
                 return line[len(line) // 2 :]
-            case _K.MISSING:
+            case "missing":
                 return b""
             case kind:
                 self._end_lasting()
                 self._lasting = kind
                 self._lasts_until_s = math.inf if fault.seconds is None else now_s + fault.seconds
-                if kind is _K.UNPLUG:
+                if kind == "unplug":
                     self.port.unplug()
         return line
 
     def _end_lasting(self) -> None:
-        if self._lasting is _K.UNPLUG:
+        if self._lasting == "unplug":
             self.port.plug()
         self._lasting = None
 
@@ -302,7 +276,7 @@ PAPER_SKETCH = Sketch(counts_per_nm=1.0, tare_counts=0.0, noise_counts=2e-5, dec
 class Hx711Board(ConverterBoard):
     """The load cell's board: converts each of `torques_nm`, requested at the end of its conversion."""
 
-    faults = (_K.GARBAGE, _K.SPIKE, _K.TORN, _K.SILENCE, _K.SATURATION, _K.STUCK, _K.UNPLUG)
+    faults = ("garbage", "spike", "torn", "silence", "saturation", "stuck", "unplug")
 
     def __init__(
         self,

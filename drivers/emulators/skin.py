@@ -14,7 +14,7 @@ from random import Random
 from typing import Protocol, TypeAlias
 
 from shearloop.drivers.emulators import number_between
-from shearloop.drivers.emulators.boards import BoardFaultKind, ConverterBoard
+from shearloop.drivers.emulators.boards import ConverterBoard
 from shearloop.drivers.emulators.ports import PtyServer, SocketServer
 
 # The conductance of an open circuit's insulation.
@@ -360,11 +360,7 @@ class EmulatedScanner(ScpiInterpreter):
 class EmulatedAdcBoard(ConverterBoard):
     """A converter board, an ADS1220: sends a line `v1,v2` in volts for each conversion."""
 
-    faults = (
-        *(BoardFaultKind.MISSING, BoardFaultKind.GARBAGE, BoardFaultKind.TORN),
-        *(BoardFaultKind.SILENCE, BoardFaultKind.STUCK, BoardFaultKind.UNPLUG),
-    )
-
+    faults = ("missing", "garbage", "torn", "silence", "stuck", "unplug")
     # 24 bits over ±0.512 V, at gain 4.
     FULL_SCALE_V, STEP_V = 0.512, 0.512 / 2**23
 

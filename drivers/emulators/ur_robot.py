@@ -171,7 +171,7 @@ class ControlScript:
         return None
 
     def _begin(self, *, asynchronous: bool) -> None:
-        """Go on beside the motion just begun, or wait for its end."""
+        """Go on during the motion just begun, or wait for its end."""
         if asynchronous:
             self._thread = "move"
             self._operations = (self._operations + 1) % 128

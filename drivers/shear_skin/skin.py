@@ -91,12 +91,12 @@ class SampleValidator:
     ) -> None:
         """Expect the current that was set, the periods of source and voltages, and gauges of `gauge_ohm` at rest."""
         self.faults: Counter[str] = Counter()
+        self.samples = 0
         self.missed = 0
         self._current_a = current_a
         self._gauge_v = gauge_ohm * current_a
         self._stale_ns = round(SOURCE_STALE_PERIODS * source_period_s * 1e9)
         self._period_ns = round(daq_period_s * 1e9)
-        self._seq = 0
         self._last: Voltages | None = None
         self._repeats = [1, 1]
         self._steps = StepFilter[tuple[float, float]]()
@@ -124,11 +124,11 @@ class SampleValidator:
             current_a=source.current_a if source is not None and source.output_on else None,
             t_mid_ns=voltages.t_mid_ns,
             t_arrival_ns=voltages.t_arrival_ns,
-            seq=self._seq,
+            seq=self.samples,
             missed=missed,
             faults=tuple(faults),
         )
-        self._seq += 1
+        self.samples += 1
         return sample
 
     def _count_missed(self, voltages: Voltages) -> int:
@@ -206,7 +206,6 @@ class ShearSkin:
         self._daq = daq
         self._validator = SampleValidator(source.current_a, source.period_s, daq.period_s, gauge_ohm)
         self._latest: SourceReading | None = None
-        self._samples = 0
 
     async def watch_source(self) -> None:
         """Set the source up and read it until cancelled; then switch its output off."""
@@ -218,7 +217,6 @@ class ShearSkin:
         """Yield a sample for every reading of the voltages, without end; iterate within `contextlib.aclosing`."""
         async with contextlib.aclosing(self._daq.readings()) as readings:
             async for voltages in readings:
-                self._samples += 1
                 yield self._validator.sample(voltages, self._latest)
 
     def diagnostics(self) -> Diagnostics:
@@ -229,7 +227,7 @@ class ShearSkin:
             **found,
             "errors": {**(errors if isinstance(errors, Mapping) else {}), **self._validator.faults},
             "expected_hz": 1.0 / self._daq.period_s,
-            "samples": self._samples,
+            "samples": self._validator.samples,
             "missed": self._validator.missed,
         }
 

@@ -18,6 +18,7 @@ from shearloop.drivers.ur.messages import (
     CommandReply,
     Disconnect,
     Enable,
+    Heartbeat,
     MoveLinear,
     RobotState,
     RtdeSample,
@@ -247,16 +248,15 @@ class CommandHandler:
         """
         return self._executor.take_rejection()
 
-    def note_daemon_alive(self, now_ns: int) -> None:
-        """Note that the daemon sent something."""
+    def request(
+        self, number: int, command: Command | Heartbeat, sample: RtdeSample, now_ns: int
+    ) -> CommandReply | None:
+        """Return the reply to a command; None for a heartbeat, and when `tick` returns it later (`Unlock`)."""
         self._daemon_alive_ns = now_ns
-
-    def request(self, number: int, command: Command, sample: RtdeSample, now_ns: int) -> CommandReply | None:
-        """Return the reply to a command; None when `tick` returns it later (`Unlock`)."""
-        if isinstance(command, Stop) and self._recovery is not None and self._unlock_number is not None:
-            self._recovery.give_up("Unlocking was ended by a stop.")
         unfit = self._why_unfit(sample)
         match command:
+            case Heartbeat():
+                return None
             case Disconnect():
                 self.leaving = True
                 if self._recovery is not None:
@@ -292,6 +292,8 @@ class CommandHandler:
 
     def _stop(self, number: int, command: Stop, sample: RtdeSample, now_ns: int) -> str:
         """Stop on command; return why not, or an empty string."""
+        if self._recovery is not None and self._unlock_number is not None:
+            self._recovery.give_up("Unlocking was ended by a stop.")
         if command.deceleration_rad_per_s2 <= 0:
             return f"A deceleration of {command.deceleration_rad_per_s2:g} rad/s² is not above 0."
         if unfit := self._why_unfit(sample):

@@ -181,8 +181,7 @@ def _control(pipe: Pipe, configured: messages.Configure, arm: "UrArm") -> NoRetu
 def _handle_commands(pipe: Pipe, handler: CommandHandler, sample: messages.RtdeSample) -> None:
     """Carry out the daemon's commands."""
     for number, message in pipe.receive():
-        handler.note_daemon_alive(time.monotonic_ns())
-        if isinstance(message, messages.Command):
+        if isinstance(message, messages.Command | messages.Heartbeat):
             reply = handler.request(number, message, sample, time.monotonic_ns())
             if reply is not None:
                 pipe.send(reply, number)

@@ -163,7 +163,7 @@ def test_help_names_every_fault(capsys: pytest.CaptureFixture[str]) -> None:
         main(["emulate", "eit-kit", "--help"])
     assert ended.value.code == 0
     told = capsys.readouterr().out
-    assert [kind.value for kind in EitKitBoard.faults if kind.value not in told] == []
+    assert [name for name in EitKitBoard.faults if name not in told] == []
 
 
 def test_the_command_runs_without_a_terminal(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from shearloop.bank.eit.channels import LINE_SLOTS, ZERO_SLOTS, line_of_channels
 from shearloop.drivers import eit_kit
 from shearloop.drivers.connection import LinkEvent, LinkMonitor
 from shearloop.drivers.eit_kit import ADC_STEP_V, EitKit, Frame, FrameErrorKind
-from shearloop.drivers.emulators.boards import BoardFault, BoardFaultKind, EitKitBoard, format_line
+from shearloop.drivers.emulators.boards import EitKitBoard, format_line, parse_fault
 from tests.running import DEADLINE_S, LinkEvents, running, take
 
 PERIOD_S = 0.003
@@ -25,11 +25,12 @@ def some_lines(n: int) -> list[NDArray[np.float64]]:
 
 
 async def play(
-    lines: Iterable[NDArray[np.float64]], n_frames: int, tmp_path: Path, faults: dict[int, BoardFault] | None = None
+    lines: Iterable[NDArray[np.float64]], n_frames: int, tmp_path: Path, faults: dict[int, str] | None = None
 ) -> tuple[EitKit, list[Frame], list[LinkEvent]]:
     link = tmp_path / "eit"
     told = LinkEvents()
-    async with running(EitKitBoard(lines, period_s=PERIOD_S, link=link, fault_at=faults).run()):
+    fault_at = {number: parse_fault(text, EitKitBoard.faults) for number, text in (faults or {}).items()}
+    async with running(EitKitBoard(lines, period_s=PERIOD_S, link=link, fault_at=fault_at).run()):
         kit = EitKit(zero_slots=ZERO_SLOTS, path=link, frame_period_s=PERIOD_S, monitor=LinkMonitor(told))
         frames = await take(kit.readings(), n_frames)
     return kit, frames, told.events
@@ -80,17 +81,17 @@ async def test_a_reader_that_stops_for_a_while_loses_nothing(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("fault", "kind", "lost"),
     [
-        (BoardFaultKind.CUT_LINE, FrameErrorKind.WRONG_COUNT, True),
-        (BoardFaultKind.WRONG_COUNT, FrameErrorKind.WRONG_COUNT, True),
-        (BoardFaultKind.NAN, FrameErrorKind.NAN, True),
-        (BoardFaultKind.GARBAGE, FrameErrorKind.WRONG_COUNT, False),
+        ("cut-line", FrameErrorKind.WRONG_COUNT, True),
+        ("wrong-count", FrameErrorKind.WRONG_COUNT, True),
+        ("nan", FrameErrorKind.NAN, True),
+        ("garbage", FrameErrorKind.WRONG_COUNT, False),
     ],
 )
 async def test_a_fault_costs_its_own_frame_at_most_and_is_counted(
-    fault: BoardFaultKind, kind: FrameErrorKind, lost: bool, tmp_path: Path
+    fault: str, kind: FrameErrorKind, lost: bool, tmp_path: Path
 ) -> None:
     lines = some_lines(6)
-    kit, frames, _ = await play(lines, 6 - lost, tmp_path, {3: BoardFault(fault)})
+    kit, frames, _ = await play(lines, 6 - lost, tmp_path, {3: fault})
     assert_same(frames, lines[:3] + lines[3 + lost :])
     facts = kit.diagnostics()
     assert facts["errors"] == {kind.name.lower(): 1}
@@ -106,7 +107,7 @@ async def test_a_repeated_line_is_handed_over_as_such(tmp_path: Path) -> None:
 async def test_a_board_that_fell_silent_is_started_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(eit_kit, "MIN_SILENCE_S", 0.05)
     lines = some_lines(8)
-    kit, frames, events = await play(lines, 8, tmp_path, {4: BoardFault(BoardFaultKind.SILENCE)})
+    kit, frames, events = await play(lines, 8, tmp_path, {4: "silence"})
     assert_same(frames, lines)
     assert cast("int", kit.diagnostics()["silences"]) >= 1  # more when the machine is slow
     assert kit.diagnostics()["connections"] == 1
@@ -117,7 +118,7 @@ async def test_a_board_that_stays_silent_is_opened_anew(tmp_path: Path, monkeypa
     monkeypatch.setattr(eit_kit, "MIN_SILENCE_S", 0.02)
     monkeypatch.setattr(eit_kit, "STARTS_BEFORE_REOPENING", 2)
     lines = some_lines(5)
-    kit, frames, events = await play(cycle(lines), 10, tmp_path, {2: BoardFault(BoardFaultKind.SILENCE, 0.5)})
+    kit, frames, events = await play(cycle(lines), 10, tmp_path, {2: "silence:0.5"})
     # What the board sends while nobody has its port open is lost, as with a real one.
     places = [[line.tolist() for line in lines].index(frame.raw.tolist()) for frame in frames]
     assert places[:2] == [0, 1]
@@ -128,7 +129,7 @@ async def test_a_board_that_stays_silent_is_opened_anew(tmp_path: Path, monkeypa
 
 async def test_a_board_that_is_unplugged_is_found_again_and_started(tmp_path: Path) -> None:
     lines = some_lines(12)
-    kit, frames, events = await play(lines, 11, tmp_path, {6: BoardFault(BoardFaultKind.UNPLUG, 0.05)})
+    kit, frames, events = await play(lines, 11, tmp_path, {6: "unplug:0.05"})
     assert_same(frames, [*lines[:6], *lines[7:]])
     facts = kit.diagnostics()
     assert facts["connections"] == 2

@@ -81,15 +81,34 @@ def run(args: argparse.Namespace) -> int:
         )
     if tool_mm is not None and not 0 < tool_mm < LARGEST_DIAMETER_MM:
         raise UserError(f"--tool-mm must be above 0 and below {LARGEST_DIAMETER_MM:g} mm, not {tool_mm:g}")
+    _check_options(args)
     check_overwrite(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
     physics = Physics(
         bank=Bank.open(args.bank) if args.bank else None, mesh=load_mesh(args.mesh) if args.mesh else None
     )
     result = calibrate(args.recordings, args.estimator, physics, options)
+    if args.assume_full_range and result.calibration.torque is None:
+        raise UserError("--assume-full-range is about torques, and these slices have diameters only; leave it out")
     result.calibration.save(args.out)
     sentences = [*sentences_of(result), f"Written to {args.out}."]
     print_result({"path": str(args.out), **result.figures()}, sentences, as_json=args.json)
     return 0
+
+
+def _check_options(args: argparse.Namespace) -> None:
+    """Raise UserError for an option that has no effect on these recordings or folders of slices."""
+    from shearloop.daemon.errors import UserError
+
+    folders = [path.is_dir() for path in args.recordings]
+    if args.assume_full_range and not all(folders):
+        raise UserError("--assume-full-range is for slices; leave it out for recordings")
+    for option, given, why in (
+        ("--load-cell-delay-s", args.load_cell_delay_s, "each slice holds its torque itself"),
+        ("--tool-mm", args.tool_mm, "a calibration of slices knows no tool"),
+        ("--sides", args.sides, "slices do not name their side"),
+    ):
+        if given is not None and any(folders):
+            raise UserError(f"{option} is for recordings: {why}; leave it out")
 
 
 def sentences_of(result: "CalibrationResult") -> list[str]:

@@ -14,7 +14,7 @@ from shearloop.daemon.control.safety import Response
 from shearloop.daemon.control.step_runner import Action, ExperimentPhase, GripTo
 from shearloop.drivers.emulators.scene import Twin, TwinSettings
 from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed
+from shearloop.drivers.ur.messages import Enable, Heartbeat, MoveLinear, Stop, Unlock, WristSpeed
 from tests.daemon.control.loop_rig import EIT, new_loop
 from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, FakeArm
 from tests.drivers.ur.test_limits import LIMITS
@@ -106,7 +106,7 @@ class WholeRig:
         self.number += 1
         torque_nm = self.twin.step(CYCLE_NS / 1e9, self.arm.reading.wrist_rad, self.force_n).torque_nm
         self.arm.be(wrench=(0.0, 0.0, 0.0, 0.0, 0.0, torque_nm))
-        self.handler.note_daemon_alive(self.now_ns)
+        self.handler.request(0, Heartbeat(), self.arm.reading, self.now_ns)
         self.handler.tick(self.arm.reading, self.now_ns)
         if self.late:
             self.late -= 1

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from shearloop.drivers.connection import LinkMonitor
-from shearloop.drivers.emulators.boards import PAPER_SKETCH, BoardFault, BoardFaultKind, Hx711Board, Sketch
+from shearloop.drivers.emulators.boards import PAPER_SKETCH, Hx711Board, Sketch
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell, LoadSample
 from tests.running import LinkEvents, pass_on, running
 
@@ -68,8 +68,8 @@ async def test_torque_comes_through_from_either_sketch(
 async def test_corrupted_lines_are_flagged_or_counted_and_the_rest_goes_on(tmp_path: Path) -> None:
     async with a_rig(tmp_path) as rig:
         await rig.until(lambda: len(rig.samples) > 5)
-        rig.board.inject(BoardFault(BoardFaultKind.SPIKE))
-        rig.board.inject(BoardFault(BoardFaultKind.GARBAGE))
+        rig.board.command("spike")
+        rig.board.command("garbage")
         await rig.until(lambda: rig.cell.diagnostics()["errors"])
         await rig.until(lambda: [sample for sample in rig.samples if sample.spike])
         n = len(rig.samples)
@@ -83,12 +83,12 @@ async def test_corrupted_lines_are_flagged_or_counted_and_the_rest_goes_on(tmp_p
 async def test_saturation_and_a_frozen_converter_are_flagged_while_they_last(tmp_path: Path) -> None:
     async with a_rig(tmp_path) as rig:
         await rig.until(lambda: rig.samples)
-        rig.board.inject(BoardFault(BoardFaultKind.SATURATION, 0.01))
+        rig.board.command("saturation:0.01")
         await rig.until(lambda: [sample for sample in rig.samples if sample.saturated])
         await rig.until(lambda: rig.samples[-1].trusted)
-        rig.board.inject(BoardFault(BoardFaultKind.STUCK))
+        rig.board.command("stuck")
         await rig.until(lambda: [sample for sample in rig.samples if sample.stuck])
-        rig.board.inject(BoardFault(BoardFaultKind.STUCK, 0.0))
+        rig.board.command("stuck:0.0")
         await rig.until(lambda: rig.samples[-1].trusted)
 
 
@@ -107,7 +107,7 @@ async def test_a_jump_in_torque_is_flagged_and_then_believed(tmp_path: Path) -> 
 async def test_an_unplugged_board_is_lost_and_found_again(tmp_path: Path) -> None:
     async with a_rig(tmp_path) as rig:
         await rig.until(lambda: len(rig.samples) > 3)
-        rig.board.inject(BoardFault(BoardFaultKind.UNPLUG, 0.05))
+        rig.board.command("unplug:0.05")
         await rig.down()
         n = len(rig.samples)
         await rig.until(lambda: len(rig.samples) > n + 3)
@@ -120,7 +120,7 @@ async def test_an_unplugged_board_is_lost_and_found_again(tmp_path: Path) -> Non
 async def test_silence_is_reported_as_a_loss(tmp_path: Path) -> None:
     async with a_rig(tmp_path) as rig:
         await rig.until(lambda: len(rig.samples) > 3)
-        rig.board.inject(BoardFault(BoardFaultKind.SILENCE))
+        rig.board.command("silence")
         await rig.down()
         assert "sent nothing for 0.7 s" in rig.losses[0].sentence
 

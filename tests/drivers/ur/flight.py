@@ -177,7 +177,7 @@ class Flight:
     def fly(self, cycles: int, *, daemon_alive: bool = True) -> None:
         for _ in range(cycles):
             if daemon_alive:
-                self.handler.note_daemon_alive(self.now_ns)
+                self.handler.request(0, messages.Heartbeat(), self.arm.reading, self.now_ns)
             decided = self.handler.tick(self.arm.reading, self.now_ns)
             if decided is not None:
                 assert decided[0] not in self.decided

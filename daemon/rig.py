@@ -1,7 +1,6 @@
 """The rig: builds gripper, robot and control loop from the configuration, and checks its experiment."""
 
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 
 from shearloop.daemon.clock import Clock
@@ -28,15 +27,16 @@ from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.supervisor import Supervisor, Task
-from shearloop.daemon.taring import Sensor, tare_all
+from shearloop.daemon.taring import Sensor
 from shearloop.drivers.calibration_files import load_calibration
 from shearloop.drivers.connection import LinkEvent, LinkMonitor
+from shearloop.drivers.errors import DriverError
 from shearloop.drivers.load_cell import LoadCalibration
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
-from shearloop.drivers.ur.client import UrRobot
-from shearloop.drivers.ur.settings import read_settings
+from shearloop.drivers.ur.client import UrRobot, missing_library
+from shearloop.drivers.ur.settings import UrSettings, read_settings
 
 
 def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
@@ -80,11 +80,19 @@ class DeviceLink(LinkLog):
             self._loop.on_link(self.device, event.sentence, up=event.up)
 
 
+def robot_settings(path: Path) -> UrSettings:
+    """Return the robot's settings; raises DriverError if they, or the library that drives it, cannot be used."""
+    settings = read_settings(path)
+    if reason := missing_library():
+        raise DriverError(f"{path}: {reason}")
+    return settings
+
+
 def make_loop(config: DaemonConfig, sources: Mapping[str, TorqueSource]) -> ControlLoop | None:
     """Return the control loop of the configured robot, if there is one; `sources` are all torques but the robot's."""
     if config.robot is None:
         return None
-    robot = read_settings(config.robot)
+    robot = robot_settings(config.robot)
     sources = {**sources, WRENCH: wrench_source(robot.rate_hz)}
     # Controller, identification and commands plan with what the robot's process lets through.
     top, most = robot.limits.wrist_speed_rad_per_s.inner, robot.limits.wrist_acceleration_rad_per_s2.inner
@@ -138,12 +146,12 @@ class Rig:
             raise ValueError("a rig needs a robot")
         self.control_loop = loop
         self.gripper = gripper
-        self.robot = UrRobot(read_settings(config.robot), LinkMonitor(DeviceLink("robot", loop)))
+        self.robot = UrRobot(robot_settings(config.robot), LinkMonitor(DeviceLink("robot", loop)))
         self.runner = ControlLoopRunner(
             loop,
             self.robot,
             gripper,
-            partial(tare_all, sensors.values()),
+            sensors.values(),
             publisher,
             clock,
             supervisor.dead,

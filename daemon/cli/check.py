@@ -64,8 +64,7 @@ def _torque(estimator: "LiveEstimator", *, calibrated: bool) -> str:
 
 
 def _rig(config: "DaemonConfig") -> dict[str, str]:
-    from shearloop.daemon.rig import gripper_calibration, load_cell_calibration
-    from shearloop.drivers.ur.settings import read_settings
+    from shearloop.daemon.rig import gripper_calibration, load_cell_calibration, robot_settings
 
     parts = {}
     if config.load_cell is not None:
@@ -77,7 +76,7 @@ def _rig(config: "DaemonConfig") -> dict[str, str]:
         gripper_calibration(config.gripper)
         parts["gripper"] = "widths by the manufacturer's figures" if path is None else f"calibration {path}"
     if config.robot is not None:
-        parts["robot"] = f"{read_settings(config.robot).host}, limits of {config.robot}"
+        parts["robot"] = f"{robot_settings(config.robot).host}, limits of {config.robot}"
     return parts
 
 

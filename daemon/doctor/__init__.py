@@ -2,7 +2,6 @@
 
 import asyncio
 import ctypes
-import importlib.util
 import os
 import shutil
 import sys
@@ -35,6 +34,7 @@ from shearloop.daemon.messaging.addresses import stop_address
 from shearloop.daemon.sensing.estimators import open_combined, open_estimator
 from shearloop.daemon.serial_ports import list_serial_ports
 from shearloop.drivers.errors import DriverError
+from shearloop.drivers.ur.client import missing_library
 from shearloop.drivers.ur.settings import read_settings
 
 __all__ = ["Finding", "examine"]
@@ -90,10 +90,9 @@ def check_computer() -> Iterator[Finding]:
     else:
         yield good("memory", found)
     version = ".".join(map(str, sys.version_info[:2]))
-    if importlib.util.find_spec("rtde_control") is None:
-        means = "everything but the robot works"
-        cure = "use Python 3.11 or 3.12 on x86-64, then `pip install ur-rtde`"
-        yield note("robot's library", f"ur-rtde is not installed for Python {version}", means, cure)
+    if reason := missing_library():
+        cause, _, cure = reason.partition(": ")
+        yield note("robot's library", cause, "everything but the robot works", cure)
     else:
         yield good("robot's library", f"ur-rtde is installed, Python {version}")
 

@@ -5,17 +5,18 @@ A new worker has motion disabled. No command is sent twice, and nothing moves be
 
 import asyncio
 import contextlib
-import importlib.util
 import math
+import platform
 import signal
 import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Coroutine
+from importlib.util import find_spec
 from typing import Any, Literal, Protocol, cast
 
 from shearloop.drivers.connection import Diagnostics, LinkMonitor
-from shearloop.drivers.errors import DeviceLostError, DriverError, ProtocolError
+from shearloop.drivers.errors import DeviceLostError, ProtocolError
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.controller import silent_sentence
 from shearloop.drivers.ur.settings import UrSettings
@@ -40,6 +41,17 @@ class LostError(DeviceLostError):
     def __init__(self, kind: LossKind, sentence: str) -> None:
         super().__init__(sentence)
         self.kind: LossKind = kind
+
+
+def missing_library() -> str:
+    """Return why the robot cannot be driven with this Python, or an empty string."""
+    if find_spec("rtde_control") is not None:
+        return ""
+    return (
+        f"the robot needs the package ur-rtde, which is not installed for Python {platform.python_version()} on "
+        f"{platform.machine()}: use Python 3.11 or 3.12 on x86-64, or build it with `pip install "
+        "'shearloop[robot-source]'`, which needs cmake, g++ and Boost's headers"
+    )
 
 
 class UrRobot:
@@ -107,17 +119,7 @@ class UrRobot:
         self._connection.send(command, self._number)
 
     async def run(self) -> None:
-        """Keep the robot connected until cancelled; then stop it and disconnect.
-
-        Raises:
-            DriverError: ur-rtde is not installed.
-        """
-        if importlib.util.find_spec("rtde_control") is None:
-            raise DriverError(
-                "The robot needs the package ur-rtde, which is not installed here. It has wheels for CPython up to "
-                "3.12 on x86-64 Linux and none for 3.13 or later: run shearloop with Python 3.11 or 3.12, then "
-                "`pip install 'ur-rtde>=1.6'`."
-            )
+        """Keep the robot connected until cancelled; then stop it and disconnect."""
         while True:
             try:
                 await self._run_worker()

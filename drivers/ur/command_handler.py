@@ -253,8 +253,6 @@ class CommandHandler:
     ) -> CommandReply | None:
         """Return the reply to a command; None for a heartbeat, and when `tick` returns it later (`Unlock`)."""
         self._daemon_alive_ns = now_ns
-        if isinstance(command, Stop) and self._recovery is not None and self._unlock_number is not None:
-            self._recovery.give_up("Unlocking was ended by a stop.")
         unfit = self._why_unfit(sample)
         match command:
             case Heartbeat():
@@ -294,6 +292,8 @@ class CommandHandler:
 
     def _stop(self, number: int, command: Stop, sample: RtdeSample, now_ns: int) -> str:
         """Stop on command; return why not, or an empty string."""
+        if self._recovery is not None and self._unlock_number is not None:
+            self._recovery.give_up("Unlocking was ended by a stop.")
         if command.deceleration_rad_per_s2 <= 0:
             return f"A deceleration of {command.deceleration_rad_per_s2:g} rad/s² is not above 0."
         if unfit := self._why_unfit(sample):

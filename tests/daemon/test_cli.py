@@ -369,3 +369,13 @@ def test_unlock_waits_and_a_missing_daemon_is_reported_at_once(
     assert main(["command", "stop"]) == 0
     assert asked == [("status", 2.0), ("unlock", 60.0), ("unlock", 5.0), ("stop", 2.0)]
     assert "unlock: done" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_a_missing_robot_library_is_one_sentence(
+    config: Callable[..., Path], command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shearloop.drivers.ur.client.find_spec", lambda _name: None)
+    said = mistake(capsys, command, str(config(robot=str(Path("config/ur.yaml").resolve()))))
+    assert "the robot needs the package ur-rtde, which is not installed for Python 3." in said
+    assert "pip install 'shearloop[robot-source]'" in said

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import LAST_WORDS_BYTES, LostError, UrRobot, WorkerConnection
 from shearloop.drivers.ur.messages import CommandReply, Failed, Stop, encode
 from tests.drivers.ur.flight import SETTINGS, Flight, flying
@@ -28,12 +27,6 @@ async def test_absent_controller_is_explained() -> None:
         assert "refused" in loss.sentence
 
 
-async def test_missing_ur_rtde_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
-    with pytest.raises(DriverError, match=r"none for 3\.13"):
-        await UrRobot(settings_for("127.0.0.254")).run()
-
-
 @pytest.fixture
 def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Run shell commands instead of the worker."""
@@ -42,7 +35,6 @@ def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Non
         script = tmp_path / "process"
         script.write_text(f"#!/bin/sh\n{commands}\n")
         script.chmod(0o700)
-        monkeypatch.setattr("importlib.util.find_spec", lambda _name: True)
         monkeypatch.setattr(sys, "executable", str(script))
 
     return write

@@ -496,7 +496,6 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
     driving = experiment.file.torque_source if experiment is not None else ""
     latest = control_loop.inputs.torques.get(driving)
     controller = control_loop.controller
-    estimates = controller.state if controller is not None else None
     tool = control_loop.tool
     return LoopState(
         source="loop",
@@ -514,9 +513,9 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
         tool_mm=experiment.file.tool_mm if experiment is not None else None,
         torque_source=driving,
         torque_nm=latest.torque_nm if latest is not None else None,
-        set_point_nm=estimates.set_point_nm if estimates else None,
-        ramp_nm=estimates.ramp_nm if estimates else None,
-        expected_nm=estimates.torque_nm if estimates else None,
+        set_point_nm=controller.set_point_nm if controller is not None else None,
+        ramp_nm=controller.ramp_nm if controller is not None else None,
+        expected_nm=controller.torque_nm if controller is not None else None,
         stiffness_nm_per_rad=tool.stiffness_nm_per_rad if tool is not None else None,
         delay_s=tool.age_s + tool.significant_lag_s if tool is not None else None,
         noise_nm=tool.noise_nm if tool is not None else None,

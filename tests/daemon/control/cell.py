@@ -172,14 +172,11 @@ class Cell:
         self.control_loop = ControlLoop(LoopConfig(), {WRENCH: source}, ("robot",))
         self.died: dict[str, str] = {}
 
-        async def no_zero() -> str:
-            return ""
-
         self.runner = ControlLoopRunner(
             self.control_loop,
             self.robot,
             self.gripper,  # type: ignore[arg-type]
-            no_zero,
+            (),
             self.published,  # type: ignore[arg-type]
             StepClock(self.robot.flight),
             self.died,

@@ -59,11 +59,11 @@ def _run_eit_kit(args: argparse.Namespace) -> int:
     from shearloop.drivers.emulators.boards import EitKitBoard
 
     console.check_positive(args, "speed")
-    fault_at = dict(_numbered_fault(text) for text in args.fault)
+    link, fault_at = console.checked_link(args.link), dict(_numbered_fault(text) for text in args.fault)
     board = EitKitBoard(
         _frames(args, FRAME_PERIOD_S),
         period_s=FRAME_PERIOD_S / args.speed,
-        link=console.checked_link(args.link),
+        link=link,
         fault_at=fault_at,
         seed=args.seed,
     )

@@ -8,14 +8,12 @@ the real controller on the simulated plant. The computed one comes from the marg
 from the monodromy matrix of one cycle of lost frames.
 """
 
-import argparse
-import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
+from benchmarks.common import parser_of, write_figures
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.analysis.charts.simulated_loop import (
     LoopController,
@@ -187,8 +185,7 @@ def worst_disagreement(rows: Iterable[Mapping[str, float | None]]) -> float:
 
 def main() -> None:
     """Measure, write the numbers, draw the chart."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON file to write")
+    parser = parser_of(__doc__)
     args = parser.parse_args()
     points = [(age, 0) for age in AGES_S] + [(EIT_AGE_S, lost) for lost in LOST[1:]]
     found = {case.name: [boundary(case, *point) for point in points] for case in CASES}
@@ -196,8 +193,7 @@ def main() -> None:
     for name, rows in found.items():
         for row in rows:
             print(f"| {name} | {' | '.join('–' if value is None else f'{value:.3g}' for value in row.values())} |")
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(found, indent=1) + "\n")
+    write_figures(args.out, found)
     print(f"largest disagreement {worst_disagreement([row for rows in found.values() for row in rows]):.1%}")
 
 

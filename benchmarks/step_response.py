@@ -8,8 +8,6 @@ the default estimator also closes the loop on the rig's own frames from both fin
 so the numbers are the same on every machine.
 """
 
-import argparse
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -18,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.common import parser_of, write_figures
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFrame
@@ -268,18 +267,14 @@ def estimator_in_the_loop(bank: Path, calibration: Calibration, seeds: Sequence[
 
 def main() -> None:
     """Measure and write the numbers."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON file to write")
+    parser = parser_of(__doc__)
     parser.add_argument("--seeds", type=int, default=200)
     parser.add_argument("--bank", type=Path, help="the emulated rig's bank, to close the loop with the estimator too")
     args = parser.parse_args()
     numbers = measure(args.seeds)
     if args.bank is not None:
         numbers["estimator"] = estimator_in_the_loop(args.bank, rig_calibration(args.bank, 7), range(20))
-    text = json.dumps(numbers, indent=2)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(text + "\n")
-    print(text)
+    print(write_figures(args.out, numbers))
 
 
 if __name__ == "__main__":

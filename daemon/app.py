@@ -15,19 +15,18 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
-from shearloop.daemon.health import HealthReporter, Reporter, TaskFacts
 from shearloop.daemon.messaging.addresses import local_stop_address
 from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import CurveAuthenticator, Refusals, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
+from shearloop.daemon.process import ending_signals
 from shearloop.daemon.recording.recorder import Recorder, daemon_identity
 from shearloop.daemon.rig import Rig, check_experiment, make_gripper, make_loop
 from shearloop.daemon.sensing.estimators import COMBINED, open_combined, open_estimator, torque_sources
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.sensors import SensorBuilder, Sensors
 from shearloop.daemon.service import notify
-from shearloop.daemon.signals import ending_signals
-from shearloop.daemon.supervisor import Supervisor, Task
+from shearloop.daemon.supervisor import HealthReporter, Reporter, Supervisor, Task, TaskFacts
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.health import HealthReporter
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
 from shearloop.daemon.rig import Rig
 from shearloop.daemon.sensors import Sensors
+from shearloop.daemon.supervisor import HealthReporter
 
 STOP_DELAY_S = 0.05
 

@@ -1,7 +1,9 @@
-"""The serial ports of this computer, their USB serial numbers, and whether the user may open them."""
+"""`shearloop ports`: the serial ports, their USB serial numbers, and whether the user may open them."""
 
+import argparse
+import json
 import os
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from serial.tools import list_ports
@@ -35,6 +37,30 @@ class SerialPortInfo:
         if self.serial_number:
             return f'{{serial_number: "{self.serial_number}"}}'
         return f"{{path: {self.stable_name or self.path}}}"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `ports`."""
+    parser.add_argument("--json", action="store_true", help="print them as JSON")
+    parser.epilog = "Shows for each port the `device` for the configuration, which is found in any socket."
+
+
+def run(args: argparse.Namespace) -> int:
+    """List the ports without opening them."""
+    ports = list_serial_ports()
+    if args.json:
+        print(json.dumps([{**asdict(port), "named_by": port.named_by} for port in ports], ensure_ascii=False))
+        return 0
+    if not ports:
+        print("there is no serial port: plug a board in, then look at `sudo dmesg | tail`")
+    for port in ports:
+        print(port.path, port.usb, port.likely or port.description, sep="  ")
+        print(f"    device: {port.named_by}")
+        if not port.serial_number:
+            print("    it has no serial number: leave it in the same socket")
+        if port.error:
+            print(f"    {port.error}")
+    return 0
 
 
 def list_serial_ports() -> list[SerialPortInfo]:

@@ -26,7 +26,7 @@ from aiohttp import WSCloseCode, web
 from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, TOPICS, stale_after_s
-from shearloop.daemon.signals import ending_signals
+from shearloop.daemon.process import ending_signals
 from shearloop.daemon.web.bridge import Bridge, BusyError, DaemonAddress
 from shearloop.daemon.web.message_store import MessageStore
 

@@ -18,7 +18,6 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.health import HealthReporter
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer, RateLimit
 from shearloop.daemon.messaging.keys import Refusals
@@ -26,6 +25,7 @@ from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.rig import Rig
 from shearloop.daemon.sensors import Sensors
+from shearloop.daemon.supervisor import HealthReporter
 
 
 def handlers() -> Mapping[str, Any]:

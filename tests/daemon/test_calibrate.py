@@ -5,7 +5,6 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 from typing import Self
 
 import pytest
@@ -34,7 +33,6 @@ class Process:
         self.end()
 
     def tell(self, line: str) -> None:
-        assert self._child.stdin is not None
         self._child.stdin.write(f"{line}\n")
         self._child.stdin.flush()
 
@@ -42,13 +40,11 @@ class Process:
         """Tell an emulator something, and wait until it has been done: commands are taken in order."""
         self.tell(line)
         self.tell("?")
-        assert self._child.stderr is not None
         assert "'?'" in self._child.stderr.readline()
 
     def hear(self, beginning: str, *, on_stderr: bool = False) -> str:
         """Return the next line that begins like this."""
         stream = self._child.stderr if on_stderr else self._child.stdout
-        assert stream is not None
         for line in stream:
             self.said.append(line.strip())
             if line.startswith(beginning):
@@ -62,7 +58,7 @@ class Process:
         return self._child.returncode, out, err
 
 
-def test_the_load_cell_is_calibrated_step_by_step_and_a_step_can_be_refused(tmp_path: Path) -> None:
+def test_the_load_cell_is_calibrated_step_by_step_and_a_step_can_be_refused(tmp_path):
     link, out = tmp_path / "load", tmp_path / "load.yaml"
     with Process("emulate", "hx711", "--link", str(link), "--speed", "20") as board:
         board.hear(str(link))
@@ -92,7 +88,7 @@ def test_the_load_cell_is_calibrated_step_by_step_and_a_step_can_be_refused(tmp_
     assert calibration.torque_nm(81_250) == pytest.approx(0.0, abs=2e-4)
 
 
-def test_for_a_script_the_result_alone_is_on_stdout(tmp_path: Path) -> None:
+def test_for_a_script_the_result_alone_is_on_stdout(tmp_path):
     link, out = tmp_path / "load", tmp_path / "load.yaml"
     with Process("emulate", "hx711", "--link", str(link), "--speed", "20") as board:
         board.hear(str(link))
@@ -113,7 +109,7 @@ def test_for_a_script_the_result_alone_is_on_stdout(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("way", ["socket", "modbus"])
-def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path: Path, way: str) -> None:
+def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path, way):
     out, link = tmp_path / "gripper.yaml", tmp_path / "gripper"
     arguments = ("--port", "0") if way == "socket" else ("--link", str(link))
     with Process("emulate", f"gripper-{way}", "--speed", "20", *arguments) as gripper:
@@ -158,13 +154,7 @@ def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path: Path, way:
         ("gripper --port /dev/none --diameter-mm 2 --diameter-mm 4 --out g.yaml", "/dev/none"),
     ],
 )
-def test_a_mistake_ends_in_one_sentence(
-    arguments: str,
-    said: str,
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_mistake_ends_in_one_sentence(arguments, said, tmp_path, capfd, monkeypatch):
     from shearloop.daemon.cli import main
 
     monkeypatch.chdir(tmp_path)
@@ -175,7 +165,7 @@ def test_a_mistake_ends_in_one_sentence(
     assert message.count("\n") == 1
 
 
-def test_the_end_of_the_input_ends_the_calibration_with_a_sentence(tmp_path: Path) -> None:
+def test_the_end_of_the_input_ends_the_calibration_with_a_sentence(tmp_path):
     link = tmp_path / "load"
     with Process("emulate", "hx711", "--link", str(link), "--speed", "20") as board:
         board.hear(str(link))
@@ -202,16 +192,14 @@ def test_the_end_of_the_input_ends_the_calibration_with_a_sentence(tmp_path: Pat
         ("gripper-modbus --link /nowhere/at/all", "/nowhere/at/all cannot be made"),
     ],
 )
-def test_an_emulator_that_cannot_be_played_says_why(
-    arguments: str, said: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_an_emulator_that_cannot_be_played_says_why(arguments, said, capfd):
     from shearloop.daemon.cli import main
 
     assert main(["emulate", *arguments.split()]) == 2
     assert said in capfd.readouterr().err
 
 
-def test_a_gripper_socket_fails_on_request() -> None:
+def test_a_gripper_socket_fails_on_request():
     import socket
 
     with Process("emulate", "gripper-socket", "--port", "0", "--speed", "10") as gripper:

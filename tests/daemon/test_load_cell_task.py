@@ -60,7 +60,7 @@ async def reading(
     published: Published | None = None, rate_hz: float = 10.9
 ) -> AsyncIterator[tuple[LoadCellTask, Board]]:
     board = Board()
-    task = LoadCellTask(board, published or Published(), Clock(), None, rate_hz)  # type: ignore[arg-type]
+    task = LoadCellTask(board, published or Published(), Clock(), None, rate_hz)
     async with running(task.run()):
         yield task, board
 
@@ -71,7 +71,7 @@ async def asked(task: LoadCellTask) -> asyncio.Task[str]:
     return zero
 
 
-async def test_whoever_waits_for_a_zero_is_told_though_another_asks_meanwhile() -> None:
+async def test_whoever_waits_for_a_zero_is_told_though_another_asks_meanwhile():
     async with reading() as (task, board):
         first = await asked(task)
         await board.send(5.0, ZERO_SAMPLES // 2)
@@ -82,7 +82,7 @@ async def test_whoever_waits_for_a_zero_is_told_though_another_asks_meanwhile() 
         assert board.tares == [7.0], "a zero is of the samples after it was asked for"
 
 
-async def test_a_zero_that_cannot_be_taken_is_given_up_with_the_reason() -> None:
+async def test_a_zero_that_cannot_be_taken_is_given_up_with_the_reason():
     async with reading() as (task, board):
         task._timeout_s = 0.05
         zero = await asked(task)
@@ -93,14 +93,14 @@ async def test_a_zero_that_cannot_be_taken_is_given_up_with_the_reason() -> None
         assert board.tares == [], "nor at whatever load comes later"
 
 
-async def test_the_operators_tare_is_taken_from_the_next_samples() -> None:
+async def test_the_operators_tare_is_taken_from_the_next_samples():
     async with reading() as (task, board):
         task.tare()
         await board.send(3.0)
         assert board.tares == [3.0]
 
 
-async def test_a_slow_board_has_the_time_that_its_readings_take() -> None:
+async def test_a_slow_board_has_the_time_that_its_readings_take():
     async with reading(rate_hz=1.0) as (task, board):
         task.tare()
         now_ns = Clock().now_ns()
@@ -111,7 +111,7 @@ async def test_a_slow_board_has_the_time_that_its_readings_take() -> None:
         assert task.diagnostics()["error"] == ""
 
 
-async def test_readings_that_know_of_the_load_before_are_not_of_the_zero() -> None:
+async def test_readings_that_know_of_the_load_before_are_not_of_the_zero():
     """An HX711 settles within four conversions: a reading is of the time since three before its own began."""
     async with reading() as (task, board):
         now_ns, period_ns = Clock().now_ns(), round(1e9 / 10.9)
@@ -126,7 +126,7 @@ async def test_readings_that_know_of_the_load_before_are_not_of_the_zero() -> No
         assert board.tares == [4 + (ZERO_SAMPLES - 1) / 2]
 
 
-async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_later_hour() -> None:
+async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_later_hour():
     async with reading() as (task, board):
         task.tare()
         await board.send(8388607.0, saturated=True)
@@ -150,7 +150,7 @@ async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_
     ("flag", "why"),
     [("saturated", "end of its range"), ("spike", "can move"), ("stuck", "two seconds"), ("partial", "longer line")],
 )
-async def test_a_reading_that_is_not_to_be_believed_says_so_to_whoever_listens(flag: str, why: str) -> None:
+async def test_a_reading_that_is_not_to_be_believed_says_so_to_whoever_listens(flag, why):
     published = Published()
     async with reading(published) as (_, board):
         board.sent.put_nowait(LoadSample(5.0, 0.1, 1, 1, 1, **{flag: True}))

@@ -39,7 +39,7 @@ class RecordingPublisher:
         self._published = asyncio.Event()
 
     def publish(self, message: Message) -> None:
-        self.messages.append((message.topic, message.source, message.frame))  # type: ignore[attr-defined]
+        self.messages.append((message.topic, message.source, message.frame))
         self._published.set()
         if len(self.messages) == self._enough:
             self.enough.set()
@@ -164,7 +164,7 @@ async def running(*coroutines: Any) -> AsyncGenerator[list[asyncio.Task[None]]]:
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def test_each_frame_is_estimated_and_then_published_in_order() -> None:
+async def test_each_frame_is_estimated_and_then_published_in_order():
     publisher = RecordingPublisher(8)
     async with running(fingertip(publisher, FakeEstimator()).run()):
         await publisher.enough.wait()
@@ -172,13 +172,13 @@ async def test_each_frame_is_estimated_and_then_published_in_order() -> None:
     assert publisher.messages == expected
 
 
-async def test_an_error_of_the_estimator_ends_the_task() -> None:
+async def test_an_error_of_the_estimator_ends_the_task():
     async with running(fingertip(RecordingPublisher(), FakeEstimator(fails=0)).run()) as (task,):
         with pytest.raises(ZeroDivisionError):
             await task
 
 
-async def test_pairs_are_estimated_in_order_by_the_first_fingertip_that_is_free() -> None:
+async def test_pairs_are_estimated_in_order_by_the_first_fingertip_that_is_free():
     publisher, slow = RecordingPublisher(), FakeEstimator(waits=0)
     combined = CombinedFingertips(estimates(COMBINED, publisher, FakeEstimator()), PERIOD_S)
     async with running(fingertip(publisher, slow, combined, in_one_read=2).run()):
@@ -190,7 +190,7 @@ async def test_pairs_are_estimated_in_order_by_the_first_fingertip_that_is_free(
 
 
 @pytest.mark.parametrize("since_ms", [1, 100, 540, 621])
-async def test_a_tare_begins_with_the_first_frame_acquired_after_it(since_ms: int) -> None:
+async def test_a_tare_begins_with_the_first_frame_acquired_after_it(since_ms):
     clock, estimator, raw = FixedClock(), FakeEstimator(), list[RawEvent]()
     task = estimates("right", RecordingPublisher(), estimator, clock, inputs=Inputs(raw))
     asked_ns = clock.t_ns
@@ -204,7 +204,7 @@ async def test_a_tare_begins_with_the_first_frame_acquired_after_it(since_ms: in
     assert [(one.kind, one.data) for one in raw] == [(InputKind.TARE, str(first).encode())], "as a replay finds it"
 
 
-async def test_a_pair_with_one_earlier_frame_is_not_part_of_the_tare() -> None:
+async def test_a_pair_with_one_earlier_frame_is_not_part_of_the_tare():
     clock, estimator = FixedClock(), FakeEstimator()
     task = estimates(COMBINED, RecordingPublisher(), estimator, clock)
     task.tare()
@@ -214,7 +214,7 @@ async def test_a_pair_with_one_earlier_frame_is_not_part_of_the_tare() -> None:
     assert estimator.tared_before == [1]
 
 
-async def test_a_second_tare_replaces_the_first() -> None:
+async def test_a_second_tare_replaces_the_first():
     clock, estimator = FixedClock(), FakeEstimator()
     task = estimates("right", RecordingPublisher(), estimator, clock)
     for seq in range(5):
@@ -225,7 +225,7 @@ async def test_a_second_tare_replaces_the_first() -> None:
     assert estimator.tared_before == [2]
 
 
-async def test_waiting_for_a_tare_ends_when_it_is_complete() -> None:
+async def test_waiting_for_a_tare_ends_when_it_is_complete():
     clock, estimator = FixedClock(), FakeEstimator()
     task = estimates("right", RecordingPublisher(), estimator, clock)
     async with running(task.tare_and_wait()) as (waiting,):
@@ -237,5 +237,5 @@ async def test_waiting_for_a_tare_ends_when_it_is_complete() -> None:
         await waiting
 
 
-def test_the_configured_frame_period_is_the_boards() -> None:
+def test_the_configured_frame_period_is_the_boards():
     assert FingertipConfig.model_fields["frame_period_s"].default == FRAME_PERIOD_S

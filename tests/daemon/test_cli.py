@@ -27,9 +27,10 @@ from shearloop.daemon.cli.completion import full_parser
 from shearloop.daemon.cli.terminal import message_json, message_line
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.runner import WRENCH
-from shearloop.daemon.messaging.messages import decode, encode
+from shearloop.daemon.messaging.messages import EitEstimate, decode, encode, wire_map
 from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
+from tests.daemon.sample_messages import sample
 
 
 def mistake(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -123,10 +124,6 @@ def test_a_fingertip_mistake_is_named(section, parts, config, capsys):
 
 
 def test_a_calibration_of_another_bank_is_refused(config, tiny_bank, tmp_path, capsys):
-    import numpy as np
-
-    from shearloop.bank.estimation import Calibration
-
     foreign = tmp_path / "foreign.yaml"
     grid = np.linspace(1, 2, 9)
     Calibration.from_matches("cd" * 32, "synthetic", torque=(grid, grid)).save(foreign)
@@ -240,6 +237,12 @@ def test_every_command_explains_itself(name, capsys):
     assert "%%" not in told
 
 
+def test_an_unknown_command_lists_the_known_ones(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["fly"])
+    assert "'run'" in capsys.readouterr().err
+
+
 def test_every_argument_has_a_help_text():
     def arguments(parser: argparse.ArgumentParser) -> Iterator[str]:
         for action in parser._actions:
@@ -257,15 +260,8 @@ def test_help_names_all_basis_models():
     assert MODEL_NAMES.replace(" or ", ", ").split(", ") == list(MODELS)
 
 
-def test_an_unknown_command_lists_the_known_ones(capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["fly"])
-    assert ended.value.code == 2
-    assert "'run'" in capsys.readouterr().err
-
-
 def test_help_loads_no_heavy_modules():
-    heavy = ("numpy", "scipy", "pydantic", "zmq", "matplotlib", "skfem", "serial", "yaml")
+    heavy = ("numpy", "scipy", "pydantic", "zmq", "matplotlib", "skfem", "serial", "yaml", "tqdm")
     program = (
         "import sys\nfrom shearloop.daemon.cli import COMMANDS, main\n"
         "for arguments in [[], *([name] for name in COMMANDS)]:\n"
@@ -278,25 +274,9 @@ def test_help_loads_no_heavy_modules():
 
 
 def test_messages_are_readable():
-    content = decode(
-        encode(
-            {
-                "timestamp": 0.0,
-                "seq": 1,
-                "source": "right",
-                "t_mono_ns": 5,
-                "torque_nm": 0.05,
-                "torque_low_nm": 0.02,
-                "torque_high_nm": 0.08,
-                "diameter_mm": 31.0,
-                "k": 3.5,
-                "sigma": 1.5,
-                "score": 0.75,
-                "valid": True,
-                "reason": "",
-            }
-        )
-    )
+    values = {"diameter_mm": 31.0, "k": 3.5, "sigma": 1.5, "score": 0.75, "reason": ""}
+    message = sample(EitEstimate, torque_nm=0.05, torque_low_nm=0.02, torque_high_nm=0.08, **values)
+    content = decode(encode(wire_map(message, timestamp=0.0, seq=1)))
     line = message_line("eit.estimate", content)
     assert "torque +0.0500 N·m [+0.0200, +0.0800]   diameter  31.0 mm   k 3.500  sigma 1.500 cm   score 0.750" in line
     assert message_json("eit.estimate", content).startswith('{"topic": "eit.estimate", "timestamp": 0.0')

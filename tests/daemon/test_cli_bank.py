@@ -2,10 +2,7 @@
 
 import json
 import signal
-import subprocess
-import sys
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -268,15 +265,6 @@ def test_mistakes_of_build_are_one_sentence(folder, tmp_path, capsys, options, p
 def test_mistakes_of_the_others_are_one_sentence(folder, capsys, arguments, part):
     assert part in refused(capsys, *(argument.format(folder=folder) for argument in arguments))
     assert not (folder / "v").exists()
-
-
-def test_help_comes_without_loading_what_is_heavy():
-    script = "import sys; from shearloop.daemon.cli import main\ntry: main(['bank', 'build', '--help'])\nfinally: "
-    script += "print(sorted({'numpy', 'scipy', 'pydantic', 'skfem', 'matplotlib', 'tqdm'} & set(sys.modules)))"
-    root = Path(__file__).parents[2]
-    done = subprocess.run([sys.executable, "-c", script], cwd=root, capture_output=True, text=True, check=True)
-    assert "--cluster [ADDRESS]" in done.stdout
-    assert done.stdout.splitlines()[-1] == "[]"
 
 
 def test_a_bank_is_of_the_mesh_file_that_the_configuration_names(fingertip_file, tmp_path):

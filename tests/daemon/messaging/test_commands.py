@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from functools import partial
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import zmq
@@ -17,14 +17,11 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.health import HealthReporter
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer, RateLimit
 from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.rig import Rig
-from shearloop.daemon.sensors import Sensors
 
 
 def handlers() -> Mapping[str, Any]:
@@ -160,10 +157,10 @@ async def test_tare_is_refused_during_an_experiment():
     experiment = SimpleNamespace(running=True, file=SimpleNamespace(name="hold"))
     sensors = {name: SimpleNamespace(tare=partial(tared.append, name)) for name in ("right", "load_cell")}
     commands = Commands(
-        rig=cast("Rig", SimpleNamespace(control_loop=SimpleNamespace(experiment=experiment))),
-        sensors=cast("Sensors", SimpleNamespace(tareable=lambda: sensors)),
+        rig=SimpleNamespace(control_loop=SimpleNamespace(experiment=experiment)),
+        sensors=SimpleNamespace(tareable=lambda: sensors),
         experiment=None,
-        health=cast("HealthReporter", None),
+        health=None,
         stop=asyncio.Event(),
     )
     tare = commands.handlers()["tare"]

@@ -32,6 +32,7 @@ from shearloop.daemon.web.bridge import Bridge, DaemonAddress
 from shearloop.daemon.web.message_store import MessageStore
 from shearloop.daemon.web.server import HEADERS, NEEDS_TOKEN, make_app, serve
 from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.daemon.sample_messages import sample
 
 TOKEN = "the token of this test, long enough for anybody"  # noqa: S105 - opens nothing but this test's page
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
@@ -141,9 +142,7 @@ async def test_every_response_has_the_security_headers(tmp_path):
         for path in ("/", "/assets/view.css", "/settings.json", "/assets/..%2Fserver.py", "/none", "/stop"):
             async with page.http.get(page.base + path) as response:
                 assert {key: response.headers[key] for key in HEADERS} == HEADERS, path
-                assert response.status == (
-                    200 if path in ("/", "/assets/view.css", "/settings.json") else response.status
-                )
+                assert response.status == 200 or path not in ("/", "/assets/view.css", "/settings.json")
                 assert "Access-Control-Allow-Origin" not in response.headers
         assert "unsafe" not in HEADERS["Content-Security-Policy"]
         async with page.http.get(f"{page.base}/assets/..%2Fserver.py") as response:
@@ -173,21 +172,9 @@ async def test_messages_reach_open_pages_and_heatmaps_need_one(tmp_path):
         assert not page.publisher.has_subscriber(EitHeatmap.topic)
         async with page.http.ws_connect(f"{page.base}/stream") as stream:
             first = await stream.receive_json()
-            assert first["first"]
-            assert (first["messages"], first["quiet_s"]) == ([], None)
+            assert (first["first"], first["messages"], first["quiet_s"]) == (True, [], None)
             await until(lambda: page.publisher.has_subscriber(EitHeatmap.topic))
-            page.publisher.publish(
-                LoadTorque(
-                    source="load_cell",
-                    t_mono_ns=1,
-                    torque_nm=0.1,
-                    raw=5.0,
-                    saturated=False,
-                    spike=False,
-                    valid=True,
-                    reason="",
-                )
-            )
+            page.publisher.publish(sample(LoadTorque, torque_nm=0.1))
             while not (batch := await stream.receive_json())["messages"]:
                 continue
             assert not batch["first"]

@@ -149,7 +149,7 @@ def step(plant: Plant, scenario: LoopScenario) -> tuple[FloatArray, bool]:
     found = identified(plant, scenario)
     settings = settings_for(found, scenario)
     controller = started_controller(plant, found, settings)
-    while controller.state.innovation_nm is None:
+    while controller.estimator.innovation_nm is None:
         run(plant, controller, plant.period_s)
     controller.set_point(TARGET_NM)
     refused = margin_refusal(settings, found, LoopConfig()) is not None

@@ -1,7 +1,6 @@
 """The rig: builds gripper, robot and control loop from the configuration, and checks its experiment."""
 
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 
 from shearloop.daemon.clock import Clock
@@ -28,7 +27,7 @@ from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.supervisor import Supervisor, Task
-from shearloop.daemon.taring import Sensor, tare_all
+from shearloop.daemon.taring import Sensor
 from shearloop.drivers.calibration_files import load_calibration
 from shearloop.drivers.connection import LinkEvent, LinkMonitor
 from shearloop.drivers.errors import DriverError
@@ -152,7 +151,7 @@ class Rig:
             loop,
             self.robot,
             gripper,
-            partial(tare_all, sensors.values()),
+            sensors.values(),
             publisher,
             clock,
             supervisor.dead,

@@ -103,12 +103,16 @@ class Bank:
 
     path: Path
     definition: BankDefinition
-    identity: str
     homogeneous: FloatArray
     min_conductivity: FloatArray
     valid: BoolArray
     signals: Float32Array
     signals_sha256: str
+
+    @property
+    def identity(self) -> str:
+        """The hash of everything that defines the bank."""
+        return self.definition.identity
 
     @property
     def model(self) -> str:
@@ -163,16 +167,8 @@ class Bank:
         if definition.identity != identity:
             raise _unusable(path, f"its grids, model and geometry do not give its identity {identity[:12]}…")
         _check_shapes(path, arrays)
-        return cls(
-            path=path,
-            definition=definition,
-            identity=identity,
-            homogeneous=arrays["homogeneous"],
-            min_conductivity=arrays["min_conductivity"],
-            valid=arrays["valid"],
-            signals=arrays["signals"],
-            signals_sha256=checksums["signals"],
-        )
+        del arrays["k_grid"], arrays["sigma_grid"]
+        return cls(path=path, definition=definition, signals_sha256=checksums["signals"], **arrays)
 
 
 def write_bank(
@@ -184,15 +180,11 @@ def write_bank(
     signals: Float32Array,
 ) -> None:
     """Write a bank file, replacing an earlier one at once. Raises BankFileError where it cannot be written."""
-    arrays: dict[str, NDArray[Any]] = {
-        "k_grid": definition.k_grid,
-        "sigma_grid": definition.sigma_grid,
-        "homogeneous": homogeneous,
-        "min_conductivity": min_conductivity,
-        "valid": valid,
-        "signals": signals,
+    arrays = definition.k_grid, definition.sigma_grid, homogeneous, min_conductivity, valid, signals
+    stored = {
+        name: np.ascontiguousarray(array, dtype=kind)
+        for (name, kind), array in zip(_TYPES.items(), arrays, strict=True)
     }
-    stored = {name: np.ascontiguousarray(arrays[name], dtype=kind) for name, kind in _TYPES.items()}
     header, offsets = _layout(definition, stored)
     preamble = _PREAMBLE.pack(BANK_MAGIC, FORMAT_VERSION, hashlib.sha256(header).digest())
     try:

@@ -6,6 +6,7 @@ discriminant detects the grip. It ignores the motion of a frame by twisting and 
 """
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import Self
 
@@ -236,33 +237,45 @@ class FingertipSet:
 
 
 class GripDetector:
-    """Detects whether one fingertip is gripped, from its grip score frame by frame.
+    """Detects whether one fingertip is gripped, from its grip score and its steps, frame by frame.
 
     A grip starts when the score rises by the threshold above the lowest score since the last grip, because a gel that
     recovers from a release scores less and less. It ends below half of that rise, or below a share of this grip's own
     mean score, because grips may be a fifth or three times as strong as the calibrated one.
     """
 
-    def __init__(self, threshold: float) -> None:
+    def __init__(self, side: FingertipValidator) -> None:
         """Start without a grip."""
-        self._threshold = threshold
+        self._side = side
         self._floor = 0.0
         self._level: float | None = None
         self._frames = 0
+        self._released = False
+        self._passed: deque[FloatArray] = deque(maxlen=STEP_FRAMES + 1)
 
-    @property
-    def gripped(self) -> bool:
-        """Whether the fingertip was gripped at the last frame."""
-        return self._level is not None
+    def forget_steps(self) -> None:
+        """Forget the last frames: they do not show a step."""
+        self._passed.clear()
 
-    def update(self, score: float) -> bool:
-        """Take the next frame's score and return whether it is gripped."""
+    def update(self, frame: FloatArray, idle: FloatArray, gain: FloatArray, least_score: float) -> bool:
+        """Take the next (896,) frame and return whether it is gripped; a grip begins above the least score."""
+        side = self._side
+        self._passed.append(frame)
+        if len(self._passed) > STEP_FRAMES and max(side.step_limit, side.fall_limit) < math.inf:
+            released = side.released(frame / gain, self._passed[0] / gain, idle / gain)
+            self._released = self._released if released is None else released
+        return self._is_high(side.grip_score(frame, idle), least_score) and not self._released
+
+    def _is_high(self, score: float, least_score: float) -> bool:
+        threshold = self._side.grip_threshold
         if self._level is None:
+            if score <= least_score:
+                return False
             self._floor = min(self._floor, max(score, 0.0))
-            if score - self._floor > self._threshold:
+            if score - self._floor > threshold:
                 self._level, self._frames = score, 1
             return self._level is not None
-        if score < max(self._floor + 0.5 * self._threshold, _LOOSE_SHARE * self._level):
+        if score < max(self._floor + 0.5 * threshold, _LOOSE_SHARE * self._level):
             self._level, self._floor = None, max(score, 0.0)
             return False
         self._frames = min(self._frames + 1, _LEVEL_FRAMES)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,16 +32,6 @@ _MAX_GAP_S = 3.0
 
 # A value and how far its 95 % interval extends below and above it.
 _Interval = tuple[float, float, float]
-
-
-@dataclass(slots=True)
-class _Inputs:
-    """Inputs of the regressors: a reading, its features and match, and the (k, m, 896) errors of imputed channels."""
-
-    reading: Reading
-    features: FloatArray
-    match: BankMatch | None
-    errors: FloatArray
 
 
 class EstimatorSession:
@@ -157,10 +147,9 @@ class EstimatorSession:
         features, match = calibration.estimator.features(reading)
         if match is not None and match.ambiguous:
             return _estimate({}, _AMBIGUOUS, match)
-        inputs = _Inputs(reading, features, match, errors)
         values: dict[Quantity, _Interval] = {}
         for quantity, (model, novelty_result) in outputs.items():
-            value, against = self._predict_quantity(quantity, model, novelty_result, inputs)
+            value, against = self._predict_quantity(quantity, model, novelty_result, reading, features, match, errors)
             reasons += [reason for reason in against if reason not in reasons]
             if not against:
                 values[quantity] = value
@@ -198,19 +187,22 @@ class EstimatorSession:
         return outputs, reasons
 
     def _predict_quantity(
-        self, quantity: Quantity, model: OutputModel, novelty: Novelty, inputs: _Inputs
-    ) -> tuple[_Interval, tuple[str, ...]]:
-        """Return one quantity with its interval, and the reasons against it."""
-        reading, estimator = inputs.reading, self.calibration.estimator
-        frame = reading.frame
-        features, complete = estimator.inputs(quantity, inputs.features, reading), None
+        self, quantity: Quantity, model: OutputModel, novelty: Novelty, reading: Reading, features: FloatArray,
+        match: BankMatch | None, errors: FloatArray,
+    ) -> tuple[_Interval, tuple[str, ...]]:  # fmt: skip
+        """Return one quantity with its interval, and the reasons against it.
+
+        Imputed channels have the (k, m, 896) errors, one standard deviation each.
+        """
+        frame, estimator = reading.frame, self.calibration.estimator
+        features, complete = estimator.inputs(quantity, features, reading), None
         if quantity == "torque" and novelty.missing_share and estimator.uses_amplitude:
             complete = self._regressor_inputs(quantity, reading, frame.difference / (1.0 - novelty.missing_share))
         usable_share = np.count_nonzero(frame.usable) / frame.usable.size
         value = model.regressor.predict(features, usable_share, novelty.widening, novelty.limit_share, complete)
         dead: tuple[str, ...] = ()
-        if len(inputs.errors):
-            changed = [self._regressor_inputs(quantity, reading, frame.difference + one) for one in inputs.errors]
+        if len(errors):
+            changed = [self._regressor_inputs(quantity, reading, frame.difference + one) for one in errors]
             error = TWO_SIDED_95 * math.hypot(*(model.regressor.predict(one)[0] - value[0] for one in changed))
             if 2 * error > value[1] + value[2]:
                 # The dead channels carried the value; the imputed ones are a guess.
@@ -218,7 +210,7 @@ class EstimatorSession:
             value = _widened(value, error)
         if quantity == "diameter":
             value = _widened(value, estimator.position_noise_mm(model.regressor) / math.sqrt(frame.held_frames))
-        against = dead or model.match_reasons(inputs.match)
+        against = dead or model.match_reasons(match)
         return value, against or model.regressor.range_reasons(value[0], features, quantity, _UNITS[quantity])
 
     def _regressor_inputs(self, quantity: Quantity, reading: Reading, difference: FloatArray) -> FloatArray:

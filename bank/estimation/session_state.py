@@ -18,7 +18,6 @@ from shearloop.bank.eit.matching import signal_above_noise
 from shearloop.bank.estimation.fingertip_validator import (
     LARGEST_JUMPING_SHARE,
     LEAST_NOISE_V,
-    STEP_FRAMES,
     FingertipSet,
     FingertipValidator,
     GripDetector,
@@ -183,47 +182,17 @@ class IdleFrames:
         self.baselines[layer] = np.mean(self._frames[layer], axis=0)
         self._update_gains()
 
-    def least_score(self, layer: int) -> float:
-        """Return the score that a grip needs: with a baseline of a few frames only a strong one counts."""
-        learning = 0 < len(self._frames[layer]) < self._least
-        return max(_OUTRIGHT, self._sides[layer].grip_threshold) if learning else -np.inf
+    def least_scores(self) -> list[float]:
+        """Return the score that a grip needs on each side: with a baseline of a few frames only a strong one counts."""
+        return [
+            max(_OUTRIGHT, one.grip_threshold) if 0 < len(frames) < self._least else -np.inf
+            for one, frames in zip(self._sides, self._frames, strict=True)
+        ]
 
     def _update_gains(self) -> None:
         if self.complete:
             gains = [one.gain(idle) for one, idle in zip(self._sides, self.baselines, strict=True)]
             self.gains = np.array(gains)[:, None]
-
-
-class Grips:
-    """Which fingertips are gripped, by their scores and by steps."""
-
-    def __init__(self, sides: Sequence[FingertipValidator]) -> None:
-        """Begin without a grip."""
-        self._sides = sides
-        self._detectors = [GripDetector(one.grip_threshold) for one in sides]
-        self._released = [False for _ in sides]
-        self._passed: deque[FloatArray] = deque(maxlen=STEP_FRAMES + 1)
-
-    def forget_steps(self) -> None:
-        """Forget the last frames."""
-        self._passed.clear()
-
-    def loose_sides(self, channels: FloatArray, idle: IdleFrames) -> list[str]:
-        """Take the next (m, 896) frame and return the sides that are not gripped."""
-        self._passed.append(channels)
-        loose = []
-        for layer, one in enumerate(self._sides):
-            if len(self._passed) > STEP_FRAMES and max(one.step_limit, one.fall_limit) < math.inf:
-                now, then, base = (
-                    each[layer] / idle.gains[layer] for each in (channels, self._passed[0], idle.baselines)
-                )
-                released = one.released(now, then, base)
-                self._released[layer] = self._released[layer] if released is None else released
-            score, grip = one.grip_score(channels[layer], idle.baselines[layer]), self._detectors[layer]
-            counts = grip.gripped or score > idle.least_score(layer)
-            if not (counts and grip.update(score)) or self._released[layer]:
-                loose.append(one.side)
-        return loose
 
 
 class GripMemory:
@@ -312,7 +281,7 @@ class SessionState:
         self._motion = motion
         self._timer = FrameTimer(period_s)
         self._idle = IdleFrames(self._fingertips, idle_frames)
-        self._grips = Grips(validators)
+        self._grips = [GripDetector(one) for one in validators]
         self._memory = GripMemory(motion, len(validators))
         self._before: FloatArray | None = None
         self._disturbed: FloatArray | None = None
@@ -332,7 +301,8 @@ class SessionState:
             # The last frames do not show how the gel has moved. In a tare, compare with its last frame: a tool may
             # have been gripped or released in the gap.
             self._memory.forget()
-            self._grips.forget_steps()
+            for grip in self._grips:
+                grip.forget_steps()
             self._before, self._disturbed, missing = self._idle.last_tare_frame(), None, 0
         channels, usable, reasons, jumping_shares = self._check(frame)
         if any(reasons):
@@ -413,7 +383,13 @@ class SessionState:
         # At the calibration's gain. It does not change while gripped.
         difference = channels - self._idle.baselines
         difference = self._motion.complete(difference, usable, self._fingertips.sides) / self._idle.gains
-        if loose := self._grips.loose_sides(channels, self._idle):
+        gripped = [
+            grip.update(*each)
+            for grip, *each in zip(
+                self._grips, channels, self._idle.baselines, self._idle.gains, self._idle.least_scores(), strict=True
+            )
+        ]
+        if loose := [one.side for one, held in zip(self._fingertips.sides, gripped, strict=True) if not held]:
             self._memory.forget()
             return ProcessedFrame(difference, (f"no grip at the {' and '.join(loose)} fingertip",), usable)
         memory = self._memory

@@ -72,7 +72,10 @@ def design_yaml(design: Design, fingertip: Path, recording: Path) -> str:
         f"# Designed for {recording}: the coarsest that adds at most {ALLOWED:.0%} of its noise, which is",
         f"# {design.relative_noise:.1%} of a difference frame. `shearloop bank build --config` takes this file.",
         *(f"# NOTE: {line}" for line in doubts(design)),
-        *(f"# {line}" for line in model_lines(design)),
+        *(
+            f"# {fit.model}: {fit.penalised:.1%} ± {fit.standard_error:.1%} of a frame unexplained on other injections"
+            for fit in sorted(design.models, key=lambda fit: fit.penalised)
+        ),
         *(f"# {line}" for line in choice_lines(design)),
         f"fingertip: {fingertip.resolve()}",
         f"mesh_size_cm: {design.mesh.chosen.setting:g}",
@@ -98,15 +101,6 @@ def doubts(design: Design) -> list[str]:
             "it hides the signal; record a tool that is gripped and twisted"
         )
     return found
-
-
-def model_lines(design: Design) -> list[str]:
-    """Return each model's fit to the data, the best first."""
-    ranked = sorted(design.models, key=lambda one: one.penalised)
-    return [
-        f"{one.model}: {one.penalised:.1%} ± {one.standard_error:.1%} of a frame unexplained on injections left out"
-        for one in ranked
-    ]
 
 
 def choice_lines(design: Design) -> list[str]:

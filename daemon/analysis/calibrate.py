@@ -109,9 +109,9 @@ def calibrate(
     calibration = fit(
         estimator, parts, _source(paths, options), physics, timing=timing, full_range=options.assume_full_range
     )
-    names = {id(one): name for name, one in (*((path.name, one) for path, one in chosen), *others)}
-    warned = zip(timing.references, timing.warnings, strict=True)
-    doubts = [f"{names[id(one)]}: {why}" for one, why in warned if why]
+    named = [*((path.name, one) for path, one in chosen), *others]
+    warned = [each for each in zip(timing.references, timing.warnings, strict=True) if each[1]]
+    doubts = [f"{name}: {why}" for name, one in named for reference, why in warned if one is reference]
     return CalibrationResult(calibration, sum(len(one.t_s) for one in parts), timing, doubts)
 
 

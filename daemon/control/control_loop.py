@@ -153,10 +153,7 @@ class ControlLoop:
     def on_action_ended(self, error: str = "") -> None:
         """Take the end of the present action, with its error if it failed."""
         experiment = self.experiment
-        if experiment is None:
-            return
-        experiment.end_action(error)
-        if error:
+        if experiment is None or not experiment.end_action(error) or error:
             return
         match experiment.command.action:
             case TareStep():

@@ -118,23 +118,6 @@ class WristCommand:
     speed_rad_per_s: float = 0.0
     reasons: tuple[str, ...] = ()
 
-    @property
-    def holds(self) -> bool:
-        """Whether the wrist is held, rather than driven with a clipped speed."""
-        return not {ControllerReason.TRAVEL, ControllerReason.SPEED}.issuperset(self.reasons)
-
-
-@dataclass(frozen=True, slots=True)
-class ControllerState:
-    """The controller's estimates; torques in N·m, None before the first set point or measurement."""
-
-    set_point_nm: float | None
-    ramp_nm: float | None
-    torque_nm: float
-    offset_nm: float
-    creep_nm_per_s: float
-    innovation_nm: float | None
-
 
 class AngleHistory:
     """Wrist angles of the last `span_ns`, interpolated linearly, with their running integral.
@@ -282,25 +265,14 @@ class TwistController:
         # The expected torque at the latest command.
         self.torque_nm = torque_nm
         self._held = self._moving = False
-        self._set_point_nm: float | None = None
-        self._ramp_nm: float | None = None
+        # None before the first set point.
+        self.set_point_nm: float | None = None
+        self.ramp_nm: float | None = None
         self._angle_rad = angle_rad
         self._t_ns = t_ns
         self._wanted = self._sent = 0.0
         # Less was sent than was wanted; nothing is integrated then.
         self._clipped = False
-
-    @property
-    def state(self) -> ControllerState:
-        """The present estimates."""
-        return ControllerState(
-            set_point_nm=self._set_point_nm,
-            ramp_nm=self._ramp_nm,
-            torque_nm=self.estimator.expected_nm(self._angle_rad),
-            offset_nm=self.estimator.offset_nm,
-            creep_nm_per_s=self.estimator.creep_nm / self.settings.sample_period_s,
-            innovation_nm=self.estimator.innovation_nm,
-        )
 
     def set_point(self, torque_nm: float) -> None:
         """Change the set point; the ramp continues, or begins at the present torque.
@@ -310,9 +282,9 @@ class TwistController:
         limit = self.settings.torque_limit_nm
         if not abs(torque_nm) <= limit:
             raise UserError(f"controller: a set point of {torque_nm:g} N·m is not within the limit of {limit:g} N·m")
-        self._set_point_nm = torque_nm
-        if self._ramp_nm is None:
-            self._ramp_nm = self.estimator.expected_nm(self._angle_rad)
+        self.set_point_nm = torque_nm
+        if self.ramp_nm is None:
+            self.ramp_nm = self.estimator.expected_nm(self._angle_rad)
 
     def hold(self) -> None:
         """Hold the wrist until `resume`; measurements are still used."""
@@ -352,7 +324,7 @@ class TwistController:
         self.torque_nm = tool.expected_nm(self._angle_rad)
         if self._held:
             reasons.append(ControllerReason.HELD)
-        if self._set_point_nm is None:
+        if self.set_point_nm is None:
             reasons.append(ControllerReason.NO_SET_POINT)
         if tool.fresh_ns is None:
             reasons.append(ControllerReason.NOT_MEASURED)
@@ -360,10 +332,10 @@ class TwistController:
             reasons.append(ControllerReason.STALE)
         if tool.lost:
             reasons.append(ControllerReason.NOT_FOLLOWING)
-        if reasons or self._set_point_nm is None:
+        if reasons or self.set_point_nm is None:
             self._rest()
             return WristCommand(0.0, tuple(reasons))
-        return self._drive(self._set_point_nm, elapsed_s)
+        return self._drive(self.set_point_nm, elapsed_s)
 
     def sent(self, speed_rad_per_s: float) -> None:
         """Correct the speed that was sent for the last command, after clipping by driver and safety."""
@@ -374,14 +346,14 @@ class TwistController:
         """Stand still; the next ramp begins at the present torque."""
         self._moving = self._clipped = False
         self._wanted = self._sent = 0.0
-        if self._set_point_nm is not None:
-            self._ramp_nm = self.torque_nm
+        if self.set_point_nm is not None:
+            self.ramp_nm = self.torque_nm
 
     def _drive(self, set_point_nm: float, elapsed_s: float) -> WristCommand:
         own = self.settings
-        before_nm = self.torque_nm if self._ramp_nm is None else self._ramp_nm
-        self._ramp_nm, slope = self._advance_ramp(before_nm, set_point_nm, elapsed_s)
-        missing_nm = self._ramp_nm - self.torque_nm
+        before_nm = self.torque_nm if self.ramp_nm is None else self.ramp_nm
+        self.ramp_nm, slope = self._advance_ramp(before_nm, set_point_nm, elapsed_s)
+        missing_nm = self.ramp_nm - self.torque_nm
         bound_nm = own.deadband_nm * (_SETTLED_SHARE if self._moving else 1.0)
         self._moving = slope != 0.0 or abs(missing_nm) > bound_nm
         wanted = 0.0

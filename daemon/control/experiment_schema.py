@@ -193,11 +193,9 @@ def first_turn_before_grip(file: ExperimentFile) -> int | None:
 def check_limits(file: ExperimentFile) -> str:
     """Return a sentence on the first step that exceeds its limits, or an empty string."""
     for number, step in enumerate(file.steps):
-        limits = file.limits_of(step)
-        allowed = limits.torque_nm, limits.angle_rad
-        for value, limit, unit, key in zip(
-            _reach(step), allowed, ("N·m", "rad"), ("torque_nm", "angle_rad"), strict=True
-        ):
+        limits, (torque_nm, angle_rad) = file.limits_of(step), _reach(step)
+        torque = torque_nm, limits.torque_nm, "N·m", "torque_nm"
+        for value, limit, unit, key in (torque, (angle_rad, limits.angle_rad, "rad", "angle_rad")):
             if value >= limit:
                 return (
                     f"`steps[{number}]` ({step.do}) asks for {value:g} {unit}, and its limit is {limit:g} {unit}; "

@@ -73,7 +73,6 @@ class ToolModel:
     angle_rad: float
     torque_nm: float
     torque_std_nm: float
-    measurements: int
 
     @property
     def known_measurements(self) -> float:
@@ -135,7 +134,6 @@ def identify(record: Record, window_s: float, stiffness_share: float = 0.1) -> T
         angle_rad=float(record.angle_rad[-1]),
         torque_nm=float(now @ best.coefficients),
         torque_std_nm=math.sqrt(now @ best.covariance @ now),
-        measurements=int(used.sum()),
     )
 
 

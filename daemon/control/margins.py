@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from numpy.polynomial.polynomial import polyadd, polyval
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_lyapunov
 
@@ -161,13 +162,9 @@ def _return_ratio(model: LoopModel, omega: FloatArray) -> ComplexArray:
     """Return the loop's return ratio (n,) at frequencies in rad per sample, broken at the tool's torque."""
     x = np.exp(-1j * omega).astype(np.complex128)
     control = model.kp + (model.ki / (1.0 - x) if model.ki else 0.0)
-    seen = model.stiffness_ratio * _at(pulse_response(model, model.lag_error_s), x) * control
-    known = control * (x - _at(pulse_response(model), x)) if model.compensated else 0.0
+    seen = model.stiffness_ratio * polyval(x, pulse_response(model, model.lag_error_s)) * control
+    known = control * (x - polyval(x, pulse_response(model))) if model.compensated else 0.0
     return np.asarray(seen / (1.0 - x + known), dtype=np.complex128)
-
-
-def _at(coefficients: FloatArray, x: ComplexArray) -> ComplexArray:
-    return np.asarray(np.polynomial.polynomial.polyval(x, coefficients), dtype=np.complex128)
 
 
 def _gain_margin(ratio: ComplexArray) -> float:
@@ -224,17 +221,12 @@ def characteristic_polynomial(model: LoopModel) -> FloatArray:
     """Return the coefficients (n,) in ascending powers of x, of the equation above times (1 − x) where ki > 0."""
     seen = pulse_response(model, model.lag_error_s) * model.stiffness_ratio
     if model.compensated:
-        seen = _sum(_sum(seen, -pulse_response(model)), np.array([0.0, 1.0]))
+        seen = polyadd(polyadd(seen, -pulse_response(model)), np.array([0.0, 1.0]))
     integrator = np.array([1.0, -1.0])
     if model.ki == 0.0:
-        return np.trim_zeros(_sum(integrator, model.kp * seen), "b")
+        return np.asarray(polyadd(integrator, model.kp * seen))
     numerator = np.array([model.kp + model.ki, -model.kp])
-    return np.trim_zeros(_sum(np.convolve(integrator, integrator), np.convolve(numerator, seen)), "b")
-
-
-def _sum(one: FloatArray, other: FloatArray) -> FloatArray:
-    size = max(one.size, other.size)
-    return np.pad(one, (0, size - one.size)) + np.pad(other, (0, size - other.size))
+    return np.asarray(polyadd(np.convolve(integrator, integrator), np.convolve(numerator, seen)))
 
 
 def integral_gain(kp: float) -> float:

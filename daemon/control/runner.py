@@ -1,7 +1,7 @@
 """The task that runs the control loop: robot states in, commands out, 125 times a second; and its messages."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Mapping
 from contextlib import suppress
 from functools import partial
 
@@ -17,6 +17,7 @@ from shearloop.daemon.control.step_runner import Action, Experiment, GripTo
 from shearloop.daemon.messaging.messages import LoopState, RobotStateMessage
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH
+from shearloop.daemon.taring import Sensor, tare_all
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import (
     ARRIVED,
@@ -64,19 +65,19 @@ class ControlLoopRunner:
         control_loop: ControlLoop,
         robot: UrRobot,
         gripper: GripperTask | None,
-        tare: Callable[[], Awaitable[str]],
+        sensors: Collection[Sensor],
         publisher: Publisher,
         clock: Clock,
         dead_tasks: Mapping[str, str],
     ) -> None:
-        """`tare` zeroes every sensor; `dead_tasks` has the error of each dead task."""
+        """`sensors` are those that an experiment tares; `dead_tasks` has the error of each dead task."""
         self._control_loop = control_loop
         self._robot = robot
         self._clock = clock
         self._dead_tasks = dead_tasks
         self._acceleration_rad_per_s2 = control_loop.config.wrist_acceleration_rad_per_s2
         self._velocity = VelocityCommandSender(robot, control_loop)
-        self._actions = ActionExecutor(robot, gripper, tare, self._velocity, control_loop)
+        self._actions = ActionExecutor(robot, gripper, sensors, self._velocity, control_loop)
         self._states = StatePublisher(publisher, control_loop)
         self._running = False
         self._stopped = True
@@ -257,7 +258,7 @@ class ActionExecutor:
         self,
         robot: UrRobot,
         gripper: GripperTask | None,
-        tare: Callable[[], Awaitable[str]],
+        sensors: Collection[Sensor],
         velocity: VelocityCommandSender,
         control_loop: ControlLoop,
     ) -> None:
@@ -268,7 +269,7 @@ class ActionExecutor:
         self.may_move = asyncio.Event()
         self.may_move.set()
         self._robot = robot
-        self._tare = tare
+        self._sensors = sensors
         self._velocity = velocity
         self._control_loop = control_loop
         self._moving = self._interrupted = False
@@ -363,7 +364,7 @@ class ActionExecutor:
                 if error := await self._rest():
                     return error
                 reply = await self._robot.send(ZeroForceTorque())
-                return reply.refusal if not reply.accepted else await self._tare()
+                return reply.refusal if not reply.accepted else await tare_all(self._sensors)
             case _:
                 raise TypeError(f"{action} is not an action of the devices")
 
@@ -445,7 +446,24 @@ class StatePublisher:
         if (block := state.cycle // PUBLISH_EVERY) == self._block:
             return False
         self._block = block
-        self._publisher.publish(robot_state(state))
+        message = RobotStateMessage(
+            source="robot",
+            t_mono_ns=state.t_mono_ns,
+            joints_rad=state.q_rad,
+            tcp_pose=state.tcp_pose,
+            wrench=state.wrench,
+            wrist_rad=state.wrist_rad,
+            wrist_speed_rad_per_s=state.qd_rad_per_s[5],
+            wrist_torque_nm=state.wrist_torque_nm,
+            robot_mode=state.robot_mode,
+            safety_mode=state.safety_mode,
+            speed_scaling=state.speed_scaling,
+            protective_stop=state.protective_stop,
+            emergency_stop=state.emergency_stop,
+            blocked=state.blocked,
+            age_s=state.age_ns / 1e9,
+        )
+        self._publisher.publish(message)
         return True
 
     def publish_loop(self, sent_rad_per_s: float, now_ns: int) -> None:
@@ -478,7 +496,6 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
     driving = experiment.file.torque_source if experiment is not None else ""
     latest = control_loop.inputs.torques.get(driving)
     controller = control_loop.controller
-    estimates = controller.state if controller is not None else None
     tool = control_loop.tool
     return LoopState(
         source="loop",
@@ -496,9 +513,9 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
         tool_mm=experiment.file.tool_mm if experiment is not None else None,
         torque_source=driving,
         torque_nm=latest.torque_nm if latest is not None else None,
-        set_point_nm=estimates.set_point_nm if estimates else None,
-        ramp_nm=estimates.ramp_nm if estimates else None,
-        expected_nm=estimates.torque_nm if estimates else None,
+        set_point_nm=controller.set_point_nm if controller is not None else None,
+        ramp_nm=controller.ramp_nm if controller is not None else None,
+        expected_nm=controller.torque_nm if controller is not None else None,
         stiffness_nm_per_rad=tool.stiffness_nm_per_rad if tool is not None else None,
         delay_s=tool.age_s + tool.significant_lag_s if tool is not None else None,
         noise_nm=tool.noise_nm if tool is not None else None,
@@ -506,27 +523,6 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
         speed_sent_rad_per_s=sent_rad_per_s,
         response=status.decision.response.name.lower().replace("_", " "),
         reasons=" ".join((*status.decision.reasons, *status.velocity.reasons)),
-    )
-
-
-def robot_state(state: RobotState) -> RobotStateMessage:
-    """Return the `robot.state` message of a state."""
-    return RobotStateMessage(
-        source="robot",
-        t_mono_ns=state.t_mono_ns,
-        joints_rad=state.q_rad,
-        tcp_pose=state.tcp_pose,
-        wrench=state.wrench,
-        wrist_rad=state.wrist_rad,
-        wrist_speed_rad_per_s=state.qd_rad_per_s[5],
-        wrist_torque_nm=state.wrist_torque_nm,
-        robot_mode=state.robot_mode,
-        safety_mode=state.safety_mode,
-        speed_scaling=state.speed_scaling,
-        protective_stop=state.protective_stop,
-        emergency_stop=state.emergency_stop,
-        blocked=state.blocked,
-        age_s=state.age_ns / 1e9,
     )
 
 

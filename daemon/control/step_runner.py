@@ -194,11 +194,14 @@ class Experiment:
             self._action = ActionState.RUNNING
         return begins
 
-    def end_action(self, error: str = "") -> None:
-        """Note the end of the step's action; its error ends the experiment."""
+    def end_action(self, error: str = "") -> bool:
+        """Note the end of the step's action; an error ends the experiment. Return whether it was under way."""
+        if self._action is not ActionState.RUNNING:
+            return False
         self._action = ActionState.DONE
         if error:
             self.stop(f"step {self.step_number} ({self.step.do}) failed: {error}")
+        return True
 
     def pause(self) -> None:
         """Stand still until `resume`."""

@@ -75,7 +75,7 @@ def test_the_wrists_acceleration_reaches_controller_identification_and_robot(whe
     assert loop.config.wrist_acceleration_rad_per_s2 == 1.5, "sent to the robot"
     found = ToolModel(
         stiffness_nm_per_rad=0.25, stiffness_std=0.01, lag_s=0.0, lag_std_s=0.1, age_s=0.3, actuation_s=0.02,
-        noise_nm=0.012, sample_period_s=0.5, angle_rad=0.0, torque_nm=0.0, torque_std_nm=0.003, measurements=70,
+        noise_nm=0.012, sample_period_s=0.5, angle_rad=0.0, torque_nm=0.0, torque_std_nm=0.003,
     )  # fmt: skip
     tuned = controller_settings(loop.config, found, source, TrackTorque(0.1, 0.05), 0.5)
     assert tuned.acceleration_limit_rad_per_s2 == 0.75

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.controller import ControllerSettings, TwistController, WristCommand
@@ -216,12 +215,11 @@ class UncompensatedController:
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """A run, one row per command period: time, true torque, wrist angle (n,), and whether the wrist was held."""
+    """A run, one row per command period: time, true torque, wrist angle (n,)."""
 
     t_s: FloatArray
     torque_nm: FloatArray
     angle_rad: FloatArray
-    held: NDArray[np.bool_]
 
 
 def nanoseconds(time_s: float) -> int:
@@ -247,9 +245,9 @@ def run(
             count += 1
         command = controller.command(now_ns, plant.angle_rad)
         plant.step(command.speed_rad_per_s)
-        rows.append((plant.t_s, plant.torque_nm, plant.angle_rad, command.holds))
+        rows.append((plant.t_s, plant.torque_nm, plant.angle_rad))
     table = np.array(rows, dtype=float)
-    return Trace(table[:, 0], table[:, 1], table[:, 2], table[:, 3].astype(bool))
+    return Trace(table[:, 0], table[:, 1], table[:, 2])
 
 
 @dataclass(frozen=True, slots=True)

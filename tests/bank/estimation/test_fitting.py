@@ -23,18 +23,16 @@ def test_values_that_are_no_numbers_are_told(recorded, name):
         fit("motion_regression", [recorded, spoilt], "rig", timing=TRUSTED)
 
 
-def test_a_slice_with_a_value_that_is_no_number_is_told(sliced):
+def test_a_recording_or_slice_without_frames_or_numbers_is_told(recorded, sliced):
     slices = sliced()
-    with pytest.raises(CalibrationError, match="holds 1 values that are not finite"):
-        fit("motion_regression", [replace(slices, channels=with_a_nan(slices.channels))], "slices")
-
-
-def test_a_recording_without_frames_is_told(recorded, sliced):
-    with pytest.raises(CalibrationError, match="recording 1 of 1 has no frames"):
-        fit("motion_regression", [recorded.between(0, 0)], "nothing")
-    slices = sliced()
-    with pytest.raises(CalibrationError, match="recording 2 of 2 has no frames"):
-        fit("motion_regression", [slices, slices.between(0, 0)], "slices")
+    for series, message in (
+        ([replace(slices, channels=with_a_nan(slices.channels))], "holds 1 values that are not finite"),
+        ([recorded.between(0, 0)], "recording 1 of 1 has no frames"),
+        ([slices, slices.between(0, 0)], "recording 2 of 2 has no frames"),
+        ([slices, recorded], "do not fit into one calibration"),
+    ):
+        with pytest.raises(CalibrationError, match=message):
+            fit("motion_regression", series, "nothing")
 
 
 def test_a_torque_of_a_single_frame_is_too_little_to_calibrate_on(recorded):

@@ -60,9 +60,7 @@ def test_a_place_between_cells_is_found_to_a_fraction_of_one(bank):
 def test_two_places_that_fit_alike_are_ambiguous(bank):
     signals = bank.signals.copy()
     signals[2], signals[18] = signals[10], signals[10]
-    twice = type(bank)(
-        bank.path, bank.definition, bank.identity, bank.homogeneous, bank.min_conductivity, bank.valid, signals, ""
-    )
+    twice = dataclasses.replace(bank, signals=signals)
     assert RefinedMatcher(twice, NOT_TURNED).match(signals[10, 8]).ambiguous
 
 
@@ -90,8 +88,9 @@ def test_another_bank_is_refused(bank):
     rng = np.random.default_rng(5)
     series = slices_of(rng.normal(1, 0.1, (20, 896)), rng.uniform(0, 1, 20))
     calibration = fit("bank", [series], "x", Physics(bank=bank))
+    other = dataclasses.replace(bank.definition, geometry_hash="0" * 64)
     with pytest.raises(CalibrationError, match="name the bank it was made with"):
-        EstimatorSession(calibration, dataclasses.replace(bank, identity="0" * 64))
+        EstimatorSession(calibration, dataclasses.replace(bank, definition=other))
 
 
 def test_an_image_shows_where_and_which_way(fingertip):

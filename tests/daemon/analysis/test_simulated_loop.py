@@ -64,9 +64,10 @@ def test_a_slipping_grip_ends_in_a_held_wrist() -> None:
     found = identified(plant, scenario)
     plant.tool = replace(plant.tool, slip_nm=0.06)
     controller = started_controller(plant, found, settings_for(found, scenario))
-    while controller.state.innovation_nm is None:
+    while controller.estimator.innovation_nm is None:
         run(plant, controller, plant.period_s)
     controller.set_point(0.10)
     trace = run(plant, controller, scenario.hold_s)
-    assert trace.held[-1]
+    assert controller.estimator.lost
+    assert trace.angle_rad[-1] == trace.angle_rad[-100]
     assert np.ptp(trace.angle_rad) < (0.1 + 0.06 + 0.01) / 0.2

@@ -169,7 +169,6 @@ FOUND = ToolModel(
     angle_rad=0.0,
     torque_nm=0.0,
     torque_std_nm=0.004,
-    measurements=60,
 )
 SETTINGS = ControllerSettings(**DEFAULTS)
 

@@ -16,8 +16,7 @@ from shearloop.drivers.emulators.scene import Twin, TwinSettings
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.messages import Enable, Heartbeat, MoveLinear, Stop, Unlock, WristSpeed
 from tests.daemon.control.loop_rig import EIT, new_loop
-from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, FakeArm
-from tests.drivers.ur.test_limits import LIMITS
+from tests.drivers.ur.flight import CYCLE_NS, LIMITS, SETTINGS, FakeArm
 
 SPEEDS = st.floats(0.01, 3.14)
 STEPS = st.one_of(

@@ -1,17 +1,25 @@
 """Fingers that are on their way when the loop stops are stopped too: they would go on by themselves."""
 
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
 import pytest
 
-from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.daemon.control.runner import WRENCH
-from tests.daemon.control.cell import GRIP, driven, no_tick
+from tests.daemon.control.cell import GRIP, Cell, driven, no_tick
 
 
-async def test_a_stop_in_the_middle_of_a_grip_stops_the_fingers_once() -> None:
+@asynccontextmanager
+async def gripping() -> AsyncIterator[Cell]:
+    """Yield a cell in the middle of a grip."""
     async with driven() as cell:
         cell.gripper.there.clear()
         await cell.start(GRIP)
         await cell.cycles(10)
+        yield cell
+
+
+async def test_a_stop_in_the_middle_of_a_grip_stops_the_fingers_once() -> None:
+    async with gripping() as cell:
         assert cell.gripper.asked == ["grip"]
         cell.control_loop.stop("the operator said stop")
         await cell.cycles(20)
@@ -45,22 +53,14 @@ async def test_a_stop_after_a_grip_leaves_the_fingers_alone() -> None:
 
 
 async def test_a_stop_that_lets_the_tool_go_in_the_middle_of_a_grip_opens_the_fingers() -> None:
-    async with driven() as cell:
-        cell.gripper.there.clear()
-        await cell.start(GRIP)
-        await cell.cycles(10)
-        now_ns = cell.robot.flight.now_ns
-        cell.control_loop.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
+    async with gripping() as cell:
+        cell.exceed_torque()
         await cell.cycles(20)
         assert cell.gripper.asked == ["grip", "grip"], "the second one wide open"
 
 
 async def test_a_loop_that_dies_in_the_middle_of_a_grip_stops_the_fingers(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with driven() as cell:
-        cell.gripper.there.clear()
-        await cell.start(GRIP)
-        await cell.cycles(10)
-
+    async with gripping() as cell:
         monkeypatch.setattr(cell.control_loop, "tick", no_tick)
         await cell.cycles(2)
         await cell.loop_died()
@@ -68,24 +68,18 @@ async def test_a_loop_that_dies_in_the_middle_of_a_grip_stops_the_fingers(monkey
 
 
 async def test_a_daemon_that_ends_in_the_middle_of_a_grip_stops_the_fingers_first() -> None:
-    async with driven() as cell:
-        cell.gripper.there.clear()
-        await cell.start(GRIP)
-        await cell.cycles(10)
+    async with gripping() as cell:
         await cell.runner.released()
         assert cell.gripper.asked == ["grip", "halt"]
 
 
 async def test_fingers_that_could_not_be_stopped_are_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with driven() as cell:
+    async with gripping() as cell:
 
         async def does_not() -> str:
             return "the gripper does not answer"
 
         monkeypatch.setattr(cell.gripper, "halt", does_not)
-        cell.gripper.there.clear()
-        await cell.start(GRIP)
-        await cell.cycles(10)
         cell.control_loop.stop("the operator said stop")
         await cell.cycles(20)
         reasons = [one.reasons for one in cell.published.messages if one.topic == "loop.state"]

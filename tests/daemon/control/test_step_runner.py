@@ -103,6 +103,7 @@ def test_tighten_ends_at_the_torque_or_at_the_angle_whichever_comes_first() -> N
 
 def test_a_failed_action_stops_the_experiment_with_its_reason() -> None:
     machine = experiment({"do": "grip"}, {"do": "release"})
+    assert not machine.end_action("of the step before")
     assert machine.begin_action()
     machine.update(TICK_NS, 0.0, None)
     assert not machine.begin_action(), "it is under way"

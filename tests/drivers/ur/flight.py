@@ -9,9 +9,34 @@ import pytest
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.settings import UrSettings
-from tests.drivers.ur.test_limits import AT_REST, SETTINGS
+from shearloop.drivers.ur.settings import Bound, JointRange, UrLimits, UrSettings, Workspace
 
+LIMITS = UrLimits(
+    joints=JointRange((-6.0, -6.0, -3.0, -6.0, -6.0, -2.0), (6.0, 6.0, 3.0, 6.0, 6.0, 2.0), 0.1),
+    workspace=Workspace((-0.8, -0.8, 0.0), (0.8, 0.8, 0.9), 0.02),
+    wrist_speed_rad_per_s=Bound(0.8, 1.0),
+    wrist_acceleration_rad_per_s2=Bound(4.0, 8.0),
+    linear_speed_m_per_s=Bound(0.1, 0.15),
+    linear_acceleration_m_per_s2=Bound(0.5, 1.0),
+    force_n=Bound(40.0, 60.0),
+    torque_nm=Bound(4.0, 6.0),
+)
+SETTINGS = UrSettings(host="10.0.0.1", limits=LIMITS)
+AT_REST = messages.RtdeSample(
+    t_mono_ns=0,
+    timestamp_s=0.0,
+    age_ns=0,
+    connected=True,
+    q_rad=(0.0, -1.5, 1.5, -1.5, -1.5, 0.0),
+    qd_rad_per_s=(0.0,) * 6,
+    tcp_pose=(-0.5, -0.1, 0.5, 0.0, math.pi, 0.0),
+    wrench=(0.0,) * 6,
+    robot_mode=7,
+    safety_mode=1,
+    runtime_state=2,
+    speed_scaling=1.0,
+    moving_linearly=False,
+)
 CYCLE_NS, WATCHDOG_NS = 8_000_000, 100_000_000
 POSE = (-0.5, -0.1, 0.45, 0.0, math.pi, 0.0)
 

@@ -5,8 +5,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from shearloop.drivers.ur.messages import Enable, Stop, Unlock, WristSpeed
-from tests.drivers.ur.flight import Flight
-from tests.drivers.ur.test_limits import LIMITS
+from tests.drivers.ur.flight import LIMITS, Flight
 
 
 class AnyFlight(RuleBasedStateMachine):

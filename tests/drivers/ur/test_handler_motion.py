@@ -3,8 +3,7 @@
 import pytest
 
 from shearloop.drivers.ur.messages import Disconnect, MoveLinear, Stop, WristSpeed
-from tests.drivers.ur.flight import POSE, Flight, flying, turning
-from tests.drivers.ur.test_limits import LIMITS
+from tests.drivers.ur.flight import LIMITS, POSE, Flight, flying, turning
 
 
 def cycles_with_calls(flight: Flight, cycles: int) -> list[int]:

@@ -11,35 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, WristSpeed
 from shearloop.drivers.ur.motion import clip_linear, clip_stop, clip_wrist, is_close, line_violation, violation
-from shearloop.drivers.ur.settings import Bound, JointRange, UrLimits, UrSettings, Workspace
+from tests.drivers.ur.flight import AT_REST, LIMITS, SETTINGS
 
 CYCLE_S = 0.008
-LIMITS = UrLimits(
-    joints=JointRange((-6.0, -6.0, -3.0, -6.0, -6.0, -2.0), (6.0, 6.0, 3.0, 6.0, 6.0, 2.0), 0.1),
-    workspace=Workspace((-0.8, -0.8, 0.0), (0.8, 0.8, 0.9), 0.02),
-    wrist_speed_rad_per_s=Bound(0.8, 1.0),
-    wrist_acceleration_rad_per_s2=Bound(4.0, 8.0),
-    linear_speed_m_per_s=Bound(0.1, 0.15),
-    linear_acceleration_m_per_s2=Bound(0.5, 1.0),
-    force_n=Bound(40.0, 60.0),
-    torque_nm=Bound(4.0, 6.0),
-)
-SETTINGS = UrSettings(host="10.0.0.1", limits=LIMITS)
-AT_REST = RtdeSample(
-    t_mono_ns=0,
-    timestamp_s=0.0,
-    age_ns=0,
-    connected=True,
-    q_rad=(0.0, -1.5, 1.5, -1.5, -1.5, 0.0),
-    qd_rad_per_s=(0.0,) * 6,
-    tcp_pose=(-0.5, -0.1, 0.5, 0.0, math.pi, 0.0),
-    wrench=(0.0,) * 6,
-    robot_mode=7,
-    safety_mode=1,
-    runtime_state=2,
-    speed_scaling=1.0,
-    moving_linearly=False,
-)
 
 
 def reading(wrist_rad: float = 0.0, speed: float = 0.0, force_n: float = 0.0, torque_nm: float = 0.0) -> RtdeSample:

@@ -30,7 +30,7 @@ from shearloop.drivers.ur.messages import (
     encode,
 )
 from shearloop.drivers.ur.settings import UrSettings
-from tests.drivers.ur.test_limits import LIMITS
+from tests.drivers.ur.flight import LIMITS
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 six = st.tuples(*[finite] * 6)

@@ -300,6 +300,7 @@ async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none()
         await cell.cycles(20)
         cell.control_loop.on_link("robot", "The robot's process died of SIGKILL.", up=False)
         cell.robot.die(50)
+        await asyncio.sleep(0)
         cell.runner.decide_now()
         assert cell.phase is ExperimentPhase.STOPPED
         assert "a command was refused" not in cell.why

@@ -307,6 +307,7 @@ async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none()
         assert "ended before it answered" in cell.why
         assert cell.why.endswith("once the robot is connected again, `shearloop command unlock`.")
         # Neither was the stop that comes next, of which there is nobody to hear.
+        await asyncio.sleep(0)
         cell.runner.decide_now()
         told = " ".join(cell.control_loop.status.decision.reasons)
         assert "not connected" in told

@@ -502,8 +502,8 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
     status, experiment = control_loop.status, control_loop.experiment
     driving = experiment.file.torque_source if experiment is not None else ""
     latest = control_loop.inputs.torques.get(driving)
-    controller = control_loop.controller
-    tool = control_loop.tool
+    controller = control_loop.wrist.controller
+    tool = control_loop.wrist.tool
     return LoopState(
         source="loop",
         t_mono_ns=now_ns,

@@ -11,7 +11,7 @@ import pytest
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.loop_inputs import GripperStatus, LoopConfig
+from shearloop.daemon.control.loop_inputs import GripperStatus, LoopConfig, TorqueSample
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
 from shearloop.daemon.control.step_runner import ExperimentPhase, GripTo
 from shearloop.drivers.ur.client import UrRobot
@@ -165,6 +165,10 @@ class Published:
         return next(one.reasons for one in reversed(self.messages) if one.topic == "loop.state")
 
 
+def experiment(*steps: Mapping[str, Any]) -> ExperimentFile:
+    return ExperimentFile.model_validate({"name": "test", "torque_source": WRENCH, "steps": list(steps)})
+
+
 class Cell:
     """Robot, gripper and loop, whose time passes in `cycles`."""
 
@@ -202,9 +206,13 @@ class Cell:
             for _ in range(8):
                 await asyncio.sleep(0)
 
+    def exceed_torque(self) -> None:
+        """Measure a torque beyond the limit."""
+        now_ns = self.robot.flight.now_ns
+        self.control_loop.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
+
     async def start(self, *steps: Mapping[str, Any]) -> None:
-        file = ExperimentFile.model_validate({"name": "test", "torque_source": WRENCH, "steps": list(steps)})
-        starting = asyncio.create_task(self.runner.start(file))
+        starting = asyncio.create_task(self.runner.start(experiment(*steps)))
         while not starting.done():
             await self.cycles(1)
         assert starting.result() is None

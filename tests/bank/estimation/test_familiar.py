@@ -7,9 +7,8 @@ import pytest
 
 from shearloop.bank.estimation import FrameSeries
 from shearloop.bank.estimation.bank_match import BankMatch
-from shearloop.bank.estimation.interval_regressor import IntervalRegressor, Mixtures, fit_interval_regressor
+from shearloop.bank.estimation.interval_regressor import IntervalRegressor, Mixtures, Ridge, fit_interval_regressor
 from shearloop.bank.estimation.novelty import NoveltyDetector, ReciprocityCheck
-from shearloop.bank.estimation.regressors import Ridge
 from tests.bank.estimation.conftest import follow, mixed
 
 ALL = np.ones(896, dtype=np.bool_)

@@ -33,8 +33,6 @@ class EmulatorProcess:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
         )
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
         self._stdin, self._stdout = self.process.stdin, self.process.stdout
         self.greeting = self._stdout.readline().decode()
         assert ready in self.greeting

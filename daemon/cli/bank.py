@@ -2,12 +2,20 @@
 
 import argparse
 import json
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shearloop.daemon.cli.options import add_cluster, add_json, check_overwrite
+from shearloop.daemon.cli.options import (
+    add_action,
+    add_cluster,
+    add_json,
+    add_option,
+    check_overwrite,
+    checked_jobs,
+    run_action,
+    writing,
+)
 from shearloop.daemon.cli.terminal import print_result, progress_bar
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.signals import report_interrupt
@@ -20,72 +28,44 @@ if TYPE_CHECKING:
     from shearloop.bank.eit.mesh import Mesh
     from shearloop.daemon.bank_config import BankPlan
 
+run = run_action
+
 # As text: `--help` imports no large library.
 MODEL_NAMES = "step, linear, cut_linear, gaussian_derivative or modulated_gaussian"
-
-_ACTIONS = {
-    "build": "build a bank, or resume an interrupted build",
-    "design": "design the smallest bank that a recording's noise asks for, as a configuration for `build`",
-    "info": "check a bank's checksums and print its definition",
-    "plot": "draw a bank's signals, and the conductivities of the five models",
-    "solve": "solve for the 896 voltages of one conductivity",
-}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the actions and their arguments."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    added = {name: actions.add_parser(name, help=text, description=text) for name, text in _ACTIONS.items()}
-    build = added["build"]
-    build.add_argument("--config", type=Path, required=True, metavar="FILE", help="the bank's configuration (YAML)")
-    build.add_argument(
-        "--out", type=Path, required=True, metavar="PATH", help="the bank file to write; with `over`, the folder"
-    )
-    build.add_argument(
-        "--jobs",
-        type=int,
-        metavar="N",
-        help="threads that solve, or workers of a cluster of this machine (default: one per core)",
-    )
+    build = add_action(actions, "build", "build a bank, or resume an interrupted build", _build)
+    add_option(build, "--config", Path, "FILE", "the bank's configuration (YAML)", required=True)
+    add_option(build, "--out", Path, "PATH", "the bank file to write; with `over`, the folder", required=True)
+    add_option(build, "--jobs", int, "N", "threads, or workers of a cluster of this machine (default: one per core)")
     add_cluster(build)
     add_json(build)
-
-    design = added["design"]
-    design.add_argument("recording", type=Path, metavar="RECORDING", help="a recording (.mcap) or a folder of slices")
-    design.add_argument(
-        "--fingertip", type=Path, metavar="FILE", help="the fingertip's measures (default: the paper's)"
-    )
+    summary = "design the smallest bank that a recording's noise asks for, as a configuration for `build`"
+    design = add_action(actions, "design", summary, _design)
+    add_option(design, "recording", Path, "RECORDING", "a recording (.mcap) or a folder of slices")
+    add_option(design, "--fingertip", Path, "FILE", "the fingertip's measures (default: the paper's)")
     design.add_argument("--side", metavar="SIDE", help="side of the recording to design for (default: its first)")
-    design.add_argument("--out", type=Path, metavar="FILE", help="write the YAML there (default: print it)")
-
-    info = added["info"]
-    info.add_argument("path", type=Path, metavar="PATH", help="the bank file")
+    add_option(design, "--out", Path, "FILE", "write the YAML there (default: print it)")
+    info = add_action(actions, "info", "check a bank's checksums and print its definition", _info)
+    add_option(info, "path", Path, "PATH", "the bank file")
     add_json(info)
-
-    plot = added["plot"]
-    plot.add_argument("path", type=Path, nargs="?", metavar="PATH", help="draw this bank's signals")
-    plot.add_argument("--config", type=Path, metavar="FILE", help="draw the models on this configuration's mesh")
-    plot.add_argument("--out", type=Path, required=True, metavar="DIR", help="directory for the PNG and SVG files")
-
-    solve = added["solve"]
-    solve.add_argument(
-        "--mesh", type=Path, required=True, metavar="FILE", help="a mesh (.npz, EIDORS .mat) or a fingertip (.yaml)"
-    )
+    plot = add_action(actions, "plot", "draw a bank's signals, and the conductivities of the five models", _plot)
+    add_option(plot, "path", Path, "PATH", "draw this bank's signals", nargs="?")
+    add_option(plot, "--config", Path, "FILE", "draw the models on this configuration's mesh")
+    add_option(plot, "--out", Path, "DIR", "directory for the PNG and SVG files", required=True)
+    solve = add_action(actions, "solve", "solve for the 896 voltages of one conductivity", _solve)
+    add_option(solve, "--mesh", Path, "FILE", "a mesh (.npz, EIDORS .mat) or a fingertip (.yaml)", required=True)
     solve.add_argument("--model", required=True, metavar="M", help=f"basis model: {MODEL_NAMES}")
-    solve.add_argument("--k", type=float, required=True, metavar="K", help="the model's first parameter")
-    solve.add_argument("--sigma", type=float, required=True, metavar="S", help="the model's second parameter")
-    solve.add_argument("--out", type=Path, required=True, metavar="V.npy", help="file for the 896 float64 voltages")
+    add_option(solve, "--k", float, "K", "the model's first parameter", required=True)
+    add_option(solve, "--sigma", float, "S", "the model's second parameter", required=True)
+    add_option(solve, "--out", Path, "V.npy", "file for the 896 float64 voltages", required=True)
     add_json(solve)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run one action and return the exit status."""
-    actions = {"build": _build, "design": _design, "info": _info, "plot": _plot, "solve": _solve}
-    return actions[args.action](args)
-
-
 def _build(args: argparse.Namespace) -> int:
-    """Build the bank, with progress on stderr."""
     try:
         return _build_all(args)
     except KeyboardInterrupt as interrupt:
@@ -101,9 +81,7 @@ def _build_all(args: argparse.Namespace) -> int:
     from shearloop.daemon.bank_config import load_bank_plans
     from shearloop.daemon.workers import open_executor
 
-    jobs = len(os.sched_getaffinity(0)) if args.jobs is None else args.jobs
-    if jobs < 1:
-        raise UserError(f"--jobs must be 1 or more, not {jobs}")
+    jobs = checked_jobs(args.jobs)
     plans = load_bank_plans(args.config)
     paths = _paths(args.out, list(plans))
     # In a folder the names are the banks' own, and an unusable bank is built again.
@@ -199,10 +177,8 @@ def _design(args: argparse.Namespace) -> int:
     if args.out is None:
         print(text, end="")
         return 0
-    try:
+    with writing(args.out, "the design"):
         args.out.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{args.out}: the design cannot be written: {error.strerror}") from error
     print(f"Build it: shearloop bank build --config {args.out} --out FILE", file=sys.stderr)
     return 0
 
@@ -237,8 +213,7 @@ def _info(args: argparse.Namespace) -> int:
         "bytes": args.path.stat().st_size,
     }
     lines = [f"{name.replace('_', ' '):<20}{_text(value)}" for name, value in facts.items()]
-    print_result(facts, [*lines, "all checksums agree"], as_json=args.json)
-    return 0
+    return print_result(facts, [*lines, "all checksums agree"], as_json=args.json)
 
 
 def _text(value: object) -> str:
@@ -266,16 +241,12 @@ def _plot(args: argparse.Namespace) -> int:
         drawn["bank_signals"] = bank_figures.signal_figure(Bank.open(args.path))
     if args.config is not None:
         drawn["models"] = bank_figures.models_figure(load_bank_plan(args.config).mesh)
-    try:
+    with writing(args.out, "the pictures"):
         args.out.mkdir(parents=True, exist_ok=True)
         for name, figure in drawn.items():
             for suffix in ("png", "svg"):
                 figure.savefig(args.out / f"{name}.{suffix}", dpi=150)
                 print(args.out / f"{name}.{suffix}")
-    except OSError as error:
-        raise UserError(
-            f"{args.out}: the pictures cannot be written: {error.strerror}; choose another --out"
-        ) from error
     return 0
 
 
@@ -294,14 +265,8 @@ def _solve(args: argparse.Namespace) -> int:
         voltages = ForwardModel(mesh).voltages(conductivity(mesh, args.model, args.k, args.sigma))
     except ConductivityError as error:
         raise UserError(f"--model {args.model} --k {args.k:g} --sigma {args.sigma:g}: {error}") from error
-    try:
-        with replace_file(args.out) as file:
-            np.save(file, voltages)
-    except OSError as error:
-        raise UserError(
-            f"{args.out}: the voltages cannot be written: {error.strerror}; choose another --out"
-        ) from error
+    with writing(args.out, "the voltages"), replace_file(args.out) as file:
+        np.save(file, voltages)
     norm = float(np.linalg.norm(voltages))
     result = {"path": str(args.out), "voltages": len(voltages), "norm": norm}
-    print_result(result, [f"{args.out}: 896 voltages, norm {norm:.9g}"], as_json=args.json)
-    return 0
+    return print_result(result, [f"{args.out}: 896 voltages, norm {norm:.9g}"], as_json=args.json)

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from shearloop.daemon.cli.options import add_cluster
+from shearloop.daemon.cli.options import add_cluster, add_option, checked_jobs
 from shearloop.daemon.errors import UserError
 
 NAMES = {
@@ -17,23 +17,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     listing = "; ".join(f"{name}: {content}" for name, content in NAMES.items())
     parser.add_argument("name", choices=NAMES, metavar="NAME", help=listing)
-    parser.add_argument(
-        "recordings", nargs="*", default=[], type=Path, metavar="REC",
-        help="recordings (.mcap) or folders of slices (default: synthetic frames)",
-    )  # fmt: skip
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the chart and its numbers")
-    parser.add_argument("--bank", type=Path, metavar="FILE", help="bank to match with (default: a small one, built)")
-    parser.add_argument(
-        "--mesh", type=Path, metavar="FILE", help="mesh or fingertip to reconstruct and solve on (default: our own)"
-    )
-    parser.add_argument(
-        "--split", type=float, default=0.6, metavar="SHARE", help="earlier part, for the fit (default: 0.6)"
-    )
+    text = "recordings (.mcap) or folders of slices (default: synthetic frames)"
+    add_option(parser, "recordings", Path, "REC", text, nargs="*", default=[])
+    add_option(parser, "--out", Path, "DIR", "folder for the chart and its numbers", required=True)
+    add_option(parser, "--bank", Path, "FILE", "bank to match with (default: a small one, built)")
+    add_option(parser, "--mesh", Path, "FILE", "mesh or fingertip to reconstruct and solve on (default: our own)")
+    add_option(parser, "--split", float, "SHARE", "earlier part, for the fit (default: 0.6)", default=0.6)
     add_cluster(parser)
-    parser.add_argument(
-        "--jobs", type=int, metavar="N", help="processes or local workers (default: 1; --cluster alone: one per core)"
-    )
-    parser.add_argument("--rounds", type=int, default=5, metavar="N", help="rounds of timing (default: 5)")
+    add_option(parser, "--jobs", int, "N", "processes or local workers (default: 1; --cluster alone: one per core)")
+    add_option(parser, "--rounds", int, "N", "rounds of timing (default: 5)", default=5)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -77,8 +69,7 @@ def _check_arguments(args: argparse.Namespace) -> None:
         raise UserError(f"--split must be a share from 0.1 to 0.9, not {args.split:g}")
     if args.rounds < 1:
         raise UserError(f"--rounds must be 1 or more, not {args.rounds}")
-    if args.jobs is not None and args.jobs < 1:
-        raise UserError(f"--jobs must be 1 or more, not {args.jobs}")
+    checked_jobs(args.jobs)
     if args.name == "speed-accuracy" and (args.cluster is not None or args.jobs not in (None, 1)):
         raise UserError("speed-accuracy measures times, one thread on this machine: leave out --cluster and --jobs")
     if args.name == "scene" and (args.bank is not None or args.mesh is not None):

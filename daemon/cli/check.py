@@ -4,6 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from shearloop.daemon.cli.options import add_option
+
 if TYPE_CHECKING:
     from shearloop.daemon.config import CurveConfig, DaemonConfig, SkinConfig
     from shearloop.daemon.sensing.estimators import LiveEstimator
@@ -11,7 +13,7 @@ if TYPE_CHECKING:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `check`."""
-    parser.add_argument("config", type=Path, metavar="CONFIG", help="a YAML file such as config/demo.yaml")
+    add_option(parser, "config", Path, "CONFIG", "a YAML file such as config/demo.yaml")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     parser.epilog = "Opens no device; `shearloop doctor CONFIG` does."
 

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from shearloop.daemon.cli.options import add_connection, client_keys
+from shearloop.daemon.cli.options import add_connection, add_option, client_keys
 from shearloop.daemon.messaging.addresses import (
     COMMAND_ADDRESS,
     COMMAND_TIMEOUT_S,
@@ -43,21 +43,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("name", choices=COMMANDS, metavar="COMMAND", help="one of the commands below")
     parser.add_argument("--source", metavar="NAME", help="for tare and set: name of the sensor (default: all)")
-    parser.add_argument(
-        "--heatmap",
-        choices=("always", "on_request"),
-        help="for set: compute heatmaps always, or only for subscribers",
-    )
-    parser.add_argument(
-        "--experiment", type=Path, metavar="FILE", help="for start (default: that of the configuration)"
-    )
+    choices, text = ("always", "on_request"), "for set: compute heatmaps always, or only for subscribers"
+    parser.add_argument("--heatmap", choices=choices, help=text)
+    add_option(parser, "--experiment", Path, "FILE", "for start (default: that of the configuration)")
     add_connection(parser, COMMAND_ADDRESS, "the daemon's command address")
-    parser.add_argument(
-        "--timeout",
-        type=float,
-        metavar="S",
-        help=f"time to wait for the reply (default: {COMMAND_TIMEOUT_S:g} s, for unlock {UNLOCK_TIMEOUT_S:g} s)",
-    )
+    text = f"time to wait for the reply (default: {COMMAND_TIMEOUT_S:g} s, for unlock {UNLOCK_TIMEOUT_S:g} s)"
+    add_option(parser, "--timeout", float, "S", text)
     parser.add_argument("--json", action="store_true", help="print the reply as JSON")
 
 

@@ -3,28 +3,17 @@
 import argparse
 from pathlib import Path
 
+from shearloop.daemon.cli.options import add_option
+
 MARKS = {"good": "ok   ", "note": "note ", "trouble": "WRONG"}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `doctor`."""
-    parser.add_argument(
-        "config",
-        type=Path,
-        nargs="?",
-        metavar="CONFIG",
-        help="check its files and devices too (default: none, this computer alone)",
-    )
-    parser.add_argument(
-        "--seconds",
-        type=float,
-        default=6.0,
-        metavar="S",
-        help="how long to listen to the devices (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--geometry", type=Path, metavar="FILE", help="the fingertip's geometry, to compare with its bank"
-    )
+    text = "check its files and devices too (default: none, this computer alone)"
+    add_option(parser, "config", Path, "CONFIG", text, nargs="?")
+    add_option(parser, "--seconds", float, "S", "how long to listen to the devices (default: %(default)s)", default=6.0)
+    add_option(parser, "--geometry", Path, "FILE", "the fingertip's geometry, to compare with its bank")
     parser.add_argument("--json", action="store_true", help="print the findings as JSON")
     parser.epilog = "Exit status: 0 nothing is wrong, 1 something is. See also docs/troubleshooting.md."
 

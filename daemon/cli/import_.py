@@ -4,6 +4,7 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
+from shearloop.daemon.cli.options import add_option
 from shearloop.daemon.cli.terminal import print_result
 
 
@@ -11,8 +12,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add a sub-parser per format."""
     formats = parser.add_subparsers(dest="format", metavar="FORMAT", required=True)
     mat = formats.add_parser("mat", help="the paper's MATLAB streams", description="Import the paper's streams.")
-    mat.add_argument("sources", nargs="+", type=Path, metavar="SRC", help=".mat files of one recording, or its folder")
-    mat.add_argument("--out", type=Path, required=True, metavar="REC", help="recording to write, e.g. twist.mcap")
+    add_option(mat, "sources", Path, "SRC", ".mat files of one recording, or its folder", nargs="+")
+    add_option(mat, "--out", Path, "REC", "recording to write, e.g. twist.mcap", required=True)
     mat.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
@@ -27,5 +28,4 @@ def run(args: argparse.Namespace) -> int:
     imported = import_mat(args.sources, args.out)
     counts = [f"{count} frames of the {side} side" for side, count in imported.frames.items()]
     sentence = f"{args.out}: {', '.join(counts)}, {imported.torques} torques."
-    print_result({"path": str(args.out), **asdict(imported)}, [sentence, *imported.remarks], as_json=args.json)
-    return 0
+    return print_result({"path": str(args.out), **asdict(imported)}, [sentence, *imported.remarks], as_json=args.json)

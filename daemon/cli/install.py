@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from shearloop.daemon.cli.options import add_json, add_option
+
 if TYPE_CHECKING:
     from shearloop.daemon.service import Step
 
@@ -16,18 +18,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     installs = not parser.prog.endswith(" uninstall")
     parser.set_defaults(installs=installs)
     parser.add_argument("--dry-run", action="store_true", help="say what would be done, and do nothing")
-    parser.add_argument(
-        "--root", type=Path, default=Path("/"), metavar="DIR", help="the root of another system, such as an image"
-    )
-    parser.add_argument("--json", action="store_true", help="print the result as JSON, and nothing else, on stdout")
+    add_option(parser, "--root", Path, "DIR", "the root of another system, such as an image", default=Path("/"))
+    add_json(parser)
     if installs:
-        parser.add_argument(
-            "--program", type=Path, metavar="PATH", help="what the service runs; by default this program"
-        )
+        add_option(parser, "--program", Path, "PATH", "what the service runs; by default this program")
         parser.add_argument("--real-time", action="store_true", help="with the real-time options of docs/service.md")
-        parser.epilog = (
-            "Installs unit, user, udev rules, folders and an example configuration, with sudo (docs/service.md)."
-        )
+        parser.epilog = "Installs unit, user, udev rules, folders and an example configuration (docs/service.md)."
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,10 +1,13 @@
 """`shearloop keys`: make and manage the CURVE keys of daemon and clients for network addresses."""
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
-from shearloop.daemon.cli.options import add_json, user_key_folder
+from shearloop.daemon.cli.options import add_action, add_json, add_option, run_action, user_key_folder
 from shearloop.daemon.cli.terminal import print_result
+
+run = run_action
 
 SERVER_FOLDER = Path("/etc/shearloop/keys")
 
@@ -13,31 +16,25 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the five actions."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
 
-    def action(name: str, summary: str, folder: Path) -> argparse.ArgumentParser:
-        added = actions.add_parser(name, help=summary, description=summary)
-        added.add_argument(
-            "--dir", type=Path, default=folder, metavar="DIR", help="folder of the keys (default: %(default)s)"
-        )
+    def action(
+        name: str, summary: str, run: Callable[[argparse.Namespace], int], folder: Path = SERVER_FOLDER
+    ) -> argparse.ArgumentParser:
+        added = add_action(actions, name, summary, run)
+        add_option(added, "--dir", Path, "DIR", "folder of the keys (default: %(default)s)", default=folder)
         add_json(added)
         return added
 
-    action("server", "make the daemon's keys and the folder of allowed clients", SERVER_FOLDER)
-    action("client", "make your own keys, on the client's machine", user_key_folder())
-    allow = action("allow", "allow a client", SERVER_FOLDER)
-    allow.add_argument("key", type=Path, metavar="FILE", help="the client's .key, which is public")
+    action("server", "make the daemon's keys and the folder of allowed clients", _server)
+    action("client", "make your own keys, on the client's machine", _client, user_key_folder())
+    allow = action("allow", "allow a client", _allow)
+    add_option(allow, "key", Path, "FILE", "the client's .key, which is public")
     allow.add_argument("--name", help="the client's name in the daemon's log (default: the file's name)")
-    revoke = action("revoke", "remove a client", SERVER_FOLDER)
+    revoke = action("revoke", "remove a client", _revoke)
     revoke.add_argument("name", metavar="NAME", help="a name from `shearloop keys list`")
-    action("list", "show the daemon's public key and the allowed clients", SERVER_FOLDER)
+    action("list", "show the daemon's public key and the allowed clients", _list)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run one action and return the exit status."""
-    {"server": _server, "client": _client, "allow": _allow, "revoke": _revoke, "list": _list}[args.action](args)
-    return 0
-
-
-def _server(args: argparse.Namespace) -> None:
+def _server(args: argparse.Namespace) -> int:
     from shearloop.daemon.messaging.keys import make_key_pair, write_error
 
     public, secret = make_key_pair(args.dir, "server")
@@ -54,10 +51,10 @@ def _server(args: argparse.Namespace) -> None:
         f"curve: {{server_key: {secret}, clients: {clients}}}",
     ]
     content = {"secret_file": str(secret), "public_file": str(public), "clients": str(clients)}
-    print_result(content, sentences, as_json=args.json)
+    return print_result(content, sentences, as_json=args.json)
 
 
-def _client(args: argparse.Namespace) -> None:
+def _client(args: argparse.Namespace) -> int:
     from shearloop.daemon.messaging.keys import make_key_pair
 
     public, secret = make_key_pair(args.dir, "client")
@@ -66,10 +63,10 @@ def _client(args: argparse.Namespace) -> None:
         f"{public}: copy this file to the daemon's machine and run `sudo shearloop keys allow FILE --name YOU` there",
         f"copy the daemon's server.key back to {args.dir / 'server.key'}",
     ]
-    print_result({"secret_file": str(secret), "public_file": str(public)}, sentences, as_json=args.json)
+    return print_result({"secret_file": str(secret), "public_file": str(public)}, sentences, as_json=args.json)
 
 
-def _allow(args: argparse.Namespace) -> None:
+def _allow(args: argparse.Namespace) -> int:
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.messaging.keys import allowed_clients, load_public_key, write_error, write_public_key
 
@@ -87,10 +84,10 @@ def _allow(args: argparse.Namespace) -> None:
         ) from error
     except OSError as error:
         raise write_error(error) from error
-    print_result({"allowed": name}, [f"{name} may connect now"], as_json=args.json)
+    return print_result({"allowed": name}, [f"{name} may connect now"], as_json=args.json)
 
 
-def _revoke(args: argparse.Namespace) -> None:
+def _revoke(args: argparse.Namespace) -> int:
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.messaging.keys import allowed_clients, write_error
 
@@ -104,10 +101,10 @@ def _revoke(args: argparse.Namespace) -> None:
     except OSError as error:
         raise write_error(error) from error
     sentence = f"{args.name} may not connect any more; restart the daemon to end an open connection"
-    print_result({"revoked": args.name}, [sentence], as_json=args.json)
+    return print_result({"revoked": args.name}, [sentence], as_json=args.json)
 
 
-def _list(args: argparse.Namespace) -> None:
+def _list(args: argparse.Namespace) -> int:
     from shearloop.daemon.messaging.keys import allowed_clients, load_public_key
 
     server = load_public_key(args.dir / "server.key").decode()
@@ -115,7 +112,7 @@ def _list(args: argparse.Namespace) -> None:
     sentences = [f"{server}  the daemon", *(f"{key}  {name}" for name, key in clients.items())]
     if not clients:
         sentences.append("no client may connect yet; see `shearloop keys allow`")
-    print_result({"server": server, "clients": clients}, sentences, as_json=args.json)
+    return print_result({"server": server, "clients": clients}, sentences, as_json=args.json)
 
 
 def _check_name(name: str) -> None:

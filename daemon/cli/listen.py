@@ -3,7 +3,7 @@
 import argparse
 import sys
 
-from shearloop.daemon.cli.options import add_connection, client_keys
+from shearloop.daemon.cli.options import add_connection, add_option, client_keys
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.signals import interrupt_status
 
@@ -20,15 +20,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `listen`."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = EPILOG
-    parser.add_argument(
-        "topics", nargs="*", default=[], metavar="TOPIC", help="topics or their beginnings, such as eit (default: all)"
-    )
+    text = "topics or their beginnings, such as eit (default: all)"
+    add_option(parser, "topics", str, "TOPIC", text, nargs="*", default=[])
     add_connection(parser, PUBLISH_ADDRESS, "where the daemon publishes")
     parser.add_argument("--json", action="store_true", help="one JSON object per line, with arrays")
-    parser.add_argument("--count", type=int, metavar="N", help="stop after N messages")
-    parser.add_argument(
-        "--timeout", type=float, metavar="S", help="stop with an error after S seconds without a message"
-    )
+    add_option(parser, "--count", int, "N", "stop after N messages")
+    add_option(parser, "--timeout", float, "S", "stop with an error after S seconds without a message")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -3,9 +3,10 @@
 import argparse
 import codecs
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import needs_keys
@@ -16,6 +17,33 @@ if TYPE_CHECKING:
 
 # Longer than the 124 characters of text at the start of a MATLAB file.
 _HEAD_BYTES = 512
+
+
+def add_option(
+    parser: argparse._ActionsContainer,
+    name: str,
+    kind: type,
+    metavar: str | tuple[str, str] | None,
+    text: str,
+    **more: Any,
+) -> None:
+    """Add an option with a value, or a positional argument, to a parser or a group."""
+    parser.add_argument(name, type=kind, metavar=metavar, help=text, **more)
+
+
+def add_action(
+    actions: "argparse._SubParsersAction[Any]", name: str, summary: str, run: Callable[[argparse.Namespace], int]
+) -> argparse.ArgumentParser:
+    """Return the parser of a new action, which `run_action` runs."""
+    parser: argparse.ArgumentParser = actions.add_parser(name, help=summary, description=summary)
+    parser.set_defaults(run_action=run)
+    return parser
+
+
+def run_action(args: argparse.Namespace) -> int:
+    """Run the given action and return the exit status."""
+    status: int = args.run_action(args)
+    return status
 
 
 def add_json(parser: argparse._ActionsContainer) -> None:
@@ -38,10 +66,8 @@ def add_cluster(parser: argparse.ArgumentParser) -> None:
 def add_connection(parser: argparse.ArgumentParser, default: str, purpose: str) -> None:
     """Add `--connect`, `--key` and `--server-key`; `purpose` describes the address."""
     parser.add_argument("--connect", default=default, metavar="ADDRESS", help=f"{purpose} (default: %(default)s)")
-    parser.add_argument(
-        "--key", type=Path, metavar="FILE", help="your .key_secret, for a daemon on the network (default: in ~/.config)"
-    )
-    parser.add_argument("--server-key", type=Path, metavar="FILE", help="that daemon's .key (default: in ~/.config)")
+    add_option(parser, "--key", Path, "FILE", "your .key_secret, for a daemon on the network (default: in ~/.config)")
+    add_option(parser, "--server-key", Path, "FILE", "that daemon's .key (default: in ~/.config)")
 
 
 def user_key_folder() -> Path:
@@ -68,6 +94,23 @@ def client_keys(args: argparse.Namespace) -> "ClientKeys | None":
                 f"{args.connect} is not on this machine, and there is no key {path}: {cure}, or give {option}"
             )
     return ClientKeys(load_key_pair(key), load_public_key(server_key))
+
+
+def checked_jobs(jobs: int | None) -> int:
+    """Return the value of --jobs, by default one per processor; raises UserError for less than 1."""
+    count = len(os.sched_getaffinity(0)) if jobs is None else jobs
+    if count < 1:
+        raise UserError(f"--jobs must be 1 or more, not {count}")
+    return count
+
+
+@contextmanager
+def writing(out: Path, what: str) -> Iterator[None]:
+    """Raise UserError where writing `out` raises OSError."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"{out}: {what} cannot be written: {error.strerror}; choose another --out") from error
 
 
 def parse_time_range(text: str) -> tuple[float, float]:

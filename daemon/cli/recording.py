@@ -6,48 +6,33 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.options import add_json
+from shearloop.daemon.cli.options import add_action, add_json, add_option, run_action
 from shearloop.daemon.cli.terminal import print_result, progress_bar
 
 if TYPE_CHECKING:
     from shearloop.daemon.recording.reader import RecordingSummary
 
 
+run = run_action
+
+
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add a sub-parser for each action."""
     parts = parser.add_subparsers(dest="part", metavar="WHAT", required=True)
-    info = parts.add_parser(
-        "info", help="show its content", description="Show the content of recordings, closed or not."
-    )
-    info.add_argument("recordings", nargs="+", type=Path, metavar="REC", help="recordings (.mcap or .mcap.partial)")
+    info = add_action(parts, "info", "show the content of recordings, closed or not", _info)
+    add_option(info, "recordings", Path, "REC", "recordings (.mcap or .mcap.partial)", nargs="+")
     info.add_argument("--json", action="store_true", help="one JSON object per recording")
-    repair = parts.add_parser(
-        "repair",
-        help="save the intact part of one that was not closed",
-        description="Copy the intact part of a recording that was not closed, or is damaged, into a new one.",
-    )
-    repair.add_argument("recording", type=Path, metavar="REC", help="e.g. NAME.mcap.partial; it is not changed")
-    repair.add_argument(
-        "--out", type=Path, metavar="FILE", help="recording to write (default: NAME.mcap, or NAME.repaired.mcap)"
-    )
+    repair = add_action(parts, "repair", "copy the intact part of a damaged or unclosed one into a new one", _repair)
+    add_option(repair, "recording", Path, "REC", "e.g. NAME.mcap.partial; it is not changed")
+    add_option(repair, "--out", Path, "FILE", "recording to write (default: NAME.mcap, or NAME.repaired.mcap)")
     add_json(repair)
-    export = parts.add_parser(
-        "export", help="as CSV, Parquet or for MATLAB", description="Write a recording's topics as tables."
-    )
-    export.add_argument("recording", type=Path, metavar="REC", help="a recording (.mcap or .mcap.partial)")
-    export.add_argument(
-        "--format", choices=("csv", "parquet", "mat"), default="csv", help="format of the tables (default: %(default)s)"
-    )
-    export.add_argument(
-        "--out", type=Path, metavar="PATH", help="folder of one file per topic; for mat a file (default: next to REC)"
-    )
+    export = add_action(parts, "export", "write a recording's topics as CSV, Parquet or for MATLAB", _export)
+    add_option(export, "recording", Path, "REC", "a recording (.mcap or .mcap.partial)")
+    text = "format of the tables (default: %(default)s)"
+    export.add_argument("--format", choices=("csv", "parquet", "mat"), default="csv", help=text)
+    add_option(export, "--out", Path, "PATH", "folder of one file per topic; for mat a file (default: next to REC)")
     export.add_argument("--topic", action="append", metavar="TOPIC", help="export only this topic; repeatable")
     add_json(export)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Run one action."""
-    return {"info": _info, "repair": _repair, "export": _export}[args.part](args)
 
 
 def _info(args: argparse.Namespace) -> int:
@@ -100,8 +85,7 @@ def _repair(args: argparse.Namespace) -> int:
     lost = [f"{result.torn_bytes} incomplete bytes at the end"] if result.torn_bytes else []
     lost += [f"{result.damaged_chunks} damaged chunks"] if result.damaged_chunks else []
     sentence = f"{result.path}: {result.messages} messages are saved; left out: {' and '.join(lost) or 'nothing'}."
-    print_result({**asdict(result), "path": str(result.path)}, [sentence], as_json=args.json)
-    return 0
+    return print_result({**asdict(result), "path": str(result.path)}, [sentence], as_json=args.json)
 
 
 def _export(args: argparse.Namespace) -> int:
@@ -120,5 +104,4 @@ def _export(args: argparse.Namespace) -> int:
     topics = args.topic or sorted(topic for topic, count in counts.items() if count)
     with progress_bar(args.format, sum(counts[topic] for topic in topics), "message") as progress:
         written = export(args.recording, args.format, out, topics, progress)
-    print_result({"files": [str(path) for path in written]}, map(str, written), as_json=args.json)
-    return 0
+    return print_result({"files": [str(path) for path in written]}, map(str, written), as_json=args.json)

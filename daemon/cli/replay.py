@@ -8,7 +8,7 @@ from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.options import add_json
+from shearloop.daemon.cli.options import add_json, add_option
 from shearloop.daemon.cli.terminal import print_result
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 
@@ -19,23 +19,16 @@ if TYPE_CHECKING:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument("recording", type=Path, metavar="REC", help="made by `shearloop run --record` or imported")
-    parser.add_argument(
-        "--speed", default="1", metavar="N", help="factor, or max for no waiting (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--publish", default=PUBLISH_ADDRESS, metavar="ADDRESS", help="publish here (default: %(default)s)"
-    )
-    parser.add_argument("--config", type=Path, metavar="FILE", help="instead of the configuration in the recording")
+    add_option(parser, "recording", Path, "REC", "made by `shearloop run --record` or imported")
+    add_option(parser, "--speed", str, "N", "factor, or max for no waiting (default: %(default)s)", default="1")
+    add_option(parser, "--publish", str, "ADDRESS", "publish here (default: %(default)s)", default=PUBLISH_ADDRESS)
+    add_option(parser, "--config", Path, "FILE", "instead of the configuration in the recording")
     parser.add_argument("--wait", action="store_true", help="begin with the first subscriber")
     printed = parser.add_mutually_exclusive_group()
     printed.add_argument("--show", action="store_true", help="print the estimates")
     add_json(printed)
-    parser.add_argument(
-        "--check",
-        action="store_true",
-        help="exit with status 1 unless all estimates equal the recorded ones, bit for bit",
-    )
+    text = "exit with status 1 unless all estimates equal the recorded ones, bit for bit"
+    parser.add_argument("--check", action="store_true", help=text)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,11 +1,11 @@
 """`shearloop reproduce`: compute the paper's numbers and figures from recorded slices."""
 
 import argparse
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from shearloop.daemon.cli.options import add_json, add_option, checked_jobs, writing
 from shearloop.daemon.cli.terminal import progress_bar
 from shearloop.daemon.errors import UserError
 
@@ -17,28 +17,19 @@ if TYPE_CHECKING:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument(
-        "recordings", type=Path, metavar="RECORDINGS", help="folder with torque_slices, diameter_slices"
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for banks, figures and numbers")
-    parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else, on stdout")
+    add_option(parser, "recordings", Path, "RECORDINGS", "folder with torque_slices, diameter_slices")
+    add_option(parser, "--out", Path, "DIR", "folder for banks, figures and numbers", required=True)
+    add_json(parser)
     geometry = parser.add_mutually_exclusive_group()
-    geometry.add_argument(
-        "--mesh",
-        type=Path,
-        metavar="FILE",
-        help="mesh (.npz, EIDORS .mat) or fingertip (.yaml); by default RECORDINGS/../reference/fingertip_mesh.npz, "
-        "or a grid of our own if that file is missing",
-    )
-    geometry.add_argument("--bank-config", type=Path, metavar="FILE", help="a bank's configuration, for its geometry")
-    parser.add_argument("--jobs", type=int, metavar="N", help="processors to use (default: all)")
+    default = "RECORDINGS/../reference/fingertip_mesh.npz, or a grid of our own if that file is missing"
+    add_option(geometry, "--mesh", Path, "FILE", f"mesh (.npz, EIDORS .mat) or fingertip (.yaml); by default {default}")
+    add_option(geometry, "--bank-config", Path, "FILE", "a bank's configuration, for its geometry")
+    add_option(parser, "--jobs", int, "N", "processors to use (default: all)")
 
 
 def run(args: argparse.Namespace) -> int:
     """Compute the numbers, then write, print and draw them."""
-    jobs = len(os.sched_getaffinity(0)) if args.jobs is None else args.jobs
-    if jobs < 1:
-        raise UserError(f"--jobs must be 1 or more, not {jobs}")
+    jobs = checked_jobs(args.jobs)
     try:
         from shearloop.daemon.analysis.reproduce.report import draw_all
     except ModuleNotFoundError as error:
@@ -47,11 +38,9 @@ def run(args: argparse.Namespace) -> int:
 
     found, banks = _reproduce(args, jobs)
     numbers = args.out / "reproduce.json"
-    try:
+    with writing(args.out, "the results"):
         numbers.write_text(json_text(found) + "\n", encoding="utf-8")
         written = [numbers, *draw_all(found, banks, args.out)]
-    except OSError as error:
-        raise UserError(f"{args.out}: the results cannot be written: {error.strerror}") from error
     written += save_calibrations(found, banks, args.recordings, args.out)
     if args.json:
         print(json_text(found))

@@ -9,6 +9,8 @@ from contextlib import ExitStack, closing, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from shearloop.daemon.cli.options import add_option
+
 if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig
     from shearloop.daemon.logs import NonBlockingWriter
@@ -17,21 +19,14 @@ if TYPE_CHECKING:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `run`."""
-    parser.add_argument("config", type=Path, metavar="CONFIG", help="a YAML file such as config/demo.yaml")
+    add_option(parser, "config", Path, "CONFIG", "a YAML file such as config/demo.yaml")
     parser.add_argument("--show", action="store_true", help="print the estimates, and a summary at the end")
-    parser.add_argument(
-        "--slices",
-        type=Path,
-        metavar="DIR",
-        help="write a slice of each held angle of a sweep, in torque_slices and diameter_slices for `reproduce`",
-    )
-    parser.add_argument(
-        "--json-log", action="store_true", default=None, help="log JSON lines (the default under systemd)"
-    )
-    parser.add_argument(
-        "--recording", type=Path, metavar="FILE", help="let the configuration's EIT emulators play this .mat recording"
-    )
-    parser.add_argument("--record", type=Path, metavar="DIR", help="record everything into files in this folder")
+    text = "write a slice of each held angle of a sweep, in torque_slices and diameter_slices for `reproduce`"
+    add_option(parser, "--slices", Path, "DIR", text)
+    text = "log JSON lines (the default under systemd)"
+    parser.add_argument("--json-log", action="store_true", default=None, help=text)
+    add_option(parser, "--recording", Path, "FILE", "let the configuration's EIT emulators play this .mat recording")
+    add_option(parser, "--record", Path, "DIR", "record everything into files in this folder")
     parser.epilog = (
         "Ends at Ctrl-C, SIGTERM, a closed terminal, `shearloop command stop`, or with the experiment if the "
         "configuration says stop_when_done. Exit status: 0 it ended as requested, 2 it could not run (and why), "

@@ -7,11 +7,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.options import add_json
+from shearloop.daemon.cli.options import add_action, add_json, add_option, check_overwrite, run_action
 from shearloop.daemon.cli.terminal import print_result
 
 if TYPE_CHECKING:
     from shearloop.bank.skin.characterisation import FigureOfMerit
+
+run = run_action
 
 SEED = 2017
 COLUMNS = ("quantity", "unit", "paper: computed", "measured", "closed form", "1-D", "2-D", "synthetic")
@@ -24,70 +26,48 @@ Synthetic: the estimator's result on a synthetic recording with the paper's meas
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add `characterise` and `calibrate`."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    characterise = actions.add_parser(
-        "characterise",
-        help="compare the paper's table with the models'",
-        description="Compare the paper's table with the models'.",
-    )
-    characterise.add_argument("--out", type=Path, metavar="DIR", help="draw figures 5, 6 and 7 here, PNG and SVG")
+    summary = "compare the paper's table with the models'"
+    characterise = add_action(actions, "characterise", summary, _characterise)
+    add_option(characterise, "--out", Path, "DIR", "draw figures 5, 6 and 7 here, PNG and SVG")
     add_json(characterise)
-    calibrate = actions.add_parser(
-        "calibrate", help="fit a calibration to a recorded table", description="Fit a calibration to a recorded table."
-    )
-    calibrate.add_argument("table", type=Path, metavar="TABLE", help="CSV with r1_ohm, r2_ohm, shear_n, normal_n")
-    calibrate.add_argument("--out", type=Path, required=True, metavar="YAML", help="the calibration file to write")
-    calibrate.add_argument(
-        "--friction", type=float, metavar="MU", help="coefficient of friction, if the table does not determine it"
-    )
+    calibrate = add_action(actions, "calibrate", "fit a calibration to a recorded table", _calibrate)
+    add_option(calibrate, "table", Path, "TABLE", "CSV with r1_ohm, r2_ohm, shear_n, normal_n")
+    add_option(calibrate, "--out", Path, "YAML", "the calibration file to write", required=True)
+    add_option(calibrate, "--friction", float, "MU", "coefficient of friction, if the table does not determine it")
     add_json(calibrate)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the action."""
-    return _characterise(args.out, args.json) if args.action == "characterise" else _calibrate(args)
-
-
-def _characterise(out: Path | None, as_json: bool) -> int:
+def _characterise(args: argparse.Namespace) -> int:
     import numpy as np
 
     from shearloop.bank.skin.characterisation import characterise
 
-    if out is not None:
+    if args.out is not None:
         # First, to report a missing library at once.
         from shearloop.daemon.analysis.charts.skin_figures import draw
     found = characterise(np.random.default_rng(SEED))
-    if as_json:
+    if args.json:
         print(json.dumps([asdict(row) for row in found.rows], indent=1, ensure_ascii=False))
     else:
         print(_table(found.rows))
-    if out is not None:
-        for path in draw(found, out):
+    if args.out is not None:
+        for path in draw(found, args.out):
             print(f"drawn: {path}", file=sys.stderr)
     return 0
 
 
 def _table(rows: "tuple[FigureOfMerit, ...]") -> str:
-    lines = [COLUMNS, *(tuple(_cell(value) for value in asdict(row).values()) for row in rows)]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(COLUMNS))]
-    printed = [
-        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
-    ]
-    printed.insert(1, "  ".join("-" * width for width in widths))
+    cells = [["" if value is None else value for value in asdict(row).values()] for row in rows]
+    shown = [[value if isinstance(value, str) else f"{value:#.3g}" if value else "0" for value in row] for row in cells]
+    widths = [max(map(len, column)) for column in zip(COLUMNS, *shown, strict=True)]
+    lines = [COLUMNS, ["-" * width for width in widths], *shown]
+    printed = ["  ".join(map(str.ljust, line, widths)).rstrip() for line in lines]
     return "\n".join([*printed, "", EXPLANATION])
-
-
-def _cell(value: str | float | None) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, str):
-        return value
-    return f"{value:#.3g}" if value else "0"
 
 
 def _calibrate(args: argparse.Namespace) -> int:
     from shearloop.bank.errors import CalibrationError
     from shearloop.bank.skin.calibration import fit_calibration, read_table, save_calibration
-    from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
 
     if args.friction is not None and not 0 <= args.friction <= 1:
@@ -121,5 +101,4 @@ def _calibrate(args: argparse.Namespace) -> int:
         f"rows left out beyond the curve       {calibration.rows_beyond}",
         f"written: {args.out}",
     ]
-    print_result(result, sentences, as_json=args.json)
-    return 0
+    return print_result(result, sentences, as_json=args.json)

@@ -18,12 +18,13 @@ READ_BYTES = 4096
 _ENVELOPE = ("timestamp", "t_mono_ns", "seq", "source", "topic")
 
 
-def print_result(result: Mapping[str, object], sentences: Iterable[str], *, as_json: bool) -> None:
-    """Print a result as one line of JSON for a script, or as sentences for a person."""
+def print_result(result: Mapping[str, object], sentences: Iterable[str], *, as_json: bool) -> int:
+    """Print a result as one line of JSON for a script, or as sentences for a person; return the exit status 0."""
     if as_json:
         print(json.dumps(result, ensure_ascii=False), flush=True)
     else:
         print(*sentences, sep="\n", flush=True)
+    return 0
 
 
 @contextmanager

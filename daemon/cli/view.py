@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from shearloop.daemon.cli.options import add_connection, client_keys
+from shearloop.daemon.cli.options import add_connection, add_option, client_keys
 from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS
 
 PORT = 7760
@@ -12,27 +12,13 @@ PORT = 7760
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `view`."""
     add_connection(parser, PUBLISH_ADDRESS, "where the daemon publishes")
-    parser.add_argument(
-        "--commands",
-        default=COMMAND_ADDRESS,
-        metavar="ADDRESS",
-        help="where the daemon takes commands (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--port",
-        type=int,
-        default=PORT,
-        help="the page's port on 127.0.0.1; 0 for any free one (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--fingertip", type=Path, metavar="FILE", help="the fingertip's dimensions; by default the paper's fingertip"
-    )
-    parser.add_argument(
-        "--token-file",
-        type=Path,
-        metavar="FILE",
-        help="the token that permits motion (default: ~/.local/state/shearloop/view-token)",
-    )
+    text = "where the daemon takes commands (default: %(default)s)"
+    add_option(parser, "--commands", str, "ADDRESS", text, default=COMMAND_ADDRESS)
+    text = "the page's port on 127.0.0.1; 0 for any free one (default: %(default)s)"
+    add_option(parser, "--port", int, "PORT", text, default=PORT)
+    add_option(parser, "--fingertip", Path, "FILE", "the fingertip's dimensions; by default the paper's fingertip")
+    text = "the token that permits motion (default: ~/.local/state/shearloop/view-token)"
+    add_option(parser, "--token-file", Path, "FILE", text)
     parser.add_argument("--new-token", action="store_true", help="make a new token; the old one becomes invalid")
     parser.add_argument("--json", action="store_true", help="print the page's address as JSON")
     parser.epilog = "Prints the address to open in a browser of this computer, and serves it until Ctrl-C."

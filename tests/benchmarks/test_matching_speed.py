@@ -18,13 +18,13 @@ def bank(tmp_path_factory: pytest.TempPathFactory) -> Bank:
     return Bank.open(path)
 
 
-def test_ratios_are_taken_turn_by_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ratios_are_taken_turn_by_turn(monkeypatch):
     monkeypatch.setattr(matching_speed, "RATIOS", {"own": ("peer", "absent")})
     seconds = {"own": [1.0, 2.0, 4.0], "peer": [3.0, 6.0, 12.0], "other": [1.0, 1.0, 1.0]}
     assert matching_speed.ratios(seconds) == {"peer / own": {"median": 3.0, "low": 3.0, "high": 3.0}}
 
 
-def test_methods_take_turns() -> None:
+def test_methods_take_turns():
     calls: list[str] = []
     methods = {name: (lambda name=name: calls.append(name), 1) for name in ("a", "b")}
     found = matching_speed.take_turns(methods, 3)
@@ -32,7 +32,7 @@ def test_methods_take_turns() -> None:
     assert {name: len(each) for name, each in found.items()} == {"a": 3, "b": 3}
 
 
-def test_fast_solvers_and_matchers_agree_with_slow_ones(bank: Bank, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fast_solvers_and_matchers_agree_with_slow_ones(bank, monkeypatch):
     monkeypatch.setattr(matching_speed, "N_CELLS", 20)
     methods, error = matching_speed.cell_methods(small_fingertip())
     assert 0 < error < 1e-9
@@ -47,7 +47,7 @@ def test_fast_solvers_and_matchers_agree_with_slow_ones(bank: Bank, monkeypatch:
         assert found["largest_score_difference"] < 1e-12
 
 
-def test_the_caches_are_overwritten_before_each_cold_match(bank: Bank, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_caches_are_overwritten_before_each_cold_match(bank, monkeypatch):
     happened: list[str] = []
 
     class Memory:

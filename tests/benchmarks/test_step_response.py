@@ -13,7 +13,6 @@ from benchmarks.step_response import estimator_in_the_loop, rig_calibration
 from shearloop.bank.eit.bank_file import BankDefinition, write_bank
 from shearloop.daemon.analysis.charts.simulated_loop import (
     SCENARIOS,
-    LoopScenario,
     Plant,
     SimulatedSensor,
     random_tool,
@@ -42,7 +41,7 @@ def small_plant(sensor: SimulatedSensor, rng: np.random.Generator) -> Plant:
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda scenario: scenario.name)
-def test_a_step_meets_its_requirements(scenario: LoopScenario) -> None:
+def test_a_step_meets_its_requirements(scenario):
     figures = step_response.steps(scenario, 3, small_plant)
     assert figures["in_band_at_settling_time_share"] == 1.0
     assert figures["time_in_band_worst_seed"] >= 0.95
@@ -51,7 +50,7 @@ def test_a_step_meets_its_requirements(scenario: LoopScenario) -> None:
     assert figures["refused_by_margins"] == 0
 
 
-def test_the_step_on_the_rigs_physics_is_held_and_a_screw_ends_at_its_target() -> None:
+def test_the_step_on_the_rigs_physics_is_held_and_a_screw_ends_at_its_target():
     numbers = step_response.measure(2)
     assert numbers["eit"]["time_in_band_mean"] > 0.95
     assert numbers["load_cell"]["in_band_at_settling_time_share"] == 1.0
@@ -61,7 +60,7 @@ def test_the_step_on_the_rigs_physics_is_held_and_a_screw_ends_at_its_target() -
     assert (creep.share, creep.time_s) == (pytest.approx(0.08, abs=0.02), pytest.approx(20.0, rel=0.5))
 
 
-def test_the_benchmark_writes_its_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_benchmark_writes_its_numbers(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["step_response", "--out", str(tmp_path / "out" / "step.json"), "--seeds", "2"])
     shorter = tuple(replace(scenario, hold_s=12.0) for scenario in step_response.TWIN_SCENARIOS)
     monkeypatch.setattr(step_response, "TWIN_SCENARIOS", shorter)
@@ -69,7 +68,7 @@ def test_the_benchmark_writes_its_numbers(tmp_path: Path, monkeypatch: pytest.Mo
     assert set(json.loads((tmp_path / "out" / "step.json").read_text())) == {"eit", "load_cell", "tighten"}
 
 
-def test_the_default_estimator_holds_a_torque_on_both_fingertips(bank: Path) -> None:
+def test_the_default_estimator_holds_a_torque_on_both_fingertips(bank):
     figures = estimator_in_the_loop(bank, rig_calibration(bank, 7), (0, 1))
     assert figures["time_in_band_worst_seed"] == 1.0
     assert figures["overshoot_worst_seed"] < 0.2

@@ -6,7 +6,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 
 
-def test_benchmarks_use_one_blas_thread() -> None:
+def test_benchmarks_use_one_blas_thread():
     """With more threads a match at all lags takes four times as long on two cores."""
     asked = "import benchmarks, os, sys; print(os.environ['OPENBLAS_NUM_THREADS'], 'numpy' in sys.modules)"
     alone = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}

@@ -2,7 +2,7 @@ import asyncio
 import signal
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,15 @@ import pytest
 import structlog
 import yaml
 import zmq
+import zmq.asyncio
+from scipy.io import savemat
 
 from shearloop.bank.eit.bank_file import Bank, BankDefinition, write_bank
+from shearloop.bank.eit.channels import LINE_SLOTS, line_of_channels
 from shearloop.bank.estimation import Calibration
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.config import load_daemon_config
+from shearloop.drivers.eit_kit import ADC_STEP_V, FRAME_PERIOD_S
 
 # Guards against a test that hangs; none waits for so long.
 DEADLINE_S = 60
@@ -113,15 +119,10 @@ def log() -> Log:
 
 
 @asynccontextmanager
-async def shearloop(*arguments: str, stdin: int | None = None) -> AsyncIterator[asyncio.subprocess.Process]:
-    """Run a command as a process of its own; it is ended at the end, whatever becomes of the test."""
-    process = await asyncio.create_subprocess_exec(
-        sys.executable,
-        *("-m", "shearloop", *arguments),
-        stdin=stdin,
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-    )
+async def shearloop(*arguments: str, **streams: int) -> AsyncIterator[asyncio.subprocess.Process]:
+    """Run a command as a process of its own; it is ended at the end, in success and in failure of the test."""
+    streams = {"stdout": asyncio.subprocess.PIPE, "stderr": asyncio.subprocess.PIPE, **streams}
+    process = await asyncio.create_subprocess_exec(sys.executable, "-m", "shearloop", *arguments, **streams)
     try:
         async with asyncio.timeout(DEADLINE_S):
             yield process
@@ -131,6 +132,52 @@ async def shearloop(*arguments: str, stdin: int | None = None) -> AsyncIterator[
         await process.communicate()
         # The transport closes its pipes one step later.
         await asyncio.sleep(0)
+
+
+@asynccontextmanager
+async def running_daemon(path: Path) -> AsyncIterator[Daemon]:
+    """Run a daemon in this process, where its parts can be reached."""
+    with zmq.asyncio.Context() as context:
+        daemon = Daemon(load_daemon_config(path), context)
+        # A daemon that dies ends the test at once.
+        async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
+            group.create_task(daemon.run())
+            try:
+                yield daemon
+            finally:
+                daemon.stop()
+
+
+def collector(daemon: Daemon, topic: str) -> "asyncio.Queue[dict[str, Any]]":
+    """Return a queue of all messages of a topic."""
+    queue: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+    daemon.publisher.add_listener(lambda name, content: queue.put_nowait(content) if name == topic else None)
+    return queue
+
+
+def robot_at(host: str, folder: Path) -> None:
+    """Write `ur.yaml`: the settings of a robot at this address."""
+    robot = yaml.safe_load(Path("config/ur.yaml").read_text())
+    (folder / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": host}))
+
+
+def recording(folder: Path, n_frames: int) -> tuple[Path, np.ndarray]:
+    """Write a recording with a touch in its second half, and return its path and its lines (n_frames, 1024)."""
+    random = np.random.default_rng(2)
+    idle = random.integers(20, 200, len(LINE_SLOTS))
+    steps = idle + random.integers(-1, 2, (n_frames, len(LINE_SLOTS)))
+    steps[n_frames // 2 :] += random.integers(-15, 16, len(LINE_SLOTS))
+    lines = np.round(line_of_channels(steps * ADC_STEP_V), 4)
+    days = 739_588 + np.arange(n_frames) * FRAME_PERIOD_S / 86_400
+    savemat(folder / "stream.mat", {"Right_Data": np.column_stack([days, lines])})
+    return folder / "stream.mat", lines
+
+
+def emulated_kit(folder: Path, frames: int, *options: str) -> AbstractAsyncContextManager[asyncio.subprocess.Process]:
+    """Play a recording of so many frames to the fingertip of `config`, twenty times as fast."""
+    play, _ = recording(folder, frames)
+    words = ("--recording", str(play), "--speed", "20", "--link", str(folder / "eit-right"), *options)
+    return shearloop("emulate", "eit-kit", *words, stdin=asyncio.subprocess.PIPE)
 
 
 @pytest.fixture

@@ -32,7 +32,7 @@ def built(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_design_is_a_configuration_that_builds(built: Path) -> None:
+def test_a_design_is_a_configuration_that_builds(built):
     config = built / "design.yaml"
     text = config.read_text()
     assert "of a difference frame" in text
@@ -51,7 +51,7 @@ def step_frames() -> np.ndarray:
     return 0.01 * np.abs(simulated_signals(ForwardModel(mesh), "step", steps))
 
 
-def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path: Path) -> None:
+def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path):
     frames = step_frames()
     # A third of a frame's size: a coarse mesh and few cells, built in no time.
     frames += np.random.default_rng(0).normal(0.0, 8e-4, frames.shape)
@@ -69,9 +69,9 @@ def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path: Pat
 
 
 @pytest.mark.parametrize(("noise_v", "mixed_up"), [(1e-4, False), (5e-3, True)])
-def test_frames_that_no_model_explains_are_called_so_on_the_screen_and_in_the_configuration(
-    noise_v: float, mixed_up: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_frames_that_no_model_explains_are_called_so_on_screen_and_in_the_configuration(
+    noise_v, mixed_up, tmp_path, capsys
+):
     frames = step_frames()
     rng = np.random.default_rng(0)
     frames = frames[:, rng.permutation(N_CHANNELS)] if mixed_up else frames
@@ -86,18 +86,18 @@ def test_frames_that_no_model_explains_are_called_so_on_the_screen_and_in_the_co
     assert load_bank_plan(config).definition.model in text
 
 
-def test_sizes_that_overflow_are_refused_without_a_warning() -> None:
+def test_sizes_that_overflow_are_refused_without_a_warning():
     t_s, frames = np.arange(12.0), np.random.default_rng(1).normal(0.0, 1e200, (12, 1, N_CHANNELS))
     with pytest.raises(CalibrationError, match="no noise to design for"):
         scene_of(FrameSeries("difference", ("right",), t_s, frames, t_s, t_s, np.full(12, np.nan)))
 
 
-def test_a_recording_that_is_none_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_recording_that_is_none_is_one_sentence(tmp_path, capsys):
     assert main(["bank", "design", str(tmp_path)]) == 2
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_a_recording_that_begins_gripped_is_designed_for_without_the_frame_that_stands_in_for_the_idle_one() -> None:
+def test_a_recording_that_begins_gripped_is_designed_for_without_the_frame_that_stands_in_for_the_idle_one():
     rng = np.random.default_rng(4)
     t_s, frames = np.arange(12.0), rng.normal(0.3, 0.01, (12, 1, N_CHANNELS))
     series = FrameSeries("raw", ("right",), t_s, frames, t_s, np.full(12, 0.1), np.full(12, np.nan))
@@ -105,9 +105,7 @@ def test_a_recording_that_begins_gripped_is_designed_for_without_the_frame_that_
     np.testing.assert_array_equal(found.differences, frames[1:, 0] - frames[0, 0])
 
 
-def test_a_side_is_designed_for_by_its_own_frames_however_few_the_other_one_has(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_side_is_designed_for_by_its_own_frames_however_few_the_other_one_has(tmp_path, monkeypatch):
     rng, period_ns = np.random.default_rng(5), 540_800_000
     with RecordingWriter(tmp_path / "one.mcap", "a test") as writer:
         for number in range(12):

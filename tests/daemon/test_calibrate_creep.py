@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,7 +29,7 @@ def track(valid: np.ndarray | None = None) -> EstimateTrack:
     return EstimateTrack(series, tuple(estimates), np.zeros(times.size))
 
 
-def test_a_grip_is_a_stretch_of_torques_and_single_frames_do_not_end_it() -> None:
+def test_a_grip_is_a_stretch_of_torques_and_single_frames_do_not_end_it():
     valid = np.ones(1109, bool)
     valid[[3, 500]] = False
     valid[200:230] = valid[:2] = False
@@ -46,9 +45,7 @@ class Loaded:
     kind: str = "raw"
 
 
-def test_it_prints_the_line_of_the_configuration(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_it_prints_the_line_of_the_configuration(monkeypatch, capsys, tmp_path):
     found = track()
     monkeypatch.setattr("shearloop.bank.estimation.Calibration.load", lambda _: Loaded())
     monkeypatch.setattr("shearloop.daemon.analysis.series.read_series", lambda *_: [found.series])
@@ -67,9 +64,7 @@ def test_it_prints_the_line_of_the_configuration(
     CreepConfig(share=told["share"], time_s=told["time_s"])
 
 
-def test_a_recording_without_held_twists_is_refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_recording_without_held_twists_is_refused(monkeypatch, capsys):
     found = track(np.arange(1109) < 10)
     monkeypatch.setattr("shearloop.bank.estimation.Calibration.load", lambda _: Loaded())
     monkeypatch.setattr("shearloop.daemon.analysis.series.read_series", lambda *_: [found.series])
@@ -78,9 +73,7 @@ def test_a_recording_without_held_twists_is_refused(
     assert "10 readings are too few for a fit; hold a twist for a minute" in capsys.readouterr().err
 
 
-def test_twists_that_are_given_twice_are_refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_twists_that_are_given_twice_are_refused(monkeypatch, capsys):
     monkeypatch.setattr("shearloop.bank.estimation.Calibration.load", lambda _: Loaded())
     monkeypatch.setattr("shearloop.daemon.analysis.series.read_series", lambda *_: [track().series])
     told_of = {"held.mcap": "is given twice; name it once", "copy.mcap": "equals held.mcap"}

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 from unittest.mock import Mock
@@ -27,11 +27,10 @@ from shearloop.daemon.cli.completion import full_parser
 from shearloop.daemon.cli.terminal import message_json, message_line
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.runner import WRENCH
-from shearloop.daemon.messaging.messages import decode, encode
+from shearloop.daemon.messaging.messages import EitEstimate, decode, encode, wire_map
 from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
-
-Write = Callable[..., Path]
+from tests.daemon.sample_messages import sample
 
 
 def mistake(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -43,15 +42,13 @@ def mistake(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return err
 
 
-def test_check_accepts_a_valid_configuration(config: Write, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_accepts_a_valid_configuration(config, capsys):
     assert main(["check", str(config())]) == 0
     assert "is in order" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("command", ["run", "check"])
-def test_a_calibration_without_torques_cannot_drive_the_loop(
-    command: str, config: Write, tiny_bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_calibration_without_torques_cannot_drive_the_loop(command, config, tiny_bank, tmp_path, capsys):
     grid, path = np.linspace(0.9, 2.1, 30), tmp_path / "diameters.yaml"
     Calibration.from_matches(Bank.open(tiny_bank).identity, "synthetic", diameter=(grid, 20.0 * grid)).save(path)
     section = {"right": {"device": {"path": "eit"}, "bank": str(tiny_bank), "calibration": str(path)}}
@@ -79,16 +76,14 @@ def test_a_calibration_without_torques_cannot_drive_the_loop(
         ({"fingertips": {"load_cell": {"device": {"path": "eit"}}}}, ["cannot be named 'load_cell', as another part"]),
     ],
 )
-def test_a_configuration_mistake_names_file_key_and_cure(
-    command: str, changes: dict[str, Any], parts: list[str], config: Write, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_configuration_mistake_names_file_key_and_cure(command, changes, parts, config, capsys):
     path = config(**changes)
     said = mistake(capsys, command, str(path))
     for part in (str(path), *parts):
         assert part in said
 
 
-async def test_fingertip_names_do_not_collide_with_task_names(config: Write, tmp_path: Path) -> None:
+async def test_fingertip_names_do_not_collide_with_task_names(config, tmp_path):
     shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
     (tmp_path / "wait.yaml").write_text("{name: one, torque_source: right, steps: [{do: wait, wait_s: 1}]}")
     whole = config(
@@ -122,21 +117,13 @@ def fingertip(**changes: Any) -> dict[str, Any]:
         (fingertip(baseline_frames=0, average_frames=0), ["baseline_frames", "average_frames"]),
     ],
 )
-def test_a_fingertip_mistake_is_named(
-    section: dict[str, Any], parts: list[str], config: Write, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_fingertip_mistake_is_named(section, parts, config, capsys):
     said = mistake(capsys, "check", str(config(fingertips=section)))
     for part in parts:
         assert part in said
 
 
-def test_a_calibration_of_another_bank_is_refused(
-    config: Write, tiny_bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    import numpy as np
-
-    from shearloop.bank.estimation import Calibration
-
+def test_a_calibration_of_another_bank_is_refused(config, tiny_bank, tmp_path, capsys):
     foreign = tmp_path / "foreign.yaml"
     grid = np.linspace(1, 2, 9)
     Calibration.from_matches("cd" * 32, "synthetic", torque=(grid, grid)).save(foreign)
@@ -166,9 +153,7 @@ def test_a_calibration_of_another_bank_is_refused(
         (["command", "tare", "--connect", "ipc:///tmp/nobody-speaks-here", "--timeout", "0.05"], "no daemon answered"),
     ],
 )
-def test_a_command_line_mistake_is_one_sentence(
-    arguments: list[str], part: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_command_line_mistake_is_one_sentence(arguments, part, capsys):
     assert part in mistake(capsys, *arguments)
 
 
@@ -188,9 +173,7 @@ def default_signals() -> Iterator[None]:
 
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_an_interrupted_command_reports_it_except_listen(
-    number: signal.Signals, status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_interrupted_command_reports_it_except_listen(number, status, monkeypatch, capsys):
     def interrupted(*_: object) -> NoReturn:
         signal.raise_signal(number)
         raise AssertionError
@@ -203,9 +186,7 @@ def test_an_interrupted_command_reports_it_except_listen(
     assert capsys.readouterr() == ("", "")
 
 
-def test_a_closed_terminal_causes_no_traceback(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_closed_terminal_causes_no_traceback(monkeypatch, capsys):
     def interrupted(_: object) -> NoReturn:
         monkeypatch.setattr(sys.stderr, "write", Mock(side_effect=OSError(5, "Input/output error")))
         raise KeyboardInterrupt
@@ -217,9 +198,7 @@ def test_a_closed_terminal_causes_no_traceback(
 
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_during_a_callback_from_compiled_code_is_not_lost(
-    number: signal.Signals, status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_signal_during_a_callback_from_compiled_code_is_not_lost(number, status, monkeypatch, capsys):
     """So numba calls us for each function that it loads: the command went on after a traceback."""
 
     def loads(_: object) -> int:
@@ -235,9 +214,7 @@ def test_a_signal_during_a_callback_from_compiled_code_is_not_lost(
 @pytest.mark.parametrize(
     ("arguments", "missing"), [([], "COMMAND"), (["chart"], "NAME, --out"), (["bank", "info"], "PATH")]
 )
-def test_missing_arguments_are_named_in_one_sentence(
-    arguments: list[str], missing: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_missing_arguments_are_named_in_one_sentence(arguments, missing, capsys):
     with pytest.raises(SystemExit) as end:
         main(arguments)
     program = " ".join(["shearloop", *arguments])
@@ -245,13 +222,13 @@ def test_missing_arguments_are_named_in_one_sentence(
     assert (end.value.code, *capsys.readouterr()) == (2, "", said)
 
 
-def test_recording_option_needs_an_emulator(config: Write, capsys: pytest.CaptureFixture[str]) -> None:
+def test_recording_option_needs_an_emulator(config, capsys):
     said = mistake(capsys, "run", str(config()), "--recording", "some.mat")
     assert "has no eit-kit among its `emulators`" in said
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_explains_itself(name, capsys):
     with pytest.raises(SystemExit) as ended:
         main([name, "--help"])
     assert ended.value.code == 0
@@ -260,7 +237,13 @@ def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[
     assert "%%" not in told
 
 
-def test_every_argument_has_a_help_text() -> None:
+def test_an_unknown_command_lists_the_known_ones(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["fly"])
+    assert "'run'" in capsys.readouterr().err
+
+
+def test_every_argument_has_a_help_text():
     def arguments(parser: argparse.ArgumentParser) -> Iterator[str]:
         for action in parser._actions:
             if isinstance(action, argparse._SubParsersAction):
@@ -273,19 +256,12 @@ def test_every_argument_has_a_help_text() -> None:
     assert list(filter(None, arguments(full_parser()))) == []
 
 
-def test_help_names_all_basis_models() -> None:
+def test_help_names_all_basis_models():
     assert MODEL_NAMES.replace(" or ", ", ").split(", ") == list(MODELS)
 
 
-def test_an_unknown_command_lists_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["fly"])
-    assert ended.value.code == 2
-    assert "'run'" in capsys.readouterr().err
-
-
-def test_help_loads_no_heavy_modules() -> None:
-    heavy = ("numpy", "scipy", "pydantic", "zmq", "matplotlib", "skfem", "serial", "yaml")
+def test_help_loads_no_heavy_modules():
+    heavy = ("numpy", "scipy", "pydantic", "zmq", "matplotlib", "skfem", "serial", "yaml", "tqdm")
     program = (
         "import sys\nfrom shearloop.daemon.cli import COMMANDS, main\n"
         "for arguments in [[], *([name] for name in COMMANDS)]:\n"
@@ -297,26 +273,10 @@ def test_help_loads_no_heavy_modules() -> None:
     assert done.stderr.strip() == ""
 
 
-def test_messages_are_readable() -> None:
-    content = decode(
-        encode(
-            {
-                "timestamp": 0.0,
-                "seq": 1,
-                "source": "right",
-                "t_mono_ns": 5,
-                "torque_nm": 0.05,
-                "torque_low_nm": 0.02,
-                "torque_high_nm": 0.08,
-                "diameter_mm": 31.0,
-                "k": 3.5,
-                "sigma": 1.5,
-                "score": 0.75,
-                "valid": True,
-                "reason": "",
-            }
-        )
-    )
+def test_messages_are_readable():
+    values = {"diameter_mm": 31.0, "k": 3.5, "sigma": 1.5, "score": 0.75, "reason": ""}
+    message = sample(EitEstimate, torque_nm=0.05, torque_low_nm=0.02, torque_high_nm=0.08, **values)
+    content = decode(encode(wire_map(message, timestamp=0.0, seq=1)))
     line = message_line("eit.estimate", content)
     assert "torque +0.0500 N·m [+0.0200, +0.0800]   diameter  31.0 mm   k 3.500  sigma 1.500 cm   score 0.750" in line
     assert message_json("eit.estimate", content).startswith('{"topic": "eit.estimate", "timestamp": 0.0')
@@ -324,9 +284,7 @@ def test_messages_are_readable() -> None:
     assert message_line("eit.estimate", invalid).endswith("no estimate: no signal")
 
 
-def test_invalid_emulators_and_recordings_are_refused_before_the_start(
-    config: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_invalid_emulators_and_recordings_are_refused_before_the_start(config, tmp_path, capsys):
     unknown = str(config(emulators=[{"device": "eit-kitt"}]))
     for command in ("check", "run"):
         assert "`emulators[0].device` is 'eit-kitt'; there are eit-kit" in mistake(capsys, command, unknown)
@@ -345,7 +303,7 @@ def test_invalid_emulators_and_recordings_are_refused_before_the_start(
     assert "the recording cannot be read" in mistake(capsys, "run", known, "--recording", str(tmp_path / "none.mat"))
 
 
-def test_missing_paths_and_shared_addresses_are_named(config: Write, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_paths_and_shared_addresses_are_named(config, capsys):
     assert "`experiment` must be the path of a file, not '.'" in mistake(
         capsys, "check", str(config(experiment="", robot="ur.yaml"))
     )
@@ -354,9 +312,7 @@ def test_missing_paths_and_shared_addresses_are_named(config: Write, capsys: pyt
     assert f"are both {both}" in mistake(capsys, "check", str(config(publish=both, commands=both)))
 
 
-def test_unlock_waits_and_a_missing_daemon_is_reported_at_once(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unlock_waits_and_a_missing_daemon_is_reported_at_once(monkeypatch, capsys):
     asked: list[tuple[str, float]] = []
 
     def answers(_address: str, content: dict[str, Any], timeout_s: float, _keys: object) -> dict[str, Any]:
@@ -372,9 +328,7 @@ def test_unlock_waits_and_a_missing_daemon_is_reported_at_once(
 
 
 @pytest.mark.parametrize("command", ["check", "run"])
-def test_a_missing_robot_library_is_one_sentence(
-    config: Callable[..., Path], command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_robot_library_is_one_sentence(config, command, capsys, monkeypatch):
     monkeypatch.setattr("shearloop.drivers.ur.client.find_spec", lambda _name: None)
     said = mistake(capsys, command, str(config(robot=str(Path("config/ur.yaml").resolve()))))
     assert "the robot needs the package ur-rtde, which is not installed for Python 3." in said

@@ -17,13 +17,12 @@ from aiohttp import web
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
-from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.web.bridge import Bridge, DaemonAddress
 from shearloop.daemon.web.message_store import MessageStore
 from shearloop.daemon.web.server import make_app
-from tests.daemon.conftest import DEADLINE_S, Log, shearloop
+from tests.daemon.conftest import DEADLINE_S, robot_at, running_daemon, shearloop
 from tests.emulator_process import own_address
 
 pytestmark = pytest.mark.real_time
@@ -46,8 +45,7 @@ def rig_config(config: Write, tiny_bank: Path, tmp_path: Path) -> Path:
     Calibration.from_matches(Bank.open(tiny_bank).identity, "synthetic", torque=(sigma, torque_of(sigma))).save(
         calibration
     )
-    robot = yaml.safe_load(Path("config/ur.yaml").read_text())
-    (tmp_path / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": HOST}))
+    robot_at(HOST, tmp_path)
     return config(
         fingertips={
             "right": {
@@ -117,27 +115,17 @@ async def running_rig(
         *("--speed", str(SPEED), "--paper-sketch", "--unlock-wait-s", "0.2", "--power-on-s", "0.1"),
         stdin=asyncio.subprocess.PIPE,
     ) as rig:
-        assert rig.stdout is not None
-        assert rig.stdin is not None
-        stdin = rig.stdin
         assert (await rig.stdout.readline()).startswith(b"rig ready")
-        with zmq.asyncio.Context() as context:
-            daemon = Daemon(load_daemon_config(path), context)
+        async with running_daemon(path) as daemon:
             watcher = Watcher(daemon)
-            task = asyncio.create_task(daemon.run())
 
             async def command(name: str, **arguments: Any) -> dict[str, Any]:
                 address = f"ipc://{run_dir}/commands"
                 return await asyncio.to_thread(send_command, address, {"command": name, **arguments}, DEADLINE_S)
 
-            try:
-                async with asyncio.timeout(DEADLINE_S):
-                    await watcher.until("robot.state", lambda _: True)
-                    await watcher.until("gripper.state", lambda _: True)
-                    yield daemon, watcher, lambda line: stdin.write(f"{line}\n".encode()), command
-            finally:
-                daemon.stop()
-                await task
+            await watcher.until("robot.state", lambda _: True)
+            await watcher.until("gripper.state", lambda _: True)
+            yield daemon, watcher, lambda line: rig.stdin.write(f"{line}\n".encode()), command
 
 
 async def started(command: Callable[..., Any], path: str) -> None:
@@ -148,7 +136,7 @@ async def started(command: Callable[..., Any], path: str) -> None:
     assert reply["ok"], reply
 
 
-async def test_a_tool_is_gripped_twisted_and_released(rig_config: Path, tiny_bank: Path, tmp_path: Path) -> None:
+async def test_a_tool_is_gripped_twisted_and_released(rig_config, tiny_bank, tmp_path):
     twist = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.3, "hold_s": 1.0}
     async with running_rig(rig_config, tiny_bank) as (_, watcher, _fault, command):
         await started(command, experiment(tmp_path, twist, {"do": "release"}))
@@ -182,9 +170,7 @@ async def served_page(folder: Path) -> AsyncIterator[str]:
             await bridge.close()
 
 
-async def test_a_stop_from_the_page_needs_no_token_and_the_wrist_stands_still(
-    rig_config: Path, tiny_bank: Path, tmp_path: Path
-) -> None:
+async def test_a_stop_from_the_page_needs_no_token_and_the_wrist_stands_still(rig_config, tiny_bank, tmp_path):
     twist = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.02, "hold_s": 60.0}
     async with (
         running_rig(rig_config, tiny_bank) as (_, watcher, _fault, command),
@@ -211,9 +197,7 @@ async def test_a_stop_from_the_page_needs_no_token_and_the_wrist_stands_still(
         await watcher.until("robot.state", lambda state: state["seq"] > later["seq"])
 
 
-async def test_a_protective_stop_ends_the_experiment_and_is_unlocked_on_the_operators_word(
-    rig_config: Path, tiny_bank: Path, tmp_path: Path
-) -> None:
+async def test_a_protective_stop_ends_the_experiment_and_the_operator_unlocks_it(rig_config, tiny_bank, tmp_path):
     twist = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.02, "hold_s": 60.0}
     async with running_rig(rig_config, tiny_bank) as (daemon, watcher, fault, command):
         path = experiment(tmp_path, twist)
@@ -234,9 +218,7 @@ async def test_a_protective_stop_ends_the_experiment_and_is_unlocked_on_the_oper
         assert not daemon.supervisor.records["loop"].restarts
 
 
-async def test_a_straight_move_brakes_while_it_is_paused_and_ends_where_it_was_to(
-    rig_config: Path, tiny_bank: Path, tmp_path: Path
-) -> None:
+async def test_a_straight_move_brakes_while_it_is_paused_and_ends_where_it_was_to(rig_config, tiny_bank, tmp_path):
     def pose(state: Mapping[str, Any]) -> np.ndarray:
         return np.frombuffer(state["tcp_pose"], "<f4")[:3]
 
@@ -260,9 +242,7 @@ async def test_a_straight_move_brakes_while_it_is_paused_and_ends_where_it_was_t
 
 
 @pytest.mark.parametrize(("fault", "finished"), [("", True), ("protective-stop", False)])
-async def test_a_daemon_that_ends_with_its_experiment_knows_whether_it_is_done(
-    fault: str, finished: bool, rig_config: Path, tiny_bank: Path
-) -> None:
+async def test_a_daemon_that_ends_with_its_experiment_knows_whether_it_is_done(fault, finished, rig_config, tiny_bank):
     path = ending_with(rig_config, {"do": "wait", "wait_s": 60.0 if fault else 0.2})
     async with running_rig(path, tiny_bank) as (daemon, watcher, cause, _command):
         await watcher.until("loop.state", lambda state: state["phase"] == "running")
@@ -272,9 +252,7 @@ async def test_a_daemon_that_ends_with_its_experiment_knows_whether_it_is_done(
         assert daemon.finished is finished
 
 
-async def test_a_daemon_that_is_ended_in_mid_experiment_tells_of_it_as_of_every_end(
-    rig_config: Path, tiny_bank: Path, log: Log
-) -> None:
+async def test_a_daemon_that_is_ended_in_mid_experiment_tells_of_it_as_of_every_end(rig_config, tiny_bank, log):
     out = StringIO()
     path = ending_with(rig_config, {"do": "release"}, {"do": "turn_to", "angle_rad": 3.0, "speed_rad_per_s": 0.2})
     async with running_rig(path, tiny_bank) as (daemon, watcher, _cause, _command):
@@ -290,7 +268,7 @@ async def test_a_daemon_that_is_ended_in_mid_experiment_tells_of_it_as_of_every_
     assert "the experiment has ended" in log.said
 
 
-async def test_a_daemon_that_ends_with_its_experiment_lets_the_tool_go_first(rig_config: Path, tiny_bank: Path) -> None:
+async def test_a_daemon_that_ends_with_its_experiment_lets_the_tool_go_first(rig_config, tiny_bank):
     """The stop that opens the gripper ends the experiment, and that the daemon, within the same millisecond."""
     twist = {"do": "twist", "angles_rad": [0.3], "speed_rad_per_s": 0.1, "limits": {"torque_nm": 0.02}}
     path = ending_with(rig_config, {"do": "grip", "width_mm": 5, "force_n": 60}, twist)
@@ -310,9 +288,7 @@ async def test_a_daemon_that_ends_with_its_experiment_lets_the_tool_go_first(rig
         ("gripper drop", "the gripper no longer holds an object"),
     ],
 )
-async def test_each_fault_ends_in_the_tables_response(
-    line: str, sentence: str, rig_config: Path, tiny_bank: Path, tmp_path: Path
-) -> None:
+async def test_each_fault_ends_in_the_tables_response(line, sentence, rig_config, tiny_bank, tmp_path):
     twist = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.01, "hold_s": 60.0}
     async with running_rig(rig_config, tiny_bank) as (_, watcher, fault, command):
         await started(command, experiment(tmp_path, twist))

@@ -1,8 +1,6 @@
 import subprocess
 from pathlib import Path
 
-import pytest
-
 from shearloop.daemon.cli import COMMANDS, main
 from shearloop.daemon.cli.completion import full_parser
 
@@ -19,7 +17,7 @@ def completed(script: Path, *words: str) -> set[str]:
     return set(done.stdout.split())
 
 
-def test_bash_completes_commands_and_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bash_completes_commands_and_options(tmp_path, capsys):
     assert main(["completion", "bash"]) == 0
     script = tmp_path / "shearloop"
     script.write_text(capsys.readouterr().out)
@@ -29,16 +27,16 @@ def test_bash_completes_commands_and_options(tmp_path: Path, capsys: pytest.Capt
     assert {"server", "client", "allow", "revoke", "list"} <= completed(script, "shearloop", "keys", "")
 
 
-def test_every_shell_has_its_script(capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_shell_has_its_script(capsys):
     for shell in ("zsh", "tcsh"):
         assert main(["completion", shell]) == 0
         assert "doctor" in capsys.readouterr().out
 
 
-def test_file_arguments_complete_file_names() -> None:
+def test_file_arguments_complete_file_names():
     config = next(action for action in _command("check")._actions if action.dest == "config")
     assert getattr(config, "complete", None)
 
 
-def _command(name: str):  # type: ignore[no-untyped-def]
+def _command(name: str):
     return next(action for action in full_parser()._actions if action.dest == "command").choices[name]

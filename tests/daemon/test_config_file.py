@@ -2,7 +2,6 @@
 
 from contextlib import suppress
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
@@ -137,7 +136,7 @@ def test_no_content_whatever_does_anything_but_load_or_be_refused(tmp_path_facto
         ("{width_mm: 5}", "`steps[0]` lacks `do`, its kind"),
     ],
 )
-def test_a_step_of_no_kind_is_told_in_a_sentence(step: str, said: str, tmp_path: Path) -> None:
+def test_a_step_of_no_kind_is_told_in_a_sentence(step, said, tmp_path):
     path = tmp_path / "steps.yaml"
     path.write_text(f"{{name: one, steps: [{step}]}}")
     with pytest.raises(UserError) as caught:

@@ -5,7 +5,6 @@ import dataclasses
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import zmq
@@ -27,25 +26,25 @@ def written() -> dict[str, str]:
 
 
 @pytest.mark.parametrize("name", ["messages.md", "safety.md"])
-def test_a_page_is_up_to_date(written: dict[str, str], name: str) -> None:
+def test_a_page_is_up_to_date(written, name):
     assert len(written) == 2
     found = (DOCS / name).read_text(encoding="utf-8")
     assert found == written[name], f"docs/{name} is out of date: run `make docs` and commit it"
 
 
-def test_every_topic_and_key_is_listed(written: dict[str, str]) -> None:
+def test_every_topic_and_key_is_listed(written):
     for topic, kind in TOPICS.items():
         assert f"### `{topic}`" in written["messages.md"]
         for key in (item.name for item in dataclasses.fields(kind)):
             assert f"| `{key}` |" in written["messages.md"]
 
 
-def test_every_row_of_the_safety_table_is_on_the_page(written: dict[str, str]) -> None:
+def test_every_row_of_the_safety_table_is_on_the_page(written):
     for rule in TABLE.values():
         assert rule.cure in written["safety.md"]
 
 
-async def test_the_python_subscriber_prints_estimates(tmp_path: Path) -> None:
+async def test_the_python_subscriber_prints_estimates(tmp_path):
     program = (DOCS / "examples/subscriber.py").read_text()
     address = f"ipc://{tmp_path}/publish"
     script = tmp_path / "subscriber.py"
@@ -56,7 +55,6 @@ async def test_the_python_subscriber_prints_estimates(tmp_path: Path) -> None:
         process = await asyncio.create_subprocess_exec(sys.executable, str(script), stdout=subprocess.PIPE)
         try:
             async with asyncio.timeout(DEADLINE_S):
-                assert process.stdout is not None
                 seen = asyncio.create_task(process.stdout.readline())
                 while not seen.done():
                     # Until it has subscribed.
@@ -74,7 +72,7 @@ async def test_the_python_subscriber_prints_estimates(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["subscriber.py", "subscriber.cpp", "subscriber.m"])
-def test_subscribers_use_existing_topics_and_keys(name: str) -> None:
+def test_subscribers_use_existing_topics_and_keys(name):
     """MATLAB is on no machine of ours, so what its subscriber reads is held to the schema of the messages."""
     program = (DOCS / "examples" / name).read_text()
     topics = set(re.findall(r'"((?:eit|load|skin|robot|gripper|loop)\.[a-z]*)"', program))
@@ -89,7 +87,7 @@ def test_subscribers_use_existing_topics_and_keys(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["subscriber.py", "subscriber.cpp", "subscriber.m"])
-def test_subscribers_are_short(name: str) -> None:
+def test_subscribers_are_short(name):
     lines = (DOCS / "examples" / name).read_text().splitlines()
     code = [line for line in lines if line.strip() and not line.lstrip().startswith(("//", "%", '"""', "#", "import"))]
     assert len(code) <= 15

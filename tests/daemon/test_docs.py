@@ -15,16 +15,15 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_lead_somewhere(page):
     for target in re.findall(r"(?<!!)\[[^\]]*\]\(([^)#]+)[^)]*\)", page.read_text()):
         if "://" not in target:
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_commands_and_options_exist(page: Path) -> None:
+def test_commands_and_options_exist(page):
     parsers = next(action for action in full_parser()._actions if action.dest == "command").choices
-    assert parsers is not None
     for text in re.findall(r"(?:^ {4}|`)(?:sudo )?(?:[./\w-]*/)?shearloop ([^`\n]*)", page.read_text(), re.MULTILINE):
         words = shlex.split(text.split(" #")[0].split(";")[0], comments=False) if text.count("'") % 2 == 0 else []
         if not words or not re.fullmatch(r"[a-z]+", words[0]):
@@ -36,7 +35,7 @@ def test_commands_and_options_exist(page: Path) -> None:
                 assert word.rstrip(",.").split("=")[0] in known, f"{page.name}: shearloop {text}"
 
 
-def test_the_readmes_recordings_are_ignored_by_git() -> None:
+def test_the_readmes_recordings_are_ignored_by_git():
     folders = {Path(one).parts[0] for one in re.findall(r"--record (\S+)", (ROOT / "README.md").read_text())}
     assert folders
     assert {f"/{folder}/" for folder in folders} <= set((ROOT / ".gitignore").read_text().splitlines())
@@ -63,7 +62,7 @@ def program_texts() -> list[str]:
     ]
 
 
-def test_every_message_of_the_troubleshooting_page_exists_in_the_code() -> None:
+def test_every_message_of_the_troubleshooting_page_exists_in_the_code():
     quoted = re.findall(r'^\| "(.*?)" \||\("(.*?)"\)', (ROOT / "docs/troubleshooting.md").read_text(), re.MULTILINE)
     messages = ["".join(pair) for pair in quoted]
     texts = program_texts()
@@ -71,7 +70,7 @@ def test_every_message_of_the_troubleshooting_page_exists_in_the_code() -> None:
     assert [message for message in messages if not any(message in text for text in texts)] == []
 
 
-def _options(parser) -> set[str]:  # type: ignore[no-untyped-def]
+def _options(parser) -> set[str]:
     found = set(parser._option_string_actions)
     for action in parser._actions:
         if hasattr(action, "_parser_class"):

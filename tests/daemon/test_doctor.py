@@ -8,7 +8,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import yaml
 
 from shearloop.daemon import doctor
 from shearloop.daemon.cli import main
@@ -26,7 +25,7 @@ from shearloop.daemon.doctor.devices import check_channels, check_rate, check_ta
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.keys import make_key_pair
 from shearloop.daemon.serial_ports import SerialPortInfo
-from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.daemon.conftest import DEADLINE_S, robot_at, shearloop
 from tests.emulator_process import own_address
 
 Write = Callable[..., Path]
@@ -37,8 +36,7 @@ SPEED = 8
 @pytest.fixture
 def rig_config(config: Write, tiny_bank: Path, tmp_path: Path) -> Path:
     """A whole rig whose boards are SPEED times as fast; its gripper is on the robot's address."""
-    robot = yaml.safe_load(Path("config/ur.yaml").read_text())
-    (tmp_path / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": HOST}))
+    robot_at(HOST, tmp_path)
     device = {"path": "eit-right"}
     return config(
         fingertips={"right": {"device": device, "bank": str(tiny_bank), "frame_period_s": 0.5412 / SPEED}},
@@ -57,7 +55,7 @@ async def examined(path: Path, seconds: float) -> dict[str, Finding]:
 
 
 @pytest.mark.real_time
-async def test_doctor_checks_a_rig_with_and_without_its_daemon(rig_config: Path, tiny_bank: Path) -> None:
+async def test_doctor_checks_a_rig_with_and_without_its_daemon(rig_config, tiny_bank):
     found = await examined(rig_config, 0.1)
     assert "There is no serial port" in found["port of right"].found
     assert "switched on" in found["robot"].next_step
@@ -65,8 +63,6 @@ async def test_doctor_checks_a_rig_with_and_without_its_daemon(rig_config: Path,
     assert found["calibration of right"].found == "not configured"
     options = ("--bank", str(tiny_bank), "--run-dir", str(rig_config.parent), "--host", HOST, "--speed", str(SPEED))
     async with shearloop("emulate", "rig", *options, stdin=asyncio.subprocess.PIPE) as rig:
-        assert rig.stdout is not None
-        assert rig.stdin is not None
         assert (await rig.stdout.readline()).startswith(b"rig ready")
         found = await examined(rig_config, 1.5)
         for subject in ("port of right", "channels of right", "robot", "robot's registers"):
@@ -98,7 +94,7 @@ async def test_doctor_checks_a_rig_with_and_without_its_daemon(rig_config: Path,
             assert found["rate of load.torque load_cell"].state == "note"
 
 
-def test_doctor_stops_at_an_invalid_configuration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_stops_at_an_invalid_configuration(tmp_path, capsys):
     assert main(["doctor", str(tmp_path / "no.yaml")]) == 1
     said = capsys.readouterr().out
     assert "WRONG configuration" in said
@@ -108,14 +104,14 @@ def test_doctor_stops_at_an_invalid_configuration(tmp_path: Path, capsys: pytest
     assert main(["doctor", "--seconds", "nan"]) == 2
 
 
-def test_the_clock() -> None:
+def test_the_clock():
     assert check_clock(1e9, 0).state == "trouble"
     assert check_clock(1.8e9, 5).state == "note"
     assert check_clock(1.8e9, 0).state == "good"
     assert clock_state() in range(-1, 6)
 
 
-def test_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_disk(tmp_path, monkeypatch):
     for free, state in ((1e8, "trouble"), (1e9, "note"), (1e11, "good")):
         monkeypatch.setattr(doctor.shutil, "disk_usage", lambda _, free=free: SimpleNamespace(free=free))
         assert check_disk(tmp_path / "not/yet/there").state == state
@@ -131,13 +127,13 @@ def test_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ({"alive": True, "connected": True, "errors": {"nan": 2}}, "note", "2 × nan"),
     ],
 )
-def test_tasks_are_judged_by_their_counters(facts: dict[str, Any], state: str, part: str) -> None:
+def test_tasks_are_judged_by_their_counters(facts, state, part):
     finding = check_task("right", facts)
     assert finding.state == state
     assert part in finding.found
 
 
-def test_rates_and_channels() -> None:
+def test_rates_and_channels():
     assert check_rate("rate", None, 1.85).state == "trouble"
     assert check_rate("rate", 1.9, 1.85).state == "good"
     assert "frame_period_s 1.0000" in check_rate("rate", 1.0, 1.85).next_step
@@ -146,7 +142,7 @@ def test_rates_and_channels() -> None:
     assert "one electrode" in check_channels("right", 0, 28, 9).next_step
 
 
-def test_a_bank_of_another_geometry_is_reported(config: Write) -> None:
+def test_a_bank_of_another_geometry_is_reported(config):
     from shearloop.daemon.config import load_daemon_config
 
     fingertip = load_daemon_config(config()).fingertips["right"]
@@ -156,7 +152,7 @@ def test_a_bank_of_another_geometry_is_reported(config: Write) -> None:
     assert check_bank("right", fingertip, Path("no.yaml")).state == "trouble"
 
 
-def test_a_secret_key_that_others_can_read_is_reported(tmp_path: Path) -> None:
+def test_a_secret_key_that_others_can_read_is_reported(tmp_path):
     from shearloop.daemon.config import CurveConfig
 
     _, secret = make_key_pair(tmp_path, "server")
@@ -171,7 +167,7 @@ def test_a_secret_key_that_others_can_read_is_reported(tmp_path: Path) -> None:
     assert check_keys(None, {}).state == "good"
 
 
-def test_an_error_sentence_becomes_a_finding_with_its_cure() -> None:
+def test_an_error_sentence_becomes_a_finding_with_its_cure():
     finding = from_error("bank", "a.bank: it is cut off; build it anew.", "nothing")
     assert (finding.found, finding.next_step) == ("a.bank: it is cut off", "build it anew")
     finding = from_error("robot", "No controller at arm: refused. Look at the pendant.", "nothing")
@@ -187,9 +183,7 @@ def port(**changes: Any) -> Any:
     return SimpleNamespace(**{**fields, **changes})
 
 
-def test_ports_are_listed_with_their_configuration_entry(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ports_are_listed_with_their_configuration_entry(monkeypatch, capsys):
     there: list[Any] = []
     monkeypatch.setattr("shearloop.daemon.serial_ports.sorted", lambda ports: ports, raising=False)
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: there)
@@ -206,7 +200,7 @@ def test_ports_are_listed_with_their_configuration_entry(
     assert "sudo usermod -aG dialout" in capsys.readouterr().out
 
 
-def test_each_denied_port_is_reported_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_denied_port_is_reported_with_its_reason(monkeypatch):
     def port(path: str, trouble: str) -> SerialPortInfo:
         return SerialPortInfo(path, "1", "", "", "", "", trouble)
 

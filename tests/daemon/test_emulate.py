@@ -4,20 +4,16 @@ import signal
 import sys
 from collections.abc import AsyncIterator
 from contextlib import aclosing, asynccontextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from shearloop.bank.eit.channels import CHANNELS, LINE_SLOTS, ZERO_SLOTS, line_of_channels
+from shearloop.bank.eit.channels import CHANNELS, ZERO_SLOTS
 from shearloop.daemon.cli import EXIT_USAGE, main
-from shearloop.drivers.eit_kit import ADC_STEP_V, EitKit, Frame
-from tests.daemon.conftest import shearloop
+from shearloop.drivers.eit_kit import EitKit, Frame
+from tests.daemon.conftest import DEADLINE_S, recording, shearloop
 from tests.running import take
 
-# Guards against a test that hangs; none of them waits for so long.
-DEADLINE_S = 60
 PERIOD_S = 0.5408
 
 
@@ -30,18 +26,7 @@ async def emulator(*arguments: str) -> AsyncIterator[tuple[asyncio.subprocess.Pr
         yield process, path
 
 
-def recording(folder: Path, n_frames: int) -> tuple[Path, NDArray[np.float64]]:
-    from scipy.io import savemat
-
-    steps = np.random.default_rng(2).integers(1, 300, (n_frames, len(LINE_SLOTS)))
-    lines = np.round(line_of_channels(steps * ADC_STEP_V), 4)
-    days = 739_588 + np.arange(n_frames) * PERIOD_S / 86_400
-    path = folder / "stream.mat"
-    savemat(path, {"Right_Data": np.column_stack([days, lines])})
-    return path, lines
-
-
-async def test_a_recording_at_a_hundred_times_its_pace_arrives_whole_and_in_order(shared: Path) -> None:
+async def test_a_recording_at_a_hundred_times_its_pace_arrives_whole_and_in_order(shared):
     from scipy.io import loadmat
 
     folder = shared / "recordings" / "streams" / "2024-12-03_16-09"
@@ -61,9 +46,7 @@ async def test_a_recording_at_a_hundred_times_its_pace_arrives_whole_and_in_orde
 
 @pytest.mark.usefixtures("hears_of_terminal")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
-async def test_a_recording_is_played_again_and_again_under_the_name_given(
-    number: signal.Signals, tmp_path: Path
-) -> None:
+async def test_a_recording_is_played_again_and_again_under_the_name_given(number, tmp_path):
     path, lines = recording(tmp_path, 3)
     link = tmp_path / "eit"
     async with emulator("--recording", str(path), "--speed", "500", "--link", str(link)) as (process, port):
@@ -75,7 +58,7 @@ async def test_a_recording_is_played_again_and_again_under_the_name_given(
     assert not link.is_symlink(), "a stopped emulator leaves no port behind"
 
 
-async def test_faults_are_switched_on_by_argument_and_by_standard_input(tmp_path: Path) -> None:
+async def test_faults_are_switched_on_by_argument_and_by_standard_input(tmp_path):
     path, lines = recording(tmp_path, 40)
     arguments = ("--recording", str(path), "--speed", "20", "--link", str(tmp_path / "eit"), "--once")
     async with emulator(*arguments, "--fault", "cut-line@1", "--fault", "unplug:0.1@3") as (process, port):
@@ -85,15 +68,12 @@ async def test_faults_are_switched_on_by_argument_and_by_standard_input(tmp_path
             async for frame in arriving:
                 frames.append(frame)
                 if len(frames) == 5:
-                    assert process.stdin is not None
                     process.stdin.write(b"what\nnan\n")
                     await process.stdin.drain()
                 if len(frames) == 37:
                     break
-        assert process.stdin is not None
         process.stdin.close()
         assert await process.wait() == 0, "it ends when its standard input does"
-        assert process.stderr is not None
         assert b"there is no fault 'what'" in await process.stderr.read()
     facts = kit.diagnostics()
     assert facts["errors"] == {"wrong_count": 1, "nan": 1}
@@ -105,7 +85,7 @@ async def test_faults_are_switched_on_by_argument_and_by_standard_input(tmp_path
     assert len({*range(40)} - {*places}) == 3
 
 
-async def test_twists_are_synthesised_from_a_bank(tmp_path: Path) -> None:
+async def test_twists_are_synthesised_from_a_bank(tmp_path):
     from shearloop.bank.eit.bank_file import BankDefinition, write_bank
 
     definition = BankDefinition("0" * 64, "gaussian_derivative", np.array([3.0, 3.5]), np.array([1.0, 2.0]))
@@ -131,6 +111,11 @@ async def test_twists_are_synthesised_from_a_bank(tmp_path: Path) -> None:
             "--recording a.mat --bank b.shb",
             "give either --recording FILE to play a recording or --bank FILE",
         ),
+        ("hx711", "--speed 0", "--speed 0"),
+        ("hx711", "--torque-nm nan", "finite"),
+        ("gripper-socket", "--port 70000", "no port"),
+        ("gripper-socket", "--bind 192.0.2.1", "cannot be played"),
+        ("gripper-modbus", "--link /nowhere/at/all", "/nowhere/at/all cannot be made"),
         ("eit-kit", "", "give either --recording FILE to play a recording or --bank FILE"),
         ("eit-kit", "--recording absent.mat", "absent.mat: the recording cannot be read"),
         ("eit-kit", "--bank absent.shb", "absent.shb"),
@@ -147,16 +132,14 @@ async def test_twists_are_synthesised_from_a_bank(tmp_path: Path) -> None:
         ("skin", "--daq-link /dev/null/daq", "--link /dev/null/daq cannot be made"),
     ],
 )
-def test_a_mistake_is_one_sentence_and_status_two(
-    device: str, arguments: str, sentence: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mistake_is_one_sentence_and_status_two(device, arguments, sentence, capsys):
     assert main(["emulate", device, *arguments.split()]) == EXIT_USAGE
     complaint = capsys.readouterr().err
     assert sentence in complaint
     assert complaint.count("\n") == 1
 
 
-def test_help_names_every_fault(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_names_every_fault(capsys):
     from shearloop.drivers.emulators.boards import EitKitBoard
 
     with pytest.raises(SystemExit) as ended:
@@ -166,7 +149,7 @@ def test_help_names_every_fault(capsys: pytest.CaptureFixture[str]) -> None:
     assert [name for name in EitKitBoard.faults if name not in told] == []
 
 
-def test_the_command_runs_without_a_terminal(tmp_path: Path) -> None:
+def test_the_command_runs_without_a_terminal(tmp_path):
     import subprocess
 
     path, _ = recording(tmp_path, 1)
@@ -175,7 +158,6 @@ def test_the_command_runs_without_a_terminal(tmp_path: Path) -> None:
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
     ) as process:
-        assert process.stdout is not None
         port = process.stdout.readline().decode().strip()
         assert os.path.exists(port)
         process.terminate()

@@ -3,7 +3,6 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,12 +22,10 @@ SPEED = 20
 
 
 async def line(process: asyncio.subprocess.Process) -> str:
-    assert process.stdout is not None
     return (await process.stdout.readline()).decode().strip()
 
 
 async def told(process: asyncio.subprocess.Process, command: str) -> None:
-    assert process.stdin is not None
     process.stdin.write(f"{command}\n".encode())
     await process.stdin.drain()
 
@@ -55,7 +52,7 @@ async def until(queue: "asyncio.Queue[SkinSample]", *faults: SkinFault, r1_ohm: 
                 return sample
 
 
-async def test_both_instruments_tied_by_one_skin_are_read_and_obey(tmp_path: Path) -> None:
+async def test_both_instruments_tied_by_one_skin_are_read_and_obey(tmp_path):
     places = ("--source-link", str(tmp_path / "source"), "--daq-link", str(tmp_path / "daq"))
     async with shearloop("emulate", "skin", *places, "--speed", str(SPEED), stdin=asyncio.subprocess.PIPE) as process:
         assert {await line(process), await line(process)} == {f"source {places[1]}", f"daq {places[3]}"}
@@ -70,14 +67,12 @@ async def test_both_instruments_tied_by_one_skin_are_read_and_obey(tmp_path: Pat
             await told(process, "nonsense")
             await told(process, "normal")
             await until(samples)
-        assert process.stdin is not None
         process.stdin.close()
         assert await process.wait() == 0
-        assert process.stderr is not None
         assert b"'nonsense' is no fault of the circuit; there are open 1|2" in await process.stderr.read()
 
 
-async def test_source_and_scanner_are_played_on_sockets_too() -> None:
+async def test_source_and_scanner_are_played_on_sockets_too():
     arguments = ("--speed", str(SPEED), "--source-port", "0", "--daq-port", "0")
     async with shearloop("emulate", "skin", *arguments, stdin=asyncio.subprocess.PIPE) as process:
         places = dict([(await line(process)).split(), (await line(process)).split()])
@@ -91,7 +86,7 @@ async def test_source_and_scanner_are_played_on_sockets_too() -> None:
             await until(samples, SkinFault.COMPLIANCE)
 
 
-def test_on_the_rig_the_robot_s_motion_shears_the_skin(tmp_path: Path) -> None:
+def test_on_the_rig_the_robot_s_motion_shears_the_skin(tmp_path):
     pushed = PushedSkin(SyntheticSkin(), lever_m=0.02)
     rig = EmulatedRig(RigSettings(run_dir=tmp_path), Blank(), pushed)
     robot, gripper = rig.controller.robot, rig.scene.gripper
@@ -116,7 +111,6 @@ def test_on_the_rig_the_robot_s_motion_shears_the_skin(tmp_path: Path) -> None:
     assert stretched_1 / r1 - 1 > 0.04
     assert stretched_2 / r2 - 1 == pytest.approx(0.0, abs=1e-3)
     rig.command("skin open 2")
-    assert rig.skin is not None
     assert rig.skin.circuit.opened == {"2"}
     rig.command("replug skin")
     assert not rig.skin.circuit.opened

@@ -38,7 +38,7 @@ def played(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Devices:
     return devices
 
 
-def test_an_event_is_sent_once_when_its_step_is_held_for_its_time(played: Devices, tmp_path: Path) -> None:
+def test_an_event_is_sent_once_when_its_step_is_held_for_its_time(played, tmp_path):
     rig = emulator(events=[{"step": 7, "held_for_s": 12, "command": "kick -0.03"}])
     with played((rig,), OBEYING) as devices:
         for content in (held(0, step=6), held(50, hold=0), held(60), held(71.9), held(73, phase="held")):
@@ -52,7 +52,7 @@ def test_an_event_is_sent_once_when_its_step_is_held_for_its_time(played: Device
 
 
 @pytest.mark.parametrize("then", ["", "signal.pause()"])
-def test_a_rig_that_ended_or_closed_its_input_gets_no_event(played: Devices, tmp_path: Path, then: str) -> None:
+def test_a_rig_that_ended_or_closed_its_input_gets_no_event(played, tmp_path, then):
     os.mkfifo(tmp_path / "closed")
     program = f"import os, signal; os.close(0); open('closed', 'w').close(); {then}"
     with played((emulator(events=[SLIP]),), program) as devices:
@@ -61,7 +61,7 @@ def test_a_rig_that_ended_or_closed_its_input_gets_no_event(played: Devices, tmp
         assert devices.sent == []
 
 
-def test_an_ended_device_is_reported_once(played: Devices) -> None:
+def test_an_ended_device_is_reported_once(played):
     devices = played((emulator(device="eit-kit"), emulator()), "input()", "raise SystemExit(3)")
     with capture_logs() as logged, devices:
         devices._alive[1][1].wait(30)
@@ -71,26 +71,24 @@ def test_an_ended_device_is_reported_once(played: Devices) -> None:
     assert (device, status) == ("rig", 3)
 
 
-def test_the_truth_is_read_up_to_its_last_complete_line(played: Devices) -> None:
+def test_the_truth_is_read_up_to_its_last_complete_line(played):
     rows = [{"t_mono_ns": 1, "torque_nm": 0.1}, {"t_mono_ns": 2, "torque_nm": 0.2}]
     with played((emulator(),), "input()") as devices:
         path = devices._truth
-        assert path is not None
         assert devices.torques() is None
         path.write_text("\n".join(map(json.dumps, rows)) + '\n{"t_mono_ns": 3, "torq')
         known = devices.torques()
-        assert known is not None
         assert known.torque_nm.tolist() == [0.1, 0.2]
     assert not path.parent.exists()
 
 
-def test_the_truth_is_unknown_without_a_rig_or_in_a_file_of_its_own(played: Devices) -> None:
+def test_the_truth_is_unknown_without_a_rig_or_in_a_file_of_its_own(played):
     own = emulator(device="eit-kit"), emulator(arguments=["--truth", "own.jsonl"])
     with played(own, "input()", "input()") as devices:
         assert devices.torques() is None
 
 
-def test_an_event_of_two_lines_is_refused(tmp_path: Path) -> None:
+def test_an_event_of_two_lines_is_refused(tmp_path):
     path = tmp_path / "emulator.yaml"
     path.write_text('device: rig\nevents: [{step: 1, command: "slip\\nkick 3"}]\n')
     with pytest.raises(Exception, match="command"):

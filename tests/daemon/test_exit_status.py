@@ -2,22 +2,17 @@
 
 import asyncio
 import signal
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
 
 import pytest
 import yaml
-import zmq.asyncio
 
-from shearloop.daemon.app import Daemon
-from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.configured_experiment import ConfiguredExperiment, CrashMarker
 from shearloop.daemon.control.step_runner import ExperimentPhase
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.rig import Rig
-from tests.daemon.conftest import Log, deadline, shearloop
+from tests.daemon.conftest import deadline, robot_at, running_daemon, shearloop
 from tests.emulator_process import own_address
 
 Write = Callable[..., Path]
@@ -27,65 +22,43 @@ LEFT_TO_OPERATOR = "it starts by `shearloop command start` only"
 @pytest.fixture
 def waiting_config(config: Write, tmp_path: Path) -> Path:
     """Write a configuration whose experiment waits for a robot that there is none of."""
-    robot = yaml.safe_load(Path("config/ur.yaml").read_text())
-    (tmp_path / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": own_address(6)}))
+    robot_at(own_address(6), tmp_path)
     steps = {"name": "test", "torque_source": "wrench", "steps": [{"do": "wait", "wait_s": 1}]}
     (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(steps))
     return config(robot="ur.yaml", experiment="experiment.yaml", stop_when_done=True)
 
 
 @pytest.mark.usefixtures("hears_of_terminal")
-@pytest.mark.parametrize(
-    ("number", "status"),
-    [(signal.SIGINT, 3), (signal.SIGTERM, 0), (signal.SIGHUP, 0)],
-)
-async def test_an_unfinished_experiment_sets_the_exit_status(
-    number: signal.Signals, status: int, waiting_config: Path
-) -> None:
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 3), (signal.SIGTERM, 0), (signal.SIGHUP, 0)])
+async def test_an_unfinished_experiment_sets_the_exit_status(number, status, waiting_config):
     async with shearloop("run", str(waiting_config)) as daemon:
-        assert daemon.stderr is not None
-        async with deadline("the daemon did not wait to start, or did not end"):
-            while b"waiting to start" not in (line := await daemon.stderr.readline()):
-                assert line, "the daemon ended before its experiment waited to start"
-            daemon.send_signal(number)
-            assert await daemon.wait() == status
-
-
-async def ended(path: Path, log: Log, *, once: str) -> Daemon:
-    """Run a daemon until its log says something, and end it in good order."""
-    with zmq.asyncio.Context() as context:
-        daemon = Daemon(load_daemon_config(path), context)
-        async with asyncio.TaskGroup() as group:
-            group.create_task(daemon.run())
-            await log.says(once)
-            daemon.stop()
-    return daemon
+        while b"waiting to start" not in (line := await daemon.stderr.readline()):
+            assert line, "the daemon ended before its experiment waited to start"
+        daemon.send_signal(number)
+        assert await daemon.wait() == status
 
 
 async def done_experiment() -> SimpleNamespace:
     return SimpleNamespace(phase=ExperimentPhase.DONE, stop_reason="")
 
 
-def rig(start: Callable[[Path], Awaitable[str | None]]) -> Rig:
-    return cast("Rig", SimpleNamespace(start=start, runner=SimpleNamespace(experiment_ended=done_experiment)))
+RUNNER = SimpleNamespace(experiment_ended=done_experiment)
 
 
-async def test_no_experiment_starts_automatically_after_a_crash(
-    waiting_config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: Log
-) -> None:
+async def test_no_experiment_starts_automatically_after_a_crash(waiting_config, tmp_path, monkeypatch, log):
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     crashed = CrashMarker()
     assert not crashed.left_behind
     crashed.set()
-    assert not (await ended(waiting_config, log, once=LEFT_TO_OPERATOR)).finished
+    async with running_daemon(waiting_config) as daemon:
+        await log.says(LEFT_TO_OPERATOR)
+    assert not daemon.finished
     assert any("crashed after it had started an experiment" in one for one in log.said)
     assert not CrashMarker().left_behind, "this one ended in good order"
 
 
 @pytest.mark.parametrize(("own", "finished"), [(True, True), (False, False)])
-async def test_a_manual_start_cancels_the_waiting_experiment(
-    own: bool, finished: bool, waiting_config: Path, tmp_path: Path, log: Log
-) -> None:
+async def test_a_manual_start_cancels_the_waiting_experiment(own, finished, waiting_config, tmp_path, log):
     """Neither by the same one again, nor by the configured one after another."""
     ready, begun = asyncio.Event(), []
 
@@ -95,30 +68,23 @@ async def test_a_manual_start_cancels_the_waiting_experiment(
         begun.append(path)
         return None
 
-    with zmq.asyncio.Context() as context:
-        daemon = Daemon(load_daemon_config(waiting_config), context)
-        assert daemon._rig is not None
-        daemon._rig.start = start  # type: ignore[method-assign]
-        daemon._rig.runner.experiment_ended = done_experiment  # type: ignore[assignment,method-assign]
-        async with asyncio.TaskGroup() as group:
-            running = group.create_task(daemon.run())
-            await log.says("waiting to start")
-            ready.set()
-            path = tmp_path / ("experiment.yaml" if own else "another.yaml")
-            await daemon.commands.handlers()["start"]({"experiment": path})
-            if not own:
-                await log.says(LEFT_TO_OPERATOR)
-                daemon.stop()
-            async with deadline("the daemon did not end"):
-                await running
+    async with running_daemon(waiting_config) as daemon:
+        daemon._rig.start = start
+        daemon._rig.runner.experiment_ended = done_experiment
+        await log.says("waiting to start")
+        ready.set()
+        path = tmp_path / ("experiment.yaml" if own else "another.yaml")
+        await daemon.commands.handlers()["start"]({"experiment": path})
+        if not own:
+            await log.says(LEFT_TO_OPERATOR)
+            daemon.stop()
+        await daemon._stop.wait()
     assert begun == [path]
     assert daemon.finished is finished
 
 
 @pytest.mark.parametrize("crashed", [False, True], ids=["called off", "after a crash"])
-async def test_a_manually_started_experiment_is_followed_to_its_end(
-    crashed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_manually_started_experiment_is_followed_to_its_end(crashed, tmp_path, monkeypatch):
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     if crashed:
         CrashMarker().set()
@@ -128,7 +94,7 @@ async def test_a_manually_started_experiment_is_followed_to_its_end(
         experiment.call_off()
         return "the gripper is not ready"
 
-    experiment = ConfiguredExperiment(path, rig(not_yet))
+    experiment = ConfiguredExperiment(path, SimpleNamespace(start=not_yet, runner=RUNNER))
     async with deadline("the experiment was not seen to its end"), asyncio.TaskGroup() as group:
         await experiment.run()
         assert experiment.left_to_operator
@@ -141,7 +107,7 @@ async def test_a_manually_started_experiment_is_followed_to_its_end(
 
 
 @pytest.mark.parametrize("by", ["stop", "another"])
-async def test_a_cancelled_experiment_stays_cancelled_after_a_crash_of_its_task(by: str, tmp_path: Path) -> None:
+async def test_a_cancelled_experiment_stays_cancelled_after_a_crash_of_its_task(by, tmp_path):
     """An experiment file may be spoilt when it is to begin, and mended after somebody has said stop."""
     begun = []
 
@@ -151,7 +117,7 @@ async def test_a_cancelled_experiment_stays_cancelled_after_a_crash_of_its_task(
         begun.append(path)
         raise UserError("the file is none")
 
-    experiment = ConfiguredExperiment(tmp_path / "experiment.yaml", rig(begin))
+    experiment = ConfiguredExperiment(tmp_path / "experiment.yaml", SimpleNamespace(start=begin, runner=RUNNER))
     with pytest.raises(UserError):
         await experiment.run()
     if by == "stop":
@@ -163,7 +129,7 @@ async def test_a_cancelled_experiment_stays_cancelled_after_a_crash_of_its_task(
     assert not experiment.begun
 
 
-def test_no_crash_marker_without_a_service_manager(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_crash_marker_without_a_service_manager(monkeypatch):
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
     mark = CrashMarker()
     mark.set()
@@ -171,6 +137,6 @@ def test_no_crash_marker_without_a_service_manager(monkeypatch: pytest.MonkeyPat
     assert not CrashMarker().left_behind
 
 
-def test_a_failing_crash_marker_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failing_crash_marker_is_reported(tmp_path, capsys):
     CrashMarker({"RUNTIME_DIRECTORY": str(tmp_path / "nowhere")}).set()
     assert "cannot write the crash marker" in capsys.readouterr().out

@@ -3,7 +3,6 @@
 import gc
 import weakref
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 import zmq.asyncio
@@ -35,7 +34,7 @@ def forgotten() -> weakref.ref[Cycle]:
     return weakref.ref(Cycle())
 
 
-def test_nothing_is_collected_until_all_that_lasts_is_there_and_then_only_what_comes() -> None:
+def test_nothing_is_collected_until_all_that_lasts_is_there_and_then_only_what_comes():
     with without_long_collections() as collect_what_comes:
         assert not gc.isenabled()
         before = forgotten()
@@ -51,13 +50,13 @@ def test_nothing_is_collected_until_all_that_lasts_is_there_and_then_only_what_c
     assert gc.get_freeze_count() == 0
 
 
-def test_what_ends_before_it_is_ready_leaves_the_collector_as_it_was() -> None:
+def test_what_ends_before_it_is_ready_leaves_the_collector_as_it_was():
     with pytest.raises(SystemExit), without_long_collections():
         raise SystemExit
     assert gc.isenabled()
 
 
-def test_collector_that_was_off_stays_off() -> None:
+def test_collector_that_was_off_stays_off():
     gc.disable()
     with without_long_collections() as collect_what_comes:
         collect_what_comes()
@@ -65,9 +64,7 @@ def test_collector_that_was_off_stays_off() -> None:
     assert not gc.isenabled()
 
 
-def test_daemon_of_the_command_line_is_collected_from_when_it_is_ready(
-    config: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_daemon_of_the_command_line_is_collected_from_when_it_is_ready(config, monkeypatch):
     collected = []
 
     async def run_daemon(_config: object, _listeners: object, _facts: object, on_ready: Callable[[], None]) -> bool:
@@ -81,7 +78,7 @@ def test_daemon_of_the_command_line_is_collected_from_when_it_is_ready(
     assert collected == [False, True]
 
 
-async def test_daemon_says_when_all_of_it_is_made(config: Callable[..., Path]) -> None:
+async def test_daemon_says_when_all_of_it_is_made(config):
     said = []
     with zmq.asyncio.Context() as context:
         daemon = Daemon(load_daemon_config(config()), context)

@@ -15,14 +15,14 @@ from shearloop.daemon.control.runner import along_tool
 HEAVY = ("scipy.stats", "scipy.optimize", "scipy.spatial", "scipy.interpolate", "skfem", "numba", "matplotlib")
 
 
-def test_the_daemon_imports_no_heavy_modules() -> None:
+def test_the_daemon_imports_no_heavy_modules():
     says = f"import sys, shearloop.daemon.app; print([name for name in {HEAVY} if name in sys.modules])"
     found = subprocess.run([sys.executable, "-c", says], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
 
 
 @given(st.lists(st.floats(-7, 7), min_size=3, max_size=3), st.floats(-1, 1))
-def test_along_tool_moves_along_the_third_axis(turned: list[float], distance_m: float) -> None:
+def test_along_tool_moves_along_the_third_axis(turned, distance_m):
     found = along_tool((0.1, -0.2, 0.3, *turned), distance_m)
     axis = Rotation.from_rotvec(turned).as_matrix()[:, 2]
     assert found[:3] == pytest.approx(np.array([0.1, -0.2, 0.3]) + distance_m * axis, abs=1e-12)

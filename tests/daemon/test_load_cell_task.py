@@ -1,6 +1,7 @@
 import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import asynccontextmanager
+from types import SimpleNamespace
 
 import pytest
 
@@ -17,6 +18,7 @@ class Board:
     def __init__(self) -> None:
         self.sent: asyncio.Queue[LoadSample] = asyncio.Queue()
         self.tares: list[float] = []
+        self.published: list[LoadTorque] = []
         # Later than all that a test asks for.
         self._seq = Clock().now_ns() + 10**9
 
@@ -31,36 +33,21 @@ class Board:
     def diagnostics(self) -> dict[str, bool | str]:
         return {"connected": True, "last_loss": ""}
 
-    async def send(self, raw: float, count: int = ZERO_SAMPLES, *, saturated: bool = False) -> None:
+    async def send(
+        self, raw: float, count: int = ZERO_SAMPLES, *, from_ns: int = 0, every_ns: int = 1, **flags: bool
+    ) -> None:
+        """Send samples that are taken from a moment on, or from where the earlier ones ended."""
+        self._seq = from_ns or self._seq
         for _ in range(count):
-            self._seq += 1
-            self.sent.put_nowait(LoadSample(raw, 0.1, self._seq, self._seq, self._seq, saturated=saturated))
+            self._seq += every_ns
+            self.sent.put_nowait(LoadSample(raw, 0.1, self._seq, self._seq, self._seq, **flags))
         await self.sent.join()
 
 
-class Later(Clock):
-    """A minute from now."""
-
-    def now_ns(self) -> int:
-        return super().now_ns() + 60 * 10**9
-
-
-class Published:
-    """What is published, as a list."""
-
-    def __init__(self) -> None:
-        self.messages: list[LoadTorque] = []
-
-    def publish(self, message: LoadTorque) -> None:
-        self.messages.append(message)
-
-
 @asynccontextmanager
-async def reading(
-    published: Published | None = None, rate_hz: float = 10.9
-) -> AsyncIterator[tuple[LoadCellTask, Board]]:
+async def reading(rate_hz: float = 10.9) -> AsyncIterator[tuple[LoadCellTask, Board]]:
     board = Board()
-    task = LoadCellTask(board, published or Published(), Clock(), None, rate_hz)  # type: ignore[arg-type]
+    task = LoadCellTask(board, SimpleNamespace(publish=board.published.append), Clock(), None, rate_hz)
     async with running(task.run()):
         yield task, board
 
@@ -71,7 +58,7 @@ async def asked(task: LoadCellTask) -> asyncio.Task[str]:
     return zero
 
 
-async def test_whoever_waits_for_a_zero_is_told_though_another_asks_meanwhile() -> None:
+async def test_whoever_waits_for_a_zero_is_told_though_another_asks_meanwhile():
     async with reading() as (task, board):
         first = await asked(task)
         await board.send(5.0, ZERO_SAMPLES // 2)
@@ -82,7 +69,7 @@ async def test_whoever_waits_for_a_zero_is_told_though_another_asks_meanwhile() 
         assert board.tares == [7.0], "a zero is of the samples after it was asked for"
 
 
-async def test_a_zero_that_cannot_be_taken_is_given_up_with_the_reason() -> None:
+async def test_a_zero_that_cannot_be_taken_is_given_up_with_the_reason():
     async with reading() as (task, board):
         task._timeout_s = 0.05
         zero = await asked(task)
@@ -93,56 +80,46 @@ async def test_a_zero_that_cannot_be_taken_is_given_up_with_the_reason() -> None
         assert board.tares == [], "nor at whatever load comes later"
 
 
-async def test_the_operators_tare_is_taken_from_the_next_samples() -> None:
+async def test_the_operators_tare_is_taken_from_the_next_samples():
     async with reading() as (task, board):
         task.tare()
         await board.send(3.0)
         assert board.tares == [3.0]
 
 
-async def test_a_slow_board_has_the_time_that_its_readings_take() -> None:
+async def test_a_slow_board_has_the_time_that_its_readings_take():
     async with reading(rate_hz=1.0) as (task, board):
         task.tare()
-        now_ns = Clock().now_ns()
-        for number in range(1, 30):
-            board.sent.put_nowait(LoadSample(3.0, 0.1, now_ns + number * 10**9, now_ns + number * 10**9, number))
-        await board.sent.join()
+        await board.send(3.0, 29, from_ns=Clock().now_ns(), every_ns=10**9)
         assert board.tares == [3.0]
         assert task.diagnostics()["error"] == ""
 
 
-async def test_readings_that_know_of_the_load_before_are_not_of_the_zero() -> None:
+async def test_readings_that_know_of_the_load_before_are_not_of_the_zero():
     """An HX711 settles within four conversions: a reading is of the time since three before its own began."""
     async with reading() as (task, board):
         now_ns, period_ns = Clock().now_ns(), round(1e9 / 10.9)
-        task._clock = type("Held", (Clock,), {"now_ns": lambda _: now_ns})()
+        task._clock = SimpleNamespace(now_ns=lambda: now_ns)
         task.tare()
         for number in range(6 + ZERO_SAMPLES):
             arrives_ns = now_ns + number * period_ns
-            sample = LoadSample(float(number), 0.1, arrives_ns - period_ns // 2, arrives_ns, number)
-            board.sent.put_nowait(sample)
+            board.sent.put_nowait(LoadSample(float(number), 0.1, arrives_ns - period_ns // 2, arrives_ns, number))
         await board.sent.join()
         # That of number 4 began exactly when it was asked for, and took a period.
         assert board.tares == [4 + (ZERO_SAMPLES - 1) / 2]
 
 
-async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_later_hour() -> None:
+async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_later_hour():
     async with reading() as (task, board):
         task.tare()
         await board.send(8388607.0, saturated=True)
-        later_ns = Clock().now_ns() + round((ZERO_TIMEOUT_S + 1.0) * 1e9)
-        for seq in range(2 * ZERO_SAMPLES):
-            board.sent.put_nowait(LoadSample(9.0, 0.1, later_ns + seq, later_ns + seq, seq))
-        await board.sent.join()
+        await board.send(9.0, 2 * ZERO_SAMPLES, from_ns=Clock().now_ns() + round((ZERO_TIMEOUT_S + 1.0) * 1e9))
         assert board.tares == []
         assert "was not taken within 15 s" in str(task.diagnostics()["error"])
-        task._clock = Later()
+        task._clock = SimpleNamespace(now_ns=lambda: Clock().now_ns() + 60 * 10**9)
         task.tare()
         assert task.diagnostics()["error"] == ""
-        later_ns = task._clock.now_ns() + 10**9
-        for seq in range(ZERO_SAMPLES):
-            board.sent.put_nowait(LoadSample(3.0, 0.1, later_ns + seq, later_ns + seq, seq))
-        await board.sent.join()
+        await board.send(3.0, from_ns=task._clock.now_ns() + 10**9)
         assert board.tares == [3.0]
 
 
@@ -150,12 +127,11 @@ async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_
     ("flag", "why"),
     [("saturated", "end of its range"), ("spike", "can move"), ("stuck", "two seconds"), ("partial", "longer line")],
 )
-async def test_a_reading_that_is_not_to_be_believed_says_so_to_whoever_listens(flag: str, why: str) -> None:
-    published = Published()
-    async with reading(published) as (_, board):
-        board.sent.put_nowait(LoadSample(5.0, 0.1, 1, 1, 1, **{flag: True}))
+async def test_a_reading_that_is_not_to_be_believed_says_so_to_whoever_listens(flag, why):
+    async with reading() as (_, board):
+        await board.send(5.0, 1, **{flag: True})
         await board.send(5.0, 1)
-    spoilt, good = published.messages
+    spoilt, good = board.published
     assert not spoilt.valid
     assert why in spoilt.reason
     assert (good.valid, good.reason) == (True, "")

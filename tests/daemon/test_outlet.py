@@ -23,7 +23,7 @@ with logging_to_stderr(), closing(Outlet(sys.stdout)) as out:
 """
 
 
-def test_what_is_written_comes_out_in_order_and_all_of_it_at_the_end() -> None:
+def test_what_is_written_comes_out_in_order_and_all_of_it_at_the_end():
     stream = io.StringIO()
     with closing(NonBlockingWriter(stream)) as outlet:
         for number in range(1000):
@@ -45,7 +45,7 @@ class Terminal(io.StringIO):
         return super().write(text)
 
 
-def test_a_terminal_that_is_stopped_keeps_nobody_waiting_and_what_it_missed_is_told_in_its_place() -> None:
+def test_a_terminal_that_is_stopped_keeps_nobody_waiting_and_what_it_missed_is_told_in_its_place():
     terminal = Terminal()
     outlet = NonBlockingWriter(terminal, most_waiting=5)
     outlet.write("0\n")
@@ -81,7 +81,7 @@ class Slow(io.StringIO):
         return written
 
 
-def test_what_is_missing_is_told_before_what_came_later() -> None:
+def test_what_is_missing_is_told_before_what_came_later():
     terminal = Slow()
     outlet = NonBlockingWriter(terminal, most_waiting=4)
     outlet.write("0\n")
@@ -102,14 +102,14 @@ def test_what_is_missing_is_told_before_what_came_later() -> None:
     assert told[:-2] == [str(number) for number in range(kept + 1)]
 
 
-def test_what_nobody_reads_any_longer_kills_nobody() -> None:
+def test_what_nobody_reads_any_longer_kills_nobody():
     ended = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
     assert ended.stderr.count("the output has no reader any more") == 1
     assert "Broken pipe" in ended.stderr
 
 
-def test_what_a_terminal_has_no_letters_for_is_spelt_and_what_follows_comes_out() -> None:
+def test_what_a_terminal_has_no_letters_for_is_spelt_and_what_follows_comes_out():
     taken = io.BytesIO()
     with closing(NonBlockingWriter(io.TextIOWrapper(taken, encoding="ascii", write_through=True))) as outlet:
         outlet.write("0.10 N·m …\n")

@@ -4,7 +4,7 @@ from shearloop.daemon.rig import DeviceLink
 from shearloop.drivers.connection import LinkEvent
 
 
-def test_the_control_loop_hears_of_a_lost_device_until_it_returns() -> None:
+def test_the_control_loop_hears_of_a_lost_device_until_it_returns():
     loop = ControlLoop(LoopConfig(), {"right": TorqueSource(name="right", period_s=0.5)}, ("robot",))
     link = DeviceLink("robot", loop)
     link.on_link_event(LinkEvent(up=False, sentence="the robot's process died", repeated=False))

@@ -40,16 +40,15 @@ def refusal(folder: Path, experiment: dict[str, Any], **more: Any) -> str:
     return str(error.value)
 
 
-def test_a_torque_that_is_measured_may_drive(tmp_path: Path) -> None:
+def test_a_torque_that_is_measured_may_drive(tmp_path):
     for drive in ("right", "load_cell", "wrench"):
         file = check_experiment(
             config(tmp_path, {"torque_source": drive}, load_cell={"device": {"path": "load"}}), {**SOURCES, **LOAD}
         )
-        assert file is not None
         assert file.torque_source == drive
 
 
-def test_a_torque_that_is_not_measured_may_not_drive(tmp_path: Path) -> None:
+def test_a_torque_that_is_not_measured_may_not_drive(tmp_path):
     assert refusal(tmp_path, {"torque_source": "load_cell"}).endswith(
         "experiment.yaml: `torque_source: load_cell` is not a measured torque: choose another, or configure its "
         "device; there are right, wrench"
@@ -62,7 +61,7 @@ def test_a_torque_that_is_not_measured_may_not_drive(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("step", [{"do": "grip"}, {"do": "release"}])
-def test_a_gripper_that_is_not_there_is_missed_before_the_start(tmp_path: Path, step: dict[str, Any]) -> None:
+def test_a_gripper_that_is_not_there_is_missed_before_the_start(tmp_path, step):
     told = refusal(tmp_path, {"steps": [*STEPS, step]})
     assert f"step 3 is `{step['do']}`, and no gripper is configured; add a `gripper` section" in told
 
@@ -92,15 +91,13 @@ LIMITS = {"torque_nm": 0.2, "angle_rad": 1.0}
         ),
     ],
 )
-def test_a_step_that_asks_for_more_than_its_limit_is_refused_with_both_numbers(
-    tmp_path: Path, step: dict[str, Any], told: str
-) -> None:
+def test_a_step_that_asks_for_more_than_its_limit_is_refused_with_both_numbers(tmp_path, step, told):
     said = refusal(tmp_path, {"torque_source": "wrench", "limits": LIMITS, "steps": [*STEPS, step]})
     assert f"`steps[2]` ({step['do']}) {told}" in said
 
 
 @pytest.mark.parametrize("between", [[], [{"do": "tare"}], [{"do": "release"}], [{"do": "grip"}]])
-def test_a_tool_of_which_nothing_is_known_is_not_held(tmp_path: Path, between: list[dict[str, Any]]) -> None:
+def test_a_tool_of_which_nothing_is_known_is_not_held(tmp_path, between):
     identify, hold = {"do": "identify"}, {"do": "hold_torque", "torque_nm": 0.1}
     gripper = {"socket": {"host": "127.0.0.1"}}
     first = [identify] if between else []
@@ -110,7 +107,7 @@ def test_a_tool_of_which_nothing_is_known_is_not_held(tmp_path: Path, between: l
     assert check_experiment(config(tmp_path, {"steps": steps}, gripper=gripper), SOURCES) is not None
 
 
-def test_a_file_that_is_none_is_told_with_its_name(tmp_path: Path) -> None:
+def test_a_file_that_is_none_is_told_with_its_name(tmp_path):
     daemon = config(tmp_path, {})
     (tmp_path / "experiment.yaml").unlink()
     with pytest.raises(UserError, match=r"experiment\.yaml: the configuration cannot be read: No such file"):

@@ -53,7 +53,7 @@ def truth_that_falls_at(t_s: float, for_s: float) -> TorqueSeries:
     return TorqueSeries(times * S, torque)
 
 
-def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturbance() -> None:
+def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturbance():
     text = told(truth_that_falls_at(26.0, 5.5), [(26 * S, "kick -0.03")])
     assert "'hold' was done, after 44 s" in text
     assert "  step 1 of 3  identify       10.0 s   stiffness" in text
@@ -70,11 +70,11 @@ def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturban
     assert "no command was refused" in text
 
 
-def test_without_a_truth_nothing_is_said_of_it() -> None:
+def test_without_a_truth_nothing_is_said_of_it():
     assert "true" not in told(None, [])
 
 
-def test_a_tool_that_the_experiment_names_is_told() -> None:
+def test_a_tool_that_the_experiment_names_is_told():
     out = StringIO()
     summary = RunSummary(out)
     for phase in ("running", "done"):
@@ -83,18 +83,18 @@ def test_a_tool_that_the_experiment_names_is_told() -> None:
     assert "tool diameter" not in told(None, [])
 
 
-def test_a_disturbance_that_is_not_overcome_is_said_to_be_none() -> None:
+def test_a_disturbance_that_is_not_overcome_is_said_to_be_none():
     assert "not back by the end" in told(truth_that_falls_at(26.0, 100.0), [(26 * S, "kick")])
 
 
-def test_a_last_moment_in_the_band_is_no_way_back() -> None:
+def test_a_last_moment_in_the_band_is_no_way_back():
     assert "not back by the end" in told(truth_that_falls_at(26.0, 17.5), [(26 * S, "kick")])
 
 
 @pytest.mark.parametrize(
     ("others", "judge"), [(("left", "load_cell"), "load_cell"), (("left", "combined"), "combined")]
 )
-def test_without_a_truth_who_judges_is_the_load_cell_and_is_named(others: tuple[str, ...], judge: str) -> None:
+def test_without_a_truth_who_judges_is_the_load_cell_and_is_named(others, judge):
     out = StringIO()
     summary = RunSummary(out)
     for content in (loop_state(0), loop_state(4, hold=1)):
@@ -108,7 +108,7 @@ def test_without_a_truth_who_judges_is_the_load_cell_and_is_named(others: tuple[
     assert f"    within ± 10% 3.0 s after the set point changed, by {judge}\n" in out.getvalue()
 
 
-def test_holds_and_refusals_are_counted_by_their_kind() -> None:
+def test_holds_and_refusals_are_counted_by_their_kind():
     reason = "no new torque has arrived: the last came 1.5 s ago. Look at the cable."
     text = told(
         None,
@@ -122,7 +122,7 @@ def test_holds_and_refusals_are_counted_by_their_kind() -> None:
     assert "1 times a command was refused: the robot is not connected." in text
 
 
-def test_an_experiment_that_was_stopped_says_why() -> None:
+def test_an_experiment_that_was_stopped_says_why():
     out = StringIO()
     summary = RunSummary(out)
     summary("loop.state", loop_state(0))
@@ -134,13 +134,13 @@ def test_an_experiment_that_was_stopped_says_why() -> None:
 
 
 @pytest.mark.parametrize("phase", ["done", "stopped", "idle"])
-def test_nothing_is_told_of_what_was_not_heard_from_its_beginning(phase: str) -> None:
+def test_nothing_is_told_of_what_was_not_heard_from_its_beginning(phase):
     out = StringIO()
     RunSummary(out)("loop.state", loop_state(0, phase=phase))
     assert not out.getvalue()
 
 
-def test_where_a_screw_ended_and_what_it_took_is_told() -> None:
+def test_where_a_screw_ended_and_what_it_took_is_told():
     out = StringIO()
     truth = TorqueSeries(np.array([10.0, 11.0, 12.0]) * S, np.array([-0.05, -0.18, -0.119]))
     summary = RunSummary(out, SimpleNamespace(torques=lambda: truth))

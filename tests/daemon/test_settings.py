@@ -46,7 +46,7 @@ def defaults(path: Path) -> Iterator[tuple[str, object, bool]]:
                     yield argument.arg, value, True
 
 
-def test_no_default_stands_twice() -> None:
+def test_no_default_stands_twice():
     """Two models may use one name with different values, as the steps do; a constructor repeats no default."""
     places: dict[str, dict[Path, tuple[object, bool]]] = defaultdict(dict)
     for path in [path for folder in ("bank", "drivers", "daemon") for path in (PACKAGE / folder).rglob("*.py")]:
@@ -63,7 +63,7 @@ def test_no_default_stands_twice() -> None:
 
 
 @pytest.mark.parametrize("where", ["loop", "robot"])
-def test_the_wrists_acceleration_reaches_controller_identification_and_robot(where: str, tmp_path: Path) -> None:
+def test_the_wrists_acceleration_reaches_controller_identification_and_robot(where, tmp_path):
     """The lower one of loop and robot counts; half of it is planned with, the robot may use all."""
     settings = yaml.safe_load(Path("config/ur.yaml").read_text())
     if where == "robot":
@@ -72,7 +72,6 @@ def test_the_wrists_acceleration_reaches_controller_identification_and_robot(whe
     loop_config = LoopConfig(wrist_acceleration_rad_per_s2=1.5) if where == "loop" else LoopConfig()
     source = TorqueSource(name="right", period_s=0.5)
     loop = make_loop(DaemonConfig.model_construct(robot=tmp_path / "ur.yaml", loop=loop_config), {"right": source})
-    assert loop is not None
     assert loop.config.wrist_acceleration_rad_per_s2 == 1.5, "sent to the robot"
     found = ToolModel(
         stiffness_nm_per_rad=0.25, stiffness_std=0.01, lag_s=0.0, lag_std_s=0.1, age_s=0.3, actuation_s=0.02,
@@ -82,5 +81,4 @@ def test_the_wrists_acceleration_reaches_controller_identification_and_robot(whe
     assert tuned.acceleration_limit_rad_per_s2 == 0.75
     wrist = WristController(source, loop.config)
     wrist.begin_identification(IdentifyStep(do="identify"), 0.5)
-    assert wrist.excitation is not None
     assert wrist.excitation.settings.acceleration_rad_per_s2 == 0.75

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from functools import partial
-from pathlib import Path
 
 import pytest
 
@@ -26,7 +25,7 @@ def as_it_was() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("as_it_was")
-def test_sighup_ends_a_process_unless_it_is_ignored() -> None:
+def test_sighup_ends_a_process_unless_it_is_ignored():
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     assert ending_signals() == (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     # As `nohup` leaves it.
@@ -45,9 +44,7 @@ def heard_anew() -> Iterator[None]:
 
 @pytest.mark.usefixtures("heard_anew")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_second_signal_does_not_kill_the_daemon(
-    number: signal.Signals, config: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_signal_does_not_kill_the_daemon(number, config, monkeypatch):
     """It killed the process, as soon as the event loop was closed, before all was written that there was to show."""
     came = []
 
@@ -67,9 +64,7 @@ def test_a_second_signal_does_not_kill_the_daemon(
     assert signal.getsignal(number) is signal.SIG_DFL, "as before the command"
 
 
-def test_commands_run_in_any_thread_without_signal_handlers(
-    config: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_commands_run_in_any_thread_without_signal_handlers(config, tmp_path, monkeypatch, capsys):
     ready = threading.Event()
     monkeypatch.setattr(realtime, "without_long_collections", lambda: nullcontext(ready.set))
     with ThreadPoolExecutor() as pool:

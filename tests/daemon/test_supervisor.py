@@ -8,11 +8,11 @@ from shearloop.daemon import supervisor
 from shearloop.daemon.supervisor import Supervisor, restart_pause_s
 
 
-def test_pauses_double_from_half_a_second_to_half_a_minute() -> None:
+def test_pauses_double_from_half_a_second_to_half_a_minute():
     assert [restart_pause_s(deaths) for deaths in (1, 2, 3, 7, 8, 500)] == [0.5, 1.0, 2.0, 30.0, 30.0, 30.0]
 
 
-async def test_a_task_that_dies_is_started_again_and_its_death_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_task_that_dies_is_started_again_and_its_death_is_told(monkeypatch):
     monkeypatch.setattr(supervisor, "FIRST_PAUSE_S", 0.0)
     watched = Supervisor()
     starts = 0
@@ -31,7 +31,7 @@ async def test_a_task_that_dies_is_started_again_and_its_death_is_told(monkeypat
     assert [entry["task"] for entry in logs] == ["reader", "reader"]
 
 
-async def test_a_cancelled_task_stays_cancelled() -> None:
+async def test_a_cancelled_task_stays_cancelled():
     watched = Supervisor()
     started = asyncio.Event()
 
@@ -49,7 +49,7 @@ async def test_a_cancelled_task_stays_cancelled() -> None:
     assert watched.records["waits"].restarts == 0
 
 
-async def test_a_task_that_dies_of_being_cancelled_is_not_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_task_that_dies_of_being_cancelled_is_not_started_again(monkeypatch):
     """As a task group does in which something fails meanwhile: nobody would cancel it once more."""
     monkeypatch.setattr(supervisor, "restart_pause_s", lambda _: pytest.fail("it is started again"))
     watched, started = Supervisor(), asyncio.Event()

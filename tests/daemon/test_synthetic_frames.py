@@ -37,7 +37,7 @@ def small_bank() -> SmallBank:
     return SmallBank(k, sigma, homogeneous, signals, valid)
 
 
-def test_frames_have_the_recorded_mean_noise_and_steps_and_pass_the_parser() -> None:
+def test_frames_have_the_recorded_mean_noise_and_steps_and_pass_the_parser():
     synthesiser = Synthesiser(small_bank())
     lines = np.array([synthesiser.line(3.0, 1.5) for _ in range(400)])
     channels = channels_of_line(lines)
@@ -51,14 +51,14 @@ def test_frames_have_the_recorded_mean_noise_and_steps_and_pass_the_parser() -> 
     assert len(parser.feed(b"".join(map(format_line, lines)), 0)) == 400
 
 
-def test_no_live_channel_reads_nothing() -> None:
+def test_no_live_channel_reads_nothing():
     bank = small_bank()
     bank.homogeneous[:5] = 0.0
     lines = np.array([Synthesiser(bank, seed=seed).line(3.0, 1.5, grip=0.0) for seed in range(20)])
     assert channels_of_line(lines).min() == pytest.approx(ADC_STEP_V)
 
 
-def test_without_noise_a_frame_is_the_magnitude_of_homogeneous_and_scaled_signal() -> None:
+def test_without_noise_a_frame_is_the_magnitude_of_homogeneous_and_scaled_signal():
     bank = small_bank()
     synthesiser = Synthesiser(bank, amplitude=0.2, noise_v=0.0)
     gain = 0.13 / np.abs(bank.homogeneous).mean()
@@ -68,13 +68,13 @@ def test_without_noise_a_frame_is_the_magnitude_of_homogeneous_and_scaled_signal
 
 
 @given(st.floats(3.0, 3.5), st.floats(1.0, 1.5))
-def test_between_cells_the_signal_is_interpolated(k: float, sigma: float) -> None:
+def test_between_cells_the_signal_is_interpolated(k, sigma):
     bank = small_bank()
     shape = bank.signals[0, 0].astype(float) / (3.0 * 1.0)
     np.testing.assert_allclose(Synthesiser(bank).signal(k, sigma), k * sigma * shape, rtol=1e-6, atol=1e-9)
 
 
-def test_a_twist_during_the_frame_shows_in_the_injections_after_it() -> None:
+def test_a_twist_during_the_frame_shows_in_the_injections_after_it():
     synthesiser = Synthesiser(small_bank(), noise_v=0.0)
     before, after = (channels_of_line(synthesiser.line(3.0, sigma)) for sigma in (1.9, 1.1))
     sigma = np.where(np.arange(32) < 20, 1.9, 1.1)
@@ -93,12 +93,12 @@ def test_a_twist_during_the_frame_shows_in_the_injections_after_it() -> None:
         (3.0, np.nan, "not nan"),
     ],
 )
-def test_what_the_bank_does_not_have_is_refused(k: float, sigma: float, sentence: str) -> None:
+def test_what_the_bank_does_not_have_is_refused(k, sigma, sentence):
     with pytest.raises(UserError, match=sentence):
         Synthesiser(small_bank()).line(k, sigma)
 
 
-def test_a_programme_idles_grips_twists_and_lets_go() -> None:
+def test_a_programme_idles_grips_twists_and_lets_go():
     programme = TwistProgramme(torque_nm=0.1, idle_s=10, grip_s=2, turn_s=4, hold_s=6, cycles=2)
     at = programme.at
     assert [at(t) for t in (0.0, 9.9)] == [(0.0, 0.0)] * 2
@@ -112,7 +112,7 @@ def test_a_programme_idles_grips_twists_and_lets_go() -> None:
     assert at(54.0 + 14.0) == at(14.0), "and again"
 
 
-def test_frames_follow_the_programme() -> None:
+def test_frames_follow_the_programme():
     programme = TwistProgramme(torque_nm=0.1, idle_s=1, grip_s=1, turn_s=2, hold_s=2, cycles=1)
     synthesiser = Synthesiser(small_bank(), noise_v=0.0, amplitude=1.0)
 
@@ -128,13 +128,13 @@ def test_frames_follow_the_programme() -> None:
     assert np.count_nonzero(channels_of_line(lines[0] != lines[9])) > N_CHANNELS / 2
 
 
-def test_the_same_seed_gives_the_same_frames() -> None:
+def test_the_same_seed_gives_the_same_frames():
     first, again, other = (Synthesiser(small_bank(), seed=seed).line(3.0, 1.5) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
 
 
-def test_a_grip_changes_the_frame_by_as_much_as_the_recorded_torques_do(shared) -> None:
+def test_a_grip_changes_the_frame_by_as_much_as_the_recorded_torques_do(shared):
     from shearloop.bank.eit.forward import ForwardModel
     from shearloop.bank.eit.mesh import load_mesh
     from shearloop.bank.eit.models import conductivity

@@ -1,7 +1,6 @@
 import asyncio
 import os
 import re
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -29,7 +28,6 @@ async def read_exactly(port: SerialPort, n_bytes: int) -> bytes:
     data = b""
     while len(data) < n_bytes:
         received = await port.read(DEADLINE_S)
-        assert received is not None
         data += received.data
     return data
 
@@ -43,32 +41,32 @@ def listed(monkeypatch: pytest.MonkeyPatch, *ports: tuple[str, str | None]) -> N
     monkeypatch.setattr(connection.list_ports, "comports", lambda: found)
 
 
-def test_a_port_is_found_by_its_usb_serial_number(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_is_found_by_its_usb_serial_number(monkeypatch):
     listed(monkeypatch, ("/dev/ttyS0", None), ("/dev/ttyACM1", "123"), ("/dev/ttyACM0", "456"))
     assert find_port(serial_number="123") == "/dev/ttyACM1"
     with pytest.raises(DeviceNotFoundError, match=r"789; available: /dev/ttyACM0 .*456.*, /dev/ttyACM1 .*123"):
         find_port(serial_number="789")
 
 
-def test_a_serial_number_with_two_ports_is_not_guessed_at(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_serial_number_with_two_ports_is_not_guessed_at(monkeypatch):
     listed(monkeypatch, ("/dev/ttyACM0", "123"), ("/dev/ttyACM1", "123"))
     with pytest.raises(DeviceNotFoundError, match="/dev/ttyACM0 and /dev/ttyACM1; name one by its path"):
         find_port(serial_number="123")
 
 
-def test_a_path_without_a_port_is_said_to_be_empty(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_path_without_a_port_is_said_to_be_empty(monkeypatch, tmp_path):
     listed(monkeypatch)
     with pytest.raises(DeviceNotFoundError, match=r"no serial port .*eit; no USB serial port is plugged in"):
         find_port(path=str(tmp_path / "eit"))
 
 
-def test_a_file_is_no_port(tmp_path: Path) -> None:
+def test_a_file_is_no_port(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(DeviceUnavailableError, match="cannot be opened as a serial port"):
         SerialPort(str(tmp_path / "file"))
 
 
-async def test_bytes_pass_unchanged_in_both_directions() -> None:
+async def test_bytes_pass_unchanged_in_both_directions():
     data = bytes(range(256)) * 100
     with PtyPort() as peer, SerialPort(peer.path) as port:
         async with asyncio.timeout(DEADLINE_S):
@@ -79,7 +77,7 @@ async def test_bytes_pass_unchanged_in_both_directions() -> None:
             assert await sent_to(peer, 256) == bytes(range(256))
 
 
-async def test_what_was_written_is_unread_at_once_until_it_is_read() -> None:
+async def test_what_was_written_is_unread_at_once_until_it_is_read():
     with PtyPort() as peer, SerialPort(peer.path) as port:
         assert not peer.unread
         for _ in range(200):
@@ -90,13 +88,13 @@ async def test_what_was_written_is_unread_at_once_until_it_is_read() -> None:
     assert not peer.unread, "nobody can read it any more"
 
 
-async def test_a_port_is_had_by_one_program_at_a_time() -> None:
+async def test_a_port_is_had_by_one_program_at_a_time():
     in_use = pytest.raises(DeviceUnavailableError, match="in use by another program")
     with PtyPort() as peer, SerialPort(peer.path), in_use:
         SerialPort(peer.path)
 
 
-async def test_silence_is_no_loss_and_a_cancelled_read_loses_nothing() -> None:
+async def test_silence_is_no_loss_and_a_cancelled_read_loses_nothing():
     with PtyPort() as peer, SerialPort(peer.path) as port:
         assert await port.read(0.01) is None
         reading = asyncio.create_task(port.read(DEADLINE_S))
@@ -106,11 +104,10 @@ async def test_silence_is_no_loss_and_a_cancelled_read_loses_nothing() -> None:
         asyncio.get_running_loop().call_later(0.01, reading.cancel)
         received = await asyncio.gather(reading, return_exceptions=True)
         rest = received[0] if isinstance(received[0], connection.Received) else await port.read(DEADLINE_S)
-        assert rest is not None
         assert rest.data == b"kept"
 
 
-async def test_bytes_wait_in_the_kernel_while_there_is_no_read(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_bytes_wait_in_the_kernel_while_there_is_no_read(monkeypatch):
     calls = []
     drain = SerialPort._drain
     monkeypatch.setattr(SerialPort, "_drain", lambda port, done: (calls.append(port), drain(port, done)))
@@ -125,7 +122,7 @@ async def test_bytes_wait_in_the_kernel_while_there_is_no_read(monkeypatch: pyte
         assert await read_exactly(port, 12) == b"and the rest"
 
 
-async def test_what_came_before_the_port_went_is_read_and_then_the_loss_is_told() -> None:
+async def test_what_came_before_the_port_went_is_read_and_then_the_loss_is_told():
     with PtyPort() as peer, SerialPort(peer.path) as port:
         reading = asyncio.create_task(port.read(DEADLINE_S))
         await asyncio.sleep(0)
@@ -136,10 +133,9 @@ async def test_what_came_before_the_port_went_is_read_and_then_the_loss_is_told(
             await port.write(b"y")
 
 
-async def test_a_write_that_nobody_takes_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_write_that_nobody_takes_ends(monkeypatch):
     monkeypatch.setattr(connection, "WRITE_TIMEOUT_S", 0.05)
     with PtyPort() as peer, SerialPort(peer.path) as port:
-        assert peer._master is not None
         asyncio.get_running_loop().remove_reader(peer._master)
 
         async def write_for_ever() -> None:
@@ -150,7 +146,7 @@ async def test_a_write_that_nobody_takes_ends(monkeypatch: pytest.MonkeyPatch) -
             await write_for_ever()
 
 
-async def test_a_link_opens_a_device_that_comes_late_and_again_after_it_went(tmp_path: Path) -> None:
+async def test_a_link_opens_a_device_that_comes_late_and_again_after_it_went(tmp_path):
     told = LinkEvents()
     path = tmp_path / "port"
     with PtyPort(path) as peer, SerialLink(path=str(path), monitor=LinkMonitor(told, 0.01, 0.02)) as link:
@@ -176,14 +172,14 @@ async def test_a_link_opens_a_device_that_comes_late_and_again_after_it_went(tmp
     assert link.port is None
 
 
-async def test_a_link_that_leads_elsewhere_by_now_is_left_alone(tmp_path: Path) -> None:
+async def test_a_link_that_leads_elsewhere_by_now_is_left_alone(tmp_path):
     path = tmp_path / "port"
     with PtyPort(path), PtyPort(path) as second:
         assert os.readlink(path) == second._terminal
     assert not path.is_symlink()
 
 
-def test_waits_grow_and_only_the_first_failure_is_news() -> None:
+def test_waits_grow_and_only_the_first_failure_is_news():
     told = LinkEvents()
     monitor = LinkMonitor(told)
     loss = DeviceLostError("The device at port 1 has gone.")
@@ -198,7 +194,7 @@ def test_waits_grow_and_only_the_first_failure_is_news() -> None:
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 20 * SECOND_NS)), max_size=200))
-def test_waits_stay_within_their_bounds(steps: list[tuple[bool, int]]) -> None:
+def test_waits_stay_within_their_bounds(steps):
     monitor, now_ns = LinkMonitor(), 0
     for connected, later_ns in steps:
         now_ns += later_ns

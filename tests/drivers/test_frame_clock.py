@@ -22,7 +22,7 @@ def delays_ns(n: int, scale_ns: float, seed: int = 0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("period_ns", [PERIOD_NS, PERIOD_NS // 100, PERIOD_NS * 4])
-def test_the_jitter_of_a_busy_reader_is_taken_out_at_any_speed(period_ns: int) -> None:
+def test_the_jitter_of_a_busy_reader_is_taken_out_at_any_speed(period_ns):
     truth = sent(400, period_ns)
     late = delays_ns(400, 0.03 * period_ns)
     clock = FrameClock(PERIOD_NS)
@@ -34,7 +34,7 @@ def test_the_jitter_of_a_busy_reader_is_taken_out_at_any_speed(period_ns: int) -
     assert abs(settled).max() < 0.25 * late[40:].max()
 
 
-def test_a_reader_that_was_away_is_late_once_and_then_on_time_again() -> None:
+def test_a_reader_that_was_away_is_late_once_and_then_on_time_again():
     truth = sent(60)
     arrivals = truth.copy()
     # Frames 40 and 41 wait until shortly after frame 41 was sent, and are then read one after the other.
@@ -43,7 +43,7 @@ def test_a_reader_that_was_away_is_late_once_and_then_on_time_again() -> None:
     assert abs(error).max() < 4_000_000
 
 
-def test_a_refused_line_takes_a_period_too() -> None:
+def test_a_refused_line_takes_a_period_too():
     truth = sent(80)
     clock = FrameClock(PERIOD_NS)
     errors = [clock.arrived(int(t), missed=n == 51) - t for n, t in enumerate(truth) if n != 50]
@@ -51,7 +51,7 @@ def test_a_refused_line_takes_a_period_too() -> None:
 
 
 @pytest.mark.parametrize("pause_periods", [0.3, 0.8, 1.4, 2.1, 7.3])
-def test_a_board_that_paused_is_followed(pause_periods: float) -> None:
+def test_a_board_that_paused_is_followed(pause_periods):
     truth = sent(80)
     truth[40:] += int(pause_periods * PERIOD_NS)
     error = straightened(truth.tolist()) - truth
@@ -59,7 +59,7 @@ def test_a_board_that_paused_is_followed(pause_periods: float) -> None:
     assert abs(error[53:]).max() < 1_000_000
 
 
-def test_frames_queued_before_the_first_read_do_not_spoil_the_period() -> None:
+def test_frames_queued_before_the_first_read_do_not_spoil_the_period():
     truth = sent(80)
     arrivals = np.maximum(truth, truth[5] + 50_000_000 * np.arange(80))
     arrivals[6:] = truth[6:]
@@ -69,7 +69,7 @@ def test_frames_queued_before_the_first_read_do_not_spoil_the_period() -> None:
     assert abs(error[30:]).max() < 4_000_000
 
 
-def test_another_speed_after_a_restart_is_learned() -> None:
+def test_another_speed_after_a_restart_is_learned():
     clock = FrameClock(PERIOD_NS)
     for t in sent(50):
         clock.arrived(int(t))
@@ -81,7 +81,7 @@ def test_another_speed_after_a_restart_is_learned() -> None:
 
 
 @given(st.lists(st.integers(0, 5_000_000_000), min_size=1, max_size=120))
-def test_whatever_comes_a_stamp_is_never_after_the_arrival_and_never_before_the_board_could(gaps: list[int]) -> None:
+def test_whatever_comes_a_stamp_is_never_after_the_arrival_and_never_before_the_board_could(gaps):
     clock = FrameClock(PERIOD_NS)
     for arrival in np.cumsum(gaps).tolist():
         stamp = clock.arrived(arrival)
@@ -90,7 +90,7 @@ def test_whatever_comes_a_stamp_is_never_after_the_arrival_and_never_before_the_
 
 
 @given(st.lists(st.floats(0, 1e9), min_size=2, max_size=60))
-def test_the_slope_is_that_of_the_best_line_below(heights: list[float]) -> None:
+def test_the_slope_is_that_of_the_best_line_below(heights):
     points = list(enumerate(round(height) for height in heights))
     n, t = np.array(points, float).T
     slope = slope_below(points)
@@ -104,7 +104,7 @@ def test_the_slope_is_that_of_the_best_line_below(heights: list[float]) -> None:
     assert (t - slope * n - (t - slope * n).min()).sum() == pytest.approx(best, rel=1e-6, abs=1e-2)
 
 
-def test_the_stamps_of_a_recording_are_straightened(shared) -> None:
+def test_the_stamps_of_a_recording_are_straightened(shared):
     from scipy.io import loadmat
 
     folder = shared / "recordings" / "streams" / "2024-12-03_16-09"

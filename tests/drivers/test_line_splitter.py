@@ -11,7 +11,7 @@ LONGEST = 8
 
 
 @given(st.lists(st.binary(max_size=2 * LONGEST), max_size=12))
-def test_slices_change_nothing_and_every_line_is_given_or_counted(slices: list[bytes]) -> None:
+def test_slices_change_nothing_and_every_line_is_given_or_counted(slices):
     data = b"".join(slices)
     whole, sliced = LineSplitter(LONGEST), LineSplitter(LONGEST)
     expected = whole.feed(data)
@@ -22,7 +22,7 @@ def test_slices_change_nothing_and_every_line_is_given_or_counted(slices: list[b
     assert sliced.in_line == whole.in_line == (bool(rest.strip()) or len(rest) > LONGEST)
 
 
-def test_memory_stays_bounded_where_no_line_ever_ends() -> None:
+def test_memory_stays_bounded_where_no_line_ever_ends():
     lines, slice_ = LineSplitter(LONGEST), b"7" * 1000
     tracemalloc.start()
     for _ in range(1000):
@@ -33,7 +33,7 @@ def test_memory_stays_bounded_where_no_line_ever_ends() -> None:
     assert (lines.too_long, lines.in_line) == (1, True)
 
 
-def test_what_had_begun_when_the_port_was_opened_again_is_counted_and_forgotten() -> None:
+def test_what_had_begun_when_the_port_was_opened_again_is_counted_and_forgotten():
     lines = LineSplitter(LONGEST)
     lines.feed(b"1\n2")
     lines.restart()
@@ -42,7 +42,7 @@ def test_what_had_begun_when_the_port_was_opened_again_is_counted_and_forgotten(
     assert lines.feed(b"3\n") == [b"3"]
 
 
-def test_line_that_is_too_long_is_counted_once_where_the_port_is_opened_again_before_its_end() -> None:
+def test_line_that_is_too_long_is_counted_once_where_the_port_is_opened_again_before_its_end():
     lines = LineSplitter(LONGEST)
     lines.feed(b"7" * 20)
     lines.feed(b"7")

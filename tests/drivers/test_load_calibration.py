@@ -38,9 +38,7 @@ def calibrate(calibrator: LoadCalibrator, signal: Callable[[float], list[LoadSam
     sign=st.sampled_from([-1, 1]),
     masses_g=st.lists(st.sampled_from([50.0, 100.0, 200.0, 500.0, 1000.0]), min_size=1, unique=True),
 )
-def test_it_finds_the_tare_and_the_scale_that_the_signal_was_made_with(
-    tare_counts: float, counts_per_g: float, wiring: int, sign: int, masses_g: list[float]
-) -> None:
+def test_it_finds_the_tare_and_the_scale_of_the_signal(tare_counts, counts_per_g, wiring, sign, masses_g):
     calibrator = LoadCalibrator(masses_g, sign=sign)
     calibrate(calibrator, lambda mass_g: noisy(tare_counts + wiring * counts_per_g * mass_g, seed=int(mass_g)))
     result = calibrator.result()
@@ -54,7 +52,7 @@ def test_it_finds_the_tare_and_the_scale_that_the_signal_was_made_with(
     assert result.residual_nm <= tolerance * max(masses_g) * 1e-3 * STANDARD_GRAVITY * 0.035
 
 
-def test_a_board_that_sends_newton_metres_is_calibrated_the_same_way() -> None:
+def test_a_board_that_sends_newton_metres_is_calibrated_the_same_way():
     calibrator = LoadCalibrator([100.0])
     calibrate(
         calibrator,
@@ -79,7 +77,7 @@ def after_empty(masses_g: list[float]) -> LoadCalibrator:
     return calibrator
 
 
-def test_a_saturated_signal_is_refused_and_the_step_asked_for_again() -> None:
+def test_a_saturated_signal_is_refused_and_the_step_asked_for_again():
     calibrator = after_empty([100.0])
     asked = calibrator.prompt
     assert "end of its range" in refused(calibrator, [*noisy(8000.0)[:-1], *samples([COUNTS_MAX])])
@@ -98,11 +96,11 @@ def test_a_saturated_signal_is_refused_and_the_step_asked_for_again() -> None:
         (True, noisy(12_000.0, seed=1), "use a larger one"),
     ],
 )
-def test_a_signal_that_is_not_fit_is_refused(after_rest: bool, signal: list[LoadSample], reason: str) -> None:
+def test_a_signal_that_is_not_fit_is_refused(after_rest, signal, reason):
     assert reason in refused(after_empty([100.0]) if after_rest else LoadCalibrator([100.0]), signal)
 
 
-def test_masses_off_the_line_or_in_the_wrong_order_are_refused() -> None:
+def test_masses_off_the_line_or_in_the_wrong_order_are_refused():
     bent = LoadCalibrator([100.0, 200.0])
     calibrate(bent, lambda mass_g: noisy(420 * mass_g * (0.8 if mass_g == 200 else 1.0)))
     with pytest.raises(DeviceCalibrationError, match="straight line"):
@@ -115,7 +113,7 @@ def test_masses_off_the_line_or_in_the_wrong_order_are_refused() -> None:
     assert "order given" in refused(swapped, noisy(42_000.0))
 
 
-def test_too_many_corrupted_values_are_refused_and_few_are_left_out() -> None:
+def test_too_many_corrupted_values_are_refused_and_few_are_left_out():
     raws = 8000 + 100 * np.random.default_rng(2).standard_normal(STEP)
     parser = LoadParser(LoadCalibration(tare_counts=0, scale_n_per_count=1e-5))
     raws[20] = 9e12
@@ -130,7 +128,7 @@ def test_too_many_corrupted_values_are_refused_and_few_are_left_out() -> None:
     assert "Only 25 of the 30" in refused(LoadCalibrator([100.0]), many)
 
 
-def test_samples_between_the_steps_count_for_nothing() -> None:
+def test_samples_between_the_steps_count_for_nothing():
     calibrator = after_empty([100.0])
     assert not any(calibrator.feed(sample) for sample in noisy(1e6))
     assert len(calibrator.levels) == 1
@@ -139,6 +137,6 @@ def test_samples_between_the_steps_count_for_nothing() -> None:
 
 
 @pytest.mark.parametrize("masses_g", [[], [0.0], [-5.0], [float("nan")], [float("inf")], [100.0, 100.0]])
-def test_masses_that_no_line_goes_through_are_refused(masses_g: list[float]) -> None:
+def test_masses_that_no_line_goes_through_are_refused(masses_g):
     with pytest.raises(DeviceCalibrationError, match="mass"):
         LoadCalibrator(masses_g)

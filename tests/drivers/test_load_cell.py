@@ -45,7 +45,7 @@ def recorded(shared: Path, name: str) -> list[tuple[int, float]]:
 
 
 @pytest.mark.parametrize("name", STREAMS)
-def test_the_two_real_corrupted_values_are_flagged_and_nothing_else(shared: Path, name: str) -> None:
+def test_the_two_real_corrupted_values_are_flagged_and_nothing_else(shared, name):
     parser = LoadParser(TORQUE_LINES)
     rows = recorded(shared, name)
     samples = [sample for t_ns, value in rows for sample in parser.feed(f"{value:.12f}\r\n".encode(), t_ns)]
@@ -56,7 +56,7 @@ def test_the_two_real_corrupted_values_are_flagged_and_nothing_else(shared: Path
     assert [sample.seq for sample in samples if not sample.trusted] == sorted({0, *(s.seq for s in samples if s.spike)})
 
 
-def test_torque_lines_keep_their_values_and_counts_become_torque() -> None:
+def test_torque_lines_keep_their_values_and_counts_become_torque():
     (_, sample) = feed_lines(LoadParser(TORQUE_LINES), ["0.000000", "0.059796800613"])
     assert sample.torque_nm == pytest.approx(0.059796800613, rel=1e-12)
     counts = LoadCalibration(tare_counts=8000, scale_n_per_count=1e-5, lever_arm_m=0.035, sign=-1)
@@ -68,7 +68,7 @@ def test_torque_lines_keep_their_values_and_counts_become_torque() -> None:
     st.lists(st.one_of(st.binary(max_size=60), st.decimals(-9e6, 9e6, places=3).map(lambda d: f"{d}\r\n".encode()))),
     st.lists(st.integers(1, 40), min_size=1),
 )
-def test_the_slices_in_which_bytes_come_change_nothing(pieces: list[bytes], widths: list[int]) -> None:
+def test_the_slices_in_which_bytes_come_change_nothing(pieces, widths):
     data = b"".join(pieces)
     whole, sliced = LoadParser(TORQUE_LINES), LoadParser(TORQUE_LINES)
     expected = whole.feed(data, 0)
@@ -92,14 +92,14 @@ NOT_DECIMAL = ("nan", "inf", "ovf", "1e5", "0x10", "1 2", "1.", ".5", "--1", "٣
 @pytest.mark.parametrize(
     ("line", "kind"), [("", "empty"), ("9" * 40, "too_long"), *((line, "not_decimal") for line in NOT_DECIMAL)]
 )
-def test_a_line_that_is_no_decimal_is_refused_by_kind_with_a_sentence(line: str, kind: str) -> None:
+def test_a_line_that_is_no_decimal_is_refused_by_kind_with_a_sentence(line, kind):
     parser = LoadParser(TORQUE_LINES)
     assert feed_lines(parser, [line]) == []
     assert dict(parser.errors) == {kind: 1}
     assert load_cell.describe_errors(parser.errors).count("(1 times)") == 1
 
 
-def test_the_ends_of_the_converters_range_are_flagged_and_their_neighbours_are_not() -> None:
+def test_the_ends_of_the_converters_range_are_flagged_and_their_neighbours_are_not():
     parser = LoadParser(LoadCalibration(tare_counts=0, scale_n_per_count=1e-6))
     samples = feed_lines(
         parser, [str(n) for n in (COUNTS_MAX - 1, COUNTS_MAX - 1, COUNTS_MAX, COUNTS_MIN, COUNTS_MIN + 1)]
@@ -107,12 +107,12 @@ def test_the_ends_of_the_converters_range_are_flagged_and_their_neighbours_are_n
     assert [s.saturated for s in samples] == [False, False, True, True, False]
 
 
-def test_a_converter_that_repeats_itself_is_flagged_until_it_moves() -> None:
+def test_a_converter_that_repeats_itself_is_flagged_until_it_moves():
     samples = feed_lines(LoadParser(TORQUE_LINES), ["0.01"] * (STUCK_AFTER + 2) + ["0.010001"])
     assert [s.stuck for s in samples] == [False] * (STUCK_AFTER - 1) + [True] * 3 + [False]
 
 
-def test_lines_that_arrive_together_are_spread_and_time_never_goes_back() -> None:
+def test_lines_that_arrive_together_are_spread_and_time_never_goes_back():
     parser = LoadParser(TORQUE_LINES)
     samples = parser.feed(b"0.1\n0.1\n0.1\n", 10 * PERIOD_NS) + parser.feed(b"0.1\n", 10 * PERIOD_NS + 1)
     assert [s.t_arrival_ns for s in samples[:3]] == [8 * PERIOD_NS, 9 * PERIOD_NS, 10 * PERIOD_NS]
@@ -122,7 +122,7 @@ def test_lines_that_arrive_together_are_spread_and_time_never_goes_back() -> Non
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 80.0])
-def test_a_board_of_another_rate_is_stamped_and_found_stuck_by_its_own(rate_hz: float) -> None:
+def test_a_board_of_another_rate_is_stamped_and_found_stuck_by_its_own(rate_hz):
     period_ns = round(1e9 / rate_hz)
     parser = LoadParser(TORQUE_LINES, rate_hz)
     samples = parser.feed(b"0.1\n0.2\n0.3\n", 10 * period_ns)
@@ -136,7 +136,7 @@ torques = st.floats(-1.7, 1.7)
 
 
 @given(torques, torques, st.integers(3, 10))
-def test_a_real_step_is_believed_after_three_agreeing_values(before: float, after: float, n: int) -> None:
+def test_a_real_step_is_believed_after_three_agreeing_values(before, after, n):
     spikes = SpikeFilter()
     assert not any(spikes.is_spike(before, k * PERIOD_NS) for k in range(5))
     flags = [spikes.is_spike(after, (5 + k) * PERIOD_NS) for k in range(n)]
@@ -145,7 +145,7 @@ def test_a_real_step_is_believed_after_three_agreeing_values(before: float, afte
 
 
 @given(st.lists(st.floats(-0.15, 0.15), min_size=3, max_size=60), st.data())
-def test_one_corrupted_value_in_a_moving_signal_is_flagged_alone(steps: list[float], data: st.DataObject) -> None:
+def test_one_corrupted_value_in_a_moving_signal_is_flagged_alone(steps, data):
     level, values = 0.0, []
     for step in steps:
         level = min(max(level + step, -1.0), 1.0)
@@ -156,14 +156,14 @@ def test_one_corrupted_value_in_a_moving_signal_is_flagged_alone(steps: list[flo
     assert [k for k, v in enumerate(values) if spikes.is_spike(v, k * PERIOD_NS)] == [where]
 
 
-def test_after_a_gap_the_rig_may_have_moved_further() -> None:
+def test_after_a_gap_the_rig_may_have_moved_further():
     spikes = SpikeFilter()
     assert not spikes.is_spike(0.0, 0)
     assert not spikes.is_spike(1.5, 10**9)
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 10.9, 80.0])
-def test_a_spike_is_what_the_rig_cannot_do_within_the_boards_own_period(rate_hz: float) -> None:
+def test_a_spike_is_what_the_rig_cannot_do_within_the_boards_own_period(rate_hz):
     within_nm = load_cell.SLEW_NM_PER_S / rate_hz
     for share, spike in ((0.9, False), (1.1, True)):
         parser, torque_nm = LoadParser(TORQUE_LINES, rate_hz), min(share * within_nm, 1.74)
@@ -172,7 +172,7 @@ def test_a_spike_is_what_the_rig_cannot_do_within_the_boards_own_period(rate_hz:
         assert samples[-1].spike == (spike and rate_hz > 2.0), "within a second it may reach all that the cell bears"
 
 
-def test_a_tare_forgets_the_level_that_spikes_are_judged_by() -> None:
+def test_a_tare_forgets_the_level_that_spikes_are_judged_by():
     parser = LoadParser(LoadCalibration(tare_counts=0, scale_n_per_count=1e-4))
     assert not feed_lines(parser, ["200000", "200000"])[-1].spike
     parser.handle(RawEvent(InputKind.TARE, 0, b"200000"))
@@ -180,7 +180,7 @@ def test_a_tare_forgets_the_level_that_spikes_are_judged_by() -> None:
     assert sample.torque_nm == 0
 
 
-def test_a_calibration_survives_its_file(tmp_path: Path) -> None:
+def test_a_calibration_survives_its_file(tmp_path):
     path = tmp_path / "load.yaml"
     calibration = LoadCalibration(tare_counts=-81234.5, scale_n_per_count=-2.3e-5, lever_arm_m=0.035, sign=-1)
     save_calibration(path, calibration)
@@ -198,7 +198,7 @@ def test_a_calibration_survives_its_file(tmp_path: Path) -> None:
         ("", "the calibration is empty"),
     ],
 )
-def test_a_calibration_file_that_is_wrong_is_refused_by_name_and_key(tmp_path: Path, text: str, said: str) -> None:
+def test_a_calibration_file_that_is_wrong_is_refused_by_name_and_key(tmp_path, text, said):
     path = tmp_path / "load.yaml"
     path.write_text(text)
     with pytest.raises(DeviceCalibrationError, match=said) as refused:
@@ -206,7 +206,7 @@ def test_a_calibration_file_that_is_wrong_is_refused_by_name_and_key(tmp_path: P
     assert str(path) in str(refused.value)
 
 
-def test_a_missing_calibration_file_says_how_to_make_one(tmp_path: Path) -> None:
+def test_a_missing_calibration_file_says_how_to_make_one(tmp_path):
     with pytest.raises(DeviceCalibrationError, match="shearloop calibrate"):
         load_calibration(tmp_path / "none.yaml", LoadCalibration)
     with pytest.raises(DeviceCalibrationError, match="cannot be written"):

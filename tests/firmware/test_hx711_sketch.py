@@ -56,7 +56,7 @@ int main() { setup(); for (;;) loop(); }
 """
 
 
-def test_the_sketch_reads_the_converter_and_speaks_the_drivers_language(tmp_path: Path) -> None:
+def test_the_sketch_reads_the_converter_and_speaks_the_drivers_language(tmp_path):
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("needs g++ to compile the sketch for this computer")

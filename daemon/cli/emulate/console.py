@@ -10,8 +10,10 @@ import sys
 import time
 from collections.abc import Callable, Coroutine, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
+from shearloop.daemon.cli.options import add_option
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.signals import ending_signals
 
@@ -35,14 +37,15 @@ def print_event(event: str, **fields: object) -> None:
 def play(
     device: Coroutine[None, None, None],
     on_command: Callable[[str], None],
-    ports: "Mapping[str, asyncio.Queue[str]] | None" = None,
-) -> None:
-    """Run `device` until it ends, SIGINT, SIGTERM or SIGHUP comes, or standard input is closed.
+    ports: "Mapping[str, asyncio.Queue[str]]" = MappingProxyType({}),
+) -> int:
+    """Run `device` until it ends, SIGINT, SIGTERM or SIGHUP comes, or standard input is closed; return 0.
 
     Each line of standard input, if that is a pipe or a terminal, goes to `on_command`; a ValueError is printed. What
     the queues of `ports` get is printed behind their names.
     """
-    asyncio.run(_play(device, on_command, ports or {}))
+    asyncio.run(_play(device, on_command, ports))
+    return 0
 
 
 async def _print_port(name: str, appearances: "asyncio.Queue[str]") -> None:
@@ -63,9 +66,7 @@ def report_busy_address(what: str, cure: str) -> Iterator[None]:
 
 
 async def _play(
-    device: Coroutine[None, None, None],
-    on_command: Callable[[str], None],
-    ports: "Mapping[str, asyncio.Queue[str]]",
+    device: Coroutine[None, None, None], on_command: Callable[[str], None], ports: "Mapping[str, asyncio.Queue[str]]"
 ) -> None:
     loop = asyncio.get_running_loop()
     task = asyncio.create_task(device)
@@ -106,9 +107,21 @@ def checked_port(option: str, port: int) -> int:
     return port
 
 
+def add_seed_and_speed(parser: argparse._ActionsContainer, pace: str) -> None:
+    """Add `--seed` and `--speed`, which multiplies `pace`."""
+    parser.add_argument("--seed", type=int, default=0, help="of all noise and garbage (default: %(default)s)")
+    add_option(parser, "--speed", float, "N", f"times {pace} (default: 1)", default=1.0)
+
+
+def add_sigma(parser: argparse._ActionsContainer) -> None:
+    """Add `--sigma`, by default that of the paper's screwdriver."""
+    text = "sigma at no torque and at 0.14 N·m (default: 1.85 1.25)"
+    add_option(parser, "--sigma", float, ("REST", "LARGEST"), text, nargs=2, default=(1.85, 1.25))
+
+
 def add_link(parser: argparse.ArgumentParser) -> None:
     """Add `--link`."""
-    parser.add_argument("--link", type=Path, metavar="PATH", help="a name for the port that outlives its replugging")
+    add_option(parser, "--link", Path, "PATH", "a name for the port that outlives its replugging")
 
 
 def checked_link(link: Path | None) -> Path | None:

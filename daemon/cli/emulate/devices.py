@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.emulate import console
+from shearloop.daemon.cli.options import add_option
 from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
@@ -18,9 +19,8 @@ if TYPE_CHECKING:
     from shearloop.drivers.emulators.ur_controller import Controller
     from shearloop.drivers.emulators.ur_robot import ControllerSpec, RobotEvent
 
-# The paper's screwdriver: σ at rest and at the largest torque of its peak samples, in N·m.
-K_CM = 3.25
-SIGMA_AT_REST_CM, SIGMA_AT_LARGEST_CM, LARGEST_TORQUE_NM = 1.85, 1.25, 0.14
+# The paper's screwdriver, and the largest torque of its peak samples.
+K_CM, LARGEST_TORQUE_NM = 3.25, 0.14
 LEVER_ARM_M, STANDARD_GRAVITY = 0.035, 9.80665
 UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standard input:
   protective-stop         stop for safety, pause the program
@@ -43,30 +43,15 @@ def _configure_eit_kit(parser: argparse.ArgumentParser) -> None:
         "silence without a number lasts until the board is started again; `normal` ends every fault."
     )
     frames = parser.add_argument_group("frames")
-    frames.add_argument("--recording", type=Path, metavar="FILE", help="a recorded stream (.mat)")
+    add_option(frames, "--recording", Path, "FILE", "a recorded stream (.mat)")
     frames.add_argument("--side", choices=("left", "right"), help="which fingertip, if the file holds both")
-    frames.add_argument("--bank", type=Path, metavar="FILE", help="synthesise twists from this bank's signals")
-    frames.add_argument(
-        "--sigma",
-        type=float,
-        nargs=2,
-        default=(SIGMA_AT_REST_CM, SIGMA_AT_LARGEST_CM),
-        metavar=("REST", "LARGEST"),
-        help=f"sigma at no torque and at {LARGEST_TORQUE_NM} N·m (default: {SIGMA_AT_REST_CM} {SIGMA_AT_LARGEST_CM})",
-    )
-    frames.add_argument("--seed", type=int, default=0, help="of noise and garbage (default: %(default)s)")
+    add_option(frames, "--bank", Path, "FILE", "synthesise twists from this bank's signals")
+    console.add_sigma(frames)
     frames.add_argument("--once", action="store_true", help="play the recording once, then be silent")
-    parser.add_argument(
-        "--speed", type=float, default=1.0, metavar="N", help="times the board's 1.85 frames per second"
-    )
+    console.add_seed_and_speed(parser, "the board's 1.85 frames per second")
     console.add_link(parser)
-    parser.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="NAME[:SECONDS]@FRAME",
-        help="a fault of one frame, counted from 0; may be given several times",
-    )
+    text = "a fault of one frame, counted from 0; may be given several times"
+    parser.add_argument("--fault", action="append", default=[], metavar="NAME[:SECONDS]@FRAME", help=text)
 
 
 def _run_eit_kit(args: argparse.Namespace) -> int:
@@ -74,8 +59,7 @@ def _run_eit_kit(args: argparse.Namespace) -> int:
     from shearloop.drivers.emulators.boards import EitKitBoard
 
     console.check_positive(args, "speed")
-    link = console.checked_link(args.link)
-    fault_at = dict(_numbered_fault(text) for text in args.fault)
+    link, fault_at = console.checked_link(args.link), dict(_numbered_fault(text) for text in args.fault)
     board = EitKitBoard(
         _frames(args, FRAME_PERIOD_S),
         period_s=FRAME_PERIOD_S / args.speed,
@@ -83,8 +67,7 @@ def _run_eit_kit(args: argparse.Namespace) -> int:
         fault_at=fault_at,
         seed=args.seed,
     )
-    console.play(board.run(), board.command, {"": board.port.appearances})
-    return 0
+    return console.play(board.run(), board.command, {"": board.port.appearances})
 
 
 def _numbered_fault(argument: str) -> "tuple[int, BoardFault]":
@@ -135,10 +118,9 @@ def _configure_hx711(parser: argparse.ArgumentParser) -> None:
         "[SECONDS], unplug [SECONDS]; `normal` ends them. `torque NM` sets the torque, `mass G` that of a "
         "mass on the lever."
     )
-    parser.add_argument("--torque-nm", type=float, default=0.0, metavar="NM", help="the torque (default: %(default)s)")
+    add_option(parser, "--torque-nm", float, "NM", "the torque (default: %(default)s)", default=0.0)
     parser.add_argument("--paper-sketch", action="store_true", help="send N·m, as the paper's board did, not counts")
-    parser.add_argument("--seed", type=int, default=0, help="of noise and garbage (default: %(default)s)")
-    parser.add_argument("--speed", type=float, default=1.0, metavar="N", help="times the board's 10.9 lines per second")
+    console.add_seed_and_speed(parser, "the board's 10.9 lines per second")
     console.add_link(parser)
 
 
@@ -167,8 +149,7 @@ def _run_hx711(args: argparse.Namespace) -> int:
             case _:
                 board.command(line)
 
-    console.play(board.run(), on_command, {"": board.port.appearances})
-    return 0
+    return console.play(board.run(), on_command, {"": board.port.appearances})
 
 
 def _finite(text: str) -> float:
@@ -207,9 +188,8 @@ def print_robot_event(event: "RobotEvent") -> None:
 def _configure_ur(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = UR_FAULTS
-    parser.add_argument(
-        "--host", default="127.0.0.1", help="address to listen on; its ports 29999, 30003 and 30004 are the client's"
-    )
+    text = "address to listen on; its ports 29999, 30003 and 30004 are the client's"
+    parser.add_argument("--host", default="127.0.0.1", help=text)
     add_robot(parser)
 
 
@@ -224,8 +204,7 @@ def _run_ur(args: argparse.Namespace) -> int:
         console.print_event("obeyed", detail=line)
 
     with console.report_busy_address(f"the controller cannot listen on {args.host}", "choose another --host"):
-        console.play(_play_ur(controller, args.host), on_command)
-    return 0
+        return console.play(_play_ur(controller, args.host), on_command)
 
 
 async def _play_ur(controller: "Controller", host: str) -> None:
@@ -242,14 +221,12 @@ def _configure_gripper(parser: argparse.ArgumentParser, printed: str) -> None:
         "[SECONDS]` breaks the connection, `silence [SECONDS]` answers nothing, `break-off` ends the next answer "
         "half-way; `normal` ends them, and a fault below 10."
     )
-    parser.add_argument("--speed", type=float, default=1.0, metavar="N", help="times the gripper's own pace")
+    add_option(parser, "--speed", float, "N", "times the gripper's own pace", default=1.0)
 
 
 def _configure_gripper_socket(parser: argparse.ArgumentParser) -> None:
     _configure_gripper(parser, "its address")
-    parser.add_argument(
-        "--bind", default="127.0.0.1", metavar="ADDRESS", help="address to listen on (default: %(default)s)"
-    )
+    add_option(parser, "--bind", str, "ADDRESS", "address to listen on (default: %(default)s)", default="127.0.0.1")
     parser.add_argument("--port", type=int, default=63352, help="0 for a free one (default: %(default)s)")
 
 
@@ -271,8 +248,7 @@ def _run_gripper(args: argparse.Namespace) -> int:
         server = SocketServer(UrcapSession(gripper), args.bind, console.checked_port("port", args.port))
     player = GripperPlayer(gripper, server, args.speed)
     with console.report_busy_address("the gripper cannot be played", "choose another port or bind address"):
-        console.play(player.run(), player.command, {"": server.appearances})
-    return 0
+        return console.play(player.run(), player.command, {"": server.appearances})
 
 
 DEVICES = {
@@ -280,7 +256,5 @@ DEVICES = {
     "hx711": console.Device("the load cell's board, on a pseudo-terminal", _configure_hx711, _run_hx711),
     "ur": console.Device("a UR robot's controller, on an address of this machine", _configure_ur, _run_ur),
     "gripper-socket": console.Device("a 2F-140 behind the URCap's socket", _configure_gripper_socket, _run_gripper),
-    "gripper-modbus": console.Device(
-        "a 2F-140 on Modbus RTU, on a pseudo-terminal", _configure_gripper_modbus, _run_gripper
-    ),
+    "gripper-modbus": console.Device("a 2F-140 on Modbus RTU, on a port", _configure_gripper_modbus, _run_gripper),
 }

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TextIO
 
 from shearloop.daemon.cli.emulate import console
 from shearloop.daemon.cli.emulate.devices import add_robot, print_robot_event, robot_make
+from shearloop.daemon.cli.options import add_option
 from shearloop.daemon.errors import UserError
 from shearloop.drivers.emulators import number_between
 
@@ -90,40 +91,22 @@ class PushedSkin:
 def _configure_rig(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = RIG_EPILOG
-    parser.add_argument("--bank", type=Path, required=True, metavar="FILE", help="synthesise frames from its signals")
-    parser.add_argument(
-        "--run-dir",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="folder for the ports eit-right, eit-left and load-cell",
-    )
-    parser.add_argument(
-        "--skin", action="store_true", help="a shear skin on one finger too: skin-source and skin-daq in --run-dir"
-    )
+    add_option(parser, "--bank", Path, "FILE", "synthesise frames from its signals", required=True)
+    text = "folder for the ports eit-right, eit-left and load-cell"
+    add_option(parser, "--run-dir", Path, "DIR", text, required=True)
+    text = "a shear skin on one finger too: skin-source and skin-daq in --run-dir"
+    parser.add_argument("--skin", action="store_true", help=text)
     parser.add_argument("--host", default="127.0.0.1", help="address of robot and gripper (default: %(default)s)")
-    parser.add_argument(
-        "--gripper", choices=("socket", "modbus"), default="socket", help="its interface (default: %(default)s)"
-    )
-    parser.add_argument("--diameter-mm", type=float, default=20.0, metavar="MM", help="of the tool (default: 20)")
-    parser.add_argument(
-        "--gel-stiffness", type=float, default=0.8, metavar="NM_PER_RAD", help="of both pads (default: %(default)s)"
-    )
-    parser.add_argument("--speed", type=float, default=1.0, metavar="N", help="of gel, fingers and boards (default: 1)")
-    parser.add_argument("--arm-speed", type=float, default=1.0, metavar="N", help="of the arm (default: 1)")
-    parser.add_argument("--seed", type=int, default=0, help="of all noise (default: %(default)s)")
-    parser.add_argument("--truth", type=Path, metavar="FILE", help="append the true state, ten times a second, as JSON")
-    parser.add_argument(
-        "--paper-sketch", action="store_true", help="the load cell sends N·m, as the paper's, not counts"
-    )
-    parser.add_argument(
-        "--sigma",
-        type=float,
-        nargs=2,
-        default=(1.85, 1.25),
-        metavar=("REST", "LARGEST"),
-        help="sigma at 0 and at 0.14 N·m (1.85 1.25)",
-    )
+    text = "its interface (default: %(default)s)"
+    parser.add_argument("--gripper", choices=("socket", "modbus"), default="socket", help=text)
+    add_option(parser, "--diameter-mm", float, "MM", "of the tool (default: 20)", default=20.0)
+    add_option(parser, "--gel-stiffness", float, "NM_PER_RAD", "of both pads (default: %(default)s)", default=0.8)
+    console.add_seed_and_speed(parser, "the pace of gel, fingers and boards")
+    add_option(parser, "--arm-speed", float, "N", "of the arm (default: 1)", default=1.0)
+    add_option(parser, "--truth", Path, "FILE", "append the true state, ten times a second, as JSON")
+    text = "the load cell sends N·m, as the paper's, not counts"
+    parser.add_argument("--paper-sketch", action="store_true", help=text)
+    console.add_sigma(parser)
     add_robot(parser)
 
 
@@ -144,8 +127,7 @@ def _run_rig(args: argparse.Namespace) -> int:
             "choose another --host or --run-dir, or end what uses them",
         ),
     ):
-        console.play(_play_rig(rig, args, file), partial(_obey, rig))
-    return 0
+        return console.play(_play_rig(rig, args, file), partial(_obey, rig))
 
 
 async def _play_rig(rig: "EmulatedRig", args: argparse.Namespace, truth: TextIO | None) -> None:
@@ -227,11 +209,10 @@ def _configure_skin(parser: argparse.ArgumentParser) -> None:
         ("daq", "a name for a converter board's port", "a scanner on a socket instead"),
     ):
         addresses = parser.add_mutually_exclusive_group()
-        addresses.add_argument(f"--{name}-link", type=Path, metavar="PATH", help=link_help)
-        addresses.add_argument(f"--{name}-port", type=int, metavar="N", help=port_help)
+        add_option(addresses, f"--{name}-link", Path, "PATH", link_help)
+        add_option(addresses, f"--{name}-port", int, "N", port_help)
     parser.add_argument("--bind", default="127.0.0.1", metavar="ADDRESS", help="of the sockets (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of all noise (default: %(default)s)")
-    parser.add_argument("--speed", type=float, default=1.0, metavar="N", help="times the instruments' own pace")
+    console.add_seed_and_speed(parser, "the instruments' own pace")
     robot = parser.add_argument_group("a robot whose wrist turns a tool on the skin")
     robot.add_argument("--robot", metavar="HOST", help="play a UR controller on this address of this machine")
     robot.add_argument("--rate-hz", type=float, default=500.0, help="control cycles per second (default: %(default)s)")
@@ -257,16 +238,14 @@ def _run_skin(args: argparse.Namespace) -> int:
             case ["robot", *words] if controller is not None:
                 controller.command(" ".join(words))
             case ["shear", newtons]:
-                pushed.skin.push(
-                    number_between(newtons, -20.0, 20.0, "no force of at most 20 N; write for instance 0.5")
-                )
+                refusal = "no force of at most 20 N; write for instance 0.5"
+                pushed.skin.push(number_between(newtons, -20.0, 20.0, refusal))
             case _:
                 instruments.command(line)
 
     ports = {"source ": instruments.source_port, "daq ": instruments.daq_port}
     with console.report_busy_address("the skin cannot be played", "choose another port or address"):
-        console.play(_play_skin(instruments, controller), on_command, ports)
-    return 0
+        return console.play(_play_skin(instruments, controller), on_command, ports)
 
 
 def _address(args: argparse.Namespace, name: str) -> "Address | None":
@@ -288,8 +267,6 @@ async def _play_skin(instruments: "SkinInstruments", controller: "Controller | N
 
 
 DEVICES = {
-    "skin": console.Device(
-        "the shear skin with source and DAQ, and the robot that turns it", _configure_skin, _run_skin
-    ),
+    "skin": console.Device("the shear skin, its instruments, the robot that turns it", _configure_skin, _run_skin),
     "rig": console.Device("all devices of the rig, tied by one physics", _configure_rig, _run_rig),
 }

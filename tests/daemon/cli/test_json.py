@@ -6,8 +6,6 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 from shearloop.daemon.cli import COMMANDS, main
 
 # What needs none, and why.
@@ -38,13 +36,13 @@ def every_parser() -> Iterator[tuple[str, argparse.ArgumentParser]]:
         yield from parsers(name, parser)
 
 
-def test_every_command_has_a_json_option_or_a_reason_for_none() -> None:
+def test_every_command_has_a_json_option_or_a_reason_for_none():
     having = {name: "--json" in parser._option_string_actions for name, parser in every_parser()}
     lacking = {name for name, has_it in having.items() if not has_it}
     assert {next((known for known in WITHOUT if name.startswith(known)), name) for name in lacking} == set(WITHOUT)
 
 
-def test_keys_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_keys_as_json(tmp_path, capsys):
     def told(*words: str) -> dict[str, object]:
         assert main(["keys", *words, "--json"]) == 0
         return json.loads(capsys.readouterr().out)

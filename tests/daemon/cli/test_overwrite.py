@@ -36,9 +36,7 @@ def matlab() -> bytes:
         ("recording export no.mcap --format mat --out", "a MATLAB file"),
     ],
 )
-def test_no_command_overwrites_a_file_of_another_kind(
-    command: str, kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_command_overwrites_a_file_of_another_kind(command, kind, tmp_path, capsys):
     there = tmp_path / "precious"
     content = matlab() if kind == "a recording" else MCAP
     there.write_bytes(content)
@@ -49,13 +47,13 @@ def test_no_command_overwrites_a_file_of_another_kind(
 
 
 @pytest.mark.parametrize("content", [MCAP, b"PK\x03\x04\x14\0", matlab(), b"\x8eSHLBANK", "σ".encode()[:1] + b"x"])
-def test_text_overwrites_only_text(content: bytes, tmp_path: Path) -> None:
+def test_text_overwrites_only_text(content, tmp_path):
     (tmp_path / "file").write_bytes(content)
     with pytest.raises(UserError, match="is not a configuration"):
         check_overwrite(tmp_path / "file", "a configuration")
 
 
-def test_same_kind_empty_and_special_files_may_be_overwritten(tmp_path: Path) -> None:
+def test_same_kind_empty_and_special_files_may_be_overwritten(tmp_path):
     file = tmp_path / "file"
     check_overwrite(file, "a bank", b"BANK")
     file.touch()

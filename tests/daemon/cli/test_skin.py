@@ -12,9 +12,7 @@ from shearloop.daemon.cli.skin import _table
 
 
 @pytest.mark.usefixtures("fonts")
-def test_characterise_holds_the_models_against_the_paper_and_draws_its_figures(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_characterise_holds_the_models_against_the_paper_and_draws_its_figures(tmp_path, capsys):
     assert main(["skin", "characterise", "--json", "--out", str(tmp_path / "figures")]) == 0
     printed = capsys.readouterr()
     rows = {row["quantity"]: row for row in json.loads(printed.out)}
@@ -44,7 +42,7 @@ def test_characterise_holds_the_models_against_the_paper_and_draws_its_figures(
     assert "0.0802" in table
 
 
-def test_figures_that_cannot_be_written_are_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_figures_that_cannot_be_written_are_a_sentence(tmp_path, capsys):
     (tmp_path / "file").write_text("in the way")
     assert main(["skin", "characterise", "--out", str(tmp_path / "file")]) == 2
     assert "the figures cannot be written" in capsys.readouterr().err
@@ -61,7 +59,7 @@ def write_table(path: Path) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-def test_calibrate_takes_a_table_to_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_takes_a_table_to_a_file(tmp_path, capsys):
     table, out = tmp_path / "table.csv", tmp_path / "skin.yaml"
     write_table(table)
     assert main(["skin", "calibrate", str(table), "--out", str(out)]) == 0
@@ -80,7 +78,7 @@ def test_calibrate_takes_a_table_to_a_file(tmp_path: Path, capsys: pytest.Captur
     assert told["rows"] == calibration.rows
 
 
-def test_a_table_that_no_curve_fits_is_refused_by_its_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_table_that_no_curve_fits_is_refused_by_its_name(tmp_path, capsys):
     table, out = tmp_path / "table.csv", tmp_path / "skin.yaml"
     write_table(table)
     # The gauges the other way round.
@@ -94,13 +92,7 @@ def test_a_table_that_no_curve_fits_is_refused_by_its_name(tmp_path: Path, capsy
     ("arguments", "named"),
     [(["none.csv"], "none.csv: the table cannot be read"), (["none.csv", "--friction", "2"], "--friction is 2.0")],
 )
-def test_a_mistake_ends_in_one_sentence(
-    arguments: list[str],
-    named: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_mistake_ends_in_one_sentence(arguments, named, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["skin", "calibrate", *arguments, "--out", "skin.yaml"]) == 2
     assert named in capsys.readouterr().err

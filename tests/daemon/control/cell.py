@@ -2,7 +2,7 @@
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -11,7 +11,7 @@ import pytest
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.loop_inputs import GripperStatus, LoopConfig
+from shearloop.daemon.control.loop_inputs import GripperStatus, LoopConfig, TorqueSample
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
 from shearloop.daemon.control.step_runner import ExperimentPhase, GripTo
 from shearloop.drivers.ur.client import UrRobot
@@ -37,37 +37,39 @@ class Robot(UrRobot):
         # How many cycles a straight move goes on after it was told to stop, ever slower than a joint at rest.
         self.brakes_for = 0
         self.flight.fly(5)
-        self._held: list[tuple[Callable[[CommandReply], None], CommandReply]] = []
+        self._held: list[tuple[asyncio.Future[CommandReply], CommandReply]] = []
         self._unread: list[RobotState] = []
         # For how many cycles there is no process yet.
         self.gone_for = 0
 
-    def send_nowait(self, command: Command, answered: Callable[[CommandReply], None]) -> None:
+    def send(self, command: Command) -> asyncio.Future[CommandReply]:
         self.commands.append(command)
         if self.dies_of is not None:
             raise self.dies_of
+        replied: asyncio.Future[CommandReply] = asyncio.get_running_loop().create_future()
         if self.gone_for:
-            answered(CommandReply(refusal="The robot is not connected."))
-            return
-        asyncio.get_running_loop().call_soon(self._obey, command, answered)
+            replied.set_result(CommandReply("The robot is not connected."))
+        else:
+            asyncio.get_running_loop().call_soon(self._obey, command, replied)
+        return replied
 
-    def _obey(self, command: Command, answered: Callable[[CommandReply], None]) -> None:
+    def _obey(self, command: Command, replied: asyncio.Future[CommandReply]) -> None:
         if isinstance(command, MoveLinear):
             self._goal = command
         reply = self.flight.ask(command)
         if isinstance(command, WristSpeed):
             # Its reply comes with the next state.
-            self._held.append((answered, reply))
-        else:
-            answered(reply)
+            self._held.append((replied, reply))
+        elif not replied.done():
+            replied.set_result(reply)
 
     def die(self, gone_for: int) -> None:
         """End the process with all that it has not said; the next one is there after so many cycles."""
         self.gone_for = gone_for
         held, self._held, self._unread = self._held, [], []
         self._disconnect()
-        for answered, _ in held:
-            answered(CommandReply(refusal="The robot's process ended before it answered."))
+        for replied, _ in held:
+            replied.set_result(CommandReply("The robot's process ended before it answered."))
 
     def cycle(self, *, read: bool = True) -> None:
         """Let 8 ms pass, and tell who waits for the next state; what is not read now is read with the next one."""
@@ -95,8 +97,8 @@ class Robot(UrRobot):
         if not read:
             return
         held, self._held = self._held, []
-        for answered, reply in held:
-            answered(reply)
+        for replied, reply in held:
+            replied.set_result(reply)
         for state in self._unread:
             self.handle_message(0, state)
         self._unread.clear()
@@ -163,6 +165,10 @@ class Published:
         return next(one.reasons for one in reversed(self.messages) if one.topic == "loop.state")
 
 
+def experiment(*steps: Mapping[str, Any]) -> ExperimentFile:
+    return ExperimentFile.model_validate({"name": "test", "torque_source": WRENCH, "steps": list(steps)})
+
+
 class Cell:
     """Robot, gripper and loop, whose time passes in `cycles`."""
 
@@ -200,9 +206,13 @@ class Cell:
             for _ in range(8):
                 await asyncio.sleep(0)
 
+    def exceed_torque(self) -> None:
+        """Measure a torque beyond the limit."""
+        now_ns = self.robot.flight.now_ns
+        self.control_loop.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
+
     async def start(self, *steps: Mapping[str, Any]) -> None:
-        file = ExperimentFile.model_validate({"name": "test", "torque_source": WRENCH, "steps": list(steps)})
-        starting = asyncio.create_task(self.runner.start(file))
+        starting = asyncio.create_task(self.runner.start(experiment(*steps)))
         while not starting.done():
             await self.cycles(1)
         assert starting.result() is None

@@ -1,3 +1,4 @@
+import math
 from typing import Any
 
 import pytest
@@ -46,14 +47,17 @@ class Bench:
     def measure(self, torque_nm: float | None, age_s: float = 0.3) -> object:
         return self.controller.measure(torque_nm, self.t_ns - int(age_s * 1e9), self.t_ns)
 
+    def seen_rad(self) -> float:
+        """Return the mean angle of the half second that has ended 50 ms ago, NaN where it is not known."""
+        mean = self.controller.estimator.angles.mean(self.t_ns - 550_000_000, self.t_ns - 50_000_000)
+        return math.nan if mean is None else mean
+
     def measured_for(self, seconds: float, stiffness: float = 0.25, origin_rad: float = 0.3) -> list[float]:
         """Advance, with a perfect measurement of a spring every half second."""
         speeds = []
         for _ in range(round(seconds / 0.5)):
             speeds += self.advance(0.5)
-            middle = self.controller.estimator.angles.mean(self.t_ns - 550_000_000, self.t_ns - 50_000_000)
-            if middle is not None:
-                self.measure(stiffness * (middle - origin_rad))
+            self.measure(stiffness * (self.seen_rad() - origin_rad))
         return speeds
 
 

@@ -7,12 +7,11 @@ from typing import Any
 import pytest
 
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.control.runner import WRENCH, along_tool
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.control.step_runner import ExperimentPhase
 from shearloop.drivers.ur.messages import MoveLinear, Stop, WristSpeed
-from tests.daemon.control.cell import GRIP, MOVE, TWIST, driven, no_tick
+from tests.daemon.control.cell import GRIP, MOVE, TWIST, driven, experiment, no_tick
 from tests.drivers.ur.flight import SETTINGS
 
 
@@ -47,8 +46,7 @@ async def test_a_gripper_that_does_not_open_after_a_stop_is_told_until_the_opera
     async with driven() as cell:
         await cell.start({"do": "wait", "wait_s": 60})
         cell.gripper.answers = answer
-        now_ns = cell.robot.flight.now_ns
-        cell.control_loop.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
+        cell.exceed_torque()
         await cell.until_ended(10)
         await cell.cycles(50)
         assert "the gripper did not open" in cell.published.reasons
@@ -94,9 +92,7 @@ async def test_a_straight_move_that_is_paused_brakes_and_goes_on_to_its_end() ->
 
 async def test_a_straight_move_is_not_begun_while_the_experiment_is_paused() -> None:
     async with driven() as cell:
-        starting = asyncio.create_task(
-            cell.runner.start(ExperimentFile.model_validate({"name": "test", "torque_source": WRENCH, "steps": [MOVE]}))
-        )
+        starting = asyncio.create_task(cell.runner.start(experiment(MOVE)))
         while not starting.done():
             await cell.cycles(1)
             cell.control_loop.pause()
@@ -159,8 +155,7 @@ async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch
             return "it did not open"
 
         monkeypatch.setattr(cell.gripper, "release", at_length)
-        now_ns = cell.robot.flight.now_ns
-        cell.control_loop.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
+        cell.exceed_torque()
         await cell.until_ended(10)
         await heard.wait()
         tick = cell.control_loop.tick
@@ -206,7 +201,7 @@ async def test_what_stopped_the_arm_is_not_enabled_again_by_a_start_that_is_refu
         await cell.start(TWIST)
         await cell.cycles(10)
         before = len(cell.robot.commands)
-        file = ExperimentFile.model_validate({"name": "other", "torque_source": WRENCH, "steps": [MOVE]})
+        file = experiment(MOVE)
         assert "is still running" in (await cell.runner.start(file) or "")
         assert all(isinstance(command, WristSpeed) for command in cell.robot.commands[before:])
 
@@ -300,12 +295,14 @@ async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none()
         await cell.cycles(20)
         cell.control_loop.on_link("robot", "The robot's process died of SIGKILL.", up=False)
         cell.robot.die(50)
+        await asyncio.sleep(0)
         cell.runner.decide_now()
         assert cell.phase is ExperimentPhase.STOPPED
         assert "a command was refused" not in cell.why
         assert "ended before it answered" in cell.why
         assert cell.why.endswith("once the robot is connected again, `shearloop command unlock`.")
         # Neither was the stop that comes next, of which there is nobody to hear.
+        await asyncio.sleep(0)
         cell.runner.decide_now()
         told = " ".join(cell.control_loop.status.decision.reasons)
         assert "not connected" in told

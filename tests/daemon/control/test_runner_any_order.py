@@ -9,12 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.daemon.control.runner import WRENCH
 from shearloop.daemon.control.safety import Response
 from shearloop.daemon.control.step_runner import ExperimentPhase
-from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, driven
+from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, driven, experiment
 
 TURN = {"do": "turn_to", "angle_rad": 0.5}
 # A stop, and what a program that is resumed at the pendant does until its watchdog ends it, takes less, in cycles.
@@ -62,7 +59,7 @@ class Story:
             await self.go(1)
 
     async def start(self, *steps: dict[str, Any]) -> None:
-        file = ExperimentFile.model_validate({"name": "any", "torque_source": WRENCH, "steps": list(steps)})
+        file = experiment(*steps)
         await self.within(self.cell.runner.start(file), 100)
 
     async def mend(self) -> None:
@@ -90,10 +87,6 @@ class Story:
         if self.arm.reading.runtime_state == 4:
             self.arm.be_resumed_at_the_pendant()
             self.excused = EXCUSED_FOR
-
-    def beyond(self) -> None:
-        now_ns = self.cell.robot.flight.now_ns
-        self.cell.control_loop.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
 
     def process_dies(self) -> None:
         self.cell.robot.die(50)
@@ -126,7 +119,7 @@ HAPPENINGS: dict[str, Callable[[Story], Any]] = {
     "the robot's process dies": lambda story: story.process_dies(),
     "a task dies": lambda story: story.cell.died.update(right="it died"),
     "the loop dies": lambda story: story.tick_dies(),
-    "torque beyond its limit": lambda story: story.beyond(),
+    "torque beyond its limit": lambda story: story.cell.exceed_torque(),
     "pushed": lambda story: story.arm.be(wrench=(100.0, 0.0, 0.0, 0.0, 0.0, 0.0)),
 }
 

@@ -5,8 +5,6 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.daemon.control.runner import WRENCH
 from tests.daemon.control.cell import GRIP, Cell, driven, no_tick
 
 
@@ -56,8 +54,7 @@ async def test_a_stop_after_a_grip_leaves_the_fingers_alone() -> None:
 
 async def test_a_stop_that_lets_the_tool_go_in_the_middle_of_a_grip_opens_the_fingers() -> None:
     async with gripping() as cell:
-        now_ns = cell.robot.flight.now_ns
-        cell.control_loop.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
+        cell.exceed_torque()
         await cell.cycles(20)
         assert cell.gripper.asked == ["grip", "grip"], "the second one wide open"
 

@@ -16,7 +16,6 @@ from tests.daemon.emulate_rig.rig import (
     COUNTS,
     DEADLINE_S,
     Reader,
-    RigProcess,
     arm_at,
     grip,
     kit_at,
@@ -29,7 +28,7 @@ from tests.running import LinkEvents
 pytestmark = pytest.mark.real_time
 
 
-async def test_disturbances_reach_the_tool_and_robot_faults_the_robot(rig: RigProcess) -> None:
+async def test_disturbances_reach_the_tool_and_robot_faults_the_robot(rig):
     async with AsyncExitStack() as stack:
         gripper = await stack.enter_async_context(open_gripper_at(rig))
         load = await stack.enter_async_context(Reader(LoadCell(COUNTS, path=rig.run_dir / "load-cell").readings()))
@@ -60,7 +59,7 @@ async def test_disturbances_reach_the_tool_and_robot_faults_the_robot(rig: RigPr
         await rig.fault("joint lever")
 
 
-async def test_gripper_faults_reach_the_gripper(rig: RigProcess) -> None:
+async def test_gripper_faults_reach_the_gripper(rig):
     async with asyncio.timeout(DEADLINE_S), open_gripper_at(rig) as gripper:
         await grip(gripper)
         await rig.fault("gripper drop")
@@ -91,7 +90,7 @@ async def _read_on(gripper: RobotiqGripper) -> None:
         await gripper.read()
 
 
-async def test_boards_fall_silent_vanish_and_come_back(rig: RigProcess) -> None:
+async def test_boards_fall_silent_vanish_and_come_back(rig):
     async with AsyncExitStack() as stack:
         told, losses = LinkEvents(), LinkEvents()
         kit, other = kit_at(rig, "right", told), kit_at(rig, "left")

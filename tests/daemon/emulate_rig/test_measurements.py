@@ -3,7 +3,6 @@
 import json
 import signal
 from contextlib import AsyncExitStack
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,9 +31,7 @@ from tests.daemon.emulate_rig.rig import (
 pytestmark = pytest.mark.real_time
 
 
-async def test_a_twist_is_felt_by_load_cell_wrench_and_both_fingertips_and_is_gone_with_the_grip(
-    rig: RigProcess,
-) -> None:
+async def test_a_twist_is_felt_by_load_cell_wrench_and_both_fingertips_and_is_gone_with_the_grip(rig):
     async with AsyncExitStack() as stack:
         arm = await stack.enter_async_context(arm_at(rig))
         gripper = await stack.enter_async_context(open_gripper_at(rig))
@@ -76,7 +73,7 @@ async def test_a_twist_is_felt_by_load_cell_wrench_and_both_fingertips_and_is_go
         assert abs(sigma_of(await mean_of(right) - free[0])) < 0.02
 
 
-async def test_the_modbus_gripper_the_papers_sketch_a_sigma_and_the_truth_in_a_file(bank: Path, tmp_path: Path) -> None:
+async def test_the_modbus_gripper_the_papers_sketch_a_sigma_and_the_truth_in_a_file(bank, tmp_path):
     run_dir, truth = tmp_path / "run", tmp_path / "truth.jsonl"
     arguments = ("--bank", str(bank), "--run-dir", str(run_dir), *PACE, "--gripper", "modbus", "--paper-sketch")
     others = ("--truth", str(truth), "--sigma", "2.0", "1.3")

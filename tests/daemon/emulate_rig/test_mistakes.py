@@ -1,7 +1,5 @@
 """What `shearloop emulate rig` says of arguments and commands that are none."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -27,9 +25,7 @@ from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings
         (["--host", "192.0.2.1"], "the rig cannot be played on 192.0.2.1"),
     ],
 )
-def test_mistakes_are_told(
-    arguments: list[str], sentence: str, bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_are_told(arguments, sentence, bank, tmp_path, capsys):
     assert main(["emulate", "rig", "--bank", str(bank), "--run-dir", str(tmp_path), *arguments]) == 2
     complaint = capsys.readouterr().err
     assert sentence in complaint
@@ -55,7 +51,7 @@ class Blank:
         ("gripper fault 99", "'99' is not a fault code"),
     ],
 )
-def test_what_is_no_command_is_said_to_be_none(line: str, sentence: str, tmp_path: Path) -> None:
+def test_what_is_no_command_is_said_to_be_none(line, sentence, tmp_path):
     rig = EmulatedRig(RigSettings(run_dir=tmp_path), Blank())
     with pytest.raises(ValueError, match=sentence):
         rig.command(line)

@@ -3,11 +3,10 @@ import os
 import socket
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import zmq
@@ -18,14 +17,11 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.health import HealthReporter
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer, RateLimit
 from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.rig import Rig
-from shearloop.daemon.sensors import Sensors
 
 
 def handlers() -> Mapping[str, Any]:
@@ -54,7 +50,7 @@ class Unbound(CommandServer):
         return ready if isinstance(ready, dict) else await self.execute(*ready)
 
 
-async def test_each_request_gets_one_reply() -> None:
+async def test_each_request_gets_one_reply():
     server = Unbound()
     assert await server.reply(encode({"command": "tare"})) == {"ok": True, "tared": ["right"]}
     for request, why in (
@@ -66,7 +62,7 @@ async def test_each_request_gets_one_reply() -> None:
     assert server.refused == {"tare refused": 1, "unknown command": 1, "malformed request": 1}
 
 
-async def test_req_and_dealer_clients_are_answered() -> None:
+async def test_req_and_dealer_clients_are_answered():
     with zmq.asyncio.Context() as context:
         server = CommandServer(context, "tcp://127.0.0.1:*", handlers(), Refusals())
         address = server._socket.getsockopt_string(zmq.LAST_ENDPOINT)
@@ -81,12 +77,12 @@ async def test_req_and_dealer_clients_are_answered() -> None:
         server.close()
 
 
-def test_a_missing_daemon_is_an_error() -> None:
+def test_a_missing_daemon_is_an_error():
     with pytest.raises(UserError, match=r"no daemon answered at ipc:///nowhere-at-all within 0.01 s; start it with"):
         send_command("ipc:///nowhere-at-all", {"command": "status"}, 0.01)
 
 
-def test_an_address_in_use_is_an_error() -> None:
+def test_an_address_in_use_is_an_error():
     with zmq.Context() as context, context.socket(zmq.PUB) as taken:
         taken.bind("tcp://127.0.0.1:*")
         address = taken.getsockopt_string(zmq.LAST_ENDPOINT)
@@ -96,14 +92,14 @@ def test_an_address_in_use_is_an_error() -> None:
             Publisher(context, "carrier-pigeon", Clock())
 
 
-async def test_a_failing_handler_is_a_refusal() -> None:
+async def test_a_failing_handler_is_a_refusal():
     server = Unbound()
     assert "unlock failed (ZeroDivisionError" in (await server.reply(encode({"command": "unlock"})))["reason"]
     assert server.refused == {"unlock failed": 1}
     assert (await server.reply(encode({"command": "tare"})))["ok"]
 
 
-def test_binding_to_ipc_keeps_files_and_running_daemons(tmp_path: Path) -> None:
+def test_binding_to_ipc_keeps_files_and_running_daemons(tmp_path):
     letter = tmp_path / "letter.txt"
     letter.write_text("dear reader")
     with zmq.Context() as context:
@@ -116,14 +112,14 @@ def test_binding_to_ipc_keeps_files_and_running_daemons(tmp_path: Path) -> None:
         first.close()
 
 
-def test_the_socket_of_a_killed_daemon_is_reused(tmp_path: Path) -> None:
+def test_the_socket_of_a_killed_daemon_is_reused(tmp_path):
     with socket.socket(socket.AF_UNIX) as killed:
         killed.bind(os.fspath(tmp_path / "publish"))
     with zmq.Context() as context:
         Publisher(context, f"ipc://{tmp_path}/publish", Clock()).close()
 
 
-def test_foreign_messages_are_an_error(tmp_path: Path) -> None:
+def test_foreign_messages_are_an_error(tmp_path):
     with zmq.Context() as context, context.socket(zmq.XPUB) as stranger:
         stranger.bind(f"ipc://{tmp_path}/stranger")
         for content in ([b"one frame"], [b"a", b"\xc1"], [b"a", encode({"timestamp": 1.0})], [b"1", b"2", b"3"]):
@@ -136,7 +132,7 @@ def test_foreign_messages_are_an_error(tmp_path: Path) -> None:
             stranger.recv()
 
 
-async def test_only_heatmap_can_be_set(config: Callable[..., Path]) -> None:
+async def test_only_heatmap_can_be_set(config):
     with zmq.asyncio.Context() as context:
         daemon = Daemon(load_daemon_config(config()), context)
         change = daemon.commands.handlers()["set"]
@@ -156,15 +152,15 @@ async def test_only_heatmap_can_be_set(config: Callable[..., Path]) -> None:
         daemon._close()
 
 
-async def test_tare_is_refused_during_an_experiment() -> None:
+async def test_tare_is_refused_during_an_experiment():
     tared: list[str] = []
     experiment = SimpleNamespace(running=True, file=SimpleNamespace(name="hold"))
     sensors = {name: SimpleNamespace(tare=partial(tared.append, name)) for name in ("right", "load_cell")}
     commands = Commands(
-        rig=cast("Rig", SimpleNamespace(control_loop=SimpleNamespace(experiment=experiment))),
-        sensors=cast("Sensors", SimpleNamespace(tareable=lambda: sensors)),
+        rig=SimpleNamespace(control_loop=SimpleNamespace(experiment=experiment)),
+        sensors=SimpleNamespace(tareable=lambda: sensors),
         experiment=None,
-        health=cast("HealthReporter", None),
+        health=None,
         stop=asyncio.Event(),
     )
     tare = commands.handlers()["tare"]

@@ -13,7 +13,6 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.health import resident_memory_mb
 from shearloop.daemon.messaging import command_server
@@ -21,6 +20,7 @@ from shearloop.daemon.messaging.command_server import RateLimit
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import CommandReply
+from tests.daemon.conftest import running_daemon
 
 FRAMES = REQUESTS = 50_000
 DEADLINE_S = 120
@@ -99,9 +99,7 @@ class Arm:
         monkeypatch.setattr(UrRobot, "send", send)
 
 
-async def test_a_flood_of_malformed_frames_and_requests(
-    config: Callable[..., Path], tiny_bank: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_flood_of_malformed_frames_and_requests(config, tiny_bank, monkeypatch):
     arm = Arm(monkeypatch)
     board, port = os.openpty()
     tty.setraw(port)
@@ -114,47 +112,35 @@ async def test_a_flood_of_malformed_frames_and_requests(
         published[topic] += 1
         told.set()
 
-    with zmq.asyncio.Context() as context:
-        configuration = load_daemon_config(path)
-        daemon = Daemon(configuration, context)
+    async with running_daemon(path) as daemon:
         daemon.publisher.add_listener(count)
-        running = asyncio.create_task(daemon.run())
-        try:
-            async with asyncio.timeout(DEADLINE_S):
-                address = configuration.commands
-                await asyncio.to_thread(exchange, address, malformed_requests(200))
-                before_mb, tasks = resident_memory_mb(), len(asyncio.all_tasks())
-                replies, _ = await asyncio.gather(
-                    asyncio.to_thread(exchange, address, malformed_requests(REQUESTS)),
-                    asyncio.to_thread(write_all, board, malformed_frames(FRAMES)),
-                )
-                while (
-                    refused := sum(daemon.sensors.fingertips["right"].diagnostics()["errors"].values())
-                ) < FRAMES - 1:
-                    told.clear()
-                    await told.wait()
-            assert replies == {False: REQUESTS}, "each is answered, and none is carried out"
-            refusals = daemon.health.tasks()["commands"]["errors"]
-            assert isinstance(refusals, dict)
-            assert sum(refusals.values()) == REQUESTS + 200
-            assert set(refusals) <= {"malformed request", "unknown command", "too many requests"}
-            assert refused <= FRAMES
-            assert published["eit.estimate"] == published["eit.frame"] == 0
-            assert arm.told == [], "nothing was asked of the robot"
-            assert daemon._rig is not None
-            assert daemon._rig.control_loop.experiment is None
-            assert not daemon.supervisor.dead
-            assert all(record.restarts == 0 for record in daemon.supervisor.records.values())
-            assert resident_memory_mb() - before_mb < MOST_GROWTH_MB
-            assert len(asyncio.all_tasks()) <= tasks + command_server.MAX_CONCURRENT
-            status = await asyncio.to_thread(exchange, address, iter([[encode({"command": "stop"})]]))
-            assert status == {True: 1}, "stop is heard in the middle of it all"
-            await daemon._stop.wait()
-        finally:
-            daemon.stop()
-            await running
-            os.close(port)
-            os.close(board)
+        address = load_daemon_config(path).commands
+        await asyncio.to_thread(exchange, address, malformed_requests(200))
+        before_mb, tasks = resident_memory_mb(), len(asyncio.all_tasks())
+        replies, _ = await asyncio.gather(
+            asyncio.to_thread(exchange, address, malformed_requests(REQUESTS)),
+            asyncio.to_thread(write_all, board, malformed_frames(FRAMES)),
+        )
+        while (refused := sum(daemon.sensors.fingertips["right"].diagnostics()["errors"].values())) < FRAMES - 1:
+            told.clear()
+            await told.wait()
+        assert replies == {False: REQUESTS}, "each is answered, and none is carried out"
+        refusals = daemon.health.tasks()["commands"]["errors"]
+        assert sum(refusals.values()) == REQUESTS + 200
+        assert set(refusals) <= {"malformed request", "unknown command", "too many requests"}
+        assert refused <= FRAMES
+        assert published["eit.estimate"] == published["eit.frame"] == 0
+        assert arm.told == [], "nothing was asked of the robot"
+        assert daemon._rig.control_loop.experiment is None
+        assert not daemon.supervisor.dead
+        assert all(record.restarts == 0 for record in daemon.supervisor.records.values())
+        assert resident_memory_mb() - before_mb < MOST_GROWTH_MB
+        assert len(asyncio.all_tasks()) <= tasks + command_server.MAX_CONCURRENT
+        status = await asyncio.to_thread(exchange, address, iter([[encode({"command": "stop"})]]))
+        assert status == {True: 1}, "stop is heard in the middle of it all"
+        await daemon._stop.wait()
+    os.close(port)
+    os.close(board)
 
 
 def exchange(address: str, requests: Iterator[list[bytes]]) -> Counter[bool]:
@@ -186,7 +172,7 @@ def write_all(board: int, lines: Iterator[bytes]) -> None:
         batch = batch[os.write(board, batch) :]
 
 
-def test_the_rate_limit_of_a_client_recovers() -> None:
+def test_the_rate_limit_of_a_client_recovers():
     limit = RateLimit()
     allowed = [limit.allow(b"loud", 0) for _ in range(1000)]
     assert sum(allowed) == command_server.CLIENT_BURST
@@ -194,7 +180,7 @@ def test_the_rate_limit_of_a_client_recovers() -> None:
     assert sum(limit.allow(b"loud", 10**9) for _ in range(1000)) == command_server.CLIENT_PER_S
 
 
-def test_many_clients_share_the_total_limit() -> None:
+def test_many_clients_share_the_total_limit():
     limit = RateLimit()
     allowed = sum(limit.allow(b"%d" % number, number * 1000) for number in range(100_000))
     assert allowed <= command_server.TOTAL_BURST + 0.1 * command_server.TOTAL_PER_S + 1

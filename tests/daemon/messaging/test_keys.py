@@ -1,6 +1,5 @@
 """CURVE on anything but loopback and ipc, keys by `shearloop keys`, an allow-list, and no way round them."""
 
-import asyncio
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,17 +9,14 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import main
-from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import has_valid_port, is_local, local_stop_address, needs_keys
-from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import ClientKeys, KeyPair, load_key_pair, load_public_key, load_server_keys
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import bind
+from tests.daemon.conftest import running_daemon
 
-Write = Callable[..., Path]
 NETWORK = "tcp://0.0.0.0:*"
 # How long somebody is waited for who is not to be heard.
 SILENCE_MS = 300
@@ -45,7 +41,7 @@ def ada(folder: Path) -> ClientKeys:
     return ClientKeys(load_key_pair(folder / "ada/client.key_secret"), load_public_key(folder / "keys/server.key"))
 
 
-def test_local_and_network_addresses() -> None:
+def test_local_and_network_addresses():
     for address in ("tcp://127.0.0.1:1", "tcp://[::1]:1", "ipc:///run/x", "ipc://@x"):
         assert is_local(address), address
     for address in ("tcp://0.0.0.0:1", "tcp://*:1", "tcp://10.0.0.1:1", "tcp://pc:1", "tcp://127.0.0.1:1;0.0.0.0:2"):
@@ -54,7 +50,7 @@ def test_local_and_network_addresses() -> None:
     assert needs_keys("tcp://pc:1")
 
 
-def test_valid_ports() -> None:
+def test_valid_ports():
     for address in ("tcp://127.0.0.1:1", "tcp://[::1]:65535", "tcp://0.0.0.0:*", "ipc:///run/x", "ipc://@x:70000"):
         assert has_valid_port(address), address
     for port in ("65536", "70000", "0000070000", "7761a", "-1", "", "²", "1" * 5000):
@@ -65,13 +61,13 @@ def test_valid_ports() -> None:
 
 
 @pytest.mark.parametrize("command", ["run", "check"])
-def test_a_network_address_needs_keys(command: str, config: Write, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_network_address_needs_keys(command, config, capsys):
     for key in ("publish", "commands"):
         assert main([command, str(config(**{key: "tcp://0.0.0.0:7769"}))]) == 2
         assert f"`{key}: tcp://0.0.0.0:7769` would open the robot to the network" in capsys.readouterr().err
 
 
-def test_a_network_address_needs_existing_keys(config: Write, keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_network_address_needs_existing_keys(config, keys, capsys):
     missing = {"server_key": str(keys / "none.key_secret"), "clients": str(keys / "keys/clients")}
     path = str(config(commands=NETWORK, curve=missing))
     for command in ("run", "check"):
@@ -107,63 +103,43 @@ def address_of(socket: Any) -> str:
     return str(socket.getsockopt_string(zmq.LAST_ENDPOINT)).replace("//0.0.0.0:", "//127.0.0.1:")
 
 
-def server(daemon: Daemon, name: str) -> CommandServer:
-    task = daemon._tasks[name]
-    assert isinstance(task, CommandServer)
-    return task
-
-
-async def test_only_allowed_clients_connect_and_only_encrypted(
-    config: Write, keys: Path, connect: Callable[..., Any]
-) -> None:
+async def test_only_allowed_clients_connect_and_only_encrypted(config, keys, connect):
     path = config(publish=NETWORK, commands=NETWORK, curve=curve(keys))
-    with zmq.asyncio.Context() as context:
-        daemon = Daemon(load_daemon_config(path), context)
-        running = asyncio.create_task(daemon.run())
-        try:
-            commands, published = address_of(server(daemon, "commands")._socket), address_of(daemon.publisher._socket)
-            known = ada(keys)
-            async with asyncio.timeout(60):
-                asking = connect(zmq.DEALER, commands, known)
-                await asking.send(encode({"command": "status"}))
-                assert decode(await asking.recv())["ok"]
-                topic, _ = await connect(zmq.SUB, published, known).recv_multipart()
-                assert topic == b"health"
-            strangers = {
-                "in the clear": None,
-                "a key that is not allowed": ClientKeys(KeyPair(*zmq.curve_keypair()), known.server_public),
-                "a server that is not ours": ClientKeys(known.own, zmq.curve_keypair()[0]),
-            }
-            for who, stranger in strangers.items():
-                asking, hearing = connect(zmq.DEALER, commands, stranger), connect(zmq.SUB, published, stranger)
-                await asking.send(encode({"command": "status"}))
-                assert not await asking.poll(SILENCE_MS), who
-                assert not await hearing.poll(0), who
-            assert daemon.health.tasks()["commands"]["errors"]["key is not allowed"] >= 1
-            await _stop_without_a_key(daemon, connect)
-        finally:
-            daemon.stop()
-            await running
+    async with running_daemon(path) as daemon:
+        commands = address_of(daemon._tasks["commands"]._socket)
+        published = address_of(daemon.publisher._socket)
+        known = ada(keys)
+        asking = connect(zmq.DEALER, commands, known)
+        await asking.send(encode({"command": "status"}))
+        assert decode(await asking.recv())["ok"]
+        topic, _ = await connect(zmq.SUB, published, known).recv_multipart()
+        assert topic == b"health"
+        strangers = {
+            "in the clear": None,
+            "a key that is not allowed": ClientKeys(KeyPair(*zmq.curve_keypair()), known.server_public),
+            "a server that is not ours": ClientKeys(known.own, zmq.curve_keypair()[0]),
+        }
+        for who, stranger in strangers.items():
+            asking, hearing = connect(zmq.DEALER, commands, stranger), connect(zmq.SUB, published, stranger)
+            await asking.send(encode({"command": "status"}))
+            assert not await asking.poll(SILENCE_MS), who
+            assert not await hearing.poll(0), who
+        assert daemon.health.tasks()["commands"]["errors"]["key is not allowed"] >= 1
+        anyone = connect(zmq.DEALER, address_of(daemon._tasks["open_stop"]._socket), None)
+        for name in ("start", "resume", "unlock", "tare", "pause"):
+            await anyone.send(encode({"command": name}))
+            assert "this command needs a key" in decode(await anyone.recv())["reason"]
+        await anyone.send(encode({"command": "stop"}))
+        assert decode(await anyone.recv())["ok"]
+        await daemon._stop.wait()
 
 
-async def _stop_without_a_key(daemon: Daemon, connect: Callable[..., Any]) -> None:
-    anyone = connect(zmq.DEALER, address_of(server(daemon, "open_stop")._socket), None)
-    for name in ("start", "resume", "unlock", "tare", "pause"):
-        await anyone.send(encode({"command": name}))
-        assert "this command needs a key" in decode(await anyone.recv())["reason"]
-    await anyone.send(encode({"command": "stop"}))
-    assert decode(await anyone.recv())["ok"]
-    await daemon._stop.wait()
-
-
-def test_the_local_stop_socket_is_named_by_the_port() -> None:
+def test_the_local_stop_socket_is_named_by_the_port():
     for address in ("tcp://0.0.0.0:7762", "tcp://127.0.0.1:7762"):
         assert local_stop_address(address) == "ipc://@shearloop-stop-7762"
 
 
-def test_a_client_needs_keys_for_another_machine(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_client_needs_keys_for_another_machine(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     for command in (["listen"], ["command", "stop"]):
         assert main([*command, "--connect", "tcp://192.0.2.1:7761"]) == 2
@@ -173,7 +149,7 @@ def test_a_client_needs_keys_for_another_machine(
     assert "copy the daemon's server.key there" in capsys.readouterr().err
 
 
-def test_keys_are_made_listed_and_revoked(keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_keys_are_made_listed_and_revoked(keys, capsys):
     folder = keys / "keys"
     assert (folder / "server.key_secret").stat().st_mode & 0o777 == 0o600
     assert (folder / "clients/ada.key").stat().st_mode & 0o777 == 0o644
@@ -193,7 +169,7 @@ def test_keys_are_made_listed_and_revoked(keys: Path, capsys: pytest.CaptureFixt
     assert "no client may connect yet" in capsys.readouterr().out
 
 
-def test_a_damaged_key_is_an_error(keys: Path) -> None:
+def test_a_damaged_key_is_an_error(keys):
     secret = keys / "keys/server.key_secret"
     other = KeyPair(*zmq.curve_keypair())
     for text, part in (
@@ -207,9 +183,7 @@ def test_a_damaged_key_is_an_error(keys: Path) -> None:
             load_key_pair(secret)
 
 
-def test_a_systemd_credential_replaces_the_key_file(
-    keys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_systemd_credential_replaces_the_key_file(keys, tmp_path, monkeypatch):
     handed = tmp_path / "handed"
     handed.mkdir()
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(handed))
@@ -221,6 +195,6 @@ def test_a_systemd_credential_replaces_the_key_file(
         load_server_keys(Path("/etc/shearloop/keys/server.key_secret"))
 
 
-def test_repr_hides_the_secret_key() -> None:
+def test_repr_hides_the_secret_key():
     pair = KeyPair(*zmq.curve_keypair())
     assert pair.secret.decode() not in repr(pair)

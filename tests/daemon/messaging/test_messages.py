@@ -18,21 +18,21 @@ def heatmap(scores: np.ndarray) -> Message:
 
 
 @given(ARRAYS)
-def test_arrays_round_trip(scores: np.ndarray) -> None:
+def test_arrays_round_trip(scores):
     content = decode(encode(wire_map(heatmap(scores), timestamp=1.5, seq=3)))
     np.testing.assert_array_equal(content["scores"], scores)
     assert "scores_shape" not in content
     assert (content["timestamp"], content["seq"], content["source"], content["t_mono_ns"]) == (1.5, 3, "right", 5)
 
 
-def test_an_array_is_bin_with_a_shape_key() -> None:
+def test_an_array_is_bin_with_a_shape_key():
     content = wire_map(heatmap(np.array([[0.25, np.nan]])), timestamp=0.0, seq=0)
     assert content["scores"] == np.array([0.25, np.nan], "<f4").tobytes()
     assert content["scores_shape"] == [1, 2]
 
 
 @given(st.lists(st.floats(), max_size=8))
-def test_a_tuple_is_encoded_like_an_array(numbers: list[float]) -> None:
+def test_a_tuple_is_encoded_like_an_array(numbers):
     with np.errstate(over="ignore"):
         array = np.array(numbers).astype("<f4")
     content = wire_map(sample(RobotStateMessage, joints_rad=tuple(numbers)), 0.0, 0)
@@ -41,12 +41,12 @@ def test_a_tuple_is_encoded_like_an_array(numbers: list[float]) -> None:
 
 
 @given(st.dictionaries(st.text().filter(lambda key: not key.endswith("_shape")), SCALARS))
-def test_scalars_round_trip(content: dict[str, object]) -> None:
+def test_scalars_round_trip(content):
     assert decode(encode(content)) == content
 
 
 @given(st.binary(max_size=300))
-def test_foreign_bytes_raise_a_value_error(payload: bytes) -> None:
+def test_foreign_bytes_raise_a_value_error(payload):
     try:
         content = decode(payload)
     except ValueError:
@@ -54,14 +54,14 @@ def test_foreign_bytes_raise_a_value_error(payload: bytes) -> None:
     assert all(isinstance(key, str) for key in content)
 
 
-def test_a_wrong_shape_is_refused() -> None:
+def test_a_wrong_shape_is_refused():
     with pytest.raises(ValueError, match="'scores' does not fit its shape"):
         decode(encode({"scores": b"\0" * 8, "scores_shape": [3]}))
     with pytest.raises(ValueError, match="does not fit"):
         decode(encode({"scores": 1.0, "scores_shape": [1]}))
 
 
-def test_every_key_of_every_topic_is_documented() -> None:
+def test_every_key_of_every_topic_is_documented():
     for topic, kind in TOPICS.items():
         assert kind.topic == topic
         assert kind.__doc__

@@ -67,7 +67,7 @@ def frames(tmp_path: Path) -> dict[str, list[bytes]]:
     return received
 
 
-def test_plotjuggler_ignores_the_topic_and_parses_the_map(frames: dict[str, list[bytes]]) -> None:
+def test_plotjuggler_ignores_the_topic_and_parses_the_map(frames):
     assert set(frames) == set(TOPICS) - {"eit.frame"}
     for topic, (name, payload) in frames.items():
         assert name == topic.encode(), "so that its topic filter finds it"
@@ -77,7 +77,7 @@ def test_plotjuggler_ignores_the_topic_and_parses_the_map(frames: dict[str, list
         assert parsed(topic.encode()) is None
 
 
-def test_each_scalar_is_a_series_and_no_array_is(frames: dict[str, list[bytes]]) -> None:
+def test_each_scalar_is_a_series_and_no_array_is(frames):
     for given in MESSAGES.values():
         kind: type[Message] = given["kind"]
         series = dict(plotted(parsed(frames[kind.topic][1])))

@@ -46,7 +46,7 @@ def connect(tmp_path: Path) -> Iterator[Connect]:
         yield connected
 
 
-def test_the_publisher_knows_the_subscribed_topics(publisher: Publisher, connect: Connect) -> None:
+def test_the_publisher_knows_the_subscribed_topics(publisher, connect):
     assert not publisher.has_subscriber("eit.heatmap")
     with connect("eit.") as one, connect("eit.heatmap"):
         until(lambda: publisher.has_subscriber("eit.heatmap") and publisher.has_subscriber("eit.frame"))
@@ -57,7 +57,7 @@ def test_the_publisher_knows_the_subscribed_topics(publisher: Publisher, connect
     until(lambda: not publisher.has_subscriber("eit.heatmap"))
 
 
-def test_an_unsendable_message_does_not_affect_the_next(publisher: Publisher, connect: Connect) -> None:
+def test_an_unsendable_message_does_not_affect_the_next(publisher, connect):
     with connect("health") as subscriber:
         until(lambda: publisher.has_subscriber("health"))
         with pytest.raises(TypeError):
@@ -67,7 +67,7 @@ def test_an_unsendable_message_does_not_affect_the_next(publisher: Publisher, co
         assert (topic, list(map(decode, payload))) == (b"health", [{"number": 1}])
 
 
-def test_subscriptions_to_unknown_topics_are_not_kept(publisher: Publisher, connect: Connect) -> None:
+def test_subscriptions_to_unknown_topics_are_not_kept(publisher, connect):
     with connect(kind=zmq.XSUB) as stranger:
         for number in range(300):
             stranger.send(b"\x01eit.%d" % number)
@@ -77,7 +77,7 @@ def test_subscriptions_to_unknown_topics_are_not_kept(publisher: Publisher, conn
         assert publisher._prefixes == (b"health",)
 
 
-def test_subscribers_come_and_go_while_messages_are_sent(publisher: Publisher, connect: Connect) -> None:
+def test_subscribers_come_and_go_while_messages_are_sent(publisher, connect):
     for _ in range(100):
         publisher.publish(sample(LoadTorque))
     with connect("load.") as one:
@@ -94,9 +94,7 @@ def test_subscribers_come_and_go_while_messages_are_sent(publisher: Publisher, c
     until(lambda: not publisher.has_subscribers())
 
 
-def test_a_subscriber_is_warned_once_and_receives_a_later_daemon(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_subscriber_is_warned_once_and_receives_a_later_daemon(tmp_path, monkeypatch):
     monkeypatch.setattr("shearloop.daemon.messaging.client.QUIET_S", 0.02)
     address, told = f"ipc://{tmp_path}/publish", []
     content = {"timestamp": 1.0, "t_mono_ns": 2, "source": "daemon"}

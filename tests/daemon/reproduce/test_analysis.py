@@ -1,5 +1,4 @@
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,7 +45,7 @@ def analysed(signals: NDArray, bank, columns: list[int], torque: list[float]) ->
     return analyse_torque(slices, matches, matches)
 
 
-def test_torque_is_related_to_the_sigma_of_the_best_match(signals: NDArray, bank) -> None:
+def test_torque_is_related_to_the_sigma_of_the_best_match(signals, bank):
     columns = [6, 5, 3, 1, 7, 6, 4, 2, 0, 7, 6, 4, 1, 1]  # three series, the first without its lowest level
     torque = [0.02, 0.04, 0.06, 0.08, 0.01, 0.021, 0.041, 0.061, 0.081, 0.011, 0.019, 0.039, 0.061, 0.079]
     found = analysed(signals, bank, columns, torque)
@@ -68,7 +67,7 @@ def test_torque_is_related_to_the_sigma_of_the_best_match(signals: NDArray, bank
     assert found.notes == ()
 
 
-def test_slices_that_are_no_repeats_are_grouped_by_torque(signals: NDArray, bank) -> None:
+def test_slices_that_are_no_repeats_are_grouped_by_torque(signals, bank):
     columns = [4, 1, 7, 2, 5, 0, 3, 6, 6, 1]
     torque = [0.03, 0.06, 0.0, 0.05, 0.02, 0.07, 0.04, 0.01, 0.011, 0.061]
     found = analysed(signals, bank, columns, torque)
@@ -78,14 +77,14 @@ def test_slices_that_are_no_repeats_are_grouped_by_torque(signals: NDArray, bank
     assert found.rmse_nm < 0.005
 
 
-def test_what_the_slices_do_not_determine_is_none_and_said(signals: NDArray, bank) -> None:
+def test_what_the_slices_do_not_determine_is_none_and_said(signals, bank):
     found = analysed(signals, bank, [4, 4, 4], [0.01, 0.02, 0.03])
     assert (found.r_focused, found.r_clustered, found.fit, found.rmse_nm) == (None, None, None, None)
     assert any("too alike for a correlation" in note for note in found.notes)
     assert any("no fit of torque over sigma" in note for note in found.notes)
 
 
-def test_diameter_is_related_to_the_k_of_the_best_match(signals: NDArray, bank) -> None:
+def test_diameter_is_related_to_the_k_of_the_best_match(signals, bank):
     rows = [5, 5, 4, 2, 1]
     slices = slices_of(signals[rows, 4], [0.0] * 5, [10.0, 10.0, 20.0, 30.0, 30.0])
     found = analyse_diameter(slices, bank, lambda _: None)
@@ -97,20 +96,20 @@ def test_diameter_is_related_to_the_k_of_the_best_match(signals: NDArray, bank) 
     assert max(found.r_single, found.r_accumulated) < -0.9
 
 
-def test_two_diameters_make_no_correlation(signals: NDArray, bank) -> None:
+def test_two_diameters_make_no_correlation(signals, bank):
     slices = slices_of(signals[[5, 1], 4], [0.0] * 2, [10.0, 30.0])
     found = analyse_diameter(slices, bank, lambda _: None)
     assert (found.r_single, found.r_accumulated, found.fit) == (None, None, None)
     assert any("2 diameters" in note for note in found.notes)
 
 
-def test_a_correlation_needs_three_points_that_differ() -> None:
+def test_a_correlation_needs_three_points_that_differ():
     assert correlation(np.arange(3.0), -np.arange(3.0)) == pytest.approx(-1.0)
     assert correlation(np.arange(2.0), np.arange(2.0)) is None
     assert correlation(np.ones(5), np.arange(5.0)) is None
 
 
-def test_without_a_raw_frame_models_are_scored_by_the_matching(signals: NDArray, coarse_mesh: Mesh) -> None:
+def test_without_a_raw_frame_models_are_scored_by_the_matching(signals, coarse_mesh):
     slices = slices_of(signals[3, [4, 5]], [0.01, 0.02])
     scores = score_models(slices, None, coarse_mesh)
     assert scores.envelope is None
@@ -120,7 +119,7 @@ def test_without_a_raw_frame_models_are_scored_by_the_matching(signals: NDArray,
     assert set(silent.chosen.values()) == {None}
 
 
-def test_sigma_falls_with_torque_on_the_shared_slices(shared: Path) -> None:
+def test_sigma_falls_with_torque_on_the_shared_slices(shared):
     mesh = load_mesh(shared / "reference" / "fingertip_mesh.npz")
     slices = read_torque_slices(shared / "recordings" / "torque_slices")
     k, sigma = np.linspace(3.1, 3.4, 6), np.linspace(1.2, 1.9, 15)
@@ -132,7 +131,7 @@ def test_sigma_falls_with_torque_on_the_shared_slices(shared: Path) -> None:
     assert correlation(np.array(best), slices.torque_nm) == pytest.approx(-0.69073, abs=0.002)
 
 
-def test_the_focused_bank_is_the_paper_s_where_the_slices_match_there() -> None:
+def test_the_focused_bank_is_the_paper_s_where_the_slices_match_there():
     paper = GRIDS["focused"]
     k, sigma = np.linspace(3.11, 3.39, 50), np.linspace(1.21, 1.89, 50)
     assert focused_grid(k, sigma) is paper
@@ -140,7 +139,7 @@ def test_the_focused_bank_is_the_paper_s_where_the_slices_match_there() -> None:
     assert focused_grid(k, sigma) is paper, "a few chance matches move nothing"
 
 
-def test_the_focused_bank_moves_to_where_the_slices_match() -> None:
+def test_the_focused_bank_moves_to_where_the_slices_match():
     k, sigma = np.full(50, 3.68), np.linspace(1.0, 1.7, 50)
     sigma[0] = 4.0
     grid = focused_grid(k, sigma)
@@ -162,7 +161,7 @@ LEVELS = np.array([0.01, 0.03, 0.05, 0.06, 0.07, 0.08, 0.10, 0.11])
     lacking=st.dictionaries(st.integers(0, 8), st.integers(0, 7), max_size=4),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_series_are_found_though_some_lack_a_level(repeats: int, lacking: dict[int, int], seed: int) -> None:
+def test_series_are_found_though_some_lack_a_level(repeats, lacking, seed):
     # One repeat is complete; the others may lack any one level but the outermost together.
     lacking = {repeat: level for repeat, level in lacking.items() if 0 < repeat < repeats}
     places = [(repeat, level) for repeat in range(repeats) for level in range(8) if lacking.get(repeat) != level]
@@ -175,7 +174,7 @@ def test_series_are_found_though_some_lack_a_level(repeats: int, lacking: dict[i
 
 
 @given(drift=st.lists(st.floats(-0.02, 0.02), min_size=14, max_size=14), lacking=st.sampled_from([1, 2, 3, 4, 5, 6]))
-def test_beyond_half_a_spacing_the_nearest_rising_levels_are_taken(drift: list[float], lacking: int) -> None:
+def test_beyond_half_a_spacing_the_nearest_rising_levels_are_taken(drift, lacking):
     """By all ways there are: values that noise made change places stay in their order, and each has its own level."""
     lacks_two = [level for level in range(1, 8) if level != lacking]
     values = LEVELS[[*range(8), *lacks_two]] + drift
@@ -191,7 +190,7 @@ def test_beyond_half_a_spacing_the_nearest_rising_levels_are_taken(drift: list[f
     assert cost[tuple(found)] == pytest.approx(min(cost.values()), abs=1e-15)
 
 
-def test_a_value_nearer_to_a_level_that_its_series_lacks_goes_there() -> None:
+def test_a_value_nearer_to_a_level_that_its_series_lacks_goes_there():
     """Nothing tells them apart: 0.06 that reads 0.0549 is 0.05, where no other value is."""
     whole, lacking = LEVELS.tolist(), np.delete(LEVELS, 2).tolist()
     for reading, level in ((0.0551, 3), (0.0549, 2)):
@@ -201,7 +200,7 @@ def test_a_value_nearer_to_a_level_that_its_series_lacks_goes_there() -> None:
         assert series[0][8:15].tolist() == [0, 1, level, 4, 5, 6, 7]
 
 
-def test_in_a_whole_series_noise_moves_no_value_to_another_level() -> None:
+def test_in_a_whole_series_noise_moves_no_value_to_another_level():
     swapped = LEVELS.copy()
     swapped[[3, 4]] = 0.071, 0.059
     series = place_in_series(np.concatenate([LEVELS, swapped, LEVELS]))
@@ -220,11 +219,11 @@ def test_in_a_whole_series_noise_moves_no_value_to_another_level() -> None:
         np.array([0.1]),
     ],
 )
-def test_what_is_no_repeated_series_is_told(values: np.ndarray) -> None:
+def test_what_is_no_repeated_series_is_told(values):
     assert place_in_series(values) is None
 
 
-def test_kmeans_finds_groups_that_are_there_and_the_same_ones_each_time() -> None:
+def test_kmeans_finds_groups_that_are_there_and_the_same_ones_each_time():
     generator = np.random.default_rng(3)
     truth = generator.permutation(np.repeat(np.arange(4), 6))
     values = truth * 10.0 + generator.normal(size=24) * 0.5
@@ -233,6 +232,6 @@ def test_kmeans_finds_groups_that_are_there_and_the_same_ones_each_time() -> Non
     np.testing.assert_allclose(group_means(values, groups), [0, 10, 20, 30], atol=1)
 
 
-def test_kmeans_takes_as_many_groups_as_there_are_values() -> None:
+def test_kmeans_takes_as_many_groups_as_there_are_values():
     assert kmeans_groups(np.array([1.0, 1.0, 5.0]), 2).tolist() == [0, 0, 1]
     assert kmeans_groups(np.ones(3), 1).tolist() == [0, 0, 0]

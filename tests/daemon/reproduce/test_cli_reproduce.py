@@ -1,6 +1,5 @@
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -26,16 +25,9 @@ KEYS = [
     "bank_valid_cells",
 ]
 FIGURES = {"figure_5_models", "figure_7_heatmap", "figure_8_torque", "figure_9_diameter"}
-MakeRecordings = Callable[..., Path]
 
 
-def test_numbers_figures_and_calibrations_are_made(
-    make_recordings: MakeRecordings,
-    coarse_fingertip: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_numbers_figures_and_calibrations_are_made(make_recordings, coarse_fingertip, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
     command = ["reproduce", str(make_recordings()), "--out", str(out), "--mesh", str(coarse_fingertip), "--jobs", "1"]
     assert main([*command, "--json"]) == 0
@@ -57,7 +49,6 @@ def test_numbers_figures_and_calibrations_are_made(
     identity = Bank.open(focused).identity
     calibration = Calibration.load(out / "calibration_torque_focused.cal")
     assert calibration.bank_identity == identity
-    assert calibration.torque is not None
     thick, thin = (calibration.torque.regressor.predict(np.array([sigma]))[0] for sigma in (1.9, 1.2))
     assert thick < thin
 
@@ -78,13 +69,7 @@ def test_numbers_figures_and_calibrations_are_made(
 
 
 @pytest.mark.parametrize("present", ["torque", "diameter"])
-def test_one_kind_of_slice_is_enough(
-    make_recordings: MakeRecordings,
-    coarse_fingertip: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    present: str,
-) -> None:
+def test_one_kind_of_slice_is_enough(make_recordings, coarse_fingertip, tmp_path, capsys, present):
     recordings = make_recordings(torque=present == "torque", diameter=present == "diameter", raw=False)
     out = tmp_path / "out"
     assert main(["reproduce", str(recordings), "--out", str(out), "--mesh", str(coarse_fingertip), "--jobs", "1"]) == 0
@@ -100,9 +85,7 @@ def test_one_kind_of_slice_is_enough(
     assert drawn == ({"figure_9_diameter"} if present == "diameter" else FIGURES - {"figure_9_diameter"})
 
 
-def test_the_papers_mesh_is_taken_where_it_is_beside_the_recordings(
-    make_recordings: MakeRecordings, tmp_path: Path, shared: Path
-) -> None:
+def test_the_papers_mesh_is_taken_where_it_is_beside_the_recordings(make_recordings, tmp_path, shared):
     recordings = make_recordings(diameter=False)
     assert banks.choose_mesh(recordings, None, None)[1] == f"our own grid for {banks.OWN_FINGERTIP}"
     beside = recordings.parent / "reference" / "fingertip_mesh.npz"
@@ -117,9 +100,7 @@ def test_the_papers_mesh_is_taken_where_it_is_beside_the_recordings(
     assert banks.choose_mesh(recordings, None, config)[0].digest == mesh.digest
 
 
-def test_mistakes_end_in_one_sentence(
-    make_recordings: MakeRecordings, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_end_in_one_sentence(make_recordings, tmp_path, capsys):
     def refused(recordings: Path, *options: str) -> str:
         assert main(["reproduce", str(recordings), "--out", str(tmp_path / "out"), *options]) == 2
         said = capsys.readouterr()

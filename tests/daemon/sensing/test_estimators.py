@@ -1,7 +1,6 @@
 """Estimators as the configuration opens them, on frames of boards."""
 
 import asyncio
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -72,7 +71,7 @@ def torques(estimator: LiveEstimator, played: FrameSeries, **flags: NDArray[np.b
     return found
 
 
-def test_both_fingertips_together_follow_another_session(calibration: Calibration) -> None:
+def test_both_fingertips_together_follow_another_session(calibration):
     played = series(seed=3)
     found = torques(LiveEstimator(calibration, fingertip()), played)
     truth = played.torque_at_frames()
@@ -82,7 +81,7 @@ def test_both_fingertips_together_follow_another_session(calibration: Calibratio
     assert np.nanmax(truth) > 0.05
 
 
-def test_a_tare_averages_the_frames_that_follow(calibration: Calibration) -> None:
+def test_a_tare_averages_the_frames_that_follow(calibration):
     played = series(seed=3)
     estimator = LiveEstimator(calibration, fingertip(baseline_frames=5))
     estimator.tare()
@@ -94,7 +93,7 @@ def test_a_tare_averages_the_frames_that_follow(calibration: Calibration) -> Non
     assert any(value is not None for value in torques(estimator, played.between(5, len(played.t_s))))
 
 
-def test_dead_channels_leave_the_rest_at_work_and_a_repeated_frame_is_refused(calibration: Calibration) -> None:
+def test_dead_channels_leave_the_rest_at_work_and_a_repeated_frame_is_refused(calibration):
     played = series(seed=4)
     dead = np.random.default_rng(0).uniform(size=896) < 0.1
     found = torques(LiveEstimator(calibration, fingertip()), played, dead=dead)
@@ -107,7 +106,7 @@ def test_dead_channels_leave_the_rest_at_work_and_a_repeated_frame_is_refused(ca
     assert estimate.reasons == ("the board sent the same frame again",)
 
 
-def test_a_bank_adds_k_sigma_and_heatmaps(calibration: Calibration, tiny_bank: Path) -> None:
+def test_a_bank_adds_k_sigma_and_heatmaps(calibration, tiny_bank):
     estimator = LiveEstimator(calibration, fingertip(bank=str(tiny_bank), matching="zero_lag"))
     played = series(seed=3)
     gripped = int((IDLE_S + 12.0) / PERIOD_S)
@@ -115,11 +114,10 @@ def test_a_bank_adds_k_sigma_and_heatmaps(calibration: Calibration, tiny_bank: P
         estimate = estimated(estimator, *(frame(number, channels) for channels in played.channels[number]))
     assert estimate.valid
     heatmap = estimator.heatmap()
-    assert heatmap is not None
     assert estimate.score == pytest.approx(np.nanmax(heatmap), abs=1e-6)
 
 
-def test_the_calibration_decides_the_estimator(files: dict[str, Path]) -> None:
+def test_the_calibration_decides_the_estimator(files):
     assert open_estimator(fingertip(calibration=files["right"]), "right").calibration.estimator.name == NAME
     tips = {"right": fingertip(), "left": fingertip()}
     combined = open_combined(CombinedConfig(calibration=files["combined"]), tips)
@@ -127,9 +125,7 @@ def test_the_calibration_decides_the_estimator(files: dict[str, Path]) -> None:
     assert combined.grids is None
 
 
-def test_doctor_and_check_show_the_assumptions(
-    calibration: Calibration, files: dict[str, Path], tmp_path: Path
-) -> None:
+def test_doctor_and_check_show_the_assumptions(calibration, files, tmp_path):
     path, tips = tmp_path / "combined.cal", {"right": fingertip(), "left": fingertip()}
     replace(calibration, assumptions=("load timing",)).save(path)
     ends = ", assuming that the load cell's delay is as given (--load-cell-delay-s)"
@@ -152,8 +148,6 @@ def test_doctor_and_check_show_the_assumptions(
         (lambda f: open_combined(CombinedConfig(calibration=f["combined"]), {"right": fingertip()}), "of both, and"),
     ],
 )  # fmt: skip
-def test_a_configuration_that_does_not_fit_is_refused(
-    open_it: Callable[[dict[str, Path]], object], sentence: str, files: dict[str, Path]
-) -> None:
+def test_a_configuration_that_does_not_fit_is_refused(open_it, sentence, files):
     with pytest.raises((UserError, BankError), match=sentence):
         open_it(files)

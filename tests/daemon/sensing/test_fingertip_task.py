@@ -1,10 +1,9 @@
 """The tasks of one fingertip and of a pair: order, tares, and errors of the estimator."""
 
 import asyncio
-import contextlib
 from collections.abc import AsyncGenerator
-from dataclasses import dataclass
-from typing import Any, cast
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,15 +12,15 @@ from shearloop.bank.estimation import Estimate
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import FingertipConfig
 from shearloop.daemon.messaging.messages import Message
-from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.fingertip_task import (
     CombinedFingertips,
     FingertipEstimates,
     FingertipTask,
 )
-from shearloop.drivers.eit_kit import FRAME_PERIOD_S, EitKit, Frame
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S, Frame
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from tests.running import running
 
 MS = 1_000_000
 PERIOD_S = 0.54
@@ -36,18 +35,11 @@ class RecordingPublisher:
         self._enough = enough
         self.messages: list[tuple[str, str, int]] = []
         self.enough = asyncio.Event()
-        self._published = asyncio.Event()
 
     def publish(self, message: Message) -> None:
-        self.messages.append((message.topic, message.source, message.frame))  # type: ignore[attr-defined]
-        self._published.set()
+        self.messages.append((message.topic, message.source, message.frame))
         if len(self.messages) == self._enough:
             self.enough.set()
-
-    async def until(self, topic: str, source: str, numbers: list[int]) -> None:
-        while self.numbers(topic, source) != numbers:
-            self._published.clear()
-            await self._published.wait()
 
     def has_subscriber(self, _topic: str) -> bool:
         return False
@@ -66,7 +58,7 @@ class FakeEstimator:
         self.begun, self.go_on = asyncio.Event(), asyncio.Event()
         self.tared_before: list[int] = []
         self._tared = False
-        self.calibration = type("", (), {"sides": ("right", "left")})
+        self.calibration = SimpleNamespace(sides=("right", "left"))
 
     def tare(self) -> None:
         self._tared = True
@@ -83,22 +75,10 @@ class FakeEstimator:
         return Estimate(valid=False, reasons=("nothing",))
 
 
-@dataclass
-class Inputs:
-    """Keeps the recorded inputs."""
-
-    events: list[RawEvent]
-
-    def record(self, event: RawEvent) -> None:
-        self.events.append(event)
-
-
 class FixedClock(Clock):
     """A clock that the test sets."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.t_ns = 10_000 * MS
+    t_ns = 10_000 * MS
 
     def now_ns(self) -> int:
         return self.t_ns
@@ -121,25 +101,15 @@ def frame(number: int, arrives_ns: int | None = None) -> Frame:
     """Return a frame that was acquired in one period, sent in 80 ms, and arrived."""
     arrival_ns = number * PERIOD_NS if arrives_ns is None else arrives_ns
     mid_ns = arrival_ns - 80 * MS - PERIOD_NS // 2
-    return Frame(
-        channels=np.full(896, 0.1),
-        raw=np.zeros(1024),
-        line=b"",
-        t_begin_ns=mid_ns - PERIOD_NS // 2,
-        t_mid_ns=mid_ns,
-        t_arrival_ns=arrival_ns,
-        seq=number,
-        saturated=NONE,
-        dead=NONE,
-        unusable=0,
-        repeated=False,
-    )
+    times = {"t_begin_ns": mid_ns - PERIOD_NS // 2, "t_mid_ns": mid_ns, "t_arrival_ns": arrival_ns}
+    flags = {"saturated": NONE, "dead": NONE, "unusable": 0, "repeated": False}
+    return Frame(channels=np.full(896, 0.1), raw=np.zeros(1024), line=b"", seq=number, **times, **flags)
 
 
 def estimates(
     name: str, publisher: RecordingPublisher, estimator: FakeEstimator, clock: Clock | None = None, **options: Any
 ) -> FingertipEstimates:
-    return FingertipEstimates(name, cast(Any, estimator), cast(Publisher, publisher), clock or Clock(), **options)
+    return FingertipEstimates(name, estimator, publisher, clock or Clock(), **options)
 
 
 def fingertip(
@@ -149,22 +119,10 @@ def fingertip(
     in_one_read: int = 1,
 ) -> FingertipTask:
     own = estimates("right", publisher, estimator)
-    return FingertipTask(cast(EitKit, Board(in_one_read)), own, cast(Publisher, publisher), combined)
+    return FingertipTask(Board(in_one_read), own, publisher, combined)
 
 
-@contextlib.asynccontextmanager
-async def running(*coroutines: Any) -> AsyncGenerator[list[asyncio.Task[None]]]:
-    tasks = [asyncio.create_task(each) for each in coroutines]
-    try:
-        async with asyncio.timeout(20):
-            yield tasks
-    finally:
-        for each in tasks:
-            each.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-
-
-async def test_each_frame_is_estimated_and_then_published_in_order() -> None:
+async def test_each_frame_is_estimated_and_then_published_in_order():
     publisher = RecordingPublisher(8)
     async with running(fingertip(publisher, FakeEstimator()).run()):
         await publisher.enough.wait()
@@ -172,13 +130,12 @@ async def test_each_frame_is_estimated_and_then_published_in_order() -> None:
     assert publisher.messages == expected
 
 
-async def test_an_error_of_the_estimator_ends_the_task() -> None:
-    async with running(fingertip(RecordingPublisher(), FakeEstimator(fails=0)).run()) as (task,):
-        with pytest.raises(ZeroDivisionError):
-            await task
+async def test_an_error_of_the_estimator_ends_the_task():
+    with pytest.raises(ZeroDivisionError):
+        await fingertip(RecordingPublisher(), FakeEstimator(fails=0)).run()
 
 
-async def test_pairs_are_estimated_in_order_by_the_first_fingertip_that_is_free() -> None:
+async def test_pairs_are_estimated_in_order_by_the_first_fingertip_that_is_free():
     publisher, slow = RecordingPublisher(), FakeEstimator(waits=0)
     combined = CombinedFingertips(estimates(COMBINED, publisher, FakeEstimator()), PERIOD_S)
     async with running(fingertip(publisher, slow, combined, in_one_read=2).run()):
@@ -190,9 +147,9 @@ async def test_pairs_are_estimated_in_order_by_the_first_fingertip_that_is_free(
 
 
 @pytest.mark.parametrize("since_ms", [1, 100, 540, 621])
-async def test_a_tare_begins_with_the_first_frame_acquired_after_it(since_ms: int) -> None:
+async def test_a_tare_begins_with_the_first_frame_acquired_after_it(since_ms):
     clock, estimator, raw = FixedClock(), FakeEstimator(), list[RawEvent]()
-    task = estimates("right", RecordingPublisher(), estimator, clock, inputs=Inputs(raw))
+    task = estimates("right", RecordingPublisher(), estimator, clock, inputs=SimpleNamespace(record=raw.append))
     asked_ns = clock.t_ns
     task.tare()
     for seq in range(5):
@@ -204,7 +161,7 @@ async def test_a_tare_begins_with_the_first_frame_acquired_after_it(since_ms: in
     assert [(one.kind, one.data) for one in raw] == [(InputKind.TARE, str(first).encode())], "as a replay finds it"
 
 
-async def test_a_pair_with_one_earlier_frame_is_not_part_of_the_tare() -> None:
+async def test_a_pair_with_one_earlier_frame_is_not_part_of_the_tare():
     clock, estimator = FixedClock(), FakeEstimator()
     task = estimates(COMBINED, RecordingPublisher(), estimator, clock)
     task.tare()
@@ -214,7 +171,7 @@ async def test_a_pair_with_one_earlier_frame_is_not_part_of_the_tare() -> None:
     assert estimator.tared_before == [1]
 
 
-async def test_a_second_tare_replaces_the_first() -> None:
+async def test_a_second_tare_replaces_the_first():
     clock, estimator = FixedClock(), FakeEstimator()
     task = estimates("right", RecordingPublisher(), estimator, clock)
     for seq in range(5):
@@ -225,7 +182,7 @@ async def test_a_second_tare_replaces_the_first() -> None:
     assert estimator.tared_before == [2]
 
 
-async def test_waiting_for_a_tare_ends_when_it_is_complete() -> None:
+async def test_waiting_for_a_tare_ends_when_it_is_complete():
     clock, estimator = FixedClock(), FakeEstimator()
     task = estimates("right", RecordingPublisher(), estimator, clock)
     async with running(task.tare_and_wait()) as (waiting,):
@@ -237,5 +194,5 @@ async def test_waiting_for_a_tare_ends_when_it_is_complete() -> None:
         await waiting
 
 
-def test_the_configured_frame_period_is_the_boards() -> None:
+def test_the_configured_frame_period_is_the_boards():
     assert FingertipConfig.model_fields["frame_period_s"].default == FRAME_PERIOD_S

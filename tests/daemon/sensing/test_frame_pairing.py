@@ -6,7 +6,7 @@ from shearloop.daemon.sensing.fingertip_task import _MAX_APART_PERIODS, FramePai
 PERIOD_NS = 540_000_000
 
 
-def test_two_boards_of_one_period_make_a_pair_a_period_whatever_their_phase() -> None:
+def test_two_boards_of_one_period_make_a_pair_a_period_whatever_their_phase():
     for phase in (0.0, 0.1, 0.5, 0.74, 0.9):
         pairing: FramePairing[int] = FramePairing(("right", "left"), PERIOD_NS)
         frames = [("right", n * PERIOD_NS, n) for n in range(20)]
@@ -18,7 +18,7 @@ def test_two_boards_of_one_period_make_a_pair_a_period_whatever_their_phase() ->
         assert all(abs(right - left) <= 1 for right, left in pairs)
 
 
-def test_a_board_that_is_silent_leaves_the_other_without_a_partner() -> None:
+def test_a_board_that_is_silent_leaves_the_other_without_a_partner():
     pairing: FramePairing[int] = FramePairing(("right", "left"), PERIOD_NS)
     assert pairing.add("left", 0, 0) is None
     assert [pairing.add("right", n * PERIOD_NS, n) for n in range(1, 5)] == [None] * 4
@@ -26,7 +26,7 @@ def test_a_board_that_is_silent_leaves_the_other_without_a_partner() -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from(["right", "left"]), st.integers(0, 20 * PERIOD_NS)), max_size=40))
-def test_every_frame_is_used_once_and_with_one_that_is_near(frames: list[tuple[str, int]]) -> None:
+def test_every_frame_is_used_once_and_with_one_that_is_near(frames):
     pairing: FramePairing[tuple[int, int]] = FramePairing(("right", "left"), PERIOD_NS)
     used = []
     for number, (side, t_ns) in enumerate(frames):

@@ -15,29 +15,26 @@ def estimate(diameter_mm: float, half_width_mm: float) -> Estimate:
     )
 
 
-def test_fingertips_apart_are_weighed_and_both_together_hold_them_already() -> None:
+def test_fingertips_apart_are_weighed_and_both_together_hold_them_already():
     diameters = FingertipDiameters("combined")
     assert diameters.latest(0) is None
     diameters.update("right", estimate(20.0, 2.0), 0)
     diameters.update("left", estimate(22.0, 4.0), 0)
     said = diameters.latest(0)
-    assert said is not None
     # Weights 1 / 2² and 1 / 4².
     assert said.value == pytest.approx((20.0 / 4 + 22.0 / 16) / (1 / 4 + 1 / 16))
     assert said.half_width == pytest.approx((1 / 4 + 1 / 16) ** -0.5)
     # Six apart is 2.6 standard deviations of the difference: so much less sure is the mean.
     diameters.update("left", estimate(26.0, 4.0), 0)
     apart = diameters.latest(0)
-    assert apart is not None
     deviations = 6.0 / ((2.0**2 + 4.0**2) ** 0.5 / 1.96)
     assert apart.half_width == pytest.approx(deviations * said.half_width)
     diameters.update("combined", estimate(21.0, 1.0), 0)
     both = diameters.latest(0)
-    assert both is not None
     assert (both.value, both.half_width) == (21.0, 1.0)
 
 
-def test_what_is_old_or_taken_back_is_no_diameter() -> None:
+def test_what_is_old_or_taken_back_is_no_diameter():
     diameters = FingertipDiameters("combined")
     diameters.update("right", estimate(20.0, 2.0), 0)
     assert diameters.latest(STALE_AFTER_NS) is not None
@@ -50,11 +47,11 @@ POSITIVE = st.floats(0.0, allow_nan=False, allow_infinity=False)
 
 
 @given(st.integers(0), st.none() | st.builds(Measured, POSITIVE, POSITIVE))
-def test_a_tool_is_read_from_a_recording_as_it_was_written(frame: int, tool: Measured | None) -> None:
+def test_a_tool_is_read_from_a_recording_as_it_was_written(frame, tool):
     assert tool_from_bytes(tool_as_bytes(frame, tool)) == (frame, tool)
 
 
 @pytest.mark.parametrize("text", [b"", b"x", b"3 20", b"3 20 x", b"3 20 1 1"])
-def test_what_is_no_tool_is_none(text: bytes) -> None:
+def test_what_is_no_tool_is_none(text):
     with pytest.raises(ValueError):  # noqa: PT011 - the recording's reader says where
         tool_from_bytes(text)

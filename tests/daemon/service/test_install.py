@@ -34,7 +34,7 @@ def without_the_users_tables(names: set[str]) -> set[str]:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="making a user and folders of his needs root")
-def test_install_and_uninstall(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_install_and_uninstall(tmp_path, capsys):
     assert place(tmp_path, "install") == 0
     said = capsys.readouterr().out
     assert without_the_users_tables(files(tmp_path)) == {*PLACES.values(), EXAMPLE}
@@ -58,7 +58,7 @@ def test_install_and_uninstall(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="making a user and folders of his needs root")
-def test_edited_files_stay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_edited_files_stay(tmp_path, capsys):
     assert place(tmp_path, "install", "--real-time") == 0
     assert (tmp_path / REAL_TIME).read_text() == service_file("realtime.conf")
     edited = tmp_path / EXAMPLE
@@ -74,9 +74,7 @@ def test_edited_files_stay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 
 
 @pytest.mark.parametrize("command", ["install", "uninstall"])
-def test_dry_run_prints_the_steps_and_changes_nothing(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_dry_run_prints_the_steps_and_changes_nothing(command, tmp_path, capsys):
     kept = tmp_path / PLACES["shearloop.service"]
     kept.parent.mkdir(parents=True)
     kept.write_text("something else")
@@ -88,7 +86,7 @@ def test_dry_run_prints_the_steps_and_changes_nothing(
     assert kept.read_text() == "something else"
 
 
-def test_the_steps_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_steps_as_json(tmp_path, capsys):
     assert place(tmp_path, "install", "--dry-run", "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told["dry_run"] is True
@@ -97,7 +95,7 @@ def test_the_steps_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert {"acts": False, "says": f"not there: {tmp_path / EXAMPLE}"} in json.loads(capsys.readouterr().out)["steps"]
 
 
-def test_a_running_system_is_notified(tmp_path: Path) -> None:
+def test_a_running_system_is_notified(tmp_path):
     told = [step.sentence for step in install_steps(tmp_path, Path(PROGRAM), real_time=False, running=True)]
     for command in ("udevadm control --reload", "udevadm trigger --subsystem-match=tty", "systemctl daemon-reload"):
         assert any(f"run `{command}`" in sentence for sentence in told)
@@ -108,9 +106,7 @@ def mistake(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return capsys.readouterr().err
 
 
-def test_mistakes_are_one_sentence(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mistakes_are_one_sentence(tmp_path, capsys, monkeypatch):
     assert "is not a file" in mistake(capsys, "install", "--root", str(tmp_path), "--program", "no/such/shearloop")
     monkeypatch.setenv("PATH", "")
     said = mistake(capsys, "install", "--root", str(tmp_path), "--program", PROGRAM)
@@ -119,9 +115,7 @@ def test_mistakes_are_one_sentence(
     assert "run it with sudo" in mistake(capsys, "uninstall")
 
 
-def test_a_program_hidden_from_the_service_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_program_hidden_from_the_service_is_refused(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sys.executable", str(tmp_path / "bin/python3"))
     assert "there is no program" in mistake(capsys, "install", "--dry-run")
     (tmp_path / "bin").mkdir()

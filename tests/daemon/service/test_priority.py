@@ -1,12 +1,9 @@
 import os
-from pathlib import Path
-
-import pytest
 
 from shearloop.daemon import realtime
 
 
-def test_the_sessions_niceness_is_restored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_sessions_niceness_is_restored(tmp_path, monkeypatch):
     asked: list[int] = []
     group = tmp_path / "autogroup"
     group.write_text("/autogroup-3 nice 2")
@@ -19,7 +16,7 @@ def test_the_sessions_niceness_is_restored(tmp_path: Path, monkeypatch: pytest.M
     assert asked == [-10]
 
 
-def test_nothing_changes_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_changes_without_permission(tmp_path, monkeypatch):
     def refuse(_kind: int, _who: int, _niceness: int) -> None:
         raise PermissionError
 

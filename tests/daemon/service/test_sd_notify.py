@@ -3,7 +3,7 @@ import ctypes
 import resource
 import signal
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -30,16 +30,14 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.
         yield listening
 
 
-def test_no_notification_without_a_service_manager(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_no_notification_without_a_service_manager(monkeypatch, tmp_path):
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     assert not notify("READY=1")
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "gone"))
     assert not notify("READY=1")
 
 
-def test_states_arrive_at_a_path_and_an_abstract_address(
-    manager: socket.socket, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_states_arrive_at_a_path_and_an_abstract_address(manager, monkeypatch):
     assert notify("READY=1", "STATUS=well")
     assert manager.recv(4096) == b"READY=1\nSTATUS=well"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as abstract:
@@ -51,15 +49,13 @@ def test_states_arrive_at_a_path_and_an_abstract_address(
         assert abstract.recv(4096) == b"WATCHDOG=1"
 
 
-def test_a_blocked_manager_does_not_block_the_daemon(manager: socket.socket) -> None:
+def test_a_blocked_manager_does_not_block_the_daemon(manager):
     # The kernel queues a few datagrams; the daemon must not wait for room.
     assert not all(notify("WATCHDOG=1") for _ in range(2000))
     assert manager.recv(4096) == b"WATCHDOG=1"
 
 
-async def test_the_daemon_notifies_ready_alive_and_stopping(
-    manager: socket.socket, config: Callable[..., Path]
-) -> None:
+async def test_the_daemon_notifies_ready_alive_and_stopping(manager, config):
     async with shearloop("run", str(config())) as daemon:
         assert await asyncio.to_thread(manager.recv, 4096) == b"READY=1"
         said = await asyncio.to_thread(manager.recv, 4096)
@@ -70,9 +66,7 @@ async def test_the_daemon_notifies_ready_alive_and_stopping(
         said = manager.recv(4096)
 
 
-async def test_the_watchdog_is_fed_only_while_all_tasks_are_alive(
-    manager: socket.socket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_the_watchdog_is_fed_only_while_all_tasks_are_alive(manager, tmp_path, monkeypatch):
     monkeypatch.setattr(health, "HEALTH_PERIOD_S", 0.0)
     supervisor = Supervisor({"right": TaskRecord(alive=True), "experiment": TaskRecord(done=True)})
     with zmq.Context() as context:
@@ -91,7 +85,7 @@ async def test_the_watchdog_is_fed_only_while_all_tasks_are_alive(
         publisher.close()
 
 
-async def test_a_finished_task_is_not_dead() -> None:
+async def test_a_finished_task_is_not_dead():
     supervisor = Supervisor()
 
     async def ends() -> None:
@@ -101,7 +95,7 @@ async def test_a_finished_task_is_not_dead() -> None:
     assert not supervisor.dead
 
 
-def test_failing_to_lock_memory_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failing_to_lock_memory_is_one_sentence(monkeypatch):
     monkeypatch.setattr("os.geteuid", lambda: 1000)
     monkeypatch.setattr(resource, "getrlimit", lambda _: (8 << 20, 8 << 20))
     with pytest.raises(UserError, match="needs an unlimited RLIMIT_MEMLOCK, and it is 8192 kB: run `sudo shearloop"):

@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,7 @@ from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.synthetic_skin import SyntheticSkin
 from shearloop.daemon.taring import tare_all
 from shearloop.drivers.emulators.skin import SkinInstruments
-from tests.daemon.conftest import DEADLINE_S
-from tests.daemon.test_run import collector, running
+from tests.daemon.conftest import DEADLINE_S, collector, running_daemon
 
 CALIBRATION = Path(__file__).parents[3] / "config" / "calibrations" / "skin_demo.yaml"
 RATE_HZ = 200.0
@@ -35,9 +34,7 @@ class Played:
     @property
     def refused_lines(self) -> int:
         skin = self.daemon.sensors.skin
-        assert skin is not None
         errors = skin.diagnostics()["errors"]
-        assert isinstance(errors, Mapping)
         return int(errors.get("not two decimals", 0))
 
     async def until(self, condition: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
@@ -104,7 +101,7 @@ async def played(
         host, port = place.split(":")
         daq = {"scanner": {"socket": {"host": host, "port": int(port)}}}
     try:
-        async with running(written(folder, {**(daemon or {}), "skin": section(daq, **changes)})) as run:
+        async with running_daemon(written(folder, {**(daemon or {}), "skin": section(daq, **changes)})) as run:
             yield Played(run, skin, instruments, f"ipc://{folder}/commands")
     finally:
         playing.cancel()
@@ -112,7 +109,7 @@ async def played(
 
 
 @pytest.mark.parametrize("socket", [False, True])
-async def test_a_shear_force_is_streamed_from_either_daq(tmp_path: Path, socket: bool) -> None:
+async def test_a_shear_force_is_streamed_from_either_daq(tmp_path, socket):
     async with played(tmp_path, socket=socket) as bench:
         content = await bench.until(lambda content: "taking the zero" in content["reason"])
         assert content["shear_n"] is None
@@ -145,7 +142,7 @@ BAD = [
 ]
 
 
-async def test_no_bad_input_stops_the_daemon_and_each_is_named(tmp_path: Path) -> None:
+async def test_no_bad_input_stops_the_daemon_and_each_is_named(tmp_path):
     async with played(tmp_path) as bench:
         await bench.valid()
         for fault, why in BAD:
@@ -166,7 +163,7 @@ async def test_no_bad_input_stops_the_daemon_and_each_is_named(tmp_path: Path) -
         assert (tasks["skin"]["restarts"], tasks["skin.source"]["restarts"]) == (0, 0)
 
 
-async def test_tare_takes_the_zero_anew_and_refuses_a_loaded_one(tmp_path: Path) -> None:
+async def test_tare_takes_the_zero_anew_and_refuses_a_loaded_one(tmp_path):
     async with played(tmp_path) as bench:
         await bench.valid()
         bench.skin.push(0.8)
@@ -182,7 +179,7 @@ async def test_tare_takes_the_zero_anew_and_refuses_a_loaded_one(tmp_path: Path)
         assert refused == {"ok": False, "reason": "there is no sensor 'left' to tare; there are skin"}
 
 
-async def test_a_zero_that_cannot_be_taken_says_why_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_zero_that_cannot_be_taken_says_why_in_time(tmp_path, monkeypatch):
     monkeypatch.setattr("shearloop.daemon.sensing.skin_task.ZERO_TIMEOUT_S", 0.3)
     async with played(tmp_path) as bench:
         await bench.valid()
@@ -192,8 +189,8 @@ async def test_a_zero_that_cannot_be_taken_says_why_in_time(tmp_path: Path, monk
         assert "gauge 2 is open" in why
 
 
-async def test_one_daemon_carries_a_fingertip_and_a_skin(config: Callable[..., Path]) -> None:
-    async with running(config(skin=section(ADC))) as daemon:
+async def test_one_daemon_carries_a_fingertip_and_a_skin(config):
+    async with running_daemon(config(skin=section(ADC))) as daemon:
         health = collector(daemon, "health")
         tasks = (await health.get())["tasks"]
         assert all(tasks[name]["alive"] for name in ("right", "skin", "skin.source"))
@@ -263,9 +260,7 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
         ({"skin": section(ADC, calibration=ROBOT)}, "is not a calibration as `shearloop skin calibrate` writes it: it"),
     ],
 )
-def test_a_mistake_in_the_skin_s_section_is_one_sentence_and_status_2(
-    tmp_path: Path, content: dict[str, Any], told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mistake_in_the_skin_s_section_is_one_sentence_and_status_2(tmp_path, content, told, capsys):
     path = written(tmp_path, content)
     for command in ("check", "run"):
         assert main([command, str(path)]) == 2
@@ -274,7 +269,7 @@ def test_a_mistake_in_the_skin_s_section_is_one_sentence_and_status_2(
         assert said.count("\n") == 1, "one line"
 
 
-def test_a_calibration_that_is_none_is_told_before_anything_is_opened(tmp_path: Path) -> None:
+def test_a_calibration_that_is_none_is_told_before_anything_is_opened(tmp_path):
     from shearloop.bank.errors import CalibrationError
 
     path = written(tmp_path, {"skin": section(ADC, calibration="none.yaml")})

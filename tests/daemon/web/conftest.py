@@ -98,7 +98,6 @@ class Viewer:
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
         )
-        assert self._process.stdout is not None
         # It says its address, in one line, and nothing else.
         with self._process.stdout as said:
             ready, _, _ = select.select([said], [], [], DEADLINE_S)

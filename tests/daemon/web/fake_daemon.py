@@ -15,23 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 import zmq
 import zmq.asyncio
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer
 from shearloop.daemon.messaging.keys import Refusals
-from shearloop.daemon.messaging.messages import (
-    EitEstimate,
-    EitHeatmap,
-    GripperStateMessage,
-    Health,
-    LoadTorque,
-    LoopState,
-    Message,
-    RobotStateMessage,
-    SkinShear,
-)
+from shearloop.daemon.messaging.messages import TOPICS, Message
 from shearloop.daemon.messaging.publisher import Publisher
 
 # Estimates and heatmaps come twice a second, all else ten times.
@@ -52,137 +43,17 @@ def scores() -> np.ndarray:
     return np.asarray(bright)
 
 
-MESSAGES: Mapping[str, Mapping[str, Any]] = {
-    "estimate": {
-        "kind": EitEstimate,
-        "source": "right",
-        "torque_nm": 0.09876,
-        "torque_low_nm": 0.07123,
-        "torque_high_nm": 0.12629,
-        "diameter_mm": 20.43,
-        "diameter_low_mm": 18.21,
-        "diameter_high_mm": 22.65,
-        "k": 3.514,
-        "sigma": 1.627,
-        "score": 0.93412,
-        "runner_up": 0.92187,
-        "valid": True,
-        "reason": "",
-        "frame": 417,
-        "latency_s": 0.0124,
-    },
-    "heatmap": {
-        "kind": EitHeatmap,
-        "source": "right",
-        "scores": scores(),
-        "k_low": 0.1,
-        "k_high": 4.4,
-        "sigma_low": 0.1,
-        "sigma_high": 4.4,
-        "model": "gaussian_derivative",
-        "frame": 417,
-    },
-    "load": {
-        "kind": LoadTorque,
-        "source": "load_cell",
-        "torque_nm": 0.10123,
-        "raw": 8123.0,
-        "saturated": False,
-        "spike": False,
-        "valid": True,
-        "reason": "",
-    },
-    "shear": {
-        "kind": SkinShear,
-        "source": "skin",
-        "shear_n": -1.2346,
-        "shear_low_n": -1.3511,
-        "shear_high_n": -1.1182,
-        "torque_nm": None,
-        "response": -0.10864,
-        "response_1": 0.0,
-        "response_2": 0.1086,
-        "r1_ohm": 25.123,
-        "r2_ohm": 27.846,
-        "deadband": False,
-        "direction": "loading",
-        "valid": True,
-        "reason": "",
-        "sample": 9,
-        "missed": 0,
-        "latency_s": 0.001,
-    },
-    "robot": {
-        "kind": RobotStateMessage,
-        "source": "robot",
-        "joints_rad": (0.0,) * 6,
-        "tcp_pose": (-0.4921, -0.1333, 0.4876, 0.0, 0.0, 0.0),
-        "wrench": (0.0,) * 6,
-        "wrist_rad": 0.1476,
-        "wrist_speed_rad_per_s": -0.0124,
-        "wrist_torque_nm": -0.1023,
-        "robot_mode": 7,
-        "safety_mode": 1,
-        "speed_scaling": 0.75,
-        "protective_stop": False,
-        "emergency_stop": False,
-        "blocked": "",
-        "age_s": 0.002,
-    },
-    "gripper": {
-        "kind": GripperStateMessage,
-        "source": "gripper",
-        "width_mm": 19.68,
-        "diameter_mm": 19.68,
-        "diameter_std_mm": 3.04,
-        "current_ma": 270.0,
-        "object": "contact closing",
-        "fault": 0,
-        "fault_text": "",
-    },
-    "loop": {
-        "kind": LoopState,
-        "source": "loop",
-        "phase": "running",
-        "experiment": "hold 0.10 N·m",
-        "step": 6,
-        "steps": 7,
-        "activity": "holding",
-        "progress": 0.62,
-        "remaining_s": 38.4,
-        "torque_source": "right",
-        "torque_nm": 0.0988,
-        "set_point_nm": 0.1,
-        "ramp_nm": 0.0875,
-        "expected_nm": 0.098,
-        "speed_command_rad_per_s": 0.0312,
-        "speed_sent_rad_per_s": 0.0201,
-        "response": "note",
-        "reasons": "",
-    },
-    "health": {
-        "kind": Health,
-        "source": "daemon",
-        "tasks": {
-            "right": {
-                "alive": True,
-                "restarts": 2,
-                "last_error": "",
-                "rate_hz": 1.8479,
-                "expected_hz": 1.85,
-                "errors": {"wrong length": 3, "not a number": 1},
-                "error": "look at the cable",
-            },
-            "loop": {"alive": False, "done": False, "restarts": 1, "last_error": "RuntimeError: a bug"},
-            "experiment": {"alive": False, "done": True, "restarts": 0, "last_error": ""},
-        },
-        "loop_lag_s": 0.0013,
-        "memory_mb": 142.3,
-        "cpu_percent": 6.04,
-    },
-}
+def messages() -> dict[str, dict[str, Any]]:
+    """Return the values of each message of the page, and its kind, by name."""
+    text = (Path(__file__).parents[2] / "data" / "page_messages.yaml").read_text()
+    found = {name: {"kind": TOPICS[given.pop("topic")], **given} for name, given in yaml.safe_load(text).items()}
+    found["heatmap"]["scores"] = scores()
+    for name in ("joints_rad", "tcp_pose", "wrench"):
+        found["robot"][name] = tuple(found["robot"][name])
+    return found
 
 
+MESSAGES = messages()
 COMMANDS = ("tare", "start", "pause", "resume", "unlock", "stop")
 
 

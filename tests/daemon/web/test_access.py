@@ -11,7 +11,7 @@ from shearloop.daemon.web.server import default_token_path, host_allowed, load_t
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.1:7760", "localhost:9000", "LOCALHOST:1", "[::1]:7760"])
-def test_loopback_hosts_are_allowed_on_any_port(host: str) -> None:
+def test_loopback_hosts_are_allowed_on_any_port(host):
     assert host_allowed(host)
 
 
@@ -22,16 +22,16 @@ def test_loopback_hosts_are_allowed_on_any_port(host: str) -> None:
         *("192.168.1.5:7760", "0.0.0.0:7760", "127.0.0.1:99999", "[::1", "127.0.0.1/@evil.example", "127.0.0.1:x"),
     ],
 )
-def test_foreign_hosts_are_refused(host: str | None) -> None:
+def test_foreign_hosts_are_refused(host):
     assert not host_allowed(host)
 
 
 @given(st.text(max_size=40))
-def test_any_host_header_gives_a_boolean(host: str) -> None:
+def test_any_host_header_gives_a_boolean(host):
     assert isinstance(host_allowed(host), bool)
 
 
-def test_foreign_origins_are_refused() -> None:
+def test_foreign_origins_are_refused():
     assert origin_allowed(None, "127.0.0.1:7760")
     assert origin_allowed("http://127.0.0.1:7760", "127.0.0.1:7760")
     for origin in (
@@ -45,13 +45,13 @@ def test_foreign_origins_are_refused() -> None:
         assert not origin_allowed(origin, "127.0.0.1:7760"), origin
 
 
-def test_only_the_complete_token_is_valid() -> None:
+def test_only_the_complete_token_is_valid():
     assert token_valid("Bearer abc", "abc")
     for header in (None, "", "abc", "Bearer", "Bearer ", "Bearer ab", "Bearer abcd", "Basic abc", "Bearer äbc"):
         assert not token_valid(header, "abc"), header
 
 
-def test_the_token_is_made_once_and_readable_by_its_owner_only(tmp_path: Path) -> None:
+def test_the_token_is_made_once_and_readable_by_its_owner_only(tmp_path):
     path = tmp_path / "state" / "shearloop" / "view-token"
     token = load_token(path)
     assert len(token) >= 43
@@ -60,7 +60,7 @@ def test_the_token_is_made_once_and_readable_by_its_owner_only(tmp_path: Path) -
     assert load_token(path, new=True) != token
 
 
-def test_readable_or_invalid_token_files_are_refused(tmp_path: Path) -> None:
+def test_readable_or_invalid_token_files_are_refused(tmp_path):
     path = tmp_path / "token"
     load_token(path)
     path.chmod(0o640)
@@ -73,7 +73,7 @@ def test_readable_or_invalid_token_files_are_refused(tmp_path: Path) -> None:
             load_token(path)
 
 
-def test_links_and_pipes_are_refused_as_token_files(tmp_path: Path) -> None:
+def test_links_and_pipes_are_refused_as_token_files(tmp_path):
     load_token(tmp_path / "other")
     (tmp_path / "link").symlink_to(tmp_path / "other")
     os.mkfifo(tmp_path / "pipe", 0o600)
@@ -82,7 +82,7 @@ def test_links_and_pipes_are_refused_as_token_files(tmp_path: Path) -> None:
             load_token(tmp_path / name)
 
 
-def test_the_default_token_path_follows_xdg(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_default_token_path_follows_xdg(monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", "/state")
     assert default_token_path() == Path("/state/shearloop/view-token")
     monkeypatch.setenv("XDG_STATE_HOME", "not/absolute")

@@ -21,7 +21,7 @@ def batch(latest: MessageStore, after: int = 0, now_s: float = 10.0) -> dict[str
     return dict(json.loads(latest.batch(after, now_s, first=True)))
 
 
-def test_a_page_gets_the_latest_of_each_topic_and_source_with_its_age() -> None:
+def test_a_page_gets_the_latest_of_each_topic_and_source_with_its_age():
     latest = MessageStore(3.6)
     latest.add("load.torque", message("load_cell", torque_nm=0.1), 1.0)
     latest.add("load.torque", message("load_cell", torque_nm=0.2), 2.0)
@@ -38,7 +38,7 @@ def test_a_page_gets_the_latest_of_each_topic_and_source_with_its_age() -> None:
     assert [each["topic"] for each in batch(latest, after=latest.number - 1)["messages"]] == ["health"]
 
 
-def test_a_new_page_gets_the_last_minute() -> None:
+def test_a_new_page_gets_the_last_minute():
     latest = MessageStore(3.6)
     for second in range(100):
         latest.add("load.torque", message("load_cell", torque_nm=0.01 * second, raw=1.0, valid=True), float(second))
@@ -51,11 +51,11 @@ def test_a_new_page_gets_the_last_minute() -> None:
     assert latest.history(1e6) == []
 
 
-def test_quiet_time_is_unknown_without_messages() -> None:
+def test_quiet_time_is_unknown_without_messages():
     assert batch(MessageStore(3.6))["quiet_s"] is None
 
 
-def test_invalid_messages_are_counted_by_kind_and_do_not_end_the_silence() -> None:
+def test_invalid_messages_are_counted_by_kind_and_do_not_end_the_silence():
     latest = MessageStore(3.6)
     latest.add("weather", message(), 1.0)
     latest.add("health", {"source": "daemon"}, 1.0)
@@ -85,14 +85,14 @@ VALUES: st.SearchStrategy[Any] = st.recursive(
 
 
 @given(st.dictionaries(st.text(), VALUES, max_size=4))
-def test_any_message_becomes_json_or_is_counted(content: dict[str, Any]) -> None:
+def test_any_message_becomes_json_or_is_counted(content):
     latest = MessageStore(3.6)
     latest.add("eit.estimate", message(**content) | {"source": "right"}, 1.0)
     told = batch(latest)
     assert len(told["messages"]) + sum(told["refused"].values()) == 1
 
 
-def test_arrays_become_float32_and_nan_becomes_null() -> None:
+def test_arrays_become_float32_and_nan_becomes_null():
     scores = np.array([[0.25, np.nan], [0.5, 1.0]])
     told = json_value(
         decode(encode({"scores": scores.astype("<f4").tobytes(), "scores_shape": [2, 2], "k": float("inf")}))
@@ -103,7 +103,7 @@ def test_arrays_become_float32_and_nan_becomes_null() -> None:
     np.testing.assert_array_equal(unpacked, scores)
 
 
-def test_a_heatmap_comes_with_its_maximum_and_runner_up() -> None:
+def test_a_heatmap_comes_with_its_maximum_and_runner_up():
     scores = np.full((20, 30), 0.1)
     scores[3, 4], scores[4, 5], scores[15, 20], scores[0, 0] = 0.9, 0.85, 0.7, np.nan
     latest = MessageStore(3.6)
@@ -114,7 +114,7 @@ def test_a_heatmap_comes_with_its_maximum_and_runner_up() -> None:
         assert batch(latest)["messages"][0]["peaks"] is None
 
 
-def test_an_estimate_comes_with_its_conductivity_profile() -> None:
+def test_an_estimate_comes_with_its_conductivity_profile():
     latest = MessageStore(3.6)
     latest.add("eit.estimate", message(k=1.8, sigma=0.9), 1.0)
     assert batch(latest)["messages"][0]["conductivity"] is None, "the model is not known yet"
@@ -124,11 +124,10 @@ def test_an_estimate_comes_with_its_conductivity_profile() -> None:
     assert told == pytest.approx(conductivity_profile("gaussian_derivative", 1.8, 0.9, 3.6))
 
 
-def test_the_profile_equals_the_banks_conductivity() -> None:
+def test_the_profile_equals_the_banks_conductivity():
     mesh = small_fingertip()
     height_cm = float(mesh.nodes[:, 1].max())
     told = conductivity_profile("gaussian_derivative", 0.6 * height_cm, 0.8 * height_cm, height_cm)
-    assert told is not None
     middles_cm = mesh.nodes[:, 1][mesh.triangles].mean(axis=1)
     at_middles = np.interp(middles_cm, np.linspace(0, height_cm, HEIGHTS), told)
     built = conductivity_of_mesh(mesh, "gaussian_derivative", 0.6 * height_cm, 0.8 * height_cm)

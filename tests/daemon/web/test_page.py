@@ -5,7 +5,6 @@ import itertools
 import pytest
 
 from shearloop.daemon.web.message_store import conductivity_profile
-from tests.daemon.web.conftest import Browsed
 from tests.daemon.web.fake_daemon import MESSAGES, REASONS
 
 pytestmark = pytest.mark.usefixtures("fresh")
@@ -46,7 +45,7 @@ def signed(value: float, digits: int) -> str:
     return f"{value:+.{digits}f}".replace("-", "\u2212")
 
 
-def test_the_page_shows_the_messages_numbers(browsed: Browsed) -> None:
+def test_the_page_shows_the_messages_numbers(browsed):
     browsed.open()
     browsed.until(".fingertip .map-text", "100 k × 100 σ")
     said = {name: dict(given) for name, given in MESSAGES.items()}
@@ -101,12 +100,11 @@ def test_the_page_shows_the_messages_numbers(browsed: Browsed) -> None:
         browsed.page.get_attribute(".fingertip .map", "aria-label")
     )
     values = conductivity_profile("gaussian_derivative", estimate["k"], estimate["sigma"], 3.6)
-    assert values is not None
     spread = f"conductivity over the height, from {min(values):.2f} to {max(values):.2f} of the untouched gel's"
     browsed.page.wait_for_function("text => document.querySelector('.gel').ariaLabel === text", arg=spread)
 
 
-def test_the_heatmap_has_k_upwards_and_sigma_to_the_right_and_shades_rise_evenly(browsed: Browsed) -> None:
+def test_the_heatmap_has_k_upwards_and_sigma_to_the_right_and_shades_rise_evenly(browsed):
     # Large enough that the marks cover little of it.
     browsed.page.set_viewport_size({"width": 1920, "height": 1080})
     browsed.open()
@@ -122,7 +120,7 @@ def test_the_heatmap_has_k_upwards_and_sigma_to_the_right_and_shades_rise_evenly
     assert grey[-1] - grey[0] > 180
 
 
-def test_lines_break_at_invalid_values_and_continue_past_other_sources(browsed: Browsed) -> None:
+def test_lines_break_at_invalid_values_and_continue_past_other_sources(browsed):
     rows = browsed.open().evaluate(
         """async () => {
           const { Series } = await import('/assets/series.js');
@@ -144,7 +142,7 @@ def test_lines_break_at_invalid_values_and_continue_past_other_sources(browsed: 
     assert b == ["", 1, "", 2, "", 3, None, None, 4], "a pause breaks the line as well"
 
 
-def test_an_invalid_estimate_shows_no_number(browsed: Browsed) -> None:
+def test_an_invalid_estimate_shows_no_number(browsed):
     nothing = {"torque_nm": None, "torque_low_nm": None, "torque_high_nm": None, "diameter_mm": None}
     browsed.daemon.say(estimate={**nothing, "valid": False, "reason": "no signal above the noise"})
     browsed.open()
@@ -159,14 +157,14 @@ def test_an_invalid_estimate_shows_no_number(browsed: Browsed) -> None:
     )
 
 
-def test_a_replay_is_drawn_at_its_own_times(browsed: Browsed) -> None:
+def test_a_replay_is_drawn_at_its_own_times(browsed):
     browsed.daemon.say(**{name: {"ago_s": 3600.0} for name in MESSAGES})
     browsed.open()
     for chart in ("#torque-chart", "#shear-chart"):
         browsed.page.wait_for_function(COLOURED, arg=chart)
 
 
-def test_every_reason_for_a_hold_is_shown(browsed: Browsed) -> None:
+def test_every_reason_for_a_hold_is_shown(browsed):
     browsed.daemon.say(loop={"phase": "held", "response": "hold", "reasons": REASONS})
     browsed.open()
     browsed.until("#holding-title", "Holding, because")
@@ -177,7 +175,7 @@ def test_every_reason_for_a_hold_is_shown(browsed: Browsed) -> None:
     browsed.page.wait_for_selector("#holding", state="hidden")
 
 
-def test_faults_of_robot_and_gripper_are_shown_in_their_panels(browsed: Browsed) -> None:
+def test_faults_of_robot_and_gripper_are_shown_in_their_panels(browsed):
     browsed.daemon.say(
         robot={"protective_stop": True, "safety_mode": 3, "blocked": "The robot is in a protective stop."},
         gripper={"fault": 11, "fault_text": "overheated"},
@@ -197,7 +195,7 @@ def test_faults_of_robot_and_gripper_are_shown_in_their_panels(browsed: Browsed)
     )
 
 
-def test_an_invalid_load_cell_reading_shows_no_number(browsed: Browsed) -> None:
+def test_an_invalid_load_cell_reading_shows_no_number(browsed):
     browsed.open()
     browsed.daemon.say(load={"valid": False, "reason": "the reading is the same for two seconds"})
     why = "load cell: the reading is the same for two seconds"
@@ -205,7 +203,7 @@ def test_an_invalid_load_cell_reading_shows_no_number(browsed: Browsed) -> None:
     assert browsed.layout()["spilt"] == []
 
 
-def test_silent_sources_are_marked_old(browsed: Browsed) -> None:
+def test_silent_sources_are_marked_old(browsed):
     browsed.open()
     browsed.daemon.say(robot=None, load=None)
     browsed.until("#robot .age", "OLD")
@@ -214,7 +212,7 @@ def test_silent_sources_are_marked_old(browsed: Browsed) -> None:
     browsed.until_old(1)
 
 
-def test_a_slow_load_cell_is_not_marked_old(browsed: Browsed) -> None:
+def test_a_slow_load_cell_is_not_marked_old(browsed):
     browsed.open()
     slow = {"load_cell": {"alive": True, "restarts": 0, "expected_hz": 0.05}}
     browsed.daemon.say(health={"tasks": slow})
@@ -224,7 +222,7 @@ def test_a_slow_load_cell_is_not_marked_old(browsed: Browsed) -> None:
     browsed.until_shown({"#load-torque": "+0.1012 N·m", "#load-note": ""})
 
 
-def test_the_page_is_redrawn_thirty_times_a_second(browsed: Browsed) -> None:
+def test_the_page_is_redrawn_thirty_times_a_second(browsed):
     page = browsed.open()
     # At some moment of a busy machine, that is: what a redraw costs is what the page can answer for.
     page.wait_for_function("() => parseFloat(document.querySelector('#rate').textContent) >= 27")
@@ -232,7 +230,7 @@ def test_the_page_is_redrawn_thirty_times_a_second(browsed: Browsed) -> None:
     assert each_ms < 33
 
 
-def test_two_fingertips_and_their_combined_estimate(browsed: Browsed) -> None:
+def test_two_fingertips_and_their_combined_estimate(browsed):
     page = browsed.open()
     browsed.daemon.say(
         loop={"torque_source": "combined"},

@@ -4,7 +4,6 @@ from typing import Any
 
 import pytest
 
-from tests.daemon.web.conftest import Browsed
 from tests.daemon.web.fake_daemon import REASONS
 
 pytestmark = pytest.mark.usefixtures("fresh")
@@ -12,7 +11,7 @@ COMMANDS = ("tare", "start", "pause", "resume", "unlock")
 SIZES = {"tablet": (1024, 768), "upright tablet": (768, 1024), "screen": (1920, 1080), "phone": (390, 844)}
 
 
-def test_stop_needs_no_token_and_motion_does(browsed: Browsed) -> None:
+def test_stop_needs_no_token_and_motion_does(browsed):
     page = browsed.open()
     assert page.locator("#controls [data-command]:disabled").count() == len(COMMANDS)
     page.click("#stop")
@@ -28,7 +27,7 @@ def test_stop_needs_no_token_and_motion_does(browsed: Browsed) -> None:
     assert browsed.daemon.asked == ["stop", "stop"]
 
 
-def test_commands_reach_the_daemon_with_the_token(browsed: Browsed) -> None:
+def test_commands_reach_the_daemon_with_the_token(browsed):
     page = browsed.open(token=True)
     assert "token" not in page.url, "it does not stay in the address bar"
     for name in COMMANDS:
@@ -40,7 +39,7 @@ def test_commands_reach_the_daemon_with_the_token(browsed: Browsed) -> None:
     browsed.until("#answer", "pause was refused: no experiment is running")
 
 
-def test_the_keyboard_reaches_everything_and_stop_first(browsed: Browsed) -> None:
+def test_the_keyboard_reaches_everything_and_stop_first(browsed):
     page = browsed.open(token=True)
     reached: list[dict[str, Any]] = []
     for _ in range(8):
@@ -66,7 +65,7 @@ def test_the_keyboard_reaches_everything_and_stop_first(browsed: Browsed) -> Non
 
 
 @pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
-def test_the_page_fits_and_stop_stays_visible(size: tuple[int, int], browsed: Browsed) -> None:
+def test_the_page_fits_and_stop_stays_visible(size, browsed):
     page = browsed.open(token=True)
     page.set_viewport_size({"width": size[0], "height": size[1]})
     browsed.daemon.say(loop={"phase": "held", "response": "hold", "reasons": REASONS})
@@ -87,7 +86,7 @@ def test_the_page_fits_and_stop_stays_visible(size: tuple[int, int], browsed: Br
             assert apart or one["bottom"] <= other["top"] or other["bottom"] <= one["top"]
 
 
-def test_a_dead_daemon_is_shown_within_two_seconds(browsed: Browsed) -> None:
+def test_a_dead_daemon_is_shown_within_two_seconds(browsed):
     page = browsed.open()
     told_after_s = []
     # The bound is the page's; a browser that the machine does not let run for half a second is given another try.
@@ -118,7 +117,7 @@ def test_a_dead_daemon_is_shown_within_two_seconds(browsed: Browsed) -> None:
     assert min(told_after_s) < 2.0
 
 
-def test_a_lost_viewer_is_shown_and_reconnects(browsed: Browsed) -> None:
+def test_a_lost_viewer_is_shown_and_reconnects(browsed):
     page = browsed.open(token=True)
     browsed.viewer.kill()
     browsed.until("#link-state", "✗ VIEWER LOST")
@@ -140,7 +139,7 @@ def test_a_lost_viewer_is_shown_and_reconnects(browsed: Browsed) -> None:
     assert (found["spilt"], len(found["panels"])) == ([], 5)
 
 
-def test_a_missing_daemon_is_shown_with_the_cure(browsed: Browsed) -> None:
+def test_a_missing_daemon_is_shown_with_the_cure(browsed):
     browsed.daemon.kill()
     browsed.viewer.kill()
     browsed.viewer.start()

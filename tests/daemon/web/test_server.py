@@ -32,6 +32,7 @@ from shearloop.daemon.web.bridge import Bridge, DaemonAddress
 from shearloop.daemon.web.message_store import MessageStore
 from shearloop.daemon.web.server import HEADERS, NEEDS_TOKEN, make_app, serve
 from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.daemon.sample_messages import sample
 
 TOKEN = "the token of this test, long enough for anybody"  # noqa: S105 - opens nothing but this test's page
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
@@ -96,7 +97,7 @@ async def post(page: Served, path: str, **headers: str) -> tuple[int, dict[str, 
         return response.status, await response.json()
 
 
-async def test_motion_needs_the_token_and_stop_does_not(tmp_path: Path) -> None:
+async def test_motion_needs_the_token_and_stop_does_not(tmp_path):
     async with served(tmp_path) as page:
         for name in NEEDS_TOKEN:
             assert (await post(page, f"/commands/{name}"))[0] == 403
@@ -123,7 +124,7 @@ async def test_motion_needs_the_token_and_stop_does_not(tmp_path: Path) -> None:
         {"Host": "evil.example", "Origin": "http://evil.example"},
     ],
 )
-async def test_pages_of_other_sites_get_nothing(headers: dict[str, str], tmp_path: Path) -> None:
+async def test_pages_of_other_sites_get_nothing(headers, tmp_path):
     async with served(tmp_path) as page:
         for path in ("/", "/assets/app.js", "/settings.json"):
             async with page.http.get(page.base + path, headers=headers) as response:
@@ -136,21 +137,19 @@ async def test_pages_of_other_sites_get_nothing(headers: dict[str, str], tmp_pat
         assert page.asked == []
 
 
-async def test_every_response_has_the_security_headers(tmp_path: Path) -> None:
+async def test_every_response_has_the_security_headers(tmp_path):
     async with served(tmp_path) as page:
         for path in ("/", "/assets/view.css", "/settings.json", "/assets/..%2Fserver.py", "/none", "/stop"):
             async with page.http.get(page.base + path) as response:
                 assert {key: response.headers[key] for key in HEADERS} == HEADERS, path
-                assert response.status == (
-                    200 if path in ("/", "/assets/view.css", "/settings.json") else response.status
-                )
+                assert response.status == 200 or path not in ("/", "/assets/view.css", "/settings.json")
                 assert "Access-Control-Allow-Origin" not in response.headers
         assert "unsafe" not in HEADERS["Content-Security-Policy"]
         async with page.http.get(f"{page.base}/assets/..%2Fserver.py") as response:
             assert response.status == 404
 
 
-def test_the_page_uses_no_external_resources() -> None:
+def test_the_page_uses_no_external_resources():
     assets = resources.files("shearloop.daemon.web") / "assets"
     for item in assets.iterdir():
         if item.name.endswith((".html", ".css", ".js")):
@@ -167,27 +166,15 @@ def test_the_page_uses_no_external_resources() -> None:
     assert "onclick" not in html
 
 
-async def test_messages_reach_open_pages_and_heatmaps_need_one(tmp_path: Path) -> None:
+async def test_messages_reach_open_pages_and_heatmaps_need_one(tmp_path):
     async with served(tmp_path) as page:
         await until(lambda: page.publisher.has_subscriber("load.torque"))
         assert not page.publisher.has_subscriber(EitHeatmap.topic)
         async with page.http.ws_connect(f"{page.base}/stream") as stream:
             first = await stream.receive_json()
-            assert first["first"]
-            assert (first["messages"], first["quiet_s"]) == ([], None)
+            assert (first["first"], first["messages"], first["quiet_s"]) == (True, [], None)
             await until(lambda: page.publisher.has_subscriber(EitHeatmap.topic))
-            page.publisher.publish(
-                LoadTorque(
-                    source="load_cell",
-                    t_mono_ns=1,
-                    torque_nm=0.1,
-                    raw=5.0,
-                    saturated=False,
-                    spike=False,
-                    valid=True,
-                    reason="",
-                )
-            )
+            page.publisher.publish(sample(LoadTorque, torque_nm=0.1))
             while not (batch := await stream.receive_json())["messages"]:
                 continue
             assert not batch["first"]
@@ -199,9 +186,7 @@ async def test_messages_reach_open_pages_and_heatmaps_need_one(tmp_path: Path) -
         await until(lambda: not page.publisher.has_subscriber(EitHeatmap.topic))
 
 
-async def test_many_stops_share_one_request_and_overtake_hanging_commands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_many_stops_share_one_request_and_overtake_hanging_commands(tmp_path, monkeypatch):
     monkeypatch.setattr(bridge_module, "COMMAND_TIMEOUT_S", 30.0)
     released, all_in, stops, wanted = asyncio.Event(), asyncio.Event(), 0, 0
 
@@ -235,7 +220,7 @@ async def test_many_stops_share_one_request_and_overtake_hanging_commands(
         assert sorted(status for status, _ in await asyncio.gather(*hanging)) == [200] * 4 + [429] * 2
 
 
-async def test_a_stop_without_a_daemon_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_stop_without_a_daemon_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(bridge_module, "COMMAND_TIMEOUT_S", 0.05)
     async with served(tmp_path) as page:
         page.bridge._address = DaemonAddress("", f"ipc://{tmp_path}/nobody")
@@ -244,7 +229,7 @@ async def test_a_stop_without_a_daemon_is_reported(tmp_path: Path, monkeypatch: 
         assert "no daemon answered" in reply["reason"]
 
 
-async def test_pages_and_their_messages_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_pages_and_their_messages_are_limited(tmp_path, monkeypatch):
     monkeypatch.setattr(server_module, "MAX_PAGES", 1)
     async with served(tmp_path) as page:
         async with page.http.ws_connect(f"{page.base}/stream") as stream:
@@ -258,7 +243,7 @@ async def test_pages_and_their_messages_are_limited(tmp_path: Path, monkeypatch:
             assert response.status in (200, 413)
 
 
-async def test_a_used_port_and_an_invalid_address_are_one_sentence(tmp_path: Path) -> None:
+async def test_a_used_port_and_an_invalid_address_are_one_sentence(tmp_path):
     def ready(_: int) -> None:
         raise AssertionError
 
@@ -277,11 +262,10 @@ async def test_a_used_port_and_an_invalid_address_are_one_sentence(tmp_path: Pat
 
 @pytest.mark.usefixtures("hears_of_terminal")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-async def test_view_prints_its_address_and_ends_on_a_signal(number: signal.Signals, tmp_path: Path) -> None:
+async def test_view_prints_its_address_and_ends_on_a_signal(number, tmp_path):
     token = tmp_path / "token"
     addresses = ("--connect", f"ipc://{tmp_path}/p", "--commands", f"ipc://{tmp_path}/c")
     async with shearloop("view", "--port", "0", "--json", "--token-file", str(token), *addresses) as view:
-        assert view.stdout is not None
         told = json.loads(await view.stdout.readline())
         assert told["url_with_token"] == f"{told['url']}#token={token.read_text().strip()}"
         async with aiohttp.ClientSession() as http, http.ws_connect(f"{told['url']}stream") as stream:

@@ -3,7 +3,7 @@
 import asyncio
 import json
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,12 +11,9 @@ from typing import Any
 
 import aiohttp
 import pytest
-import zmq.asyncio
 
-from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import main
-from shearloop.daemon.config import load_daemon_config
-from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.daemon.conftest import running_daemon, shearloop
 
 
 @dataclass
@@ -69,37 +66,27 @@ async def page_of(places: dict[str, str], folder: Path, who: str | None) -> Asyn
     if who is not None:
         words += ["--key", str(folder / who / "client.key_secret"), "--server-key", str(folder / "keys" / "server.key")]
     async with shearloop(*words) as view, aiohttp.ClientSession() as http:
-        assert view.stdout is not None
         told = json.loads(await view.stdout.readline())
         yield Page(http, told["url"], told["url_with_token"].partition("#token=")[2])
 
 
-async def test_over_the_network_motion_needs_key_and_token_and_stop_neither(
-    config: Callable[..., Path], places: dict[str, str], tmp_path: Path
-) -> None:
+async def test_over_the_network_motion_needs_key_and_token_and_stop_neither(config, places, tmp_path):
     curve = {"server_key": str(tmp_path / "keys/server.key_secret"), "clients": str(tmp_path / "keys/clients")}
-    with zmq.asyncio.Context() as context:
-        daemon = Daemon(load_daemon_config(config(**places, curve=curve)), context)
-        running = asyncio.create_task(daemon.run())
-        try:
-            async with asyncio.timeout(DEADLINE_S):
-                async with page_of(places, tmp_path, "ada") as page:
-                    assert await page.hears()
-                    for command in ("tare", "start", "pause", "resume", "unlock"):
-                        assert (await page.post(f"commands/{command}"))[0] == 403, command
-                    assert await page.post("commands/tare", token=True) == (200, {"ok": True, "tared": ["right"]})
-                    # It came to the daemon, which has nothing to start.
-                    status, reply = await page.post("commands/start", token=True)
-                    assert status == 409
-                    assert reply["reason"].startswith("no experiment is given")
-                    assert await page.post("stop") == (200, {"ok": True, "stopped": ""})
-                for who in ("eve", None):
-                    async with page_of(places, tmp_path, who) as page:
-                        status, reply = await page.post("commands/tare", token=True)
-                        assert (status, reply["ok"]) == (503, False), who
-                        assert await page.post("stop") == (200, {"ok": True, "stopped": ""}), who
-            assert daemon.health.tasks()["commands"]["errors"]["key is not allowed"] >= 1
-            assert not daemon._stop.is_set(), "a stop from a page ends what moves, and not the daemon"
-        finally:
-            daemon.stop()
-            await running
+    async with running_daemon(config(**places, curve=curve)) as daemon:
+        async with page_of(places, tmp_path, "ada") as page:
+            assert await page.hears()
+            for command in ("tare", "start", "pause", "resume", "unlock"):
+                assert (await page.post(f"commands/{command}"))[0] == 403, command
+            assert await page.post("commands/tare", token=True) == (200, {"ok": True, "tared": ["right"]})
+            # It came to the daemon, which has nothing to start.
+            status, reply = await page.post("commands/start", token=True)
+            assert status == 409
+            assert reply["reason"].startswith("no experiment is given")
+            assert await page.post("stop") == (200, {"ok": True, "stopped": ""})
+        for who in ("eve", None):
+            async with page_of(places, tmp_path, who) as page:
+                status, reply = await page.post("commands/tare", token=True)
+                assert (status, reply["ok"]) == (503, False), who
+                assert await page.post("stop") == (200, {"ok": True, "stopped": ""}), who
+        assert daemon.health.tasks()["commands"]["errors"]["key is not allowed"] >= 1
+        assert not daemon._stop.is_set(), "a stop from a page ends what moves, and not the daemon"

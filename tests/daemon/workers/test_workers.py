@@ -44,7 +44,7 @@ def dies_once(folder: str, item: int) -> int:
     return item * item
 
 
-def test_all_executors_give_the_same_numbers(scheduler: str) -> None:
+def test_all_executors_give_the_same_numbers(scheduler):
     items, shared = list(range(12)), {"factor": 0.37}
     alone = dict(SerialExecutor().map(square, shared, items))
     assert dict(ProcessExecutor(2).map(square, shared, items)) == alone
@@ -63,9 +63,7 @@ def test_all_executors_give_the_same_numbers(scheduler: str) -> None:
         (LOCAL, 5, 5),
     ],
 )
-def test_without_an_address_tasks_run_in_processes_of_this_computer(
-    cluster: str | None, jobs: int | None, count: int
-) -> None:
+def test_without_an_address_tasks_run_in_processes_of_this_computer(cluster, jobs, count):
     with open_executor(cluster, jobs) as executor:
         if count == 1:
             assert isinstance(executor, SerialExecutor)
@@ -74,12 +72,12 @@ def test_without_an_address_tasks_run_in_processes_of_this_computer(
             assert executor._count == count
 
 
-def test_a_tasks_error_is_raised(scheduler: str) -> None:
+def test_a_tasks_error_is_raised(scheduler):
     with open_executor(scheduler) as cluster, pytest.raises(UserError, match="item 2 is wrong"):
         list(cluster.map(fails, None, range(4)))
 
 
-def test_a_killed_worker_costs_only_its_own_tasks(scheduler: str, tmp_path: Path) -> None:
+def test_a_killed_worker_costs_only_its_own_tasks(scheduler, tmp_path):
     with open_executor(scheduler) as cluster:
         results = dict(cluster.map(dies_once, str(tmp_path), range(12)))
     assert results == {item: item * item for item in range(12)}
@@ -90,7 +88,7 @@ def test_a_killed_worker_costs_only_its_own_tasks(scheduler: str, tmp_path: Path
     assert len(runs) < 2 * 12 - 3
 
 
-def test_unfinished_results_are_dropped_quietly(scheduler: str) -> None:
+def test_unfinished_results_are_dropped_quietly(scheduler):
     """So ends what is interrupted where a result is used; a traceback told of it after the sentence."""
     with open_executor(scheduler) as cluster:
         found = cluster.map(square, {"factor": 0.37}, range(3))
@@ -104,13 +102,13 @@ def size(_: None, item: Any) -> int:
     return int(item.size)
 
 
-def test_a_large_recording_is_sent_to_a_cluster_without_a_warning(scheduler: str) -> None:
+def test_a_large_recording_is_sent_to_a_cluster_without_a_warning(scheduler):
     """Dask warned of what is over 10 MB, in six lines; warnings are errors here."""
     with open_executor(scheduler) as cluster:
         assert list(cluster.map(size, None, [np.zeros(1_500_000)])) == [(0, 1_500_000)]
 
 
-def test_a_missing_scheduler_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_scheduler_is_one_sentence(tmp_path, capsys):
     (tmp_path / "tip.yaml").write_text(FINGERTIP)
     (tmp_path / "bank.yaml").write_text(BANK)
     command = ["bank", "build", "--config", str(tmp_path / "bank.yaml"), "--out", str(tmp_path / "a.bank")]
@@ -118,7 +116,7 @@ def test_a_missing_scheduler_is_one_sentence(tmp_path: Path, capsys: pytest.Capt
     assert "no Dask scheduler answers at tcp://127.0.0.1:9" in capsys.readouterr().err
 
 
-def test_a_server_that_is_no_scheduler_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_that_is_no_scheduler_times_out(monkeypatch):
     monkeypatch.setattr("shearloop.daemon.workers.CONNECT_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as deaf:
         address = f"tcp://127.0.0.1:{deaf.getsockname()[1]}"
@@ -149,9 +147,7 @@ def lonely(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
         process.wait(STARTED_S)
 
 
-def test_a_scheduler_without_workers_or_a_lost_one_is_one_sentence(
-    lonely: tuple[subprocess.Popen[bytes], str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scheduler_without_workers_or_a_lost_one_is_one_sentence(lonely, monkeypatch):
     import distributed
 
     process, address = lonely
@@ -172,7 +168,7 @@ def test_a_scheduler_without_workers_or_a_lost_one_is_one_sentence(
         list(cluster.map(square, {"factor": 1.0}, range(3)))
 
 
-def test_a_cluster_address_needs_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cluster_address_needs_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(UserError, match=r"pip install 'shearloop\[cluster\]'"), open_executor("tcp://127.0.0.1:9"):
         pass

@@ -30,7 +30,7 @@ def banks(scheduler: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     return built[0], built[1]
 
 
-def test_a_bank_has_the_same_bytes_from_a_cluster(banks: tuple[Path, Path]) -> None:
+def test_a_bank_has_the_same_bytes_from_a_cluster(banks):
     assert banks[0].read_bytes() == banks[1].read_bytes()
 
 
@@ -46,7 +46,7 @@ def varied(banks: tuple[Path, Path], scheduler: str) -> tuple[Path, Path]:
     return folder / "over-here", folder / "over-there"
 
 
-def test_banks_over_more_parameters_have_the_same_bytes_from_a_cluster(varied: tuple[Path, Path]) -> None:
+def test_banks_over_more_parameters_have_the_same_bytes_from_a_cluster(varied):
     here, there = ({path.name: path.read_bytes() for path in folder.iterdir()} for folder in varied)
     assert len(set(here.values())) == 4
     assert here == there
@@ -76,9 +76,7 @@ def killed(scheduler: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int
         client.wait_for_workers(2, timeout=STARTED_S)
 
 
-def test_evaluate_gives_the_same_figures_on_a_cluster_with_a_killed_worker(
-    scheduler: str, shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], killed: list[int]
-) -> None:
+def test_evaluate_gives_the_same_figures_on_a_cluster_with_a_killed_worker(scheduler, shared, tmp_path, capsys, killed):
     slices, cylinders = (str(shared / "recordings" / name) for name in ("torque_slices", "diameter_slices"))
     calibration = str(tmp_path / "slices.cal")
     assert main(["calibrate", slices, "--estimator", "regression", "--time-range", "0:0.6", "--out", calibration]) == 0
@@ -92,9 +90,7 @@ def test_evaluate_gives_the_same_figures_on_a_cluster_with_a_killed_worker(
     assert figures[0] == figures[1]
 
 
-def test_a_bank_has_the_same_bytes_after_a_killed_worker(
-    banks: tuple[Path, Path], scheduler: str, killed: list[int]
-) -> None:
+def test_a_bank_has_the_same_bytes_after_a_killed_worker(banks, scheduler, killed):
     again = banks[0].with_name("killed.bank")
     config = str(banks[0].with_name("bank.yaml"))
     assert main(["bank", "build", "--config", config, "--out", str(again), "--cluster", scheduler]) == 0
@@ -103,7 +99,7 @@ def test_a_bank_has_the_same_bytes_after_a_killed_worker(
 
 
 @pytest.mark.usefixtures("few_mixtures")
-def test_a_chart_has_the_same_numbers_after_a_killed_worker(scheduler: str, killed: list[int], tmp_path: Path) -> None:
+def test_a_chart_has_the_same_numbers_after_a_killed_worker(scheduler, killed, tmp_path):
     from shearloop.bank.estimation import Name, Physics
     from shearloop.daemon.analysis.charts.fault_sweeps import FAULTS, sweeps
     from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, synthetic_slices

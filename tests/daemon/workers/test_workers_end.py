@@ -28,7 +28,7 @@ def ignored_signals(_: None, __: int) -> set[int]:
     return {number for number in (signal.SIGINT, signal.SIGHUP) if signal.getsignal(number) is signal.SIG_IGN}
 
 
-def test_worker_processes_ignore_the_terminals_signals() -> None:
+def test_worker_processes_ignore_the_terminals_signals():
     assert list(ProcessExecutor(1).map(ignored_signals, None, [0])) == [(0, {signal.SIGINT, signal.SIGHUP})]
 
 
@@ -58,9 +58,7 @@ def interrupted_once_it_works(tmp_path: Path) -> Iterator[Interrupted]:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("more", ["", "x" * (1 << 20)], ids=["small", "large"])
-def test_worker_processes_end_on_an_interrupt(
-    number: signal.Signals, more: str, interrupted_once_it_works: Interrupted, tmp_path: Path
-) -> None:
+def test_worker_processes_end_on_an_interrupt(number, more, interrupted_once_it_works, tmp_path):
     """They were waited for until their tasks were done; of SIGTERM they did not hear, and stayed.
 
     Tasks that no pipe holds were waited for as well, for ever and deaf to more signals (Python 3.11.2, Debian 12).

@@ -14,12 +14,11 @@ async def two_lines(port: SerialPort) -> bytes:
     data = b""
     while data.count(b"\n") < 2:
         received = await port.read(20)
-        assert received is not None
         data += received.data
     return data
 
 
-def test_a_line_is_what_the_board_sends_byte_for_byte() -> None:
+def test_a_line_is_what_the_board_sends_byte_for_byte():
     values = np.zeros(1024)
     values[[1, 2, 1023]] = [0.0021484375, 0.55, 1.0162109375]
     line = format_line(values)
@@ -29,14 +28,14 @@ def test_a_line_is_what_the_board_sends_byte_for_byte() -> None:
 
 
 @given(st.integers(0, 2**32))
-def test_what_it_sends_is_what_the_driver_reads(seed: int) -> None:
+def test_what_it_sends_is_what_the_driver_reads(seed):
     values = np.where(ZERO_SLOTS, 0, np.random.default_rng(seed).integers(1, 22_000, 1024) / 10_000)
     read = read_line(format_line(values).removesuffix(b"\n"), ZERO_SLOTS)
     assert not isinstance(read, FrameError)
     np.testing.assert_array_equal(read, values)
 
 
-def test_faults_are_parsed() -> None:
+def test_faults_are_parsed():
     assert parse_fault("cut-line", EitKitBoard.faults) == BoardFault("cut-line")
     assert parse_fault(" silence 3\n", EitKitBoard.faults) == BoardFault("silence", 3.0)
     assert parse_fault("unplug:0.5", EitKitBoard.faults) == BoardFault("unplug", 0.5)
@@ -53,12 +52,12 @@ def test_faults_are_parsed() -> None:
         ("unplug nan", "'nan' is no duration"),
     ],
 )
-def test_invalid_faults_are_refused(text: str, sentence: str) -> None:
+def test_invalid_faults_are_refused(text, sentence):
     with pytest.raises(ValueError, match=sentence):
         parse_fault(text, EitKitBoard.faults)
 
 
-async def test_it_says_nothing_before_it_is_started_and_is_silent_after_its_last_frame() -> None:
+async def test_it_says_nothing_before_it_is_started_and_is_silent_after_its_last_frame():
     line = np.where(ZERO_SLOTS, 0, 0.25)
     board = EitKitBoard([line, line], period_s=0.001)
     async with running(board.run()):
@@ -72,7 +71,7 @@ async def test_it_says_nothing_before_it_is_started_and_is_silent_after_its_last
     assert board.port.appearances.qsize() == 1
 
 
-async def test_faults_can_be_switched_on_while_it_runs() -> None:
+async def test_faults_can_be_switched_on_while_it_runs():
     line = np.where(ZERO_SLOTS, 0, 0.25)
     board = EitKitBoard([line, line], period_s=0.001)
     board.command("nan")

@@ -50,9 +50,7 @@ async def a_rig(
     ("sketch", "calibration", "noise_nm"),
     [(SKETCH, CALIBRATION, 120 / SKETCH.counts_per_nm), (PAPER_SKETCH, LoadCalibration.of_torque_lines(), 2e-5)],
 )
-async def test_torque_comes_through_from_either_sketch(
-    tmp_path: Path, sketch: Sketch, calibration: LoadCalibration, noise_nm: float
-) -> None:
+async def test_torque_comes_through_from_either_sketch(tmp_path, sketch, calibration, noise_nm):
     torques = [0.0, *(0.001 * n for n in range(60))]
     async with a_rig(tmp_path, torques, sketch, calibration) as rig:
         await rig.until(lambda: rig.samples and rig.samples[-1].torque_nm > 0.0585)
@@ -65,7 +63,7 @@ async def test_torque_comes_through_from_either_sketch(
         assert rig.cell.diagnostics()["flagged"] == 1  # the first line, whose beginning may be missing
 
 
-async def test_corrupted_lines_are_flagged_or_counted_and_the_rest_goes_on(tmp_path: Path) -> None:
+async def test_corrupted_lines_are_flagged_or_counted_and_the_rest_goes_on(tmp_path):
     async with a_rig(tmp_path) as rig:
         await rig.until(lambda: len(rig.samples) > 5)
         rig.board.command("spike")
@@ -80,7 +78,7 @@ async def test_corrupted_lines_are_flagged_or_counted_and_the_rest_goes_on(tmp_p
         assert all(sample.trusted for sample in rig.samples[n:])
 
 
-async def test_saturation_and_a_frozen_converter_are_flagged_while_they_last(tmp_path: Path) -> None:
+async def test_saturation_and_a_frozen_converter_are_flagged_while_they_last(tmp_path):
     async with a_rig(tmp_path) as rig:
         await rig.until(lambda: rig.samples)
         rig.board.command("saturation:0.01")
@@ -92,7 +90,7 @@ async def test_saturation_and_a_frozen_converter_are_flagged_while_they_last(tmp
         await rig.until(lambda: rig.samples[-1].trusted)
 
 
-async def test_a_jump_in_torque_is_flagged_and_then_believed(tmp_path: Path) -> None:
+async def test_a_jump_in_torque_is_flagged_and_then_believed(tmp_path):
     held_nm = [0.03]
     async with a_rig(tmp_path, (held_nm[0] for _ in repeat(None))) as rig:
         await rig.until(lambda: len(rig.samples) > 3)
@@ -104,7 +102,7 @@ async def test_a_jump_in_torque_is_flagged_and_then_believed(tmp_path: Path) -> 
         assert jumped[-1].torque_nm == pytest.approx(1.63, abs=0.01)
 
 
-async def test_an_unplugged_board_is_lost_and_found_again(tmp_path: Path) -> None:
+async def test_an_unplugged_board_is_lost_and_found_again(tmp_path):
     async with a_rig(tmp_path) as rig:
         await rig.until(lambda: len(rig.samples) > 3)
         rig.board.command("unplug:0.05")
@@ -117,7 +115,7 @@ async def test_an_unplugged_board_is_lost_and_found_again(tmp_path: Path) -> Non
         assert "gone" in rig.losses[0].sentence
 
 
-async def test_silence_is_reported_as_a_loss(tmp_path: Path) -> None:
+async def test_silence_is_reported_as_a_loss(tmp_path):
     async with a_rig(tmp_path) as rig:
         await rig.until(lambda: len(rig.samples) > 3)
         rig.board.command("silence")
@@ -125,7 +123,7 @@ async def test_silence_is_reported_as_a_loss(tmp_path: Path) -> None:
         assert "sent nothing for 0.7 s" in rig.losses[0].sentence
 
 
-async def test_a_tare_takes_effect_with_the_next_sample(tmp_path: Path) -> None:
+async def test_a_tare_takes_effect_with_the_next_sample(tmp_path):
     async with a_rig(tmp_path) as rig:
         await rig.until(lambda: len(rig.samples) > 3)
         rig.cell.tare(rig.samples[-1].raw)

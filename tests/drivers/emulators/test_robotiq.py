@@ -38,7 +38,7 @@ def framed(request: bytes) -> bytes:
     return request + crc16(request)
 
 
-def test_activation_opens_closes_and_opens_at_its_speed() -> None:
+def test_activation_opens_closes_and_opens_at_its_speed():
     gripper = Gripper()
     gripper.write(GripperRegisters(act=True))
     travelled, extremes, t_s = 0.0, set(), 0.0
@@ -55,7 +55,7 @@ def test_activation_opens_closes_and_opens_at_its_speed() -> None:
 
 
 @pytest.mark.parametrize(("speed", "mm_s"), [(0, 30.0), (255, 250.0), (51, 74.0)])
-def test_fingers_move_at_the_commanded_speed(speed: int, mm_s: float) -> None:
+def test_fingers_move_at_the_commanded_speed(speed, mm_s):
     gripper = active_gripper()
     go(gripper, 230, speed)
     steps(gripper, 0.2)
@@ -64,7 +64,7 @@ def test_fingers_move_at_the_commanded_speed(speed: int, mm_s: float) -> None:
 
 
 @given(st.floats(1, 139), st.integers(0, 255), st.floats(0.001, 0.2))
-def test_fingers_never_pass_through_an_object(width: float, force: int, dt_s: float) -> None:
+def test_fingers_never_pass_through_an_object(width, force, dt_s):
     gripper = active_gripper()
     gripper.put_between(width)
     go(gripper, 255, force=force)
@@ -76,7 +76,7 @@ def test_fingers_never_pass_through_an_object(width: float, force: int, dt_s: fl
     assert gripper.grip_force_n == pytest.approx(10 + 115 * force / 255)
 
 
-def test_closing_on_air_ends_at_the_fingers_own_stop_without_an_object() -> None:
+def test_closing_on_air_ends_at_the_fingers_own_stop_without_an_object():
     gripper = active_gripper()
     go(gripper, 255)
     steps(gripper, 1.0)
@@ -84,7 +84,7 @@ def test_closing_on_air_ends_at_the_fingers_own_stop_without_an_object() -> None
     assert gripper.grip_force_n == 0
 
 
-def test_moving_before_activation_is_fault_7_and_a_major_fault_waits_for_an_edge() -> None:
+def test_moving_before_activation_is_fault_7_and_a_major_fault_waits_for_an_edge():
     gripper = Gripper()
     go(gripper, 100)
     steps(gripper, 0.1)
@@ -103,7 +103,7 @@ def test_moving_before_activation_is_fault_7_and_a_major_fault_waits_for_an_edge
     assert (gripper.flt, gripper.sta) == (0, 3)
 
 
-def test_frames_are_the_manuals_byte_for_byte() -> None:
+def test_frames_are_the_manuals_byte_for_byte():
     # Instruction manual, "Modbus RTU example": requests and replies with their checks.
     assert framed(bytes.fromhex("0910 03E8 0003 06 0000 0000 0000")) == bytes.fromhex("091003E800030600000000000073 30")
     assert framed(bytes.fromhex("0910 03E8 0003 06 0900 00FF FFFF"))[-2:] == bytes.fromhex("4229")
@@ -123,7 +123,7 @@ def test_frames_are_the_manuals_byte_for_byte() -> None:
 
 
 @given(st.lists(st.integers(1, 12), min_size=1))
-def test_modbus_requests_come_in_any_slices(widths: list[int]) -> None:
+def test_modbus_requests_come_in_any_slices(widths):
     requests = [
         framed(READ_STATUS),
         framed(bytes.fromhex("0910 03E8 0003 06 0900 0064 FF32")),
@@ -150,12 +150,12 @@ def test_modbus_requests_come_in_any_slices(widths: list[int]) -> None:
         ("0903 07D0 0000", "0983 02"),
     ],
 )
-def test_invalid_modbus_requests_get_error_codes(request_hex: str, reply_hex: str) -> None:
+def test_invalid_modbus_requests_get_error_codes(request_hex, reply_hex):
     assert ModbusSlave(Gripper()).replies(framed(bytes.fromhex(request_hex)), 0.0) == framed(bytes.fromhex(reply_hex))
 
 
 @given(st.binary(max_size=600), st.integers(1, 50))
-def test_noise_on_the_line_does_no_harm(noise: bytes, width: int) -> None:
+def test_noise_on_the_line_does_no_harm(noise, width):
     face = ModbusSlave(Gripper())
     for start in range(0, len(noise), width):
         face.replies(noise[start : start + width], 0.0)
@@ -163,7 +163,7 @@ def test_noise_on_the_line_does_no_harm(noise: bytes, width: int) -> None:
     assert face.replies(framed(READ_STATUS), 1.0)[:3] == bytes.fromhex("090306")
 
 
-def test_the_socket_answers_as_the_urcap_does() -> None:
+def test_the_socket_answers_as_the_urcap_does():
     gripper = active_gripper()
     face = UrcapSession(gripper)
     assert face.feed(b"SET POS 100 SPE 255 FOR 50 GTO 1\n") == b"ack"
@@ -177,7 +177,7 @@ def test_the_socket_answers_as_the_urcap_does() -> None:
 
 
 @given(st.binary(max_size=2000), st.integers(1, 100))
-def test_invalid_input_gets_no_reply_and_moves_nothing(noise: bytes, width: int) -> None:
+def test_invalid_input_gets_no_reply_and_moves_nothing(noise, width):
     gripper = active_gripper()
     face = UrcapSession(gripper)
     for start in range(0, len(noise), width):
@@ -187,11 +187,11 @@ def test_invalid_input_gets_no_reply_and_moves_nothing(noise: bytes, width: int)
 
 
 @pytest.mark.parametrize("line", [b"SET POS 256\n", b"SET POS -1\n", b"SET POS\n", b"SET XYZ 1\n", b"SET\n", b"\n"])
-def test_invalid_set_is_not_acknowledged(line: bytes) -> None:
+def test_invalid_set_is_not_acknowledged(line):
     assert UrcapSession(active_gripper()).feed(line) == b""
 
 
-def test_positions_and_widths_are_each_others_inverse() -> None:
+def test_positions_and_widths_are_each_others_inverse():
     mechanics = GripperMechanics()
     assert mechanics.width_mm(mechanics.counts(42.0)) == pytest.approx(42.0)
     assert (mechanics.width_mm(3), mechanics.width_mm(230)) == (140.0, 0.0)

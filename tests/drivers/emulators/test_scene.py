@@ -38,7 +38,7 @@ class Hands:
         return self.scene.truth()
 
 
-def test_a_twist_of_the_wrist_is_felt_by_flange_lever_and_gel_while_the_tool_is_gripped() -> None:
+def test_a_twist_of_the_wrist_is_felt_by_flange_lever_and_gel_while_the_tool_is_gripped():
     hands = Hands()
     assert hands.twist(0.1, 0.2).torque_nm == 0.0, "nothing is gripped yet"
     truth = hands.go(255)
@@ -53,7 +53,7 @@ def test_a_twist_of_the_wrist_is_felt_by_flange_lever_and_gel_while_the_tool_is_
     assert (truth.gripped, truth.torque_nm, truth.shear_torque_nm, hands.flange_nm) == (False, 0.0, 0.0, 0.0)
 
 
-def test_a_load_cell_gives_the_mean_over_its_conversion() -> None:
+def test_a_load_cell_gives_the_mean_over_its_conversion():
     hands = Hands()
     hands.go(255)
     truth = hands.twist(0.2, 1.0)
@@ -61,7 +61,7 @@ def test_a_load_cell_gives_the_mean_over_its_conversion() -> None:
     assert hands.scene.conversion_nm(0.09) == pytest.approx(truth.torque_nm - STIFF * 0.2 * 0.045, rel=1e-4)
 
 
-def test_each_injection_of_a_frame_sees_the_shear_of_its_own_moment() -> None:
+def test_each_injection_of_a_frame_sees_the_shear_of_its_own_moment():
     hands = Hands()
     hands.go(255)
     truth = hands.twist(0.2, 1.0)
@@ -72,7 +72,7 @@ def test_each_injection_of_a_frame_sees_the_shear_of_its_own_moment() -> None:
     np.testing.assert_allclose(seen.shear_torque_nm, truth.shear_torque_nm - STIFF * 0.2 * before_s, rtol=1e-4)
 
 
-def test_a_faster_scene_relaxes_faster_and_its_measurements_cover_its_own_time() -> None:
+def test_a_faster_scene_relaxes_faster_and_its_measurements_cover_its_own_time():
     slow, fast = (Hands(TwinSettings(), speed) for speed in (1.0, 20.0))
     relaxed = []
     for hands, speed in ((slow, 1.0), (fast, 20.0)):
@@ -86,7 +86,7 @@ def test_a_faster_scene_relaxes_faster_and_its_measurements_cover_its_own_time()
     assert relaxed[0] < 0.98 * STIFF * 0.1
 
 
-def test_a_kick_is_a_jump_of_the_torque_and_gone_with_the_grip() -> None:
+def test_a_kick_is_a_jump_of_the_torque_and_gone_with_the_grip():
     hands = Hands()
     with pytest.raises(ValueError, match="kick needs a tool in the grip"):
         hands.scene.kick(0.05)
@@ -99,7 +99,7 @@ def test_a_kick_is_a_jump_of_the_torque_and_gone_with_the_grip() -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_slip_leaves_so_much_torque_and_the_grip_holds_again(sign: float) -> None:
+def test_a_slip_leaves_so_much_torque_and_the_grip_holds_again(sign):
     hands = Hands()
     hands.go(255)
     hands.twist(sign * 0.15, 0.1)
@@ -112,7 +112,7 @@ def test_a_slip_leaves_so_much_torque_and_the_grip_holds_again(sign: float) -> N
     assert hands.wait(DT_S).torque_nm == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_tool_that_falls_takes_the_torque_with_it() -> None:
+def test_a_tool_that_falls_takes_the_torque_with_it():
     hands = Hands()
     hands.go(255)
     hands.twist(0.1, 0.1)
@@ -122,7 +122,7 @@ def test_a_tool_that_falls_takes_the_torque_with_it() -> None:
     assert truth.width_mm == pytest.approx(0.0)
 
 
-def test_another_screw_is_one_that_nobody_has_turned() -> None:
+def test_another_screw_is_one_that_nobody_has_turned():
     hands = Hands()
     hands.go(255)
     hands.twist(0.1, 0.1)

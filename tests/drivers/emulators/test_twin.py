@@ -17,12 +17,12 @@ def sweep(twin: Twin, stop_rad: float, speed_rad_per_s: float = 0.2, start_rad: 
     return [twin.step(DT_S, start_rad + (stop_rad - start_rad) * n / steps, FIRM_N) for n in range(steps + 1)]
 
 
-def test_a_quick_twist_is_a_spring() -> None:
+def test_a_quick_twist_is_a_spring():
     twin = Twin(TwinSettings(relaxation_s=1e9))
     assert sweep(twin, 0.15)[-1].torque_nm == pytest.approx(STIFF * 0.15, rel=1e-6)
 
 
-def test_a_held_twist_relaxes_to_its_share_with_its_time_constant() -> None:
+def test_a_held_twist_relaxes_to_its_share_with_its_time_constant():
     twin = Twin()
     twin.step(DT_S, 0.0, FIRM_N)
     first = twin.step(1e-6, 0.1, FIRM_N).torque_nm
@@ -35,7 +35,7 @@ def test_a_held_twist_relaxes_to_its_share_with_its_time_constant() -> None:
     assert at_time_constant == pytest.approx(math.exp(-1), abs=0.05)
 
 
-def test_the_grip_slips_at_the_torque_that_its_force_bears() -> None:
+def test_the_grip_slips_at_the_torque_that_its_force_bears():
     twin = Twin()
     for n in range(500):
         twin.step(DT_S, 0.002 * n, 10.0)
@@ -43,7 +43,7 @@ def test_the_grip_slips_at_the_torque_that_its_force_bears() -> None:
     assert twin.state.slipped_rad > 0.5
 
 
-def test_conductivity_lags_behind_a_reversal_by_the_width_of_the_band() -> None:
+def test_conductivity_lags_behind_a_reversal_by_the_width_of_the_band():
     twin = Twin(TwinSettings(relaxation_s=1e9, joint_stiffness_nm_per_rad=1e9))
     up = sweep(twin, 0.1)[-1]
     down = sweep(twin, 0.05, start_rad=0.1)[-1]
@@ -51,7 +51,7 @@ def test_conductivity_lags_behind_a_reversal_by_the_width_of_the_band() -> None:
     assert down.torque_nm - down.shear_torque_nm == pytest.approx(-0.8 * 0.002, rel=1e-3)
 
 
-def test_a_seized_screw_breaks_loose_and_turns_at_a_lower_torque() -> None:
+def test_a_seized_screw_breaks_loose_and_turns_at_a_lower_torque():
     twin = Twin(TwinSettings(joint=Joint.SEIZED))
     torques = [state.torque_nm for state in sweep(twin, 0.6)]
     assert max(torques) == pytest.approx(0.18, abs=0.005)
@@ -59,7 +59,7 @@ def test_a_seized_screw_breaks_loose_and_turns_at_a_lower_torque() -> None:
     assert twin.state.tool_angle_rad > 0.3
 
 
-def test_a_screw_tightens_clockwise_and_a_stripping_one_gives_way() -> None:
+def test_a_screw_tightens_clockwise_and_a_stripping_one_gives_way():
     tight = Twin(TwinSettings(joint=Joint.TIGHTENING))
     torques = [-state.torque_nm for state in sweep(tight, -1.5)]
     assert torques[-1] > torques[len(torques) // 2] > 0.1
@@ -69,14 +69,14 @@ def test_a_screw_tightens_clockwise_and_a_stripping_one_gives_way() -> None:
     assert torques[-1] == pytest.approx(0.03, abs=1e-6)
 
 
-def test_opening_the_gripper_lets_the_torque_go() -> None:
+def test_opening_the_gripper_lets_the_torque_go():
     twin = Twin()
     sweep(twin, 0.1)
     assert twin.step(DT_S, 0.1, 0.0) == TwinState(tool_angle_rad=twin.state.tool_angle_rad)
     assert twin.step(DT_S, 0.1, FIRM_N).torque_nm == pytest.approx(0.0, abs=1e-12)
 
 
-def test_a_screw_is_regripped_without_torque() -> None:
+def test_a_screw_is_regripped_without_torque():
     twin = Twin(TwinSettings(joint=Joint.TIGHTENING))
     sweep(twin, -1.0)
     twin.step(DT_S, -1.0, 0.0)
@@ -87,7 +87,7 @@ def test_a_screw_is_regripped_without_torque() -> None:
     st.sampled_from(Joint),
     st.lists(st.tuples(st.floats(-3, 3), st.floats(0, 60), st.floats(0.001, 5)), min_size=1, max_size=30),
 )
-def test_the_torque_never_exceeds_what_the_grip_bears(joint: Joint, story: list[tuple[float, float, float]]) -> None:
+def test_the_torque_never_exceeds_what_the_grip_bears(joint, story):
     twin = Twin(TwinSettings(joint=joint))
     for wrist_rad, force_n, dt_s in story:
         state = twin.step(dt_s, wrist_rad, force_n)

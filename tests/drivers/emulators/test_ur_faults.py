@@ -7,7 +7,7 @@ from shearloop.drivers.emulators.ur_robot import Robot
 from shearloop.drivers.emulators.ur_rtde import ConnectionFaults
 
 
-def test_faults_are_carried_out_and_ended() -> None:
+def test_faults_are_carried_out_and_ended():
     controller = Controller(Robot())
     robot = controller.robot
     for line in (
@@ -25,6 +25,6 @@ def test_faults_are_carried_out_and_ended() -> None:
     ("line", "said"),
     [("fire", "there are protective-stop, emergency-stop"), ("silence long", "long"), ("silence", "nothing")],
 )
-def test_unknown_fault_is_refused(line: str, said: str) -> None:
+def test_unknown_fault_is_refused(line, said):
     with pytest.raises(ValueError, match=said):
         Controller(Robot()).command(line)

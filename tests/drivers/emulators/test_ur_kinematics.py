@@ -14,7 +14,7 @@ angles = st.floats(-math.pi, math.pi)
 joints = st.tuples(*[angles] * 6).map(np.array)
 
 
-def test_stretched_arm_pose_follows_the_dimensions() -> None:
+def test_stretched_arm_pose_follows_the_dimensions():
     x, y, z = link_frames(np.zeros(6))[-1][:3, 3]
     assert x == pytest.approx(-0.425 - 0.3922)
     assert y == pytest.approx(-0.1333 - 0.0996)
@@ -22,7 +22,7 @@ def test_stretched_arm_pose_follows_the_dimensions() -> None:
 
 
 @given(joints, angles)
-def test_wrist_3_turns_the_tool_about_its_own_axis(q: np.ndarray, turn: float) -> None:
+def test_wrist_3_turns_the_tool_about_its_own_axis(q, turn):
     turned = q + np.array([0, 0, 0, 0, 0, turn])
     before, after = link_frames(q)[-1], link_frames(turned)[-1]
     assert after[:3, 3] == pytest.approx(before[:3, 3], abs=1e-12)
@@ -31,7 +31,7 @@ def test_wrist_3_turns_the_tool_about_its_own_axis(q: np.ndarray, turn: float) -
 
 
 @given(joints)
-def test_jacobian_is_the_derivative_of_the_pose(q: np.ndarray) -> None:
+def test_jacobian_is_the_derivative_of_the_pose(q):
     step = 1e-6
     frames = link_frames(q)
     for joint, column in enumerate(jacobian(frames).T):

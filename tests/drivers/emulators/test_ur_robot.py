@@ -50,7 +50,7 @@ def down(robot: Robot, metres: float = 0.2) -> list[float]:
 
 
 def started(**spec: float) -> Robot:
-    robot = Robot(ControllerSpec(**spec))  # type: ignore[arg-type]  # numbers only in these tests
+    robot = Robot(ControllerSpec(**spec))  # numbers only in these tests
     robot.upload()
     wait(robot, DT_S)
     return robot
@@ -64,7 +64,7 @@ def moving_asynchronously(robot: Robot) -> bool:
     return bool(int(robot.registers["output_int_register_2"]) & 1 << 15)
 
 
-def test_speed_is_reached_with_the_acceleration_and_held() -> None:
+def test_speed_is_reached_with_the_acceleration_and_held():
     robot = started()
     turn(robot, 0.4)
     wait(robot, 0.1)
@@ -75,14 +75,14 @@ def test_speed_is_reached_with_the_acceleration_and_held() -> None:
     assert not robot.arm.qd_rad_per_s[:5].any()
 
 
-def test_without_a_watchdog_the_speed_outlives_its_client() -> None:
+def test_without_a_watchdog_the_speed_outlives_its_client():
     robot = started()
     turn(robot, 0.4)
     wait(robot, 3.0)
     assert robot.arm.qd_rad_per_s[5] == pytest.approx(0.4)
 
 
-def test_watchdog_ends_the_motion_of_a_dead_client() -> None:
+def test_watchdog_ends_the_motion_of_a_dead_client():
     robot = started()
     do(robot, control_script.SET_WATCHDOG, 10.0)
     turn(robot, 0.4)
@@ -96,7 +96,7 @@ def test_watchdog_ends_the_motion_of_a_dead_client() -> None:
     assert not robot.program_running
 
 
-def test_watchdog_ends_with_its_program() -> None:
+def test_watchdog_ends_with_its_program():
     robot = started()
     do(robot, control_script.SET_WATCHDOG, 10.0)
     robot.upload()
@@ -104,7 +104,7 @@ def test_watchdog_ends_with_its_program() -> None:
     assert robot.program_running
 
 
-def test_script_may_arm_its_watchdog_by_itself() -> None:
+def test_script_may_arm_its_watchdog_by_itself():
     text = b'  rtde_set_watchdog("input_int_register_0", watchdog_min_frequency, "stop")\n'
     assert control_script.armed_hz(text) == 0.0
     own_hz = control_script.armed_hz(text + b'rtde_set_watchdog("input_int_register_0", 12.5, "stop")\n')
@@ -118,7 +118,7 @@ def test_script_may_arm_its_watchdog_by_itself() -> None:
     assert not robot.program_running
 
 
-def test_watchdog_ends_the_program_under_a_blocking_move() -> None:
+def test_watchdog_ends_the_program_under_a_blocking_move():
     robot = started()
     do(robot, control_script.SET_WATCHDOG, 10.0)
     send(robot, control_script.MOVE_L, *down(robot))
@@ -126,7 +126,7 @@ def test_watchdog_ends_the_program_under_a_blocking_move() -> None:
     assert not robot.program_running
 
 
-def test_new_program_obeys_old_registers() -> None:
+def test_new_program_obeys_old_registers():
     robot = started()
     turn(robot, 0.4)
     wait(robot, 0.1)
@@ -138,7 +138,7 @@ def test_new_program_obeys_old_registers() -> None:
     assert robot.arm.qd_rad_per_s[5] > 0, "a driver has to clear the registers"
 
 
-def test_linear_move_arrives_at_the_pose_on_a_straight_line() -> None:
+def test_linear_move_arrives_at_the_pose_on_a_straight_line():
     robot = started()
     begin = robot.arm.pose
     target = begin.copy()
@@ -158,7 +158,7 @@ def test_linear_move_arrives_at_the_pose_on_a_straight_line() -> None:
     assert happened(robot, "motion-stopped")[0] == pytest.approx(np.linalg.norm(way) / 0.1 + 0.2, abs=0.03)
 
 
-def test_linear_move_out_of_reach_ends_in_a_protective_stop() -> None:
+def test_linear_move_out_of_reach_ends_in_a_protective_stop():
     robot = started()
     send(robot, control_script.MOVE_L, 2.0, 0.0, 0.5, 0, math.pi, 0, 1.0, 1.0, asynchronous=True)
     wait(robot, 4.0)
@@ -166,7 +166,7 @@ def test_linear_move_out_of_reach_ends_in_a_protective_stop() -> None:
     assert not robot.arm.qd_rad_per_s.any()
 
 
-def test_asynchronous_move_is_stopped_on_command() -> None:
+def test_asynchronous_move_is_stopped_on_command():
     robot = started()
     z_m = robot.arm.pose[2]
     do(robot, control_script.MOVE_L, *down(robot), asynchronous=True)
@@ -179,7 +179,7 @@ def test_asynchronous_move_is_stopped_on_command() -> None:
     assert robot.arm.pose[2] > z_m - 0.1
 
 
-def test_two_threads_may_not_move_the_arm() -> None:
+def test_two_threads_may_not_move_the_arm():
     robot = started()
     turn(robot, 0.4)
     wait(robot, 0.1)
@@ -189,7 +189,7 @@ def test_two_threads_may_not_move_the_arm() -> None:
     assert "another thread" in robot._events[-1].detail or "another thread" in robot._events[-2].detail
 
 
-def test_after_speed_stop_a_move_is_possible() -> None:
+def test_after_speed_stop_a_move_is_possible():
     robot = started()
     turn(robot, 0.4)
     wait(robot, 0.3)
@@ -199,7 +199,7 @@ def test_after_speed_stop_a_move_is_possible() -> None:
     assert robot.program_running
 
 
-def test_protective_stop_pauses_and_is_not_unlocked_at_once() -> None:
+def test_protective_stop_pauses_and_is_not_unlocked_at_once():
     robot = started()
     turn(robot, 0.4)
     wait(robot, 0.3)
@@ -216,7 +216,7 @@ def test_protective_stop_pauses_and_is_not_unlocked_at_once() -> None:
     assert not robot.arm.qd_rad_per_s.any(), "unlocking must not resume"
 
 
-def test_emergency_stop_cuts_power_that_returns_in_two_steps() -> None:
+def test_emergency_stop_cuts_power_that_returns_in_two_steps():
     robot = started(power_on_s=0.5)
     robot.emergency_stop()
     robot.safety.power_on(robot.time_s)
@@ -245,7 +245,7 @@ class Spring:
         return -2.0 * wrist_rad
 
 
-def test_wrench_is_the_plants_torque_about_the_tool_axis() -> None:
+def test_wrench_is_the_plants_torque_about_the_tool_axis():
     robot = Robot(plant=Spring())
     robot.upload()
     turn(robot, 0.5, 10.0)
@@ -259,7 +259,7 @@ def test_wrench_is_the_plants_torque_about_the_tool_axis() -> None:
     assert robot.arm.wrench == pytest.approx(np.zeros(6), abs=1e-9)
 
 
-def test_fast_arm_motion_keeps_the_controllers_time() -> None:
+def test_fast_arm_motion_keeps_the_controllers_time():
     springs = Spring(), Spring()
     robots = [Robot(plant=spring, pace=pace) for spring, pace in zip(springs, (1.0, 20.0), strict=True)]
     for robot, spring in zip(robots, springs, strict=True):
@@ -276,7 +276,7 @@ def test_fast_arm_motion_keeps_the_controllers_time() -> None:
     assert fast.program_running
 
 
-def test_unknown_command_ends_the_program() -> None:
+def test_unknown_command_ends_the_program():
     robot = started()
     send(robot, 45)
     wait(robot, DT_S)

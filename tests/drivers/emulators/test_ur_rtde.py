@@ -45,7 +45,7 @@ def replies(data: bytes) -> list[tuple[int, bytes]]:
     return found
 
 
-def test_conversation_of_a_client() -> None:
+def test_conversation_of_a_client():
     rtde = session()
     assert replies(rtde.receive(CONVERSATION)) == [
         (ord("V"), b"\x01"),
@@ -64,7 +64,7 @@ def test_conversation_of_a_client() -> None:
 
 
 @given(st.lists(st.integers(0, len(CONVERSATION)), max_size=20))
-def test_bytes_may_arrive_in_any_pieces(cuts: list[int]) -> None:
+def test_bytes_may_arrive_in_any_pieces(cuts):
     whole, pieces = session(), session()
     answer = whole.receive(CONVERSATION)
     edges = [0, *sorted(cuts), len(CONVERSATION)]
@@ -77,7 +77,7 @@ any_packages = st.tuples(st.sampled_from(b"VvOISPUM"), st.binary(max_size=60)).m
 
 
 @given(st.binary(max_size=200) | st.lists(any_packages).map(b"".join))
-def test_foreign_bytes_are_answered_or_refused_but_never_crash(data: bytes) -> None:
+def test_foreign_bytes_are_answered_or_refused_but_never_crash(data):
     rtde = session()
     rtde.receive(CONVERSATION)
     try:
@@ -87,7 +87,7 @@ def test_foreign_bytes_are_answered_or_refused_but_never_crash(data: bytes) -> N
     assert len(rtde._buffer) <= 4096
 
 
-def test_data_comes_at_the_rate_asked_for_and_not_before_the_start() -> None:
+def test_data_comes_at_the_rate_asked_for_and_not_before_the_start():
     rtde = session()
     rtde.receive(GREETING + package(ord("O"), struct.pack(">d", 125.0) + b"timestamp"))
     packages = 0
@@ -103,7 +103,7 @@ def test_data_comes_at_the_rate_asked_for_and_not_before_the_start() -> None:
     assert packages == 126
 
 
-def test_registers_in_use_and_unknown_variables_are_refused_by_name() -> None:
+def test_registers_in_use_and_unknown_variables_are_refused_by_name():
     rtde = RtdeSession(Robot(), 500.0, ConnectionFaults(registers_in_use=True))
     ((_, answer),) = replies(rtde.receive(package(ord("I"), COMMAND)))
     assert answer == b"\x00IN_USE,IN_USE"
@@ -111,7 +111,7 @@ def test_registers_in_use_and_unknown_variables_are_refused_by_name() -> None:
     assert answer == b"\x00DOUBLE,NOT_FOUND"
 
 
-def test_short_vector_is_dropped() -> None:
+def test_short_vector_is_dropped():
     rtde = session()
     rtde.receive(CONVERSATION)
     rtde.receive(package(ord("U"), struct.pack(">Bi", 1, 11)))
@@ -119,7 +119,7 @@ def test_short_vector_is_dropped() -> None:
 
 
 @given(st.lists(st.floats(allow_nan=False), min_size=7, max_size=7), st.integers(-(2**31), 2**31 - 1))
-def test_values_survive_the_wire(numbers: list[float], integer: int) -> None:
+def test_values_survive_the_wire(numbers, integer):
     kinds = ["VECTOR6D", "INT32", "DOUBLE"]
     data = pack(kinds, [numbers[:6], integer, numbers[6]])
     assert unpack(kinds, data) == [*numbers[:6], integer, numbers[6]]
@@ -127,12 +127,12 @@ def test_values_survive_the_wire(numbers: list[float], integer: int) -> None:
 
 
 @pytest.mark.parametrize("size", [0, 2, 5000])
-def test_impossible_lengths_end_the_connection(size: int) -> None:
+def test_impossible_lengths_end_the_connection(size):
     with pytest.raises(NotRtdeError, match="bytes"):
         session().receive(struct.pack(">HB", size, ord("V")))
 
 
-async def test_clock_runs_on_while_the_emulator_is_paused(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_clock_runs_on_while_the_emulator_is_paused(monkeypatch):
     """Samples carry the present time; the robot's time, which the watchdog uses, stands still."""
     robot, now_s, pauses_s = Robot(), 50.0, iter([0.002, 0.3, 0.002])
 

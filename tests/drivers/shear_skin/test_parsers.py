@@ -33,7 +33,7 @@ CUTS = st.lists(st.integers(0, 400), max_size=8)
 
 
 @given(st.lists(st.tuples(VOLTS, VOLTS), min_size=1, max_size=8), CUTS)
-def test_every_line_of_the_board_comes_through_in_any_slices(pairs: list[tuple[float, float]], cuts: list[int]) -> None:
+def test_every_line_of_the_board_comes_through_in_any_slices(pairs, cuts):
     parser = PairParser()
     data = b"2,0.123\r\n" + b"".join(f"{v1:.6f},{v2:.6f}\r\n".encode() for v1, v2 in pairs)
     found = [voltages for part in slices(data, cuts) for voltages in parser.feed(part, 10**9)]
@@ -44,9 +44,7 @@ def test_every_line_of_the_board_comes_through_in_any_slices(pairs: list[tuple[f
 
 
 @given(st.binary(max_size=600), CUTS)
-def test_no_bytes_break_the_board_s_parser_and_a_sound_line_comes_through_after_them(
-    noise: bytes, cuts: list[int]
-) -> None:
+def test_no_bytes_break_the_board_s_parser_and_a_sound_line_comes_through_after_them(noise, cuts):
     parser = PairParser()
     for part in slices(noise, cuts):
         parser.feed(part, 1)
@@ -55,13 +53,13 @@ def test_no_bytes_break_the_board_s_parser_and_a_sound_line_comes_through_after_
     assert (found.v1_v, found.v2_v) == (0.125, -0.124)
 
 
-def test_refused_lines_are_counted_by_kind() -> None:
+def test_refused_lines_are_counted_by_kind():
     parser = PairParser()
     parser.feed(b"cut\n0.1,0.2,0.3\n0.1\n0,1\nnan,0.1\n\r\n" + b"1" * 50 + b"\n0.100000,0.200000\n", 0)
     assert parser.errors == {"not two decimals": 4, "empty": 1, "too long": 1}
 
 
-def test_lines_that_arrive_together_are_a_period_apart() -> None:
+def test_lines_that_arrive_together_are_a_period_apart():
     parser = PairParser()
     parser.feed(b"\n", 0)
     first, second = parser.feed(b"0.125000,0.126000\r\n" * 2, 10**9)
@@ -71,7 +69,7 @@ def test_lines_that_arrive_together_are_a_period_apart() -> None:
 
 
 @given(st.lists(st.from_regex(r"[ -~]{1,40}", fullmatch=True).filter(str.strip), max_size=6), CUTS)
-def test_replies_come_through_whatever_ends_their_lines(replies: list[str], cuts: list[int]) -> None:
+def test_replies_come_through_whatever_ends_their_lines(replies, cuts):
     for end in (b"\n", b"\r", b"\r\n", b"\n\r"):
         lines = ReplyLines()
         data = b"".join(reply.encode() + end for reply in replies)
@@ -80,7 +78,7 @@ def test_replies_come_through_whatever_ends_their_lines(replies: list[str], cuts
 
 
 @given(st.binary(max_size=2 * MAX_REPLY_BYTES), CUTS)
-def test_no_bytes_break_the_reply_lines(noise: bytes, cuts: list[int]) -> None:
+def test_no_bytes_break_the_reply_lines(noise, cuts):
     lines = ReplyLines()
     for part in slices(noise, cuts):
         lines.replies(part)
@@ -88,7 +86,7 @@ def test_no_bytes_break_the_reply_lines(noise: bytes, cuts: list[int]) -> None:
     assert lines.replies(b"1\n") == ["1"]
 
 
-def test_a_flood_without_an_end_is_counted_once_and_forgotten() -> None:
+def test_a_flood_without_an_end_is_counted_once_and_forgotten():
     lines = ReplyLines()
     for _ in range(10):
         assert lines.replies(b"7" * 300) == []
@@ -97,7 +95,7 @@ def test_a_flood_without_an_end_is_counted_once_and_forgotten() -> None:
 
 
 @given(st.text(max_size=80))
-def test_what_is_no_reading_is_refused_by_name(text: str) -> None:
+def test_what_is_no_reading_is_refused_by_name(text):
     for read in (lambda: read_elements(Reply(text, 0, 0)), lambda: read_scan(Reply(text, 0, 2))):
         if re.fullmatch(r"[0-9Ee.,+ -]+", text):
             with suppress(ProtocolError):
@@ -107,7 +105,7 @@ def test_what_is_no_reading_is_refused_by_name(text: str) -> None:
                 read()
 
 
-def test_the_manual_s_own_example_is_read() -> None:
+def test_the_manual_s_own_example_is_read():
     # Figure 17-1 of the 6430's manual, without the resistance and the time; 10 kΩ at 100 µA.
     reading = read_elements(Reply("+1.000206E+00, +1.000000E-04, +4.813200E+04", 0, 5))
     assert (reading.voltage_v, reading.current_a, reading.t_ns) == (1.000206, 1e-4, 5)
@@ -116,17 +114,17 @@ def test_the_manual_s_own_example_is_read() -> None:
 
 
 @pytest.mark.parametrize("bit", [0, 3, 4, 16])
-def test_every_way_of_not_keeping_its_current_is_compliance(bit: int) -> None:
+def test_every_way_of_not_keeping_its_current_is_compliance(bit):
     assert read_elements(Reply(f"+1.0E+00,+1.0E-09,{38916 | 1 << bit:+.6E}", 0, 0)).compliance
 
 
 @pytest.mark.parametrize("text", ["+9.91E37,+5.0E-03,+3.8E+04", "1,2", "1,2,-1", "1,2,3E+08", "inf,nan,1", "1_0,2,3"])
-def test_a_reading_that_was_not_made_is_refused(text: str) -> None:
+def test_a_reading_that_was_not_made_is_refused(text):
     with pytest.raises(ProtocolError):
         read_elements(Reply(text, 0, 0))
 
 
-def test_an_overload_of_the_scanner_is_told_by_channel() -> None:
+def test_an_overload_of_the_scanner_is_told_by_channel():
     voltages = read_scan(Reply("+9.90000000E+37,-1.25000000E-01", 100, 300))
     assert (voltages.over_1, voltages.over_2, voltages.t_mid_ns) == (True, False, 200)
     assert parse_numbers("-1,2.5E3", 2, "It") == [-1.0, 2500.0]

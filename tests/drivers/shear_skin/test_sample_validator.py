@@ -26,7 +26,7 @@ def said(v1_v: float, v2_v: float, source: SourceReading | None = GOOD, **more: 
     return judge().sample(voltages(v1_v, v2_v, **more), source)
 
 
-def test_two_sound_voltages_are_two_resistances() -> None:
+def test_two_sound_voltages_are_two_resistances():
     sample = said(0.123, 0.1265)
     assert (sample.r1_ohm, sample.r2_ohm) == pytest.approx((24.6, 25.3))
     assert sample.trusted
@@ -53,35 +53,33 @@ STUCK_OPEN = SourceReading(0, output_on=True, voltage_v=1.0, current_a=1e-9, com
         (0.123, 0.126, SourceReading(0, True, 0.252, 4.8e-3), [SkinFault.CURRENT]),
     ],
 )
-def test_each_fault_has_its_name_and_leaves_no_resistance(
-    v1_v: float, v2_v: float, source: SourceReading | None, faults: list[SkinFault]
-) -> None:
+def test_each_fault_has_its_name_and_leaves_no_resistance(v1_v, v2_v, source, faults):
     sample = said(v1_v, v2_v, source)
     assert list(sample.faults) == faults
     assert sample.r1_ohm is None
     assert sample.r2_ohm is None
 
 
-def test_beyond_the_range_is_open_only_where_nothing_is_across_the_other_gauge() -> None:
+def test_beyond_the_range_is_open_only_where_nothing_is_across_the_other_gauge():
     assert list(said(9.9e37, 0.126, over_1=True).faults) == [SkinFault.OVERRANGE_1]
     assert list(said(0.512, 0.0, STUCK_OPEN, over_1=True).faults) == [SkinFault.COMPLIANCE, SkinFault.OPEN_1]
 
 
-def test_a_source_that_falls_silent_is_lost_after_two_seconds() -> None:
+def test_a_source_that_falls_silent_is_lost_after_two_seconds():
     one = judge()
     assert one.sample(voltages(0.123, 0.126, 20), GOOD).trusted
     assert list(one.sample(voltages(0.124, 0.126, 21), GOOD).faults) == [SkinFault.SOURCE_LOST]
     assert one.faults == {"source_lost": 1}
 
 
-def test_missing_readings_are_counted_where_they_are_missing() -> None:
+def test_missing_readings_are_counted_where_they_are_missing():
     one = judge()
     missed = [one.sample(voltages(0.123 + 1e-6 * n, 0.126, n), GOOD).missed for n in (0, 1, 2, 5, 6)]
     assert missed == [0, 0, 0, 2, 0]
     assert one.missed == 2
 
 
-def test_a_jump_is_a_disturbance_until_it_stays() -> None:
+def test_a_jump_is_a_disturbance_until_it_stays():
     one = judge()
     path = [0.123, 0.123, 0.19, 0.1231, 0.17, 0.17, 0.17, 0.17]
     trusted = []
@@ -91,7 +89,7 @@ def test_a_jump_is_a_disturbance_until_it_stays() -> None:
     assert trusted == [True, True, False, True, False, False, True, True]
 
 
-def test_voltages_from_before_the_current_flowed_are_not_called_a_short() -> None:
+def test_voltages_from_before_the_current_flowed_are_not_called_a_short():
     one = judge()
     on = SourceReading(2 * 10**8, output_on=True, voltage_v=0.252, current_a=CURRENT_A)
     assert one.sample(voltages(0.0, 0.0, 1), on).faults == (SkinFault.SOURCE_LOST,)
@@ -103,7 +101,7 @@ def test_voltages_from_before_the_current_flowed_are_not_called_a_short() -> Non
     assert one.sample(voltages(0.0, 0.0, 6), on).faults == (SkinFault.SHORT_1, SkinFault.SHORT_2)
 
 
-def test_a_converter_that_stands_still_is_told_by_gauge() -> None:
+def test_a_converter_that_stands_still_is_told_by_gauge():
     one = judge()
     sources = [SourceReading(n * 10**8, output_on=True, voltage_v=0.252, current_a=CURRENT_A) for n in range(60)]
     samples = [one.sample(voltages(0.123, 0.126 + 1e-6 * (n % 2), n), source) for n, source in enumerate(sources)]
@@ -118,9 +116,7 @@ ANY = st.floats(-2, 2) | st.just(9.9e37)
     st.lists(st.tuples(ANY, ANY, st.integers(1, 4)), max_size=30),
     st.sampled_from([None, GOOD, STUCK_OPEN, SourceReading(0, output_on=False)]),
 )
-def test_whatever_comes_a_trusted_sample_has_two_resistances_that_a_gauge_can_have(
-    story: list[tuple[float, float, int]], source: SourceReading | None
-) -> None:
+def test_whatever_comes_a_trusted_sample_has_two_resistances_that_a_gauge_can_have(story, source):
     one, number = judge(), 0
     for v1_v, v2_v, step in story:
         number += step

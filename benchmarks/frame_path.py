@@ -31,16 +31,7 @@ import zmq.asyncio
 from numpy.typing import NDArray
 
 import shearloop
-from benchmarks.common import (
-    FIRST_FRAME,
-    FIRST_VALID_FRAME,
-    PAUSE_S,
-    PlayedBoard,
-    emulated_rig,
-    line_text,
-    write_config,
-    write_rig_config,
-)
+from benchmarks import common
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli.calibrate_demo import calibrate, record
 from shearloop.daemon.config import load_daemon_config
@@ -156,14 +147,14 @@ async def trace_frame(folder: Path, lines: Sequence[NDArray[np.float64]]) -> lis
     """Return the calls of one frame, in order."""
     ways: list[list[CodeType]] = []
     trace = Trace()
-    with contextlib.closing(PlayedBoard(folder / "board")) as board, trace.installed():
-        config = write_config(folder, fingertips=fingertip(folder, "board", frame_period_s=PAUSE_S))
+    with contextlib.closing(common.PlayedBoard(folder / "board")) as board, trace.installed():
+        config = common.write_config(folder, fingertips=fingertip(folder, "board", frame_period_s=common.PAUSE_S))
         async with running(config, "eit.estimate", "eit.frame") as subscriber:
             await asyncio.to_thread(board.wait_for_start)
-            for number, line in enumerate(lines[FIRST_FRAME:]):
-                await asyncio.sleep(PAUSE_S)
-                trace.calls, trace.recording = [], number >= FIRST_VALID_FRAME
-                await asyncio.to_thread(board.send, line_text(line))
+            for number, line in enumerate(lines[common.FIRST_FRAME :]):
+                await asyncio.sleep(common.PAUSE_S)
+                trace.calls, trace.recording = [], number >= common.FIRST_VALID_FRAME
+                await asyncio.to_thread(board.send, common.line_text(line))
                 received = dict([await subscriber.recv_multipart() for _ in range(2)])
                 trace.recording = False
                 if trace.calls and msgpack.unpackb(received[b"eit.estimate"])["valid"]:
@@ -176,9 +167,9 @@ async def trace_frame(folder: Path, lines: Sequence[NDArray[np.float64]]) -> lis
 async def trace_command(folder: Path) -> list[CodeType]:
     """Return the calls from an estimate to a sent speed, in order."""
     fingertips = fingertip(folder, "eit-right")
-    config = write_rig_config(folder, "config/demo_ur.yaml", fingertips=fingertips, experiment="hold.yaml")
+    config = common.write_rig_config(folder, "config/demo_ur.yaml", fingertips=fingertips, experiment="hold.yaml")
     trace = CommandTrace()
-    with emulated_rig(folder, folder / "demo.bank"), contextlib.ExitStack() as installed:
+    with common.emulated_rig(folder, folder / "demo.bank"), contextlib.ExitStack() as installed:
         async with running(config, "loop.state") as subscriber:
             while len(trace.ways) < TRACED:
                 state = msgpack.unpackb((await subscriber.recv_multipart())[1])

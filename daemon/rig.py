@@ -147,15 +147,8 @@ class Rig:
         self.control_loop = loop
         self.gripper = gripper
         self.robot = UrRobot(robot_settings(config.robot), LinkMonitor(DeviceLink("robot", loop)))
-        self.runner = ControlLoopRunner(
-            loop,
-            self.robot,
-            gripper,
-            sensors.values(),
-            publisher,
-            clock,
-            supervisor.dead,
-        )
+        zeroed, dead = sensors.values(), supervisor.dead
+        self.runner = ControlLoopRunner(loop, self.robot, gripper, zeroed, publisher, clock, dead)
         self._recorder = recorder
         # Counts the operator's stops, also while an experiment starts.
         self._stops = 0

@@ -6,8 +6,6 @@ import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from serial.tools import list_ports
-
 # USB vendor numbers, as in systemd/60-shearloop.rules.
 BOARDS = {
     0x16C0: "EIT-kit (Teensy)",
@@ -65,6 +63,8 @@ def run(args: argparse.Namespace) -> int:
 
 def list_serial_ports() -> list[SerialPortInfo]:
     """Return all USB ports and other ports with a driver."""
+    from serial.tools import list_ports
+
     found = []
     for port in sorted(list_ports.comports()):
         usb = f"{port.vid:04x}:{port.pid:04x}" if port.vid is not None and port.pid is not None else ""

@@ -143,8 +143,8 @@ async def running(config: Path, *topics: str) -> AsyncIterator["zmq.asyncio.Sock
                 await task
 
 
-async def trace_frame(folder: Path, lines: Sequence[NDArray[np.float64]]) -> list[CodeType]:
-    """Return the calls of one frame, in order."""
+async def trace_frame(folder: Path, lines: Sequence[NDArray[np.float64]]) -> list[list[CodeType]]:
+    """Return the calls of each frame, in order."""
     ways: list[list[CodeType]] = []
     trace = Trace()
     with contextlib.closing(common.PlayedBoard(folder / "board")) as board, trace.installed():
@@ -161,11 +161,11 @@ async def trace_frame(folder: Path, lines: Sequence[NDArray[np.float64]]) -> lis
                     ways.append(trace.calls)
                 if len(ways) == TRACED:
                     break
-    return shortest(ways)
+    return ways
 
 
-async def trace_command(folder: Path) -> list[CodeType]:
-    """Return the calls from an estimate to a sent speed, in order."""
+async def trace_command(folder: Path) -> list[list[CodeType]]:
+    """Return the calls from each estimate to a sent speed, in order."""
     fingertips = fingertip(folder, "eit-right")
     config = common.write_rig_config(folder, "config/demo_ur.yaml", fingertips=fingertips, experiment="hold.yaml")
     trace = CommandTrace()
@@ -179,26 +179,15 @@ async def trace_command(folder: Path) -> list[CodeType]:
                     trace.recording = True
                     # Not before: it slows the loop.
                     installed.enter_context(trace.installed())
-    return shortest(trace.ways)
+    return trace.ways
 
 
-def shortest(ways: Sequence[list[CodeType]]) -> list[CodeType]:
-    """Return the calls with the fewest distinct functions."""
-    return min(ways, key=lambda calls: len(set(calls)))
-
-
-def module_of(code: CodeType) -> str:
-    """Return a function's module, as a path in the package."""
-    return code.co_filename.removeprefix(PACKAGE)
-
-
-def diagram(calls: Sequence[CodeType]) -> str:
+def by_module(calls: Sequence[CodeType]) -> dict[str, dict[str, None]]:
     """Return the modules in the order of their first call, each with its functions in that order."""
     functions: dict[str, dict[str, None]] = {}
     for code in calls:
-        functions.setdefault(module_of(code), {})[code.co_qualname] = None
-    width = max(map(len, functions))
-    return "\n".join(f"{module:<{width}}  {' · '.join(names)}" for module, names in functions.items())
+        functions.setdefault(code.co_filename.removeprefix(PACKAGE), {})[code.co_qualname] = None
+    return functions
 
 
 def main() -> None:
@@ -209,16 +198,15 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         lines = make_rig(folder)
-        frame = asyncio.run(trace_frame(folder, lines))
-        command = asyncio.run(trace_command(folder))
-    counts = {}
-    for name, calls in (("a frame", frame), ("an estimate to a sent speed", command)):
-        modules = {module_of(code) for code in calls}
-        counts[name] = {"functions": len(set(calls)), "modules": len(modules), "calls": len(calls)}
+        traced = {"": asyncio.run(trace_frame(folder, lines)), "command_": asyncio.run(trace_command(folder))}
+    counts: dict[str, int] = {}
+    for name, ways in traced.items():
+        calls = min(ways, key=lambda way: len(set(way)))
+        found = by_module(calls)
+        counts |= {f"{name}functions": len(set(calls)), f"{name}modules": len(found), f"{name}calls": len(calls)}
         if not args.json:
-            print(f"{name}: {counts[name]}\n\n{diagram(calls)}\n")
-    if args.json:
-        print(json.dumps(counts))
+            print(*(f"{module:<40}  {' · '.join(functions)}" for module, functions in found.items()), "", sep="\n")
+    print(json.dumps(counts))
 
 
 if __name__ == "__main__":

@@ -46,6 +46,16 @@ def write_figures(path: Path, figures: object) -> str:
     return text
 
 
+def table_row(*cells: str | float | None) -> str:
+    """Return a row of a Markdown table; numbers get four digits."""
+    return f"| {' | '.join('–' if c is None else c if isinstance(c, str) else f'{c:.4g}' for c in cells)} |"
+
+
+def table_head(*names: str) -> str:
+    """Return the first two lines of a Markdown table."""
+    return f"{table_row(*names)}\n{'|---' * len(names)}|"
+
+
 class PlayedBoard:
     """An EIT board at the other end of a pseudo-terminal; the benchmark writes its lines."""
 

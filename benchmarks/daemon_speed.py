@@ -23,20 +23,7 @@ from typing import Any
 import numpy as np
 import zmq
 
-from benchmarks.common import (
-    FIRST_FRAME,
-    FIRST_VALID_FRAME,
-    PAUSE_S,
-    PlayedBoard,
-    emulated_rig,
-    line_text,
-    parser_of,
-    running_daemon,
-    subscription,
-    write_config,
-    write_figures,
-    write_rig_config,
-)
+from benchmarks import common
 from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.sensing.estimators import COMBINED
@@ -77,8 +64,8 @@ def resident_mb(pid: int) -> float:
 
 def recorded_lines(rig: Path, side: str, n: int) -> list[bytes]:
     """Return n lines of one board from the emulated rig's recording: idle ones, then a gripped tool being twisted."""
-    lines = [line_text(one) for one in read_recording(rig / "rig-25mm.mcap").sides[side].lines[FIRST_FRAME:]]
-    return list(islice(cycle(lines), n))
+    recorded = read_recording(rig / "rig-25mm.mcap").sides[side].lines[common.FIRST_FRAME :]
+    return list(islice(cycle([common.line_text(values) for values in recorded]), n))
 
 
 def by_bank(args: argparse.Namespace, matching: str) -> dict[str, Any]:
@@ -97,20 +84,20 @@ def by_default(args: argparse.Namespace, sides: Sequence[str]) -> dict[str, Any]
 
 
 @contextlib.contextmanager
-def played(config: dict[str, Any], period_s: float) -> Iterator[tuple[dict[str, PlayedBoard], int, float, Any]]:
+def played(config: dict[str, Any], period_s: float) -> Iterator[tuple[dict[str, common.PlayedBoard], int, float, Any]]:
     """Run a daemon on boards that the benchmark plays; yield them, its process id, ready time, and estimates."""
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as opened:
         folder = Path(name)
-        boards = {
-            side: opened.enter_context(contextlib.closing(PlayedBoard(folder / side))) for side in config["fingertips"]
-        }
+        boards = {side: common.PlayedBoard(folder / side) for side in config["fingertips"]}
+        for board in boards.values():
+            opened.callback(board.close)
         fingertips = {
             side: {**fingertip, "device": {"path": str(folder / side)}, "frame_period_s": period_s}
             for side, fingertip in config["fingertips"].items()
         }
-        path = write_config(folder, **{**config, "fingertips": fingertips})
-        daemon, ready_s = opened.enter_context(running_daemon(path))
-        estimates = opened.enter_context(subscription(folder, "eit.estimate"))
+        path = common.write_config(folder, **{**config, "fingertips": fingertips})
+        daemon, ready_s = opened.enter_context(common.running_daemon(path))
+        estimates = opened.enter_context(common.subscription(folder, "eit.estimate"))
         for board in boards.values():
             board.wait_for_start()
         yield boards, daemon.pid, ready_s, estimates
@@ -123,13 +110,13 @@ def latency(config: dict[str, Any], rig: Path, n_frames: int, period_s: float) -
     valid, are not timed; an estimate that does not come within a second is missed.
     """
     sides = list(config["fingertips"])
-    lines = {side: recorded_lines(rig, side, FIRST_VALID_FRAME + n_frames) for side in sides}
+    lines = {side: recorded_lines(rig, side, common.FIRST_VALID_FRAME + n_frames) for side in sides}
     last_sources = {sides[-1], COMBINED} if len(sides) > 1 else {sides[-1]}
     taken: dict[str, list[float]] = {source: [] for source in (*sides, *last_sources)}
     missed, latest = dict.fromkeys(taken, 0), dict.fromkeys(taken, -1)
     with played(config, period_s) as (boards, _, ready_s, estimates):
         estimates.setsockopt(zmq.RCVTIMEO, 1000)
-        for number in range(FIRST_VALID_FRAME + n_frames):
+        for number in range(common.FIRST_VALID_FRAME + n_frames):
             time.sleep(0.5 * period_s)
             for side, board in boards.items():
                 # Two boards do not keep step.
@@ -147,7 +134,7 @@ def latency(config: dict[str, Any], rig: Path, n_frames: int, period_s: float) -
                     if source in awaited and estimate["frame"] > latest[source]:
                         awaited.remove(source)
                         latest[source] = estimate["frame"]
-                        if number >= FIRST_VALID_FRAME and (estimate["valid"] or estimate["k"] is not None):
+                        if number >= common.FIRST_VALID_FRAME and (estimate["valid"] or estimate["k"] is not None):
                             taken[source].append((arrived_ns - sent_ns) / 1e6)
     return {
         source: {
@@ -188,16 +175,16 @@ def rated(bank: Path, rig_bank: Path, seconds: float) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as opened:
         folder = Path(name)
         fingertip = {"bank": str(bank.resolve()), "matching": "all_lags"}
-        config = write_rig_config(
+        config = common.write_rig_config(
             folder,
             "config/demo_ur.yaml",
             fingertips={side: {"device": {"path": f"eit-{side}"}, **fingertip} for side in ("left", "right")},
             load_cell={"device": {"path": "load-cell"}},
             recording={"folder": str(folder / "recordings")},
         )
-        opened.enter_context(emulated_rig(folder, rig_bank, "--paper-sketch"))
-        daemon, ready_s = opened.enter_context(running_daemon(config))
-        health = opened.enter_context(subscription(folder, "health"))
+        opened.enter_context(common.emulated_rig(folder, rig_bank, "--paper-sketch"))
+        daemon, ready_s = opened.enter_context(common.running_daemon(config))
+        health = opened.enter_context(common.subscription(folder, "health"))
         _listen(health, SETTLING_S)
         before, begun = {each: cpu_s(each) for each in process_tree(daemon.pid)}, time.monotonic()
         _listen(health, seconds)
@@ -247,7 +234,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         }
         found["latency"] = {
             name: {
-                "every_30_ms": latency(config, args.rig, args.frames, PAUSE_S),
+                "every_30_ms": latency(config, args.rig, args.frames, common.PAUSE_S),
                 "at_the_boards_rate": latency(config, args.rig, args.frames // 3, FRAME_PERIOD_S),
             }
             for name, config in configs.items()
@@ -261,14 +248,14 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     """Measure and write the figures."""
-    parser = parser_of(__doc__)
+    parser = common.parser_of(__doc__)
     parser.add_argument("--bank", type=Path, required=True, help="the fingertips' bank, of 100 × 100 cells")
     parser.add_argument("--rig", type=Path, required=True, help="folder with rig-25mm.mcap, rig*.cal and demo.bank")
     parser.add_argument("--frames", type=int, default=240, help="number of timed frames")
     parser.add_argument("--rated-s", type=float, default=30.0, help="seconds at rated speeds")
     parser.add_argument("--only", nargs="+", choices=MEASUREMENTS, default=MEASUREMENTS)
     args = parser.parse_args()
-    print(write_figures(args.out, measure(args)))
+    print(common.write_figures(args.out, measure(args)))
 
 
 if __name__ == "__main__":

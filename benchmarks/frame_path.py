@@ -31,16 +31,7 @@ import zmq.asyncio
 from numpy.typing import NDArray
 
 import shearloop
-from benchmarks.common import (
-    FIRST_FRAME,
-    FIRST_VALID_FRAME,
-    PAUSE_S,
-    PlayedBoard,
-    emulated_rig,
-    line_text,
-    write_config,
-    write_rig_config,
-)
+from benchmarks import common
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli.calibrate_demo import calibrate, record
 from shearloop.daemon.config import load_daemon_config
@@ -152,33 +143,33 @@ async def running(config: Path, *topics: str) -> AsyncIterator["zmq.asyncio.Sock
                 await task
 
 
-async def trace_frame(folder: Path, lines: Sequence[NDArray[np.float64]]) -> list[CodeType]:
-    """Return the calls of one frame, in order."""
+async def trace_frame(folder: Path, lines: Sequence[NDArray[np.float64]]) -> list[list[CodeType]]:
+    """Return the calls of each frame, in order."""
     ways: list[list[CodeType]] = []
     trace = Trace()
-    with contextlib.closing(PlayedBoard(folder / "board")) as board, trace.installed():
-        config = write_config(folder, fingertips=fingertip(folder, "board", frame_period_s=PAUSE_S))
+    with contextlib.closing(common.PlayedBoard(folder / "board")) as board, trace.installed():
+        config = common.write_config(folder, fingertips=fingertip(folder, "board", frame_period_s=common.PAUSE_S))
         async with running(config, "eit.estimate", "eit.frame") as subscriber:
             await asyncio.to_thread(board.wait_for_start)
-            for number, line in enumerate(lines[FIRST_FRAME:]):
-                await asyncio.sleep(PAUSE_S)
-                trace.calls, trace.recording = [], number >= FIRST_VALID_FRAME
-                await asyncio.to_thread(board.send, line_text(line))
+            for number, line in enumerate(lines[common.FIRST_FRAME :]):
+                await asyncio.sleep(common.PAUSE_S)
+                trace.calls, trace.recording = [], number >= common.FIRST_VALID_FRAME
+                await asyncio.to_thread(board.send, common.line_text(line))
                 received = dict([await subscriber.recv_multipart() for _ in range(2)])
                 trace.recording = False
                 if trace.calls and msgpack.unpackb(received[b"eit.estimate"])["valid"]:
                     ways.append(trace.calls)
                 if len(ways) == TRACED:
                     break
-    return shortest(ways)
+    return ways
 
 
-async def trace_command(folder: Path) -> list[CodeType]:
-    """Return the calls from an estimate to a sent speed, in order."""
+async def trace_command(folder: Path) -> list[list[CodeType]]:
+    """Return the calls from each estimate to a sent speed, in order."""
     fingertips = fingertip(folder, "eit-right")
-    config = write_rig_config(folder, "config/demo_ur.yaml", fingertips=fingertips, experiment="hold.yaml")
+    config = common.write_rig_config(folder, "config/demo_ur.yaml", fingertips=fingertips, experiment="hold.yaml")
     trace = CommandTrace()
-    with emulated_rig(folder, folder / "demo.bank"), contextlib.ExitStack() as installed:
+    with common.emulated_rig(folder, folder / "demo.bank"), contextlib.ExitStack() as installed:
         async with running(config, "loop.state") as subscriber:
             while len(trace.ways) < TRACED:
                 state = msgpack.unpackb((await subscriber.recv_multipart())[1])
@@ -188,26 +179,15 @@ async def trace_command(folder: Path) -> list[CodeType]:
                     trace.recording = True
                     # Not before: it slows the loop.
                     installed.enter_context(trace.installed())
-    return shortest(trace.ways)
+    return trace.ways
 
 
-def shortest(ways: Sequence[list[CodeType]]) -> list[CodeType]:
-    """Return the calls with the fewest distinct functions."""
-    return min(ways, key=lambda calls: len(set(calls)))
-
-
-def module_of(code: CodeType) -> str:
-    """Return a function's module, as a path in the package."""
-    return code.co_filename.removeprefix(PACKAGE)
-
-
-def diagram(calls: Sequence[CodeType]) -> str:
+def by_module(calls: Sequence[CodeType]) -> dict[str, dict[str, None]]:
     """Return the modules in the order of their first call, each with its functions in that order."""
     functions: dict[str, dict[str, None]] = {}
     for code in calls:
-        functions.setdefault(module_of(code), {})[code.co_qualname] = None
-    width = max(map(len, functions))
-    return "\n".join(f"{module:<{width}}  {' · '.join(names)}" for module, names in functions.items())
+        functions.setdefault(code.co_filename.removeprefix(PACKAGE), {})[code.co_qualname] = None
+    return functions
 
 
 def main() -> None:
@@ -218,16 +198,15 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         lines = make_rig(folder)
-        frame = asyncio.run(trace_frame(folder, lines))
-        command = asyncio.run(trace_command(folder))
-    counts = {}
-    for name, calls in (("a frame", frame), ("an estimate to a sent speed", command)):
-        modules = {module_of(code) for code in calls}
-        counts[name] = {"functions": len(set(calls)), "modules": len(modules), "calls": len(calls)}
+        traced = {"": asyncio.run(trace_frame(folder, lines)), "command_": asyncio.run(trace_command(folder))}
+    counts: dict[str, int] = {}
+    for name, ways in traced.items():
+        calls = min(ways, key=lambda way: len(set(way)))
+        found = by_module(calls)
+        counts |= {f"{name}functions": len(set(calls)), f"{name}modules": len(found), f"{name}calls": len(calls)}
         if not args.json:
-            print(f"{name}: {counts[name]}\n\n{diagram(calls)}\n")
-    if args.json:
-        print(json.dumps(counts))
+            print(*(f"{module:<40}  {' · '.join(functions)}" for module, functions in found.items()), "", sep="\n")
+    print(json.dumps(counts))
 
 
 if __name__ == "__main__":

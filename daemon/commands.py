@@ -30,24 +30,15 @@ class Commands:
 
     def handlers(self) -> Mapping[str, Handler]:
         """Return the handler of every command."""
-        return {
-            "tare": self._tare,
-            STATUS: self._status,
-            STOP: self._stop,
-            "start": self._start,
-            "pause": self._pause,
-            "resume": self._resume,
-            "unlock": self._unlock,
-            "set": self._set,
-        }
+        named = {"tare": self._tare, STATUS: self._status, STOP: self._stop, "start": self._start, "set": self._set}
+        return {**named, "pause": self._pause, "resume": self._resume, "unlock": self._unlock}
 
     def open_handlers(self) -> Mapping[str, Handler]:
         """Return the handlers for users of this machine without a key: only `stop` and `status` work."""
 
         async def refuse(_request: Request) -> Reply:
-            raise CommandRefusedError(
-                "this command needs a key: give --key and --server-key; without one only `stop` works"
-            )
+            reason = "this command needs a key: give --key and --server-key; without one only `stop` works"
+            raise CommandRefusedError(reason)
 
         return {name: own if name in (STOP, STATUS) else refuse for name, own in self.handlers().items()}
 

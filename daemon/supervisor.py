@@ -129,7 +129,11 @@ class HealthReporter:
             used_s, passed_s = time.process_time() - cpu_s, max(loop.time() - measured_s, 1e-9)
             cpu_s, measured_s = cpu_s + used_s, measured_s + passed_s
             self._clock.synchronise()
-            self._notify_systemd()
+            # A task that stays dead ends the service: systemd's watchdog is fed only while all are alive.
+            if dead := self._supervisor.dead:
+                notify(f"STATUS=dead, restarting: {', '.join(dead)}")
+            else:
+                notify("WATCHDOG=1", f"STATUS={len(self._supervisor.records)} tasks are alive")
             self._publisher.publish(
                 Health(
                     source="daemon",
@@ -140,14 +144,6 @@ class HealthReporter:
                     cpu_percent=100.0 * used_s / passed_s,
                 )
             )
-
-    def _notify_systemd(self) -> None:
-        """Feed systemd's watchdog unless a task is dead; a task that stays dead ends the service."""
-        dead = self._supervisor.dead
-        if dead:
-            notify(f"STATUS=dead, restarting: {', '.join(dead)}")
-        else:
-            notify("WATCHDOG=1", f"STATUS={len(self._supervisor.records)} tasks are alive")
 
 
 def resident_memory_mb() -> float:

@@ -90,7 +90,7 @@ def _run(
                 devices=[emulator.device for emulator in config.emulators],
             )
         if args.show:
-            listeners += [EstimatePrinter(out), RunSummary(out, emulated, emulated)]
+            listeners += [EstimatePrinter(out), RunSummary(out, emulated)]
         finished = asyncio.run(run_daemon(config, tuple(listeners), reporters, on_ready))
     if slices is not None:
         out.write(f"{args.slices}: {slices.summary}\n")

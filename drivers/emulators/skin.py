@@ -104,7 +104,8 @@ class Circuit:
         current_a = 0.0
         if self.output_on:
             current_a = self.compliance_v / whole_ohm if compliance else self.level_a
-        v = [(-1 if ("reversed", name) in self.faults else 1) * r * current_a for name, r in zip(GAUGES, ohm, strict=True)]
+        signs = [-1 if ("reversed", name) in self.faults else 1 for name in GAUGES]
+        v = [sign * r * current_a for sign, r in zip(signs, ohm, strict=True)]
         if self.swapped:
             v.reverse()
         return CircuitState(current_a, current_a * whole_ohm, v[0], v[1], compliance)

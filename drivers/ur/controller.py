@@ -111,11 +111,13 @@ def query_controller(host: str, timeout_s: float) -> ControllerInfo:
     version = probe_controller(host, timeout_s)
     requests = ("robotmode", "safetymode", "is in remote control")
     robot_mode, safety_mode, remote = ask_dashboard(host, timeout_s, requests)
-    with explain_failure(host, timeout_s, "asking for its registers"):
+    with (
+        explain_failure(host, timeout_s, "asking for its registers"),
         # A register belongs to a connection: closing it gives the register back.
-        with socket.create_connection((host, RTDE_PORT), timeout=timeout_s) as connection:
-            _agree_on_protocol(connection)
-            free = b"IN_USE" not in _request(connection, _INPUTS, ",".join(_REGISTERS).encode())
+        socket.create_connection((host, RTDE_PORT), timeout=timeout_s) as connection,
+    ):
+        _agree_on_protocol(connection)
+        free = b"IN_USE" not in _request(connection, _INPUTS, ",".join(_REGISTERS).encode())
     return ControllerInfo(
         version,
         robot_mode.removeprefix("Robotmode: "),

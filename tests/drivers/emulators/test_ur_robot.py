@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from shearloop.drivers.emulators import ur_robot as control_script
-from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, PAUSED, STOPPED, ControllerSpec, Robot
+from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, PAUSED, STOPPED, Robot
 
 DT_S = 0.002
 
@@ -50,7 +50,7 @@ def down(robot: Robot, metres: float = 0.2) -> list[float]:
 
 
 def started(**spec: float) -> Robot:
-    robot = Robot(ControllerSpec(**spec))  # numbers only in these tests
+    robot = Robot(control_script.ControllerSpec(**spec))  # numbers only in these tests
     robot.upload()
     wait(robot, DT_S)
     return robot

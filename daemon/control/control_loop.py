@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from shearloop.daemon.control.controller import TwistController, WristCommand
+from shearloop.daemon.control.controller import WristCommand
 from shearloop.daemon.control.experiment_schema import (
     ExperimentFile,
     ExperimentLimits,
@@ -22,7 +22,6 @@ from shearloop.daemon.control.fault_detection import (
     detect_faults,
     fresh_for_s,
 )
-from shearloop.daemon.control.identification import ToolModel
 from shearloop.daemon.control.loop_inputs import ArmStatus, Creep, GripperStatus, LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDecision, SafetyMonitor
 from shearloop.daemon.control.step_runner import ACTIVE, Action, Experiment, ExperimentPhase, GripTo, Hold, TrackTorque
@@ -92,10 +91,10 @@ class ControlLoop:
             name: WristController(source, config) for name, source in sources.items() if source.measures_torque
         }
         # The wrist's controller for the driving torque, and the faults to watch for.
-        self._wrist = next(iter(self._wrists.values()))
+        self.wrist = next(iter(self._wrists.values()))
         self._watched = MonitorInputs(
-            driving=self._wrist.source,
-            supervising=self._others(self._wrist.source),
+            driving=self.wrist.source,
+            supervising=self._others(self.wrist.source),
             fresh_s=fresh_s,
             limits=ExperimentLimits(),
             required=required,
@@ -148,7 +147,7 @@ class ControlLoop:
 
     def on_speed_sent(self, wrist_rad_per_s: float) -> None:
         """Take the wrist speed that was sent, after all clipping."""
-        self._wrist.on_speed_sent(wrist_rad_per_s)
+        self.wrist.on_speed_sent(wrist_rad_per_s)
 
     def on_action_ended(self, error: str = "") -> None:
         """Take the end of the present action, with its error if it failed."""
@@ -191,7 +190,7 @@ class ControlLoop:
         if number is not None and uncertain:
             turning = f"step {number} ({file.steps[number - 1].do}), which turns the wrist"
             return f"{uncertain}; put a `grip` or a `release` before {turning}"
-        self.experiment, self._watched, self._wrist = Experiment(file, t_ns), watched, self._wrists[file.torque_source]
+        self.experiment, self._watched, self.wrist = Experiment(file, t_ns), watched, self._wrists[file.torque_source]
         # Without a gripper of ours the tool is held by other means; with one, it may hold a tool already.
         gripper = self.inputs.gripper
         expected = "gripper" not in watched.required or (gripper is not None and gripper.holding)
@@ -200,19 +199,11 @@ class ControlLoop:
 
     def pause(self) -> str | None:
         """Stand still until `resume`; return None, or why not."""
-        if self.experiment is not None and self.experiment.phase is ExperimentPhase.PAUSED:
-            return "the experiment is paused already; `resume` continues it"
-        if self.experiment is None or self.experiment.phase is not ExperimentPhase.RUNNING:
-            return "no experiment is running"
-        self.experiment.pause()
-        return None
+        return self.experiment.pause() if self.experiment is not None else "no experiment is running"
 
     def resume(self) -> str | None:
         """Continue after `pause`; return None, or why not."""
-        if self.experiment is None or self.experiment.phase is not ExperimentPhase.PAUSED:
-            return "no experiment is paused"
-        self.experiment.resume()
-        return None
+        return self.experiment.resume() if self.experiment is not None else "no experiment is paused"
 
     def stop(self, reason: str) -> None:
         """End the experiment and stand still."""
@@ -232,7 +223,7 @@ class ControlLoop:
         if experiment is not None:
             watched = replace(watched, limits=experiment.limits)
         if experiment is not None and active:
-            command, controller = experiment.command, self._wrist.controller
+            command, controller = experiment.command, self.wrist.controller
             gripped = grip.expected and not isinstance(command.action, GripTo)
             turns = not isinstance(command.wrist, Hold) or isinstance(command.action, IdentifyStep)
             watched = replace(
@@ -257,16 +248,6 @@ class ControlLoop:
             return self._ended(decision)
         return self._run_step(experiment, decision, arm.wrist_rad, t_ns)
 
-    @property
-    def controller(self) -> TwistController | None:
-        """The torque controller while the loop is closed."""
-        return self._wrist.controller
-
-    @property
-    def tool(self) -> ToolModel | None:
-        """The identified tool."""
-        return self._wrist.tool
-
     def _others(self, driving: TorqueSource) -> tuple[TorqueSource, ...]:
         return tuple(source for source in self._sources.values() if source is not driving)
 
@@ -280,7 +261,7 @@ class ControlLoop:
 
     def _run_step(self, experiment: Experiment, decision: SafetyDecision, wrist_rad: float, t_ns: int) -> ControlOutput:
         """Let the experiment choose its command, and the wrist's controller a speed."""
-        wrist, grip, held = self._wrist, self._grip, decision.response is Response.HOLD
+        wrist, grip, held = self.wrist, self._grip, decision.response is Response.HOLD
         if grip.origin_rad is None:
             grip.origin_rad = wrist_rad
         latest = self.inputs.torques.get(experiment.file.torque_source)
@@ -316,7 +297,7 @@ class ControlLoop:
         return ControlOutput(velocity.speed_rad_per_s, hold=still, action=action)
 
     def _forget_tool(self) -> None:
-        self._wrist.reset()
+        self.wrist.reset()
         for creep in self._creep.values():
             creep.reset()
 

@@ -235,20 +235,27 @@ class VelocityCommandSender:
             return
         self.unanswered += 1
         try:
-            self._robot.send_nowait(command, self._on_reply)
+            self._robot.send(command).add_done_callback(self._on_reply)
         except Exception as error:  # noqa: BLE001 - the next decision ends the experiment
-            structlog.get_logger().exception("a command to the robot failed")
             self.unanswered -= 1
-            self._control_loop.on_crash(error_text(error))
+            self._fail(error)
 
-    def _on_reply(self, reply: CommandReply) -> None:
+    def _on_reply(self, replied: asyncio.Future[CommandReply]) -> None:
         self.unanswered -= 1
-        if not reply.accepted and self._robot.state is None:
-            self._control_loop.on_command_unanswered(reply.refusal)
-        elif not reply.accepted:
-            self._control_loop.on_command_refused(reply.refusal)
-        self.sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
-        self._control_loop.on_speed_sent(self.sent_rad_per_s)
+        try:
+            reply = replied.result()
+            if not reply.accepted and self._robot.state is None:
+                self._control_loop.on_command_unanswered(reply.refusal)
+            elif not reply.accepted:
+                self._control_loop.on_command_refused(reply.refusal)
+            self.sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
+            self._control_loop.on_speed_sent(self.sent_rad_per_s)
+        except Exception as error:  # noqa: BLE001 - the next decision ends the experiment
+            self._fail(error)
+
+    def _fail(self, error: Exception) -> None:
+        structlog.get_logger().exception("a command to the robot failed")
+        self._control_loop.on_crash(error_text(error))
 
 
 class ActionExecutor:
@@ -495,8 +502,8 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
     status, experiment = control_loop.status, control_loop.experiment
     driving = experiment.file.torque_source if experiment is not None else ""
     latest = control_loop.inputs.torques.get(driving)
-    controller = control_loop.controller
-    tool = control_loop.tool
+    controller = control_loop.wrist.controller
+    tool = control_loop.wrist.tool
     return LoopState(
         source="loop",
         t_mono_ns=now_ns,

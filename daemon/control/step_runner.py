@@ -203,15 +203,21 @@ class Experiment:
             self.stop(f"step {self.step_number} ({self.step.do}) failed: {error}")
         return True
 
-    def pause(self) -> None:
-        """Stand still until `resume`."""
-        if self.phase is ExperimentPhase.RUNNING:
-            self.phase = ExperimentPhase.PAUSED
-
-    def resume(self) -> None:
-        """Continue after `pause`."""
+    def pause(self) -> str | None:
+        """Stand still until `resume`; return None, or why not."""
         if self.phase is ExperimentPhase.PAUSED:
-            self.phase = ExperimentPhase.RUNNING
+            return "the experiment is paused already; `resume` continues it"
+        if self.phase is not ExperimentPhase.RUNNING:
+            return "no experiment is running"
+        self.phase = ExperimentPhase.PAUSED
+        return None
+
+    def resume(self) -> str | None:
+        """Continue after `pause`; return None, or why not."""
+        if self.phase is not ExperimentPhase.PAUSED:
+            return "no experiment is paused"
+        self.phase = ExperimentPhase.RUNNING
+        return None
 
     def stop(self, reason: str) -> None:
         """End for good; a stopped experiment cannot be resumed."""

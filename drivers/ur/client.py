@@ -11,7 +11,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Coroutine
+from collections.abc import Coroutine
 from importlib.util import find_spec
 from typing import Any, Literal, Protocol, cast
 
@@ -66,7 +66,7 @@ class UrRobot:
         self.states = 0
         self.failed_program_stops = 0
         self._connection: WorkerConnection | None = None
-        self._replies: dict[int, Callable[[messages.CommandReply], None]] = {}
+        self._replies: dict[int, asyncio.Future[messages.CommandReply]] = {}
         self._number = 0
         self._lost_s = -math.inf
         self._next: asyncio.Future[messages.RobotState] | None = None
@@ -94,29 +94,16 @@ class UrRobot:
             self._next = asyncio.get_running_loop().create_future()
         return await asyncio.shield(self._next)
 
-    async def send(self, command: messages.Command) -> messages.CommandReply:
-        """Send a command and return its reply."""
+    def send(self, command: messages.Command) -> asyncio.Future[messages.CommandReply]:
+        """Send a command at once and return its reply; when the worker dies first, the reply is a refusal."""
         replied: asyncio.Future[messages.CommandReply] = asyncio.get_running_loop().create_future()
-
-        def on_reply(reply: messages.CommandReply) -> None:
-            if not replied.done():
-                replied.set_result(reply)
-
-        self.send_nowait(command, on_reply)
-        return await replied
-
-    def send_nowait(self, command: messages.Command, on_reply: Callable[[messages.CommandReply], None]) -> None:
-        """Send a command and pass its reply to `on_reply`.
-
-        When the worker dies first, the command is refused and not sent again. An exception in `on_reply` ends the
-        connection; where that has ended, it goes to the event loop's handler.
-        """
         if self._connection is None or self.state is None:
-            on_reply(messages.CommandReply(refusal=f"The robot is not connected. {self.link.latest.sentence}"))
-            return
-        self._number += 1
-        self._replies[self._number] = on_reply
-        self._connection.send(command, self._number)
+            replied.set_result(messages.CommandReply(f"The robot is not connected. {self.link.latest.sentence}"))
+        else:
+            self._number += 1
+            self._replies[self._number] = replied
+            self._connection.send(command, self._number)
+        return replied
 
     async def run(self) -> None:
         """Keep the robot connected until cancelled; then stop it and disconnect."""
@@ -146,12 +133,9 @@ class UrRobot:
             # A lost network does not make a foreign program ours.
             self._lost_s = time.monotonic() if self.state.owns_program else -math.inf
         self.state = None
-        replies, self._replies = self._replies, {}
-        unanswered = messages.CommandReply(
-            refusal="The robot's process ended before it answered; nothing is sent again."
-        )
-        for on_reply in replies.values():
-            asyncio.get_running_loop().call_soon(on_reply, unanswered)
+        unanswered = messages.CommandReply("The robot's process ended before it answered; nothing is sent again.")
+        for number in list(self._replies):
+            self.handle_message(number, unanswered)
 
     def handle_message(self, number: int, message: messages.Message) -> None:
         """Handle a message of the worker."""
@@ -169,9 +153,9 @@ class UrRobot:
                     self._next.set_result(message)
                     self._next = None
             case messages.CommandReply():
-                on_reply = self._replies.pop(number, None)
-                if on_reply is not None:
-                    on_reply(message)
+                replied = self._replies.pop(number, None)
+                if replied is not None and not replied.done():
+                    replied.set_result(message)
             case messages.Failed():
                 raise LostError(message.kind, message.sentence)
 

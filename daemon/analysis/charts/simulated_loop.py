@@ -17,7 +17,10 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.controller import ControllerSettings, TwistController, WristCommand
 from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
-from shearloop.daemon.control.margins import gain_for_noise, integral_gain
+from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
+from shearloop.daemon.control.margins import integral_gain
+from shearloop.daemon.control.step_runner import TrackTorque
+from shearloop.daemon.control.wrist_controller import controller_settings
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 
 PERIOD_S = 0.008
@@ -298,16 +301,13 @@ def identified(plant: Plant, scenario: LoopScenario) -> ToolModel:
 
 
 def settings_for(found: ToolModel, scenario: LoopScenario) -> ControllerSettings:
-    """Return the controller's settings for an identified tool."""
-    kp = gain_for_noise(found.noise_nm, ALLOWED_NOISE_NM)
-    return ControllerSettings(
-        stiffness_nm_per_rad=found.stiffness_nm_per_rad, sample_period_s=found.sample_period_s,
-        window_s=scenario.sensor.window_s, lag_s=max(found.significant_lag_s, 0.0), kp=kp, ki=integral_gain(kp),
-        wrist_bandwidth_per_s=scenario.wrist_bandwidth_per_s, ramp_nm_per_s=scenario.ramp_nm_per_s,
-        noise_nm=found.noise_nm, deadband_nm=0.001, innovation_limit_nm=max(3.0 * found.noise_nm, 0.01),
-        creep_limit_nm_per_s=0.005, offset_limit_nm=0.06, torque_limit_nm=0.2, speed_limit_rad_per_s=0.8,
-        acceleration_limit_rad_per_s2=3.0, travel_limit_rad=1.5,
+    """Return the controller's settings for an identified tool, as the control loop chooses them."""
+    config = LoopConfig(
+        allowed_noise_nm=ALLOWED_NOISE_NM, torque_bandwidth_per_s=scenario.wrist_bandwidth_per_s,
+        wrist_speed_rad_per_s=0.8, wrist_acceleration_rad_per_s2=6.0,
     )  # fmt: skip
+    source = TorqueSource(name=scenario.name, period_s=scenario.sensor.period_s, window_s=scenario.sensor.window_s)
+    return controller_settings(config, found, source, TrackTorque(0.0, scenario.ramp_nm_per_s), torque_limit_nm=0.2)
 
 
 def started_controller(plant: Plant, found: ToolModel, settings: ControllerSettings) -> TwistController:

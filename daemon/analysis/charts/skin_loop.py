@@ -142,7 +142,7 @@ class SkinLoop:
         if isinstance(orders.action, TareStep):
             self.estimator.tare()
             self._zero_begun = True
-        controller = self.brain.controller
+        controller = self.brain.wrist.controller
         wanted_nm = controller.set_point_nm if controller is not None else None
         self.trace.truth_n.append(self.skin.shear_n)
         self.trace.set_point_n.append(math.nan if wanted_nm is None else wanted_nm / RADIUS_MM * 1e3)

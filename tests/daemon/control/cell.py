@@ -2,7 +2,7 @@
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -37,37 +37,39 @@ class Robot(UrRobot):
         # How many cycles a straight move goes on after it was told to stop, ever slower than a joint at rest.
         self.brakes_for = 0
         self.flight.fly(5)
-        self._held: list[tuple[Callable[[CommandReply], None], CommandReply]] = []
+        self._held: list[tuple[asyncio.Future[CommandReply], CommandReply]] = []
         self._unread: list[RobotState] = []
         # For how many cycles there is no process yet.
         self.gone_for = 0
 
-    def send_nowait(self, command: Command, answered: Callable[[CommandReply], None]) -> None:
+    def send(self, command: Command) -> asyncio.Future[CommandReply]:
         self.commands.append(command)
         if self.dies_of is not None:
             raise self.dies_of
+        replied: asyncio.Future[CommandReply] = asyncio.get_running_loop().create_future()
         if self.gone_for:
-            answered(CommandReply(refusal="The robot is not connected."))
-            return
-        asyncio.get_running_loop().call_soon(self._obey, command, answered)
+            replied.set_result(CommandReply("The robot is not connected."))
+        else:
+            asyncio.get_running_loop().call_soon(self._obey, command, replied)
+        return replied
 
-    def _obey(self, command: Command, answered: Callable[[CommandReply], None]) -> None:
+    def _obey(self, command: Command, replied: asyncio.Future[CommandReply]) -> None:
         if isinstance(command, MoveLinear):
             self._goal = command
         reply = self.flight.ask(command)
         if isinstance(command, WristSpeed):
             # Its reply comes with the next state.
-            self._held.append((answered, reply))
-        else:
-            answered(reply)
+            self._held.append((replied, reply))
+        elif not replied.done():
+            replied.set_result(reply)
 
     def die(self, gone_for: int) -> None:
         """End the process with all that it has not said; the next one is there after so many cycles."""
         self.gone_for = gone_for
         held, self._held, self._unread = self._held, [], []
         self._disconnect()
-        for answered, _ in held:
-            answered(CommandReply(refusal="The robot's process ended before it answered."))
+        for replied, _ in held:
+            replied.set_result(CommandReply("The robot's process ended before it answered."))
 
     def cycle(self, *, read: bool = True) -> None:
         """Let 8 ms pass, and tell who waits for the next state; what is not read now is read with the next one."""
@@ -95,8 +97,8 @@ class Robot(UrRobot):
         if not read:
             return
         held, self._held = self._held, []
-        for answered, reply in held:
-            answered(reply)
+        for replied, reply in held:
+            replied.set_result(reply)
         for state in self._unread:
             self.handle_message(0, state)
         self._unread.clear()

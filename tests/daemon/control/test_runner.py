@@ -295,12 +295,14 @@ async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none()
         await cell.cycles(20)
         cell.control_loop.on_link("robot", "The robot's process died of SIGKILL.", up=False)
         cell.robot.die(50)
+        await asyncio.sleep(0)
         cell.runner.decide_now()
         assert cell.phase is ExperimentPhase.STOPPED
         assert "a command was refused" not in cell.why
         assert "ended before it answered" in cell.why
         assert cell.why.endswith("once the robot is connected again, `shearloop command unlock`.")
         # Neither was the stop that comes next, of which there is nobody to hear.
+        await asyncio.sleep(0)
         cell.runner.decide_now()
         told = " ".join(cell.control_loop.status.decision.reasons)
         assert "not connected" in told

@@ -1,6 +1,6 @@
 """The wrist's speed for a set point, and its approach to an angle."""
 
-from collections.abc import Callable
+import asyncio
 from types import SimpleNamespace
 from typing import cast
 
@@ -67,20 +67,21 @@ FASTEST_PER_S = next(
 )
 
 
-def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> list[float]:
+async def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> list[float]:
     """Return how far from the angle the wrist is in each cycle."""
     flight = flying()
     config = LoopConfig(angle_bandwidth_per_s=bandwidth_per_s)
     wrist = WristController(TorqueSource(name="load_cell", period_s=0.1), config)
-    replies: list[Callable[[], None]] = []
+    replies: list[tuple[asyncio.Future[CommandReply], CommandReply]] = []
 
-    def send_nowait(command: Command, answered: Callable[[CommandReply], None]) -> None:
+    def send(command: Command) -> asyncio.Future[CommandReply]:
         reply = flight.ask(command)
         assert reply.accepted
-        # It comes with the next state that is told.
-        replies.append(lambda: answered(reply))
+        # It comes with the next state.
+        replies.append((asyncio.get_running_loop().create_future(), reply))
+        return replies[-1][0]
 
-    robot = SimpleNamespace(settings=SETTINGS, state=None, send_nowait=send_nowait)
+    robot = SimpleNamespace(settings=SETTINGS, state=None, send=send)
     brain = SimpleNamespace(on_speed_sent=wrist.on_speed_sent, on_command_refused=pytest.fail, on_crash=pytest.fail)
     commands = VelocityCommandSender(cast(UrRobot, robot), cast(ControlLoop, brain))
     origin_rad, errors = flight.state.wrist_rad, []
@@ -90,7 +91,9 @@ def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> l
         errors.append(state.wrist_rad - origin_rad - angle_rad)
         robot.state = state
         while replies:
-            replies.pop()()
+            replied, reply = replies.pop()
+            replied.set_result(reply)
+        await asyncio.sleep(0)
         turn = wrist.turn(MoveToAngle(angle_rad, 0.5), flight.now_ns, state.wrist_rad, origin_rad)
         commands.send(WristSpeed(turn.speed_rad_per_s, 4.0))
     return errors
@@ -98,7 +101,7 @@ def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> l
 
 @pytest.mark.parametrize("angle_rad", [0.01, 0.03, 0.1])
 @pytest.mark.parametrize("bandwidth_per_s", [5.0, FASTEST_PER_S])
-def test_wrist_comes_to_rest_at_an_angle_however_fast_it_may_be_asked_to(
+async def test_wrist_comes_to_rest_at_an_angle_however_fast_it_may_be_asked_to(
     angle_rad: float, bandwidth_per_s: float
 ) -> None:
-    assert max(map(abs, errors_rad(angle_rad, bandwidth_per_s)[-150:])) < 1e-4
+    assert max(map(abs, (await errors_rad(angle_rad, bandwidth_per_s))[-150:])) < 1e-4

@@ -196,7 +196,7 @@ async def test_hung_worker_is_replaced(controller: ControllerProcess) -> None:
         os.kill(pid_of(robot), signal.SIGSTOP)
         stopped = await controller.event("motion-stopped", hung_ns)
         assert stopped_after_s(stopped, hung_ns) <= STOPPED_WITHIN_S
-        unanswered = asyncio.create_task(robot.send(Stop(1.0)))
+        unanswered = robot.send(Stop(1.0))
         await link.down()
         assert robot.losses == {"hung": 1}
         assert "ended before it answered" in (await unanswered).refusal

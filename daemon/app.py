@@ -171,7 +171,7 @@ def _build_rig(
     sources = torque_sources(config, estimators, combined)
     check_experiment(config, sources)
     loop = make_loop(config, sources)
-    diameters = FingertipDiameters(COMBINED)
+    diameters = FingertipDiameters(COMBINED) if loop is not None else None
     gripper = make_gripper(config, loop, publisher, diameters) if loop is not None else None
     builder = SensorBuilder(config, publisher, clock, recorder, loop)
     sensors = builder.build(estimators, combined, gripper, diameters)

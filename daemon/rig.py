@@ -112,7 +112,7 @@ def make_loop(config: DaemonConfig, sources: Mapping[str, TorqueSource]) -> Cont
 
 
 def make_gripper(
-    config: DaemonConfig, loop: ControlLoop, publisher: Publisher, diameters: FingertipDiameters
+    config: DaemonConfig, loop: ControlLoop, publisher: Publisher, diameters: FingertipDiameters | None
 ) -> GripperTask | None:
     """Return the gripper's task, if a gripper is configured; `diameters` are the fingertips'."""
     if config.gripper is None:

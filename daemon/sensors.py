@@ -68,7 +68,7 @@ class SensorBuilder:
         estimators: Mapping[str, LiveEstimator],
         combined: LiveEstimator | None,
         gripper: GripperTask | None,
-        diameters: FingertipDiameters,
+        diameters: FingertipDiameters | None,
     ) -> Sensors:
         """Return all sensors; `diameters` receives the fingertips' estimates, and the gripper gives the held tool."""
 

@@ -421,15 +421,15 @@ class EitKit(SerialSensor[Frame]):
         }
 
     def _parse(self, event: RawEvent) -> list[Frame]:
-        return self._parser.handle(event)
+        frames = self._parser.handle(event)
+        self._longest_silence_s = max(SILENT_PERIODS * self._parser.clock.period_ns / 1e9, MIN_SILENCE_S)
+        return frames
 
     async def _on_open(self, port: Port) -> None:
+        self._silence_s = self._longest_silence_s
         await port.write(START)
 
-    def _timeout_s(self) -> float:
-        return max(SILENT_PERIODS * self._parser.clock.period_ns / 1e9, MIN_SILENCE_S)
-
-    async def _on_timeout(self, port: Port, _waited_s: float) -> None:
+    async def _on_timeout(self, port: Port) -> None:
         if self._timeouts > STARTS_BEFORE_REOPENING:
             raise DeviceLostError(
                 f"{port.path} is open but silent, though the board was started {STARTS_BEFORE_REOPENING} times more; "

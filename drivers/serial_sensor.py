@@ -174,8 +174,10 @@ class SerialSensor(ABC, Generic[ValueT]):
         """Use the link, not yet open, of a board with a line every `period_s`; `inputs` keeps every parser input."""
         self._link = link
         self._period_s = period_s
+        self._longest_silence_s = SILENT_PERIODS * period_s
         self._inputs = inputs
-        self._has_sent = False
+        # A silence of this time means that the board is lost, or needs another start.
+        self._silence_s = BOOT_S
         self._timeouts = 0
 
     async def readings(self) -> AsyncGenerator[ValueT]:
@@ -195,16 +197,15 @@ class SerialSensor(ABC, Generic[ValueT]):
             while True:
                 try:
                     port = self._link.port or await self._open()
-                    timeout_s = self._timeout_s()
-                    received = await port.read(timeout_s)
+                    received = await port.read(self._silence_s)
                     if received is None:
                         self._timeouts += 1
-                        await self._on_timeout(port, timeout_s)
+                        await self._on_timeout(port)
                         continue
                 except DriverError as error:
                     await self._link.lost(error)
                     continue
-                self._has_sent, self._timeouts = True, 0
+                self._timeouts, self._silence_s = 0, self._longest_silence_s
                 yield self._dispatch(InputKind.DATA, received.t_arrival_ns, received.data)
 
     def diagnostics(self) -> Diagnostics:
@@ -220,7 +221,7 @@ class SerialSensor(ABC, Generic[ValueT]):
     async def _open(self) -> Port:
         port = await self._link.open()
         self._dispatch(InputKind.OPENED, time.monotonic_ns())
-        self._has_sent, self._timeouts = False, 0
+        self._timeouts, self._silence_s = 0, BOOT_S
         await self._on_open(port)
         return port
 
@@ -231,9 +232,6 @@ class SerialSensor(ABC, Generic[ValueT]):
     async def _on_open(self, port: Port) -> None:
         """Set up a board after its port was opened."""
 
-    def _timeout_s(self) -> float:
-        return SILENT_PERIODS * self._period_s if self._has_sent else BOOT_S
-
-    async def _on_timeout(self, port: Port, waited_s: float) -> None:
+    async def _on_timeout(self, port: Port) -> None:
         hint = self.silence_hint
-        raise DeviceLostError(f"{port.path} is open but has sent nothing for {waited_s:.1f} s; {hint}")
+        raise DeviceLostError(f"{port.path} is open but has sent nothing for {self._silence_s:.1f} s; {hint}")

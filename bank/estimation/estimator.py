@@ -30,10 +30,11 @@ from shearloop.bank.estimation.interval_regressor import (
     IntervalRegressor,
     PolynomialRegressor,
     RegressorFit,
+    Ridge,
     fit_interval_regressor,
 )
 from shearloop.bank.estimation.novelty import NoveltyDetector
-from shearloop.bank.estimation.regressors import ChannelImputer, Ridge, later_origins
+from shearloop.bank.estimation.regressors import ChannelImputer, later_origins
 from shearloop.bank.estimation.session_state import Motion, ProcessedFrame
 
 if TYPE_CHECKING:
@@ -70,9 +71,9 @@ class OutputModel:
     novelty: NoveltyDetector | None
     k_range: FloatArray
 
-    def match_reasons(self, match: BankMatch | None) -> tuple[str, ...]:
+    def match_reasons(self, match: BankMatch) -> tuple[str, ...]:
         """Return the reason against a bank match far from the calibrated ones, if there is one."""
-        if match is None or not len(self.k_range):
+        if not len(self.k_range):
             return ()
         low, high = self.k_range.tolist()
         margin = max(high - low, _LEAST_MARGIN_K_CM)

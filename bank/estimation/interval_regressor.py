@@ -1,4 +1,7 @@
-"""A regressor with 95 % prediction intervals, and its fit.
+"""Ridges from features to a value, with 95 % prediction intervals, and their fit.
+
+`Ridge` is for features that contain the value linearly. `TobitRidge` is for a load cell that a lever pushes from one
+side only: where it reads nothing the twist may be anything below, so these frames bound the value (Tobin 1958).
 
 Intervals come from residuals on frames later than those fitted to: split-conformal in strata of the prediction (Vovk
 2012), namely free of load, about to touch, loaded. In each stratum the half width is the 95 % quantile of the absolute
@@ -12,14 +15,12 @@ from dataclasses import dataclass, field
 from typing import Protocol, Self, TypeAlias
 
 import numpy as np
-from scipy.special import stdtrit
+from scipy.special import log_ndtr, stdtrit
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.regressors import (
     InverseCalibration,
-    Regressor,
-    TobitRidge,
     later_splits,
     left_out_blocks,
 )
@@ -27,6 +28,9 @@ from shearloop.bank.estimation.values import INLINE
 from shearloop.bank.polynomial import TWO_SIDED_95, Polynomial
 
 LEVEL = 0.95
+# Readings below this share of the largest torque mean that the lever does not touch.
+CENSORED_SHARE = 0.02
+_LEAST_SIGMA_SHARE, _EM_ROUNDS = 0.01, 100
 LEAST_IN_STRATUM = 20
 _LEAST_RESIDUALS = 5
 # Narrowest interval as a share of the calibrated range: load cells are noisy too.
@@ -63,6 +67,82 @@ class Mixtures:
     limit_shares: FloatArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Ridge:
+    """value = offset + (features − mean) · weights; strength is the chosen penalty."""
+
+    mean: FloatArray
+    weights: FloatArray
+    offset: float
+    strength: float
+
+    @classmethod
+    def fit(cls, features: FloatArray, values: FloatArray, strength: float) -> Self:
+        """Fit to (n, d) features of one unit and (n,) values; strength is in units of the features' sum of squares."""
+        mean, offset = features.mean(axis=0), float(values.mean())
+        u, s, vt = np.linalg.svd(features - mean, full_matrices=False)
+        penalty = strength * float((s**2).sum())
+        weights = vt.T @ (s / (s**2 + penalty) * (u.T @ (values - offset)))
+        return cls(mean, weights, offset, strength)
+
+    @classmethod
+    def fit_scaled(cls, features: FloatArray, values: FloatArray, strength: float) -> Self:
+        """Fit with each feature in units of its own spread: for features of different kinds."""
+        spread = features.std(axis=0)
+        spread = np.where(spread > 0, spread, 1.0)
+        scaled = cls.fit(features / spread, values, strength)
+        return cls(scaled.mean * spread, scaled.weights / spread, scaled.offset, strength)
+
+    def predict(self, features: FloatArray) -> FloatArray:
+        """Return the values of (…, d) features."""
+        return np.asarray(self.offset + (features - self.mean) @ self.weights)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TobitRidge(Ridge):
+    """A ridge with readings of no load as bounds; `sign` is the direction of the lever's push.
+
+    It predicts a latent value along the sign. Where that is below zero, the lever does not touch: no torque.
+    """
+
+    sigma: float
+    sign: float
+
+    @classmethod
+    def fit(cls, features: FloatArray, values: FloatArray, strength: float) -> Self:
+        """Fit by expectation–maximisation to (n, d) features and (n,) values of one sign."""
+        largest = float(values[np.argmax(np.abs(values))])
+        sign = 1.0 if largest > 0 else -1.0
+        y = sign * values
+        touching = y >= CENSORED_SHARE * y.max()
+        mean = features.mean(axis=0)
+        u, s, vt = np.linalg.svd(features - mean, full_matrices=False)
+        gain = s / (s**2 + strength * float((s**2).sum()))
+        latent, sigma = y.copy(), max(float(y[touching].std()), _LEAST_SIGMA_SHARE * y.max())
+        for _ in range(_EM_ROUNDS):
+            offset = float(latent.mean())
+            coefficients = gain * (u.T @ (latent - offset))
+            predicted = offset + u @ (s * coefficients)
+            expected, variance = _moments_below_zero(predicted[~touching], sigma)
+            latent = y.copy()
+            latent[~touching] = expected
+            sigma = max(
+                float(np.sqrt((((latent - predicted) ** 2).sum() + variance.sum()) / len(y))),
+                _LEAST_SIGMA_SHARE * float(y.max()),
+            )
+        offset = float(latent.mean())
+        weights = vt.T @ (gain * (u.T @ (latent - offset)))
+        return cls(mean, weights, offset, strength, sigma, sign)
+
+
+def _moments_below_zero(mean: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
+    """Return mean and variance of Gaussians of this mean and sigma, given that they are below zero."""
+    u = -mean / sigma
+    ratio = np.exp(-0.5 * u**2 - 0.5 * np.log(2 * np.pi) - log_ndtr(u))
+    return mean - sigma * ratio, sigma**2 * np.clip(1 - u * ratio - ratio**2, 0.0, 1.0)
+
+
+Regressor: TypeAlias = Ridge | TobitRidge | InverseCalibration
 RegressorFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Regressor]
 
 
@@ -183,17 +263,20 @@ class IntervalRegressor:
         """
         rows = features[None] if complete is None else np.array([features, complete])
         raws = self.point.predict(rows)
-        raw, (value, *others) = float(raws[0]), _reported(self.point, raws).tolist()
+        lever = self.point if isinstance(self.point, TobitRidge) else None
+        # No torque where the lever would not touch.
+        reported = raws if lever is None else lever.sign * np.maximum(raws, 0.0)
+        raw, (value, *others) = float(raws[0]), reported.tolist()
         widening /= math.sqrt(max(usable_share, 0.1))
-        half = widening * self.intervals.half_width(raw)
+        half = widening * float(self.intervals.half_widths[self.intervals.edges.searchsorted(raw)])
         moved = others[0] - value if others else 0.0
         below = max(half + max(-moved, 0.0), limit_share * self.contamination_below)
         above = max(half + max(moved, 0.0), limit_share * self.contamination_above)
         if self.misses_loads:
             below, above = below + max(value - self.range.low, 0.0), above + max(self.range.high - value, 0.0)
-        if isinstance(self.point, TobitRidge) and raw < 0:
-            other_way = widening * TWO_SIDED_95 * self.point.sigma - raw
-            below, above = (max(below, other_way), above) if self.point.sign > 0 else (below, max(above, other_way))
+        if lever is not None and raw < 0:
+            other_way = widening * TWO_SIDED_95 * lever.sigma - raw
+            below, above = (max(below, other_way), above) if lever.sign > 0 else (below, max(above, other_way))
         if value <= self.range.low_end:
             below = max(below, value - self.range.lowest)
         if value >= self.range.high_end:

@@ -33,13 +33,15 @@ from shearloop.bank.estimation.interval_regressor import (
     Intervals,
     PolynomialRegressor,
     RegressorFit,
+    Ridge,
+    TobitRidge,
     ValueRange,
     best_strength,
     fit_interval_regressor,
     is_one_sided,
 )
 from shearloop.bank.estimation.novelty import fitted_parts, reciprocal_means
-from shearloop.bank.estimation.regressors import InverseCalibration, Ridge, TobitRidge
+from shearloop.bank.estimation.regressors import InverseCalibration
 from shearloop.bank.estimation.session_state import BASELINE_FRAMES, Motion
 from shearloop.bank.polynomial import TWO_SIDED_95
 
@@ -95,8 +97,6 @@ class TemporalFeatures(Motion):
 
     def complete(self, difference: FloatArray, usable: BoolArray, sides: Sequence[FingertipValidator]) -> FloatArray:
         """Return a (m, 896) difference to the idle frame, unusable channels along the directions and the grip."""
-        if usable.all():
-            return difference
         imputed = [
             self._impute(layer, difference[layer], usable[layer], one.noise, one.gripped - one.idle)
             for layer, one in enumerate(sides)

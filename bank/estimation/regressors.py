@@ -1,27 +1,20 @@
-"""Regressors from features to a value, and an imputer of dead channels.
+"""Frames as a curve over the value, an imputer of dead channels, and ways to leave frames out.
 
-`Ridge` is for features that contain the value linearly. `TobitRidge` is for a load cell that a lever pushes from one
-side only: where it reads nothing the twist may be anything below, so these frames bound the value (Tobin 1958).
 `InverseCalibration` models frames as a smooth curve over the value with correlated drift (classical calibration by
 generalised least squares). Unlike a ridge it does not pull estimates towards the mean.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Self, TypeAlias
+from typing import Self
 
 import numpy as np
-from scipy.special import log_ndtr
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.values import INLINE
 
-# Readings below this share of the largest torque mean that the lever does not touch.
-CENSORED_SHARE = 0.02
-_LEAST_SIGMA_SHARE = 0.01
-_EM_ROUNDS = 100
 N_BLOCKS = 5
 FIRST_ORIGIN, N_ORIGINS, LEAST_BEFORE_ORIGIN = 0.6, 20, 12
 # Penalties of the curve's higher terms and of the trend, as this many frames without them. From 10 to 100 for the trend
@@ -32,81 +25,6 @@ N_RANKED = 272
 # Filled frames of the emulated rig, the recorded stream and formulas give estimates within a tenth of their error for
 # 2 to 16 directions.
 _MOST_DIRECTIONS = 4
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Ridge:
-    """value = offset + (features − mean) · weights; strength is the chosen penalty."""
-
-    mean: FloatArray
-    weights: FloatArray
-    offset: float
-    strength: float
-
-    @classmethod
-    def fit(cls, features: FloatArray, values: FloatArray, strength: float) -> Self:
-        """Fit to (n, d) features of one unit and (n,) values; strength is in units of the features' sum of squares."""
-        mean, offset = features.mean(axis=0), float(values.mean())
-        u, s, vt = np.linalg.svd(features - mean, full_matrices=False)
-        penalty = strength * float((s**2).sum())
-        weights = vt.T @ (s / (s**2 + penalty) * (u.T @ (values - offset)))
-        return cls(mean, weights, offset, strength)
-
-    @classmethod
-    def fit_scaled(cls, features: FloatArray, values: FloatArray, strength: float) -> Self:
-        """Fit with each feature in units of its own spread: for features of different kinds."""
-        spread = features.std(axis=0)
-        spread = np.where(spread > 0, spread, 1.0)
-        scaled = cls.fit(features / spread, values, strength)
-        return cls(scaled.mean * spread, scaled.weights / spread, scaled.offset, strength)
-
-    def predict(self, features: FloatArray) -> FloatArray:
-        """Return the values of (…, d) features."""
-        return np.asarray(self.offset + (features - self.mean) @ self.weights)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TobitRidge(Ridge):
-    """A ridge with readings of no load as bounds; `sign` is the direction of the lever's push.
-
-    It predicts a latent value along the sign. Where that is below zero, the lever does not touch: no torque.
-    """
-
-    sigma: float
-    sign: float
-
-    @classmethod
-    def fit(cls, features: FloatArray, values: FloatArray, strength: float) -> Self:
-        """Fit by expectation–maximisation to (n, d) features and (n,) values of one sign."""
-        largest = float(values[np.argmax(np.abs(values))])
-        sign = 1.0 if largest > 0 else -1.0
-        y = sign * values
-        touching = y >= CENSORED_SHARE * y.max()
-        mean = features.mean(axis=0)
-        u, s, vt = np.linalg.svd(features - mean, full_matrices=False)
-        gain = s / (s**2 + strength * float((s**2).sum()))
-        latent, sigma = y.copy(), max(float(y[touching].std()), _LEAST_SIGMA_SHARE * y.max())
-        for _ in range(_EM_ROUNDS):
-            offset = float(latent.mean())
-            coefficients = gain * (u.T @ (latent - offset))
-            predicted = offset + u @ (s * coefficients)
-            expected, variance = _moments_below_zero(predicted[~touching], sigma)
-            latent = y.copy()
-            latent[~touching] = expected
-            sigma = max(
-                float(np.sqrt((((latent - predicted) ** 2).sum() + variance.sum()) / len(y))),
-                _LEAST_SIGMA_SHARE * float(y.max()),
-            )
-        offset = float(latent.mean())
-        weights = vt.T @ (gain * (u.T @ (latent - offset)))
-        return cls(mean, weights, offset, strength, sigma, sign)
-
-
-def _moments_below_zero(mean: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
-    """Return mean and variance of Gaussians of this mean and sigma, given that they are below zero."""
-    u = -mean / sigma
-    ratio = np.exp(-0.5 * u**2 - 0.5 * np.log(2 * np.pi) - log_ndtr(u))
-    return mean - sigma * ratio, sigma**2 * np.clip(1 - u * ratio - ratio**2, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -211,9 +129,6 @@ class InverseCalibration:
         before, here, after = cost[i - 1 : i + 2]
         bend = before - 2 * here + after
         return float(grid[i] + (0.5 * (before - after) / bend if bend > 0 else 0.0) * (grid[1] - grid[0]))
-
-
-Regressor: TypeAlias = Ridge | TobitRidge | InverseCalibration
 
 
 def _spread_about_parabola(frames: FloatArray, z: FloatArray) -> FloatArray:

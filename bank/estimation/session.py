@@ -1,7 +1,7 @@
 """A session with a calibration: frames in, estimates out, causally."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -26,11 +26,12 @@ from shearloop.bank.polynomial import TWO_SIDED_95
 
 REPEATED_FRAME = ("the board sent the same frame again",)
 _UNITS: dict[Quantity, str] = {"torque": "N·m", "diameter": "mm"}
+_UNKNOWN = (None, None, None)
 _AMBIGUOUS = ("two positions of the bank far apart fit the frame equally well",)
 # A longer gap restarts the average of frames.
 _MAX_GAP_S = 3.0
 
-# A value and how far its 95 % interval extends below and above it.
+# A value, and its 95 % interval: how far it extends below and above, or its ends.
 _Interval = tuple[float, float, float]
 
 
@@ -58,6 +59,10 @@ class EstimatorSession:
         self._averaging = (average_frames, max_gap_s)
         self._baseline_frames = baseline_frames
         self._matcher = matcher or calibration.matcher(bank)
+        self._outputs = calibration.outputs
+        self._position_noise_mm = 0.0
+        if calibration.diameter is not None:
+            self._position_noise_mm = calibration.estimator.position_noise_mm(calibration.diameter.regressor)
         self.set_tool(None)
         self.reset()
 
@@ -95,23 +100,14 @@ class EstimatorSession:
         else:
             motion = calibration.estimator.motion
             self._state = SessionState(calibration.validators, motion, self._period_s, idle_frames)
-        self._difference: FloatArray | None = None
-        self._latest: list[bytes] = []
-
-    def _repeats(self, channels: FloatArray) -> bool:
-        """Return whether a side of a (m, 896) frame equals the last one; noise makes new ones differ."""
-        before, self._latest = self._latest, [side.tobytes() for side in channels]
-        return any(one == other for one, other in zip(self._latest, before, strict=False))
+        # The (m, 896) difference to the idle frame behind the last estimate, None where there was none.
+        self.difference: FloatArray | None = None
+        self._latest: FloatArray = np.full(calibration.estimator.scale.shape, np.nan)
 
     @property
     def taring(self) -> bool:
         """Whether frames are being averaged into the idle frame."""
         return self._state.taring
-
-    @property
-    def difference(self) -> FloatArray | None:
-        """The (m, 896) difference to the idle frame behind the last estimate, None where there was none."""
-        return self._difference
 
     def estimate(self, frame: TactileFrame) -> Estimate:
         """Return the estimate of a frame of the calibration's sides.
@@ -124,14 +120,18 @@ class EstimatorSession:
                 f"the calibration is of {shape[0]} sides ({', '.join(self.calibration.sides)}), and the frame has the "
                 f"shape {frame.channels.shape}"
             )
-        self._difference = None
-        if self._state.refuses_repeats and self._repeats(frame.channels):
+        self.difference = None
+        # Noise makes every side of a new frame differ.
+        repeats = (frame.channels == self._latest).all(axis=1).any()
+        self._latest = frame.channels
+        if self._state.refuses_repeats and repeats:
             return Estimate(valid=False, reasons=REPEATED_FRAME)
         processed = self._state.process(frame)
         if processed.reasons:
             return Estimate(valid=False, reasons=processed.reasons)
-        self._difference = processed.difference
-        return replace(self._predict(processed, frame.t_s), lag_s=processed.lag_s)
+        self.difference = processed.difference
+        estimate = self._predict(processed, frame.t_s)
+        return replace(estimate, lag_s=processed.lag_s) if processed.lag_s else estimate
 
     def _predict(self, frame: ProcessedFrame, t_s: float) -> Estimate:
         calibration, curves_only = self.calibration, self._state.curves_only
@@ -142,7 +142,7 @@ class EstimatorSession:
         if not frame.usable.all():
             novelty = next((one.novelty for one, _ in outputs.values() if one.novelty is not None), None)
             difference, errors = calibration.estimator.impute(frame.difference, frame.usable, novelty)
-            self._difference, frame = difference, replace(frame, difference=difference)
+            self.difference, frame = difference, replace(frame, difference=difference)
         reading = Reading(frame, t_s, self._matcher)
         features, match = calibration.estimator.features(reading)
         if match is not None and match.ambiguous:
@@ -150,28 +150,27 @@ class EstimatorSession:
         values: dict[Quantity, _Interval] = {}
         for quantity, (model, novelty_result) in outputs.items():
             value, against = self._predict_quantity(quantity, model, novelty_result, reading, features, match, errors)
-            reasons += [reason for reason in against if reason not in reasons]
+            reasons |= dict.fromkeys(against)
             if not against:
-                values[quantity] = value
+                values[quantity] = value[0], value[0] - value[1], value[0] + value[2]
         torque_missing = calibration.torque is not None and "torque" not in values
         if calibration.kind == "raw" and (torque_missing or (curves_only and reasons)):
             # A frame beyond the calibrated torques is beyond the calibrated diameters too.
             values.clear()
         return _estimate(values, reasons, match)
 
-    def _select_outputs(self, frame: ProcessedFrame) -> tuple[dict[Quantity, tuple[OutputModel, Novelty]], list[str]]:
-        """Return the models to apply to a frame with its novelty, and the reasons against the others."""
+    def _select_outputs(
+        self, frame: ProcessedFrame
+    ) -> tuple[dict[Quantity, tuple[OutputModel, Novelty]], dict[str, None]]:
+        """Return the models to apply to a frame with its novelty, and the reasons against the others, in order."""
         calibration = self.calibration
         if self._state.curves_only and calibration.torque is None:
-            fitted = calibration.diameter is not None
-            return {}, [
-                "the calibration was made without torques: sigma has no torque"
-                if fitted
-                else "no calibration is configured: k and sigma have no torque"
-            ]
+            if calibration.diameter is not None:
+                return {}, {"the calibration was made without torques: sigma has no torque": None}
+            return {}, {"no calibration is configured: k and sigma have no torque": None}
         outputs: dict[Quantity, tuple[OutputModel, Novelty]] = {}
-        reasons: list[str] = []
-        for quantity, model in calibration.outputs.items():
+        reasons: dict[str, None] = {}
+        for quantity, model in self._outputs.items():
             novelty = FAMILIAR
             if model.novelty is not None:
                 novelty = model.novelty.assess(frame.difference[0], frame.usable[0])
@@ -179,9 +178,9 @@ class EstimatorSession:
             if quantity == "diameter" and not frame.has_baseline:
                 # The gel's position means nothing without its idle position.
                 if calibration.torque is None:
-                    reasons.append("the fingertip was gripped from the first frame on: its idle frame is not known")
+                    reasons["the fingertip was gripped from the first frame on: its idle frame is not known"] = None
                 continue
-            reasons += [reason for reason in against if reason not in reasons]
+            reasons |= dict.fromkeys(against)
             if not against:
                 outputs[quantity] = model, novelty
         return outputs, reasons
@@ -207,10 +206,11 @@ class EstimatorSession:
             if 2 * error > value[1] + value[2]:
                 # The dead channels carried the value; the imputed ones are a guess.
                 dead = _dead_channel_reasons(self.calibration.validators, frame.usable)
-            value = _widened(value, error)
+            value = value[0], math.hypot(value[1], error), math.hypot(value[2], error)
         if quantity == "diameter":
-            value = _widened(value, estimator.position_noise_mm(model.regressor) / math.sqrt(frame.held_frames))
-        against = dead or model.match_reasons(match)
+            error = self._position_noise_mm / math.sqrt(frame.held_frames)
+            value = value[0], math.hypot(value[1], error), math.hypot(value[2], error)
+        against = dead or (model.match_reasons(match) if match is not None else ())
         return value, against or model.regressor.range_reasons(value[0], features, quantity, _UNITS[quantity])
 
     def _regressor_inputs(self, quantity: Quantity, reading: Reading, difference: FloatArray) -> FloatArray:
@@ -231,16 +231,9 @@ def _dead_channel_reasons(validators: tuple[FingertipValidator, ...], usable: Bo
     )
 
 
-def _widened(value: _Interval, error: float) -> _Interval:
-    """Return a value with an independent error added to its interval."""
-    return value[0], math.hypot(value[1], error), math.hypot(value[2], error)
-
-
-def _estimate(values: Mapping[Quantity, _Interval], reasons: Sequence[str], match: BankMatch | None) -> Estimate:
-    torque, diameter = (
-        (value[0], value[0] - value[1], value[0] + value[2]) if (value := values.get(quantity)) else (None,) * 3
-        for quantity in _UNITS
-    )
+def _estimate(values: Mapping[Quantity, _Interval], reasons: Iterable[str], match: BankMatch | None) -> Estimate:
+    """Return the estimate of values with the ends of their intervals."""
+    torque, diameter = values.get("torque", _UNKNOWN), values.get("diameter", _UNKNOWN)
     estimate = Estimate(bool(values), () if values else tuple(reasons), *torque, *diameter)
     if match is None:
         return estimate

@@ -119,6 +119,10 @@ class IdleFrames:
         self._sides = fingertips.sides
         self.baselines: FloatArray = fingertips.idle.copy()
         self.gains: FloatArray = np.ones((len(self._sides), 1))
+        # The score that a grip needs on each side: with a baseline of a few frames only a strong one counts.
+        self.least_scores = [-np.inf] * len(self._sides)
+        # Whether this session has seen every fingertip idle, and whether frames are averaged into the idle frame.
+        self.complete, self.taring = False, wanted > 0
         self._frames: list[deque[FloatArray]] = [deque(maxlen=BASELINE_FRAMES) for _ in self._sides]
         self._followed = False
         self._wanted = wanted
@@ -126,19 +130,9 @@ class IdleFrames:
         self._least = min(_LEAST_IDLE, wanted or _LEAST_IDLE)
 
     @property
-    def taring(self) -> bool:
-        """Whether frames are being averaged into the idle frame."""
-        return len(self._tare_frames) < self._wanted
-
-    @property
     def begun(self) -> bool:
         """Whether any frame has been looked at."""
         return self._followed or bool(self._tare_frames)
-
-    @property
-    def complete(self) -> bool:
-        """Whether this session has seen every fingertip idle."""
-        return all(self._frames)
 
     def last_tare_frame(self) -> FloatArray | None:
         """Return the last frame of a tare that is not complete."""
@@ -149,10 +143,10 @@ class IdleFrames:
         self._tare_frames.append(channels)
         n = len(self._tare_frames)
         if n == self._wanted:
-            self.baselines, self._followed = np.mean(self._tare_frames, axis=0), True
+            self.baselines, self._followed, self.taring = np.mean(self._tare_frames, axis=0), True, False
             for layer, frames in enumerate(self._frames):
                 frames.extend(one[layer] for one in self._tare_frames)
-            self._update_gains()
+            self._update()
         return f"taking the homogeneous frame, {n} of {self._wanted}"
 
     def restart_tare(self) -> None:
@@ -180,16 +174,14 @@ class IdleFrames:
             self._frames[layer].clear()
         self._frames[layer].append(channels)
         self.baselines[layer] = np.mean(self._frames[layer], axis=0)
-        self._update_gains()
+        self._update()
 
-    def least_scores(self) -> list[float]:
-        """Return the score that a grip needs on each side: with a baseline of a few frames only a strong one counts."""
-        return [
+    def _update(self) -> None:
+        self.complete = all(self._frames)
+        self.least_scores = [
             max(_OUTRIGHT, one.grip_threshold) if 0 < len(frames) < self._least else -np.inf
             for one, frames in zip(self._sides, self._frames, strict=True)
         ]
-
-    def _update_gains(self) -> None:
         if self.complete:
             gains = [one.gain(idle) for one, idle in zip(self._sides, self.baselines, strict=True)]
             self.gains = np.array(gains)[:, None]
@@ -201,27 +193,18 @@ class GripMemory:
     def __init__(self, motion: Motion, n_sides: int) -> None:
         """Begin without a grip."""
         self._motion = motion
-        self._positions: deque[FloatArray] = deque(maxlen=motion.n_lags + 1)
+        self.positions: deque[FloatArray] = deque(maxlen=motion.n_lags + 1)
         self._bridged: deque[bool] = deque(maxlen=motion.n_lags + 1)
         self._skipped_in_a_row = 0
-        self._from_idle: FloatArray = np.zeros(0)
+        # Features of the last frames' motion.
+        self.features: FloatArray = np.zeros(0)
         # Over the last valid frames, and their number.
         self.mean_difference: FloatArray = np.zeros((n_sides, N_CHANNELS))
         self.held_frames = 0
 
-    @property
-    def empty(self) -> bool:
-        """Whether no frame of a grip is remembered."""
-        return not self._positions
-
-    @property
-    def features(self) -> FloatArray:
-        """Features of the last frames' motion."""
-        return self._motion.features(self._positions, self._from_idle)
-
     def forget(self) -> None:
         """Forget the grip."""
-        self._positions.clear()
+        self.positions.clear()
         self._bridged.clear()
         self._skipped_in_a_row, self.held_frames = 0, 0
         self.mean_difference = np.zeros_like(self.mean_difference)
@@ -231,36 +214,37 @@ class GripMemory:
         self._skipped_in_a_row += 1
         if self._skipped_in_a_row > _LARGEST_BRIDGED:
             self.forget()
-        elif self._positions:
+        elif self.positions:
             self._repeat_position(1 + missing)
 
     def remember(self, channels: FloatArray, difference: FloatArray, missing: int) -> str:
         """Take the next gripped frame, interpolate those before it, and return the reason against an estimate."""
-        position, self._from_idle = self._motion.project(np.array([channels, difference]))
+        position, from_idle = self._motion.project(np.array([channels, difference]))
         self._skipped_in_a_row = 0
-        if self._positions:
+        if missing and self.positions:
             self._repeat_position(missing)
         between = 0
         while between < len(self._bridged) and self._bridged[-1 - between]:
             between += 1
-        if 0 < between < len(self._positions):
-            begin = self._positions[-1 - between]
+        if 0 < between < len(self.positions):
+            begin = self.positions[-1 - between]
             for i in range(1, between + 1):
-                self._positions[i - 1 - between] = begin + i / (between + 1) * (position - begin)
-        self._positions.append(position)
+                self.positions[i - 1 - between] = begin + i / (between + 1) * (position - begin)
+        self.positions.append(position)
         self._bridged.append(False)
-        if wanted := self._motion.n_lags + 1 - len(self._positions):
+        if wanted := self._motion.n_lags + 1 - len(self.positions):
             return f"gripped too recently: {wanted} more frames are needed"
         if sum(self._bridged) > _LARGEST_BRIDGED:
             return "too many of the last frames were disturbed or are missing"
         self.held_frames = min(self.held_frames + 1, _HELD_FRAMES)
         self.mean_difference = self.mean_difference + (difference - self.mean_difference) / self.held_frames
+        self.features = self._motion.features(self.positions, from_idle)
         return ""
 
     def _repeat_position(self, times: int) -> None:
         """Repeat the last position for missing frames until the next frame allows interpolation."""
         for _ in range(times):
-            self._positions.append(self._positions[-1])
+            self.positions.append(self.positions[-1])
             self._bridged.append(True)
 
 
@@ -310,31 +294,34 @@ class SessionState:
             self._disturbed = None
             self._memory.skip(missing)
             return ProcessedFrame.refused(usable, *filter(None, reasons))
-        if jumping_shares and (disturbance := self._fingertips.disturbance(jumping_shares)):
+        if (jumping_shares > LARGEST_JUMPING_SHARE).any():
             self._bridge(channels, missing)
-            return ProcessedFrame.refused(usable, disturbance)
+            return ProcessedFrame.refused(usable, self._fingertips.disturbance(jumping_shares))
         is_first = self._before is None
         if is_first and not self._idle.begun:
             self._unknown = ~usable
         self._disturbed, self._before = None, channels
-        if self.taring:
+        if self._idle.taring:
             return ProcessedFrame.refused(usable, self._idle.add_to_tare(channels))
         if is_first:
             return ProcessedFrame.refused(usable, "there is no earlier frame to compare with")
-        self._update_baseline(channels, frame)
+        if not self._memory.positions:
+            self._update_baseline(channels, frame)
         return self._finish(channels, usable, missing)
 
-    def _check(self, frame: TactileFrame) -> tuple[FloatArray, BoolArray, list[str], list[float]]:
+    def _check(self, frame: TactileFrame) -> tuple[FloatArray, BoolArray, list[str], FloatArray]:
         """Return the filled channels, the usable ones, each side's reason, and its share of jumping channels.
 
         There are no shares without an earlier frame.
         """
         usable = mask_saturated(frame.channels, frame.usable)
-        channels = self._fill(frame.channels, usable)
+        channels = frame.channels if usable.all() else self._fill(frame.channels, usable)
         reasons, lost = self._fingertips.check(channels, usable)
         # Channels that stay lost are left out; while they are being lost they count as jumping.
         judged = usable & ~((lost & self._lost) | self._unknown)
-        shares = self._fingertips.jumping_shares(channels, self._before, judged) if self._before is not None else []
+        shares = np.zeros(0)
+        if self._before is not None:
+            shares = self._fingertips.jumping_shares(channels, self._before, judged)
         self._lost = lost
         if self._unknown.any() or lost.any():
             usable = usable & ~(lost | self._unknown)
@@ -344,8 +331,6 @@ class SessionState:
 
     def _fill(self, channels: FloatArray, usable: BoolArray) -> FloatArray:
         """Return the channels with unusable ones moved on from the last frame as the usable ones moved."""
-        if usable.all():
-            return channels
         if self._before is None:
             return np.where(usable, channels, self._fingertips.gripped)
         moved = self._motion.fill(channels - self._before, usable, self._fingertips.sides)
@@ -353,10 +338,10 @@ class SessionState:
 
     def _bridge(self, channels: FloatArray, missing: int) -> None:
         """Skip a disturbed frame; if the next one agrees with it, the change is real and the past is void."""
-        confirmed = self._disturbed is not None and all(
-            share <= LARGEST_JUMPING_SHARE
-            for share in self._fingertips.jumping_shares(channels, self._disturbed, self._fingertips.alive)
-        )
+        confirmed = False
+        if self._disturbed is not None:
+            shares = self._fingertips.jumping_shares(channels, self._disturbed, self._fingertips.alive)
+            confirmed = bool((shares <= LARGEST_JUMPING_SHARE).all())
         if confirmed:
             # In a tare, the tool was gripped or released meanwhile.
             self._memory.forget()
@@ -371,7 +356,7 @@ class SessionState:
 
         Channels that were unknown and work again in an idle frame are restored in `channels` (m, 896).
         """
-        for layer in self._idle.idle_sides(channels) if self._memory.empty else ():
+        for layer in self._idle.idle_sides(channels):
             back = self._unknown[layer]
             if back.any():
                 back = back & (mask_saturated(frame.channels, frame.usable) & ~self._lost)[layer]
@@ -381,15 +366,15 @@ class SessionState:
 
     def _finish(self, channels: FloatArray, usable: BoolArray, missing: int) -> ProcessedFrame:
         # At the calibration's gain. It does not change while gripped.
-        difference = channels - self._idle.baselines
-        difference = self._motion.complete(difference, usable, self._fingertips.sides) / self._idle.gains
-        gripped = [
-            grip.update(*each)
-            for grip, *each in zip(
-                self._grips, channels, self._idle.baselines, self._idle.gains, self._idle.least_scores(), strict=True
-            )
-        ]
-        if loose := [one.side for one, held in zip(self._fingertips.sides, gripped, strict=True) if not held]:
+        idle, difference, loose = self._idle, channels - self._idle.baselines, []
+        if not usable.all():
+            difference = self._motion.complete(difference, usable, self._fingertips.sides)
+        difference = difference / idle.gains
+        for layer, (one, grip) in enumerate(zip(self._fingertips.sides, self._grips, strict=True)):
+            known = idle.baselines[layer], idle.gains[layer], idle.least_scores[layer]
+            if not grip.update(channels[layer], *known):
+                loose.append(one.side)
+        if loose:
             self._memory.forget()
             return ProcessedFrame(difference, (f"no grip at the {' and '.join(loose)} fingertip",), usable)
         memory = self._memory

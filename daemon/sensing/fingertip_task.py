@@ -89,11 +89,22 @@ class FingertipEstimates:
         self._inputs = inputs
         self._tare_from_ns: int | None = None
         self._tared = asyncio.Event()
+        self._tared.set()
         self._held: Measured | None = None
 
     async def process(self, *frames: Frame) -> None:
         """Estimate from the frames of one time, hand the estimate to the control loop, and publish it."""
-        self._prepare(frames)
+        number, now_ns = frames[0].seq, self._clock.now_ns()
+        # A replay tares, and takes the held tool, before the same frame.
+        if self._tare_from_ns is not None and min(frame.t_begin_ns for frame in frames) >= self._tare_from_ns:
+            self._tare_from_ns = None
+            self.estimator.tare()
+            self._record(InputKind.TARE, now_ns, str(number).encode())
+        tool = self._gripper.held_tool(now_ns) if self._gripper is not None else None
+        if tool != self._held:
+            self._held = tool
+            self.estimator.set_tool(tool)
+            self._record(InputKind.TOOL, now_ns, tool_as_bytes(number, tool))
         estimate = await self.estimator.estimate(*frames)
         now_ns = self._clock.now_ns()
         message = estimate_message(self.name, frames, estimate, now_ns)
@@ -104,7 +115,7 @@ class FingertipEstimates:
             self._diameters.update(self.name, estimate, now_ns)
         self._publisher.publish(message)
         self.count += 1
-        if self._tare_from_ns is None and not self.estimator.taring:
+        if not (self._tared.is_set() or self._tare_from_ns is not None or self.estimator.taring):
             self._tared.set()
 
     def tare(self) -> None:
@@ -118,20 +129,9 @@ class FingertipEstimates:
         await self._tared.wait()
         return ""
 
-    def _prepare(self, frames: tuple[Frame, ...]) -> None:
-        """Begin a tare that is due, and take the held tool; a replay does both before the same frame."""
-        number, now_ns = frames[0].seq, self._clock.now_ns()
-        if self._tare_from_ns is not None and min(frame.t_begin_ns for frame in frames) >= self._tare_from_ns:
-            self._tare_from_ns = None
-            self.estimator.tare()
-            if self._inputs is not None:
-                self._inputs.record(RawEvent(InputKind.TARE, now_ns, str(number).encode()))
-        tool = self._gripper.held_tool(now_ns) if self._gripper is not None else None
-        if tool != self._held:
-            self._held = tool
-            self.estimator.set_tool(tool)
-            if self._inputs is not None:
-                self._inputs.record(RawEvent(InputKind.TOOL, now_ns, tool_as_bytes(number, tool)))
+    def _record(self, kind: InputKind, t_ns: int, data: bytes) -> None:
+        if self._inputs is not None:
+            self._inputs.record(RawEvent(kind, t_ns, data))
 
 
 class CombinedFingertips:

@@ -20,8 +20,8 @@ from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatch
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import Calibration, FrameSeries, Physics, fit, measure_timing
 from shearloop.bank.estimation.bank_match import NOT_TURNED, RefinedMatcher
-from shearloop.bank.estimation.interval_regressor import IntervalRegressor, fit_interval_regressor
-from shearloop.bank.estimation.regressors import Ridge, ranked_channels
+from shearloop.bank.estimation.interval_regressor import IntervalRegressor, Ridge, fit_interval_regressor
+from shearloop.bank.estimation.regressors import ranked_channels
 from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.analysis.charts import drawing
 from shearloop.daemon.analysis.charts.drawing import LINES, MARKS, SHADES

@@ -26,9 +26,8 @@ from shearloop.bank.estimation import (
     fit,
 )
 from shearloop.bank.estimation.bank_match import NOT_TURNED
-from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
+from shearloop.bank.estimation.interval_regressor import Ridge, fit_interval_regressor
 from shearloop.bank.estimation.novelty import NoveltyDetector, ReciprocityCheck
-from shearloop.bank.estimation.regressors import Ridge
 from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.analysis.charts import skin_loop
 from shearloop.daemon.analysis.charts.drawing import SHADES, figure, look, save, slug

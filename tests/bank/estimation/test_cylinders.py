@@ -9,8 +9,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.estimation import TRUSTED, EstimatorSession, fit
+from shearloop.bank.estimation.interval_regressor import Ridge
 from shearloop.bank.estimation.motion_regression import CylinderGrip, fit_cylinders, fit_line
-from shearloop.bank.estimation.regressors import Ridge
 from tests.bank.estimation.conftest import follow
 
 KNOWN_MM = (10.0, 25.0, 40.0)

@@ -12,8 +12,8 @@ from shearloop.bank.estimation.fingertip_validator import (
     LEAST_NOISE_V,
     FingertipSet,
     FingertipValidator,
-    ReferenceFrames,
     channel_noise,
+    compare_frames,
     segment_grip,
 )
 
@@ -135,9 +135,7 @@ def test_gain_and_deviation_are_medians_of_the_channels_that_are_compared(seed: 
     random = np.random.default_rng(seed)
     known, usable = random.uniform(0.0, 0.3, (2, 896)), random.random(896) >= left_out
     frame = random.uniform(0.5, 2.0) * known[0] + random.normal(0, 0.02, 896)
-    compared = ReferenceFrames(known, usable)
-    off_from_each, deviations = compared.compare(frame)
-    gains = compared.gains(frame)[:, 0]
+    gains, off_from_each, deviations = compare_frames(frame, known, usable)
     for one, gain, deviation, channels in zip(known, gains, deviations, off_from_each, strict=True):
         judged = usable & (one > 0.03)
         if not judged.any():

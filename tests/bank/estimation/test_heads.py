@@ -5,12 +5,15 @@ import pytest
 from scipy.stats import truncnorm
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.interval_regressor import best_strength, fit_interval_regressor
-from shearloop.bank.estimation.regressors import (
-    InverseCalibration,
+from shearloop.bank.estimation.interval_regressor import (
     Ridge,
     TobitRidge,
     _moments_below_zero,
+    best_strength,
+    fit_interval_regressor,
+)
+from shearloop.bank.estimation.regressors import (
+    InverseCalibration,
     later_origins,
     later_splits,
     left_out_blocks,

@@ -7,10 +7,9 @@ import pytest
 
 from shearloop.bank.estimation import FrameSeries, fit
 from shearloop.bank.estimation.fitting import ContaminationTest, Mixtures
-from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
+from shearloop.bank.estimation.interval_regressor import Ridge, fit_interval_regressor
 from shearloop.bank.estimation.motion_regression import MotionRegression
 from shearloop.bank.estimation.novelty import NoveltyDetector
-from shearloop.bank.estimation.regressors import Ridge
 from tests.bank.estimation.conftest import follow, judged, mixed, slices_of
 
 

@@ -10,9 +10,8 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration, Estimate, FrameSeries, fit
 from shearloop.bank.estimation.estimator import Estimator, OutputModel, Reading, Regression
-from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
+from shearloop.bank.estimation.interval_regressor import Ridge, fit_interval_regressor
 from shearloop.bank.estimation.load_delay import LoadDelay, LoadTiming
-from shearloop.bank.estimation.regressors import Ridge
 from shearloop.bank.estimators import ESTIMATORS
 from shearloop.daemon.analysis.calibrate import CalibrationResult
 from shearloop.daemon.analysis.evaluate import EstimateTrack, InvalidReason, figures_of, invalid_reasons

@@ -24,9 +24,6 @@ class ConfiguredExperiment:
         """Take the experiment's file; its end sets `stop`."""
         self.path = path
         self.done = False
-        self.begun = False
-        # Only the operator may start it.
-        self.left_to_operator = False
         self._rig = rig
         self._stop = stop
         self._awaited = self._called_off = False
@@ -42,7 +39,7 @@ class ConfiguredExperiment:
         If only the operator may start it, return at once, or at its end where the daemon ends with it.
         """
         await self._start_once()
-        if self.begun or self._stop is not None:
+        if self._has_begun.is_set() or self._stop is not None:
             await self.wait_for_end()
         if self._stop is not None:
             self._stop.set()
@@ -56,7 +53,7 @@ class ConfiguredExperiment:
             )
             self._called_off = True
         # After a crash of this task, an experiment that has begun or was called off is not started again.
-        self._awaited = not (self.begun or self._called_off)
+        self._awaited = not (self._has_begun.is_set() or self._called_off)
         while self._awaited:
             reason = await self._rig.start(self.path)
             if reason is None:
@@ -66,8 +63,7 @@ class ConfiguredExperiment:
                     log.info("waiting to start", reason=reason)
                     logged = reason
                 await asyncio.sleep(START_RETRY_S)
-        self.left_to_operator = not self.begun
-        if self.left_to_operator:
+        if not self._has_begun.is_set():
             log.info("it starts by `shearloop command start` only")
 
     async def wait_for_end(self) -> None:
@@ -95,7 +91,6 @@ class ConfiguredExperiment:
         self._crash_marker.set()
         self._awaited, self._called_off = False, True
         if path.resolve() == self.path.resolve():
-            self.begun = True
             self._has_begun.set()
 
     def call_off(self) -> Path | None:

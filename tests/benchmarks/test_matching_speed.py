@@ -10,7 +10,7 @@ from shearloop.bank.eit.bank_file import Bank
 from tests.bank.conftest import small_fingertip
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def bank(tiny_bank: Path) -> Bank:
     return Bank.open(tiny_bank)
 

@@ -38,14 +38,9 @@ class Client:
 @pytest.fixture
 def arm(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     """The module `shearloop.drivers.ur.arm` over fake clients."""
-    for name, kinds in (
-        ("rtde_control", ["RTDEControlInterface"]),
-        ("dashboard_client", ["DashboardClient"]),
-        ("script_client", ["ScriptClient"]),
-    ):
+    for name, kind in (("rtde_control", "RTDEControlInterface"), ("script_client", "ScriptClient")):
         module = ModuleType(name)
-        for kind in kinds:
-            setattr(module, kind, Client)
+        setattr(module, kind, Client)
         monkeypatch.setitem(sys.modules, name, module)
     # Another test may have imported it over the real clients.
     monkeypatch.delitem(sys.modules, "shearloop.drivers.ur.arm", raising=False)

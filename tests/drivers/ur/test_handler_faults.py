@@ -115,7 +115,7 @@ def test_foreign_program_gets_no_commands():
     assert "someone else" in flight.ask(Enable()).refusal
     assert flight.arm.calls == []
     assert flight.ask(Unlock()).accepted
-    assert flight.arm.calls[:4] == ["closePopup", "stop", "clear_command", "upload"]
+    assert flight.arm.calls[:4] == ["close popup", "stop", "clear_command", "upload"]
 
 
 def test_program_after_an_abandoned_start_may_be_ours(monkeypatch):
@@ -165,7 +165,7 @@ def test_protective_stop_is_unlocked_only_by_the_operator():
     flight.arm.unlockable = True
     flight.arm.calls.clear()
     assert flight.ask(Unlock()).accepted
-    assert flight.arm.calls == ["unlockProtectiveStop", "closePopup", "clear_command", "upload", "arm_watchdog"]
+    assert flight.arm.calls == ["unlock protective stop", "close popup", "clear_command", "upload", "arm_watchdog"]
     flight.fly(100)
     assert flight.wrist_speed == 0, "the speed from before the stop is not taken up again"
     assert flight.ask(WristSpeed(0.1, 1.0)).accepted
@@ -184,7 +184,7 @@ def test_recovery_from_an_emergency_stop_needs_the_button_released():
     flight.arm.calls.clear()
     assert flight.ask(Unlock()).accepted
     assert flight.arm.calls == [
-        "closePopup", "powerOn", "brakeRelease", "clear_command", "upload", "arm_watchdog",
+        "close popup", "power on", "brake release", "clear_command", "upload", "arm_watchdog",
     ]  # fmt: skip
 
 

@@ -14,10 +14,10 @@ import zmq
 import zmq.asyncio
 
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.health import resident_memory_mb
 from shearloop.daemon.messaging import command_server
 from shearloop.daemon.messaging.command_server import RateLimit
 from shearloop.daemon.messaging.messages import decode, encode
+from shearloop.daemon.supervisor import resident_memory_mb
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import CommandReply
 from tests.daemon.conftest import running_daemon

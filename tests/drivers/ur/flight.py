@@ -77,7 +77,7 @@ class FakeArm:
         )
 
     def be(self, **changes: object) -> None:
-        self.reading = dataclasses.replace(self.reading, **changes)  # type: ignore[arg-type]
+        self.reading = dataclasses.replace(self.reading, **changes)
 
     def read(self) -> messages.RtdeSample:
         return self.reading

@@ -202,8 +202,14 @@ def subscriber() -> Iterator[Callable[[str, str], "zmq.Socket[bytes]"]]:
 
 
 @pytest.fixture
-def hears_of_terminal() -> Iterator[None]:
-    """Processes that are started hear of a terminal that is closed, even where the tests do not (`nohup`)."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+def default_signals() -> Iterator[None]:
+    """Signals do what they do in a new process: one that runs tests may ignore some (`nohup`)."""
+    defaults = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: signal.SIG_DFL,
+        signal.SIGHUP: signal.SIG_DFL,
+    }
+    before = {number: signal.signal(number, handler) for number, handler in defaults.items()}
     yield
-    signal.signal(signal.SIGHUP, before)
+    after = {number: signal.signal(number, handler) for number, handler in before.items()}
+    assert after == defaults, "what a command does with signals is undone at its end"

@@ -157,20 +157,6 @@ def test_a_command_line_mistake_is_one_sentence(arguments, part, capsys):
     assert part in mistake(capsys, *arguments)
 
 
-@pytest.fixture
-def default_signals() -> Iterator[None]:
-    """Signals do what they do in a new process: one that runs tests may have been told to ignore them (`nohup`)."""
-    defaults = {
-        signal.SIGINT: signal.default_int_handler,
-        signal.SIGTERM: signal.SIG_DFL,
-        signal.SIGHUP: signal.SIG_DFL,
-    }
-    before = {number: signal.signal(number, handler) for number, handler in defaults.items()}
-    yield
-    after = {number: signal.signal(number, handler) for number, handler in before.items()}
-    assert after == defaults, "what a command does with signals is undone at its end"
-
-
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_an_interrupted_command_reports_it_except_listen(number, status, monkeypatch, capsys):

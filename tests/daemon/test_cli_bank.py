@@ -50,6 +50,7 @@ def test_build_writes_the_bank_and_tells_its_identity(folder, tmp_path, capsys):
     assert told["valid_cells"] == bank.valid.sum()
 
 
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("rows_done", [0, 2])
 def test_an_interrupted_build_says_so_and_the_same_command_goes_on(rows_done, folder, tmp_path, capsys, monkeypatch):
     """SIGINT, as Ctrl-C sends it, while rows are being solved: no bank, no half of one, and no work lost."""
@@ -61,14 +62,9 @@ def test_an_interrupted_build_says_so_and_the_same_command_goes_on(rows_done, fo
     def interrupted(*_):
         yield lambda done: signal.raise_signal(signal.SIGINT) if done == rows_done else None
 
-    # The test process may ignore SIGINT.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with monkeypatch.context() as patched:
-            patched.setattr(bank_command, "progress_bar", interrupted)
-            assert main(build) == 130
-    finally:
-        signal.signal(signal.SIGINT, before)
+    with monkeypatch.context() as patched:
+        patched.setattr(bank_command, "progress_bar", interrupted)
+        assert main(build) == 130
     told = capsys.readouterr()
     assert told.out == ""
     assert f"shearloop bank: interrupted: finished rows are in {out}.part" in told.err

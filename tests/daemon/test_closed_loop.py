@@ -29,6 +29,7 @@ pytestmark = pytest.mark.real_time
 
 HOST = own_address(4)
 SPEED = 8
+SLOW_TWIST = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.02, "hold_s": 60.0}
 Write = Callable[..., Path]
 
 
@@ -171,13 +172,12 @@ async def served_page(folder: Path) -> AsyncIterator[str]:
 
 
 async def test_a_stop_from_the_page_needs_no_token_and_the_wrist_stands_still(rig_config, tiny_bank, tmp_path):
-    twist = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.02, "hold_s": 60.0}
     async with (
         running_rig(rig_config, tiny_bank) as (_, watcher, _fault, command),
         served_page(tmp_path) as page,
         aiohttp.ClientSession() as http,
     ):
-        await started(command, experiment(tmp_path, twist))
+        await started(command, experiment(tmp_path, SLOW_TWIST))
         await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.01)
         async with http.post(f"{page}/commands/pause") as refused:
             assert refused.status == 403
@@ -198,9 +198,8 @@ async def test_a_stop_from_the_page_needs_no_token_and_the_wrist_stands_still(ri
 
 
 async def test_a_protective_stop_ends_the_experiment_and_the_operator_unlocks_it(rig_config, tiny_bank, tmp_path):
-    twist = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.02, "hold_s": 60.0}
     async with running_rig(rig_config, tiny_bank) as (daemon, watcher, fault, command):
-        path = experiment(tmp_path, twist)
+        path = experiment(tmp_path, SLOW_TWIST)
         await started(command, path)
         await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.01)
         fault("protective-stop")
@@ -289,9 +288,8 @@ async def test_a_daemon_that_ends_with_its_experiment_lets_the_tool_go_first(rig
     ],
 )
 async def test_each_fault_ends_in_the_tables_response(line, sentence, rig_config, tiny_bank, tmp_path):
-    twist = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.01, "hold_s": 60.0}
     async with running_rig(rig_config, tiny_bank) as (_, watcher, fault, command):
-        await started(command, experiment(tmp_path, twist))
+        await started(command, experiment(tmp_path, SLOW_TWIST))
         await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.005)
         fault(line)
         state = await watcher.until("loop.state", lambda state: sentence in state["reasons"])

@@ -44,7 +44,7 @@ async def test_a_recording_at_a_hundred_times_its_pace_arrives_whole_and_in_orde
     assert spread_s > 0.9 * 831 * PERIOD_S / 100
 
 
-@pytest.mark.usefixtures("hears_of_terminal")
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 async def test_a_recording_is_played_again_and_again_under_the_name_given(number, tmp_path):
     path, lines = recording(tmp_path, 3)

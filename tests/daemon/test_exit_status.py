@@ -28,7 +28,7 @@ def waiting_config(config: Write, tmp_path: Path) -> Path:
     return config(robot="ur.yaml", experiment="experiment.yaml", stop_when_done=True)
 
 
-@pytest.mark.usefixtures("hears_of_terminal")
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 3), (signal.SIGTERM, 0), (signal.SIGHUP, 0)])
 async def test_an_unfinished_experiment_sets_the_exit_status(number, status, waiting_config):
     async with shearloop("run", str(waiting_config)) as daemon:

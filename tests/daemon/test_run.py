@@ -62,7 +62,7 @@ async def stop_and_time(daemon: asyncio.subprocess.Process, number: signal.Signa
     assert time.monotonic() - begun < 5
 
 
-@pytest.mark.usefixtures("hears_of_terminal")
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 async def test_the_daemon_and_its_emulators_stop_cleanly_on_a_signal(number, config, tmp_path, subscriber):
     link = tmp_path / "eit-right"

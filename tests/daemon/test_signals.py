@@ -16,33 +16,16 @@ from shearloop.daemon.signals import ending_signals
 from tests.daemon.conftest import DEADLINE_S
 
 
-@pytest.fixture
-def as_it_was() -> Iterator[None]:
-    """Put back what is done at SIGHUP."""
-    before = signal.getsignal(signal.SIGHUP)
-    yield
-    signal.signal(signal.SIGHUP, before)
-
-
-@pytest.mark.usefixtures("as_it_was")
+@pytest.mark.usefixtures("default_signals")
 def test_sighup_ends_a_process_unless_it_is_ignored():
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     assert ending_signals() == (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     # As `nohup` leaves it.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     assert ending_signals() == (signal.SIGINT, signal.SIGTERM)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
-@pytest.fixture
-def heard_anew() -> Iterator[None]:
-    """SIGTERM and SIGHUP do what they do in a new process, and what they did here afterwards."""
-    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGHUP)}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
-@pytest.mark.usefixtures("heard_anew")
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_second_signal_does_not_kill_the_daemon(number, config, monkeypatch):
     """It killed the process, as soon as the event loop was closed, before all was written that there was to show."""

@@ -11,6 +11,7 @@ from shearloop.drivers import eit_kit
 from shearloop.drivers.eit_kit import ADC_STEP_V, FULL_SCALE_SINE_RMS_V, Frame, FrameErrorKind, FrameParser
 from shearloop.drivers.emulators.boards import format_line
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from tests.slices import slices
 
 PERIOD_NS = eit_kit.NOMINAL_PERIOD_NS
 
@@ -22,15 +23,6 @@ def some_line(seed: int) -> bytes:
 
 LINES = [some_line(seed) for seed in range(4)]
 GOOD = LINES[0]
-
-
-def slices(data: bytes, cuts: list[int]) -> list[bytes]:
-    edges = [0, *sorted(cut % (len(data) + 1) for cut in cuts), len(data)]
-    return [data[a:b] for a, b in pairwise(edges)]
-
-
-def feed_all(parser: FrameParser, parts: list[bytes]) -> list[Frame]:
-    return [frame for n, part in enumerate(parts) for frame in parser.feed(part, n)]
 
 
 def with_value(position: int, value: bytes, line: bytes = GOOD) -> bytes:
@@ -149,7 +141,7 @@ def test_every_good_line_among_broken_ones_arrives_and_every_broken_one_is_count
     stream = GOOD + b"".join(lines)
     cuts = data.draw(st.lists(st.integers(0, len(stream)), max_size=10))
     parser = FrameParser(ZERO_SLOTS)
-    frames = feed_all(parser, slices(stream, cuts))
+    frames = [frame for n, part in enumerate(slices(stream, cuts)) for frame in parser.feed(part, n)]
     assert [frame.line + b"\n" for frame in frames] == [GOOD, *[line for line in lines if line in LINES]]
     assert parser.errors.total() == len(lines) + 1 - len(frames)
 

@@ -88,6 +88,12 @@ class Bench:
         return list(self.to(shear_n))[-1]
 
 
+@pytest.fixture
+def bench(calibration: SkinCalibration) -> Bench:
+    """A skin with its zero."""
+    return Bench(calibration).zeroed()
+
+
 def holds(reading: SkinReading, shear_n: float) -> bool:
     interval = reading.interval
     return interval is not None and interval.low_n <= shear_n <= interval.high_n
@@ -114,8 +120,7 @@ def test_the_zero_comes_first_and_then_every_sample_is_a_force(calibration):
     assert bench.push(-1.0).shear_n == pytest.approx(-1.0, abs=0.02)
 
 
-def test_normal_force_alone_is_no_shear(calibration):
-    bench = Bench(calibration).zeroed()
+def test_normal_force_alone_is_no_shear(bench):
     readings = [bench.at(0.0, normal_n) for normal_n in (0.0, 1.0, 2.0, 2.0, 2.0, 2.0)]
     assert all(holds(reading, 0.0) for reading in readings)
     assert all(abs(reading.shear_n or 0.0) < 0.01 for reading in readings)
@@ -125,8 +130,7 @@ def test_normal_force_alone_is_no_shear(calibration):
 @pytest.mark.parametrize(
     "fault", [SkinFault.OPEN_1, SkinFault.SHORT_2, SkinFault.REVERSED_1, SkinFault.COMPLIANCE, SkinFault.SOURCE_LOST]
 )
-def test_what_the_driver_refuses_is_no_force_and_the_next_good_sample_is_one(calibration, fault):
-    bench = Bench(calibration).zeroed()
+def test_what_the_driver_refuses_is_no_force_and_the_next_good_sample_is_one(bench, fault):
     bench.push(0.8)
     refused = bench.estimator.update(bench.sample(r1_ohm=None, r2_ohm=None, faults=(fault,)))
     assert refused.reasons == (str(fault),)
@@ -138,8 +142,7 @@ def test_what_the_driver_refuses_is_no_force_and_the_next_good_sample_is_one(cal
     assert holds(again, 0.8)
 
 
-def test_across_missing_samples_the_direction_is_not_assumed(calibration):
-    bench = Bench(calibration).zeroed()
+def test_across_missing_samples_the_direction_is_not_assumed(bench):
     assert bench.push(0.8).direction is Direction.LOADING
     bench.skin.push(0.7)
     reading = bench.estimator.update(bench.sample(missed=3))
@@ -147,8 +150,7 @@ def test_across_missing_samples_the_direction_is_not_assumed(calibration):
     assert holds(reading, 0.7)
 
 
-def test_a_zero_under_load_is_refused_until_the_load_is_off(calibration):
-    bench = Bench(calibration).zeroed()
+def test_a_zero_under_load_is_refused_until_the_load_is_off(bench):
     bench.push(0.8)
     bench.estimator.tare()
     readings = [bench.at(0.8) for _ in range(25)]
@@ -162,8 +164,7 @@ def test_a_zero_under_load_is_refused_until_the_load_is_off(calibration):
     assert not bench.estimator.refused
 
 
-def test_a_sample_that_was_under_way_when_a_zero_was_asked_for_is_not_of_it(calibration):
-    bench = Bench(calibration).zeroed()
+def test_a_sample_that_was_under_way_when_a_zero_was_asked_for_is_not_of_it(bench):
     asked_ns = round(bench.time_s * 1e9) + 3 * PERIOD_NS // 4
     bench.estimator.tare(asked_ns)
     reasons = []
@@ -207,15 +208,13 @@ def test_swapped_gauges_are_refused_at_the_zero(calibration):
     assert "the wires of the gauges are swapped" in reading.reasons[0]
 
 
-def test_gauges_that_are_swapped_after_the_zero_are_not_believed(calibration):
-    bench = Bench(calibration).zeroed()
+def test_gauges_that_are_swapped_after_the_zero_are_not_believed(bench):
     bench.spoil = lambda r1, r2, _: (r2, r1)
     assert not bench.at(0.0).valid
 
 
 @pytest.mark.parametrize(("gauge", "per_s"), [(1, -2e-4), (2, 2e-4), (2, -2e-4)])
-def test_a_gauge_that_drifts_where_it_shows_widens_the_interval_and_is_then_named(calibration, gauge, per_s):
-    bench = Bench(calibration).zeroed()
+def test_a_gauge_that_drifts_where_it_shows_widens_the_interval_and_is_then_named(bench, gauge, per_s):
     begin_s = bench.time_s
 
     def drift(r1: float, r2: float, time_s: float) -> tuple[float, float]:
@@ -235,8 +234,7 @@ def test_a_gauge_that_drifts_where_it_shows_widens_the_interval_and_is_then_name
     assert "drifts" in readings[-1].reasons[0]
 
 
-def test_a_drift_that_no_response_shows_is_learnt_at_the_next_zero(calibration):
-    bench = Bench(calibration).zeroed()
+def test_a_drift_that_no_response_shows_is_learnt_at_the_next_zero(bench):
     assert bench.estimator.drift_per_hour == pytest.approx(DRIFT_PER_HOUR)
     begin_s = bench.time_s
     per_s = 1e-5  # 3.6 % an hour, and 0.4 N
@@ -262,8 +260,7 @@ def test_the_paper_s_own_drift_stays_within_the_interval_for_an_hour(calibration
     assert held >= 18
 
 
-def test_a_force_beyond_the_curve_is_not_a_force(calibration):
-    bench = Bench(calibration).zeroed()
+def test_a_force_beyond_the_curve_is_not_a_force(bench):
     assert bench.push(4.5).valid
     assert "beyond the calibrated curve" in bench.push(6.0).reasons[0]
 

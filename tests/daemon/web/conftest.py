@@ -36,13 +36,24 @@ LAYOUT = """() => {
 }"""
 
 
-class FakeDaemon:
+class Killable:
+    """A process that a test kills and starts again."""
+
+    _process: subprocess.Popen[bytes] | None = None
+
+    def kill(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
+
+class FakeDaemon(Killable):
     """The sockets of a daemon, in a process that can be killed."""
 
     def __init__(self, folder: Path) -> None:
         self.publish, self.commands = f"ipc://{folder}/publish", f"ipc://{folder}/commands"
         self._folder = folder
-        self._process: subprocess.Popen[bytes] | None = None
         self.forget()
 
     def say(self, *, refusal: str = "", **changed: Mapping[str, Any] | None) -> None:
@@ -71,20 +82,13 @@ class FakeDaemon:
     def check(self) -> None:
         assert self._process is None or self._process.poll() is None, "the daemon's sockets have died"
 
-    def kill(self) -> None:
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
-            self._process = None
 
-
-class Viewer:
+class Viewer(Killable):
     """`shearloop view` as a process of its own, on a port that it keeps when it is started again."""
 
     def __init__(self, folder: Path, daemon: FakeDaemon) -> None:
         self._folder, self._daemon = folder, daemon
         self._port = 0
-        self._process: subprocess.Popen[bytes] | None = None
         self.url = self.url_with_token = ""
 
     def start(self) -> None:
@@ -107,12 +111,6 @@ class Viewer:
         told = json.loads(line)
         self.url, self.url_with_token = told["url"], told["url_with_token"]
         self._port = int(self.url.rstrip("/").rpartition(":")[2])
-
-    def kill(self) -> None:
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
-            self._process = None
 
 
 class Browsed:
@@ -139,8 +137,7 @@ class Browsed:
 
     def layout(self) -> dict[str, Any]:
         """Return where things are once the page is scrolled to its end."""
-        found: dict[str, Any] = self.page.evaluate(LAYOUT)
-        return found
+        return self.page.evaluate(LAYOUT)
 
     def text(self, selector: str) -> str:
         """Return the text of one element."""

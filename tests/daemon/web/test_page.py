@@ -41,6 +41,9 @@ GREY = """async () => {
 }"""
 
 
+NO_ESTIMATE = dict.fromkeys(("torque_nm", "torque_low_nm", "torque_high_nm", "diameter_mm"))
+
+
 def signed(value: float, digits: int) -> str:
     return f"{value:+.{digits}f}".replace("-", "\u2212")
 
@@ -142,21 +145,6 @@ def test_lines_break_at_invalid_values_and_continue_past_other_sources(browsed):
     assert b == ["", 1, "", 2, "", 3, None, None, 4], "a pause breaks the line as well"
 
 
-def test_an_invalid_estimate_shows_no_number(browsed):
-    nothing = {"torque_nm": None, "torque_low_nm": None, "torque_high_nm": None, "diameter_mm": None}
-    browsed.daemon.say(estimate={**nothing, "valid": False, "reason": "no signal above the noise"})
-    browsed.open()
-    browsed.until_shown(
-        {
-            "#torque-reason": "no estimate: no signal above the noise",
-            ".fingertip .invalid": "not valid: no signal above the noise",
-            "#torque-now": "–",
-            "#torque-interval": "",
-            "#diameter": "–",
-        }
-    )
-
-
 def test_a_replay_is_drawn_at_its_own_times(browsed):
     browsed.daemon.say(**{name: {"ago_s": 3600.0} for name in MESSAGES})
     browsed.open()
@@ -175,31 +163,50 @@ def test_every_reason_for_a_hold_is_shown(browsed):
     browsed.page.wait_for_selector("#holding", state="hidden")
 
 
-def test_faults_of_robot_and_gripper_are_shown_in_their_panels(browsed):
-    browsed.daemon.say(
-        robot={"protective_stop": True, "safety_mode": 3, "blocked": "The robot is in a protective stop."},
-        gripper={"fault": 11, "fault_text": "overheated"},
-        loop={"phase": "stopped", "response": "stop and keep grip", "reasons": REASONS, "activity": "a long sentence"},
-    )
+@pytest.mark.parametrize(
+    ("said", "shown"),
+    [
+        (
+            {"load": {"valid": False, "reason": "the reading is the same for two seconds"}},
+            {
+                "#load-torque": "–",
+                "#load-note": "not valid",
+                "#torque-reason": "load cell: the reading is the same for two seconds",
+            },
+        ),
+        (
+            {"estimate": {**NO_ESTIMATE, "valid": False, "reason": "no signal above the noise"}},
+            {
+                "#torque-reason": "no estimate: no signal above the noise",
+                ".fingertip .invalid": "not valid: no signal above the noise",
+                "#torque-now": "–",
+                "#torque-interval": "",
+                "#diameter": "–",
+            },
+        ),
+        (
+            {
+                "robot": {"protective_stop": True, "safety_mode": 3, "blocked": "The robot is in a protective stop."},
+                "gripper": {"fault": 11, "fault_text": "overheated"},
+                "loop": {"phase": "stopped", "response": "stop and keep grip", "reasons": REASONS, "activity": "a"},
+            },
+            {
+                "#robot-blocked": "PROTECTIVE STOP: The robot is in a protective stop.",
+                "#safety-mode": "protective stop (3)",
+                "#gripper-fault": "fault 11: overheated",
+                "#holding-title": "Stopped: stop and keep grip",
+                "#phase-activity": "",
+                "#wanted": "–",
+                "#progress-text": "",
+            },
+        ),
+    ],
+    ids=["load cell", "estimate", "robot and gripper"],
+)
+def test_what_is_invalid_or_faulty_says_why_and_shows_no_number(said, shown, browsed):
     browsed.open()
-    browsed.until_shown(
-        {
-            "#robot-blocked": "PROTECTIVE STOP: The robot is in a protective stop.",
-            "#safety-mode": "protective stop (3)",
-            "#gripper-fault": "fault 11: overheated",
-            "#holding-title": "Stopped: stop and keep grip",
-            "#phase-activity": "",
-            "#wanted": "–",
-            "#progress-text": "",
-        }
-    )
-
-
-def test_an_invalid_load_cell_reading_shows_no_number(browsed):
-    browsed.open()
-    browsed.daemon.say(load={"valid": False, "reason": "the reading is the same for two seconds"})
-    why = "load cell: the reading is the same for two seconds"
-    browsed.until_shown({"#load-torque": "–", "#load-note": "not valid", "#torque-reason": why})
+    browsed.daemon.say(**said)
+    browsed.until_shown(shown)
     assert browsed.layout()["spilt"] == []
 
 

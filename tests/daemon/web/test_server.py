@@ -260,7 +260,7 @@ async def test_a_used_port_and_an_invalid_address_are_one_sentence(tmp_path):
                 await serve(DaemonAddress(publish, commands), 0, TOKEN, tip, ready)
 
 
-@pytest.mark.usefixtures("hears_of_terminal")
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 async def test_view_prints_its_address_and_ends_on_a_signal(number, tmp_path):
     token = tmp_path / "token"

@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from pathlib import Path
 
@@ -33,42 +33,43 @@ def importable_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     sys.path.remove(str(folder))
 
 
-@pytest.fixture(scope="module")
-def scheduler(tmp_path_factory: pytest.TempPathFactory, importable_tests: str) -> Iterator[str]:
-    """Start a scheduler and two workers, all processes of their own, and return the address."""
+@contextmanager
+def dask(folder: Path, *workers: str, path: str = "") -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """Start a scheduler and, with these options, workers, as processes; yield the address and the processes."""
     from distributed import Client
 
-    folder = tmp_path_factory.mktemp("dask")
-    found, log = folder / "scheduler.json", folder / "log"
+    found = folder / "scheduler.json"
     environment = os.environ | {
-        "PYTHONPATH": importable_tests,
+        "PYTHONPATH": path,
         "OPENBLAS_NUM_THREADS": "1",
         # A worker is forked, also the one that takes a killed one's place, instead of importing everything anew.
         "DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD": "forkserver",
         "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
     }
     common = ["--scheduler-file", str(found), "--no-dashboard"]
-    two = ["--nworkers", "2", "--nthreads", "1", "--local-directory", str(folder)]
-    commands = [
-        ["distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", *common],
-        ["distributed.cli.dask_worker", *two, *common],
-    ]
-    processes: list[subprocess.Popen[bytes]] = []
-    with ExitStack() as stack:
-        output = stack.enter_context(log.open("wb"))
+    commands = [["distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", *common]]
+    if workers:
+        commands.append(["distributed.cli.dask_worker", *workers, "--local-directory", str(folder), *common])
+    processes = []
+    with (folder / "log").open("wb") as log:
         try:
-            processes += [
-                subprocess.Popen(
-                    [sys.executable, "-m", *command], cwd=ROOT, env=environment, stdout=output, stderr=output
-                )
-                for command in commands
-            ]
+            for command in commands:
+                words = [sys.executable, "-m", *command]
+                processes.append(subprocess.Popen(words, cwd=ROOT, env=environment, stdout=log, stderr=log))
             with Client(scheduler_file=str(found), timeout=STARTED_S) as client:
-                client.wait_for_workers(2, timeout=STARTED_S)
+                if workers:
+                    client.wait_for_workers(2, timeout=STARTED_S)
                 address = str(client.scheduler.address)
-            yield address
+            yield address, processes
         finally:
             # The workers first: without their scheduler they would wait for it.
             for process in reversed(processes):
                 process.terminate()
                 process.wait(STARTED_S)
+
+
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory: pytest.TempPathFactory, importable_tests: str) -> Iterator[str]:
+    """Start a scheduler and two workers, all processes of their own, and return the address."""
+    with dask(tmp_path_factory.mktemp("dask"), "--nworkers", "2", "--nthreads", "1", path=importable_tests) as found:
+        yield found[0]

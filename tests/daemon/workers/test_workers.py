@@ -16,7 +16,7 @@ from shearloop.daemon.cli import main
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.workers import LOCAL, ProcessExecutor, SerialExecutor, open_executor
 from tests.daemon.test_bank_config import BANK, FINGERTIP
-from tests.daemon.workers.conftest import ROOT, STARTED_S
+from tests.daemon.workers.conftest import dask
 
 # Every worker imports this module for its tasks: what takes long to import is imported by the test that needs it.
 
@@ -128,29 +128,16 @@ def test_a_server_that_is_no_scheduler_times_out(monkeypatch):
 
 
 @pytest.fixture
-def lonely(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
-    """Start a scheduler without workers, and return its process and its address."""
-    from distributed import Client
-
-    found = tmp_path / "scheduler.json"
-    options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(found)]
-    with (tmp_path / "log").open("wb") as output:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "distributed.cli.dask_scheduler", *options], cwd=ROOT, stdout=output, stderr=output
-        )
-    try:
-        with Client(scheduler_file=str(found), timeout=STARTED_S) as client:
-            address = str(client.scheduler.address)
-        yield process, address
-    finally:
-        process.kill()
-        process.wait(STARTED_S)
+def lonely(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """Start a scheduler without workers, and return its address and its process."""
+    with dask(tmp_path) as found:
+        yield found
 
 
 def test_a_scheduler_without_workers_or_a_lost_one_is_one_sentence(lonely, monkeypatch):
     import distributed
 
-    process, address = lonely
+    address, (process,) = lonely
     monkeypatch.setattr("shearloop.daemon.workers.FIRST_WORKER_S", 0.5)
     with (
         pytest.raises(UserError, match=f"at {address} has no worker; start some with `dask worker"),

@@ -100,7 +100,7 @@ def test_a_bank_has_the_same_bytes_after_a_killed_worker(banks, scheduler, kille
 
 @pytest.mark.usefixtures("few_mixtures")
 def test_a_chart_has_the_same_numbers_after_a_killed_worker(scheduler, killed, tmp_path):
-    from shearloop.bank.estimation import Name, Physics
+    from shearloop.bank.estimation import Physics
     from shearloop.daemon.analysis.charts.fault_sweeps import FAULTS, sweeps
     from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, synthetic_slices
     from shearloop.daemon.analysis.reproduce.banks import Grid
@@ -110,7 +110,7 @@ def test_a_chart_has_the_same_numbers_after_a_killed_worker(scheduler, killed, t
     # Few frames are judged at each level of each fault.
     split = Split("slices", slices.between(0, 29), slices.between(29, 31), slices)
     # The quickest one, twice: a task each.
-    names: tuple[Name, ...] = ("regression", "regression")
+    names = ("regression", "regression")
     with open_executor(scheduler) as cluster:
         there = sweeps(split, names, Physics(bank, None), bank, cluster)
     assert killed

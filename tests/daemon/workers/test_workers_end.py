@@ -3,7 +3,7 @@
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from multiprocessing import active_children
 from pathlib import Path
 from typing import TypeAlias
@@ -33,7 +33,7 @@ def test_worker_processes_ignore_the_terminals_signals():
 
 
 @pytest.fixture
-def interrupted_once_it_works(tmp_path: Path) -> Iterator[Interrupted]:
+def interrupted_once_it_works(tmp_path: Path) -> Interrupted:
     """Interrupts this process as soon as a task `waits`, and returns the process that the task was in."""
     os.mkfifo(tmp_path / "told")
     running: list[int] = []
@@ -50,12 +50,10 @@ def interrupted_once_it_works(tmp_path: Path) -> Iterator[Interrupted]:
         thread.join()
         return running[0]
 
-    # A test process may have been told to ignore it.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield during
-    signal.signal(signal.SIGINT, before)
+    return during
 
 
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("more", ["", "x" * (1 << 20)], ids=["small", "large"])
 def test_worker_processes_end_on_an_interrupt(number, more, interrupted_once_it_works, tmp_path):

@@ -27,6 +27,12 @@ class Rig(LinkEvents):
         self.samples.append(sample)
         self.note()
 
+    async def more(self, count: int) -> int:
+        """Wait for so many samples more, and return how many there were before."""
+        before = len(self.samples)
+        await self.until(lambda: len(self.samples) >= before + count)
+        return before
+
 
 @contextlib.asynccontextmanager
 async def a_rig(
@@ -43,6 +49,7 @@ async def a_rig(
     async with running(board.run()):
         await board.port.appearances.get()
         async with running(pass_on(cell.readings(), rig.on_sample)):
+            await rig.more(4)
             yield rig
 
 
@@ -65,13 +72,11 @@ async def test_torque_comes_through_from_either_sketch(tmp_path, sketch, calibra
 
 async def test_corrupted_lines_are_flagged_or_counted_and_the_rest_goes_on(tmp_path):
     async with a_rig(tmp_path) as rig:
-        await rig.until(lambda: len(rig.samples) > 5)
         rig.board.command("spike")
         rig.board.command("garbage")
         await rig.until(lambda: rig.cell.diagnostics()["errors"])
         await rig.until(lambda: [sample for sample in rig.samples if sample.spike])
-        n = len(rig.samples)
-        await rig.until(lambda: len(rig.samples) > n + 5)
+        n = await rig.more(6)
         assert [sample.raw for sample in rig.samples if sample.spike] == [38399996]
         assert rig.cell.diagnostics()["errors"] == {"not_decimal": 1}
         assert "not a decimal" in str(rig.cell.diagnostics()["error_details"])
@@ -80,7 +85,6 @@ async def test_corrupted_lines_are_flagged_or_counted_and_the_rest_goes_on(tmp_p
 
 async def test_saturation_and_a_frozen_converter_are_flagged_while_they_last(tmp_path):
     async with a_rig(tmp_path) as rig:
-        await rig.until(lambda: rig.samples)
         rig.board.command("saturation:0.01")
         await rig.until(lambda: [sample for sample in rig.samples if sample.saturated])
         await rig.until(lambda: rig.samples[-1].trusted)
@@ -93,7 +97,6 @@ async def test_saturation_and_a_frozen_converter_are_flagged_while_they_last(tmp
 async def test_a_jump_in_torque_is_flagged_and_then_believed(tmp_path):
     held_nm = [0.03]
     async with a_rig(tmp_path, (held_nm[0] for _ in repeat(None))) as rig:
-        await rig.until(lambda: len(rig.samples) > 3)
         held_nm[0] = 1.63
         await rig.until(lambda: rig.samples[-1].trusted and rig.samples[-1].torque_nm > 1.5)
         jumped = [sample for sample in rig.samples if sample.torque_nm > 1.5]
@@ -104,11 +107,9 @@ async def test_a_jump_in_torque_is_flagged_and_then_believed(tmp_path):
 
 async def test_an_unplugged_board_is_lost_and_found_again(tmp_path):
     async with a_rig(tmp_path) as rig:
-        await rig.until(lambda: len(rig.samples) > 3)
         rig.board.command("unplug:0.05")
         await rig.down()
-        n = len(rig.samples)
-        await rig.until(lambda: len(rig.samples) > n + 3)
+        n = await rig.more(4)
         assert rig.samples[n].partial
         assert rig.samples[n].seq == rig.samples[n - 1].seq + 1
         assert rig.cell.diagnostics()["connections"] == 2
@@ -117,7 +118,6 @@ async def test_an_unplugged_board_is_lost_and_found_again(tmp_path):
 
 async def test_silence_is_reported_as_a_loss(tmp_path):
     async with a_rig(tmp_path) as rig:
-        await rig.until(lambda: len(rig.samples) > 3)
         rig.board.command("silence")
         await rig.down()
         assert "sent nothing for 0.7 s" in rig.losses[0].sentence
@@ -125,9 +125,7 @@ async def test_silence_is_reported_as_a_loss(tmp_path):
 
 async def test_a_tare_takes_effect_with_the_next_sample(tmp_path):
     async with a_rig(tmp_path) as rig:
-        await rig.until(lambda: len(rig.samples) > 3)
         rig.cell.tare(rig.samples[-1].raw)
-        n = len(rig.samples)
-        await rig.until(lambda: len(rig.samples) > n + 1)
+        await rig.more(2)
         assert rig.samples[-1].torque_nm == pytest.approx(0.0, abs=0.001)
         assert rig.samples[-1].trusted

@@ -38,6 +38,13 @@ class Hands:
         return self.scene.truth()
 
 
+def twisted(by_rad: float, duration_s: float) -> tuple[Hands, Truth]:
+    """Return hands that grip the tool and have twisted it."""
+    hands = Hands()
+    hands.go(255)
+    return hands, hands.twist(by_rad, duration_s)
+
+
 def test_a_twist_of_the_wrist_is_felt_by_flange_lever_and_gel_while_the_tool_is_gripped():
     hands = Hands()
     assert hands.twist(0.1, 0.2).torque_nm == 0.0, "nothing is gripped yet"
@@ -54,17 +61,13 @@ def test_a_twist_of_the_wrist_is_felt_by_flange_lever_and_gel_while_the_tool_is_
 
 
 def test_a_load_cell_gives_the_mean_over_its_conversion():
-    hands = Hands()
-    hands.go(255)
-    truth = hands.twist(0.2, 1.0)
+    hands, truth = twisted(0.2, 1.0)
     # The mean of a ramp is its value in the middle.
     assert hands.scene.conversion_nm(0.09) == pytest.approx(truth.torque_nm - STIFF * 0.2 * 0.045, rel=1e-4)
 
 
 def test_each_injection_of_a_frame_sees_the_shear_of_its_own_moment():
-    hands = Hands()
-    hands.go(255)
-    truth = hands.twist(0.2, 1.0)
+    hands, truth = twisted(0.2, 1.0)
     seen = hands.scene.frame(0.5)
     assert seen.diameter_mm == pytest.approx(20.0)
     assert (seen.grip == 1.0).all()
@@ -100,9 +103,7 @@ def test_a_kick_is_a_jump_of_the_torque_and_gone_with_the_grip():
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_slip_leaves_so_much_torque_and_the_grip_holds_again(sign):
-    hands = Hands()
-    hands.go(255)
-    hands.twist(sign * 0.15, 0.1)
+    hands, _ = twisted(sign * 0.15, 0.1)
     hands.scene.slip(0.03)
     truth = hands.wait(DT_S)
     assert truth.torque_nm == pytest.approx(sign * 0.03)
@@ -113,9 +114,7 @@ def test_a_slip_leaves_so_much_torque_and_the_grip_holds_again(sign):
 
 
 def test_a_tool_that_falls_takes_the_torque_with_it():
-    hands = Hands()
-    hands.go(255)
-    hands.twist(0.1, 0.1)
+    hands, _ = twisted(0.1, 0.1)
     hands.gripper.put_between(None)
     truth = hands.wait(1.0)
     assert (truth.gripped, truth.torque_nm, truth.diameter_mm) == (False, 0.0, None)
@@ -123,9 +122,7 @@ def test_a_tool_that_falls_takes_the_torque_with_it():
 
 
 def test_another_screw_is_one_that_nobody_has_turned():
-    hands = Hands()
-    hands.go(255)
-    hands.twist(0.1, 0.1)
+    hands, _ = twisted(0.1, 0.1)
     hands.scene.put_on(Joint.SEIZED)
     assert hands.wait(DT_S).torque_nm == pytest.approx(0.0, abs=1e-12)
     truth = hands.twist(0.6, 1.0)

@@ -56,6 +56,14 @@ def started(**spec: float) -> Robot:
     return robot
 
 
+def turning(seconds: float) -> Robot:
+    """Return a robot that has turned its wrist for so long, to 0.4 rad/s."""
+    robot = started()
+    turn(robot, 0.4)
+    wait(robot, seconds)
+    return robot
+
+
 def happened(robot: Robot, name: str) -> list[float]:
     return [event.time_s for event in robot._events if event.name == name]
 
@@ -65,9 +73,7 @@ def moving_asynchronously(robot: Robot) -> bool:
 
 
 def test_speed_is_reached_with_the_acceleration_and_held():
-    robot = started()
-    turn(robot, 0.4)
-    wait(robot, 0.1)
+    robot = turning(0.1)
     assert robot.arm.qd_rad_per_s[5] == pytest.approx(0.2)
     wait(robot, 0.9)
     # 0.4²/2·2 to get up to speed, then 0.8 s at 0.4 rad/s.
@@ -76,9 +82,7 @@ def test_speed_is_reached_with_the_acceleration_and_held():
 
 
 def test_without_a_watchdog_the_speed_outlives_its_client():
-    robot = started()
-    turn(robot, 0.4)
-    wait(robot, 3.0)
+    robot = turning(3.0)
     assert robot.arm.qd_rad_per_s[5] == pytest.approx(0.4)
 
 
@@ -127,9 +131,7 @@ def test_watchdog_ends_the_program_under_a_blocking_move():
 
 
 def test_new_program_obeys_old_registers():
-    robot = started()
-    turn(robot, 0.4)
-    wait(robot, 0.1)
+    robot = turning(0.1)
     robot.end_program("test")
     wait(robot, 0.2)
     assert not robot.arm.qd_rad_per_s.any()
@@ -180,9 +182,7 @@ def test_asynchronous_move_is_stopped_on_command():
 
 
 def test_two_threads_may_not_move_the_arm():
-    robot = started()
-    turn(robot, 0.4)
-    wait(robot, 0.1)
+    robot = turning(0.1)
     send(robot, control_script.MOVE_L, *down(robot), asynchronous=True)
     wait(robot, 0.1)
     assert not robot.program_running
@@ -190,9 +190,7 @@ def test_two_threads_may_not_move_the_arm():
 
 
 def test_after_speed_stop_a_move_is_possible():
-    robot = started()
-    turn(robot, 0.4)
-    wait(robot, 0.3)
+    robot = turning(0.3)
     assert do(robot, control_script.SPEED_STOP, 2.0) == pytest.approx(0.2, abs=0.01)
     do(robot, control_script.MOVE_L, *down(robot), asynchronous=True)
     wait(robot, 0.1)
@@ -200,9 +198,7 @@ def test_after_speed_stop_a_move_is_possible():
 
 
 def test_protective_stop_pauses_and_is_not_unlocked_at_once():
-    robot = started()
-    turn(robot, 0.4)
-    wait(robot, 0.3)
+    robot = turning(0.3)
     robot.protective_stop("test")
     wait(robot, 0.1)
     assert robot.runtime_state == PAUSED

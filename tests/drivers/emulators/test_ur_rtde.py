@@ -2,7 +2,6 @@
 
 import asyncio
 import struct
-from itertools import pairwise
 from types import SimpleNamespace
 
 import pytest
@@ -20,6 +19,7 @@ from shearloop.drivers.emulators.ur_rtde import (
     unpack,
     variable,
 )
+from tests.slices import slices
 
 GREETING = package(ord("V"), b"\x00\x02") + package(ord("v"), b"")
 COMMAND = b"input_int_register_0,input_double_register_0,"
@@ -67,8 +67,7 @@ def test_conversation_of_a_client():
 def test_bytes_may_arrive_in_any_pieces(cuts):
     whole, pieces = session(), session()
     answer = whole.receive(CONVERSATION)
-    edges = [0, *sorted(cuts), len(CONVERSATION)]
-    got = b"".join(pieces.receive(CONVERSATION[a:b]) for a, b in pairwise(edges))
+    got = b"".join(pieces.receive(part) for part in slices(CONVERSATION, cuts))
     assert got == answer
     assert pieces.robot.registers["input_double_register_0"] == 0.25
 

@@ -2,7 +2,6 @@
 
 import re
 from contextlib import suppress
-from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -19,14 +18,10 @@ from shearloop.drivers.shear_skin.instruments import (
     read_elements,
     read_scan,
 )
+from tests.slices import slices
 
 PERIOD_NS = 100_000_000
 VOLTS = st.floats(-0.6, 0.6).map(lambda volts: round(volts, 6))
-
-
-def slices(data: bytes, cuts: list[int]) -> list[bytes]:
-    ends = sorted({min(cut, len(data)) for cut in cuts} | {0, len(data)})
-    return [data[begin:end] for begin, end in pairwise(ends)]
 
 
 CUTS = st.lists(st.integers(0, 400), max_size=8)

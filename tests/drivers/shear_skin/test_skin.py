@@ -87,6 +87,7 @@ async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: f
             )
         bench.skin = ShearSkin(Keithley6430(source_link, period_s=0.01, timeout_s=deadline_s), daq)
         async with running(bench.skin.watch_source(), pass_on(bench.skin.samples(), bench.on_sample)):
+            await bench.next_says()
             yield bench
 
 
@@ -116,7 +117,6 @@ async def test_resistances_come_through_over_every_way_in(tmp_path, serial_sourc
 @pytest.mark.parametrize("outage", ["silence", "unplug"])
 async def test_a_source_that_cannot_be_switched_off_is_told(tmp_path, serial_source, outage):
     async with a_bench(tmp_path, serial_source=serial_source, adc=True, deadline_s=0.1) as bench:
-        await bench.next_says()
         bench.source.command(outage)
         await bench.next_says(SkinFault.SOURCE_LOST)
     assert bench.source_errors["not switched off"] == 1
@@ -138,7 +138,6 @@ FAULTS = [
 @pytest.mark.parametrize("adc", [True, False])
 async def test_each_fault_of_the_circuit_is_named_and_goes_away_with_its_cause(tmp_path, adc):
     async with a_bench(tmp_path, serial_source=False, adc=adc) as bench:
-        await bench.next_says()
         for text, faults in FAULTS:
             bench.circuit.command(text, time.monotonic())
             await bench.next_says(*faults)
@@ -151,7 +150,6 @@ async def test_each_fault_of_the_circuit_is_named_and_goes_away_with_its_cause(t
 @pytest.mark.parametrize("serial_source", [True, False])
 async def test_a_source_that_is_silent_or_gone_is_named_and_set_up_again_without_a_reset(tmp_path, serial_source):
     async with a_bench(tmp_path, serial_source=serial_source, adc=True, deadline_s=0.1) as bench:
-        await bench.next_says()
         for outage in ("silence", "unplug"):
             losses = len(bench.losses)
             bench.source.command(outage)
@@ -167,7 +165,6 @@ async def test_a_source_that_is_silent_or_gone_is_named_and_set_up_again_without
 
 async def test_a_source_that_is_switched_off_by_hand_stays_off_and_says_so(tmp_path):
     async with a_bench(tmp_path, serial_source=False, adc=False) as bench:
-        await bench.next_says()
         bench.circuit.output_on = False
         await bench.next_says(SkinFault.SOURCE_OFF)
         assert not bench.circuit.output_on
@@ -177,7 +174,6 @@ async def test_a_source_that_is_switched_off_by_hand_stays_off_and_says_so(tmp_p
 
 async def test_a_source_that_is_switched_off_between_two_questions_stays_off_too(tmp_path):
     async with a_bench(tmp_path, serial_source=False, adc=False, deadline_s=1.0) as bench:
-        await bench.next_says()
         openings = bench.skin.source_diagnostics()["connections"]
         sound = bench.played.feed
 
@@ -196,7 +192,6 @@ async def test_a_source_that_is_switched_off_between_two_questions_stays_off_too
 
 async def test_a_source_that_says_nonsense_is_not_believed(tmp_path):
     async with a_bench(tmp_path, serial_source=False, adc=False, deadline_s=0.1) as bench:
-        await bench.next_says()
         sound = bench.played.feed
         bench.played.feed = lambda data: sound(data) and b"%%%\n"  # a bad cable
         await bench.until(lambda: bench.source_errors.get("not understood", 0) >= 3)
@@ -222,7 +217,6 @@ async def test_voltages_that_stop_coming_are_awaited(tmp_path, adc):
 @pytest.mark.parametrize("serial_source", [True, False])
 async def test_a_source_that_breaks_off_in_mid_answer_is_named_counted_and_asked_again(tmp_path, serial_source, query):
     async with a_bench(tmp_path, serial_source=serial_source, adc=True) as bench:
-        await bench.next_says()
         sound = bench.played.feed
 
         def broken_off_at_the_query(data: bytes) -> bytes:
@@ -244,7 +238,6 @@ async def test_a_source_that_breaks_off_in_mid_answer_is_named_counted_and_asked
 
 async def test_a_scanner_that_breaks_off_in_mid_answer_is_named_counted_and_asked_again(tmp_path):
     async with a_bench(tmp_path, serial_source=False, adc=False) as bench:
-        await bench.next_says()
         bench.reader("break-off")
         await bench.until(lambda: bench.skin.diagnostics()["connections"] == 2)
         await bench.next_says()
@@ -266,7 +259,6 @@ def errors_of_start(bench: Bench) -> Mapping[str, int]:
 
 async def test_lines_of_the_board_that_are_missing_torn_or_garbage_are_counted(tmp_path):
     async with a_bench(tmp_path, serial_source=False, adc=True) as bench:
-        await bench.next_says()
         for fault in ("garbage", "missing", "torn", "missing"):
             bench.reader(fault)
         count = len(bench.samples)

@@ -10,6 +10,8 @@ import time
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from pymodbus.framer import FramerRTU
+
 from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.ports import Server
 
@@ -234,13 +236,8 @@ class UrcapSession:
 
 
 def crc16(data: bytes) -> bytes:
-    """Return the frame check, low byte first: CRC-16 with the polynomial 0xA001, reflected, from 0xFFFF."""
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
-    return crc.to_bytes(2, "little")
+    """Return the frame check."""
+    return FramerRTU.compute_CRC(data).to_bytes(2, "big")
 
 
 class ModbusSlave:
@@ -251,12 +248,9 @@ class ModbusSlave:
         self._buffer = b""
         self._last_s = 0.0
 
-    def feed(self, data: bytes) -> bytes:
-        """Return the reply frames to bytes of now."""
-        return self.replies(data, time.monotonic())
-
-    def replies(self, data: bytes, t_s: float) -> bytes:
-        """Return the reply frames to the bytes at `t_s`; damaged requests and those to other devices get none."""
+    def feed(self, data: bytes, t_s: float | None = None) -> bytes:
+        """Return the reply frames to the bytes at `t_s`, now; damaged requests and those to other devices get none."""
+        t_s = time.monotonic() if t_s is None else t_s
         if t_s - self._last_s > PAUSE_S:
             self._buffer = b""
         self._last_s = t_s

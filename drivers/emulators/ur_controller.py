@@ -180,10 +180,10 @@ class Controller:
                 refusal = f"Cannot unlock protective stop until 5s after occurrence. {cause}"
                 return "Protective stop releasing" if robot.unlock() else refusal
             case "power on":
-                robot.safety.power_on(robot.time_s)
+                robot.safety.begin_power_step(MODE_POWER_OFF, robot.time_s)
                 return "Powering on"
             case "brake release":
-                robot.safety.brake_release(robot.time_s)
+                robot.safety.begin_power_step(MODE_IDLE, robot.time_s)
                 return "Brake releasing"
             case "close popup" | "close safety popup":
                 return request.replace("close", "closing")

@@ -205,46 +205,30 @@ class SafetyController:
         self._stopped_s = 0.0
         self._power_step_s = math.inf
 
-    @property
-    def allows_motion(self) -> bool:
-        """Whether a program may run."""
-        return self.safety_mode == SAFETY_NORMAL and self.robot_mode == MODE_RUNNING
-
     def pass_time(self, now_s: float) -> None:
         """End a step of powering that has taken its time."""
         if now_s >= self._power_step_s:
             self._power_step_s = math.inf
             self.robot_mode = MODE_IDLE if self.robot_mode == MODE_POWER_OFF else MODE_RUNNING
 
-    def stop(self, clock_s: float) -> None:
-        """Begin a protective stop."""
-        self.safety_mode, self._stopped_s = SAFETY_PROTECTIVE_STOP, clock_s
+    def stop(self, clock_s: float, mode: int = SAFETY_PROTECTIVE_STOP) -> None:
+        """Begin a protective stop, or an emergency stop, which switches the power off."""
+        self.safety_mode, self._stopped_s = mode, clock_s
+        if mode == SAFETY_EMERGENCY_STOP:
+            self.robot_mode = MODE_POWER_OFF
 
-    def unlock(self, clock_s: float) -> bool:
-        """End a protective stop; False within `unlock_wait_s` of its beginning."""
-        if self.safety_mode == SAFETY_PROTECTIVE_STOP:
-            if clock_s - self._stopped_s < self._spec.unlock_wait_s:
-                return False
-            self.safety_mode = SAFETY_NORMAL
+    def end_stop(self, mode: int, clock_s: float) -> bool:
+        """End a stop of this mode; False within `unlock_wait_s` of the beginning of a protective stop."""
+        if self.safety_mode != mode:
+            return True
+        if mode == SAFETY_PROTECTIVE_STOP and clock_s - self._stopped_s < self._spec.unlock_wait_s:
+            return False
+        self.safety_mode = SAFETY_NORMAL
         return True
 
-    def press_button(self) -> None:
-        """Press the emergency stop button: the power goes off."""
-        self.safety_mode, self.robot_mode = SAFETY_EMERGENCY_STOP, MODE_POWER_OFF
-
-    def release_button(self) -> None:
-        """Release the button; the power stays off."""
-        if self.safety_mode == SAFETY_EMERGENCY_STOP:
-            self.safety_mode = SAFETY_NORMAL
-
-    def power_on(self, now_s: float) -> None:
-        """Begin to power the arm."""
-        if self.robot_mode == MODE_POWER_OFF and self.safety_mode != SAFETY_EMERGENCY_STOP:
-            self._power_step_s = min(self._power_step_s, now_s + self._spec.power_on_s)
-
-    def brake_release(self, now_s: float) -> None:
-        """Begin to release the brakes of a powered arm."""
-        if self.robot_mode == MODE_IDLE:
+    def begin_power_step(self, from_mode: int, now_s: float) -> None:
+        """Begin to power the arm, or to release its brakes, if it is in this mode."""
+        if self.robot_mode == from_mode and self.safety_mode != SAFETY_EMERGENCY_STOP:
             self._power_step_s = min(self._power_step_s, now_s + self._spec.power_on_s)
 
 
@@ -314,7 +298,7 @@ class Robot:
 
     def upload(self, watchdog_hz: float = 0.0) -> None:
         """Run a control script that arms its watchdog at `watchdog_hz` by itself; 0 for one that does not."""
-        if not self.safety.allows_motion:
+        if (self.safety.safety_mode, self.safety.robot_mode) != (SAFETY_NORMAL, MODE_RUNNING):
             modes = f"robot mode {self.safety.robot_mode}, safety mode {self.safety.safety_mode}"
             self._note("script-refused", modes)
             return
@@ -348,18 +332,18 @@ class Robot:
             self.arm.halt(SAFETY_DECELERATION)
             self._note("emergency-stop", "the button is pressed")
             self.end_program("emergency stop")
-        self.safety.press_button()
+            self.safety.stop(self.clock_s, SAFETY_EMERGENCY_STOP)
 
     def release(self) -> None:
         """Release the emergency stop button."""
         if self.safety.safety_mode == SAFETY_EMERGENCY_STOP:
             self._note("emergency-stop-released")
-        self.safety.release_button()
+        self.safety.end_stop(SAFETY_EMERGENCY_STOP, self.clock_s)
 
     def unlock(self) -> bool:
         """End a protective stop; False within `unlock_wait_s` of its beginning."""
         stopped = self.safety.safety_mode == SAFETY_PROTECTIVE_STOP
-        unlocked = self.safety.unlock(self.clock_s)
+        unlocked = self.safety.end_stop(SAFETY_PROTECTIVE_STOP, self.clock_s)
         if stopped and unlocked:
             self._note("protective-stop-unlocked")
         return unlocked

@@ -13,12 +13,11 @@ import sys
 import time
 from collections.abc import Callable
 
-import dashboard_client
 import rtde_control
 import script_client
 
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.ur.controller import RTDE_PORT, RtdeReceiver, SampleAge, ScriptReadiness
+from shearloop.drivers.ur.controller import RTDE_PORT, RtdeReceiver, SampleAge, ScriptReadiness, ask_dashboard
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, WristSpeed
 from shearloop.drivers.ur.settings import UrSettings
 
@@ -155,16 +154,10 @@ class UrArm:
         return done
 
     def ask_dashboard(self, *requests: str) -> None:
-        """Call methods of ur-rtde's dashboard client; `DriverError` if the controller refuses or does not answer."""
-        dashboard = dashboard_client.DashboardClient(self._settings.host)
-        try:
-            dashboard.connect()
-            for request in requests:
-                getattr(dashboard, request)()
-        except RuntimeError as error:
-            raise DriverError(str(error)) from error
-        finally:
-            dashboard.disconnect()
+        """Send requests to the dashboard; DriverError if the controller refuses to unlock or does not answer."""
+        answers = ask_dashboard(self._settings.host, 2.5, requests)
+        if requests == ("unlock protective stop",) and answers != ["Protective stop releasing"]:
+            raise DriverError(f"The controller refused: {answers[0]}")
 
 
 def arm_watchdog_in(script: str, watchdog_hz: float) -> str:

@@ -85,7 +85,7 @@ class Recovery:
             try:
                 self._step(sample, now_ns)
             except DriverError as error:
-                self.refusal = f"The controller refused: {error}"
+                self.refusal = str(error)
         return self.ready or self.refusal is not None
 
     def _step(self, sample: RtdeSample, now_ns: int) -> None:
@@ -122,20 +122,20 @@ class Recovery:
             self.refusal = "The emergency stop is still pressed: make the cell safe, release it, and unlock again."
         elif sample.protective_stop:
             # Once: the controller refuses it in the first 5 s.
-            if "unlockProtectiveStop" not in self._asked_ns:
-                self._ask_dashboard(now_ns, "unlockProtectiveStop")
+            if "unlock protective stop" not in self._asked_ns:
+                self._ask_dashboard(now_ns, "unlock protective stop")
         elif not safe:
             self.refusal = f"Safety mode {sample.safety_mode} cannot be cured from here: look at the pendant."
         else:
             self._close_popups(now_ns)
             if sample.robot_mode == ROBOT_MODE_POWER_OFF:
-                self._ask_dashboard(now_ns, "powerOn")
+                self._ask_dashboard(now_ns, "power on")
             elif sample.robot_mode == ROBOT_MODE_IDLE:
-                self._ask_dashboard(now_ns, "brakeRelease")
+                self._ask_dashboard(now_ns, "brake release")
 
     def _close_popups(self, now_ns: int) -> None:
-        if self._operator_asked and "closePopup" not in self._asked_ns:
-            self._ask_dashboard(now_ns, "closePopup", "closeSafetyPopup")
+        if self._operator_asked and "close popup" not in self._asked_ns:
+            self._ask_dashboard(now_ns, "close popup", "close safety popup")
 
     def _ask_dashboard(self, now_ns: int, *requests: str) -> None:
         if self._is_due(requests[0], now_ns):

@@ -109,14 +109,15 @@ def probe_controller(host: str, timeout_s: float) -> str:
 def query_controller(host: str, timeout_s: float) -> ControllerInfo:
     """Return a controller's mode without changing anything; DriverError where it is absent or silent."""
     version = probe_controller(host, timeout_s)
-    with explain_failure(host, timeout_s, "asking for its mode"):
-        robot_mode, safety_mode, remote = _ask_dashboard(
-            host, timeout_s, ("robotmode", "safetymode", "is in remote control")
-        )
+    requests = ("robotmode", "safetymode", "is in remote control")
+    robot_mode, safety_mode, remote = ask_dashboard(host, timeout_s, requests)
+    with (
+        explain_failure(host, timeout_s, "asking for its registers"),
         # A register belongs to a connection: closing it gives the register back.
-        with socket.create_connection((host, RTDE_PORT), timeout=timeout_s) as connection:
-            _agree_on_protocol(connection)
-            free = b"IN_USE" not in _request(connection, _INPUTS, ",".join(_REGISTERS).encode())
+        socket.create_connection((host, RTDE_PORT), timeout=timeout_s) as connection,
+    ):
+        _agree_on_protocol(connection)
+        free = b"IN_USE" not in _request(connection, _INPUTS, ",".join(_REGISTERS).encode())
     return ControllerInfo(
         version,
         robot_mode.removeprefix("Robotmode: "),
@@ -126,18 +127,20 @@ def query_controller(host: str, timeout_s: float) -> ControllerInfo:
     )
 
 
-def _ask_dashboard(host: str, timeout_s: float, questions: tuple[str, ...]) -> list[str]:
+def ask_dashboard(host: str, timeout_s: float, requests: tuple[str, ...]) -> list[str]:
+    """Return the dashboard server's answers; DriverError where it is absent or silent."""
     answers = []
     with (
+        explain_failure(host, timeout_s, "asking its dashboard"),
         socket.create_connection((host, DASHBOARD_PORT), timeout=timeout_s) as connection,
         connection.makefile("rb") as lines,
     ):
         lines.readline(_LONGEST_LINE)  # the banner
-        for question in questions:
-            connection.sendall(f"{question}\n".encode())
+        for request in requests:
+            connection.sendall(f"{request}\n".encode())
             answer = lines.readline(_LONGEST_LINE)
             if not answer:
-                raise DriverError(f"The dashboard server at {host} closed the connection at `{question}`.")
+                raise DriverError(f"The dashboard server at {host} closed the connection at `{request}`.")
             answers.append(answer.decode(errors="replace").strip())
     return answers
 

@@ -111,6 +111,6 @@ def test_on_the_rig_the_robot_s_motion_shears_the_skin(tmp_path):
     assert stretched_1 / r1 - 1 > 0.04
     assert stretched_2 / r2 - 1 == pytest.approx(0.0, abs=1e-3)
     rig.command("skin open 2")
-    assert rig.skin.circuit.opened == {"2"}
+    assert rig.skin.circuit.faults == {("open", "2")}
     rig.command("replug skin")
-    assert not rig.skin.circuit.opened
+    assert not rig.skin.circuit.faults

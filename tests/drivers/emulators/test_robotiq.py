@@ -112,12 +112,12 @@ def test_frames_are_the_manuals_byte_for_byte():
     assert framed(bytes.fromhex("0903 06 B900 00FF BD00"))[-2:] == bytes.fromhex("1D7C")
     gripper = active_gripper()
     face = ModbusSlave(gripper)
-    assert face.replies(bytes.fromhex("0910 03E8 0003 06 0900 00FF FFFF 4229"), 0.0) == framed(
+    assert face.feed(bytes.fromhex("0910 03E8 0003 06 0900 00FF FFFF 4229"), 0.0) == framed(
         bytes.fromhex("0910 03E8 0003")
     )
     gripper.put_between(gripper.mechanics.width_mm(189))
     steps(gripper, 1.0)
-    reply = face.replies(framed(READ_STATUS), 0.0)
+    reply = face.feed(framed(READ_STATUS), 0.0)
     assert reply[:7] == bytes.fromhex("0903 06 B900 00FF")
     assert reply[7] == 189
     assert crc16(reply[:-2]) == reply[-2:]
@@ -132,8 +132,8 @@ def test_modbus_requests_come_in_any_slices(cuts):
         framed(bytes.fromhex("0904 07D0 0003")),
     ]
     whole, sliced = ModbusSlave(active_gripper()), ModbusSlave(active_gripper())
-    expected = b"".join(whole.replies(request, 0.0) for request in requests)
-    assert b"".join(sliced.replies(part, 0.0) for part in slices(b"".join(requests), cuts)) == expected
+    expected = b"".join(whole.feed(request, 0.0) for request in requests)
+    assert b"".join(sliced.feed(part, 0.0) for part in slices(b"".join(requests), cuts)) == expected
 
 
 @pytest.mark.parametrize(
@@ -147,16 +147,16 @@ def test_modbus_requests_come_in_any_slices(cuts):
     ],
 )
 def test_invalid_modbus_requests_get_error_codes(request_hex, reply_hex):
-    assert ModbusSlave(Gripper()).replies(framed(bytes.fromhex(request_hex)), 0.0) == framed(bytes.fromhex(reply_hex))
+    assert ModbusSlave(Gripper()).feed(framed(bytes.fromhex(request_hex)), 0.0) == framed(bytes.fromhex(reply_hex))
 
 
 @given(st.binary(max_size=600), st.integers(1, 50))
 def test_noise_on_the_line_does_no_harm(noise, width):
     face = ModbusSlave(Gripper())
     for start in range(0, len(noise), width):
-        face.replies(noise[start : start + width], 0.0)
+        face.feed(noise[start : start + width], 0.0)
     # After a pause the next frame is understood.
-    assert face.replies(framed(READ_STATUS), 1.0)[:3] == bytes.fromhex("090306")
+    assert face.feed(framed(READ_STATUS), 1.0)[:3] == bytes.fromhex("090306")
 
 
 def test_the_socket_answers_as_the_urcap_does():

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from shearloop.drivers.emulators import ur_robot as control_script
-from shearloop.drivers.emulators.ur_robot import MODE_POWER_OFF, MODE_RUNNING, PAUSED, STOPPED, ControllerSpec, Robot
+from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, PAUSED, STOPPED, Robot
 
 DT_S = 0.002
 
@@ -50,7 +50,7 @@ def down(robot: Robot, metres: float = 0.2) -> list[float]:
 
 
 def started(**spec: float) -> Robot:
-    robot = Robot(ControllerSpec(**spec))  # numbers only in these tests
+    robot = Robot(control_script.ControllerSpec(**spec))  # numbers only in these tests
     robot.upload()
     wait(robot, DT_S)
     return robot
@@ -215,15 +215,15 @@ def test_protective_stop_pauses_and_is_not_unlocked_at_once():
 def test_emergency_stop_cuts_power_that_returns_in_two_steps():
     robot = started(power_on_s=0.5)
     robot.emergency_stop()
-    robot.safety.power_on(robot.time_s)
+    robot.safety.begin_power_step(MODE_POWER_OFF, robot.time_s)
     wait(robot, 1.0)
     assert robot.safety.robot_mode == MODE_POWER_OFF, "the button is still pressed"
     robot.release()
-    robot.safety.power_on(robot.time_s)
+    robot.safety.begin_power_step(MODE_POWER_OFF, robot.time_s)
     wait(robot, 0.6)
     robot.upload()
     assert not robot.program_running, "the brakes are on"
-    robot.safety.brake_release(robot.time_s)
+    robot.safety.begin_power_step(MODE_IDLE, robot.time_s)
     wait(robot, 0.6)
     assert robot.safety.robot_mode == MODE_RUNNING
     robot.upload()

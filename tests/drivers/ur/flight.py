@@ -77,7 +77,7 @@ class FakeArm:
         )
 
     def be(self, **changes: object) -> None:
-        self.reading = dataclasses.replace(self.reading, **changes)  # type: ignore[arg-type]
+        self.reading = dataclasses.replace(self.reading, **changes)
 
     def read(self) -> messages.RtdeSample:
         return self.reading
@@ -139,13 +139,13 @@ class FakeArm:
     def ask_dashboard(self, *requests: str) -> None:
         self.calls.append(requests[0])
         match requests[0]:
-            case "unlockProtectiveStop":
+            case "unlock protective stop":
                 if not self.unlockable:
                     raise DriverError("not in the first 5 s")
                 self.be(safety_mode=1)
-            case "powerOn":
+            case "power on":
                 self.be(robot_mode=5)
-            case "brakeRelease":
+            case "brake release":
                 self.be(robot_mode=7)
             case "stop" if self.stop_fails_silently:
                 pass

@@ -4,8 +4,8 @@
 
 Each figure is measured on a daemon in its own process, through a pseudo-terminal and a subscriber's socket. Latency
 counts from before the last byte is written until the subscriber has the estimate. `--rig` is the folder of
-`shearloop.daemon.cli.calibrate_demo`, with the default estimator's recording and calibrations, and the rig's bank. Needs
-the extra `bench`.
+`shearloop.daemon.cli.calibrate_demo`, with the default estimator's recording and calibrations, and the rig's bank.
+Needs the extra `bench`.
 """
 
 import argparse

@@ -12,12 +12,10 @@ from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.messaging import addresses
 
 # Names of other tasks, sources and recordings; a fingertip needs a different one.
-TAKEN_NAMES = frozenset(
-    (
-        *("load_cell", "wrench", "skin", "combined", "robot", "gripper", "loop", "experiment", "recording", "slices"),
-        *("commands", "open_stop", "keys", "health", "log", "shown", "daemon", "clock"),
-    )
-)
+TAKEN_NAMES = {
+    *("load_cell", "wrench", "skin", "combined", "robot", "gripper", "loop", "experiment", "recording", "slices"),
+    *("commands", "open_stop", "keys", "health", "log", "shown", "daemon", "clock"),
+}
 
 
 def _known_transport(address: str) -> str:

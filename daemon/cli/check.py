@@ -68,14 +68,13 @@ def _rig(config: "DaemonConfig") -> dict[str, str]:
     from shearloop.daemon.rig import gripper_calibration, load_cell_calibration, robot_settings
 
     parts = {}
-    if config.load_cell is not None:
-        path = config.load_cell.calibration
-        load_cell_calibration(config.load_cell)
-        parts["load_cell"] = "torques in N·m from the board" if path is None else f"calibration {path}"
-    if config.gripper is not None:
-        path = config.gripper.calibration
-        gripper_calibration(config.gripper)
-        parts["gripper"] = "widths by the manufacturer's figures" if path is None else f"calibration {path}"
+    if (cell := config.load_cell) is not None:
+        load_cell_calibration(cell)
+        parts["load_cell"] = f"calibration {cell.calibration}" if cell.calibration else "torques in N·m from the board"
+    if (hand := config.gripper) is not None:
+        gripper_calibration(hand)
+        own = f"calibration {hand.calibration}" if hand.calibration else "widths by the manufacturer's figures"
+        parts["gripper"] = own
     if config.robot is not None:
         parts["robot"] = f"{robot_settings(config.robot).host}, limits of {config.robot}"
     return parts

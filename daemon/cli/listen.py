@@ -45,12 +45,9 @@ def run(args: argparse.Namespace) -> int:
     write = message_json if args.json else message_line
 
     def print_hint() -> None:
-        print(
-            f"shearloop listen: no message came from {args.connect} in {QUIET_S:g} s; waiting. Is a daemon running "
-            f"there (`shearloop run CONFIG`), and does it publish {' or '.join(args.topics) or 'anything'}?",
-            file=sys.stderr,
-            flush=True,
-        )
+        nothing = f"shearloop listen: no message came from {args.connect} in {QUIET_S:g} s; waiting"
+        asked = f"there (`shearloop run CONFIG`), and does it publish {' or '.join(args.topics) or 'anything'}?"
+        print(f"{nothing}. Is a daemon running {asked}", file=sys.stderr, flush=True)
 
     try:
         received = receive_messages(args.connect, args.topics, args.timeout, client_keys(args), print_hint)

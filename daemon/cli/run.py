@@ -85,10 +85,9 @@ def _run(
         listeners.append(emulated)
         if config.emulators:
             # The daemon does not know about emulation and will report missing devices.
-            structlog.get_logger().info(
-                "emulated devices are starting; the daemon misses them for a second",
-                devices=[emulator.device for emulator in config.emulators],
-            )
+            names = [emulator.device for emulator in config.emulators]
+            sentence = "emulated devices are starting; the daemon misses them for a second"
+            structlog.get_logger().info(sentence, devices=names)
         if args.show:
             listeners += [EstimatePrinter(out), RunSummary(out, emulated)]
         finished = asyncio.run(run_daemon(config, tuple(listeners), reporters, on_ready))

@@ -80,16 +80,12 @@ def _calibrate(args: argparse.Namespace) -> int:
         raise UserError(f"{args.table}: {error}") from error
     save_calibration(calibration, args.out)
     source = "fitted" if args.friction is None else "given"
+    named = ("friction", "slope_per_n", "prediction_half_width_n", "linear_to_n", "rows", "rows_beyond")
     result = {
         "path": str(args.out),
-        "friction": calibration.friction,
         "friction_given": args.friction is not None,
-        "slope_per_n": calibration.slope_per_n,
-        "prediction_half_width_n": calibration.prediction_half_width_n,
-        "linear_to_n": calibration.linear_to_n,
         "tension_n": [calibration.tension_n[0], calibration.tension_n[-1]],
-        "rows": calibration.rows,
-        "rows_beyond": calibration.rows_beyond,
+        **{name: getattr(calibration, name) for name in named},
     }
     sentences = [
         f"friction coefficient ({source})        {calibration.friction:.4f}",

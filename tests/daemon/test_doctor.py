@@ -34,7 +34,7 @@ SPEED = 8
 
 
 @pytest.fixture
-def rig_config(config: Write, tiny_bank: Path, tmp_path: Path) -> Path:
+def rig_config(config, tiny_bank, tmp_path) -> Path:
     """A whole rig whose boards are SPEED times as fast; its gripper is on the robot's address."""
     robot_at(HOST, tmp_path)
     device = {"path": "eit-right"}

@@ -48,17 +48,17 @@ from shearloop.daemon.workers import SerialExecutor
 
 
 @pytest.fixture(scope="module")
-def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scratch(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp("stability")
 
 
 @pytest.fixture(scope="module")
-def parts(scratch: Path) -> list[Split]:
+def parts(scratch) -> list[Split]:
     return splits([], 0.6, scratch)
 
 
 @pytest.fixture(scope="module")
-def bank(scratch: Path) -> Bank:
+def bank(scratch) -> Bank:
     grid = Grid(np.linspace(3.0, 3.6, 13), np.linspace(1.0, 2.1, 30))
     return bank_of(None, own_fingertip(0.4).mesh(), scratch, grid)
 
@@ -191,7 +191,7 @@ def test_a_recording_that_no_estimator_can_be_calibrated_on_is_one_sentence(bank
 
 
 @pytest.fixture(scope="module")
-def slices(parts: list[Split]) -> FrameSeries:
+def slices(parts) -> FrameSeries:
     return next(one.whole for one in parts if one.past.kind == "difference")
 
 

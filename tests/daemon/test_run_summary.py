@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from io import StringIO
 from types import SimpleNamespace
 from typing import Any
@@ -34,27 +35,25 @@ def loop_state(t_s: float, **changes: Any) -> dict[str, Any]:
     }
 
 
-def told(truth: TorqueSeries | None, happened: list[tuple[int, str]], *more: dict[str, Any]) -> str:
-    out = StringIO()
-    summary = RunSummary(out, SimpleNamespace(torques=lambda: truth, sent=happened))
-    first = {"step": 1, "step_name": "identify", "set_point_nm": None}
-    for content in (loop_state(0, **first), loop_state(10), loop_state(14, hold=1), *more):
-        summary("loop.state", content)
-    for t_s in np.arange(14.0, 44.0, 0.5):
-        reading = {"source": "right", "t_mono_ns": round(t_s * S), "torque_nm": 0.098, "valid": True, "diameter_mm": 20}
-        summary("eit.estimate", reading)
-    summary("eit.estimate", {"source": "right", "t_mono_ns": 44 * S, "torque_nm": None, "valid": False})
-    summary("loop.state", loop_state(44, phase="done", hold=0))
-    return out.getvalue()
-
-
-def summary_of(*messages: dict[str, Any], truth: TorqueSeries | None = None) -> str:
+def summary_of(
+    *messages: dict[str, Any], truth: TorqueSeries | None = None, sent: Sequence[tuple[int, str]] = ()
+) -> str:
     """Return what is told of these messages, each of the topic of its source."""
     out = StringIO()
-    summary = RunSummary(out, SimpleNamespace(torques=lambda: truth))
+    summary = RunSummary(out, SimpleNamespace(torques=lambda: truth, sent=sent))
     for content in messages:
         summary(TOPICS.get(content["source"], "eit.estimate"), content)
     return out.getvalue()
+
+
+def told(truth: TorqueSeries | None, happened: list[tuple[int, str]], *more: dict[str, Any]) -> str:
+    first = {"step": 1, "step_name": "identify", "set_point_nm": None}
+    messages = [loop_state(0, **first), loop_state(10), loop_state(14, hold=1), *more]
+    for t_s in np.arange(14.0, 44.0, 0.5):
+        values = {"torque_nm": 0.098, "valid": True, "diameter_mm": 20}
+        messages.append({"source": "right", "t_mono_ns": round(t_s * S), **values})
+    messages.append({"source": "right", "t_mono_ns": 44 * S, "torque_nm": None, "valid": False})
+    return summary_of(*messages, loop_state(44, phase="done", hold=0), truth=truth, sent=happened)
 
 
 def truth_that_falls_at(t_s: float, for_s: float) -> TorqueSeries:

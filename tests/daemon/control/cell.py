@@ -4,6 +4,7 @@ import asyncio
 import math
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -43,7 +44,7 @@ class Robot(UrRobot):
         self.gone_for = 0
 
     def send(self, command: Command) -> asyncio.Future[CommandReply]:
-        self.commands.append(command)
+        self.commands.append(replace(command, decided_ns=0) if isinstance(command, WristSpeed) else command)
         if self.dies_of is not None:
             raise self.dies_of
         replied: asyncio.Future[CommandReply] = asyncio.get_running_loop().create_future()

@@ -3,7 +3,7 @@
 import pytest
 
 from shearloop.drivers.ur.messages import Disconnect, MoveLinear, Stop, WristSpeed
-from tests.drivers.ur.flight import LIMITS, POSE, Flight, flying, moving, turning
+from tests.drivers.ur.flight import CYCLE_NS, LIMITS, POSE, Flight, flying, moving, turning
 
 
 def cycles_with_calls(flight: Flight, cycles: int) -> list[int]:
@@ -21,11 +21,25 @@ def test_wrist_speed_ends_when_it_is_not_renewed():
     state = flight.fly_until(lambda state: state.motion == "idle")
     assert state.end_reason == "the wrist speed was not renewed within 0.3 s"
     assert flight.wrist_speed == 0
-    # 0.3 s of turning, then 0.5/4 s of braking, then the speed thread is ended and the watchdog kicked.
+    # 0.3 s of turning, then 0.5/8 s of braking, then the speed thread is ended and the watchdog kicked.
     assert state.wrist_rad == pytest.approx(0.5 * 0.3, abs=0.03)
     assert flight.arm.calls[-1] == "end_speed"
     flight.fly(3)
     assert flight.arm.calls[-1] == "send_heartbeat"
+
+
+def test_wrist_speed_holds_from_its_decision_and_not_from_its_arrival() -> None:
+    flight = flying()
+    late = WristSpeed(0.5, 4.0, decided_ns=flight.now_ns - 60_000_000)
+    assert flight.ask(late).accepted
+    decided_ns = flight.now_ns - 60_000_000
+    flight.fly_until(lambda _: flight.arm.target == 0.0)
+    assert flight.now_ns - decided_ns <= 300_000_000 + 2 * CYCLE_NS
+    flight.fly_until(lambda state: state.motion == "idle")
+    refused = flight.ask(WristSpeed(0.5, 4.0, decided_ns=flight.now_ns - 301_000_000))
+    assert refused.refusal == "The wrist speed was decided 0.30 s ago: the computer is too busy."
+    flight.fly(1)
+    assert flight.state.motion == "idle"
 
 
 def test_something_is_sent_in_each_cycle_of_a_motion():

@@ -75,3 +75,10 @@ def test_mistake_is_reported(tmp_path, old, new, said):
 def test_missing_file_is_reported(tmp_path):
     with pytest.raises(DriverError, match="nowhere"):
         read_settings(tmp_path / "nowhere.yaml")
+
+
+def test_a_wrist_without_decisions_stands_within_0_2_s() -> None:
+    settings = read_settings(Path("config/ur.yaml"))
+    limits = settings.limits
+    braking_s = limits.wrist_speed_rad_per_s.inner / limits.wrist_acceleration_rad_per_s2.hard
+    assert settings.command_timeout_s + 2 / settings.rate_hz + braking_s <= 0.2

@@ -53,14 +53,8 @@ def add_json(parser: argparse._ActionsContainer) -> None:
 
 def add_cluster(parser: argparse.ArgumentParser) -> None:
     """Add `--cluster`, which runs heavy work on other processes or computers."""
-    parser.add_argument(
-        "--cluster",
-        nargs="?",
-        const="local",
-        metavar="ADDRESS",
-        help="run on the Dask scheduler at this address, such as tcp://host:8786; without an address: on processes of "
-        "this computer",
-    )
+    text = "run on the Dask scheduler at this address, such as tcp://host:8786; without one on processes here"
+    parser.add_argument("--cluster", nargs="?", const="local", metavar="ADDRESS", help=text)
 
 
 def add_connection(parser: argparse.ArgumentParser, default: str, purpose: str) -> None:

@@ -79,7 +79,7 @@ def test_banks_that_are_interrupted_in_a_folder_say_what_is_there(folder, tmp_pa
     (folder / "over.yaml").write_text(f"{BANK}over: {{amplitude: {{low: 0.5, high: 1, count: 2}}}}\n")
     capsys.readouterr()
 
-    def interrupted(_):
+    def interrupted(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(bank_command, "_result", interrupted)

@@ -116,12 +116,9 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
             "--load-cell-delay-s 0."
         )
     if calibration.kind == "raw":
-        sentences.append(
-            "The recordings do not name one tool's diameter, and on another tool the torque would be wrong: name it "
-            "with --tool-mm."
-            if result.tool_mm is None
-            else f"The tool's diameter is {result.tool_mm:.3g} mm."
-        )
+        unnamed = "The recordings do not name one tool's diameter, and on another tool the torque would be wrong"
+        named = f"{unnamed}: name it with --tool-mm." if result.tool_mm is None else ""
+        sentences.append(named or f"The tool's diameter is {result.tool_mm:.3g} mm.")
     return sentences
 
 

@@ -66,7 +66,7 @@ def fonts() -> None:
 
 
 @pytest.fixture(scope="session")
-def tiny_bank(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tiny_bank(tmp_path_factory) -> Path:
     """A bank of 8 × 8 random signals: scored in a millisecond."""
     import numpy as np
 
@@ -87,7 +87,7 @@ def tiny_bank(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def few_mixtures(monkeypatch: pytest.MonkeyPatch) -> None:
+def few_mixtures(monkeypatch) -> None:
     """Have slices mixed with two foreign frames in place of fifteen: most of a fit, where no interval is judged."""
     from shearloop.bank.estimation import fitting
 
@@ -137,7 +137,7 @@ def _open_files() -> dict[str, str]:
 
 
 @pytest.fixture(autouse=True)
-def nothing_left_over(request: pytest.FixtureRequest) -> Iterator[None]:
+def nothing_left_over(request) -> Iterator[None]:
     """Fail a test that leaves threads or file handles; session fixtures requested here are made beforehand."""
     for name in request.fixturenames:
         if name != "nothing_left_over" and _is_shared(request, name):

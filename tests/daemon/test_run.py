@@ -115,7 +115,7 @@ async def test_a_heatmap_is_computed_only_with_a_subscriber(config, tmp_path, su
 
 
 @pytest.fixture
-def robotless(config: Write, tmp_path: Path) -> Path:
+def robotless(config, tmp_path) -> Path:
     """Write a configuration with an experiment, and with a robot that is not there."""
     robot_at(own_address(7), tmp_path)
     rig = {

@@ -49,7 +49,7 @@ class Rig:
 
 
 @contextlib.asynccontextmanager
-async def a_rig(way: str, tmp_path: Path) -> AsyncIterator[Rig]:
+async def a_rig(way: str, tmp_path: Path, *, connected: bool = False, active: bool = False) -> AsyncIterator[Rig]:
     model = Gripper(MECHANICS)
     server: Server
     client: GripperClient
@@ -63,12 +63,8 @@ async def a_rig(way: str, tmp_path: Path) -> AsyncIterator[Rig]:
         await server.restore()
         client = ModbusClient(path=str(link), reply_deadline_s=0.2)
     rig = Rig(model, server)
-    driver = rig.driver = RobotiqGripper(
-        client,
-        CALIBRATION,
-        poll_s=0.0,
-        monitor=LinkMonitor(rig.link, 0.001, 0.002),
-    )
+    driver = RobotiqGripper(client, CALIBRATION, poll_s=0.0, monitor=LinkMonitor(rig.link, 0.001, 0.002))
+    rig.driver = driver
 
     async def pass_time() -> None:
         while True:
@@ -81,6 +77,10 @@ async def a_rig(way: str, tmp_path: Path) -> AsyncIterator[Rig]:
     tasks = [asyncio.create_task(pass_time()), asyncio.create_task(server.run())]
     try:
         with patch("shearloop.drivers.robotiq.gripper.time", rig):
+            if connected or active:
+                await driver.connect()
+            if active:
+                await driver.activate()
             yield rig
     finally:
         await driver.close()

@@ -52,9 +52,7 @@ async def test_gripper_activates_moves_and_measures_an_object(way, tmp_path):
 
 @WAYS
 async def test_old_contact_is_ignored_until_the_command_is_taken_up(way, tmp_path):
-    async with a_rig(way, tmp_path) as rig:
-        await rig.driver.connect()
-        await rig.driver.activate()
+    async with a_rig(way, tmp_path, active=True) as rig:
         rig.model.put_between(20.0)
         await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
         rig.stopped = True
@@ -69,9 +67,7 @@ async def test_old_contact_is_ignored_until_the_command_is_taken_up(way, tmp_pat
 
 @WAYS
 async def test_halted_gripper_reports_no_object(way, tmp_path):
-    async with a_rig(way, tmp_path) as rig:
-        await rig.driver.connect()
-        await rig.driver.activate()
+    async with a_rig(way, tmp_path, active=True) as rig:
         sent = await rig.driver.move(messages.GripperCommand(0.0, speed_mm_s=30.0))
         while (await rig.driver.read()).width_mm >= 140:
             pass
@@ -87,10 +83,8 @@ async def test_halted_gripper_reports_no_object(way, tmp_path):
 
 @WAYS
 async def test_major_fault_needs_the_operators_confirmation(way, tmp_path):
-    async with a_rig(way, tmp_path) as rig:
+    async with a_rig(way, tmp_path, active=True) as rig:
         driver = rig.driver
-        await driver.connect()
-        await driver.activate()
         sent = await driver.move(messages.GripperCommand(0.0, speed_mm_s=30.0))
         rig.model.fail(14)
         with pytest.raises(messages.GripperFaultError, match="too much current"):
@@ -107,9 +101,7 @@ async def test_major_fault_needs_the_operators_confirmation(way, tmp_path):
 
 @WAYS
 async def test_overheating_passes_without_activation(way, tmp_path):
-    async with a_rig(way, tmp_path) as rig:
-        await rig.driver.connect()
-        await rig.driver.activate()
+    async with a_rig(way, tmp_path, active=True) as rig:
         rig.model.fail(8)
         with pytest.raises(messages.GripperFaultError, match="too hot"):
             await rig.driver.move(messages.GripperCommand(50.0))
@@ -119,9 +111,7 @@ async def test_overheating_passes_without_activation(way, tmp_path):
 
 @WAYS
 async def test_activating_an_active_gripper_moves_nothing(way, tmp_path):
-    async with a_rig(way, tmp_path) as rig:
-        await rig.driver.connect()
-        await rig.driver.activate()
+    async with a_rig(way, tmp_path, active=True) as rig:
         rig.model.put_between(25.0)
         held = await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
         again = await rig.driver.activate()

@@ -5,7 +5,6 @@ import gc
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -28,7 +27,7 @@ async def test_absent_controller_is_explained():
 
 
 @pytest.fixture
-def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+def play(tmp_path, monkeypatch) -> Callable[[str], None]:
     """Run shell commands instead of the worker."""
 
     def write(commands: str) -> None:
@@ -40,23 +39,25 @@ def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Non
     return write
 
 
-async def test_error_output_of_a_worker_ended_by_its_alarm_is_quoted(play):
-    play("echo 'waiting for the dashboard' >&2; kill -ALRM $$")
+@pytest.mark.parametrize(
+    ("commands", "kind", "said", "ends"),
+    [
+        ("echo 'waiting for the dashboard' >&2; kill -ALRM $$", "hung", "", "words: waiting for the dashboard."),
+        (
+            "head -c 300000 /dev/zero | tr '\\0' x >&2; echo >&2; echo 'no memory' >&2; exit 3",
+            *("crashed", "ended with status 3", "xxx / no memory."),
+        ),
+    ],
+    ids=["ended by its alarm", "long"],
+)
+async def test_error_output_of_a_worker_is_quoted_and_shortened(play, commands, kind, said, ends):
+    play(commands)
     link = LinkEvents()
     async with running(settings_for("127.0.0.254"), link) as robot:
         loss = await link.down()
-    assert [*robot.losses] == ["hung"]
-    assert loss.sentence.endswith("Its last words: waiting for the dashboard.")
-
-
-async def test_long_error_output_is_shortened(play):
-    play("head -c 300000 /dev/zero | tr '\\0' x >&2; echo >&2; echo 'no memory' >&2; exit 3")
-    link = LinkEvents()
-    async with running(settings_for("127.0.0.254"), link) as robot:
-        loss = await link.down()
-    assert [*robot.losses] == ["crashed"]
-    assert "ended with status 3" in loss.sentence
-    assert loss.sentence.endswith("xxx / no memory.")
+    assert [*robot.losses] == [kind]
+    assert said in loss.sentence
+    assert loss.sentence.endswith(ends)
     assert len(loss.sentence) < LAST_WORDS_BYTES + 400
 
 

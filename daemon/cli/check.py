@@ -1,6 +1,8 @@
 """`shearloop check`: check a configuration and the files it names."""
 
 import argparse
+import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,7 +22,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Load everything that `run` loads, without opening a device."""
-    import json
 
     from shearloop.daemon.cli.emulated_devices import check_emulators
     from shearloop.daemon.config import load_daemon_config
@@ -88,8 +89,6 @@ def _clients(curve: "CurveConfig") -> str:
 
 
 def _skin(config: "SkinConfig") -> str:
-    import math
-
     from shearloop.bank.skin.calibration import load_calibration
     from shearloop.daemon.sensing.skin_estimator import MAX_CHANGE
     from shearloop.daemon.sensing.skin_task import check_circuit

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_option
+from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig
@@ -100,7 +101,6 @@ def _config(args: argparse.Namespace) -> "DaemonConfig":
     """Return the configuration with the arguments' changes, after checking its emulators."""
     from shearloop.daemon.cli.emulated_devices import check_emulators
     from shearloop.daemon.config import RecordingConfig, load_daemon_config
-    from shearloop.daemon.errors import UserError
 
     config = load_daemon_config(args.config)
     options = check_emulators(config.emulators, args.config)

@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, Self, TextIO
 
+from shearloop.daemon.errors import UserError
+
 if TYPE_CHECKING:
     from shearloop.daemon.logs import NonBlockingWriter
 
@@ -81,7 +83,6 @@ class Operator:
 
     async def ask(self, prompt: str) -> str:
         """Print the prompt and return the next line; raise UserError at the end of the input."""
-        from shearloop.daemon.errors import UserError
 
         self.say(prompt)
         line = await self._lines.get()

@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -181,8 +182,6 @@ def _design(args: argparse.Namespace) -> int:
 
 
 def _info(args: argparse.Namespace) -> int:
-    from dataclasses import asdict
-
     import numpy as np
 
     from shearloop.bank.eit.bank_file import FORMAT_VERSION, Bank

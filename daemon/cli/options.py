@@ -20,12 +20,7 @@ _HEAD_BYTES = 512
 
 
 def add_option(
-    parser: argparse._ActionsContainer,
-    name: str,
-    kind: type,
-    metavar: str | tuple[str, str] | None,
-    text: str,
-    **more: Any,
+    parser: argparse._ActionsContainer, name: str, kind: type, metavar: str | tuple[str, str], text: str, **more: Any
 ) -> None:
     """Add an option with a value, or a positional argument, to a parser or a group."""
     parser.add_argument(name, type=kind, metavar=metavar, help=text, **more)

@@ -35,7 +35,7 @@ hypothesis.settings.load_profile("shearloop")
 # Files of more than some five seconds, the longest first (`make test PYTEST_ARGS=--durations=60` shows them).
 LONGEST = (
     *("test_shared_recordings.py", "test_run.py", "test_page_controls.py", "test_page.py", "test_pruned_matching.py"),
-    *("test_skin_run.py", "test_under_systemd.py", "test_charts.py", "test_calibrate.py", "test_filling.py"),
+    *("test_skin_run.py", "test_under_systemd.py", "test_calibrate.py", "test_filling.py"),
     *("test_workers_commands.py", "test_stability_map.py", "test_batch_forward.py", "test_load_delay.py"),
     *("test_emulate.py", "test_cli_reproduce.py", "test_runner_any_order.py", "test_client_process.py"),
     *("test_workers.py", "test_with_keys.py", "test_replay_combined.py", "test_cli_recordings.py", "test_mixtures.py"),

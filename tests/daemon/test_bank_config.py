@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import GeometryError
 from shearloop.daemon.bank_config import ModelName, load_bank_plan, load_bank_plans, load_geometry
@@ -58,8 +59,6 @@ def test_the_papers_fingertip_gives_the_papers_voltages_within_the_error_of_its_
 
 
 def test_the_papers_electrodes_are_where_the_papers_mesh_has_them(shared):
-    from shearloop.bank.eit.mesh import load_mesh
-
     ours = load_geometry(CONFIG / "fingertips" / "paper.yaml")
     theirs = load_mesh(shared / "reference" / "fingertip_mesh.npz")
     for electrode in range(32):

@@ -11,6 +11,7 @@ import pytest
 
 from shearloop.daemon import doctor
 from shearloop.daemon.cli import main
+from shearloop.daemon.config import CurveConfig, load_daemon_config
 from shearloop.daemon.doctor.devices import check_channels, check_rate, check_task, from_error
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.keys import make_key_pair
@@ -133,8 +134,6 @@ def test_rates_and_channels():
 
 
 def test_a_bank_of_another_geometry_is_reported(config):
-    from shearloop.daemon.config import load_daemon_config
-
     fingertip = load_daemon_config(config()).fingertips["right"]
     assert doctor.check_bank("right", fingertip).state == "good"
     other = doctor.check_bank("right", fingertip, Path("config/fingertips/paper.yaml"))
@@ -143,8 +142,6 @@ def test_a_bank_of_another_geometry_is_reported(config):
 
 
 def test_a_secret_key_that_others_can_read_is_reported(tmp_path):
-    from shearloop.daemon.config import CurveConfig
-
     _, secret = make_key_pair(tmp_path, "server")
     (tmp_path / "clients").mkdir()
     curve = CurveConfig(server_key=secret, clients=tmp_path / "clients")

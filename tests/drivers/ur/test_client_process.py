@@ -63,7 +63,6 @@ async def test_error_output_of_a_worker_is_quoted_and_shortened(play, commands, 
 
 BRIEFLY = """
 import os, sys
-from shearloop.drivers.ur.messages import Configure
 from shearloop.drivers.ur.messages import MessageDecoder, encode
 from tests.drivers.ur.flight import Flight
 
@@ -80,9 +79,8 @@ os.write(1, encode(flight.state))
 
 DISCONNECTS = """
 import os, sys
-from shearloop.drivers.ur.messages import Disconnect
 from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.messages import MessageDecoder, encode
+from shearloop.drivers.ur.messages import Disconnect, MessageDecoder, encode
 from tests.drivers.ur.flight import SETTINGS, FakeArm
 
 os.write(1, encode(CommandHandler(SETTINGS, FakeArm(), 0).state(FakeArm().reading, 0)))

@@ -132,7 +132,7 @@ class Daemon:
                 self._rig.close()
                 if self._experiment is not None:
                     await self._experiment.wait_for_report()
-                await self._rig.runner.released()
+                await self._rig.runner.halt_and_wait()
             for task in running:
                 task.cancel()
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import structlog
 
-from shearloop.daemon.control.step_runner import ExperimentPhase
+from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.rig import Rig
 
 # Interval between attempts to start.

@@ -19,7 +19,7 @@ from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.supervisor import Supervisor, Task
-from shearloop.daemon.taring import Sensor
+from shearloop.daemon.taring import Tareable
 from shearloop.drivers.calibration_files import load_calibration
 from shearloop.drivers.connection import LinkEvent, LinkMonitor
 from shearloop.drivers.errors import DriverError
@@ -121,7 +121,7 @@ class Rig:
         config: DaemonConfig,
         loop: ControlLoop,
         gripper: GripperTask | None,
-        sensors: Mapping[str, Sensor],
+        sensors: Mapping[str, Tareable],
         publisher: Publisher,
         clock: Clock,
         supervisor: Supervisor,

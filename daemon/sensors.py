@@ -12,13 +12,13 @@ from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.rig import DeviceLink, load_cell_calibration
-from shearloop.daemon.sensing.estimators import COMBINED, LiveEstimator
-from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipEstimates, FingertipTask
+from shearloop.daemon.sensing.estimators import COMBINED, FrameEstimator
+from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipPipeline, FingertipTask
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
 from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, RecordedSkin, SkinTask
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.supervisor import Task
-from shearloop.daemon.taring import Sensor
+from shearloop.daemon.taring import Tareable
 from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.load_cell import LoadCell
@@ -34,11 +34,11 @@ class Sensors:
     skin: SkinTask | None
     load_cell: LoadCellTask | None
 
-    def tareable(self) -> dict[str, Sensor]:
+    def tareable(self) -> dict[str, Tareable]:
         """Return everything that has a zero, by its name."""
-        named: dict[str, Sensor | None] = {
-            **{name: task.estimates for name, task in self.fingertips.items()},
-            COMBINED: self.combined.estimates if self.combined is not None else None,
+        named: dict[str, Tareable | None] = {
+            **{name: task.pipeline for name, task in self.fingertips.items()},
+            COMBINED: self.combined.pipeline if self.combined is not None else None,
             SKIN: self.skin,
             LOAD_CELL: self.load_cell,
         }
@@ -66,15 +66,15 @@ class SensorBuilder:
 
     def build(
         self,
-        estimators: Mapping[str, LiveEstimator],
-        combined: LiveEstimator | None,
+        estimators: Mapping[str, FrameEstimator],
+        combined: FrameEstimator | None,
         gripper: GripperTask | None,
         diameters: FingertipDiameters | None,
     ) -> Sensors:
         """Return all sensors; `diameters` receives the fingertips' estimates, and the gripper gives the held tool."""
 
-        def estimates(name: str, estimator: LiveEstimator) -> FingertipEstimates:
-            return FingertipEstimates(
+        def estimates(name: str, estimator: FrameEstimator) -> FingertipPipeline:
+            return FingertipPipeline(
                 name,
                 estimator,
                 self.publisher,

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import Protocol
 
 
-class Sensor(Protocol):
+class Tareable(Protocol):
     """A sensor with a zero."""
 
     def tare(self) -> None:
@@ -15,7 +15,7 @@ class Sensor(Protocol):
         """Take a new zero and wait until it is done; return the reason of a failure, else an empty text."""
 
 
-async def tare_all(sensors: Iterable[Sensor]) -> str:
+async def tare_all(sensors: Iterable[Tareable]) -> str:
     """Zero every sensor at the same time; return the reasons of failures, or an empty text."""
     return " ".join(filter(None, await asyncio.gather(*(sensor.tare_and_wait() for sensor in sensors))))
 

@@ -80,7 +80,7 @@ def _build_all(args: argparse.Namespace) -> int:
     from shearloop.bank.eit.build import build_bank, solve_row
     from shearloop.bank.errors import EmptyBankError
     from shearloop.daemon.bank_config import load_bank_plans
-    from shearloop.daemon.workers import open_executor
+    from shearloop.daemon.executors import open_executor
 
     jobs = checked_jobs(args.jobs)
     plans = load_bank_plans(args.config)

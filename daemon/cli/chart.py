@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.analysis.charts import scene, speed_accuracy, stability
     from shearloop.daemon.analysis.charts.drawing import check_takes_pictures
     from shearloop.daemon.analysis.charts.sources import bank_of, mesh_of, splits
-    from shearloop.daemon.workers import open_executor
+    from shearloop.daemon.executors import open_executor
 
     check_takes_pictures(args.out)
     scratch = args.out / "banks"

@@ -10,7 +10,7 @@ from shearloop.daemon.cli.options import add_option
 
 if TYPE_CHECKING:
     from shearloop.daemon.config import CurveConfig, DaemonConfig, SkinConfig
-    from shearloop.daemon.sensing.estimators import LiveEstimator
+    from shearloop.daemon.sensing.estimators import FrameEstimator
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _torque(estimator: "LiveEstimator", *, calibrated: bool) -> str:
+def _torque(estimator: "FrameEstimator", *, calibrated: bool) -> str:
     if estimator.measures_torque:
         return f"with torque{estimator.assumptions}"
     reason = "its calibration has diameters only" if calibrated else "no calibration is configured"

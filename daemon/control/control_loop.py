@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from shearloop.daemon.control.controller import WristCommand
+from shearloop.daemon.control.experiment import ACTIVE, Action, Experiment, ExperimentPhase, GripTo, Hold, TrackTorque
 from shearloop.daemon.control.experiment_schema import (
     ExperimentFile,
     ExperimentLimits,
@@ -16,15 +17,21 @@ from shearloop.daemon.control.experiment_schema import (
     first_turn_before_grip,
 )
 from shearloop.daemon.control.fault_detection import (
-    LoopInputs,
-    MonitorInputs,
+    Watched,
     compared_for_s,
     detect_faults,
     fresh_for_s,
 )
-from shearloop.daemon.control.loop_inputs import ArmStatus, Creep, GripperStatus, LoopConfig, TorqueSample, TorqueSource
+from shearloop.daemon.control.loop_inputs import (
+    ArmStatus,
+    Creep,
+    GripperStatus,
+    LoopConfig,
+    LoopInputs,
+    TorqueSample,
+    TorqueSource,
+)
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDecision, SafetyMonitor
-from shearloop.daemon.control.step_runner import ACTIVE, Action, Experiment, ExperimentPhase, GripTo, Hold, TrackTorque
 from shearloop.daemon.control.wrist_controller import WristController
 
 
@@ -92,7 +99,7 @@ class ControlLoop:
         }
         # The wrist's controller for the driving torque, and the faults to watch for.
         self.wrist = next(iter(self._wrists.values()))
-        self._watched = MonitorInputs(
+        self._watched = Watched(
             driving=self.wrist.source,
             supervising=self._others(self.wrist.source),
             fresh_s=fresh_s,

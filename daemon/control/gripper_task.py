@@ -7,9 +7,9 @@ from collections.abc import Awaitable, Callable, Mapping
 from shearloop.bank.estimation import Measured, combine
 from shearloop.bank.polynomial import TWO_SIDED_95
 from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.experiment import GripTo
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.loop_inputs import GripperStatus
-from shearloop.daemon.control.step_runner import GripTo
 from shearloop.daemon.messaging.messages import GripperStateMessage, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters

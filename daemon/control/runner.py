@@ -9,15 +9,15 @@ import structlog
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
+from shearloop.daemon.control.experiment import Action, Experiment, GripTo
 from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, TareStep
 from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
-from shearloop.daemon.control.step_runner import Action, Experiment, GripTo
 from shearloop.daemon.messaging.messages import LoopState, RobotStateMessage
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH
-from shearloop.daemon.taring import Sensor, tare_all
+from shearloop.daemon.taring import Tareable, tare_all
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import (
     ARRIVED,
@@ -65,7 +65,7 @@ class ControlLoopRunner:
         control_loop: ControlLoop,
         robot: UrRobot,
         gripper: GripperTask | None,
-        sensors: Collection[Sensor],
+        sensors: Collection[Tareable],
         publisher: Publisher,
         clock: Clock,
         dead_tasks: Mapping[str, str],
@@ -76,7 +76,7 @@ class ControlLoopRunner:
         self._clock = clock
         self._dead_tasks = dead_tasks
         self._acceleration_rad_per_s2 = control_loop.config.wrist_acceleration_rad_per_s2
-        self._velocity = VelocityCommandSender(robot, control_loop)
+        self._velocity = CommandSender(robot, control_loop)
         self._actions = ActionExecutor(robot, gripper, sensors, self._velocity, control_loop)
         self._states = StatePublisher(publisher, control_loop)
         self._running = False
@@ -106,7 +106,7 @@ class ControlLoopRunner:
             self._actions.abort()
             await self._brake()
             # Without this wait the gripper might not receive its final command.
-            await self.released()
+            await self.halt_and_wait()
             raise
         finally:
             self._running = False
@@ -145,11 +145,11 @@ class ControlLoopRunner:
             await self._states.changed.wait()
         return experiment
 
-    async def released(self) -> None:
+    async def halt_and_wait(self) -> None:
         """Halt moving fingers, and wait for the end of the last release or halt."""
         if self._actions.fingers_move:
             self._actions.cancel()
-        await self._actions.released()
+        await self._actions.halt_and_wait()
 
     async def unlock(self) -> str | None:
         """Enable robot and gripper after a stop, on the operator's command; return None, or why not."""
@@ -215,7 +215,7 @@ class ControlLoopRunner:
             structlog.get_logger().exception("the arm could not be stopped")
 
 
-class VelocityCommandSender:
+class CommandSender:
     """Sends wrist velocities and stops to the robot's process, and reports the results to the control loop."""
 
     def __init__(self, robot: UrRobot, control_loop: ControlLoop) -> None:
@@ -265,8 +265,8 @@ class ActionExecutor:
         self,
         robot: UrRobot,
         gripper: GripperTask | None,
-        sensors: Collection[Sensor],
-        velocity: VelocityCommandSender,
+        sensors: Collection[Tareable],
+        velocity: CommandSender,
         control_loop: ControlLoop,
     ) -> None:
         self.gripper = gripper
@@ -311,7 +311,7 @@ class ActionExecutor:
         if self._task is not self._final_task:
             self.cancel()
 
-    async def released(self) -> None:
+    async def halt_and_wait(self) -> None:
         """Wait for the end of the last release or halt."""
         if self._final_task is not None:
             await asyncio.wait({self._final_task}, timeout=RELEASED_WITHIN_S)

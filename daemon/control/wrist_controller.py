@@ -4,17 +4,17 @@ import math
 from collections import deque
 
 from shearloop.daemon.control.controller import ControllerSettings, TwistController, WristCommand
-from shearloop.daemon.control.experiment_schema import IdentifyStep
-from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
-from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSample, TorqueSource
-from shearloop.daemon.control.margins import gain_for_noise, integral_gain, margin_refusal
-from shearloop.daemon.control.step_runner import (
+from shearloop.daemon.control.experiment import (
     ConstantVelocity,
     Hold,
     MoveToAngle,
     TrackTorque,
     WristSetpoint,
 )
+from shearloop.daemon.control.experiment_schema import IdentifyStep
+from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
+from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSample, TorqueSource
+from shearloop.daemon.control.margins import gain_for_noise, integral_gain, margin_refusal
 
 # Torques that wait for the next wrist angle.
 MOST_PENDING = 64

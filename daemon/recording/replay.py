@@ -26,7 +26,7 @@ from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.reader import check_identity, open_recording, reading
 from shearloop.daemon.rig import load_cell_calibration
-from shearloop.daemon.sensing.estimators import COMBINED, LiveEstimator, open_combined, open_estimator
+from shearloop.daemon.sensing.estimators import COMBINED, FrameEstimator, open_combined, open_estimator
 from shearloop.daemon.sensing.fingertip_task import FramePairing, estimate_message, frame_message
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
 from shearloop.daemon.sensing.skin_task import SKIN, RecordedSkin
@@ -142,7 +142,7 @@ class ReplayPipeline:
         # Per source: the difference between recorded and replayed frame numbers, and the latest frame.
         self._number_offset: dict[str, int] = {}
         self._latest_frame: dict[str, int] = {}
-        self._estimators: dict[str, LiveEstimator] = {
+        self._estimators: dict[str, FrameEstimator] = {
             name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()
         }
         self._pairing: FramePairing[Frame] | None = None

@@ -35,7 +35,7 @@ _in_use: WeakValueDictionary[tuple[str, str], PrunedMatcher | PrunedZeroLagMatch
 _MAX_GAP_S = 3.0
 
 
-class LiveEstimator:
+class FrameEstimator:
     """Estimates from the frames of one fingertip, or of several together, in order.
 
     Around a session it adds the board's flags, and the bank match where a bank is configured.
@@ -125,7 +125,7 @@ class LiveEstimator:
         return difference[0] if difference is not None and difference[0].any() else None
 
 
-def open_estimator(config: FingertipConfig, name: str) -> LiveEstimator:
+def open_estimator(config: FingertipConfig, name: str) -> FrameEstimator:
     """Return the estimator of one fingertip.
 
     Raises BankError for a file that is missing, damaged or does not fit, and UserError for a calibration of another
@@ -150,15 +150,15 @@ def open_estimator(config: FingertipConfig, name: str) -> LiveEstimator:
     if config.bank is None:
         raise _without_bank("paper", name)
     if config.calibration is not None:
-        return LiveEstimator(Calibration.load(config.calibration), config)
-    return LiveEstimator(Calibration.uncalibrated(Bank.open(config.bank).identity), config)
+        return FrameEstimator(Calibration.load(config.calibration), config)
+    return FrameEstimator(Calibration.uncalibrated(Bank.open(config.bank).identity), config)
 
 
 def _without_bank(estimator: str, name: str) -> UserError:
     return UserError(f"the estimator {estimator} of {name} needs its bank; add `bank:` to the fingertip")
 
 
-def open_combined(config: CombinedConfig, fingertips: Mapping[str, FingertipConfig]) -> LiveEstimator:
+def open_combined(config: CombinedConfig, fingertips: Mapping[str, FingertipConfig]) -> FrameEstimator:
     """Return the estimator of several fingertips together; raises as `open_estimator` does."""
     calibration = _load(config.calibration, config.estimator)
     missing = [side for side in calibration.sides if side not in fingertips]
@@ -171,7 +171,7 @@ def open_combined(config: CombinedConfig, fingertips: Mapping[str, FingertipConf
 
 
 def torque_sources(
-    config: DaemonConfig, estimators: Mapping[str, LiveEstimator], combined: LiveEstimator | None
+    config: DaemonConfig, estimators: Mapping[str, FrameEstimator], combined: FrameEstimator | None
 ) -> dict[str, TorqueSource]:
     """Return the period of each sensor's torque, and the time that it averages over."""
     sources = {
@@ -203,9 +203,9 @@ def _shared_matcher(bank: Bank, matching: str) -> PrunedMatcher | PrunedZeroLagM
     return shared
 
 
-def _live(path: Path, calibration: Calibration, config: FingertipConfig) -> LiveEstimator:
+def _live(path: Path, calibration: Calibration, config: FingertipConfig) -> FrameEstimator:
     try:
-        return LiveEstimator(calibration, config)
+        return FrameEstimator(calibration, config)
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from error
 

@@ -17,7 +17,7 @@ from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.messaging.messages import EitEstimate, EitFrame, EitHeatmap
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sensing.estimators import LiveEstimator
+from shearloop.daemon.sensing.estimators import FrameEstimator
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters, tool_as_bytes
 from shearloop.daemon.supervisor import TaskFacts
 from shearloop.drivers.eit_kit import EitKit, Frame
@@ -59,13 +59,13 @@ class FramePairing(Generic[Item]):
         return found
 
 
-class FingertipEstimates:
+class FingertipPipeline:
     """Estimates from the frames of one fingertip, or of several together, for the control loop and for subscribers."""
 
     def __init__(
         self,
         name: str,
-        estimator: LiveEstimator,
+        estimator: FrameEstimator,
         publisher: Publisher,
         clock: Clock,
         *,
@@ -137,10 +137,10 @@ class FingertipEstimates:
 class CombinedFingertips:
     """Pairs the frames of several fingertips, and estimates from each pair."""
 
-    def __init__(self, estimates: FingertipEstimates, period_s: float) -> None:
+    def __init__(self, pipeline: FingertipPipeline, period_s: float) -> None:
         """Take the estimates of the pairs, and the frame period."""
-        self.estimates = estimates
-        self.sides = estimates.estimator.calibration.sides
+        self.pipeline = pipeline
+        self.sides = pipeline.estimator.calibration.sides
         self._period_s = period_s
         self._pairing: FramePairing[Frame] = FramePairing(self.sides, round(period_s * 1e9))
         self._pairs: deque[tuple[Frame, ...]] = deque()
@@ -156,11 +156,11 @@ class CombinedFingertips:
         """Estimate from the pairs that wait, in order."""
         async with self._in_order:
             while self._pairs:
-                await self.estimates.process(*self._pairs.popleft())
+                await self.pipeline.process(*self._pairs.popleft())
 
     def diagnostics(self) -> TaskFacts:
         """Return the values for the health message."""
-        return {"expected_hz": 1.0 / self._period_s, "estimates": self.estimates.count}
+        return {"expected_hz": 1.0 / self._period_s, "estimates": self.pipeline.count}
 
 
 class FingertipTask:
@@ -169,15 +169,15 @@ class FingertipTask:
     def __init__(
         self,
         board: EitKit,
-        estimates: FingertipEstimates,
+        pipeline: FingertipPipeline,
         publisher: Publisher,
         combined: CombinedFingertips | None = None,
         *,
         always_heatmap: bool = False,
     ) -> None:
         """Take the board, its estimates, and the estimates that also need its frames, if there are any."""
-        self.name = estimates.name
-        self.estimates = estimates
+        self.name = pipeline.name
+        self.pipeline = pipeline
         self._always_heatmap = always_heatmap
         self._board = board
         self._publisher = publisher
@@ -194,7 +194,7 @@ class FingertipTask:
 
     async def process_frame(self, frame: Frame) -> None:
         """Estimate from a frame and from the pairs that wait; publish the estimates, then the frame."""
-        await self.estimates.process(frame)
+        await self.pipeline.process(frame)
         if self._combined is not None:
             await self._combined.process_pairs()
         self._publisher.publish(frame_message(self.name, frame))
@@ -212,11 +212,11 @@ class FingertipTask:
             **board,
             "rate_hz": board["measured_hz"],
             "error": board["last_frame_error"] if board["connected"] else board["last_loss"],
-            "estimates": self.estimates.count,
+            "estimates": self.pipeline.count,
         }
 
     async def _publish_heatmap(self, frame: Frame) -> None:
-        estimator = self.estimates.estimator
+        estimator = self.pipeline.estimator
         scores = await asyncio.to_thread(estimator.heatmap)
         if scores is None or estimator.grids is None:
             return

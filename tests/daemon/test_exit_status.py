@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from shearloop.daemon.configured_experiment import ConfiguredExperiment, CrashMarker
-from shearloop.daemon.control.step_runner import ExperimentPhase
+from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.errors import UserError
 from tests.daemon.conftest import deadline, robot_at, running_daemon, shearloop
 from tests.emulator_process import own_address

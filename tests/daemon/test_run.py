@@ -14,7 +14,7 @@ import zmq.asyncio
 
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
-from shearloop.daemon.sensing.estimators import LiveEstimator
+from shearloop.daemon.sensing.estimators import FrameEstimator
 from tests.daemon.conftest import (
     DEADLINE_S,
     collector,
@@ -157,15 +157,15 @@ async def test_a_lost_board_reconnects_and_health_counts_refused_lines(config, t
 
 
 async def test_a_crashed_estimator_restarts_and_is_reported(config, tmp_path, monkeypatch):
-    estimate = LiveEstimator.estimate
+    estimate = FrameEstimator.estimate
     deaths = iter([True])
 
-    async def fragile(self: LiveEstimator, frame: Any) -> Any:
+    async def fragile(self: FrameEstimator, frame: Any) -> Any:
         if frame.seq == 3 and next(deaths, False):
             raise RuntimeError("a bug")
         return await estimate(self, frame)
 
-    monkeypatch.setattr(LiveEstimator, "estimate", fragile)
+    monkeypatch.setattr(FrameEstimator, "estimate", fragile)
     async with running_daemon(config()) as daemon:
         estimates = collector(daemon, "eit.estimate")
         async with emulated_kit(tmp_path, 40):

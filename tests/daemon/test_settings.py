@@ -9,10 +9,10 @@ import pytest
 import yaml
 
 from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.control.experiment import TrackTorque
 from shearloop.daemon.control.experiment_schema import IdentifyStep
 from shearloop.daemon.control.identification import ToolModel
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
-from shearloop.daemon.control.step_runner import TrackTorque
 from shearloop.daemon.control.wrist_controller import WristController, controller_settings
 from shearloop.daemon.rig import make_loop
 

@@ -27,7 +27,7 @@ from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.analysis.bank_design import residual_noise
 from shearloop.daemon.analysis.charts.drawing import figure, look
 from shearloop.daemon.analysis.charts.sources import Split
-from shearloop.daemon.workers import Executor, in_order
+from shearloop.daemon.executors import Executor, in_order
 from shearloop.drivers.eit_kit import ADC_STEP_V
 
 Mask = NDArray[np.bool_]

@@ -13,7 +13,7 @@ from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.daemon.analysis.bank_design import doubts, scene_of
 from shearloop.daemon.analysis.charts.drawing import SHADES, figure, save, slug
 from shearloop.daemon.analysis.charts.sources import Split, own_fingertip
-from shearloop.daemon.workers import Executor, in_order
+from shearloop.daemon.executors import Executor, in_order
 
 _MESH_SIZE_CM = 0.07
 _LEAST_SHOWN, _MOST_TICKS = 1e-3, 12

@@ -19,13 +19,13 @@ from matplotlib.figure import Figure
 from shearloop.bank.skin.calibration import SkinCalibration, load_calibration
 from shearloop.daemon.analysis.charts.drawing import figure, look, save
 from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
 from shearloop.daemon.control.loop_inputs import ArmStatus, LoopConfig, TorqueSample, TorqueSource
-from shearloop.daemon.control.step_runner import ExperimentPhase
+from shearloop.daemon.executors import Executor, in_order
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
 from shearloop.daemon.synthetic_skin import SyntheticSkin
-from shearloop.daemon.workers import Executor, in_order
 from shearloop.drivers.shear_skin.skin import SkinSample
 
 TICK_S, SAMPLE_TICKS = 0.008, 12.5

@@ -58,8 +58,8 @@ from shearloop.daemon.analysis.charts.sources import (
     torque_of,
 )
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.executors import Executor, in_order
 from shearloop.daemon.synthetic_frames import Synthesiser
-from shearloop.daemon.workers import Executor, in_order
 
 STEPS = 25
 SLICE_NAMES: tuple[EstimatorName, ...] = ("paper", "bank", "regression", "reconstruction", "motion_regression")

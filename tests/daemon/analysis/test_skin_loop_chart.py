@@ -11,9 +11,9 @@ from shearloop.daemon.analysis.charts import skin_loop
 from shearloop.daemon.analysis.charts.skin_loop import CALIBRATION, SkinLoop, SkinLoopCase, judge
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.config_file import load_yaml_model
+from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, HoldTorqueStep
-from shearloop.daemon.control.step_runner import ExperimentPhase
-from shearloop.daemon.workers import SerialExecutor
+from shearloop.daemon.executors import SerialExecutor
 
 CONFIG = Path(__file__).parents[3] / "config"
 

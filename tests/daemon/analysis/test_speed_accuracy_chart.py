@@ -36,7 +36,7 @@ from shearloop.daemon.analysis.charts.speed_accuracy import (
 from shearloop.daemon.analysis.reproduce.banks import Grid
 from shearloop.daemon.cli import main
 from shearloop.daemon.cli.chart import NAMES
-from shearloop.daemon.workers import SerialExecutor
+from shearloop.daemon.executors import SerialExecutor
 
 
 @pytest.fixture(scope="module")

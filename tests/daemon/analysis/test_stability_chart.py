@@ -17,7 +17,7 @@ from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingert
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.reproduce.banks import Grid
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.workers import SerialExecutor
+from shearloop.daemon.executors import SerialExecutor
 
 
 @pytest.fixture(scope="module")

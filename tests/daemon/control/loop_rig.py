@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
+from shearloop.daemon.control.experiment import Action, ExperimentPhase, GripTo
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopConfig, TorqueSample, TorqueSource
-from shearloop.daemon.control.step_runner import Action, ExperimentPhase, GripTo
 from shearloop.drivers.emulators.scene import Twin, TwinSettings
 
 TICK_S = 0.008

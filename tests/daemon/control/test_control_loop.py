@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from shearloop.daemon.control.experiment import ExperimentPhase, GripTo
 from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, TareStep
 from shearloop.daemon.control.safety import FaultCode, Response
-from shearloop.daemon.control.step_runner import ExperimentPhase, GripTo
 from tests.daemon.control.loop_rig import EIT, GRIP, TICK_S, Rig, new_loop, phase, started
 
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.safety import Response
-from shearloop.daemon.control.step_runner import ExperimentPhase
 from tests.daemon.control.loop_rig import GRIP, TICK_S, Rig, new_loop, phase, started
 
 FAULTS = st.sampled_from(["right", "load_cell", "arm", "hand", "protective", "pause", "resume", "stop", "kick", "ack"])

@@ -5,13 +5,19 @@ import pytest
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.fault_detection import (
     ARM_STALE_S,
-    LoopInputs,
-    MonitorInputs,
+    Watched,
     compared_for_s,
     detect_faults,
     fresh_for_s,
 )
-from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopConfig, TorqueSample, TorqueSource
+from shearloop.daemon.control.loop_inputs import (
+    ArmStatus,
+    GripperStatus,
+    LoopConfig,
+    LoopInputs,
+    TorqueSample,
+    TorqueSource,
+)
 from shearloop.daemon.control.runner import PUBLISH_EVERY, wrench_source
 from shearloop.daemon.control.safety import TABLE, FaultCode, Response
 from shearloop.drivers.ur.controller import SampleAge
@@ -31,8 +37,8 @@ def torque(
     return TorqueSample(source.name, torque_nm, why, t_ns - round((acquired_s + way_s) * 1e9), t_ns)
 
 
-def watched(driving: TorqueSource, supervising: tuple[TorqueSource, ...]) -> MonitorInputs:
-    return MonitorInputs(
+def watched(driving: TorqueSource, supervising: tuple[TorqueSource, ...]) -> Watched:
+    return Watched(
         driving=driving,
         supervising=supervising,
         fresh_s=fresh_for_s((driving, *supervising), LoopConfig()),

@@ -10,10 +10,10 @@ import pytest
 
 from shearloop.bank.polynomial import TWO_SIDED_95
 from shearloop.daemon.control import gripper_task
+from shearloop.daemon.control.experiment import GripTo
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import GripperStatus
-from shearloop.daemon.control.step_runner import GripTo
 from tests.daemon.conftest import DEADLINE_S
 from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
 

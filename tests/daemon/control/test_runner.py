@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
+from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.runner import WRENCH
 from shearloop.daemon.control.safety import FaultCode
-from shearloop.daemon.control.step_runner import ExperimentPhase
 from shearloop.drivers.ur.messages import MoveLinear, Stop, WristSpeed
 from tests.daemon.control.cell import GRIP, MOVE, TWIST, driven, experiment, no_tick
 from tests.drivers.ur.flight import SETTINGS

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.safety import Response
-from shearloop.daemon.control.step_runner import ExperimentPhase
 from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, driven, experiment
 
 TURN = {"do": "turn_to", "angle_rad": 0.5}

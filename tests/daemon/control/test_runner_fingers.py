@@ -39,7 +39,7 @@ async def test_a_grip_that_has_failed_stops_the_fingers_once(answer):
         await cell.cycles(20)
         cell.control_loop.stop("the operator said stop")
         await cell.cycles(20)
-        await cell.runner.released()
+        await cell.runner.halt_and_wait()
         assert cell.gripper.asked == ["grip", "halt", "grip"]
 
 
@@ -67,7 +67,7 @@ async def test_a_loop_that_dies_in_the_middle_of_a_grip_stops_the_fingers(monkey
 
 async def test_a_daemon_that_ends_in_the_middle_of_a_grip_stops_the_fingers_first():
     async with gripping() as cell:
-        await cell.runner.released()
+        await cell.runner.halt_and_wait()
         assert cell.gripper.asked == ["grip", "halt"]
 
 

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
+from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.safety import Fault, FaultCode
-from shearloop.daemon.control.step_runner import ExperimentPhase
 from tests.daemon.control.cell import TWIST, driven
 from tests.drivers.ur.flight import CYCLE_NS
 

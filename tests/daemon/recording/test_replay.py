@@ -32,8 +32,8 @@ from shearloop.daemon.recording.replay import (
     restored_wire_map,
 )
 from shearloop.daemon.recording.schema import message_json, with_missing_keys
-from shearloop.daemon.sensing.estimators import LiveEstimator
-from shearloop.daemon.sensing.fingertip_task import FingertipEstimates
+from shearloop.daemon.sensing.estimators import FrameEstimator
+from shearloop.daemon.sensing.fingertip_task import FingertipPipeline
 from tests.daemon.conftest import DEADLINE_S, emulated_kit, running_daemon
 from tests.daemon.sample_messages import sample
 
@@ -46,7 +46,7 @@ RELATIVE = 1e-9
 class Gripper:
     """Holds a tool while the number of estimates is within a range."""
 
-    def __init__(self, estimates: FingertipEstimates, tool: Measured, held: range) -> None:
+    def __init__(self, estimates: FingertipPipeline, tool: Measured, held: range) -> None:
         self._estimates, self._tool, self._held = estimates, tool, held
 
     def held_tool(self, _t_ns: int) -> Measured | None:
@@ -259,7 +259,7 @@ HELD, BEGUN, ZEROED, ENOUGH = 6, 12, 18, 40
 async def record_experiments(config: Path) -> list[dict[str, Any]]:
     """Run a daemon through two experiments; return what was published as estimates."""
     async with recording_daemon(config) as (daemon, published, until):
-        recorder, right = daemon.recorder, daemon.sensors.fingertips["right"].estimates
+        recorder, right = daemon.recorder, daemon.sensors.fingertips["right"].pipeline
         right._gripper = Gripper(right, OTHER_TOOL, range(HELD, 10 * ENOUGH))
         recorder.record_experiment("first")
         await until(BEGUN)
@@ -276,7 +276,7 @@ def test_a_later_file_replays_frame_numbers_tares_and_tools(config, tmp_path, mo
     ((zeroed,),) = RecordedRun(later).replay_events().tares.values()
     assert zeroed >= ZEROED
     held: list[object] = []
-    monkeypatch.setattr(LiveEstimator, "set_tool", lambda _self, tool: held.append(tool))
+    monkeypatch.setattr(FrameEstimator, "set_tool", lambda _self, tool: held.append(tool))
     again, _ = asyncio.run(replayed(later, math.inf))
     assert held == [OTHER_TOOL], "which was told before the file began"
     estimates = {content["frame"]: content for topic, content in again if topic == "eit.estimate"}

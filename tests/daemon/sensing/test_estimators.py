@@ -14,7 +14,7 @@ from shearloop.daemon.cli.check import _torque
 from shearloop.daemon.config import CombinedConfig, FingertipConfig
 from shearloop.daemon.doctor import _calibration, _combined
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.sensing.estimators import LiveEstimator, open_combined, open_estimator
+from shearloop.daemon.sensing.estimators import FrameEstimator, open_combined, open_estimator
 from shearloop.drivers.eit_kit import Frame
 from tests.bank.estimation.conftest import IDLE_S, PERIOD_S, series
 
@@ -56,12 +56,12 @@ def frame(
     )  # fmt: skip
 
 
-def estimated(estimator: LiveEstimator, *frames: Frame) -> Estimate:
+def estimated(estimator: FrameEstimator, *frames: Frame) -> Estimate:
     """Return the estimate of frames of one time."""
     return asyncio.run(estimator.estimate(*frames))
 
 
-def torques(estimator: LiveEstimator, played: FrameSeries, **flags: NDArray[np.bool_]) -> list[float | None]:
+def torques(estimator: FrameEstimator, played: FrameSeries, **flags: NDArray[np.bool_]) -> list[float | None]:
     """Return the torque of every pair, None where there is none."""
     found = []
     for number, pair in enumerate(played.channels):
@@ -73,7 +73,7 @@ def torques(estimator: LiveEstimator, played: FrameSeries, **flags: NDArray[np.b
 
 def test_both_fingertips_together_follow_another_session(calibration):
     played = series(seed=3)
-    found = torques(LiveEstimator(calibration, fingertip()), played)
+    found = torques(FrameEstimator(calibration, fingertip()), played)
     truth = played.torque_at_frames()
     errors = [value - true for value, true in zip(found, truth, strict=True) if value is not None]
     assert len(errors) > 0.6 * len(found)
@@ -83,7 +83,7 @@ def test_both_fingertips_together_follow_another_session(calibration):
 
 def test_a_tare_averages_the_frames_that_follow(calibration):
     played = series(seed=3)
-    estimator = LiveEstimator(calibration, fingertip(baseline_frames=5))
+    estimator = FrameEstimator(calibration, fingertip(baseline_frames=5))
     estimator.tare()
     for number in range(5):
         assert estimator.taring
@@ -96,18 +96,18 @@ def test_a_tare_averages_the_frames_that_follow(calibration):
 def test_dead_channels_leave_the_rest_at_work_and_a_repeated_frame_is_refused(calibration):
     played = series(seed=4)
     dead = np.random.default_rng(0).uniform(size=896) < 0.1
-    found = torques(LiveEstimator(calibration, fingertip()), played, dead=dead)
+    found = torques(FrameEstimator(calibration, fingertip()), played, dead=dead)
     assert np.count_nonzero([value is not None for value in found]) > 0.6 * len(found)
     elsewhere = replace(played, channels=np.where(dead, 0.3, played.channels))
-    again = torques(LiveEstimator(calibration, fingertip()), elsewhere, dead=dead)
+    again = torques(FrameEstimator(calibration, fingertip()), elsewhere, dead=dead)
     assert again == found, "the values of dead channels do not matter"
     pair = [frame(0, channels, repeated=True) for channels in played.channels[0]]
-    estimate = estimated(LiveEstimator(calibration, fingertip()), *pair)
+    estimate = estimated(FrameEstimator(calibration, fingertip()), *pair)
     assert estimate.reasons == ("the board sent the same frame again",)
 
 
 def test_a_bank_adds_k_sigma_and_heatmaps(calibration, tiny_bank):
-    estimator = LiveEstimator(calibration, fingertip(bank=str(tiny_bank), matching="zero_lag"))
+    estimator = FrameEstimator(calibration, fingertip(bank=str(tiny_bank), matching="zero_lag"))
     played = series(seed=3)
     gripped = int((IDLE_S + 12.0) / PERIOD_S)
     for number in range(gripped):

@@ -15,7 +15,7 @@ from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.fingertip_task import (
     CombinedFingertips,
-    FingertipEstimates,
+    FingertipPipeline,
     FingertipTask,
 )
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S, Frame
@@ -108,8 +108,8 @@ def frame(number: int, arrives_ns: int | None = None) -> Frame:
 
 def estimates(
     name: str, publisher: RecordingPublisher, estimator: FakeEstimator, clock: Clock | None = None, **options: Any
-) -> FingertipEstimates:
-    return FingertipEstimates(name, estimator, publisher, clock or Clock(), **options)
+) -> FingertipPipeline:
+    return FingertipPipeline(name, estimator, publisher, clock or Clock(), **options)
 
 
 def fingertip(

@@ -10,8 +10,8 @@ from typing import TypeAlias
 
 import pytest
 
+from shearloop.daemon.executors import ProcessExecutor
 from shearloop.daemon.process import raise_ending_signals
-from shearloop.daemon.workers import ProcessExecutor
 
 # From a signal and what it interrupts to the process in which a task was.
 Interrupted: TypeAlias = Callable[[signal.Signals, Callable[[], object]], int]

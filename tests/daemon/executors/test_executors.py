@@ -14,9 +14,9 @@ import pytest
 
 from shearloop.daemon.cli import main
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.workers import LOCAL, ProcessExecutor, SerialExecutor, open_executor
+from shearloop.daemon.executors import LOCAL, ProcessExecutor, SerialExecutor, open_executor
+from tests.daemon.executors.conftest import dask
 from tests.daemon.test_bank_config import BANK, FINGERTIP
-from tests.daemon.workers.conftest import dask
 
 # Every worker imports this module for its tasks: what takes long to import is imported by the test that needs it.
 
@@ -115,7 +115,7 @@ def test_a_missing_scheduler_is_one_sentence(tmp_path, capsys):
 
 
 def test_a_server_that_is_no_scheduler_times_out(monkeypatch):
-    monkeypatch.setattr("shearloop.daemon.workers.CONNECT_S", 0.5)
+    monkeypatch.setattr("shearloop.daemon.executors.CONNECT_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as deaf:
         address = f"tcp://127.0.0.1:{deaf.getsockname()[1]}"
         with (
@@ -136,7 +136,7 @@ def test_a_scheduler_without_workers_or_a_lost_one_is_one_sentence(lonely, monke
     import distributed
 
     address, (process,) = lonely
-    monkeypatch.setattr("shearloop.daemon.workers.FIRST_WORKER_S", 0.5)
+    monkeypatch.setattr("shearloop.daemon.executors.FIRST_WORKER_S", 0.5)
     with (
         pytest.raises(UserError, match=f"at {address} has no worker; start some with `dask worker"),
         open_executor(address),

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from shearloop.daemon.cli import main
-from shearloop.daemon.workers import DaskExecutor, SerialExecutor, open_executor
+from shearloop.daemon.executors import DaskExecutor, SerialExecutor, open_executor
+from tests.daemon.executors.conftest import STARTED_S
 from tests.daemon.test_bank_config import BANK, FINGERTIP
-from tests.daemon.workers.conftest import STARTED_S
 
 
 @pytest.fixture(scope="module")

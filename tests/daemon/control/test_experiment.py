@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from shearloop.daemon.config_file import load_yaml_model
-from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.step_runner import (
+from shearloop.daemon.control.experiment import (
     ConstantVelocity,
     Experiment,
     ExperimentPhase,
@@ -17,6 +16,7 @@ from shearloop.daemon.control.step_runner import (
     StepCommand,
     TrackTorque,
 )
+from shearloop.daemon.control.experiment_schema import ExperimentFile
 
 TICK_NS = 8_000_000
 STIFFNESS_NM_PER_RAD = 0.2

@@ -17,7 +17,7 @@ from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.emulators.gripper import Gripper, GripperMechanics, ModbusSlave, UrcapSession
 from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
-from shearloop.drivers.robotiq.messages import GripperClient
+from shearloop.drivers.robotiq.messages import GripperClient, GripperCommand, GripperState
 from shearloop.drivers.robotiq.modbus_client import ModbusClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from tests.running import LinkEvents
@@ -44,12 +44,17 @@ class Rig:
         self.steps_left = MOST_STEPS
         return round(self.t_s * 1e9)
 
+    async def hold(self, object_mm: float) -> GripperState:
+        """Grip an object and return the state."""
+        self.model.put_between(object_mm)
+        return await self.driver.finish(await self.driver.move(GripperCommand(0.0)))
+
     def silence(self, silent: bool) -> None:
         self.server.command("silence" if silent else "normal")
 
 
 @contextlib.asynccontextmanager
-async def a_rig(way: str, tmp_path: Path) -> AsyncIterator[Rig]:
+async def a_rig(way: str, tmp_path: Path, *, active: bool = False) -> AsyncIterator[Rig]:
     model = Gripper(MECHANICS)
     server: Server
     client: GripperClient
@@ -81,6 +86,9 @@ async def a_rig(way: str, tmp_path: Path) -> AsyncIterator[Rig]:
     tasks = [asyncio.create_task(pass_time()), asyncio.create_task(server.run())]
     try:
         with patch("shearloop.drivers.robotiq.gripper.time", rig):
+            if active:
+                await driver.connect()
+                await driver.activate()
             yield rig
     finally:
         await driver.close()

@@ -55,11 +55,8 @@ async def test_gripper_activates_moves_and_measures_an_object(way: str, tmp_path
 
 @WAYS
 async def test_old_contact_is_ignored_until_the_command_is_taken_up(way: str, tmp_path: Path) -> None:
-    async with a_rig(way, tmp_path) as rig:
-        await rig.driver.connect()
-        await rig.driver.activate()
-        rig.model.put_between(20.0)
-        await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
+    async with a_rig(way, tmp_path, active=True) as rig:
+        await rig.hold(20.0)
         rig.stopped = True
         sent = await rig.driver.move(messages.GripperCommand(100.0))
         # The registers still say "contact closing" of the motion before.
@@ -72,9 +69,7 @@ async def test_old_contact_is_ignored_until_the_command_is_taken_up(way: str, tm
 
 @WAYS
 async def test_halted_gripper_reports_no_object(way: str, tmp_path: Path) -> None:
-    async with a_rig(way, tmp_path) as rig:
-        await rig.driver.connect()
-        await rig.driver.activate()
+    async with a_rig(way, tmp_path, active=True) as rig:
         sent = await rig.driver.move(messages.GripperCommand(0.0, speed_mm_s=30.0))
         while (await rig.driver.read()).width_mm >= 140:
             pass
@@ -90,10 +85,8 @@ async def test_halted_gripper_reports_no_object(way: str, tmp_path: Path) -> Non
 
 @WAYS
 async def test_major_fault_needs_the_operators_confirmation(way: str, tmp_path: Path) -> None:
-    async with a_rig(way, tmp_path) as rig:
+    async with a_rig(way, tmp_path, active=True) as rig:
         driver = rig.driver
-        await driver.connect()
-        await driver.activate()
         sent = await driver.move(messages.GripperCommand(0.0, speed_mm_s=30.0))
         rig.model.fail(14)
         with pytest.raises(messages.GripperFaultError, match="too much current"):
@@ -110,9 +103,7 @@ async def test_major_fault_needs_the_operators_confirmation(way: str, tmp_path: 
 
 @WAYS
 async def test_overheating_passes_without_activation(way: str, tmp_path: Path) -> None:
-    async with a_rig(way, tmp_path) as rig:
-        await rig.driver.connect()
-        await rig.driver.activate()
+    async with a_rig(way, tmp_path, active=True) as rig:
         rig.model.fail(8)
         with pytest.raises(messages.GripperFaultError, match="too hot"):
             await rig.driver.move(messages.GripperCommand(50.0))
@@ -122,11 +113,8 @@ async def test_overheating_passes_without_activation(way: str, tmp_path: Path) -
 
 @WAYS
 async def test_activating_an_active_gripper_moves_nothing(way: str, tmp_path: Path) -> None:
-    async with a_rig(way, tmp_path) as rig:
-        await rig.driver.connect()
-        await rig.driver.activate()
-        rig.model.put_between(25.0)
-        held = await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
+    async with a_rig(way, tmp_path, active=True) as rig:
+        held = await rig.hold(25.0)
         again = await rig.driver.activate()
         assert again.position_counts == held.position_counts
         assert again.diameter_mm == held.diameter_mm
@@ -159,8 +147,7 @@ async def test_command_of_another_master_is_seen_at_the_next_poll(
     async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
         await anext(states)
         await rig.driver.activate()
-        rig.model.put_between(20.0)
-        await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
+        await rig.hold(20.0)
         rig.stopped = True
         while (await anext(states)).object is not messages.ObjectStatus.CONTACT_CLOSING:
             pass

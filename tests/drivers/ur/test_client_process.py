@@ -40,23 +40,26 @@ def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Non
     return write
 
 
-async def test_error_output_of_a_worker_ended_by_its_alarm_is_quoted(play: Callable[[str], None]) -> None:
-    play("echo 'waiting for the dashboard' >&2; kill -ALRM $$")
+@pytest.mark.parametrize(
+    ("commands", "kind", "cause", "words"),
+    [
+        ("echo 'waiting for the dashboard' >&2; kill -ALRM $$", "hung", "", "waiting for the dashboard"),
+        (
+            "head -c 300000 /dev/zero | tr '\\0' x >&2; echo >&2; echo 'no memory' >&2; exit 3",
+            "crashed", "ended with status 3", "xxx / no memory",
+        ),
+    ],
+)  # fmt: skip
+async def test_error_output_of_an_ended_worker_is_quoted_and_shortened(
+    play: Callable[[str], None], commands: str, kind: str, cause: str, words: str
+) -> None:
+    play(commands)
     link = LinkEvents()
     async with running(settings_for("127.0.0.254"), link) as robot:
         loss = await link.down()
-    assert [*robot.losses] == ["hung"]
-    assert loss.sentence.endswith("Its last words: waiting for the dashboard.")
-
-
-async def test_long_error_output_is_shortened(play: Callable[[str], None]) -> None:
-    play("head -c 300000 /dev/zero | tr '\\0' x >&2; echo >&2; echo 'no memory' >&2; exit 3")
-    link = LinkEvents()
-    async with running(settings_for("127.0.0.254"), link) as robot:
-        loss = await link.down()
-    assert [*robot.losses] == ["crashed"]
-    assert "ended with status 3" in loss.sentence
-    assert loss.sentence.endswith("xxx / no memory.")
+    assert [*robot.losses] == [kind]
+    assert cause in loss.sentence
+    assert loss.sentence.endswith(f"{words}.")
     assert len(loss.sentence) < LAST_WORDS_BYTES + 400
 
 

@@ -14,7 +14,7 @@ from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.boards import LOAD_PERIOD_S, EitKitBoard, Hx711Board, Sketch
 from shearloop.drivers.emulators.gripper import URCAP_PORT, Gripper, GripperPlayer, ModbusSlave, UrcapSession
-from shearloop.drivers.emulators.ports import PtyServer, SocketServer
+from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.drivers.emulators.scene import FloatArray, Joint, Scene, TwinSettings
 from shearloop.drivers.emulators.skin import Gauges, SkinInstruments
 from shearloop.drivers.emulators.ur_controller import FAULTS, Controller
@@ -131,16 +131,14 @@ class EmulatedRig:
             link=run_dir / "load-cell",
             seed=seed,
         )
-        self.skin = (
-            None
-            if skin is None
-            else SkinInstruments(skin, run_dir / "skin-source", run_dir / "skin-daq", speed=speed, seed=seed)
-        )
-        self._played = (*boards.values(), player.server, *([] if self.skin is None else [self.skin]))
+        self._played: list[EitKitBoard | Hx711Board | Server | SkinInstruments] = [*boards.values(), player.server]
         self._commanded: dict[str, Commanded] = {**boards, "gripper": player, "robot": self.controller}
         self.ports = {name: board.port.appearances for name, board in boards.items()}
         self.ports["gripper"] = player.server.appearances
-        if self.skin is not None:
+        self.skin: SkinInstruments | None = None
+        if skin is not None:
+            self.skin = SkinInstruments(skin, run_dir / "skin-source", run_dir / "skin-daq", speed=speed, seed=seed)
+            self._played.append(self.skin)
             self._commanded["skin"] = self.skin
             self.ports |= {"skin-source": self.skin.source_port, "skin-daq": self.skin.daq_port}
 
@@ -155,10 +153,8 @@ class EmulatedRig:
         match text.split():
             case ["kick", jump_nm]:
                 self.scene.kick(_torque(jump_nm))
-            case ["slip"]:
-                self.scene.slip()
-            case ["slip", left_nm]:
-                self.scene.slip(_torque(left_nm))
+            case ["slip", *left_nm] if len(left_nm) < 2:
+                self.scene.slip(*map(_torque, left_nm))
             case ["joint", name] if name in JOINTS:
                 self.scene.put_on(JOINTS[name])
             case ["object", *_]:

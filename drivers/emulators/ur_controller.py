@@ -97,12 +97,8 @@ class Controller:
             case ["stop-hangs", count]:
                 hangs = int(number_between(count, 0, 1000, "not a number of requests from 0 to 1000"))
                 self.faults = replace(self.faults, stop_hangs=hangs)
-            case ["registers-in-use"]:
-                self.faults = replace(self.faults, registers_in_use=True)
-            case ["local-control"]:
-                self.faults = replace(self.faults, local_control=True)
-            case ["refuse-protocol"]:
-                self.faults = replace(self.faults, refuse_protocol=True)
+            case ["registers-in-use" | "local-control" | "refuse-protocol" as fault]:
+                self.faults = replace(self.faults, **{fault.replace("-", "_"): True})
             case ["normal"]:
                 self.robot.clear_faults()
                 self.faults = ConnectionFaults()

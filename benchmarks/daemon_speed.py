@@ -9,132 +9,31 @@ counts from before the last byte is written until the subscriber has the estimat
 
 import argparse
 import contextlib
-import json
 import os
-import pty
-import socket
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-import tty
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 import zmq
-from numpy.typing import NDArray
 
+from benchmarks import common
 from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.sensing.estimators import COMBINED
-from shearloop.drivers.eit_kit import FRAME_PERIOD_S, TRANSFER_NS
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 
 MEASUREMENTS = ("commands", "latency", "flood", "rated")
 REPEATS = 5
-READY_S = 30.0
-# Between frames: long enough for the daemon to be idle again.
-PAUSE_S = 0.03
 FLOOD_HZ = 500.0
-USB_PACKET_BYTES = 512
 # Before processor time counts: until everything is connected.
 SETTLING_S = 10.0
-# Idle frames to skip, and the number of frames until the default estimator is valid in the grip.
-FIRST_FRAME, FIRST_VALID_FRAME = 12, 28
-
-
-class PlayedBoard:
-    """An EIT board at the other end of a pseudo-terminal; the benchmark writes its lines."""
-
-    def __init__(self, link: Path) -> None:
-        """Open a pseudo-terminal and link to it."""
-        self._master, self._slave = pty.openpty()
-        tty.setraw(self._slave)
-        link.symlink_to(os.ttyname(self._slave))
-
-    def wait_for_start(self) -> None:
-        """Wait until the daemon has started the board."""
-        os.read(self._master, 16)
-
-    def send(self, line: bytes) -> int:
-        """Write bytes; return the time in ns just before the last of them was written."""
-        while line:
-            sent_ns = time.monotonic_ns()
-            line = line[os.write(self._master, line) :]
-        return sent_ns
-
-    def send_in_packets(self, line: bytes) -> int:
-        """Write a line in high-speed USB packets, over a Teensy 4's transfer time."""
-        begun = time.monotonic_ns()
-        for start in range(0, len(line), USB_PACKET_BYTES):
-            # Busy: a sleep would be a tenth of a millisecond too long.
-            while time.monotonic_ns() - begun < TRANSFER_NS * start // len(line):
-                continue
-            sent = self.send(line[start : start + USB_PACKET_BYTES])
-        return sent
-
-    def close(self) -> None:
-        """Close both ends."""
-        os.close(self._master)
-        os.close(self._slave)
-
-
-def line_text(values: NDArray[np.float64]) -> bytes:
-    """Return the bytes that a board sends for 1024 values in volts."""
-    return b"".join(b"%.4f, " % value for value in values.tolist()) + b"\n"
-
-
-def write_config(folder: Path, **content: Any) -> Path:
-    """Write a daemon configuration with sockets in the folder, and return its path."""
-    path = folder / "daemon.yaml"
-    sockets = {"publish": f"ipc://{folder}/publish", "commands": f"ipc://{folder}/commands"}
-    path.write_text(yaml.safe_dump({**sockets, **content}))
-    return path
-
-
-@contextlib.contextmanager
-def running_daemon(config: Path) -> Iterator[tuple[int, float]]:
-    """Run a daemon in its own process; yield its process id and the seconds until it was ready."""
-    folder = config.parent
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready, (folder / "daemon.log").open("wb") as log:
-        ready.bind(str(folder / "notify"))
-        ready.settimeout(READY_S)
-        # Let Python keep its compiled modules, as an installation does.
-        kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-        begun = time.monotonic()
-        process = subprocess.Popen(
-            [sys.executable, "-m", "shearloop", "run", str(config)],
-            env={**kept, "NOTIFY_SOCKET": str(folder / "notify")},
-            stderr=log,
-        )
-        try:
-            while b"READY=1" not in ready.recv(4096):
-                continue
-            yield process.pid, time.monotonic() - begun
-        finally:
-            process.terminate()
-            process.wait(READY_S)
-
-
-@contextlib.contextmanager
-def subscription(folder: Path, topic: str) -> Iterator["zmq.Socket[bytes]"]:
-    """Subscribe to a topic of the daemon; yields when the subscription works."""
-    with zmq.Context() as context, context.socket(zmq.SUB) as subscriber:
-        subscriber.setsockopt(zmq.RCVHWM, 0)
-        subscriber.setsockopt(zmq.RCVTIMEO, 10_000)
-        subscriber.connect(f"ipc://{folder}/publish")
-        subscriber.setsockopt(zmq.SUBSCRIBE, topic.encode())
-        # Health comes once a second and shows that the daemon knows the subscriptions.
-        subscriber.setsockopt(zmq.SUBSCRIBE, b"health")
-        while subscriber.recv_multipart()[0] != b"health":
-            continue
-        if topic != "health":
-            subscriber.setsockopt(zmq.UNSUBSCRIBE, b"health")
-        yield subscriber
 
 
 def receive(subscriber: "zmq.Socket[bytes]") -> tuple[int, dict[str, Any]]:
@@ -165,8 +64,8 @@ def resident_mb(pid: int) -> float:
 
 def recorded_lines(rig: Path, side: str, n: int) -> list[bytes]:
     """Return n lines of one board from the emulated rig's recording: idle ones, then a gripped tool being twisted."""
-    lines = [line_text(one) for one in read_recording(rig / "rig-25mm.mcap").sides[side].lines[FIRST_FRAME:]]
-    return list(islice(cycle(lines), n))
+    recorded = read_recording(rig / "rig-25mm.mcap").sides[side].lines[common.FIRST_FRAME :]
+    return list(islice(cycle([common.line_text(values) for values in recorded]), n))
 
 
 def by_bank(args: argparse.Namespace, matching: str) -> dict[str, Any]:
@@ -185,20 +84,23 @@ def by_default(args: argparse.Namespace, sides: Sequence[str]) -> dict[str, Any]
 
 
 @contextlib.contextmanager
-def played(config: dict[str, Any], period_s: float) -> Iterator[tuple[dict[str, PlayedBoard], int, float, Any]]:
+def played(config: dict[str, Any], period_s: float) -> Iterator[tuple[dict[str, common.PlayedBoard], int, float, Any]]:
     """Run a daemon on boards that the benchmark plays; yield them, its process id, ready time, and estimates."""
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as opened:
         folder = Path(name)
-        boards = {
-            side: opened.enter_context(contextlib.closing(PlayedBoard(folder / side))) for side in config["fingertips"]
+        boards = {side: common.PlayedBoard(folder / side) for side in config["fingertips"]}
+        for board in boards.values():
+            opened.callback(board.close)
+        fingertips = {
+            side: {**fingertip, "device": {"path": str(folder / side)}, "frame_period_s": period_s}
+            for side, fingertip in config["fingertips"].items()
         }
-        for side, fingertip in config["fingertips"].items():
-            fingertip |= {"device": {"path": str(folder / side)}, "frame_period_s": period_s}
-        pid, ready_s = opened.enter_context(running_daemon(write_config(folder, **config)))
-        estimates = opened.enter_context(subscription(folder, "eit.estimate"))
+        path = common.write_config(folder, **{**config, "fingertips": fingertips})
+        daemon, ready_s = opened.enter_context(common.running_daemon(path))
+        estimates = opened.enter_context(common.subscription(folder, "eit.estimate"))
         for board in boards.values():
             board.wait_for_start()
-        yield boards, pid, ready_s, estimates
+        yield boards, daemon.pid, ready_s, estimates
 
 
 def latency(config: dict[str, Any], rig: Path, n_frames: int, period_s: float) -> dict[str, dict[str, float]]:
@@ -208,13 +110,13 @@ def latency(config: dict[str, Any], rig: Path, n_frames: int, period_s: float) -
     valid, are not timed; an estimate that does not come within a second is missed.
     """
     sides = list(config["fingertips"])
-    lines = {side: recorded_lines(rig, side, FIRST_VALID_FRAME + n_frames) for side in sides}
+    lines = {side: recorded_lines(rig, side, common.FIRST_VALID_FRAME + n_frames) for side in sides}
     last_sources = {sides[-1], COMBINED} if len(sides) > 1 else {sides[-1]}
     taken: dict[str, list[float]] = {source: [] for source in (*sides, *last_sources)}
     missed, latest = dict.fromkeys(taken, 0), dict.fromkeys(taken, -1)
     with played(config, period_s) as (boards, _, ready_s, estimates):
         estimates.setsockopt(zmq.RCVTIMEO, 1000)
-        for number in range(FIRST_VALID_FRAME + n_frames):
+        for number in range(common.FIRST_VALID_FRAME + n_frames):
             time.sleep(0.5 * period_s)
             for side, board in boards.items():
                 # Two boards do not keep step.
@@ -232,7 +134,7 @@ def latency(config: dict[str, Any], rig: Path, n_frames: int, period_s: float) -
                     if source in awaited and estimate["frame"] > latest[source]:
                         awaited.remove(source)
                         latest[source] = estimate["frame"]
-                        if number >= FIRST_VALID_FRAME and (estimate["valid"] or estimate["k"] is not None):
+                        if number >= common.FIRST_VALID_FRAME and (estimate["valid"] or estimate["k"] is not None):
                             taken[source].append((arrived_ns - sent_ns) / 1e6)
     return {
         source: {
@@ -272,45 +174,29 @@ def rated(bank: Path, rig_bank: Path, seconds: float) -> dict[str, float]:
     """Return processor time and memory with the whole emulated rig at its rated speeds, recording."""
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as opened:
         folder = Path(name)
-        host = f"127.{os.getpid() >> 14 & 63 | 192}.{os.getpid() >> 7 & 127}.{1 + os.getpid() % 128}"
-        robot = yaml.safe_load(Path("config/demo_ur.yaml").read_text())
-        (folder / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": host}))
         fingertip = {"bank": str(bank.resolve()), "matching": "all_lags"}
-        config = write_config(
+        config = common.write_rig_config(
             folder,
+            "config/demo_ur.yaml",
             fingertips={side: {"device": {"path": f"eit-{side}"}, **fingertip} for side in ("left", "right")},
             load_cell={"device": {"path": "load-cell"}},
-            robot="ur.yaml",
-            gripper={"socket": {"host": host}},
             recording={"folder": str(folder / "recordings")},
         )
-        rig = opened.enter_context(
-            subprocess.Popen(
-                [
-                    *(sys.executable, "-m", "shearloop", "emulate", "rig", "--bank", str(rig_bank.resolve())),
-                    *("--run-dir", str(folder), "--host", host, "--paper-sketch"),
-                ],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-            )
-        )
-        opened.callback(rig.terminate)
-        if rig.stdout is not None:
-            rig.stdout.readline()
-        pid, ready_s = opened.enter_context(running_daemon(config))
-        health = opened.enter_context(subscription(folder, "health"))
+        opened.enter_context(common.emulated_rig(folder, rig_bank, "--paper-sketch"))
+        daemon, ready_s = opened.enter_context(common.running_daemon(config))
+        health = opened.enter_context(common.subscription(folder, "health"))
         _listen(health, SETTLING_S)
-        before, begun = {each: cpu_s(each) for each in process_tree(pid)}, time.monotonic()
+        before, begun = {each: cpu_s(each) for each in process_tree(daemon.pid)}, time.monotonic()
         _listen(health, seconds)
         took_s = time.monotonic() - begun
         shares = {each: (cpu_s(each) - cpu) / took_s for each, cpu in before.items()}
         memory = {each: resident_mb(each) for each in before}
     return {
         "ready_s": ready_s,
-        "core_share_of_daemon": shares[pid],
-        "core_share_of_robot_worker": sum(shares.values()) - shares[pid],
-        "memory_mb_of_daemon": memory[pid],
-        "memory_mb_of_robot_worker": sum(memory.values()) - memory[pid],
+        "core_share_of_daemon": shares[daemon.pid],
+        "core_share_of_robot_worker": sum(shares.values()) - shares[daemon.pid],
+        "memory_mb_of_daemon": memory[daemon.pid],
+        "memory_mb_of_robot_worker": sum(memory.values()) - memory[daemon.pid],
     }
 
 
@@ -340,16 +226,16 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
             found["build_10000_cells_s"] = command_s(*built)
         found["help_s"] = command_s("--help", repeats=REPEATS)
     if "latency" in args.only:
-        configs: dict[str, Callable[[], dict[str, Any]]] = {
-            "zero_lag": lambda: by_bank(args, "zero_lag"),
-            "all_lags": lambda: by_bank(args, "all_lags"),
-            "default_one_fingertip": lambda: by_default(args, ("right",)),
-            "default_both": lambda: by_default(args, ("right", "left")),
+        configs = {
+            "zero_lag": by_bank(args, "zero_lag"),
+            "all_lags": by_bank(args, "all_lags"),
+            "default_one_fingertip": by_default(args, ("right",)),
+            "default_both": by_default(args, ("right", "left")),
         }
         found["latency"] = {
             name: {
-                "every_30_ms": latency(config(), args.rig, args.frames, PAUSE_S),
-                "at_the_boards_rate": latency(config(), args.rig, args.frames // 3, FRAME_PERIOD_S),
+                "every_30_ms": latency(config, args.rig, args.frames, common.PAUSE_S),
+                "at_the_boards_rate": latency(config, args.rig, args.frames // 3, FRAME_PERIOD_S),
             }
             for name, config in configs.items()
         }
@@ -362,18 +248,14 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     """Measure and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser_of(__doc__)
     parser.add_argument("--bank", type=Path, required=True, help="the fingertips' bank, of 100 × 100 cells")
     parser.add_argument("--rig", type=Path, required=True, help="folder with rig-25mm.mcap, rig*.cal and demo.bank")
     parser.add_argument("--frames", type=int, default=240, help="number of timed frames")
     parser.add_argument("--rated-s", type=float, default=30.0, help="seconds at rated speeds")
     parser.add_argument("--only", nargs="+", choices=MEASUREMENTS, default=MEASUREMENTS)
-    parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
-    text = json.dumps(measure(args), indent=2)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(text + "\n")
-    print(text)
+    print(common.write_figures(args.out, measure(args)))
 
 
 if __name__ == "__main__":

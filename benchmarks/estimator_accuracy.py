@@ -8,12 +8,11 @@ on the emulated rig, calibrated on three to seven cylinders and judged on other 
 diameter_slices and streams. Writes estimators.json, and the default's truth against estimate as estimators.png.
 """
 
-import argparse
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from benchmarks.common import parser_of, table_head, table_row, write_figures
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.errors import BankError
@@ -133,28 +132,20 @@ def other_tools(bank: Path, seed: int, repeats: int) -> Iterator[tuple[int, tupl
             yield len(cylinders_mm), sides, figures_of(tracks)
 
 
-def table_row(*cells: str | float | None) -> str:
-    """Return a Markdown row; numbers get four digits."""
-    return f"| {' | '.join('–' if c is None else c if isinstance(c, str) else f'{c:.4g}' for c in cells)} |"
-
-
 def main() -> None:
     """Measure, print, write, draw."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("recordings", type=Path, help="folder with torque_slices, diameter_slices and streams")
     parser.add_argument("--bank", type=Path, required=True, help="bank for the estimators paper and bank")
     parser.add_argument("--mesh", type=Path, required=True, help="mesh for the estimator reconstruction")
     parser.add_argument("--rig", action="store_true", help="judge tools on the emulated rig too; --bank is the rig's")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     physics = Physics(Bank.open(args.bank), load_mesh(args.mesh))
     names: list[EstimatorName] = ["paper", "bank", "regression", DEFAULT, "reconstruction"]
     found: dict[str, dict[str, Figures]] = {}
     tracks: dict[str, EstimateTrack] = {}
-    print(
-        "| fitted to | estimator | r | RMSE, N·m or mm | bias, N·m | coverage | valid |\n|---|---|---|---|---|---|---|"
-    )
+    print(table_head("fitted to", "estimator", "r", "RMSE, N·m or mm", "bias, N·m", "coverage", "valid"))
     for title, name, track in later_frames(args.recordings, args.out, names, physics):
         figures = figures_of([track])
         found.setdefault(title, {})[name] = figures
@@ -163,7 +154,7 @@ def main() -> None:
         print(table_row(title, name, *columns), flush=True)
         if name == DEFAULT:
             tracks[title] = track
-    print("\n| fitted to | r on the other day | RMSE, N·m | coverage | valid |\n|---|---|---|---|---|")
+    print(table_head("fitted to", "r on the other day", "RMSE, N·m", "coverage", "valid"))
     for title, result in other_day(args.recordings, args.out):
         if isinstance(result, str):
             print(table_row(title, result, None, None, None))
@@ -171,12 +162,12 @@ def main() -> None:
         found[f"{title}, other day"] = {DEFAULT: result}
         print(table_row(title, *(result[key] for key in ("r", "rmse_nm", "coverage_95", "valid_fraction"))))
     if args.rig:
-        print("\n| cylinders | fingertips | diameter RMSE, mm | coverage |\n|---|---|---|---|")
+        print(table_head("cylinders", "fingertips", "diameter RMSE, mm", "coverage"))
         for count, sides, figures in other_tools(args.bank, 5000, 4):
             found.setdefault(f"{count} cylinders", {})[" and ".join(sides)] = figures
             rmse_mm, coverage = figures["diameter_rmse_mm"], figures["diameter_coverage_95"]
             print(table_row(count, " and ".join(sides), rmse_mm, coverage), flush=True)
-    (args.out / "estimators.json").write_text(json.dumps(found, indent=1) + "\n")
+    write_figures(args.out / "estimators.json", found)
     title = f"{DEFAULT}, on frames later than its fit"
     draw_tracks(list(tracks.values()), [f"fitted to {name}" for name in tracks], title, args.out / "estimators.png")
 

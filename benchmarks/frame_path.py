@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Iterator, Sequence
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
@@ -31,7 +31,7 @@ import zmq.asyncio
 from numpy.typing import NDArray
 
 import shearloop
-from benchmarks.daemon_speed import FIRST_FRAME, FIRST_VALID_FRAME, PAUSE_S, PlayedBoard, line_text, write_config
+from benchmarks import common
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli.calibrate_demo import calibrate, record
 from shearloop.daemon.config import load_daemon_config
@@ -46,19 +46,7 @@ SEED = 7
 DIAMETERS_MM = (17.5, 20.0, 25.0)
 TRACED = 5
 RECEIVE_MS = 60_000
-EXPERIMENT = {
-    "name": "hold 0.05 N·m",
-    "torque_source": SIDE,
-    "limits": {"torque_nm": 0.25, "angle_rad": 1.5},
-    "steps": [
-        {"do": "release", "timeout_s": 15},
-        {"do": "tare", "timeout_s": 30},
-        {"do": "grip", "width_mm": 5, "force_n": 60, "timeout_s": 15},
-        {"do": "wait", "wait_s": 8},
-        {"do": "identify", "amplitude_rad": 0.15, "timeout_s": 180},
-        {"do": "hold_torque", "torque_nm": 0.05, "ramp_nm_per_s": 0.02, "hold_s": 60, "timeout_s": 60},
-    ],
-}
+EXPERIMENT = Path("config/experiments/hold_torque.yaml")
 
 
 class Trace:
@@ -68,15 +56,16 @@ class Trace:
         self.recording = False
         self.calls: list[CodeType] = []
 
-    def install(self) -> None:
+    @contextlib.contextmanager
+    def installed(self) -> Iterator[None]:
         """Watch this thread and all that begin later."""
         threading.setprofile(self._on_event)
         sys.setprofile(self._on_event)
-
-    def remove(self) -> None:
-        """Watch nothing."""
-        threading.setprofile(None)
-        sys.setprofile(None)
+        try:
+            yield
+        finally:
+            threading.setprofile(None)
+            sys.setprofile(None)
 
     def _on_event(self, frame: FrameType, event: str, _argument: object) -> None:
         if self.recording and event == "call" and frame.f_code.co_filename.startswith(PACKAGE):
@@ -116,7 +105,9 @@ class CommandTrace(Trace):
 
 
 def make_rig(folder: Path) -> list[NDArray[np.float64]]:
-    """Build the demo's bank and calibrate the default estimator on the emulated rig; return frames of one board."""
+    """Write the emulated rig's bank, calibration and experiment; return frames of one board."""
+    experiment = yaml.safe_load(EXPERIMENT.read_text())
+    (folder / "hold.yaml").write_text(yaml.safe_dump({**experiment, "torque_source": SIDE}, allow_unicode=True))
     build = ("bank", "build", "--config", "config/banks/demo.yaml", "--out", str(folder / "demo.bank"))
     subprocess.run([sys.executable, "-m", "shearloop", *build], check=True, stdout=subprocess.DEVNULL)
     recorded = list(record(folder / "demo.bank", SEED, DIAMETERS_MM))
@@ -125,10 +116,9 @@ def make_rig(folder: Path) -> list[NDArray[np.float64]]:
     return [pair[index] for pair in recorded[-1][1].lines]
 
 
-def fingertip(folder: Path, port: str, period_s: float | None = None) -> dict[str, Any]:
+def fingertip(folder: Path, port: str, **more: float) -> dict[str, Any]:
     """Return the configuration of the fingertip with the default estimator."""
-    device = {"device": {"path": str(folder / port)}, "calibration": str(folder / "right.cal")}
-    return {"fingertips": {SIDE: {**device, **({"frame_period_s": period_s} if period_s is not None else {})}}}
+    return {SIDE: {"device": {"path": str(folder / port)}, "calibration": str(folder / "right.cal"), **more}}
 
 
 @contextlib.asynccontextmanager
@@ -146,96 +136,58 @@ async def running(config: Path, *topics: str) -> AsyncIterator["zmq.asyncio.Sock
             for topic in topics:
                 subscriber.setsockopt(zmq.SUBSCRIBE, topic.encode())
             subscriber.connect(loaded.publish)
-            yield subscriber
-        daemon.stop()
-        await task
+            try:
+                yield subscriber
+            finally:
+                daemon.stop()
+                await task
 
 
-async def trace_frame(folder: Path, lines: Sequence[NDArray[np.float64]]) -> list[CodeType]:
-    """Return the calls of one frame, in order."""
-    ways = []
-    with contextlib.closing(PlayedBoard(folder / "board")) as board:
-        trace = Trace()
-        trace.install()
-        try:
-            config = write_config(folder, **fingertip(folder, "board", PAUSE_S))
-            async with running(config, "eit.estimate", "eit.frame") as subscriber:
-                await asyncio.to_thread(board.wait_for_start)
-                for number, line in enumerate(lines[FIRST_FRAME:]):
-                    await asyncio.sleep(PAUSE_S)
-                    trace.calls, trace.recording = [], number >= FIRST_VALID_FRAME
-                    await asyncio.to_thread(board.send, line_text(line))
-                    received: dict[str, Any] = {}
-                    while len(received) < 2:
-                        topic, payload = await subscriber.recv_multipart()
-                        received[topic.decode()] = payload
-                    trace.recording = False
-                    if trace.calls and msgpack.unpackb(received["eit.estimate"])["valid"]:
-                        ways.append(trace.calls)
-                    if len(ways) == TRACED:
-                        break
-        finally:
-            trace.remove()
-    return shortest(ways)
+async def trace_frame(folder: Path, lines: Sequence[NDArray[np.float64]]) -> list[list[CodeType]]:
+    """Return the calls of each frame, in order."""
+    ways: list[list[CodeType]] = []
+    trace = Trace()
+    with contextlib.closing(common.PlayedBoard(folder / "board")) as board, trace.installed():
+        config = common.write_config(folder, fingertips=fingertip(folder, "board", frame_period_s=common.PAUSE_S))
+        async with running(config, "eit.estimate", "eit.frame") as subscriber:
+            await asyncio.to_thread(board.wait_for_start)
+            for number, line in enumerate(lines[common.FIRST_FRAME :]):
+                await asyncio.sleep(common.PAUSE_S)
+                trace.calls, trace.recording = [], number >= common.FIRST_VALID_FRAME
+                await asyncio.to_thread(board.send, common.line_text(line))
+                received = dict([await subscriber.recv_multipart() for _ in range(2)])
+                trace.recording = False
+                if trace.calls and msgpack.unpackb(received[b"eit.estimate"])["valid"]:
+                    ways.append(trace.calls)
+                if len(ways) == TRACED:
+                    break
+    return ways
 
 
-def write_experiment(folder: Path, host: str) -> Path:
-    """Write the configuration of the emulated rig's experiment, and return its path."""
-    robot = yaml.safe_load(Path("config/demo_ur.yaml").read_text())
-    (folder / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": host}))
-    (folder / "hold.yaml").write_text(yaml.safe_dump(EXPERIMENT, allow_unicode=True))
-    devices = {"robot": "ur.yaml", "gripper": {"socket": {"host": host}}, "experiment": "hold.yaml"}
-    return write_config(folder, **fingertip(folder, "eit-right"), **devices)
-
-
-async def trace_command(folder: Path) -> list[CodeType]:
-    """Return the calls from an estimate to a sent speed, in order."""
-    # Every process has an address of its own, so that several can run at once.
-    host = f"127.{os.getpid() >> 14 & 63 | 192}.{os.getpid() >> 7 & 127}.{1 + os.getpid() % 128}"
-    config = write_experiment(folder, host)
-    rig = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "shearloop", "emulate", "rig", "--bank", str(folder / "demo.bank")),
-        *("--run-dir", str(folder), "--host", host),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-    )
+async def trace_command(folder: Path) -> list[list[CodeType]]:
+    """Return the calls from each estimate to a sent speed, in order."""
+    fingertips = fingertip(folder, "eit-right")
+    config = common.write_rig_config(folder, "config/demo_ur.yaml", fingertips=fingertips, experiment="hold.yaml")
     trace = CommandTrace()
-    try:
-        if rig.stdout is not None:
-            await rig.stdout.readline()
+    with common.emulated_rig(folder, folder / "demo.bank"), contextlib.ExitStack() as installed:
         async with running(config, "loop.state") as subscriber:
-            trace.install()
             while len(trace.ways) < TRACED:
                 state = msgpack.unpackb((await subscriber.recv_multipart())[1])
-                trace.recording = state["step_name"] == "hold_torque" and state["phase"] == "running"
                 if state["phase"] not in ("idle", "running", "held"):
                     raise RuntimeError(f"the experiment ended before it was traced: {state['activity']}")
-            trace.remove()
-    finally:
-        trace.remove()
-        with contextlib.suppress(ProcessLookupError):
-            rig.terminate()
-        await rig.wait()
-    return shortest(trace.ways)
+                if not trace.recording and state["step_name"] == "hold_torque":
+                    trace.recording = True
+                    # Not before: it slows the loop.
+                    installed.enter_context(trace.installed())
+    return trace.ways
 
 
-def shortest(ways: Sequence[list[CodeType]]) -> list[CodeType]:
-    """Return the calls with the fewest distinct functions."""
-    return min(ways, key=lambda calls: len(set(calls)))
-
-
-def module_of(code: CodeType) -> str:
-    """Return a function's module, as a path in the package."""
-    return code.co_filename.removeprefix(PACKAGE)
-
-
-def diagram(calls: Sequence[CodeType]) -> str:
+def by_module(calls: Sequence[CodeType]) -> dict[str, dict[str, None]]:
     """Return the modules in the order of their first call, each with its functions in that order."""
     functions: dict[str, dict[str, None]] = {}
     for code in calls:
-        functions.setdefault(module_of(code), {})[code.co_qualname] = None
-    width = max(map(len, functions))
-    return "\n".join(f"{module:<{width}}  {' · '.join(names)}" for module, names in functions.items())
+        functions.setdefault(code.co_filename.removeprefix(PACKAGE), {})[code.co_qualname] = None
+    return functions
 
 
 def main() -> None:
@@ -246,24 +198,15 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         lines = make_rig(folder)
-        frame = asyncio.run(trace_frame(folder, lines))
-        command = asyncio.run(trace_command(folder))
-    counts = {
-        "functions": len(set(frame)),
-        "modules": len({module_of(code) for code in frame}),
-        "calls": len(frame),
-        "command_functions": len(set(command)),
-        "command_modules": len({module_of(code) for code in command}),
-    }
-    if args.json:
-        print(json.dumps(counts))
-        return
-    print("One frame: {functions} functions in {modules} modules, {calls} calls\n".format(**counts))
-    print(diagram(frame))
-    print(
-        "\nAn estimate to a sent speed: {command_functions} functions in {command_modules} modules\n".format(**counts)
-    )
-    print(diagram(command))
+        traced = {"": asyncio.run(trace_frame(folder, lines)), "command_": asyncio.run(trace_command(folder))}
+    counts: dict[str, int] = {}
+    for name, ways in traced.items():
+        calls = min(ways, key=lambda way: len(set(way)))
+        found = by_module(calls)
+        counts |= {f"{name}functions": len(set(calls)), f"{name}modules": len(found), f"{name}calls": len(calls)}
+        if not args.json:
+            print(*(f"{module:<40}  {' · '.join(functions)}" for module, functions in found.items()), "", sep="\n")
+    print(json.dumps(counts))
 
 
 if __name__ == "__main__":

@@ -8,8 +8,6 @@ EIDORS needs MATLAB or Octave, so its time is cited. `--every N` also checks eve
 reference matchers, with runner-up, which takes a tenth of a second a frame and more.
 """
 
-import argparse
-import json
 import os
 import statistics
 from collections.abc import Callable, Iterator, Mapping
@@ -23,6 +21,7 @@ import numpy as np
 from scipy import fft
 from scipy.io import loadmat
 
+from benchmarks.common import parser_of, write_figures
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import MIN_SIGNAL_NORM, Bank
 from shearloop.bank.eit.channels import N_CHANNELS, N_LINE_VALUES, channels_of_line
@@ -204,13 +203,12 @@ def spread(values: list[float]) -> dict[str, float]:
 
 def main() -> None:
     """Measure all and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--bank", type=Path, required=True, help="a bank of 100 × 100 cells")
     parser.add_argument("--mesh", type=Path, default=Path("config/fingertips/paper.yaml"))
     parser.add_argument("--recordings", type=Path, required=True, help="folder with slices and streams")
     parser.add_argument("--turns", type=int, default=7)
     parser.add_argument("--every", type=int, default=0, metavar="N", help="check every N-th frame (default: none)")
-    parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
     bank, slices = Bank.open(args.bank), recorded_slices(args.recordings)
     frames = slices[np.linspace(0, len(slices) - 1, N_FRAMES).astype(int)]
@@ -227,9 +225,7 @@ def main() -> None:
     }
     if args.every:
         found["like_the_reference"] = compare_with_reference(bank, list(recorded_frames(args.recordings, args.every)))
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(found, indent=2) + "\n")
-    print(json.dumps(found, indent=2))
+    print(write_figures(args.out, found))
 
 
 if __name__ == "__main__":

@@ -9,24 +9,20 @@ killed with SIGKILL in the middle of a fast twist, and the emulated robot report
 folder of `shearloop.daemon.cli.calibrate_demo`, with demo.bank and rig-right.cal.
 """
 
-import argparse
 import json
 import os
 import signal
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
-import zmq
 
-from benchmarks.daemon_speed import write_config
+from benchmarks.common import emulated_rig, parser_of, running_daemon, subscription, write_figures, write_rig_config
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import TOPICS, decode
 
@@ -65,42 +61,22 @@ FAULTS = (
 class RunningRig:
     """One emulated rig and one daemon in processes of their own."""
 
-    def __init__(self, folder: Path, args: argparse.Namespace, stack: ExitStack) -> None:
-        """Start both."""
+    def __init__(self, folder: Path, rig: Path, stack: ExitStack) -> None:
+        """Start both; `rig` is the folder with bank and calibration."""
         self.folder = folder
-        bank = args.rig / "demo.bank"
-        self._rig = stack.enter_context(
-            _process(
-                *("emulate", "rig", "--bank", str(bank), "--run-dir", str(folder), "--host", args.host),
-                *("--paper-sketch", "--unlock-wait-s", "0.5", "--power-on-s", "0.2"),
-                stdin=subprocess.PIPE,
-            )
-        )
-        if self._rig.stdout is None or not self._rig.stdout.readline().startswith(b"rig ready"):
-            raise RuntimeError("the rig did not start")
-        self.daemon = stack.enter_context(_process("run", str(self._write_config(args))))
-        context = stack.enter_context(zmq.Context())
-        self._socket: zmq.Socket[bytes] = stack.enter_context(context.socket(zmq.SUB))
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.connect(f"ipc://{folder}/publish")
-        for topic in ("loop.state", "robot.state", "gripper.state"):
-            self._socket.setsockopt(zmq.SUBSCRIBE, topic.encode())
-
-    def _write_config(self, args: argparse.Namespace) -> Path:
-        shipped = yaml.safe_load(Path("config/ur.yaml").read_text())
-        (self.folder / "ur.yaml").write_text(yaml.safe_dump({**shipped, "host": args.host}))
-        calibration = str((args.rig / "rig-right.cal").resolve())
-        return write_config(
-            self.folder,
-            fingertips={
-                "right": {"device": {"path": "eit-right"}, "estimator": "motion_regression", "calibration": calibration}
-            },
+        waits = ("--unlock-wait-s", "0.5", "--power-on-s", "0.2")
+        self._rig = stack.enter_context(emulated_rig(folder, rig / "demo.bank", "--paper-sketch", *waits))
+        right = {"estimator": "motion_regression", "calibration": str((rig / "rig-right.cal").resolve())}
+        config = write_rig_config(
+            folder,
+            "config/ur.yaml",
+            fingertips={"right": {"device": {"path": "eit-right"}, **right}},
             load_cell={"device": {"path": "load-cell"}},
-            robot="ur.yaml",
-            gripper={"socket": {"host": args.host}},
             # Estimates that disagree are no fault here.
             loop={"disagreement_nm": 1.0, "max_innovation_nm": 1.0},
         )
+        self.daemon, _ = stack.enter_context(running_daemon(config))
+        self._messages = stack.enter_context(subscription(folder, "loop.state", "robot.state", "gripper.state"))
 
     def tell_rig(self, command: str) -> int:
         """Send the rig a command; return the time in ns."""
@@ -117,31 +93,22 @@ class RunningRig:
 
     def wait_for(self, topic: str, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         """Return the first new message of a topic that meets a condition."""
-        while self._socket.poll(0):
-            self._socket.recv_multipart()
+        while self._messages.poll(0):
+            self._messages.recv_multipart()
         end_s = time.monotonic() + DEADLINE_S
-        loop: dict[str, Any] = {}
         while time.monotonic() < end_s and self.daemon.poll() is None:
-            if self._socket.poll(100):
-                name, payload = self._socket.recv_multipart()
-                content = decode(payload)
-                if name == b"loop.state":
-                    loop = content
-                if name.decode() == topic and condition(content):
-                    return content
-        raise RuntimeError(f"no such {topic}; daemon's status {self.daemon.poll()}, latest loop.state {loop}")
+            name, payload = self._messages.recv_multipart()
+            if name == topic.encode() and condition(content := decode(payload)):
+                return content
+        raise RuntimeError(f"no such {topic}; the daemon's status is {self.daemon.poll()}")
 
-    def wait_for_phase(self, phase: str) -> dict[str, Any]:
-        """Return the first loop state in a phase."""
-        return self.wait_for("loop.state", lambda state: state["phase"] == phase)
-
-    def wait_for_event(self, name: str, since_ns: int) -> dict[str, Any]:
-        """Return the first event of the emulated robot with a name, since a moment."""
+    def motion_stopped_ns(self, since_ns: int) -> int:
+        """Return when the emulated robot next stood still, since a moment."""
         for line in self._rig.stdout or ():
             event: dict[str, Any] = json.loads(line) if line.startswith(b"{") else {}
-            if event.get("event") == name and event["t_mono_ns"] >= since_ns:
-                return event
-        raise RuntimeError(f"the rig ended without an event {name} from the robot")
+            if event.get("event") == "motion-stopped" and event["t_mono_ns"] >= since_ns:
+                return int(event["t_mono_ns"])
+        raise RuntimeError("the rig ended before the robot stood still")
 
     def start(self, path: Path) -> None:
         """Start an experiment as soon as possible, unlocking as the operator does."""
@@ -151,16 +118,6 @@ class RunningRig:
                 raise RuntimeError(reply["reason"])
             time.sleep(0.2)
             self.command("unlock")
-
-
-@contextmanager
-def _process(*arguments: str, **options: Any) -> Iterator["subprocess.Popen[bytes]"]:
-    command = [sys.executable, "-m", "shearloop", *arguments]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, **options) as process:
-        try:
-            yield process
-        finally:
-            process.terminate()
 
 
 def _experiment(folder: Path, name: str, *steps: dict[str, Any]) -> Path:
@@ -173,44 +130,34 @@ def _experiment(folder: Path, name: str, *steps: dict[str, Any]) -> Path:
     return path
 
 
-def measure_faults(rig: RunningRig) -> list[dict[str, Any]]:
-    """Cause each fault in a slow twist, cure it, and run a short experiment."""
-    slow = {"do": "twist", "angles_rad": [0.12], "speed_rad_per_s": 0.005, "hold_s": 60}
-    twist = _experiment(rig.folder, "twist", slow)
-    short = _experiment(rig.folder, "short", {"do": "wait", "wait_s": 0.2}, {"do": "release"})
-    found = []
-    for fault in FAULTS:
-        rig.start(twist)
-        rig.wait_for("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.003)
-        began_ns = rig.tell_rig(fault.command)
-
-        def reports(state: dict[str, Any], sentence: str = fault.sentence) -> bool:
-            return sentence in state["reasons"] and state["phase"] in ("held", "stopped")
-
-        state = rig.wait_for("loop.state", reports)
-        after_s = (state["t_mono_ns"] - began_ns) / 1e9
-        then = "running" if fault.passes else "stopped"
-        last = state if state["phase"] == then else rig.wait_for_phase(then)
-        if fault.passes:
-            rig.command("stop")
-        if fault.cure:
-            rig.tell_rig(fault.cure)
-        rig.start(short)
-        end = rig.wait_for("loop.state", lambda s: s["experiment"] == "short" and s["phase"] in ("done", "stopped"))
-        row = {
-            "fault": fault.command,
-            "after_s": after_s,
-            "periods": after_s * (TOPICS[fault.topic].rate_hz or 1.0),
-            "topic": fault.topic,
-            "response": state["response"],
-            "then": last["phase"],
-            "sentence": state["reasons"],
-            "next_experiment": end["phase"],
-        }
-        found.append(row)
-        print(f"{fault.command:18} {after_s * 1e3:7.0f} ms, {row['periods']:5.1f} periods of {fault.topic:14} "
-              f"{state['response']:20} then {end['phase']}", flush=True)  # fmt: skip
-    return found
+def measure_fault(rig: RunningRig, fault: RigFault, twist: Path, short: Path) -> dict[str, Any]:
+    """Cause a fault in a slow twist, cure it, and run a short experiment."""
+    rig.start(twist)
+    rig.wait_for("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.003)
+    began_ns = rig.tell_rig(fault.command)
+    state = rig.wait_for(
+        "loop.state", lambda state: fault.sentence in state["reasons"] and state["phase"] in ("held", "stopped")
+    )
+    after_s = (state["t_mono_ns"] - began_ns) / 1e9
+    then = "running" if fault.passes else "stopped"
+    if state["phase"] != then:
+        rig.wait_for("loop.state", lambda later: later["phase"] == then)
+    if fault.passes:
+        rig.command("stop")
+    if fault.cure:
+        rig.tell_rig(fault.cure)
+    rig.start(short)
+    end = rig.wait_for("loop.state", lambda s: s["experiment"] == "short" and s["phase"] in ("done", "stopped"))
+    return {
+        "fault": fault.command,
+        "after_s": after_s,
+        "periods": after_s * (TOPICS[fault.topic].rate_hz or 1.0),
+        "topic": fault.topic,
+        "response": state["response"],
+        "then": then,
+        "sentence": state["reasons"],
+        "next_experiment": end["phase"],
+    }
 
 
 def measure_kill(rig: RunningRig) -> float:
@@ -222,26 +169,29 @@ def measure_kill(rig: RunningRig) -> float:
     rig.wait_for("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.45)
     killed_ns = time.monotonic_ns()
     os.kill(rig.daemon.pid, signal.SIGKILL)
-    stopped_ns: int = rig.wait_for_event("motion-stopped", killed_ns)["t_mono_ns"]
-    return (stopped_ns - killed_ns) / 1e9
+    return (rig.motion_stopped_ns(killed_ns) - killed_ns) / 1e9
 
 
 def main() -> None:
     """Measure and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--rig", type=Path, required=True, help="folder with demo.bank and rig-right.cal")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--host", default="127.0.0.62")
     args = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        rig = RunningRig(Path(folder), args, stack)
+    found = []
+    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
+        rig = RunningRig(Path(name), args.rig, stack)
         rig.wait_for("robot.state", lambda _: True)
         rig.wait_for("gripper.state", lambda _: True)
-        faults = measure_faults(rig)
+        slow = {"do": "twist", "angles_rad": [0.12], "speed_rad_per_s": 0.005, "hold_s": 60}
+        twist = _experiment(rig.folder, "twist", slow)
+        short = _experiment(rig.folder, "short", {"do": "wait", "wait_s": 0.2}, {"do": "release"})
+        for fault in FAULTS:
+            found.append(measure_fault(rig, fault, twist, short))
+            print("{fault:18} {after_s:7.3f} s, {periods:5.1f} periods of {topic:14} {response:20} "
+                  "then {next_experiment}".format(**found[-1]), flush=True)  # fmt: skip
         stopped_s = measure_kill(rig)
     print(f"SIGKILL: the robot stood still after {stopped_s:.3f} s")
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps({"faults": faults, "sigkill_stopped_after_s": stopped_s}, indent=1) + "\n")
+    write_figures(args.out, {"faults": found, "sigkill_stopped_after_s": stopped_s})
 
 
 if __name__ == "__main__":

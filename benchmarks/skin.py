@@ -13,21 +13,11 @@ from functools import partial
 
 import numpy as np
 
+from benchmarks.common import table_head, table_row
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.skin.characterisation import loading, loop, responses
-from shearloop.bank.skin.membrane import (
-    PAPER_SECTION,
-    loading_response,
-    paper_membrane,
-    section_membrane,
-)
-from shearloop.bank.skin.plane_strain import (
-    MESH_112,
-    MeshSize,
-    condense,
-    gauge_responses,
-    states_along,
-)
+from shearloop.bank.skin.membrane import PAPER_SECTION, loading_response, paper_membrane, section_membrane
+from shearloop.bank.skin.plane_strain import MESH_112, MeshSize, condense, gauge_responses, states_along
 
 NORMAL_N, AMPLITUDE_N = 1.0, 1.0
 MESHES = {56: MeshSize(3, 4, 6, 2, 2), 112: MESH_112, 448: MESH_112.refined(2)}
@@ -58,11 +48,11 @@ def main() -> None:
     reference = two_dimensional(MESH_112.refined(4))
     true_up, true_loop = reference(up), reference(there_and_back)
     scale = abs(true_loop).max()
-    print("| model | µs per step | loading | whole loop |\n|---|---|---|---|")
+    print(table_head("model", "µs per step", "loading", "whole loop"))
     for name, model in models().items():
         step_us = 1e6 * min(timeit.repeat(partial(model, there_and_back), number=1)) / len(there_and_back)
         errors = abs(model(up) - true_up).max() / scale, abs(model(there_and_back) - true_loop).max() / scale
-        print(f"| {name} | {step_us:.1f} | {errors[0]:.3%} | {errors[1]:.3%} |", flush=True)
+        print(table_row(name, step_us, *(f"{error:.3%}" for error in errors)), flush=True)
 
 
 if __name__ == "__main__":

@@ -8,8 +8,6 @@ the default estimator also closes the loop on the rig's own frames from both fin
 so the numbers are the same on every machine.
 """
 
-import argparse
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -18,24 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.common import parser_of, write_figures
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFrame
-from shearloop.daemon.analysis.charts.simulated_loop import (
-    EIT,
-    LOAD_CELL,
-    PERIOD_S,
-    SCENARIOS,
-    LoopScenario,
-    Plant,
-    PlantSample,
-    SimulatedSensor,
-    SimulatedTool,
-    identified,
-    run,
-    settings_for,
-    started_controller,
-)
+from shearloop.daemon.analysis.charts import simulated_loop as sim
 from shearloop.daemon.analysis.creep import Stretch, fit_creep
 from shearloop.daemon.cli.calibrate_demo import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
 from shearloop.daemon.control.loop_inputs import Creep, LoopConfig
@@ -46,7 +31,7 @@ from shearloop.drivers.emulators.gripper import Gripper
 from shearloop.drivers.emulators.rig import SIDES
 from shearloop.drivers.emulators.scene import Joint, Scene, Twin, TwinSettings
 
-PlantOf = Callable[[SimulatedSensor, np.random.Generator], Plant]
+PlantOf = Callable[[sim.SimulatedSensor, np.random.Generator], sim.Plant]
 
 TARGET_NM = 0.10
 BAND = 0.10
@@ -54,7 +39,7 @@ BAND = 0.10
 GEL_NM_PER_RAD = (0.5, 1.1)
 # A stiff gel needs less travel for its identification.
 AMPLITUDE_RAD = 0.12
-TWIN_SCENARIOS = tuple(replace(one, excite=replace(one.excite, amplitude_rad=AMPLITUDE_RAD)) for one in SCENARIOS)
+TWIN_SCENARIOS = tuple(replace(one, excite=replace(one.excite, amplitude_rad=AMPLITUDE_RAD)) for one in sim.SCENARIOS)
 # The shipped experiments' grip force.
 GRIP_FORCE_N = 60.0
 # The recording for the creep's calibration: ten twists of 40 s and the rests between them.
@@ -65,7 +50,7 @@ DIAMETER_MM = 25.0
 
 
 @dataclass(slots=True)
-class TwinPlant(Plant):
+class TwinPlant(sim.Plant):
     """The emulated rig's physics as a plant: a gel that creeps and lags, a grip that slips, a lever.
 
     With `sees_gel` the sensor is a fingertip and sees the gel's shear; otherwise it sees the torque. `creep` corrects
@@ -76,9 +61,9 @@ class TwinPlant(Plant):
     sees_gel: bool = True
     creep: Creep | None = None
 
-    def collect(self) -> list[PlantSample]:
+    def collect(self) -> list[sim.PlantSample]:
         """Return the measurements that have become known, each once."""
-        known = Plant.collect(self)
+        known = sim.Plant.collect(self)
         if self.creep is None:
             return known
         return [
@@ -96,7 +81,7 @@ class TwinPlant(Plant):
 
 
 @dataclass(slots=True)
-class RigPlant(Plant):
+class RigPlant(sim.Plant):
     """The emulated rig with both boards' frames as a plant; an estimator's torques are the measurements."""
 
     frames: RigFrames = field(kw_only=True)
@@ -108,7 +93,7 @@ class RigPlant(Plant):
 
     def __post_init__(self) -> None:
         """Activate the gripper, stay idle, grip, and let the gel settle."""
-        Plant.__post_init__(self)
+        sim.Plant.__post_init__(self)
         gripper = Gripper(object_mm=DIAMETER_MM)
         self.scene = Scene(gripper)
         gripper.write(ACTIVATE)
@@ -141,22 +126,22 @@ class RigPlant(Plant):
             return
         self.estimated += 1
         self.outside_interval += not estimate.torque_low_nm <= true_nm <= estimate.torque_high_nm
-        self._samples.append(PlantSample(estimate.torque_nm, t_mid_s, self.t_s + self.sensor.transfer_s))
+        self._samples.append(sim.PlantSample(estimate.torque_nm, t_mid_s, self.t_s + self.sensor.transfer_s))
 
 
-def step(plant: Plant, scenario: LoopScenario) -> tuple[FloatArray, bool]:
+def step(plant: sim.Plant, scenario: sim.LoopScenario) -> tuple[FloatArray, bool]:
     """Identify the tool and step to TARGET_NM; return the true torques, and whether the margins were refused."""
-    found = identified(plant, scenario)
-    settings = settings_for(found, scenario)
-    controller = started_controller(plant, found, settings)
+    found = sim.identified(plant, scenario)
+    settings = sim.settings_for(found, scenario)
+    controller = sim.started_controller(plant, found, settings)
     while controller.estimator.innovation_nm is None:
-        run(plant, controller, plant.period_s)
+        sim.run(plant, controller, plant.period_s)
     controller.set_point(TARGET_NM)
     refused = margin_refusal(settings, found, LoopConfig()) is not None
-    return run(plant, controller, scenario.hold_s).torque_nm, refused
+    return sim.run(plant, controller, scenario.hold_s).torque_nm, refused
 
 
-def steps(scenario: LoopScenario, seeds: int, plant_of: PlantOf) -> dict[str, float]:
+def steps(scenario: sim.LoopScenario, seeds: int, plant_of: PlantOf) -> dict[str, float]:
     """Return the figures of merit of the true torque after the step, over many seeds."""
     rows, refused = [], 0
     for seed in range(seeds):
@@ -170,7 +155,7 @@ def judge_steps(rows: Sequence[FloatArray], settled_s: float) -> dict[str, float
     """Return the figures of merit of true torques, one row per seed, after the step at time 0."""
     # Rounding of the time makes some rows one sample longer.
     error = np.array([row[: min(map(len, rows))] for row in rows]) / TARGET_NM - 1.0
-    late = error[:, round(settled_s / PERIOD_S) :]
+    late = error[:, round(settled_s / sim.PERIOD_S) :]
     inside = np.abs(late) <= BAND
     return {
         "seeds": float(len(error)),
@@ -188,7 +173,7 @@ def judge_steps(rows: Sequence[FloatArray], settled_s: float) -> dict[str, float
 def calibrated_creep() -> Creep:
     """Return the creep that ten held twists of one gel reveal, with the load cell: a fingertip's calibration."""
     rng = np.random.default_rng(26)
-    plants = [TwinPlant(SimulatedTool(), each, rng) for each in (EIT, LOAD_CELL)]
+    plants = [TwinPlant(sim.SimulatedTool(), each, rng) for each in (sim.EIT, sim.LOAD_CELL)]
     plants[1].sees_gel = False
     series: list[FloatArray] = []
     for plant in plants:
@@ -202,12 +187,12 @@ def calibrated_creep() -> Creep:
     return fit_creep([Stretch(eit_s, shear_nm, np.interp(eit_s, load_s, load_nm))], scale_is_right=True).creep
 
 
-def rig_twin(sensor: SimulatedSensor, rng: np.random.Generator) -> Plant:
+def rig_twin(sensor: sim.SimulatedSensor, rng: np.random.Generator) -> sim.Plant:
     """Return the rig's physics with a gel of random stiffness."""
-    sees_gel = sensor is EIT
+    sees_gel = sensor is sim.EIT
     creep = Creep(calibrated_creep().share, calibrated_creep().time_s) if sees_gel else None
     twin = Twin(TwinSettings(gel_stiffness_nm_per_rad=float(rng.uniform(*GEL_NM_PER_RAD))))
-    return TwinPlant(SimulatedTool(), sensor, rng, twin=twin, sees_gel=sees_gel, creep=creep)
+    return TwinPlant(sim.SimulatedTool(), sensor, rng, twin=twin, sees_gel=sees_gel, creep=creep)
 
 
 def tightened(seed: int) -> tuple[float, float]:
@@ -216,18 +201,18 @@ def tightened(seed: int) -> tuple[float, float]:
     settings = TwinSettings(
         gel_stiffness_nm_per_rad=float(rng.uniform(*GEL_NM_PER_RAD)), joint=Joint.TIGHTENING, tightening_nm_per_rad=0.15
     )
-    plant = TwinPlant(SimulatedTool(), LOAD_CELL, rng, twin=Twin(settings), sees_gel=False)
+    plant = TwinPlant(sim.SimulatedTool(), sim.LOAD_CELL, rng, twin=Twin(settings), sees_gel=False)
     latest_nm = 0.0
     while latest_nm < TIGHTEN_NM:
         plant.step(-TIGHTEN_RAD_PER_S)
         for sample in plant.collect():
             latest_nm = -sample.torque_nm
     # The robot still carries out the speeds sent before the stop.
-    for _ in range(round(1.0 / PERIOD_S)):
+    for _ in range(round(1.0 / sim.PERIOD_S)):
         plant.step(0.0)
     # A fresh gel and the joint, in series.
     stiffness = 1.0 / (1.0 / settings.gel_stiffness_nm_per_rad + 1.0 / settings.joint_stiffness_nm_per_rad)
-    return -plant.torque_nm - TIGHTEN_NM, stiffness * TIGHTEN_RAD_PER_S * LOAD_CELL.period_s
+    return -plant.torque_nm - TIGHTEN_NM, stiffness * TIGHTEN_RAD_PER_S * sim.LOAD_CELL.period_s
 
 
 def measure(seeds: int) -> dict[str, Any]:
@@ -254,7 +239,7 @@ def estimator_in_the_loop(bank: Path, calibration: Calibration, seeds: Sequence[
     rows, plants = [], []
     for seed in seeds:
         plant = RigPlant(
-            SimulatedTool(), EIT, np.random.default_rng((30, seed)),
+            sim.SimulatedTool(), sim.EIT, np.random.default_rng((30, seed)),
             frames=RigFrames(bank, seed), tracker=EstimatorSession(calibration),
         )  # fmt: skip
         rows.append(step(plant, scenario)[0])
@@ -268,18 +253,14 @@ def estimator_in_the_loop(bank: Path, calibration: Calibration, seeds: Sequence[
 
 def main() -> None:
     """Measure and write the numbers."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON file to write")
+    parser = parser_of(__doc__)
     parser.add_argument("--seeds", type=int, default=200)
     parser.add_argument("--bank", type=Path, help="the emulated rig's bank, to close the loop with the estimator too")
     args = parser.parse_args()
     numbers = measure(args.seeds)
     if args.bank is not None:
         numbers["estimator"] = estimator_in_the_loop(args.bank, rig_calibration(args.bank, 7), range(20))
-    text = json.dumps(numbers, indent=2)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(text + "\n")
-    print(text)
+    print(write_figures(args.out, numbers))
 
 
 if __name__ == "__main__":

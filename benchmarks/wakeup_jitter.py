@@ -7,18 +7,16 @@ millisecond, as the daemon's loop does. Two endless computations per processor r
 turns. Prints and writes the lateness in ms: median, 99 %, 99.9 %, worst, and the share later than a whole period.
 """
 
-import argparse
 import asyncio
-import json
 import multiprocessing
 import os
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 
 import numpy as np
 
-from shearloop.daemon.realtime import NICENESS, lock_memory
+from benchmarks.common import parser_of, write_figures
+from shearloop.daemon.process import NICENESS, lock_memory
 
 PERIOD_S = 0.008
 WORK_S = 0.0005
@@ -102,9 +100,8 @@ def lateness(option: str, seconds: float) -> list[float]:
 
 def main() -> None:
     """Measure all options in turn, print and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--seconds", type=float, default=4.0, help="per option and round, of three (default: 4)")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for wakeup_jitter.json")
     args = parser.parse_args()
     late: dict[str, list[float]] = {option: [] for option in OPTIONS}
     for _ in range(ROUNDS):
@@ -117,8 +114,7 @@ def main() -> None:
         missed = float(np.mean(np.array(values) > PERIOD_S))
         found[option] = {"median": p50, "p99": p99, "p99_9": p99_9, "worst": worst, "missed_share": missed}
         print(f"{option:<28}{p50:8.2f}{p99:8.2f}{p99_9:8.2f}{worst:8.2f}{missed:8.1%}")
-    args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "wakeup_jitter.json").write_text(json.dumps(found, indent=1) + "\n")
+    write_figures(args.out / "wakeup_jitter.json", found)
 
 
 if __name__ == "__main__":

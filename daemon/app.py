@@ -15,19 +15,18 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
-from shearloop.daemon.health import HealthReporter, Reporter, TaskFacts
 from shearloop.daemon.messaging.addresses import local_stop_address
 from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import CurveAuthenticator, Refusals, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
+from shearloop.daemon.process import ending_signals
 from shearloop.daemon.recording.recorder import Recorder, daemon_identity
 from shearloop.daemon.rig import Rig, check_experiment, make_gripper, make_loop
 from shearloop.daemon.sensing.estimators import COMBINED, open_combined, open_estimator, torque_sources
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.sensors import SensorBuilder, Sensors
 from shearloop.daemon.service import notify
-from shearloop.daemon.signals import ending_signals
-from shearloop.daemon.supervisor import Supervisor, Task
+from shearloop.daemon.supervisor import HealthReporter, Reporter, Supervisor, Task, TaskFacts
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +65,10 @@ class Daemon:
                 authenticator = CurveAuthenticator(context, config.curve.clients, refusals)
                 opened.callback(authenticator.close)
             self.publisher = opened.enter_context(contextlib.closing(Publisher(context, config.publish, clock, keys)))
-            self.recorder = _open_recorder(config, clock, self.publisher)
-            if self.recorder is not None:
+            self.recorder: Recorder | None = None
+            if config.recording is not None:
+                self.recorder = Recorder(config.recording.folder, daemon_identity(config), clock)
+                self.publisher.add_listener(self.recorder.record_message)
                 opened.callback(self.recorder.close)
             self.health = HealthReporter(self.publisher, self.supervisor, clock)
             self.sensors, self._rig = _build_rig(config, self.publisher, clock, self.recorder, self.supervisor)
@@ -151,15 +152,6 @@ class Daemon:
     def finished(self) -> bool:
         """Whether the experiment that ends the daemon is done; True without one."""
         return self._experiment is None or self._experiment.done or not self._stop_when_done
-
-
-def _open_recorder(config: DaemonConfig, clock: Clock, publisher: Publisher) -> Recorder | None:
-    """Return the recorder of all messages, if one is configured; raises UserError if it cannot write."""
-    if config.recording is None:
-        return None
-    recorder = Recorder(config.recording.folder, daemon_identity(config), clock)
-    publisher.add_listener(recorder.record_message)
-    return recorder
 
 
 def _build_rig(

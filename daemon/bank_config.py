@@ -68,19 +68,15 @@ class OverConfig(ConfigModel):
     @classmethod
     def _turns_less_than_a_quarter(cls, tilt_deg: GridConfig | None) -> GridConfig | None:
         if tilt_deg is not None and not -QUARTER_DEG < tilt_deg.low <= tilt_deg.high < QUARTER_DEG:
-            raise ValueError(
-                f"must be above -{QUARTER_DEG:g} and below {QUARTER_DEG:g} degrees, not from {tilt_deg.low:g} to "
-                f"{tilt_deg.high:g}"
-            )
+            limits = f"must be above -{QUARTER_DEG:g} and below {QUARTER_DEG:g} degrees"
+            raise ValueError(f"{limits}, not from {tilt_deg.low:g} to {tilt_deg.high:g}")
         return tilt_deg
 
     def values(self) -> list[dict[str, float]]:
         """Return every combination by name, the last parameter changing first."""
         grids = {name: grid for name in type(self).model_fields if (grid := getattr(self, name)) is not None}
-        return [
-            dict(zip(grids, chosen, strict=True))
-            for chosen in product(*(grid.values().tolist() for grid in grids.values()))
-        ]
+        combinations = product(*(grid.values().tolist() for grid in grids.values()))
+        return [dict(zip(grids, chosen, strict=True)) for chosen in combinations]
 
 
 # More banks than this fill a disk before anyone notices.
@@ -142,14 +138,8 @@ class FingertipGeometryConfig(ConfigModel):
 
     def fingertip(self) -> Fingertip:
         """Return the fingertip; raises GeometryError for electrodes that are not 32, leave their side or overlap."""
-        return Fingertip(
-            width_cm=self.width_cm,
-            height_cm=self.height_cm,
-            electrode_width_cm=self.electrode_width_cm,
-            contact_impedance=self.contact_impedance,
-            mesh_size_cm=self.mesh_size_cm,
-            electrodes=tuple(ElectrodePlace(run.side, centre) for run in self.electrodes for centre in run.centres_cm),
-        )
+        places = tuple(ElectrodePlace(run.side, centre) for run in self.electrodes for centre in run.centres_cm)
+        return Fingertip(**self.model_dump(exclude={"electrodes"}), electrodes=places)
 
 
 class BankPlan(NamedTuple):
@@ -187,10 +177,8 @@ def load_bank_plans(path: Path) -> dict[str, BankPlan]:
         if (name := _shown(chosen)) in plans:
             raise UserError(f"{path}: two banks of `over` would be named {name}; take fewer values, or further apart")
         mesh = meshes[key]
-        definition = BankDefinition(
-            mesh.digest, config.model, config.k.values(), config.sigma.values(), Variation(**varied)
-        )
-        plans[name] = BankPlan(mesh, definition)
+        grids = config.k.values(), config.sigma.values()
+        plans[name] = BankPlan(mesh, BankDefinition(mesh.digest, config.model, *grids, Variation(**varied)))
     return plans
 
 
@@ -205,9 +193,7 @@ def _mesh_of(path: Path, config: BankConfig, geometry: dict[str, float]) -> Mesh
 
 def load_geometry(path: Path) -> Mesh:
     """Return the mesh of a file: a fingertip's description (.yaml, .yml), an .npz or an EIDORS .mat file."""
-    if path.suffix not in (".yaml", ".yml"):
-        return load_mesh(path)
-    return _fingertip_mesh(path)
+    return _fingertip_mesh(path) if path.suffix in (".yaml", ".yml") else load_mesh(path)
 
 
 def _fingertip_mesh(path: Path, **changed: float) -> Mesh:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.health import HealthReporter
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
 from shearloop.daemon.rig import Rig
 from shearloop.daemon.sensors import Sensors
+from shearloop.daemon.supervisor import HealthReporter
 
 STOP_DELAY_S = 0.05
 
@@ -30,24 +30,15 @@ class Commands:
 
     def handlers(self) -> Mapping[str, Handler]:
         """Return the handler of every command."""
-        return {
-            "tare": self._tare,
-            STATUS: self._status,
-            STOP: self._stop,
-            "start": self._start,
-            "pause": self._pause,
-            "resume": self._resume,
-            "unlock": self._unlock,
-            "set": self._set,
-        }
+        named = {"tare": self._tare, STATUS: self._status, STOP: self._stop, "start": self._start, "set": self._set}
+        return {**named, "pause": self._pause, "resume": self._resume, "unlock": self._unlock}
 
     def open_handlers(self) -> Mapping[str, Handler]:
         """Return the handlers for users of this machine without a key: only `stop` and `status` work."""
 
         async def refuse(_request: Request) -> Reply:
-            raise CommandRefusedError(
-                "this command needs a key: give --key and --server-key; without one only `stop` works"
-            )
+            reason = "this command needs a key: give --key and --server-key; without one only `stop` works"
+            raise CommandRefusedError(reason)
 
         return {name: own if name in (STOP, STATUS) else refuse for name, own in self.handlers().items()}
 

@@ -9,14 +9,7 @@ from pydantic import AfterValidator, Field, model_validator
 from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model
 from shearloop.daemon.control.loop_inputs import LoopConfig
-from shearloop.daemon.messaging.addresses import (
-    COMMAND_ADDRESS,
-    LARGEST_PORT,
-    PUBLISH_ADDRESS,
-    has_valid_port,
-    is_local,
-    network_refusal,
-)
+from shearloop.daemon.messaging import addresses
 
 # Names of other tasks, sources and recordings; a fingertip needs a different one.
 TAKEN_NAMES = frozenset(
@@ -30,8 +23,10 @@ TAKEN_NAMES = frozenset(
 def _known_transport(address: str) -> str:
     if not address.startswith(("ipc://", "tcp://")):
         raise ValueError("must be ipc or a tcp address, for this machine only a loopback one: tcp://127.0.0.1:7761")
-    if not has_valid_port(address):
-        raise ValueError(f"must end in a port, a whole number up to {LARGEST_PORT}, as in tcp://127.0.0.1:7761")
+    if not addresses.has_valid_port(address):
+        raise ValueError(
+            f"must end in a port, a whole number up to {addresses.LARGEST_PORT}, as in tcp://127.0.0.1:7761"
+        )
     return address
 
 
@@ -214,8 +209,8 @@ class EmulatorConfig(ConfigModel):
 class DaemonConfig(ConfigModel):
     """A whole configuration."""
 
-    publish: Address = PUBLISH_ADDRESS
-    commands: Address = COMMAND_ADDRESS
+    publish: Address = addresses.PUBLISH_ADDRESS
+    commands: Address = addresses.COMMAND_ADDRESS
     curve: CurveConfig | None = Field(None, description="keys for addresses that are open to the network")
     fingertips: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], FingertipConfig] = Field(
         default_factory=dict
@@ -239,14 +234,13 @@ class DaemonConfig(ConfigModel):
         if not self.fingertips and self.skin is None:
             raise ValueError("nothing is measured: give `fingertips`, a `skin`, or both")
         if taken := sorted(TAKEN_NAMES & self.fingertips.keys()):
-            raise ValueError(
-                f"a fingertip cannot be named {taken[0]!r}, as another part of the daemon is: try right or left"
-            )
+            text = f"a fingertip cannot be named {taken[0]!r}, as another part of the daemon is"
+            raise ValueError(f"{text}: try right or left")
         if self.combined is not None and len(self.fingertips) < 2:
             raise ValueError("`combined` needs two `fingertips`, named as the sides of its calibration: right and left")
         for key, address in self.network_addresses.items():
             if self.curve is None:
-                raise ValueError(network_refusal(address, key))
+                raise ValueError(addresses.network_refusal(address, key))
         if self.publish == self.commands and not self.publish.endswith(":*"):
             raise ValueError(f"`publish` and `commands` are both {self.publish}; give them different addresses")
         for port, keys in self._ports().items():
@@ -274,8 +268,8 @@ class DaemonConfig(ConfigModel):
     @property
     def network_addresses(self) -> dict[str, str]:
         """The configuration keys and addresses that are open to the network."""
-        addresses = {"publish": self.publish, "commands": self.commands}
-        return {key: address for key, address in addresses.items() if not is_local(address)}
+        both = {"publish": self.publish, "commands": self.commands}
+        return {key: address for key, address in both.items() if not addresses.is_local(address)}
 
 
 def load_daemon_config(path: Path) -> DaemonConfig:

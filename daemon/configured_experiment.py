@@ -77,11 +77,9 @@ class ConfiguredExperiment:
         try:
             experiment = await self._rig.runner.experiment_ended()
             self.done = experiment.phase is ExperimentPhase.DONE
+            phase, reason = experiment.phase.value, experiment.stop_reason
             structlog.get_logger().info(
-                "the experiment has ended",
-                experiment=str(self.path),
-                phase=experiment.phase.value,
-                reason=experiment.stop_reason,
+                "the experiment has ended", experiment=str(self.path), phase=phase, reason=reason
             )
         finally:
             self._end_reported.set()

@@ -20,11 +20,7 @@ RESPONSES = {
     Response.STOP_AND_RELEASE: "stop, the gripper opens",
 }
 _ENVELOPE = ("source", "t_mono_ns")
-_LANGUAGES = (
-    ("Python", "subscriber.py", "python"),
-    ("C++", "subscriber.cpp", "cpp"),
-    ("MATLAB", "subscriber.m", "matlab"),
-)
+_LANGUAGES = {"Python": ("py", "python"), "C++": ("cpp", "cpp"), "MATLAB": ("m", "matlab")}
 
 
 def topics() -> str:
@@ -45,8 +41,8 @@ def commands() -> str:
 def subscribers() -> str:
     """Return the example programs of `docs/examples/`."""
     parts = []
-    for language, name, fence in _LANGUAGES:
-        text = (EXAMPLES / name).read_text(encoding="utf-8").strip()
+    for language, (ending, fence) in _LANGUAGES.items():
+        text = (EXAMPLES / f"subscriber.{ending}").read_text(encoding="utf-8").strip()
         parts.append(f"### {language}\n\n```{fence}\n{text}\n```")
     return "\n\n".join(parts)
 

@@ -103,23 +103,19 @@ def logging_to_stderr(*, json_lines: bool | None = None, level: int = logging.IN
     """Configure structlog for the context: readable lines at a console, JSON under systemd or with `json_lines`."""
     if json_lines is None:
         json_lines = "JOURNAL_STREAM" in os.environ
-    renderer: structlog.typing.Processor = (
-        structlog.processors.JSONRenderer(ensure_ascii=False)
-        if json_lines
-        else structlog.dev.ConsoleRenderer(
-            colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback
-        )
-    )
     processors: list[structlog.typing.Processor] = [
         structlog.contextvars.merge_contextvars,
         structlog.processors.add_log_level,
         structlog.processors.TimeStamper(fmt="iso" if json_lines else "%H:%M:%S.%f", utc=json_lines),
     ]
     if json_lines:
-        processors.append(structlog.processors.format_exc_info)
+        processors += [structlog.processors.format_exc_info, structlog.processors.JSONRenderer(ensure_ascii=False)]
+    else:
+        plain = structlog.dev.plain_traceback
+        processors.append(structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), exception_formatter=plain))
     with closing(NonBlockingWriter(sys.stderr)) as writer:
         structlog.configure(
-            processors=[*processors, renderer],
+            processors=processors,
             wrapper_class=structlog.make_filtering_bound_logger(level),
             logger_factory=structlog.WriteLoggerFactory(cast(TextIO, writer)),
             cache_logger_on_first_use=False,

@@ -6,16 +6,8 @@ from pathlib import Path
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig
 from shearloop.daemon.config_file import load_yaml_model
+from shearloop.daemon.control import experiment_schema
 from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.experiment_schema import (
-    ExperimentFile,
-    GripStep,
-    HoldTorqueStep,
-    IdentifyStep,
-    ReleaseStep,
-    TareStep,
-    check_limits,
-)
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import Creep, TorqueSource
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
@@ -147,15 +139,8 @@ class Rig:
         self.control_loop = loop
         self.gripper = gripper
         self.robot = UrRobot(robot_settings(config.robot), LinkMonitor(DeviceLink("robot", loop)))
-        self.runner = ControlLoopRunner(
-            loop,
-            self.robot,
-            gripper,
-            sensors.values(),
-            publisher,
-            clock,
-            supervisor.dead,
-        )
+        zeroed, dead = sensors.values(), supervisor.dead
+        self.runner = ControlLoopRunner(loop, self.robot, gripper, zeroed, publisher, clock, dead)
         self._recorder = recorder
         # Counts the operator's stops, also while an experiment starts.
         self._stops = 0
@@ -195,15 +180,17 @@ class Rig:
             self.runner.decide_now()
 
 
-def read_experiment(path: Path) -> ExperimentFile:
+def read_experiment(path: Path) -> experiment_schema.ExperimentFile:
     """Return the experiment of a file; raises UserError for an invalid one, or one that exceeds its own limits."""
-    file = load_yaml_model(path, ExperimentFile)
-    if error := check_limits(file):
+    file = load_yaml_model(path, experiment_schema.ExperimentFile)
+    if error := experiment_schema.check_limits(file):
         raise UserError(f"{path}: {error}")
     return file
 
 
-def check_experiment(config: DaemonConfig, sources: Mapping[str, TorqueSource]) -> ExperimentFile | None:
+def check_experiment(
+    config: DaemonConfig, sources: Mapping[str, TorqueSource]
+) -> experiment_schema.ExperimentFile | None:
     """Return the configured experiment, if any; raises UserError if the configured devices cannot run it.
 
     `sources` are all torques but the robot's.
@@ -218,7 +205,7 @@ def check_experiment(config: DaemonConfig, sources: Mapping[str, TorqueSource]) 
         raise UserError(f"{path}: `torque_source: {file.torque_source}` {reason}; there are {', '.join(driving)}")
     if config.gripper is None:
         for number, step in enumerate(file.steps, 1):
-            if isinstance(step, GripStep | ReleaseStep):
+            if isinstance(step, experiment_schema.GripStep | experiment_schema.ReleaseStep):
                 raise UserError(
                     f"{path}: step {number} is `{step.do}`, and no gripper is configured; "
                     "add a `gripper` section to the configuration, or take the step out"
@@ -231,7 +218,7 @@ def check_experiment(config: DaemonConfig, sources: Mapping[str, TorqueSource]) 
     return file
 
 
-def _holds_unidentified(file: ExperimentFile) -> int | None:
+def _holds_unidentified(file: experiment_schema.ExperimentFile) -> int | None:
     """Return the number of the first step that closes the loop on an unidentified tool, or None.
 
     A new grip or a new zero invalidates an identification.
@@ -239,11 +226,11 @@ def _holds_unidentified(file: ExperimentFile) -> int | None:
     identified = False
     for number, step in enumerate(file.steps, 1):
         match step:
-            case IdentifyStep():
+            case experiment_schema.IdentifyStep():
                 identified = True
-            case TareStep() | GripStep() | ReleaseStep():
+            case experiment_schema.TareStep() | experiment_schema.GripStep() | experiment_schema.ReleaseStep():
                 identified = False
-            case HoldTorqueStep() if not identified:
+            case experiment_schema.HoldTorqueStep() if not identified:
                 return number
     return None
 

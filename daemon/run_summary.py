@@ -6,9 +6,10 @@ An emulated rig adds the true torque and the disturbances.
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol, TextIO
+from typing import TYPE_CHECKING, Any, Protocol, TextIO, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
@@ -23,6 +24,8 @@ STAYS_S = 1.0
 # Topics with a torque.
 TORQUES = ("eit.estimate", "load.torque", "skin.shear")
 _ENDS = ("done", "stopped")
+# The time of each disturbance in ns, and its description.
+_Events: TypeAlias = Sequence[tuple[int, str]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +55,13 @@ class _StepSummary:
     wrist_to_rad: float | None = None
 
 
-class _Truth(Protocol):
-    # The true torque so far, None if it is unknown.
-    def torques(self) -> TorqueSeries | None: ...
+class Emulated(Protocol):
+    """An emulated rig; `sent` holds the disturbances, with their times in ns."""
 
-
-class _Disturbances(Protocol):
-    # Time in ns and description.
     sent: list[tuple[int, str]]
+
+    def torques(self) -> TorqueSeries | None:
+        """Return the true torque so far, None if it is unknown."""
 
 
 @dataclass(slots=True)
@@ -68,7 +70,7 @@ class _Run:
     first: Mapping[str, Any]
     last: Mapping[str, Any]
     steps: list[_StepSummary] = field(default_factory=list)
-    identified: tuple[float, float, float] | None = None
+    identified: str = ""
     held_s: float = 0.0
     hold_reasons: Counter[str] = field(default_factory=Counter)
     refused: Counter[str] = field(default_factory=Counter)
@@ -80,13 +82,9 @@ class _Run:
 class RunSummary:
     """Collects every message of a daemon and writes the summary when an experiment ends."""
 
-    def __init__(
-        self, out: "TextIO | NonBlockingWriter", truth: _Truth | None = None, disturbances: _Disturbances | None = None
-    ) -> None:
-        """Write to `out`; an emulated rig has a true torque and disturbances."""
+    def __init__(self, out: "TextIO | NonBlockingWriter", emulated: Emulated | None = None) -> None:
         self._out = out
-        self._truth = truth
-        self._disturbances = disturbances
+        self._emulated = emulated
         self._run: _Run | None = None
 
     def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
@@ -105,9 +103,9 @@ class RunSummary:
         _update(run, content)
         if phase in _ENDS:
             self._run = None
-            truth = self._truth.torques() if self._truth is not None else None
-            events = self._disturbances.sent if self._disturbances is not None else ()
-            self._out.write("\n".join(("", *_lines(run, truth, events), "", "")))
+            rig = self._emulated
+            lines = _lines(run, None, ()) if rig is None else _lines(run, rig.torques(), rig.sent)
+            self._out.write("\n".join(("", *lines, "", "")))
 
 
 def _on_sample(run: _Run, topic: str, content: Mapping[str, Any]) -> None:
@@ -147,10 +145,12 @@ def _update(run: _Run, content: Mapping[str, Any]) -> None:
         if content["hold"] and step.held_from_ns is None:
             step.held_from_ns = now_ns
     if content["stiffness_nm_per_rad"] is not None:
-        run.identified = (content["stiffness_nm_per_rad"], content["delay_s"], content["noise_nm"])
+        text = "   stiffness {stiffness_nm_per_rad:.3f} N·m/rad, delay {delay_s:.2f} s, "
+        text += "noise of one torque {noise_nm:.4f} N·m"
+        run.identified = text.format_map(content)
 
 
-def _lines(run: _Run, truth: TorqueSeries | None, disturbances: Sequence[tuple[int, str]]) -> Iterator[str]:
+def _lines(run: _Run, truth: TorqueSeries | None, events: _Events) -> Iterator[str]:
     done = run.last["phase"] == "done"
     ended, took_s = "done" if done else "STOPPED before its end", _elapsed_s(run.first, run.last)
     yield f"What happened: {run.first['experiment']!r} was {ended}, after {took_s:.0f} s."
@@ -158,9 +158,10 @@ def _lines(run: _Run, truth: TorqueSeries | None, disturbances: Sequence[tuple[i
         yield f"  {run.last['activity']}"
     for step in run.steps:
         took_s = (step.to_ns - step.from_ns) / 1e9
-        yield f"  step {step.number} of {run.first['steps']}  {step.name:<12} {took_s:6.1f} s{_details(step, run)}"
+        details = {"identify": run.identified, "twist": f"   {step.holds} angles held"}.get(step.name, "")
+        yield f"  step {step.number} of {run.first['steps']}  {step.name:<12} {took_s:6.1f} s{details}"
         if step.set_point_nm is not None and step.held_from_ns is not None:
-            here = [event for event in disturbances if step.from_ns <= event[0] <= step.to_ns]
+            here = [event for event in events if step.from_ns <= event[0] <= step.to_ns]
             yield from _held(step, step.set_point_nm, step.held_from_ns, run, truth, here)
         if step.name == "tighten":
             yield from _turned(step, run, truth)
@@ -169,15 +170,6 @@ def _lines(run: _Run, truth: TorqueSeries | None, disturbances: Sequence[tuple[i
 
 def _elapsed_s(first: Mapping[str, Any], last: Mapping[str, Any]) -> float:
     return float(last["t_mono_ns"] - first["t_mono_ns"]) / 1e9
-
-
-def _details(step: _StepSummary, run: _Run) -> str:
-    if step.name == "identify" and run.identified is not None:
-        stiffness, delay_s, noise_nm = run.identified
-        return f"   stiffness {stiffness:.3f} N·m/rad, delay {delay_s:.2f} s, noise of one torque {noise_nm:.4f} N·m"
-    if step.name == "twist":
-        return f"   {step.holds} angles held"
-    return ""
 
 
 def _turned(step: _StepSummary, run: _Run, truth: TorqueSeries | None) -> Iterator[str]:
@@ -197,12 +189,7 @@ def _all_torques(run: _Run, truth: TorqueSeries | None) -> dict[str, TorqueSerie
 
 
 def _held(
-    step: _StepSummary,
-    set_nm: float,
-    from_ns: int,
-    run: _Run,
-    truth: TorqueSeries | None,
-    disturbances: list[tuple[int, str]],
+    step: _StepSummary, set_nm: float, from_ns: int, run: _Run, truth: TorqueSeries | None, events: _Events
 ) -> Iterator[str]:
     driving, held_s = run.first["torque_source"], (step.to_ns - from_ns) / 1e9
     yield f"    set point {set_nm:+.3f} N·m, held for {held_s:.0f} s; torque source: {driving}"
@@ -210,33 +197,30 @@ def _held(
     for name, series in sources.items():
         held = series.between(from_ns, step.to_ns).torque_nm
         if held.size:
-            share = np.mean(np.abs(held - set_nm) <= BAND * abs(set_nm))
-            yield (
-                f"    {name:<10} {held.mean():+.4f} N·m on average, ± {held.std():.4f}, "
-                f"within ± {BAND:.0%} for {share:.0%} of the time"
-            )
+            mean = f"    {name:<10} {held.mean():+.4f} N·m on average, ± {held.std():.4f}"
+            yield f"{mean}, within ± {BAND:.0%} for {np.mean(_in_band(held, set_nm)):.0%} of the time"
     # Judge by the true torque, the load cell or another source, never by the one that drove the loop.
     names = sorted(set(sources) - {driving}, key=lambda name: (name != "true", name != LOAD_CELL, name))
-    if not names:
-        return
-    judge = sources[names[0]]
-    if (reached_s := _recovery_s(judge.between(step.from_ns, step.to_ns), step.from_ns, set_nm)) is not None:
-        yield f"    within ± {BAND:.0%} {reached_s:.1f} s after the set point changed, by {names[0]}"
-    for t_ns, description in disturbances:
-        after = judge.between(t_ns, step.to_ns)
-        if after.torque_nm.size:
-            recovery_s, worst_nm = _recovery_s(after, t_ns, set_nm), float(np.abs(after.torque_nm - set_nm).max())
-            back = (
-                f"back within ± {BAND:.0%} after {recovery_s:.1f} s"
-                if recovery_s is not None
-                else "not back by the end"
-            )
-            yield f"    disturbed after {(t_ns - from_ns) / 1e9:.1f} s ({description}): {worst_nm:.3f} N·m off, {back}"
+    for name in names[:1]:
+        reached_s = _recovery_s(sources[name].between(step.from_ns, step.to_ns), step.from_ns, set_nm)
+        if reached_s is not None:
+            yield f"    within ± {BAND:.0%} {reached_s:.1f} s after the set point changed, by {name}"
+        for t_ns, description in events:
+            after = sources[name].between(t_ns, step.to_ns)
+            if after.torque_nm.size:
+                back_s, worst_nm = _recovery_s(after, t_ns, set_nm), np.abs(after.torque_nm - set_nm).max()
+                back = "not back by the end" if back_s is None else f"back within ± {BAND:.0%} after {back_s:.1f} s"
+                since_s = (t_ns - from_ns) / 1e9
+                yield f"    disturbed after {since_s:.1f} s ({description}): {worst_nm:.3f} N·m off, {back}"
+
+
+def _in_band(torque_nm: FloatArray, set_nm: float) -> NDArray[np.bool_]:
+    return np.abs(torque_nm - set_nm) <= BAND * abs(set_nm)
 
 
 def _recovery_s(series: TorqueSeries, since_ns: float, set_nm: float) -> float | None:
     """Return the time until the torque enters the band and stays there; None if it does not."""
-    inside = np.abs(series.torque_nm - set_nm) <= BAND * abs(set_nm)
+    inside = _in_band(series.torque_nm, set_nm)
     seen = series.t_ns <= series.t_ns[-1:] - STAYS_S * 1e9
     for at in np.flatnonzero(inside & seen):
         stays = inside[(series.t_ns >= series.t_ns[at]) & (series.t_ns <= series.t_ns[at] + STAYS_S * 1e9)]
@@ -250,8 +234,7 @@ def _counted(run: _Run) -> Iterator[str]:
         yield f"  tool diameter {run.first['tool_mm']:g} mm, from the experiment"
     for source, values in run.diameters.items():
         yield f"  diameter by {source}: {np.mean(values):.1f} mm ± {np.std(values):.1f} of one reading"
-    total = sum(run.hold_reasons.values())
-    if total:
+    if run.hold_reasons:
         reasons = "; ".join(f"{count} times {reason}" for reason, count in run.hold_reasons.most_common())
         yield f"  the wrist was held for {run.held_s:.1f} s in all: {reasons}"
     else:
@@ -259,10 +242,6 @@ def _counted(run: _Run) -> Iterator[str]:
     for source, count in run.invalid.items():
         # A source without any torque has another purpose.
         if source in run.torques:
-            total = count + len(run.torques[source])
-            yield f"  {count} of {total} torques of {source} were not valid and not used"
-    if run.refused:
-        for reason, count in run.refused.most_common():
-            yield f"  {count} times {reason}"
-    else:
-        yield "  no command was refused"
+            yield f"  {count} of {count + len(run.torques[source])} torques of {source} were not valid and not used"
+    refused = [f"  {count} times {reason}" for reason, count in run.refused.most_common()]
+    yield from refused or ["  no command was refused"]

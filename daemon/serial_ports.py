@@ -1,10 +1,10 @@
-"""The serial ports of this computer, their USB serial numbers, and whether the user may open them."""
+"""`shearloop ports`: the serial ports, their USB serial numbers, and whether the user may open them."""
 
+import argparse
+import json
 import os
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-
-from serial.tools import list_ports
 
 # USB vendor numbers, as in systemd/60-shearloop.rules.
 BOARDS = {
@@ -37,8 +37,34 @@ class SerialPortInfo:
         return f"{{path: {self.stable_name or self.path}}}"
 
 
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `ports`."""
+    parser.add_argument("--json", action="store_true", help="print them as JSON")
+    parser.epilog = "Shows for each port the `device` for the configuration, which is found in any socket."
+
+
+def run(args: argparse.Namespace) -> int:
+    """List the ports without opening them."""
+    ports = list_serial_ports()
+    if args.json:
+        print(json.dumps([{**asdict(port), "named_by": port.named_by} for port in ports], ensure_ascii=False))
+        return 0
+    if not ports:
+        print("there is no serial port: plug a board in, then look at `sudo dmesg | tail`")
+    for port in ports:
+        print(port.path, port.usb, port.likely or port.description, sep="  ")
+        print(f"    device: {port.named_by}")
+        if not port.serial_number:
+            print("    it has no serial number: leave it in the same socket")
+        if port.error:
+            print(f"    {port.error}")
+    return 0
+
+
 def list_serial_ports() -> list[SerialPortInfo]:
     """Return all USB ports and other ports with a driver."""
+    from serial.tools import list_ports
+
     found = []
     for port in sorted(list_ports.comports()):
         usb = f"{port.vid:04x}:{port.pid:04x}" if port.vid is not None and port.pid is not None else ""

@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
@@ -139,12 +140,10 @@ def _write(target: Path, content: bytes, *, keep: bool = False) -> Step:
         return Step(f"left as it is: {target}")
 
     def write() -> None:
-        try:
+        with _reported(target, "written"):
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(content)
             target.chmod(0o644)
-        except OSError as error:
-            raise _file_error(target, "written", error) from error
 
     return Step(f"{'replace' if exists else 'write'} {target}", write)
 
@@ -157,10 +156,8 @@ def _remove(target: Path, unless_edited: bytes | None = None) -> Step:
         return Step(f"left because it was edited: {target}")
 
     def remove() -> None:
-        try:
+        with _reported(target, "removed"):
             target.unlink()
-        except OSError as error:
-            raise _file_error(target, "removed", error) from error
 
     return Step(f"remove {target}", remove)
 
@@ -170,11 +167,9 @@ def _remove_empty_folder(target: Path) -> Step:
         return Step(f"not there: {target}")
 
     def remove() -> None:
-        try:
+        with _reported(target, "removed"):
             if not any(target.iterdir()):
                 target.rmdir()
-        except OSError as error:
-            raise _file_error(target, "removed", error) from error
 
     return Step(f"remove {target} if it is empty", remove)
 
@@ -186,9 +181,8 @@ def _program(arguments: list[str], purpose: str, *, may_fail: bool = False) -> S
         program = shutil.which(arguments[0])
         if program is None:
             raise UserError(f"there is no program {arguments[0]} on this system; install it and try again")
-        done = subprocess.run(
-            [program, *arguments[1:]], capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL
-        )
+        command = [program, *arguments[1:]]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
         if done.returncode != 0 and not may_fail:
             output = " ".join((done.stderr or done.stdout).split())
             raise UserError(f"`{' '.join(arguments)}` failed with status {done.returncode}: {output}")
@@ -196,6 +190,10 @@ def _program(arguments: list[str], purpose: str, *, may_fail: bool = False) -> S
     return Step(f"run `{' '.join(arguments)}`, which {purpose}", run)
 
 
-def _file_error(path: Path, action: str, error: OSError) -> UserError:
-    cure = "; run it with sudo" if isinstance(error, PermissionError) else ""
-    return UserError(f"{path} cannot be {action}: {error.strerror}{cure}")
+@contextmanager
+def _reported(path: Path, action: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        cure = "; run it with sudo" if isinstance(error, PermissionError) else ""
+        raise UserError(f"{path} cannot be {action}: {error.strerror}{cure}") from error

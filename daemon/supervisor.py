@@ -1,10 +1,19 @@
-"""Restarts crashed tasks after a growing pause, and counts and reports the crashes."""
+"""Runs the daemon's tasks: restarts crashed ones after a growing pause, and publishes the health of all."""
 
 import asyncio
-from dataclasses import dataclass, field
-from typing import Protocol
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import structlog
+
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.messaging.messages import Health, Scalar
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.service import notify
 
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 30.0
@@ -12,6 +21,8 @@ LONGEST_PAUSE_S = 30.0
 RECOVERED_AFTER_S = 60.0
 # Characters of an error in messages; the log has the whole text.
 MAX_ERROR_LENGTH = 300
+HEALTH_PERIOD_S = 1.0
+TaskFacts = Mapping[str, Scalar | Mapping[str, int]]
 
 
 def restart_pause_s(deaths_in_a_row: int) -> float:
@@ -73,3 +84,68 @@ class Supervisor:
             finally:
                 record.alive = False
             await asyncio.sleep(pause_s)
+
+
+@runtime_checkable
+class Reporter(Protocol):
+    """A part of the daemon with values for `health`."""
+
+    def diagnostics(self) -> TaskFacts:
+        """Return the present counters: frames, errors by kind, rate."""
+
+
+class HealthReporter:
+    """Collects the supervisor's records and the tasks' own counters, and publishes them."""
+
+    def __init__(self, publisher: Publisher, supervisor: Supervisor, clock: Clock) -> None:
+        self._publisher = publisher
+        self._supervisor = supervisor
+        self._clock = clock
+        self._reporters: dict[str, Reporter] = {}
+
+    def add(self, name: str, reporter: Reporter) -> None:
+        """Add a part of the daemon; it is asked for every message."""
+        self._reporters[name] = reporter
+
+    def tasks(self) -> dict[str, TaskFacts]:
+        """Return the present state of each task."""
+        gathered: dict[str, TaskFacts] = {name: asdict(record) for name, record in self._supervisor.records.items()}
+        for name, reporter in self._reporters.items():
+            gathered[name] = {**gathered.get(name, {}), **reporter.diagnostics()}
+        return gathered
+
+    async def run(self) -> None:
+        """Publish once a second until cancelled."""
+        loop = asyncio.get_running_loop()
+        due_s = measured_s = loop.time()
+        cpu_s = time.process_time()
+        while True:
+            due_s += HEALTH_PERIOD_S
+            await asyncio.sleep(max(0.0, due_s - loop.time()))
+            lag_s = loop.time() - due_s
+            if lag_s > HEALTH_PERIOD_S:
+                # After a long stall, send one late message instead of a burst.
+                due_s = loop.time()
+            used_s, passed_s = time.process_time() - cpu_s, max(loop.time() - measured_s, 1e-9)
+            cpu_s, measured_s = cpu_s + used_s, measured_s + passed_s
+            self._clock.synchronise()
+            # A task that stays dead ends the service: systemd's watchdog is fed only while all are alive.
+            if dead := self._supervisor.dead:
+                notify(f"STATUS=dead, restarting: {', '.join(dead)}")
+            else:
+                notify("WATCHDOG=1", f"STATUS={len(self._supervisor.records)} tasks are alive")
+            self._publisher.publish(
+                Health(
+                    source="daemon",
+                    t_mono_ns=self._clock.now_ns(),
+                    tasks=self.tasks(),
+                    loop_lag_s=lag_s,
+                    memory_mb=resident_memory_mb(),
+                    cpu_percent=100.0 * used_s / passed_s,
+                )
+            )
+
+
+def resident_memory_mb() -> float:
+    """Return the resident memory of this process in megabytes."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6

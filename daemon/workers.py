@@ -44,7 +44,7 @@ class Executor(Protocol):
 
 
 class SerialExecutor:
-    """Runs tasks one after the other in this process."""
+    """Runs tasks in this process."""
 
     def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[tuple[int, R]]:
         """Yield the results in order."""
@@ -62,9 +62,8 @@ class ProcessExecutor:
         """Yield results as they arrive; end the processes at once if the results are no longer wanted."""
         others = active_children()
         tasks: dict[Future[R], int] = {}
-        pool = ProcessPoolExecutor(
-            min(self._count, max(len(items), 1)), get_context("spawn"), initializer=_ignore_terminal
-        )
+        count = min(self._count, max(len(items), 1))
+        pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_ignore_terminal)
         try:
             tasks |= {pool.submit(function, shared, item): number for number, item in enumerate(items)}
             for task in as_completed(list(tasks)):
@@ -113,16 +112,12 @@ class DaskExecutor:
             for task in as_completed(list(tasks)):
                 yield tasks[task], task.result()
         except KilledWorker as error:
-            raise UserError(
-                "one task killed several workers, perhaps for lack of memory; give the workers more memory, or run "
-                "without --cluster"
-            ) from error
+            cure = "give the workers more memory, or run without --cluster"
+            raise UserError(f"one task killed several workers, perhaps for lack of memory; {cure}") from error
         except CancelledError as error:
             # We cancel no task that we wait for, so the scheduler is gone.
-            raise UserError(
-                "the connection to the Dask scheduler was lost; start it and its workers, and run the same command "
-                "again"
-            ) from error
+            cure = "start it and its workers, and run the same command again"
+            raise UserError(f"the connection to the Dask scheduler was lost; {cure}") from error
         finally:
             # The generator may be closed after its client.
             if self._client.status == "running":

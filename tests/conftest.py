@@ -65,6 +65,27 @@ def fonts() -> None:
     figure.savefig(io.BytesIO(), format="svg")
 
 
+@pytest.fixture(scope="session")
+def tiny_bank(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bank of 8 × 8 random signals: scored in a millisecond."""
+    import numpy as np
+
+    from shearloop.bank.eit.bank_file import BankDefinition, write_bank
+
+    path = tmp_path_factory.mktemp("bank") / "tiny.bank"
+    random = np.random.default_rng(1)
+    grid = np.linspace(1.0, 2.0, 8)
+    write_bank(
+        path,
+        BankDefinition("ab" * 32, "gaussian_derivative", grid, grid),
+        random.normal(0.0, 0.3, 896),
+        np.ones((8, 8)),
+        np.ones((8, 8), bool),
+        random.normal(0.0, 0.05, (8, 8, 896)).astype(np.float32),
+    )
+    return path
+
+
 @pytest.fixture
 def few_mixtures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have slices mixed with two foreign frames in place of fifteen: most of a fit, where no interval is judged."""

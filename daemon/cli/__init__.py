@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from typing import NamedTuple, NoReturn, Protocol
 
-from shearloop.daemon.signals import raise_ending_signals, report_interrupt
+from shearloop.daemon.process import raise_ending_signals, report_interrupt
 
 # Our products are small: a BLAS with one thread is faster. Must be set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -29,7 +29,7 @@ COMMANDS = {
     name: Command(f"shearloop.daemon.{module}", summary)
     for name, module, summary in (
         ("run", "cli.run", "run the daemon that a configuration describes"),
-        ("import", "cli.import_", "convert the paper's MATLAB streams into a recording"),
+        ("import", "cli.recording", "convert the paper's MATLAB streams into a recording"),
         ("recording", "cli.recording", "inspect recordings, repair them, and export them as tables"),
         ("replay", "cli.replay", "send a recording through the same estimators again, as if live"),
         ("evaluate", "cli.evaluate", "judge a calibrated estimator on recordings or slices"),
@@ -42,7 +42,7 @@ COMMANDS = {
         ("emulate", "cli.emulate", "emulate a device, byte for byte, on a port of its own"),
         ("bank", "cli.bank", "solve, build, inspect and draw banks of simulated signals"),
         ("doctor", "cli.doctor", "find out what is wrong: files, ports, devices, robot, clock, disk, keys"),
-        ("ports", "cli.ports", "list the serial ports with their serial numbers"),
+        ("ports", "serial_ports", "list the serial ports with their serial numbers"),
         ("keys", "cli.keys", "make the keys for daemon and clients on a network"),
         ("completion", "cli.completion", "print the completion script for bash, zsh or tcsh"),
         ("install", "cli.install", "install the daemon as a service of this computer"),

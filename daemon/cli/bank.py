@@ -18,7 +18,7 @@ from shearloop.daemon.cli.options import (
 )
 from shearloop.daemon.cli.terminal import print_result, progress_bar
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.signals import report_interrupt
+from shearloop.daemon.process import report_interrupt
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -4,13 +4,7 @@ import argparse
 from pathlib import Path
 
 from shearloop.daemon.cli.options import add_connection, add_option, client_keys
-from shearloop.daemon.messaging.addresses import (
-    COMMAND_ADDRESS,
-    COMMAND_TIMEOUT_S,
-    UNLOCK_TIMEOUT_S,
-    needs_keys,
-    stop_address,
-)
+from shearloop.daemon.messaging import addresses
 
 COMMANDS = {
     "tare": "set the zero of the torque sensors, with nothing gripped and no experiment running",
@@ -46,9 +40,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     choices, text = ("always", "on_request"), "for set: compute heatmaps always, or only for subscribers"
     parser.add_argument("--heatmap", choices=choices, help=text)
     add_option(parser, "--experiment", Path, "FILE", "for start (default: that of the configuration)")
-    add_connection(parser, COMMAND_ADDRESS, "the daemon's command address")
-    text = f"time to wait for the reply (default: {COMMAND_TIMEOUT_S:g} s, for unlock {UNLOCK_TIMEOUT_S:g} s)"
-    add_option(parser, "--timeout", float, "S", text)
+    add_connection(parser, addresses.COMMAND_ADDRESS, "the daemon's command address")
+    default = f"{addresses.COMMAND_TIMEOUT_S:g} s, for unlock {addresses.UNLOCK_TIMEOUT_S:g} s"
+    add_option(parser, "--timeout", float, "S", f"time to wait for the reply (default: {default})")
     parser.add_argument("--json", action="store_true", help="print the reply as JSON")
 
 
@@ -66,16 +60,16 @@ def run(args: argparse.Namespace) -> int:
         # The daemon may run in another folder.
         arguments["experiment"] = str(args.experiment.resolve())
     address, keys = args.connect, None
-    if args.name in ("stop", "status") and args.key is None and not needs_keys(address):
+    if args.name in ("stop", "status") and args.key is None and not addresses.needs_keys(address):
         # These two need no key on the daemon's own machine.
-        address = stop_address(address)
+        address = addresses.stop_address(address)
     else:
         keys = client_keys(args)
-    timeout_s = COMMAND_TIMEOUT_S if args.timeout is None else check_timeout_s(args.timeout)
+    timeout_s = addresses.COMMAND_TIMEOUT_S if args.timeout is None else check_timeout_s(args.timeout)
     if args.name == "unlock" and args.timeout is None:
         # A missing daemon is reported without the long timeout.
-        send_command(address, {"command": "status"}, COMMAND_TIMEOUT_S, keys)
-        timeout_s = UNLOCK_TIMEOUT_S
+        send_command(address, {"command": "status"}, addresses.COMMAND_TIMEOUT_S, keys)
+        timeout_s = addresses.UNLOCK_TIMEOUT_S
     reply = send_command(address, {"command": args.name, **arguments}, timeout_s, keys)
     accepted = bool(reply.pop("ok", False))
     if args.json:

@@ -29,16 +29,13 @@ def check_emulators(emulators: "tuple[EmulatorConfig, ...]", config: Path) -> li
 
     options = []
     for number, emulator in enumerate(emulators):
-        if emulator.device not in DEVICES:
-            raise UserError(
-                f"{config}: `emulators[{number}].device` is {emulator.device!r}; there are {', '.join(DEVICES)}"
-            )
+        device, where = emulator.device, f"{config}: `emulators[{number}]"
+        if device not in DEVICES:
+            raise UserError(f"{where}.device` is {device!r}; there are {', '.join(DEVICES)}")
         try:
-            options.append(
-                checked_arguments(emulator.device, (*emulator.arguments, *emulator.synthetic), config.parent)
-            )
+            options.append(checked_arguments(device, (*emulator.arguments, *emulator.synthetic), config.parent))
         except UserError as error:
-            raise UserError(f"{config}: `emulators[{number}].arguments`: {emulator.device}: {error}") from error
+            raise UserError(f"{where}.arguments`: {device}: {error}") from error
     return options
 
 
@@ -125,11 +122,8 @@ class EmulatedDevices:
     def _report_ended(self) -> None:
         for entry in [entry for entry in self._alive if entry[1].poll() is not None]:
             self._alive.remove(entry)
-            structlog.get_logger().error(
-                "an emulated device has ended: restart the daemon to emulate it again",
-                device=entry[0],
-                status=entry[1].returncode,
-            )
+            sentence = "an emulated device has ended: restart the daemon to emulate it again"
+            structlog.get_logger().error(sentence, device=entry[0], status=entry[1].returncode)
 
 
 def _stop(processes: "list[subprocess.Popen[bytes]]") -> None:

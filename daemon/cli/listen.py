@@ -5,7 +5,7 @@ import sys
 
 from shearloop.daemon.cli.options import add_connection, add_option, client_keys
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
-from shearloop.daemon.signals import interrupt_status
+from shearloop.daemon.process import interrupt_status
 
 EPILOG = """
 examples:

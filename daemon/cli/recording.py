@@ -1,4 +1,4 @@
-"""`shearloop recording info|repair|export`: show the content of recordings, repair them, export tables."""
+"""`shearloop recording` and `shearloop import mat`: inspect, repair, export and import recordings."""
 
 import argparse
 import json
@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.options import add_action, add_json, add_option, run_action
+from shearloop.daemon.cli.options import add_action, add_json, add_option, check_overwrite, run_action
 from shearloop.daemon.cli.terminal import print_result, progress_bar
 
 if TYPE_CHECKING:
@@ -17,7 +17,14 @@ run = run_action
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add a sub-parser for each action."""
+    """Add the actions of `recording`, or the formats of `import` to its parser."""
+    if parser.prog.endswith(" import"):
+        formats = parser.add_subparsers(dest="format", metavar="FORMAT", required=True)
+        mat = add_action(formats, "mat", "import the paper's MATLAB streams", _import)
+        add_option(mat, "sources", Path, "SRC", ".mat files of one recording, or its folder", nargs="+")
+        add_option(mat, "--out", Path, "REC", "recording to write, e.g. twist.mcap", required=True)
+        add_json(mat)
+        return
     parts = parser.add_subparsers(dest="part", metavar="WHAT", required=True)
     info = add_action(parts, "info", "show the content of recordings, closed or not", _info)
     add_option(info, "recordings", Path, "REC", "recordings (.mcap or .mcap.partial)", nargs="+")
@@ -89,7 +96,6 @@ def _repair(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace) -> int:
-    from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.recording.export import count_messages, export
 
@@ -105,3 +111,15 @@ def _export(args: argparse.Namespace) -> int:
     with progress_bar(args.format, sum(counts[topic] for topic in topics), "message") as progress:
         written = export(args.recording, args.format, out, topics, progress)
     return print_result({"files": [str(path) for path in written]}, map(str, written), as_json=args.json)
+
+
+def _import(args: argparse.Namespace) -> int:
+    from mcap.writer import MCAP0_MAGIC
+
+    from shearloop.daemon.recording.matlab import import_mat
+
+    check_overwrite(args.out, "a recording", MCAP0_MAGIC)
+    imported = import_mat(args.sources, args.out)
+    counts = [f"{count} frames of the {side} side" for side, count in imported.frames.items()]
+    sentence = f"{args.out}: {', '.join(counts)}, {imported.torques} torques."
+    return print_result({"path": str(args.out), **asdict(imported)}, [sentence, *imported.remarks], as_json=args.json)

@@ -37,8 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run until a signal, `shearloop command stop`, or the end of the experiment (`stop_when_done`)."""
     from shearloop.daemon.logs import NonBlockingWriter, logging_to_stderr
-    from shearloop.daemon.realtime import without_long_collections
-    from shearloop.daemon.signals import ending_signals
+    from shearloop.daemon.process import ending_signals, without_long_collections
 
     # Until the event loop handles the signals: stopping a service that is still starting is no failure.
     for number in ending_signals():
@@ -61,9 +60,9 @@ def _run(
     from shearloop.daemon.cli import EXIT_OK, EXIT_UNFINISHED
     from shearloop.daemon.cli.emulated_devices import EmulatedDevices
     from shearloop.daemon.cli.terminal import EstimatePrinter
-    from shearloop.daemon.health import Reporter
-    from shearloop.daemon.realtime import high_priority, lock_memory
+    from shearloop.daemon.process import high_priority, lock_memory
     from shearloop.daemon.run_summary import RunSummary
+    from shearloop.daemon.supervisor import Reporter
 
     config = _config(args)
     if config.lock_memory:
@@ -91,7 +90,7 @@ def _run(
                 devices=[emulator.device for emulator in config.emulators],
             )
         if args.show:
-            listeners += [EstimatePrinter(out), RunSummary(out, emulated, emulated)]
+            listeners += [EstimatePrinter(out), RunSummary(out, emulated)]
         finished = asyncio.run(run_daemon(config, tuple(listeners), reporters, on_ready))
     if slices is not None:
         out.write(f"{args.slices}: {slices.summary}\n")

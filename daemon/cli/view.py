@@ -40,8 +40,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.bank_config import FingertipGeometryConfig
     from shearloop.daemon.config_file import load_yaml_model
     from shearloop.daemon.logs import logging_to_stderr
-    from shearloop.daemon.web.bridge import DaemonAddress
-    from shearloop.daemon.web.server import default_token_path, load_token, serve
+    from shearloop.daemon.web.server import DaemonAddress, default_token_path, load_token, serve
 
     address = DaemonAddress(args.connect, args.commands, client_keys(args))
     path = args.token_file or default_token_path()

@@ -194,7 +194,7 @@ class ControlLoopRunner:
                 self._velocity.send(Stop(self._acceleration_rad_per_s2))
             if output.action is not None:
                 self._actions.begin(output.action)
-            self._velocity.send(WristSpeed(output.wrist_rad_per_s, self._acceleration_rad_per_s2))
+            self._velocity.send(WristSpeed(output.wrist_rad_per_s, self._acceleration_rad_per_s2, now_ns))
         self._states.publish_loop(self._velocity.sent_rad_per_s, now_ns)
 
     def _stop(self, output: ControlOutput) -> None:

@@ -7,17 +7,17 @@ import time
 from collections import defaultdict
 from collections.abc import AsyncIterator, Awaitable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import zmq
 
 from shearloop.bank.eit.channels import ZERO_SLOTS
 from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.client import send_command
-from shearloop.daemon.messaging.messages import decode
+from shearloop.daemon.messaging.client import receive_messages, send_command
+from shearloop.daemon.messaging.messages import TOPICS
 from shearloop.daemon.rig import make_gripper_client
 from shearloop.daemon.serial_ports import access_error
 from shearloop.drivers.connection import find_port
@@ -39,25 +39,14 @@ class Finding:
     """One check's result. `means` and `next_step` are empty when all is well."""
 
     subject: str
-    state: Literal["good", "note", "trouble"]
     found: str
     means: str = ""
     next_step: str = ""
+    state: Literal["good", "note", "trouble"] = "good"
 
 
-def good(subject: str, found: str) -> Finding:
-    """Return the finding that all is well."""
-    return Finding(subject, "good", found)
-
-
-def note(subject: str, found: str, means: str, next_step: str) -> Finding:
-    """Return the finding that something works, but not as well as it could."""
-    return Finding(subject, "note", found, means, next_step)
-
-
-def trouble(subject: str, found: str, means: str, next_step: str) -> Finding:
-    """Return the finding that something keeps the loop from working."""
-    return Finding(subject, "trouble", found, means, next_step)
+# All is well; something works, but not as well as it could; something keeps the loop from working.
+good, note, trouble = Finding, partial(Finding, state="note"), partial(Finding, state="trouble")
 
 
 def from_error(subject: str, error: Exception | str, means: str) -> Finding:
@@ -77,9 +66,9 @@ def from_file(subject: str, sentence: str, means: str) -> Finding:
 
 async def check_devices(config: DaemonConfig, seconds: float) -> list[Finding]:
     """Open every device, listen to all at once for `seconds`, and return findings in the configuration's order."""
-    checks: list[Awaitable[list[Finding]]] = []
-    for name, fingertip in config.fingertips.items():
-        checks.append(_check_fingertip(name, fingertip, seconds))
+    checks: list[Awaitable[list[Finding]]] = [
+        _check_fingertip(name, fingertip, seconds) for name, fingertip in config.fingertips.items()
+    ]
     if config.load_cell is not None:
         checks.append(_check_load_cell(config.load_cell, seconds))
     if config.skin is not None:
@@ -262,16 +251,13 @@ def daemon_tasks(address: str) -> Mapping[str, Mapping[str, Any]] | None:
 def listen(address: str, seconds: float) -> dict[tuple[str, str], list[Mapping[str, Any]]]:
     """Collect the messages of a local daemon for `seconds`, by topic and source."""
     received: dict[tuple[str, str], list[Mapping[str, Any]]] = defaultdict(list)
-    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.SUBSCRIBE, b"")
-        socket.connect(address)
-        end_s = time.monotonic() + seconds
-        while (left_s := end_s - time.monotonic()) > 0:
-            if socket.poll(int(left_s * 1000) + 1):
-                topic, payload = socket.recv_multipart()[:2]
-                content = decode(payload)
-                received[topic.decode(), str(content.get("source"))].append(content)
+    end_s = time.monotonic() + seconds
+    # `health` comes every second.
+    with contextlib.suppress(UserError):
+        for topic, content in receive_messages(address, (), seconds):
+            received[topic, str(content["source"])].append(content)
+            if time.monotonic() > end_s:
+                break
     return received
 
 
@@ -319,15 +305,13 @@ def check_task(name: str, status: Mapping[str, Any]) -> Finding:
 
 def _expected_rates(config: DaemonConfig) -> dict[tuple[str, str], float]:
     """Return each expected message's rate in Hz, by topic and source."""
-    rates = {("health", "daemon"): 1.0}
-    for name, fingertip in config.fingertips.items():
-        rates["eit.frame", name] = 1.0 / fingertip.frame_period_s
-    if config.load_cell is not None:
-        rates["load.torque", "load_cell"] = config.load_cell.rate_hz
-    if config.skin is not None:
-        rates["skin.shear", "skin"] = config.skin.daq.rate_hz
-    if config.robot is not None:
-        rates["robot.state", "robot"] = 25.0
-    if config.gripper is not None:
-        rates["gripper.state", "gripper"] = 10.0
-    return rates
+    cell, skin = config.load_cell, config.skin
+    rates = {
+        ("health", "daemon"): TOPICS["health"].rate_hz,
+        **{("eit.frame", name): 1.0 / one.frame_period_s for name, one in config.fingertips.items()},
+        ("load.torque", "load_cell"): cell.rate_hz if cell is not None else None,
+        ("skin.shear", "skin"): skin.daq.rate_hz if skin is not None else None,
+        ("robot.state", "robot"): TOPICS["robot.state"].rate_hz if config.robot is not None else None,
+        ("gripper.state", "gripper"): TOPICS["gripper.state"].rate_hz if config.gripper is not None else None,
+    }
+    return {key: rate_hz for key, rate_hz in rates.items() if rate_hz is not None}

@@ -8,6 +8,7 @@ import asyncio
 import time
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import structlog
@@ -37,23 +38,22 @@ class CommandRefusedError(Exception):
     """A command is refused; the message is the reason that the operator reads."""
 
 
+@dataclass(slots=True)
 class TokenBucket:
     """Allows `burst` requests at once and `per_s` requests per second on average."""
 
-    def __init__(self, burst: float, per_s: float) -> None:
-        self._burst = burst
-        self._per_s = per_s
-        self._tokens = burst
-        self._updated_ns = 0
+    burst: float
+    per_s: float
+    used: float = 0.0
+    updated_ns: int = 0
 
     def allow(self, t_ns: int) -> bool:
         """Use one token at monotonic time t_ns; return False if no token is left."""
-        self._tokens = min(self._burst, self._tokens + self._per_s * (t_ns - self._updated_ns) / 1e9)
-        self._updated_ns = t_ns
-        if self._tokens < 1.0:
-            return False
-        self._tokens -= 1.0
-        return True
+        self.used = max(0.0, self.used - self.per_s * (t_ns - self.updated_ns) / 1e9)
+        self.updated_ns = t_ns
+        allowed = self.used <= self.burst - 1.0
+        self.used += allowed
+        return allowed
 
 
 class RateLimit:

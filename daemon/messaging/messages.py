@@ -6,9 +6,9 @@ A message has two ZeroMQ frames: the topic and a msgpack map. Scalars are plain 
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar, TypeAlias, TypeVar, dataclass_transform
 
 import msgpack
 import numpy as np
@@ -38,12 +38,28 @@ class Message:
     t_mono_ns: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+M = TypeVar("M", bound=Message)
+
+# By topic, in the order of this file.
+TOPICS: dict[str, type[Message]] = {}
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(column,))
+def message(topic: str, *, rate_hz: float | None) -> Callable[[type[M]], type[M]]:
+    """Declare the dataclass of a topic."""
+
+    def declare(kind: type[M]) -> type[M]:
+        kind = dataclass(frozen=True, slots=True, kw_only=True)(kind)
+        kind.topic, kind.rate_hz = topic, rate_hz
+        TOPICS[topic] = kind
+        return kind
+
+    return declare
+
+
+@message("eit.frame", rate_hz=1.85)
 class EitFrame(Message):
     """One frame of a fingertip; its time is the middle of the acquisition."""
-
-    topic: ClassVar[str] = "eit.frame"
-    rate_hz: ClassVar[float | None] = 1.85
 
     channels: NDArray[np.floating] = column("V", "the 896 channels in the order of the channel table")
     line: NDArray[np.floating] = column("V", "the 1024 values of the raw line")
@@ -54,12 +70,9 @@ class EitFrame(Message):
     repeated: bool = column("", "whether the line equals the one before it exactly")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@message("eit.estimate", rate_hz=1.85)
 class EitEstimate(Message):
     """The estimate from one frame; torque and diameter are nil unless `valid` is true."""
-
-    topic: ClassVar[str] = "eit.estimate"
-    rate_hz: ClassVar[float | None] = 1.85
 
     torque_nm: float | None = column("N·m", "torque on the tool")
     torque_low_nm: float | None = column("N·m", "lower end of its 95 % interval")
@@ -77,12 +90,9 @@ class EitEstimate(Message):
     latency_s: float = column("s", "from the arrival of the frame's last byte to this message")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@message("eit.heatmap", rate_hz=None)
 class EitHeatmap(Message):
     """The scores of all cells for one frame, NaN for invalid cells; sent only while there is a subscriber."""
-
-    topic: ClassVar[str] = "eit.heatmap"
-    rate_hz: ClassVar[float | None] = None
 
     scores: NDArray[np.floating] = column("", "score of each cell, k by sigma")
     k_low: float = column("cm", "first k of the grid")
@@ -93,12 +103,9 @@ class EitHeatmap(Message):
     frame: int = column("", "number of the frame")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@message("load.torque", rate_hz=10.9)
 class LoadTorque(Message):
     """One reading of the load cell on the lever; the torque can be used only if `valid` is true."""
-
-    topic: ClassVar[str] = "load.torque"
-    rate_hz: ClassVar[float | None] = 10.9
 
     torque_nm: float = column("N·m", "torque on the lever, after tare and scale")
     raw: float = column("", "the number that the board sent")
@@ -108,12 +115,9 @@ class LoadTorque(Message):
     reason: str = column("", "why it is not valid, in a sentence; empty when it is")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@message("skin.shear", rate_hz=10.0)
 class SkinShear(Message):
     """One reading of the shear skin; the force and its interval are nil unless `valid` is true."""
-
-    topic: ClassVar[str] = "skin.shear"
-    rate_hz: ClassVar[float | None] = 10.0
 
     shear_n: float | None = column("N", "shear force on the skin; positive where it stretches gauge 1")
     shear_low_n: float | None = column("N", "lower end of the interval: 95 %, plus the range left open by friction")
@@ -133,12 +137,9 @@ class SkinShear(Message):
     latency_s: float = column("s", "from the reading's arrival to this message")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@message("robot.state", rate_hz=25.0)
 class RobotStateMessage(Message):
     """The state of the robot's controller."""
-
-    topic: ClassVar[str] = "robot.state"
-    rate_hz: ClassVar[float | None] = 25.0
 
     joints_rad: tuple[float, ...] = column("rad", "the six joint angles, base to wrist 3")
     tcp_pose: tuple[float, ...] = column("m, rad", "position and rotation vector of the tool centre in the base frame")
@@ -155,12 +156,9 @@ class RobotStateMessage(Message):
     age_s: float = column("s", "since the controller made the sample, by its own clock against ours")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@message("gripper.state", rate_hz=10.0)
 class GripperStateMessage(Message):
     """The state of the gripper; its width when it stops on an object is a diameter measurement."""
-
-    topic: ClassVar[str] = "gripper.state"
-    rate_hz: ClassVar[float | None] = 10.0
 
     width_mm: float = column("mm", "distance between the fingertips")
     diameter_mm: float | None = column("mm", "the same while an object is held, else nil")
@@ -173,12 +171,9 @@ class GripperStateMessage(Message):
     fault_text: str = column("", "the fault in a sentence; empty for none")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@message("loop.state", rate_hz=1.0)
 class LoopState(Message):
     """The state of the closed loop: setpoints, the command that was sent, and every reason for holding."""
-
-    topic: ClassVar[str] = "loop.state"
-    rate_hz: ClassVar[float | None] = 1.0
 
     phase: str = column("", "idle, running, paused, held, done or stopped")
     experiment: str = column("", "name of the experiment; empty when there is none")
@@ -205,12 +200,9 @@ class LoopState(Message):
     reasons: str = column("", "every reason for holding or stopping, in sentences")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@message("health", rate_hz=1.0)
 class Health(Message):
     """The state of the process and of each of its tasks."""
-
-    topic: ClassVar[str] = "health"
-    rate_hz: ClassVar[float | None] = 1.0
 
     tasks: Mapping[str, Mapping[str, Scalar | Mapping[str, int]]] = column(
         "", "per task: alive, done, restarts, rate_hz, expected_hz, errors by kind, and the latest error in a sentence"
@@ -218,22 +210,6 @@ class Health(Message):
     loop_lag_s: float = column("s", "how late the event loop woke this message's task")
     memory_mb: float = column("MB", "resident memory")
     cpu_percent: float = column("%", "of one core since the message before")
-
-
-TOPICS: dict[str, type[Message]] = {
-    kind.topic: kind
-    for kind in (
-        EitFrame,
-        EitEstimate,
-        EitHeatmap,
-        LoadTorque,
-        SkinShear,
-        RobotStateMessage,
-        GripperStateMessage,
-        LoopState,
-        Health,
-    )
-}
 
 
 def stale_after_s(topic: str) -> float:

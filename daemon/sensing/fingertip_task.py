@@ -15,11 +15,11 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.daemon.health import TaskFacts
 from shearloop.daemon.messaging.messages import EitEstimate, EitFrame, EitHeatmap
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.estimators import LiveEstimator
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters, tool_as_bytes
+from shearloop.daemon.supervisor import TaskFacts
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 

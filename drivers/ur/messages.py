@@ -40,10 +40,14 @@ SAFETY_EMERGENCY_STOPS: Final = (6, 7)
 
 @dataclass(frozen=True, slots=True)
 class WristSpeed:
-    """Turn the tool about its axis. Repeat the command within `command_timeout_s` or the wrist stops."""
+    """Turn the tool about its axis. It holds for `command_timeout_s` after it was decided (monotonic, ns).
+
+    A `decided_ns` of 0 stands for its arrival.
+    """
 
     rad_per_s: float
     acceleration_rad_per_s2: float
+    decided_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,7 +56,7 @@ class _Turn:
     """The wrist turns at the speed last asked for."""
 
     asked: WristSpeed
-    asked_ns: int
+    decided_ns: int
 
 
 @dataclass(slots=True)
@@ -118,6 +118,8 @@ class MotionExecutor:
     def begin(self, motion_id: int, asked: WristSpeed | MoveLinear, sample: RtdeSample, now_ns: int) -> str:
         """Turn the wrist at a speed from now on, or begin a linear move; return why not, or the empty string."""
         match asked, self._motion:
+            case WristSpeed(decided_ns=decided_ns), _ if decided_ns and self._is_too_old(decided_ns, now_ns):
+                return f"The wrist speed was decided {(now_ns - decided_ns) / 1e9:.2f} s ago: the computer is too busy."
             case WristSpeed(_, acceleration), _ if acceleration <= 0:
                 return f"An acceleration of {acceleration:g} rad/s² is not above 0."
             case WristSpeed(), _Braking():
@@ -130,7 +132,7 @@ class MotionExecutor:
                 return "The arm moves: stop it before a linear move."
         self.motion_id, self.end_reason = motion_id, ""
         if isinstance(asked, WristSpeed):
-            self._motion = _Turn(asked, now_ns)
+            self._motion = _Turn(asked, asked.decided_ns or now_ns)
             self._send_clipped_speed(asked, sample)
         else:
             self._end_speed_thread()
@@ -209,10 +211,13 @@ class MotionExecutor:
             case None:
                 self._arm.send_heartbeat()
 
+    def _is_too_old(self, decided_ns: int, now_ns: int) -> bool:
+        return now_ns - decided_ns > self._settings.command_timeout_s * 1e9
+
     def _keep_turning(self, turn: _Turn, sample: RtdeSample, now_ns: int) -> None:
-        if now_ns - turn.asked_ns > self._settings.command_timeout_s * 1e9:
+        if self._is_too_old(turn.decided_ns, now_ns):
             late = f"the wrist speed was not renewed within {self._settings.command_timeout_s:g} s"
-            self.stop_now(sample, now_ns, late, self._settings.limits.wrist_acceleration_rad_per_s2.inner)
+            self.stop_now(sample, now_ns, late)
         else:
             self._send_clipped_speed(turn.asked, sample)
 

@@ -105,10 +105,10 @@ class UrSettings(_Checked):
     rate_hz: float = 125.0
     # The robot ends its program when it receives nothing for 1/watchdog_hz.
     watchdog_hz: float = 10.0
-    # A wrist speed holds for this long; then the wrist stops.
-    command_timeout_s: float = 0.3
-    # Motion stops when the daemon sends nothing for this long.
-    silence_timeout_s: float = 0.3
+    # A wrist speed holds for this long after it was decided; then the wrist stops.
+    command_timeout_s: float = 0.1
+    # Other motion stops when the daemon sends nothing for this long.
+    silence_timeout_s: float = 0.1
     # A sample older than this blocks motion; at three times this age the connection counts as lost.
     state_timeout_s: float = 0.25
     connect_timeout_s: float = 10.0

@@ -177,7 +177,7 @@ def test_two_builds_of_one_target_do_not_mix(fingertip, interrupted):
         build(fingertip, interrupted)
 
 
-def test_a_bank_that_the_disk_has_no_room_for_is_written_from_its_journal_when_there_is(
+def test_a_bank_that_found_no_room_on_the_disk_is_written_from_its_journal_later(
     finished, fingertip, tmp_path, monkeypatch
 ):
     path = tmp_path / "full.bank"

@@ -65,13 +65,13 @@ def noisy(clean, fingertip):
     return design_bank(scene(clean, 6e-5), fingertip)
 
 
-def test_more_noise_asks_for_less_of_everything(quiet, noisy) -> None:
+def test_more_noise_asks_for_less_of_everything(quiet, noisy):
     assert noisy.relative_noise == pytest.approx(3 * quiet.relative_noise, rel=0.05)
     assert noisy.mesh.chosen.setting > quiet.mesh.chosen.setting
     assert noisy.k_count.chosen.setting < quiet.k_count.chosen.setting
 
 
-def test_the_model_that_made_the_frames_is_the_one_that_they_support(quiet) -> None:
+def test_the_model_that_made_the_frames_is_the_one_that_they_support(quiet):
     assert quiet.model == "gaussian_derivative"
     others = [one.penalised for one in quiet.models if one.model != quiet.model]
     assert min(one.penalised for one in quiet.models) < 0.7 * min(others)
@@ -95,7 +95,7 @@ def before(choice: DesignChoice) -> float:
     return choice.steps[choice.steps.index(choice.chosen) - 1].setting
 
 
-def test_a_bank_with_as_many_cells_as_chosen_misses_no_frame_by_more_than_a_third_of_the_noise(quiet, forward) -> None:
+def test_a_bank_with_as_many_cells_as_chosen_misses_no_frame_by_more_than_a_third_of_the_noise(quiet, forward):
     """Frames between the cells are looked for in the whole bank: with fewer cells some are further off than that."""
     ends = {"k": quiet.k_range, "sigma": quiet.sigma_range}
     middle = {name: sum(one) / 2 for name, one in ends.items()}
@@ -111,9 +111,7 @@ def test_a_bank_with_as_many_cells_as_chosen_misses_no_frame_by_more_than_a_thir
         assert worst(before(choice)) > 0.85 * ALLOWED
 
 
-def test_the_mesh_is_within_a_third_of_the_noise_of_a_much_finer_one_and_the_one_before_is_not(
-    noisy, fingertip
-) -> None:
+def test_the_mesh_is_within_a_third_of_the_noise_of_a_much_finer_one_and_the_one_before_is_not(noisy, fingertip):
     place = (sum(noisy.k_range) / 2, sum(noisy.sigma_range) / 2)
 
     def signal(size: float) -> np.ndarray:
@@ -128,7 +126,7 @@ def test_the_mesh_is_within_a_third_of_the_noise_of_a_much_finer_one_and_the_one
     assert off[1] > 0.8 * ALLOWED * noisy.relative_noise
 
 
-def test_injections_cost_what_generalised_least_squares_loses_without_them() -> None:
+def test_injections_cost_what_generalised_least_squares_loses_without_them():
     """By the true slope, drift and noise, and the whole covariance: nothing of it is known to the choice."""
     rng = np.random.default_rng(6)
     slope, other = 1e-3 * rng.normal(size=(2, 896)) * (1 + CHANNELS[:, 0] % 5)
@@ -148,7 +146,7 @@ def test_injections_cost_what_generalised_least_squares_loses_without_them() -> 
         assert step.added == pytest.approx(expected, rel=0.1, abs=0.01)
 
 
-def test_a_model_without_a_sigma_gets_one_cell_along_it(fingertip, forward) -> None:
+def test_a_model_without_a_sigma_gets_one_cell_along_it(fingertip, forward):
     steps = [Setting(k, 1.0) for k in np.linspace(1.2, 2.2, 10).tolist()]
     design = design_bank(scene(0.01 * np.abs(simulated_signals(forward, "step", steps)), 4e-4), fingertip)
     assert design.model == "step"
@@ -158,21 +156,21 @@ def test_a_model_without_a_sigma_gets_one_cell_along_it(fingertip, forward) -> N
     assert design.k_count.chosen.setting > 1
 
 
-def test_all_injections_lose_nothing_and_half_of_them_are_twice_as_fast(quiet) -> None:
+def test_all_injections_lose_nothing_and_half_of_them_are_twice_as_fast(quiet):
     assert quiet.injections.steps[-1].added == 0.0
     assert "1.86 frames/s" in quiet.injections.steps[-1].cost
     assert "3.72 frames/s" in quiet.injections.steps[15].cost
     assert len(quiet.injections.steps) == len(np.unique(CHANNELS[:, 0]))
 
 
-def test_a_choice_that_nothing_is_good_enough_for_says_so() -> None:
+def test_a_choice_that_nothing_is_good_enough_for_says_so():
     choice = DesignChoice("mesh size", "cm", (DesignStep(0.5, 3.0, "few"), DesignStep(0.1, 1.0, "many")))
     assert not choice.enough
     assert choice.chosen.setting == 0.1
     assert choice.next_step is None
 
 
-def test_what_is_good_enough_by_luck_is_not_chosen() -> None:
+def test_what_is_good_enough_by_luck_is_not_chosen():
     """A step falls between the nodes of one mesh as it should, and of the next finer one not."""
     choice = DesignChoice(
         "mesh size",
@@ -183,7 +181,7 @@ def test_what_is_good_enough_by_luck_is_not_chosen() -> None:
     assert DesignChoice("", "", choice.steps[:3]).chosen.setting == 0.1
 
 
-def test_too_few_frames_are_refused(clean) -> None:
+def test_too_few_frames_are_refused(clean):
     with pytest.raises(CalibrationError, match="too few to judge a model by"):
         MeasuredFrames(clean[:5], 1e-4, None)
 
@@ -191,7 +189,7 @@ def test_too_few_frames_are_refused(clean) -> None:
 @pytest.mark.parametrize(
     ("scale", "noise_v"), [(1, 0.0), (1, 1e-20), (1, np.inf), (1, np.nan), (0, 0.0), (1e-200, 1e-205), (1e200, 1e195)]
 )
-def test_frames_without_noise_or_size_are_refused_in_a_sentence(clean, scale: float, noise_v: float) -> None:
+def test_frames_without_noise_or_size_are_refused_in_a_sentence(clean, scale, noise_v):
     with pytest.raises(CalibrationError, match="no noise to design for"):
         MeasuredFrames(scale * clean, noise_v, None)
 
@@ -202,19 +200,19 @@ SLOW = 2 + np.sin(2 * np.pi * CHANNEL / N_CHANNELS)
 SIGNAL = SLOW * (1 + np.cos(2 * np.pi * CHANNEL / 64))
 
 
-def test_the_envelope_runs_over_the_peaks_and_closes_upon_itself() -> None:
+def test_the_envelope_runs_over_the_peaks_and_closes_upon_itself():
     over = envelope(SIGNAL)
     # A peak of the cosine is at 2; the moving average looks back over five channels.
     np.testing.assert_allclose(over, 2 * np.roll(SLOW, 2), rtol=0.01)
     assert abs(over[0] - over[-1]) < 0.05
 
 
-def test_a_signal_without_peaks_has_no_envelope() -> None:
+def test_a_signal_without_peaks_has_no_envelope():
     with pytest.raises(MatchingError, match="without peaks"):
         envelope(np.ones(N_CHANNELS))
 
 
-def test_the_score_is_spearmans_at_the_best_shift() -> None:
+def test_the_score_is_spearmans_at_the_best_shift():
     other = np.random.default_rng(2).uniform(0.5, 1.5, N_CHANNELS) * SIGNAL
     smooth = np.mean([np.roll(other, shift) for shift in range(5)], axis=0)
     a, b = envelope(smooth), envelope(SIGNAL)
@@ -223,12 +221,12 @@ def test_the_score_is_spearmans_at_the_best_shift() -> None:
 
 
 @pytest.mark.parametrize("changed", [np.roll(SIGNAL, 320), -7.0 * SIGNAL, SIGNAL + 3.0])
-def test_neither_shift_nor_scale_nor_offset_matters_to_the_score(changed: np.ndarray) -> None:
+def test_neither_shift_nor_scale_nor_offset_matters_to_the_score(changed):
     assert envelope_score(changed, SIGNAL) == pytest.approx(envelope_score(SIGNAL, SIGNAL), abs=1e-3)
     assert envelope_score(changed, SIGNAL) > 0.99
 
 
-def test_only_physical_settings_are_simulated(forward: ForwardModel) -> None:
+def test_only_physical_settings_are_simulated(forward):
     settings = [Setting(1.6, 0.1), Setting(1.6, 1.0), Setting(1.6, 2.0)]
     signals = simulated_signals(forward, "gaussian_derivative", settings)
     assert signals.shape == (2, N_CHANNELS), "a narrow Gaussian's conductivity falls below 0"
@@ -238,14 +236,14 @@ def test_only_physical_settings_are_simulated(forward: ForwardModel) -> None:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_every_model_has_settings_that_are_physical(forward: ForwardModel, model: str) -> None:
+def test_every_model_has_settings_that_are_physical(forward, model):
     height = forward.mesh.height_cm
     for settings in (centred_settings(model, height / 2), searched_settings(model, height)):
         assert len(set(settings)) == len(settings)
         assert len(simulated_signals(forward, model, settings)) >= 1
 
 
-def test_the_matching_score_is_the_best_over_settings_and_lags() -> None:
+def test_the_matching_score_is_the_best_over_settings_and_lags():
     signals = np.random.default_rng(3).normal(size=(4, N_CHANNELS))
     shifted = np.concatenate([signals[2, 1:], [0.0]])
     best = matching_scores(np.array([signals[1], shifted, np.ones(N_CHANNELS)]), signals)
@@ -254,7 +252,7 @@ def test_the_matching_score_is_the_best_over_settings_and_lags() -> None:
     assert 0.7 < best[2] < 0.9
 
 
-def test_the_papers_scores_and_its_best_model_are_found(shared: Path) -> None:
+def test_the_papers_scores_and_its_best_model_are_found(shared):
     folder = shared / "recordings" / "torque_slices"
     frame = loadmat(folder / "TorqueSlice.mat")["clipped_data"].ravel()
     homogeneous = loadmat(folder / "TorqueSliceHom.mat")["clipped_data_hom"].ravel()

@@ -105,19 +105,19 @@ def test_a_conductivity_that_is_not_positive_is_refused_before_solving(fingertip
         forward.voltages(np.ones(3))
 
 
-def test_the_table_has_896_channels_and_128_zero_slots() -> None:
+def test_the_table_has_896_channels_and_128_zero_slots():
     assert channels.CHANNELS.shape == (channels.N_CHANNELS, 4)
     assert channels.ZERO_SLOTS.sum() == 128
 
 
-def test_no_channel_measures_on_a_driven_electrode() -> None:
+def test_no_channel_measures_on_a_driven_electrode():
     for sink, source, positive, negative in channels.CHANNELS:
         assert {sink, source}.isdisjoint({positive, negative})
         assert source == (sink + 16) % 32
         assert negative == (positive + 1) % 32
 
 
-def test_a_line_and_its_channels_are_one_another() -> None:
+def test_a_line_and_its_channels_are_one_another():
     frame = np.arange(1.0, channels.N_CHANNELS + 1)
     line = channels.line_of_channels(frame)
     assert (line[channels.ZERO_SLOTS] == 0).all()
@@ -125,7 +125,7 @@ def test_a_line_and_its_channels_are_one_another() -> None:
     assert line[:3].tolist() == [0.0, 1.0, 2.0], "injection 0: the pair 0-1 touches the driven electrode 0"
 
 
-def test_smoothing_keeps_what_is_constant_and_spreads_a_peak_over_nine_channels() -> None:
+def test_smoothing_keeps_what_is_constant_and_spreads_a_peak_over_nine_channels():
     peak = np.zeros((2, 896))
     peak[0] = 3.0
     peak[1, 100] = 1.0

@@ -40,7 +40,7 @@ def correlations(frame: np.ndarray, cell: tuple[int, int]) -> np.ndarray:
 
 @given(frames)
 @settings(max_examples=20, deadline=None)
-def test_scores_are_those_of_the_definition(frame: np.ndarray) -> None:
+def test_scores_are_those_of_the_definition(frame):
     reference, zero_lag = (matcher.heatmap(frame) for matcher in MATCHERS)
     for cell in [(0, 1), (3, 3), (6, 6)]:
         every_lag = correlations(frame, cell)
@@ -52,9 +52,7 @@ def test_scores_are_those_of_the_definition(frame: np.ndarray) -> None:
 @both
 @given(frame=frames, scale=st.floats(1e-150, 1e150))
 @settings(max_examples=20, deadline=None)
-def test_scores_lie_between_0_and_1_and_know_neither_scale_nor_sign(
-    matcher: Matcher, frame: np.ndarray, scale: float
-) -> None:
+def test_scores_lie_between_0_and_1_and_know_neither_scale_nor_sign(matcher, frame, scale):
     heatmap = matcher.heatmap(frame)
     assert (np.isnan(heatmap) == ~VALID).all()
     assert ((heatmap[VALID] >= 0) & (heatmap[VALID] <= 1)).all()
@@ -62,7 +60,7 @@ def test_scores_lie_between_0_and_1_and_know_neither_scale_nor_sign(
 
 
 @both
-def test_a_bank_row_is_found_in_its_own_cell(matcher: Matcher) -> None:
+def test_a_bank_row_is_found_in_its_own_cell(matcher):
     for row, column in np.argwhere(VALID):
         match = best_match(matcher.heatmap(SIGNALS[row, column] * -3.0), K_GRID, SIGMA_GRID)
         assert match.cell == (row, column)
@@ -70,7 +68,7 @@ def test_a_bank_row_is_found_in_its_own_cell(matcher: Matcher) -> None:
         assert (match.k, match.sigma) == (K_GRID[row], SIGMA_GRID[column])
 
 
-def test_only_the_reference_finds_a_shifted_signal() -> None:
+def test_only_the_reference_finds_a_shifted_signal():
     shifted = np.concatenate([SIGNALS[4, 4, 7:], np.zeros(7)])
     reference, zero_lag = (best_match(matcher.heatmap(shifted), K_GRID, SIGMA_GRID) for matcher in MATCHERS)
     assert reference.cell == (4, 4)
@@ -79,14 +77,14 @@ def test_only_the_reference_finds_a_shifted_signal() -> None:
 
 
 @both
-def test_many_frames_are_scored_like_each_of_them(matcher: Matcher) -> None:
+def test_many_frames_are_scored_like_each_of_them(matcher):
     batch = np.random.default_rng(2).normal(size=(3, N_CHANNELS))
     maps = matcher.heatmaps(batch)
     for frame, heatmap in zip(batch, maps, strict=True):
         np.testing.assert_allclose(matcher.heatmap(frame), heatmap, atol=1e-14)
 
 
-def test_a_bank_of_more_cells_than_fit_a_chunk_is_scored_cell_by_cell_all_the_same() -> None:
+def test_a_bank_of_more_cells_than_fit_a_chunk_is_scored_cell_by_cell_all_the_same():
     signals = np.random.default_rng(3).normal(size=(1030, 2, N_CHANNELS)).astype(np.float32)
     every = np.ones((1030, 2), dtype=np.bool_)
     large = ReferenceMatcher(signals, every, np.arange(1030.0), np.arange(2.0))
@@ -105,12 +103,12 @@ def test_a_bank_of_more_cells_than_fit_a_chunk_is_scored_cell_by_cell_all_the_sa
         (np.ones(1024), "896 channels; the array has shape"),
     ],
 )
-def test_frames_that_cannot_be_matched_are_refused(matcher: Matcher, frame: np.ndarray, says: str) -> None:
+def test_frames_that_cannot_be_matched_are_refused(matcher, frame, says):
     with pytest.raises(MatchingError, match=says):
         matcher.heatmap(frame)
 
 
-def test_banks_that_cannot_be_matched_are_refused() -> None:
+def test_banks_that_cannot_be_matched_are_refused():
     with pytest.raises(MatchingError, match="no cell of the bank is valid"):
         ReferenceMatcher(SIGNALS, np.zeros_like(VALID), K_GRID, SIGMA_GRID)
     with pytest.raises(MatchingError, match="needs signals of shape"):
@@ -126,9 +124,7 @@ heatmaps = hnp.arrays(np.float64, (7, 8), elements=st.floats(0, 1) | st.just(np.
 
 
 @given(heatmaps, st.integers(0, 8))
-def test_the_match_is_the_maximum_and_the_runner_up_stands_outside_its_neighbourhood(
-    heatmap: np.ndarray, radius: int
-) -> None:
+def test_the_match_is_the_maximum_and_the_runner_up_stands_outside_its_neighbourhood(heatmap, radius):
     match = best_match(heatmap, K_GRID, SIGMA_GRID, radius)
     assert match.score == heatmap[match.cell] >= np.nanmax(heatmap) - 1e-12
     outside = [
@@ -144,7 +140,7 @@ def test_the_match_is_the_maximum_and_the_runner_up_stands_outside_its_neighbour
         assert match.runner_up == pytest.approx(max(heatmap[cell] for cell in outside), abs=1e-12)
 
 
-def test_of_scores_that_tie_the_first_cell_wins() -> None:
+def test_of_scores_that_tie_the_first_cell_wins():
     heatmap = np.full((7, 8), 0.5)
     heatmap[1, 2], heatmap[3, 4] = 0.7, 0.7 + 5e-13
     assert best_match(heatmap, K_GRID, SIGMA_GRID).cell == (1, 2)
@@ -152,14 +148,14 @@ def test_of_scores_that_tie_the_first_cell_wins() -> None:
     assert best_match(heatmap, K_GRID, SIGMA_GRID).cell == (3, 4)
 
 
-def test_a_heatmap_without_a_valid_cell_is_refused() -> None:
+def test_a_heatmap_without_a_valid_cell_is_refused():
     with pytest.raises(MatchingError, match="no cell of the heatmap is valid"):
         best_match(np.full((7, 8), np.nan), K_GRID, SIGMA_GRID)
     with pytest.raises(MatchingError, match="the grids 7 k × 8 σ"):
         best_match(np.ones((8, 7)), K_GRID, SIGMA_GRID)
 
 
-def test_noise_is_no_signal_and_a_signal_is_not_noise() -> None:
+def test_noise_is_no_signal_and_a_signal_is_not_noise():
     generator = np.random.default_rng(4)
     std = generator.uniform(1e-4, 1e-2, N_CHANNELS)
     frames_of_noise = std * generator.normal(size=(2000, N_CHANNELS))
@@ -170,7 +166,7 @@ def test_noise_is_no_signal_and_a_signal_is_not_noise() -> None:
     assert silent == "no signal above the noise: the difference is 0.00 times the noise, and a signal needs 1.11 times"
 
 
-def test_the_noise_test_keeps_its_false_alarm_rate() -> None:
+def test_the_noise_test_keeps_its_false_alarm_rate():
     # χ² of 896 degrees is close to Gaussian: mean 896, variance 2 · 896; the quantile of 1e-6 is 4.75 sd and a little.
     limit = 896 + 4.7534 * np.sqrt(2 * 896)
     lower, upper = (np.full(N_CHANNELS, np.sqrt(energy / 896)) for energy in (limit, limit + 20))
@@ -179,6 +175,6 @@ def test_the_noise_test_keeps_its_false_alarm_rate() -> None:
 
 
 @pytest.mark.parametrize("noise", [0.0, -1.0, np.nan, np.inf, np.zeros(N_CHANNELS), np.ones(3)])
-def test_a_noise_that_cannot_be_is_refused(noise: float | np.ndarray) -> None:
+def test_a_noise_that_cannot_be_is_refused(noise):
     with pytest.raises(MatchingError):
         signal_above_noise(np.ones(N_CHANNELS), noise)

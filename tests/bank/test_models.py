@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS, Variation, averaging_points, conductivity
 from shearloop.bank.errors import ModelError
 
@@ -58,7 +57,7 @@ def test_the_functions_have_the_values_of_the_equations():
     )
 
 
-def test_mistakes_are_refused(fingertip: Mesh):
+def test_mistakes_are_refused(fingertip):
     with pytest.raises(ModelError, match="no basis model 'square'; choose one of step, linear"):
         conductivity(fingertip, "square", 1, 1)
     with pytest.raises(ModelError, match="sigma must be above 0 for the model linear, not 0"):

@@ -115,7 +115,7 @@ def without_runner_up(match: Match) -> Match:
 amplitudes = hnp.arrays(np.float64, N_CHANNELS, elements=st.floats(-10, 10, width=32)).filter(np.any)
 
 
-def test_a_bank_of_few_cells_is_not_searched_and_matches_the_same() -> None:
+def test_a_bank_of_few_cells_is_not_searched_and_matches_the_same():
     signals, valid = BANK[0][:6], BANK[1][:6]
     assert 0 < valid.sum() < pruned_matching.MIN_PRUNED_CELLS <= BANK[1].sum()
     slow, fast = pair(ReferenceMatcher, PrunedMatcher, (signals, valid))
@@ -125,7 +125,7 @@ def test_a_bank_of_few_cells_is_not_searched_and_matches_the_same() -> None:
 
 
 @both
-def test_a_matcher_that_was_copied_matches_the_same(slow: Matcher, fast: PrunedMatcher) -> None:
+def test_a_matcher_that_was_copied_matches_the_same(slow, fast):
     frame = np.random.default_rng(5).normal(size=N_CHANNELS)
     for one in (slow, fast):
         # As pickling does, which sends it to another process.
@@ -137,7 +137,7 @@ def test_a_matcher_that_was_copied_matches_the_same(slow: Matcher, fast: PrunedM
 @both
 @given(frame=amplitudes)
 @settings(max_examples=25, deadline=None)
-def test_random_frames(slow: Matcher, fast: PrunedMatcher, frame: np.ndarray) -> None:
+def test_random_frames(slow, fast, frame):
     assert_same(fast.match(frame), slow.match(frame))
 
 
@@ -151,7 +151,7 @@ def test_random_frames(slow: Matcher, fast: PrunedMatcher, frame: np.ndarray) ->
     seed=st.integers(0, 1000),
 )
 @settings(max_examples=50, deadline=None)
-def test_frames_like_those_of_the_bank(slow, fast, cell, other, share, noise, lag, seed) -> None:
+def test_frames_like_those_of_the_bank(slow, fast, cell, other, share, noise, lag, seed):
     signals = BANK[0].astype(np.float64)
     frame = np.abs((1 - share) * signals[cell] + share * signals[other])
     frame += noise * np.abs(np.random.default_rng(seed).normal(size=N_CHANNELS))
@@ -162,7 +162,7 @@ def test_frames_like_those_of_the_bank(slow, fast, cell, other, share, noise, la
 
 
 @both
-def test_constant_frames_and_cells_that_tie(slow, fast) -> None:
+def test_constant_frames_and_cells_that_tie(slow, fast):
     one = np.eye(N_CHANNELS)
     alike = np.ones(N_CHANNELS), BANK[0][12, 6], BANK[0][20, 3], np.arange(N_CHANNELS)
     for frame in (*alike, one[895], 1e-300 * one[5], 1e300 * one[[0, 400]].sum(axis=0)):
@@ -175,7 +175,7 @@ def test_constant_frames_and_cells_that_tie(slow, fast) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 @given(n_k=st.integers(1, 14), n_sigma=st.integers(1, 14), few=st.integers(1, 40), seed=st.integers(0, 1000))
 @settings(max_examples=8, deadline=None)
-def test_banks_of_a_few_numbers_where_many_cells_tie(kind, n_k, n_sigma, few, seed) -> None:
+def test_banks_of_a_few_numbers_where_many_cells_tie(kind, n_k, n_sigma, few, seed):
     random = np.random.default_rng(seed)
     signals = np.zeros((n_k, n_sigma, N_CHANNELS), dtype=np.float32)
     signals[..., random.choice(N_CHANNELS, few)] = random.choice([0, 1, 2, 1e-3], (n_k, n_sigma, few))
@@ -187,7 +187,7 @@ def test_banks_of_a_few_numbers_where_many_cells_tie(kind, n_k, n_sigma, few, se
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("bank", [BANK, bank_of_noise()], ids=["smooth", "noise"])
-def test_a_basis_that_is_fitted_to_few_cells_bounds_all(kind, bank, monkeypatch) -> None:
+def test_a_basis_that_is_fitted_to_few_cells_bounds_all(kind, bank, monkeypatch):
     monkeypatch.setattr(pruned_matching, "_FITTED_CELLS", 5)
     slow, fast = pair(*kind, bank)
     random = np.random.default_rng(7)
@@ -197,14 +197,14 @@ def test_a_basis_that_is_fitted_to_few_cells_bounds_all(kind, bank, monkeypatch)
 
 
 @both
-def test_the_maximum_alone_is_the_same_without_the_runner_up(slow, fast) -> None:
+def test_the_maximum_alone_is_the_same_without_the_runner_up(slow, fast):
     frame = np.random.default_rng(7).normal(size=N_CHANNELS)
     assert fast.match(frame, runner_up=False) == without_runner_up(fast.match(frame))
     np.testing.assert_array_equal(fast.heatmap(frame), slow.heatmap(frame))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_cells_that_all_score_nothing_tie(kind) -> None:
+def test_cells_that_all_score_nothing_tie(kind):
     """Wherever the search begins: the first one is the lowest of all."""
     slow, fast = pair(*kind, bank_of_noise(n_live=40))
     frame = np.eye(N_CHANNELS)[-1]
@@ -214,7 +214,7 @@ def test_cells_that_all_score_nothing_tie(kind) -> None:
 
 
 @both
-def test_what_cannot_be_matched_is_refused_alike(slow, fast) -> None:
+def test_what_cannot_be_matched_is_refused_alike(slow, fast):
     for frame, says in (
         (np.zeros(N_CHANNELS), "zero in all channels"),
         (np.full(N_CHANNELS, np.nan), "not finite"),
@@ -244,7 +244,7 @@ def recorded_frames(shared: Path) -> list[np.ndarray]:
 
 
 @both
-def test_recorded_frames(recorded_frames: list[np.ndarray], slow, fast) -> None:
+def test_recorded_frames(recorded_frames, slow, fast):
     """Far from anything in this bank, as they are from every bank: a hard case."""
     assert len(recorded_frames) > 60
     for frame in recorded_frames:
@@ -253,7 +253,7 @@ def test_recorded_frames(recorded_frames: list[np.ndarray], slow, fast) -> None:
 
 @pytest.mark.parametrize("kind", KINDS[:1])
 @pytest.mark.parametrize("far", [30, 640])
-def test_the_runner_up_may_be_at_a_lag_at_which_nothing_reaches_what_is_known_from_lag_0(kind, far) -> None:
+def test_the_runner_up_may_be_at_a_lag_at_which_nothing_reaches_what_is_known_from_lag_0(kind, far):
     """Both that are high at lag 0 are in the peak of the best cell, and nothing at its own lag is as high.
 
     At lag 640 so little of the frame overlaps with the bank that the lag is left out at first.
@@ -269,7 +269,7 @@ def test_the_runner_up_may_be_at_a_lag_at_which_nothing_reaches_what_is_known_fr
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_of_cells_that_tie_but_for_rounding_the_first_is_found(kind) -> None:
+def test_of_cells_that_tie_but_for_rounding_the_first_is_found(kind):
     """Two cells of two channels each; the frame has both, the first of them a little smaller."""
     signals, valid = bank_of_noise(n_live=40)
     signals[3, 3] = signals[9, 9] = 0.0
@@ -283,7 +283,7 @@ def test_of_cells_that_tie_but_for_rounding_the_first_is_found(kind) -> None:
 
 
 @pytest.mark.parametrize("first", [True, False])
-def test_the_outermost_lags_are_searched(first) -> None:
+def test_the_outermost_lags_are_searched(first):
     signals, valid = bank_of_noise()
     signals[14, 5] = 0.1
     signals[14, 5, 0 if first else -1] = 30.0
@@ -294,13 +294,13 @@ def test_the_outermost_lags_are_searched(first) -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 6, 191, 192, 1859, 2887, *range(100, 110)])
-def test_frames_of_two_contacts(seed) -> None:
+def test_frames_of_two_contacts(seed):
     """In one of eight the known runner-up lies in the best cell's peak, and the search begins again."""
     slow, fast = PAIRS[0]
     assert_same(fast.match(two_contacts(seed)), slow.match(two_contacts(seed)))
 
 
-def test_of_lags_that_tie_the_highest_score_is_returned() -> None:
+def test_of_lags_that_tie_the_highest_score_is_returned():
     """The frame, of two channels, is a cell's signal at lag 0, and nearly so at lag 100."""
     signals, valid = bank_of_noise(n_live=40)
     signals[3, 3] = 0.0
@@ -313,7 +313,7 @@ def test_of_lags_that_tie_the_highest_score_is_returned() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_cells_that_float32_hardly_tells_apart(kind) -> None:
+def test_cells_that_float32_hardly_tells_apart(kind):
     """Next to nothing is left out of the basis, so the bounds have no room for their own rounding."""
     random = np.random.default_rng(3)
     signals = 1 + 1e-3 * (random.random((*SHAPE, 3)) @ random.random((3, N_CHANNELS)))
@@ -324,7 +324,7 @@ def test_cells_that_float32_hardly_tells_apart(kind) -> None:
 
 @both
 @pytest.mark.parametrize(("limit", "value"), [("_MAX_BOUNDS", 10), ("_FEW_LAGS", 0)])
-def test_where_bounds_do_not_help_all_is_scored(slow, fast, monkeypatch, limit, value) -> None:
+def test_where_bounds_do_not_help_all_is_scored(slow, fast, monkeypatch, limit, value):
     monkeypatch.setattr(pruned_matching, limit, value)
     for frame in np.random.default_rng(5).random((4, N_CHANNELS)):
         assert_same(fast.match(frame), slow.match(frame))
@@ -332,7 +332,7 @@ def test_where_bounds_do_not_help_all_is_scored(slow, fast, monkeypatch, limit, 
 
 @settings(max_examples=100)
 @given(cells, st.sampled_from([0.0, 1e-6, 1e-4, 1e-2, 0.1, 1.0]), st.integers(0, 2**32 - 1))
-def test_no_bound_is_below_its_score(cell, noise, seed) -> None:
+def test_no_bound_is_below_its_score(cell, noise, seed):
     """Also of frames that are a cell's own signal, where next to nothing is left out of the bank's basis."""
     _, fast = PAIRS[1]
     noisy = BANK[0][cell] + noise * np.random.default_rng(seed).normal(size=N_CHANNELS)
@@ -347,7 +347,7 @@ def test_no_bound_is_below_its_score(cell, noise, seed) -> None:
         assert set(np.flatnonzero(scores >= score)) <= set(found.candidates(score).cells)
 
 
-def test_no_group_of_cells_is_bounded_below_one_of_them() -> None:
+def test_no_group_of_cells_is_bounded_below_one_of_them():
     """By frames that point from one cell to another, or along the mean: where a centre alone says too little."""
     bank = PAIRS[0][1].compressed
     signals = np.abs(BANK[0][BANK[1]].astype(np.float64))
@@ -363,7 +363,7 @@ def test_no_group_of_cells_is_bounded_below_one_of_them() -> None:
 
 @settings(max_examples=12, deadline=None)
 @given(cells, st.sampled_from([0.0, 1e-6, 1e-2, 1.0]), st.integers(0, 2**32 - 1))
-def test_no_bound_at_any_lag_is_below_its_score(cell, noise, seed) -> None:
+def test_no_bound_at_any_lag_is_below_its_score(cell, noise, seed):
     slow, fast = PAIRS[0]
     frame = BANK[0][cell] + noise * np.random.default_rng(seed).normal(size=N_CHANNELS)
     found = AllLagsBounds(fast, unit_magnitudes(frame[None])[0])
@@ -378,7 +378,7 @@ def test_no_bound_at_any_lag_is_below_its_score(cell, noise, seed) -> None:
 
 
 @both
-def test_few_cells_are_scored_exactly(slow, fast, monkeypatch) -> None:
+def test_few_cells_are_scored_exactly(slow, fast, monkeypatch):
     """What makes it fast: of a frame near to the bank's, most cells are never read."""
     read = []
     contenders = type(fast)._contenders
@@ -394,7 +394,7 @@ def test_few_cells_are_scored_exactly(slow, fast, monkeypatch) -> None:
 
 
 @both
-def test_a_tie_that_hangs_on_rounding_is_left_to_the_slow_matcher(slow, fast, monkeypatch) -> None:
+def test_a_tie_that_hangs_on_rounding_is_left_to_the_slow_matcher(slow, fast, monkeypatch):
     frame = BANK[0][6, 6] + BANK[0][16, 5]
     expected = slow.match(frame)
     scored = []

@@ -1,21 +1,18 @@
 """The bench of matching_speed: what it compares agrees, and ratios are of one turn."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from benchmarks import matching_speed
-from shearloop.bank.eit.bank_file import Bank, BankDefinition, write_bank
+from shearloop.bank.eit.bank_file import Bank
 from tests.bank.conftest import small_fingertip
 
 
 @pytest.fixture(scope="module")
-def bank(tmp_path_factory: pytest.TempPathFactory) -> Bank:
-    path = tmp_path_factory.mktemp("bank") / "a.bank"
-    random, grid = np.random.default_rng(1), np.linspace(1.0, 2.0, 8)
-    signals = random.normal(0.0, 0.05, (8, 8, 896)).astype(np.float32)
-    definition = BankDefinition("ab" * 32, "gaussian_derivative", grid, grid)
-    write_bank(path, definition, signals[0, 0], np.ones((8, 8)), np.ones((8, 8), bool), signals)
-    return Bank.open(path)
+def bank(tiny_bank: Path) -> Bank:
+    return Bank.open(tiny_bank)
 
 
 def test_ratios_are_taken_turn_by_turn(monkeypatch):

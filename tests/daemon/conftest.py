@@ -14,7 +14,7 @@ import zmq
 import zmq.asyncio
 from scipy.io import savemat
 
-from shearloop.bank.eit.bank_file import Bank, BankDefinition, write_bank
+from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import LINE_SLOTS, line_of_channels
 from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
@@ -23,23 +23,6 @@ from shearloop.drivers.eit_kit import ADC_STEP_V, FRAME_PERIOD_S
 
 # Guards against a test that hangs; none waits for so long.
 DEADLINE_S = 60
-
-
-@pytest.fixture(scope="session")
-def tiny_bank(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bank of 8 × 8 random signals: scored in a millisecond."""
-    path = tmp_path_factory.mktemp("bank") / "tiny.bank"
-    random = np.random.default_rng(1)
-    grid = np.linspace(1.0, 2.0, 8)
-    write_bank(
-        path,
-        BankDefinition("ab" * 32, "gaussian_derivative", grid, grid),
-        random.normal(0.0, 0.3, 896),
-        np.ones((8, 8)),
-        np.ones((8, 8), bool),
-        random.normal(0.0, 0.05, (8, 8, 896)).astype(np.float32),
-    )
-    return path
 
 
 @pytest.fixture(scope="session")

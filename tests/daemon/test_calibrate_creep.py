@@ -1,7 +1,7 @@
 """`calibrate creep`: from recordings of held twists to the line of the configuration."""
 
 import json
-from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -39,17 +39,17 @@ def test_a_grip_is_a_stretch_of_torques_and_single_frames_do_not_end_it():
     np.testing.assert_array_equal(first.t_s[:2], track().series.t_s[[2, 4]])
 
 
-@dataclass
-class Loaded:
-    sides: tuple[str, ...] = ("right",)
-    kind: str = "raw"
+def played(monkeypatch: pytest.MonkeyPatch, found: EstimateTrack) -> None:
+    """Have every recording and every calibration give these estimates."""
+    loaded = SimpleNamespace(sides=("right",), kind="raw")
+    monkeypatch.setattr("shearloop.bank.estimation.Calibration.load", lambda _: loaded)
+    monkeypatch.setattr("shearloop.daemon.analysis.series.read_series", lambda *_: [found.series])
+    monkeypatch.setattr("shearloop.daemon.analysis.evaluate.estimate_series", lambda *_: found)
 
 
 def test_it_prints_the_line_of_the_configuration(monkeypatch, capsys, tmp_path):
     found = track()
-    monkeypatch.setattr("shearloop.bank.estimation.Calibration.load", lambda _: Loaded())
-    monkeypatch.setattr("shearloop.daemon.analysis.series.read_series", lambda *_: [found.series])
-    monkeypatch.setattr("shearloop.daemon.analysis.evaluate.estimate_series", lambda *_: found)
+    played(monkeypatch, found)
     arguments = ["calibrate", "creep", str(tmp_path / "held.mcap"), "--calibration", "right.cal"]
     assert main([*arguments, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -66,16 +66,13 @@ def test_it_prints_the_line_of_the_configuration(monkeypatch, capsys, tmp_path):
 
 def test_a_recording_without_held_twists_is_refused(monkeypatch, capsys):
     found = track(np.arange(1109) < 10)
-    monkeypatch.setattr("shearloop.bank.estimation.Calibration.load", lambda _: Loaded())
-    monkeypatch.setattr("shearloop.daemon.analysis.series.read_series", lambda *_: [found.series])
-    monkeypatch.setattr("shearloop.daemon.analysis.evaluate.estimate_series", lambda *_: found)
+    played(monkeypatch, found)
     assert main(["calibrate", "creep", "held.mcap", "--calibration", "right.cal"]) == 2
     assert "10 readings are too few for a fit; hold a twist for a minute" in capsys.readouterr().err
 
 
 def test_twists_that_are_given_twice_are_refused(monkeypatch, capsys):
-    monkeypatch.setattr("shearloop.bank.estimation.Calibration.load", lambda _: Loaded())
-    monkeypatch.setattr("shearloop.daemon.analysis.series.read_series", lambda *_: [track().series])
+    played(monkeypatch, track())
     told_of = {"held.mcap": "is given twice; name it once", "copy.mcap": "equals held.mcap"}
     for copy, told in told_of.items():
         assert main(["calibrate", "creep", "held.mcap", copy, "--calibration", "right.cal"]) == 2

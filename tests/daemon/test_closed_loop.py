@@ -19,9 +19,8 @@ from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.run_summary import RunSummary
-from shearloop.daemon.web.bridge import Bridge, DaemonAddress
 from shearloop.daemon.web.message_store import MessageStore
-from shearloop.daemon.web.server import make_app
+from shearloop.daemon.web.server import Bridge, DaemonAddress, make_app
 from tests.daemon.conftest import DEADLINE_S, robot_at, running_daemon, shearloop
 from tests.emulator_process import own_address
 

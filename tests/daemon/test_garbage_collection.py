@@ -11,7 +11,7 @@ from shearloop.daemon import app
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import main
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.realtime import without_long_collections
+from shearloop.daemon.process import without_long_collections
 
 
 class Cycle:

@@ -35,7 +35,7 @@ def loop_state(t_s: float, **changes: Any) -> dict[str, Any]:
 
 def told(truth: TorqueSeries | None, happened: list[tuple[int, str]], *more: dict[str, Any]) -> str:
     out = StringIO()
-    summary = RunSummary(out, SimpleNamespace(torques=lambda: truth), SimpleNamespace(sent=happened))
+    summary = RunSummary(out, SimpleNamespace(torques=lambda: truth, sent=happened))
     first = {"step": 1, "step_name": "identify", "set_point_nm": None}
     for content in (loop_state(0, **first), loop_state(10), loop_state(14, hold=1), *more):
         summary("loop.state", content)
@@ -143,7 +143,7 @@ def test_nothing_is_told_of_what_was_not_heard_from_its_beginning(phase):
 def test_where_a_screw_ended_and_what_it_took_is_told():
     out = StringIO()
     truth = TorqueSeries(np.array([10.0, 11.0, 12.0]) * S, np.array([-0.05, -0.18, -0.119]))
-    summary = RunSummary(out, SimpleNamespace(torques=lambda: truth))
+    summary = RunSummary(out, SimpleNamespace(torques=lambda: truth, sent=[]))
     turning = {"step_name": "tighten", "torque_source": "load_cell", "set_point_nm": None}
     summary("loop.state", loop_state(10, **turning))
     for t_s, wrist_rad, torque_nm in ((10.0, 0.4, -0.05), (11.0, 0.2, -0.176), (12.0, -0.1, -0.121)):

@@ -10,9 +10,9 @@ from functools import partial
 
 import pytest
 
-from shearloop.daemon import realtime
+from shearloop.daemon import process
 from shearloop.daemon.cli import emulated_devices, main
-from shearloop.daemon.signals import ending_signals
+from shearloop.daemon.process import ending_signals
 from tests.daemon.conftest import DEADLINE_S
 
 
@@ -39,9 +39,7 @@ def test_a_second_signal_does_not_kill_the_daemon(number, config, monkeypatch):
         came.append("again")
 
     monkeypatch.setattr(emulated_devices, "EmulatedDevices", emulators)
-    monkeypatch.setattr(
-        realtime, "without_long_collections", lambda: nullcontext(partial(os.kill, os.getpid(), number))
-    )
+    monkeypatch.setattr(process, "without_long_collections", lambda: nullcontext(partial(os.kill, os.getpid(), number)))
     assert main(["run", str(config())]) == 0
     assert came == ["again"]
     assert signal.getsignal(number) is signal.SIG_DFL, "as before the command"
@@ -49,7 +47,7 @@ def test_a_second_signal_does_not_kill_the_daemon(number, config, monkeypatch):
 
 def test_commands_run_in_any_thread_without_signal_handlers(config, tmp_path, monkeypatch, capsys):
     ready = threading.Event()
-    monkeypatch.setattr(realtime, "without_long_collections", lambda: nullcontext(ready.set))
+    monkeypatch.setattr(process, "without_long_collections", lambda: nullcontext(ready.set))
     with ThreadPoolExecutor() as pool:
         assert pool.submit(ending_signals).result() == ()
         daemon = pool.submit(main, ["run", str(config())])

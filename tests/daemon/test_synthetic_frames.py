@@ -1,11 +1,10 @@
-from dataclasses import dataclass
 from itertools import islice
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, ZERO_SLOTS, channels_of_line
 from shearloop.daemon.errors import UserError
@@ -16,25 +15,19 @@ from shearloop.drivers.emulators.boards import format_line
 ADC_STEP_V = 2.2 / 1024
 
 
-@dataclass(frozen=True)
-class SmallBank:
-    """Signals with the shape of a bank's, growing with k and σ, whose every value can be said in advance."""
-
-    k_grid: NDArray[np.float64]
-    sigma_grid: NDArray[np.float64]
-    homogeneous: NDArray[np.float64]
-    signals: NDArray[np.float32]
-    valid: NDArray[np.bool_]
-
-
-def small_bank() -> SmallBank:
+def small_bank() -> SimpleNamespace:
+    """Signals with the shape of a bank's, growing with k and σ, that can be computed in advance."""
     k, sigma = np.array([3.0, 3.5]), np.array([1.0, 1.5, 2.0])
-    homogeneous = 0.5 * np.sin(CHANNELS @ [0.1, 0.2, 0.3, 0.4]) + 0.7
     shape = np.cos(CHANNELS @ [0.3, 0.1, 0.2, 0.5])
-    signals = (k[:, None, None] * sigma[None, :, None] * shape / 10).astype(np.float32)
     valid = np.ones((2, 3), bool)
     valid[1, 2] = False
-    return SmallBank(k, sigma, homogeneous, signals, valid)
+    return SimpleNamespace(
+        k_grid=k,
+        sigma_grid=sigma,
+        homogeneous=0.5 * np.sin(CHANNELS @ [0.1, 0.2, 0.3, 0.4]) + 0.7,
+        signals=(k[:, None, None] * sigma[None, :, None] * shape / 10).astype(np.float32),
+        valid=valid,
+    )
 
 
 def test_frames_have_the_recorded_mean_noise_and_steps_and_pass_the_parser():
@@ -145,7 +138,8 @@ def test_a_grip_changes_the_frame_by_as_much_as_the_recorded_torques_do(shared):
     homogeneous = forward.voltages(np.ones(len(mesh.triangles)))
     k, sigma = np.array([3.25]), np.array([1.25, 1.85])
     signals = [[forward.voltages(conductivity(mesh, "gaussian_derivative", k[0], s)) - homogeneous for s in sigma]]
-    bank = SmallBank(k, sigma, homogeneous, np.array(signals, np.float32), np.ones((1, 2), bool))
+    arrays = {"signals": np.array(signals, np.float32), "valid": np.ones((1, 2), bool)}
+    bank = SimpleNamespace(k_grid=k, sigma_grid=sigma, homogeneous=homogeneous, **arrays)
     synthesiser = Synthesiser(bank)
     idle, gripped = (
         np.mean([channels_of_line(synthesiser.line(3.25, 1.55, grip)) for _ in range(60)], axis=0) for grip in (0, 1)

@@ -63,17 +63,21 @@ def test_a_board_that_sends_newton_metres_is_calibrated_the_same_way():
     assert calibrator.result().calibration.nm_per_count == pytest.approx(1.0, rel=1e-3)
 
 
-def refused(calibrator: LoadCalibrator, signal: list[LoadSample]) -> str:
+def step(calibrator: LoadCalibrator, signal: Iterable[LoadSample]) -> bool:
+    """Return whether these samples are enough for the next step."""
     calibrator.start_step()
+    return any(calibrator.feed(sample) for sample in signal)
+
+
+def refused(calibrator: LoadCalibrator, signal: list[LoadSample]) -> str:
     with pytest.raises(DeviceCalibrationError) as error:
-        any(calibrator.feed(sample) for sample in signal)
+        step(calibrator, signal)
     return str(error.value)
 
 
 def after_empty(masses_g: list[float]) -> LoadCalibrator:
     calibrator = LoadCalibrator(masses_g)
-    calibrator.start_step()
-    assert any(calibrator.feed(sample) for sample in noisy(8000.0))
+    assert step(calibrator, noisy(8000.0))
     return calibrator
 
 
@@ -82,8 +86,7 @@ def test_a_saturated_signal_is_refused_and_the_step_asked_for_again():
     asked = calibrator.prompt
     assert "end of its range" in refused(calibrator, [*noisy(8000.0)[:-1], *samples([COUNTS_MAX])])
     assert calibrator.prompt == asked
-    calibrator.start_step()
-    assert any(calibrator.feed(sample) for sample in noisy(50_000.0))
+    assert step(calibrator, noisy(50_000.0))
     assert calibrator.finished
 
 
@@ -106,10 +109,8 @@ def test_masses_off_the_line_or_in_the_wrong_order_are_refused():
     with pytest.raises(DeviceCalibrationError, match="straight line"):
         bent.result()
     swapped = LoadCalibrator([100.0, 200.0])
-    swapped.start_step()
-    assert any(swapped.feed(sample) for sample in noisy(0.0))
-    swapped.start_step()
-    assert any(swapped.feed(sample) for sample in noisy(84_000.0))
+    assert step(swapped, noisy(0.0))
+    assert step(swapped, noisy(84_000.0))
     assert "order given" in refused(swapped, noisy(42_000.0))
 
 
@@ -119,8 +120,7 @@ def test_too_many_corrupted_values_are_refused_and_few_are_left_out():
     raws[20] = 9e12
     few = parser.feed(b"0\n" + b"".join(b"%.0f\n" % raw for raw in raws), 0)[1:]
     calibrator = LoadCalibrator([100.0])
-    calibrator.start_step()
-    assert any(calibrator.feed(sample) for sample in few)
+    assert step(calibrator, few)
     assert calibrator.levels[0].n == load_calibration.SAMPLES_PER_STEP - 1
     raws[20:25] = 9e12
     parser.restart()

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from shearloop.daemon.cli.options import add_option
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.signals import ending_signals
+from shearloop.daemon.process import ending_signals
 
 STDIN = 0
 READ_BYTES = 4096

@@ -69,9 +69,7 @@ FAULTS = st.lists(
     st.sampled_from(["motion_regression", "motion_regression", "regression"]), st.integers(1, 2), FAULTS,
     st.integers(0, 130), st.booleans(),
 )  # fmt: skip
-def test_a_copy_goes_on_with_the_same_estimates_to_the_bit(
-    how, calibration_of, twisting, name, m, faults, at, tared
-) -> None:
+def test_a_copy_goes_on_with_the_same_estimates_to_the_bit(how, calibration_of, twisting, name, m, faults, at, tared):
     calibration = calibration_of(name, m)
     series = twisting(cycles=2, seed=9).select_sides(calibration.sides)
     tracker = EstimatorSession(calibration, period_s=0.54)

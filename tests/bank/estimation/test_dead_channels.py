@@ -31,9 +31,7 @@ def torques(estimates: list[Estimate]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["electrode", "a fifth", "lost"])
-def test_channels_that_the_session_began_without_say_nothing_when_they_come_back_in_the_grip(
-    motion_calibration, twisting, kind
-) -> None:
+def test_channels_that_the_session_began_without_say_nothing_when_they_come_back(motion_calibration, twisting, kind):
     """Their idle voltages are not known: what is measured from made-up ones would be wrong, and pass for certain."""
     series, back = twisting(seed=3, cycles=2), GRIPPED + 30
     trackers = [EstimatorSession(motion_calibration, period_s=PERIOD_S) for _ in range(2)]
@@ -48,9 +46,7 @@ def test_channels_that_the_session_began_without_say_nothing_when_they_come_back
 
 @pytest.mark.parametrize("kind", ["electrode", "a fifth", "lost"])
 @pytest.mark.parametrize("with_motion", [True, False])
-def test_channels_that_come_back_while_idle_are_used_from_then_on(
-    motion_calibration, twisting, with_motion, kind
-) -> None:
+def test_channels_that_come_back_while_idle_are_used_from_then_on(motion_calibration, twisting, with_motion, kind):
     calibration, series = motion_calibration, twisting(seed=3, cycles=2)
     motion = calibration.estimator.motion if with_motion else Motion()
     memory = SessionState(calibration.validators, motion, period_s=PERIOD_S)

@@ -44,7 +44,7 @@ def _n_valid_of_whole(calibration: Calibration, bank: Bank) -> int:
 
 @pytest.mark.parametrize("start", [0, DEATH])
 @pytest.mark.parametrize("dead", list(DEAD))
-def test_what_died_after_the_calibration_is_told_by_the_others(calibration, bank, twisting, dead, start) -> None:
+def test_what_died_after_the_calibration_is_told_by_the_others(calibration, bank, twisting, dead, start):
     """It stayed what it was when it died: up to 62 % of the torques were false-valid."""
     series = twisting(seed=3, cycles=3)
     whole = _n_valid_of_whole(calibration, bank)
@@ -54,7 +54,7 @@ def test_what_died_after_the_calibration_is_told_by_the_others(calibration, bank
     assert found.coverage > 0.88
 
 
-def test_what_an_estimate_was_made_from_holds_nothing_of_dead_channels(calibration, bank, twisting) -> None:
+def test_what_an_estimate_was_made_from_holds_nothing_of_dead_channels(calibration, bank, twisting):
     """A heatmap of them showed where they were when they died."""
     series, tracker, seen = twisting(seed=3, cycles=3), EstimatorSession(calibration, bank), []
     for t_s, channels in zip(series.t_s, series.channels, strict=True):
@@ -68,7 +68,7 @@ def test_what_an_estimate_was_made_from_holds_nothing_of_dead_channels(calibrati
 
 
 @pytest.mark.parametrize("start", [0, DEATH])
-def test_torques_that_the_dead_channels_alone_told_of_are_refused(twisting, monkeypatch, start) -> None:
+def test_torques_that_the_dead_channels_alone_told_of_are_refused(twisting, monkeypatch, start):
     """What the others say of them is a guess then: nine of ten torques lay outside of their intervals."""
     tip = conftest.tip
 
@@ -96,7 +96,7 @@ def test_torques_that_the_dead_channels_alone_told_of_are_refused(twisting, monk
         assert found.coverage > 0.92
 
 
-def test_channels_that_were_dead_at_calibration_refuse_nothing_and_change_nothing(recorded, twisting) -> None:
+def test_channels_that_were_dead_at_calibration_refuse_nothing_and_change_nothing(recorded, twisting):
     def still(series: FrameSeries) -> FrameSeries:
         return replace(series, channels=np.where(ELECTRODE, 0.2, series.channels))
 
@@ -110,7 +110,7 @@ def test_channels_that_were_dead_at_calibration_refuse_nothing_and_change_nothin
             assert one.torque_nm == pytest.approx(other.torque_nm, abs=1e-9)
 
 
-def test_what_is_filled_in_is_the_conditional_mean_of_a_gaussian() -> None:
+def test_what_is_filled_in_is_the_conditional_mean_of_a_gaussian():
     rng = np.random.default_rng(1)
     shapes, variances = rng.normal(size=(3, 2, 6)), rng.uniform(0.5, 2.0, (2, 6))
     filling = ChannelImputer(rng.normal(size=(2, 6)), shapes, 1.0 / variances)

@@ -131,7 +131,7 @@ def test_too_little_is_said_to_be(recorded):
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.4, 0.75, 0.76, 1.0]))
-def test_gain_and_deviation_are_medians_of_the_channels_that_are_compared(seed: int, left_out: float) -> None:
+def test_gain_and_deviation_are_medians_of_the_channels_that_are_compared(seed, left_out):
     random = np.random.default_rng(seed)
     known, usable = random.uniform(0.0, 0.3, (2, 896)), random.random(896) >= left_out
     frame = random.uniform(0.5, 2.0) * known[0] + random.normal(0, 0.02, 896)

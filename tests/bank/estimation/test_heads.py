@@ -173,7 +173,7 @@ def test_of_equal_strengths_the_strongest():
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_twist_the_other_way_than_the_lever_pushed_is_no_sure_zero(sign: float) -> None:
+def test_a_twist_the_other_way_than_the_lever_pushed_is_no_sure_zero(sign):
     """The load cell read 0 whenever the tool was twisted the other way: a 0 that may be anything on that side."""
     rng = np.random.default_rng(9)
     twist = np.sin(np.arange(400) / 9.0)

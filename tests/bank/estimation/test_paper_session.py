@@ -43,7 +43,7 @@ def tared(matcher: OneCell, calibration: Calibration | None = None, average: int
     """Return a session that has its homogeneous frame."""
     session = EstimatorSession(
         calibration or Calibration.from_matches("bank", "synthetic", torque=TORQUE, diameter=DIAMETER),
-        matcher=PaperMatcher(matcher),  # type: ignore[arg-type]
+        matcher=PaperMatcher(matcher),
         average_frames=average,
     )
     for number in range(10):
@@ -53,7 +53,7 @@ def tared(matcher: OneCell, calibration: Calibration | None = None, average: int
     return session
 
 
-def test_the_baseline_is_the_mean_of_its_frames_and_has_their_noise() -> None:
+def test_the_baseline_is_the_mean_of_its_frames_and_has_their_noise():
     state = PaperState(400, 1, 3.0)
     for number in range(400):
         state.process(TactileFrame.of(float(number), noisy()[None]))
@@ -62,14 +62,14 @@ def test_the_baseline_is_the_mean_of_its_frames_and_has_their_noise() -> None:
     assert np.median(state._noise) == pytest.approx(0.002, rel=0.02)
 
 
-def test_channels_that_do_not_move_have_the_converters_noise() -> None:
+def test_channels_that_do_not_move_have_the_converters_noise():
     state = PaperState(2, 1, 3.0)
     for number in range(2):
         state.process(TactileFrame.of(float(number), HOMOGENEOUS[None]))
     np.testing.assert_allclose(state._noise, 0.00215 / np.sqrt(12))
 
 
-def test_a_signal_becomes_torque_and_diameter_with_their_intervals() -> None:
+def test_a_signal_becomes_torque_and_diameter_with_their_intervals():
     matcher = OneCell()
     estimate = estimated(tared(matcher), 10, noisy(PATTERN))
     assert estimate.valid
@@ -79,14 +79,14 @@ def test_a_signal_becomes_torque_and_diameter_with_their_intervals() -> None:
     np.testing.assert_allclose(matcher.asked[0], PATTERN, atol=0.02)
 
 
-def test_a_frame_like_the_homogeneous_one_gives_no_estimate() -> None:
+def test_a_frame_like_the_homogeneous_one_gives_no_estimate():
     matcher = OneCell()
     estimate = estimated(tared(matcher), 10, noisy())
     assert "no signal above the noise" in estimate.reasons[0]
     assert (estimate.torque_nm, estimate.k, matcher.asked) == (None, None, [])
 
 
-def test_a_match_outside_of_the_calibration_is_shown_without_an_estimate() -> None:
+def test_a_match_outside_of_the_calibration_is_shown_without_an_estimate():
     estimate = estimated(tared(OneCell((0, 0))), 10, noisy(PATTERN))
     assert (estimate.valid, estimate.torque_nm, estimate.diameter_mm) == (False, None, None)
     assert estimate.k is not None
@@ -102,20 +102,20 @@ def test_a_match_outside_of_the_calibration_is_shown_without_an_estimate() -> No
         (Calibration.from_matches("bank", "x", diameter=DIAMETER), "made without torques"),
     ],
 )
-def test_without_a_torque_curve_the_match_alone_is_shown(calibration: Calibration, reason: str) -> None:
+def test_without_a_torque_curve_the_match_alone_is_shown(calibration, reason):
     estimate = estimated(tared(OneCell(), calibration), 10, noisy(PATTERN))
     assert reason in estimate.reasons[0]
     assert (estimate.valid, estimate.torque_nm, estimate.diameter_mm) == (False, None, None)
     assert estimate.sigma == pytest.approx(1.5)
 
 
-def test_too_many_unusable_channels_give_no_estimate() -> None:
+def test_too_many_unusable_channels_give_no_estimate():
     estimate = estimated(tared(OneCell()), 10, noisy(PATTERN), unusable=90)
     assert estimate.reasons[0].startswith("90 of 896 channels are saturated or dead; check the ribbon cable")
     assert estimated(tared(OneCell()), 10, noisy(PATTERN), unusable=89).valid
 
 
-def test_the_latest_frames_are_averaged_and_a_tare_forgets_them() -> None:
+def test_the_latest_frames_are_averaged_and_a_tare_forgets_them():
     matcher = OneCell()
     session = tared(matcher, average=3)
     for number, scale in enumerate((1.0, 2.0, 3.0, 4.0), start=10):
@@ -127,12 +127,11 @@ def test_the_latest_frames_are_averaged_and_a_tare_forgets_them() -> None:
     assert estimated(session, 20, noisy(PATTERN)).reasons == ("taking the homogeneous frame, 1 of 10",)
 
 
-def test_frames_before_a_gap_are_not_averaged_with_those_after_it() -> None:
+def test_frames_before_a_gap_are_not_averaged_with_those_after_it():
     matcher = OneCell()
     session = tared(matcher, average=2)
     estimated(session, 10, noisy(PATTERN))
     after = noisy(-PATTERN)
     estimate = estimated(session, 5000, after)
-    assert isinstance(session._state, PaperState)
     np.testing.assert_allclose(matcher.asked[-1] + session._state._homogeneous, after, atol=1e-12)
     assert estimate.lag_s == 0

@@ -272,9 +272,7 @@ def test_a_board_that_is_faster_than_configured_is_followed_all_the_same(motion_
 
 
 @pytest.mark.parametrize("spoilt", [2, 3])
-def test_after_frames_that_were_left_out_the_interval_holds_a_load_that_rises_meanwhile(
-    motion_calibration, twisting, spoilt
-):
+def test_after_frames_left_out_the_interval_holds_a_load_that_rises_meanwhile(motion_calibration, twisting, spoilt):
     """The gel was remembered where it had been before them, as if all of its motion were of the last step."""
     inside, rng = [], np.random.default_rng(0)
     for seed in range(1, 5):

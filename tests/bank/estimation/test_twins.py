@@ -19,7 +19,7 @@ def slices(n: int, seed: int, noise: float = 1e-3) -> np.ndarray:
     return mean + rng.normal(size=(n, 3)) @ ways + rng.normal(0.0, noise, (n, 896))
 
 
-def test_opposite_injections_read_the_same_magnitudes() -> None:
+def test_opposite_injections_read_the_same_magnitudes():
     forward = BatchForwardModel(small_fingertip())
     cells = np.random.default_rng(1).uniform(0.5, 2.0, (1, len(forward.mesh.triangles)))
     (voltages,) = np.abs(forward.voltages(cells))
@@ -27,7 +27,7 @@ def test_opposite_injections_read_the_same_magnitudes() -> None:
     assert sorted([*_FIRST, *_SECOND]) == list(range(896))
 
 
-def test_the_misfit_of_noise_is_that_of_noise() -> None:
+def test_the_misfit_of_noise_is_that_of_noise():
     """By the chi-squared distribution: twice the noise is four times the median square, which has a closed form."""
     frames = slices(400, 2)
     twins = ReciprocityCheck.fit(frames[:200])
@@ -38,12 +38,11 @@ def test_the_misfit_of_noise_is_that_of_noise() -> None:
     assert np.median([twins.residual(one, ALL) for one in loud]) == pytest.approx(4 * quiet, rel=0.1)
 
 
-def test_drift_in_a_few_channels_is_familiar_and_a_share_of_a_foreign_frame_is_not() -> None:
+def test_drift_in_a_few_channels_is_familiar_and_a_share_of_a_foreign_frame_is_not():
     frames = slices(60, 3)
     guard, later = NoveltyDetector.fit(frames[:40]), frames[50]
     drifted = later + np.where(np.arange(896) % 28 < 2, 4e-3, 0.0)
     foreign = 0.85 * later + 0.15 * later[np.random.default_rng(4).permutation(896)]
-    assert guard.reciprocity is not None
     by_mean, by_twins = (
         [one(frame, ALL) for frame in (drifted, foreign)]
         for one in (lambda *a: guard.q_residual(*a)[0], guard.reciprocity.residual)
@@ -54,7 +53,7 @@ def test_drift_in_a_few_channels_is_familiar_and_a_share_of_a_foreign_frame_is_n
     assert any("opposite injections" in why or "Q residual" in why for why in guard.assess(foreign, ALL).reasons)
 
 
-def test_what_one_of_the_two_does_not_say_is_left_out() -> None:
+def test_what_one_of_the_two_does_not_say_is_left_out():
     frames = slices(50, 5)
     twins = ReciprocityCheck.fit(frames[:40])
     usable = ALL.copy()

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -69,7 +68,7 @@ def calibration() -> SkinCalibration:
     return fit_calibration(record(FULL, noise=2e-4, drift_ohm=0.2))
 
 
-def test_friction_slope_and_scatter_are_found(calibration: SkinCalibration) -> None:
+def test_friction_slope_and_scatter_are_found(calibration):
     assert calibration.friction == pytest.approx(0.04, abs=0.002)
     assert calibration.slope_per_n == pytest.approx(0.088, rel=0.01)
     # 1.96 · 2e-4 and what straight pieces leave of a parabola.
@@ -78,7 +77,7 @@ def test_friction_slope_and_scatter_are_found(calibration: SkinCalibration) -> N
     assert calibration.rows_beyond == 0
 
 
-def test_below_1_2_newton_it_is_one_straight_line_and_beyond_it_rises_to_5(calibration: SkinCalibration) -> None:
+def test_below_1_2_newton_it_is_one_straight_line_and_beyond_it_rises_to_5(calibration):
     tension, response = np.array(calibration.tension_n), np.array(calibration.response)
     assert 1.2 in tension
     assert -1.2 in tension
@@ -97,7 +96,7 @@ def test_below_1_2_newton_it_is_one_straight_line_and_beyond_it_rises_to_5(calib
 
 
 @given(st.lists(st.floats(-4, 4), min_size=1, max_size=8), st.floats(0, 2))
-def test_without_direction_the_interval_is_wider_and_holds_the_force(path: list[float], normal_n: float) -> None:
+def test_without_direction_the_interval_is_wider_and_holds_the_force(path, normal_n):
     exact = exact_calibration()
     tension = replace(MEMBRANE, axial_stiffness_n=1.0, gauge_factor=1.0)
     state = UNSTRETCHED
@@ -127,7 +126,7 @@ def exact_calibration() -> SkinCalibration:
     )
 
 
-def test_the_deadband_is_taken_out_only_where_the_direction_is_known(calibration: SkinCalibration) -> None:
+def test_the_deadband_is_taken_out_only_where_the_direction_is_known(calibration):
     response = true_response(MEMBRANE, [0.2, 0.5], 2.0)[-1]
     loading_n = calibration.shear_from_response(response, 2.0, Direction.LOADING)
     unknown = calibration.shear_from_response(response, 2.0)
@@ -137,7 +136,7 @@ def test_the_deadband_is_taken_out_only_where_the_direction_is_known(calibration
     assert calibration.shear_from_response(0.0, 2.0, Direction.LOADING).in_deadband
 
 
-def test_beyond_the_curve_the_interval_has_no_end(calibration: SkinCalibration) -> None:
+def test_beyond_the_curve_the_interval_has_no_end(calibration):
     beyond = calibration.response[-1] * 1.1
     assert calibration.shear_from_response(beyond, 1.0).high_n == np.inf
     assert calibration.shear_from_response(-beyond, 1.0).low_n == -np.inf
@@ -145,7 +144,7 @@ def test_beyond_the_curve_the_interval_has_no_end(calibration: SkinCalibration) 
 
 
 @pytest.mark.parametrize("direction", list(Direction))
-def test_the_interval_of_a_new_recording_holds_95_percent(calibration: SkinCalibration, direction: Direction) -> None:
+def test_the_interval_of_a_new_recording_holds_95_percent(calibration, direction):
     rng, held, tried = np.random.default_rng(9), 0, 0
     for _ in range(300):
         shear_n, normal_n = rng.uniform(0.1, 1.2), rng.uniform(0.2, 2.0)
@@ -157,7 +156,7 @@ def test_the_interval_of_a_new_recording_holds_95_percent(calibration: SkinCalib
     assert held / tried > 0.93
 
 
-def test_a_light_loading_needs_no_curve_and_drops_no_row_silently() -> None:
+def test_a_light_loading_needs_no_curve_and_drops_no_row_silently():
     path = np.concatenate([loop(1.1), loading(1.5)])
     found = fit_calibration(record([(1.0, path), (2.0, path)], noise=1e-4))
     assert len(found.tension_n) == 2
@@ -165,7 +164,7 @@ def test_a_light_loading_needs_no_curve_and_drops_no_row_silently() -> None:
     assert found.friction == pytest.approx(0.04, abs=0.003)
 
 
-def test_a_table_without_friction_in_it_is_refused_unless_friction_is_given() -> None:
+def test_a_table_without_friction_in_it_is_refused_unless_friction_is_given():
     light = record([(0.0, loading(1.0)), (0.0, -loading(1.0))], noise=1e-4)
     with pytest.raises(CalibrationError, match="--friction"):
         fit_calibration(light)
@@ -173,7 +172,7 @@ def test_a_table_without_friction_in_it_is_refused_unless_friction_is_given() ->
     assert given_friction.slope_per_n == pytest.approx(0.088, rel=0.01)
 
 
-def test_swapped_gauges_few_rows_and_no_rest_are_refused_with_their_cure() -> None:
+def test_swapped_gauges_few_rows_and_no_rest_are_refused_with_their_cure():
     table = record(FULL)
     with pytest.raises(CalibrationError, match="R1 is the gauge stretched by a positive shear force"):
         fit_calibration(CalibrationTable(table.r2_ohm, table.r1_ohm, table.shear_n, table.normal_n), friction=0.04)
@@ -189,7 +188,7 @@ def columns(table: CalibrationTable) -> list[NDArray[np.float64]]:
     return [table.r1_ohm, table.r2_ohm, table.shear_n, table.normal_n]
 
 
-def test_a_calibration_comes_back_from_its_file(calibration: SkinCalibration, tmp_path: Path) -> None:
+def test_a_calibration_comes_back_from_its_file(calibration, tmp_path):
     path = tmp_path / "skin.yaml"
     save_calibration(calibration, path)
     assert load_calibration(path) == calibration
@@ -209,7 +208,7 @@ def test_a_calibration_comes_back_from_its_file(calibration: SkinCalibration, tm
         ("rows: 100", "rows: [", r"line \d+, column \d+: "),
     ],
 )
-def test_a_file_with_a_mistake_is_refused_by_name(old: str, new: str, named: str, tmp_path: Path) -> None:
+def test_a_file_with_a_mistake_is_refused_by_name(old, new, named, tmp_path):
     path = tmp_path / "skin.yaml"
     save_calibration(exact_calibration(), path)
     text = path.read_text()
@@ -220,14 +219,14 @@ def test_a_file_with_a_mistake_is_refused_by_name(old: str, new: str, named: str
     assert "skin.yaml" in str(refused.value)
 
 
-def test_a_missing_file_and_an_unwritable_place_are_sentences(tmp_path: Path) -> None:
+def test_a_missing_file_and_an_unwritable_place_are_sentences(tmp_path):
     with pytest.raises(CalibrationError, match="cannot be read"):
         load_calibration(tmp_path / "none.yaml")
     with pytest.raises(CalibrationError, match="cannot be written"):
         save_calibration(exact_calibration(), tmp_path / "none" / "skin.yaml")
 
 
-def test_a_table_is_read_whatever_the_order_of_its_columns(tmp_path: Path) -> None:
+def test_a_table_is_read_whatever_the_order_of_its_columns(tmp_path):
     path = tmp_path / "table.csv"
     path.write_text("shear_n,normal_n,r1_ohm,r2_ohm\n0,0,25,26\n0.5,1,26,26\n")
     table = read_table(path)
@@ -249,7 +248,7 @@ def test_a_table_is_read_whatever_the_order_of_its_columns(tmp_path: Path) -> No
         ("r1_ohm,r2_ohm,shear_n,normal_n\n25,25,0,0\n25,25,1,-1\n", "line 3: normal_n is -1; a force that presses"),
     ],
 )
-def test_a_table_with_a_mistake_is_refused_by_line_and_column(text: str, named: str, tmp_path: Path) -> None:
+def test_a_table_with_a_mistake_is_refused_by_line_and_column(text, named, tmp_path):
     path = tmp_path / "table.csv"
     path.write_text(text)
     with pytest.raises(CalibrationError, match=named) as refused:
@@ -292,7 +291,7 @@ def ramp(begin_n: float, end_n: float, n_per_s: float) -> list[float]:
 
 @pytest.mark.parametrize("n_per_s", [0.05, 0.2, 1.0])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_ramp_is_followed_up_and_down_through_zero(n_per_s: float, sign: float) -> None:
+def test_a_ramp_is_followed_up_and_down_through_zero(n_per_s, sign):
     path = [0.0] * 20 + ramp(0.0, sign, n_per_s) + ramp(sign, -sign, n_per_s)
     found = followed(path)
     errors = np.abs([shear_n - true_n for (_, shear_n, _, _), true_n in zip(found, path, strict=True)])
@@ -305,7 +304,7 @@ def test_a_ramp_is_followed_up_and_down_through_zero(n_per_s: float, sign: float
     assert errors[steady].max() < 0.02 + 0.3 * n_per_s / 10, "while the skin slips the force is one number"
 
 
-def test_a_force_that_stays_is_neither_loading_nor_unloading_for_an_hour() -> None:
+def test_a_force_that_stays_is_neither_loading_nor_unloading_for_an_hour():
     path = ramp(0.0, 0.8, 0.2) + [0.8] * 36_000
     found = followed(path, seed=3)
     held = found[60:]
@@ -313,7 +312,7 @@ def test_a_force_that_stays_is_neither_loading_nor_unloading_for_an_hour() -> No
     assert all(abs(shear_n - 0.8) < 0.012 for _, shear_n, _, _ in held)
 
 
-def test_within_the_band_the_force_stays_where_it_was_known_and_the_band_holds_the_truth() -> None:
+def test_within_the_band_the_force_stays_where_it_was_known_and_the_band_holds_the_truth():
     path = ramp(0.0, 0.8, 0.2) + ramp(0.8, 0.76, 0.02) + [0.76] * 30
     direction, shear_n, low_n, high_n = followed(path)[-1]
     assert direction is Direction.UNKNOWN
@@ -322,14 +321,14 @@ def test_within_the_band_the_force_stays_where_it_was_known_and_the_band_holds_t
     assert low_n == pytest.approx(0.8 - 2 * HOLD_N - 0.07, abs=0.02)
 
 
-def test_below_friction_nothing_is_told_from_nothing() -> None:
+def test_below_friction_nothing_is_told_from_nothing():
     for direction, shear_n, low_n, high_n in followed([0.0] * 20 + ramp(0.0, 0.035, 0.05) + [0.035] * 20):
         assert direction is Direction.UNKNOWN
         assert abs(shear_n) < 0.01
         assert low_n < 0.035 < high_n
 
 
-def test_after_a_gap_the_direction_is_found_anew() -> None:
+def test_after_a_gap_the_direction_is_found_anew():
     finder = DirectionFinder(NOISE)
     for number in range(20):
         finder.update(number / 10, 0.002 * number)
@@ -338,7 +337,7 @@ def test_after_a_gap_the_direction_is_found_anew() -> None:
     assert finder.update(2.1, 0.02) is Direction.UNKNOWN
 
 
-def test_a_direction_is_remembered_for_a_moment_only() -> None:
+def test_a_direction_is_remembered_for_a_moment_only():
     finder = DirectionFinder(NOISE)
     for number in range(10):
         finder.update(number / 10, 0.004 * number)
@@ -353,9 +352,7 @@ def test_a_direction_is_remembered_for_a_moment_only() -> None:
     st.lists(st.tuples(st.floats(-1.1, 1.1), st.floats(0.03, 1.0), st.integers(0, 20)), min_size=1, max_size=5),
     st.integers(0, 1000),
 )
-def test_whatever_the_hand_does_the_band_with_its_noise_holds_the_force_but_for_moments(
-    moves: list[tuple[float, float, int]], seed: int
-) -> None:
+def test_whatever_the_hand_does_the_band_with_its_noise_holds_the_force_but_for_moments(moves, seed):
     path = [0.0] * 10
     for target_n, n_per_s, rest in moves:
         path += ramp(path[-1], target_n, n_per_s) + [target_n] * rest

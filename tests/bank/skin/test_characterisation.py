@@ -18,7 +18,7 @@ from shearloop.bank.skin.characterisation import (
 from shearloop.bank.skin.membrane import paper_membrane
 
 
-def test_the_noise_floor_is_the_noise_put_in_and_not_the_wandering_between_windows() -> None:
+def test_the_noise_floor_is_the_noise_put_in_and_not_the_wandering_between_windows():
     rng = np.random.default_rng(20)
     time_s = np.arange(0, 600, 0.1)
     wandering = 0.05 * np.floor(time_s) / 600
@@ -29,7 +29,7 @@ def test_the_noise_floor_is_the_noise_put_in_and_not_the_wandering_between_windo
         noise_floor_n(np.arange(0, 100, 5.0), np.zeros(20), 0.08)
 
 
-def test_a_line_by_hand() -> None:
+def test_a_line_by_hand():
     line = fit_line(np.array([0.0, 1.0, 2.0, 3.0]), np.array([1.0, 1.0, 3.0, 3.0]))
     assert (line.slope_per_n, line.offset) == pytest.approx((0.8, 0.8))
     assert line.scatter == pytest.approx(math.sqrt(0.8 / 2))
@@ -41,7 +41,7 @@ def test_a_line_by_hand() -> None:
 
 
 @pytest.mark.parametrize("put_in", [SkinFigures(), SkinFigures(0.004, 0.05, 4e-4, 3e-4, -0.003)])
-def test_what_is_put_into_a_synthetic_skin_is_found_again(put_in: SkinFigures) -> None:
+def test_what_is_put_into_a_synthetic_skin_is_found_again(put_in):
     found = [estimated_figures(paper_membrane(), put_in, np.random.default_rng(seed)) for seed in range(20)]
     noise = put_in.noise_floor_n * 0.088
     for name, spread in {
@@ -56,7 +56,7 @@ def test_what_is_put_into_a_synthetic_skin_is_found_again(put_in: SkinFigures) -
         assert mean == pytest.approx(getattr(put_in, name), rel=spread), name
 
 
-def test_friction_alone_makes_a_prediction_interval_of_the_paper_s_size() -> None:
+def test_friction_alone_makes_a_prediction_interval_of_the_paper_s_size():
     """Loading alone it is narrower than the paper's ± 0.0802 N, over a whole loop wider."""
     membrane = paper_membrane()
     up = loading(1.0)
@@ -67,6 +67,6 @@ def test_friction_alone_makes_a_prediction_interval_of_the_paper_s_size() -> Non
     assert there.prediction_half_width_n(0.0) < 0.0802 < round_trip.prediction_half_width_n(0.0)
 
 
-def test_the_paths_of_the_paper() -> None:
+def test_the_paths_of_the_paper():
     np.testing.assert_allclose(loading(0.5), [0.1, 0.2, 0.3, 0.4, 0.5])
     np.testing.assert_allclose(loop(0.2), [0.1, 0.2, 0.1, 0.0, -0.1, -0.2, -0.1, 0.0, 0.1, 0.2], atol=1e-15)

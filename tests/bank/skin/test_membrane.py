@@ -40,13 +40,13 @@ def force(response: float, normal_n: float, direction: Direction = Direction.UNK
     return MEMBRANE.shear_from_tensions(tension, tension, tension, normal_n, direction)
 
 
-def test_without_friction_it_is_the_paper_s_0_088_per_newton() -> None:
+def test_without_friction_it_is_the_paper_s_0_088_per_newton():
     slippery = Membrane(MEMBRANE.axial_stiffness_n, 0.0, MEMBRANE.gauge_angle_rad)
     assert slippery.response(slippery.step(UNSTRETCHED, 1.0, 2.0)) == pytest.approx(0.088)
 
 
 @pytest.mark.parametrize("normal_n", [0.5, 1.0, 1.5, 2.0])
-def test_the_deadband_is_friction_times_normal_force_exactly(normal_n: float) -> None:
+def test_the_deadband_is_friction_times_normal_force_exactly(normal_n):
     edge = MEMBRANE.friction * normal_n
     for sign in (1, -1):
         inside = MEMBRANE.step(UNSTRETCHED, sign * edge, normal_n)
@@ -56,7 +56,7 @@ def test_the_deadband_is_friction_times_normal_force_exactly(normal_n: float) ->
 
 
 @pytest.mark.parametrize("normal_n", [0.5, 1.0, 1.5, 2.0])
-def test_a_fit_through_the_origin_of_loading_from_zero_gives_the_paper_s_0_078(normal_n: float) -> None:
+def test_a_fit_through_the_origin_of_loading_from_zero_gives_the_paper_s_0_078(normal_n):
     """The rule: least squares through the origin over the paper's loading, 0.1 N steps up to the normal force."""
     shear_n = loading(normal_n)
     assert shear_n[0] == pytest.approx(0.1)
@@ -65,14 +65,14 @@ def test_a_fit_through_the_origin_of_loading_from_zero_gives_the_paper_s_0_078(n
 
 
 @given(forces)
-def test_one_side_alone_is_stretched_and_none_compressed(path: list[tuple[float, float]]) -> None:
+def test_one_side_alone_is_stretched_and_none_compressed(path):
     for state in walk(path):
         assert min(state.gauge_tension_1_n, state.gauge_tension_2_n) == 0
         assert max(state.gauge_tension_1_n, state.gauge_tension_2_n) >= 0
 
 
 @given(forces)
-def test_left_and_right_are_alike(path: list[tuple[float, float]]) -> None:
+def test_left_and_right_are_alike(path):
     for state, mirrored in zip(walk(path), walk([(-s, n) for s, n in path]), strict=True):
         assert (state.gauge_tension_1_n, state.gauge_tension_2_n) == (
             mirrored.gauge_tension_2_n,
@@ -81,7 +81,7 @@ def test_left_and_right_are_alike(path: list[tuple[float, float]]) -> None:
 
 
 @given(forces, st.integers(2, 7))
-def test_a_step_taken_in_parts_ends_where_the_whole_one_does(path: list[tuple[float, float]], parts: int) -> None:
+def test_a_step_taken_in_parts_ends_where_the_whole_one_does(path, parts):
     normal_n = path[0][1]
     whole = walk([(shear_n, normal_n) for shear_n, _ in path])
     turns = [0.0, *(shear_n for shear_n, _ in path)]
@@ -118,7 +118,7 @@ def belt_of_sliders(
     return found
 
 
-def test_tension_at_the_gauge_is_that_of_a_slow_chain_of_springs_and_sliders() -> None:
+def test_tension_at_the_gauge_is_that_of_a_slow_chain_of_springs_and_sliders():
     friction, angle = 0.3, 1.0
     pulls = [0.5, 1.0, 0.9, 0.7, 0.75, 1.1, 0.6, 0.3, 0.35, 0.8, 0.0]
     membrane, state = Membrane(1.0, friction, angle, 1.0), UNSTRETCHED
@@ -132,7 +132,7 @@ def test_tension_at_the_gauge_is_that_of_a_slow_chain_of_springs_and_sliders() -
 
 
 @given(forces)
-def test_the_interval_holds_the_force_whatever_came_before(path: list[tuple[float, float]]) -> None:
+def test_the_interval_holds_the_force_whatever_came_before(path):
     for state, (shear_n, normal_n) in zip(walk(path), path, strict=True):
         found = force(MEMBRANE.response(state), normal_n)
         assert found.low_n - 1e-9 <= shear_n <= found.high_n + 1e-9
@@ -140,7 +140,7 @@ def test_the_interval_holds_the_force_whatever_came_before(path: list[tuple[floa
 
 
 @given(forces)
-def test_a_change_of_response_tells_the_direction_and_with_it_the_force(path: list[tuple[float, float]]) -> None:
+def test_a_change_of_response_tells_the_direction_and_with_it_the_force(path):
     before = 0.0
     for state, (shear_n, normal_n) in zip(walk(path), path, strict=True):
         now = MEMBRANE.response(state)
@@ -151,7 +151,7 @@ def test_a_change_of_response_tells_the_direction_and_with_it_the_force(path: li
         before = now
 
 
-def test_without_response_the_force_is_anything_within_the_deadband() -> None:
+def test_without_response_the_force_is_anything_within_the_deadband():
     for direction in Direction:
         found = force(0.0, 1.0, direction)
         assert found == pytest.approx((0.0, -0.04, 0.04))
@@ -159,7 +159,7 @@ def test_without_response_the_force_is_anything_within_the_deadband() -> None:
     assert not force(0.05, 1.0).in_deadband
 
 
-def test_an_unknown_direction_costs_the_deadband_on_both_sides_and_the_capstan() -> None:
+def test_an_unknown_direction_costs_the_deadband_on_both_sides_and_the_capstan():
     response = 0.0462
     found = force(response, 1.0)
     tension = response / 0.088
@@ -167,13 +167,13 @@ def test_an_unknown_direction_costs_the_deadband_on_both_sides_and_the_capstan()
     assert found.high_n == pytest.approx(tension / CAPSTAN + 0.04)
 
 
-def test_a_belt_that_cannot_be_is_refused() -> None:
+def test_a_belt_that_cannot_be_is_refused():
     with pytest.raises(CalibrationError, match="stiffness must be positive"):
         Membrane(0.0, 0.04, 1.0)
     assert section_membrane().axial_stiffness_n == pytest.approx(MEMBRANE.axial_stiffness_n, rel=0.1)
 
 
-def test_the_paper_s_gauge_has_25_ohm_and_stays_within_5_kelvin() -> None:
+def test_the_paper_s_gauge_has_25_ohm_and_stays_within_5_kelvin():
     assert pytest.approx(25.0, rel=0.02) == GAUGE_RESISTANCE_OHM
     assert 0 < joule_heating_k(EXCITATION_A**2 * GAUGE_RESISTANCE_OHM) < 5.0
 
@@ -188,6 +188,6 @@ def test_the_paper_s_gauge_has_25_ohm_and_stays_within_5_kelvin() -> None:
         ({"gauge_to_deg": 89.0}, "gauge"),
     ],
 )
-def test_an_impossible_section_is_refused_by_name(wrong: dict[str, float], named: str) -> None:
+def test_an_impossible_section_is_refused_by_name(wrong, named):
     with pytest.raises(GeometryError, match=named):
         Section(**wrong)

@@ -68,14 +68,14 @@ def lame_errors(size: MeshSize) -> tuple[float, float]:
     return float(np.sqrt(squared.assemble(basis, u=u))), float(np.sqrt(gradient_squared.assemble(basis, u=u)))
 
 
-def test_a_ring_under_pressure_converges_at_the_rates_of_quadratic_elements() -> None:
+def test_a_ring_under_pressure_converges_at_the_rates_of_quadratic_elements():
     errors = np.array([lame_errors(MeshSize(1, 2, 3, 1, 2).refined(k)) for k in (2, 4, 8)])
     rates = np.log2(errors[:-1] / errors[1:])
     assert (rates[:, 0] > 2.8).all(), f"displacement: {rates[:, 0]}"
     assert (rates[:, 1] > 1.9).all(), f"strain: {rates[:, 1]}"
 
 
-def test_the_mesh_is_the_half_annulus_with_the_load_s_and_gauges_ends_on_element_edges() -> None:
+def test_the_mesh_is_the_half_annulus_with_the_load_s_and_gauges_ends_on_element_edges():
     mesh = annulus_mesh(SECTION)
     assert mesh.t.shape[1] == 112
     area = skfem.Functional(lambda _: 1.0).assemble(skfem.Basis(mesh, skfem.ElementQuad2()))
@@ -86,7 +86,7 @@ def test_the_mesh_is_the_half_annulus_with_the_load_s_and_gauges_ends_on_element
         assert abs(angles - wanted).min() < 1e-9
 
 
-def test_condensation_only_leaves_out_what_was_eliminated(skin_112: CondensedSkin) -> None:
+def test_condensation_only_leaves_out_what_was_eliminated(skin_112):
     """Without contact forces the skin is a clamped arch: solved whole, it has the same displacements and strains."""
     normal_n, shear_n = 0.3, 0.2
     mesh = annulus_mesh(SECTION)
@@ -131,7 +131,7 @@ def test_condensation_only_leaves_out_what_was_eliminated(skin_112: CondensedSki
 
 
 @pytest.mark.parametrize("wrong", [(0, 1, 1, 1, 2), (1, 1, 1, 1, 1), (1, 1, 1, 1, 3)])
-def test_a_mesh_without_a_mid_line_is_refused(wrong: tuple[int, int, int, int, int]) -> None:
+def test_a_mesh_without_a_mid_line_is_refused(wrong):
     with pytest.raises(GeometryError, match="even number of layers"):
         MeshSize(*wrong)
 
@@ -150,9 +150,7 @@ def shears(states: list[ContactState]) -> FloatArray:
     return np.array([state.shear_n for state in states])
 
 
-def test_its_sensitivity_is_the_paper_s_within_20_percent_under_any_load(
-    skin_112: CondensedSkin, loadings: Loadings
-) -> None:
+def test_its_sensitivity_is_the_paper_s_within_20_percent_under_any_load(skin_112, loadings):
     for estimate in (origin_slope, lambda x, y: fit_line(x, y).slope_per_n):
         found = [estimate(shears(states), gauge_responses(skin_112, states)) for states in loadings.values()]
         assert 0.085 <= min(found) <= max(found) <= 0.090
@@ -160,7 +158,7 @@ def test_its_sensitivity_is_the_paper_s_within_20_percent_under_any_load(
         assert np.ptp(found) < 0.005 * np.mean(found)
 
 
-def test_it_begins_to_respond_at_the_paper_s_0_04_newton(skin_112: CondensedSkin, loadings: Loadings) -> None:
+def test_it_begins_to_respond_at_the_paper_s_0_04_newton(skin_112, loadings):
     line = fit_line(shears(loadings[1.0]), gauge_responses(skin_112, loadings[1.0]))
     assert line.kink_n == pytest.approx(0.040, abs=0.005)
     assert line.kink_n == pytest.approx(SECTION.friction * SECTION.inner_radius_mm / SECTION.outer_radius_mm, rel=0.02)
@@ -172,14 +170,14 @@ def test_it_begins_to_respond_at_the_paper_s_0_04_newton(skin_112: CondensedSkin
     assert slopes[fine[1:] > 0.0499] == pytest.approx(1.0, abs=0.03)
 
 
-def test_tension_is_even_along_the_skin_and_falls_to_the_bracket(skin_112: CondensedSkin, loadings: Loadings) -> None:
+def test_tension_is_even_along_the_skin_and_falls_to_the_bracket(skin_112, loadings):
     strain = midline_strain(skin_112, loadings[1.0][-1])
     flank = strain[(skin_112.midline_deg > 15) & (skin_112.midline_deg < 75)]
     assert flank.min() > 0
     assert 0.02 < np.ptp(flank) / flank.mean() < 0.04, "friction takes something, but less than 4 %"
 
 
-def test_the_compressed_side_lifts_off_and_hardly_responds(skin_112: CondensedSkin, loadings: Loadings) -> None:
+def test_the_compressed_side_lifts_off_and_hardly_responds(skin_112, loadings):
     for states in loadings.values():
         strain_1, strain_2 = gauge_strains(skin_112, states)[-1]
         assert strain_2 < 0 < strain_1
@@ -190,7 +188,7 @@ def test_the_compressed_side_lifts_off_and_hardly_responds(skin_112: CondensedSk
         assert touching[stretched].mean() > 0.95
 
 
-def test_there_is_no_response_to_normal_force_alone(skin_112: CondensedSkin) -> None:
+def test_there_is_no_response_to_normal_force_alone(skin_112):
     for normal_n in NORMAL_FORCES:
         pressed = apply_load(skin_112, unloaded(skin_112), normal_n, 0.0)
         assert abs(gauge_responses(skin_112, [pressed])).max() < 1e-6
@@ -210,7 +208,7 @@ def test_there_is_no_response_to_normal_force_alone(skin_112: CondensedSkin) -> 
         ({"friction": 0.0}, 0.015),
     ],
 )
-def test_it_agrees_with_the_closed_form_within_one_percent(changed: dict[str, float], tolerance: float) -> None:
+def test_it_agrees_with_the_closed_form_within_one_percent(changed, tolerance):
     section = replace(SECTION, **changed)
     skin = condense(section)
     states = states_along(skin, 1.0, loading(1.0))
@@ -225,7 +223,7 @@ def gaps_and_forces(skin: CondensedSkin, state: ContactState) -> tuple[FloatArra
     return moved[:n], state.contact_force_n[:n], state.contact_force_n[n:]
 
 
-def test_the_contact_conditions_hold_at_every_node(loadings: Loadings, skin_112: CondensedSkin) -> None:
+def test_the_contact_conditions_hold_at_every_node(loadings, skin_112):
     for state in itertools.chain(*loadings.values()):
         gap, pressing, along = gaps_and_forces(skin_112, state)
         assert gap.min() > -1e-12
@@ -258,7 +256,7 @@ def projected_gauss_seidel(
 
 
 @pytest.mark.parametrize("friction", [0.04, 1.0])
-def test_a_slow_solver_finds_the_same_forces(friction: float) -> None:
+def test_a_slow_solver_finds_the_same_forces(friction):
     skin = condense(SECTION, MeshSize(1, 1, 1, 1, 2))
     state = unloaded(skin)
     for normal_n, shear_n in [(1.0, 0.0), (1.0, 0.5), (1.0, 1.0), (1.0, 0.3), (0.5, -0.2)]:
@@ -270,7 +268,7 @@ def test_a_slow_solver_finds_the_same_forces(friction: float) -> None:
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.04, 0.3, 1.0])
-def test_it_converges_from_random_starts_and_in_one_jump(skin_112: CondensedSkin, friction: float) -> None:
+def test_it_converges_from_random_starts_and_in_one_jump(skin_112, friction):
     rng = np.random.default_rng(1)
     n = len(skin_112.contact_deg)
     for normal_n, shear_n in [(1.0, 0.0), (1.0, 1.0), (2.0, -1.5), (0.5, 3.0)]:
@@ -283,14 +281,14 @@ def test_it_converges_from_random_starts_and_in_one_jump(skin_112: CondensedSkin
             np.testing.assert_allclose(jump, jumps[0], atol=1e-12)
 
 
-def test_one_jump_ends_where_small_steps_do_while_the_load_rises(skin_112: CondensedSkin, loadings: Loadings) -> None:
+def test_one_jump_ends_where_small_steps_do_while_the_load_rises(skin_112, loadings):
     pressed = apply_load(skin_112, unloaded(skin_112), 1.0, 0.0)
     jump = apply_load(skin_112, pressed, 1.0, 1.0)
     found = gauge_responses(skin_112, [jump, loadings[1.0][-1]])
     assert found[0] == pytest.approx(found[1], rel=1e-6)
 
 
-def test_random_histories_of_slip_do_not_stop_it() -> None:
+def test_random_histories_of_slip_do_not_stop_it():
     skin = condense(SECTION, MeshSize(3, 4, 6, 2, 2))
     n = len(skin.contact_deg)
     for seed in range(40):
@@ -305,7 +303,7 @@ def test_random_histories_of_slip_do_not_stop_it() -> None:
 
 
 @pytest.mark.parametrize(("thickness_mm", "friction"), [(0.05, 0.04), (0.7, 1.0)])
-def test_a_loop_is_followed_far_from_the_paper_s_section(thickness_mm: float, friction: float) -> None:
+def test_a_loop_is_followed_far_from_the_paper_s_section(thickness_mm, friction):
     skin = condense(replace(SECTION, thickness_mm=thickness_mm, friction=friction))
     for state in states_along(skin, 1.0, loop(1.0)[:13]):
         gap, pressing, along = gaps_and_forces(skin, state)
@@ -316,19 +314,19 @@ def test_a_loop_is_followed_far_from_the_paper_s_section(thickness_mm: float, fr
         assert (abs(along) <= friction * pressing + 1e-9 * scale).all()
 
 
-def test_numbers_that_are_none_are_refused_not_returned(skin_112: CondensedSkin) -> None:
+def test_numbers_that_are_none_are_refused_not_returned(skin_112):
     with pytest.raises(ContactError, match="is not a number"):
         apply_load(skin_112, unloaded(skin_112), float("nan"), 0.0)
 
 
-def test_the_response_converges_long_before_the_corners_do(skin_112: CondensedSkin) -> None:
+def test_the_response_converges_long_before_the_corners_do(skin_112):
     fine = condense(SECTION, MeshSize(10, 18, 26, 4, 4))
     path = loading(1.0)[2::3]  # growing loads need no steps in between
     found = [gauge_responses(skin, states_along(skin, 1.0, path)) for skin in (skin_112, fine)]
     np.testing.assert_allclose(found[0], found[1], rtol=1e-3, atol=1e-5)
 
 
-def test_its_hysteresis_is_that_of_the_membrane(skin_112: CondensedSkin) -> None:
+def test_its_hysteresis_is_that_of_the_membrane(skin_112):
     path = loop(1.0)
     two = gauge_responses(skin_112, states_along(skin_112, 1.0, path))
     assert abs(responses(section_membrane(), path, 1.0) - two).max() < 0.03 * abs(two).max()

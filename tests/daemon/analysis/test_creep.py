@@ -19,7 +19,7 @@ def twisted(for_s: float, noise_nm: float = 0.0) -> tuple[np.ndarray, np.ndarray
     return times, shears, np.array([state.torque_nm for state in states])
 
 
-def test_without_noise_the_torque_of_the_rigs_gel_comes_back_from_its_shear() -> None:
+def test_without_noise_the_torque_of_the_rigs_gel_comes_back_from_its_shear():
     times, shears, torques = twisted(120.0)
     creep = Creep(0.08, 20.0)
     found = [creep.torque_nm(shear, round(t_s * 1e9)) for t_s, shear in zip(times, shears, strict=True)]
@@ -27,7 +27,7 @@ def test_without_noise_the_torque_of_the_rigs_gel_comes_back_from_its_shear() ->
     np.testing.assert_allclose(found, torques, atol=4e-4)
 
 
-def test_ten_noisy_twists_tell_the_creep() -> None:
+def test_ten_noisy_twists_tell_the_creep():
     found = fit_creep([Stretch(*twisted(600.0, 0.003))])
     assert found.creep.share == pytest.approx(0.08, abs=0.02)
     assert found.creep.time_s == pytest.approx(20.0, rel=0.5)
@@ -35,7 +35,7 @@ def test_ten_noisy_twists_tell_the_creep() -> None:
     assert found.before_nm > 1.1 * found.after_nm
 
 
-def test_noise_shifts_neither_the_time_nor_the_scale_but_widens_what_is_found() -> None:
+def test_noise_shifts_neither_the_time_nor_the_scale_but_widens_what_is_found():
     """Fitted the other way round, torque to readings, 12 mN·m of noise make 20 s 50 s and the scale 0.95."""
     times, shears, torques = twisted(600.0)
     random = np.random.default_rng(5)
@@ -45,7 +45,7 @@ def test_noise_shifts_neither_the_time_nor_the_scale_but_widens_what_is_found() 
     assert np.mean([one.scale for one in found]) == pytest.approx(1.0, abs=0.015)
 
 
-def test_a_wrong_scale_of_the_estimator_is_not_taken_for_creep() -> None:
+def test_a_wrong_scale_of_the_estimator_is_not_taken_for_creep():
     times, shears, torques = twisted(600.0)
     found = fit_creep([Stretch(times, 1.1 * shears, torques)])
     assert found.creep.share == pytest.approx(0.08, abs=0.005)
@@ -56,9 +56,7 @@ def test_a_wrong_scale_of_the_estimator_is_not_taken_for_creep() -> None:
 
 
 @pytest.mark.parametrize(("fingertip_nm", "load_cell_nm"), [(0.02, 0.0), (0.0, 0.005)])
-def test_several_grips_tell_as_much_as_one_long_one_and_a_wrong_zero_tells_hardly_anything(
-    fingertip_nm: float, load_cell_nm: float
-) -> None:
+def test_several_grips_tell_as_much_as_one_long_one_and_a_wrong_zero_tells_hardly_anything(fingertip_nm, load_cell_nm):
     """The load cell's zero was taken when the recording began; a fingertip's may be far off."""
     times, shears, torques = twisted(300.0)
     found = fit_creep([Stretch(t_s, shears + fingertip_nm, torques + load_cell_nm) for t_s in (times, times + 1e4)])
@@ -68,7 +66,7 @@ def test_several_grips_tell_as_much_as_one_long_one_and_a_wrong_zero_tells_hardl
     assert found.creep.time_s == pytest.approx(20.0, rel=0.1)
 
 
-def test_a_new_grip_finds_the_gel_at_rest() -> None:
+def test_a_new_grip_finds_the_gel_at_rest():
     creep = Creep(0.1, 5.0)
     for second in range(60):
         creep.torque_nm(0.1, second * 10**9)
@@ -77,7 +75,7 @@ def test_a_new_grip_finds_the_gel_at_rest() -> None:
     assert creep.torque_nm(0.05, 61 * 10**9) == 0.05
 
 
-def test_what_is_no_creep_is_refused() -> None:
+def test_what_is_no_creep_is_refused():
     times, shears, torques = twisted(120.0)
     with pytest.raises(UserError, match="too few"):
         fit_creep([Stretch(times[:10], shears[:10], torques[:10])])

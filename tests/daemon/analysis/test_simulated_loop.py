@@ -35,7 +35,7 @@ class FixedSpeed:
         return WristCommand(self.speed if t_ns < self.until_ns else 0.0)
 
 
-def test_the_plant_measures_the_mean_of_its_window_and_reports_it_late() -> None:
+def test_the_plant_measures_the_mean_of_its_window_and_reports_it_late():
     sensor = SimulatedSensor(period_s=0.5, window_s=0.5, transfer_s=0.1)
     tool = SimulatedTool(relaxing_share=0.0, actuation_s=0.0)
     loop = FixedSpeed(0.2, until_s=1e9)
@@ -46,7 +46,7 @@ def test_the_plant_measures_the_mean_of_its_window_and_reports_it_late() -> None
         assert 0.35 <= (now_ns - mid_ns) / 1e9 <= 0.36
 
 
-def test_the_plant_relaxes_and_slips() -> None:
+def test_the_plant_relaxes_and_slips():
     tool = SimulatedTool(relaxing_share=0.1, relaxing_s=2.0)
     plant = Plant(tool, LOAD_CELL, np.random.default_rng(0))
     run(plant, FixedSpeed(0.5, until_s=0.8), 20.0)
@@ -58,7 +58,7 @@ def test_the_plant_relaxes_and_slips() -> None:
     assert slipping.torque_nm < 0.04
 
 
-def test_a_slipping_grip_ends_in_a_held_wrist() -> None:
+def test_a_slipping_grip_ends_in_a_held_wrist():
     scenario = SCENARIOS[0]
     plant = Plant(SimulatedTool(), scenario.sensor, np.random.default_rng(22))
     found = identified(plant, scenario)

@@ -30,9 +30,7 @@ def calibration() -> SkinCalibration:
         SkinLoopCase(name="Fn = 2 N", normal_n=2.0, deadband_nm=0.0, kp=0.15, hold_s=6.0),
     ],
 )
-def test_a_force_is_held_without_a_limit_cycle_wider_than_friction_s_band(
-    case: SkinLoopCase, calibration: SkinCalibration
-) -> None:
+def test_a_force_is_held_without_a_limit_cycle_wider_than_friction_s_band(case, calibration):
     held, _ = judge(case, calibration)
     assert held.phase == "done"
     assert held.bound_n == pytest.approx(2 * 0.04 * case.normal_n)
@@ -40,14 +38,12 @@ def test_a_force_is_held_without_a_limit_cycle_wider_than_friction_s_band(
     assert held.offset_n <= 0.02
 
 
-def test_without_the_band_the_limit_cycle_is_wide(calibration: SkinCalibration) -> None:
+def test_without_the_band_the_limit_cycle_is_wide(calibration):
     held, _ = judge(SkinLoopCase(name="without the band", band=False, seed=5, kp=0.15, hold_s=12.0), calibration)
     assert held.width_n > held.bound_n
 
 
-def test_a_gauge_that_drifts_while_a_force_is_held_ends_in_a_hold_and_not_in_a_push(
-    calibration: SkinCalibration,
-) -> None:
+def test_a_gauge_that_drifts_while_a_force_is_held_ends_in_a_hold_and_not_in_a_push(calibration):
     loop = SkinLoop(SkinLoopCase(name="drift"), calibration)
     begin = []
     measured = loop.skin.resistances_ohm
@@ -60,14 +56,14 @@ def test_a_gauge_that_drifts_while_a_force_is_held_ends_in_a_hold_and_not_in_a_p
         seconds = (loop.t_ns - begin[0]) / 1e9 - 8.0 if begin else 0.0
         return r1 * (1 - 0.01 * max(seconds, 0.0)), r2
 
-    loop.skin.resistances_ohm = drifting  # type: ignore[method-assign]
+    loop.skin.resistances_ohm = drifting
     said = loop.run(60.0)
     assert said.startswith(ExperimentPhase.STOPPED.value)
     assert max(loop.trace.truth_n) < 2.0, "half of what the drift would have had it push by then"
 
 
 @pytest.mark.usefixtures("fonts")
-def test_the_stability_chart_shows_the_limit_cycle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_stability_chart_shows_the_limit_cycle(tmp_path, monkeypatch):
     case = SkinLoopCase(name="with the band", hold_s=4.0)
     monkeypatch.setattr(skin_loop, "over_gains", lambda: [case])
     monkeypatch.setattr(skin_loop, "over_delays", lambda: [replace(case, name="without the band", band=False)])
@@ -80,10 +76,8 @@ def test_the_stability_chart_shows_the_limit_cycle(tmp_path: Path, monkeypatch: 
     assert paths[2].stat().st_size > 20_000
 
 
-def test_the_demo_holds_the_force_that_it_says() -> None:
+def test_the_demo_holds_the_force_that_it_says():
     config = load_daemon_config(CONFIG / "skin_demo.yaml")
-    assert config.skin is not None
-    assert config.experiment is not None
     assert config.skin.tool_radius_mm is not None
     file = load_yaml_model(config.experiment, ExperimentFile)
     (hold,) = [step for step in file.steps if isinstance(step, HoldTorqueStep)]

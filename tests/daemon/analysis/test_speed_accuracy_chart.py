@@ -44,12 +44,12 @@ def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("charts")
 
 
-def test_the_frontier_is_what_nothing_beats_in_both() -> None:
+def test_the_frontier_is_what_nothing_beats_in_both():
     assert frontier([1.0, 2.0, 3.0, 4.0, 2.5], [9.0, 5.0, 6.0, 1.0, 5.0]) == [0, 1, 3]
     assert frontier([1.0, 1.0], [2.0, 1.0]) == [1], "of equally fast ones the more accurate"
 
 
-def test_a_method_with_few_valid_frames_is_not_on_the_frontier(scratch: Path) -> None:
+def test_a_method_with_few_valid_frames_is_not_on_the_frontier(scratch):
     split = splits([], 0.6, scratch)[0]
     methods = [
         MeasuredMethod(name, name, cost, cost, cost, error, None, valid)
@@ -70,7 +70,7 @@ def test_a_method_with_few_valid_frames_is_not_on_the_frontier(scratch: Path) ->
     ]
 
 
-def test_marks_distinguish_the_noises_of_loops_at_one_window() -> None:
+def test_marks_distinguish_the_noises_of_loops_at_one_window():
     axes = figure(5, 5).add_subplot()
     runs = [(loop, noise, n) for loop in LOOPS[:2] for noise in (0.002, 0.01, 0.02) for n in (1, 2)]
     runs += [(LOOPS[2], noise, 1) for noise in (0.002, 0.01, 0.02)]
@@ -82,7 +82,7 @@ def test_marks_distinguish_the_noises_of_loops_at_one_window() -> None:
     assert len(looks) == len(set(looks)) == 9
 
 
-def test_synthetic_frames_are_split_in_time_and_the_same_each_time(scratch: Path) -> None:
+def test_synthetic_frames_are_split_in_time_and_the_same_each_time(scratch):
     slices, stream = splits([], 0.6, scratch)
     assert slices.past.t_s[-1] < slices.future.t_s[0]
     assert len(slices.past.t_s) + len(slices.future.t_s) == 49
@@ -92,7 +92,7 @@ def test_synthetic_frames_are_split_in_time_and_the_same_each_time(scratch: Path
     np.testing.assert_array_equal(again.channels[: len(stream.past.t_s)], stream.past.channels)
 
 
-def test_errors_fall_with_the_mesh_size_towards_the_extrapolated_signals() -> None:
+def test_errors_fall_with_the_mesh_size_towards_the_extrapolated_signals():
     meshes = [own_fingertip(size).mesh() for size in (0.2, 0.1, 0.05)]
     truth = converged(meshes[1], meshes[2], 2.0)
     errors = [error_of(direct(mesh)(), truth) for mesh in meshes]
@@ -100,7 +100,7 @@ def test_errors_fall_with_the_mesh_size_towards_the_extrapolated_signals() -> No
 
 
 @pytest.mark.usefixtures("fonts", "few_mixtures")
-def test_the_speed_accuracy_chart_holds_every_method_with_its_ratio(scratch: Path, tmp_path: Path) -> None:
+def test_the_speed_accuracy_chart_holds_every_method_with_its_ratio(scratch, tmp_path):
     mesh = own_fingertip(0.4).mesh()
     bank = bank_of(None, mesh, scratch, Grid(np.linspace(3.0, 3.6, 7), np.linspace(1.0, 2.1, 12)))
     compared = [compare_methods(split, bank, mesh, 1) for split in splits([], 0.6, scratch)]
@@ -136,18 +136,14 @@ def test_the_speed_accuracy_chart_holds_every_method_with_its_ratio(scratch: Pat
     ],
 )
 @pytest.mark.parametrize("name", NAMES)
-def test_a_mistake_is_one_sentence(
-    name: str, arguments: list[str], complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mistake_is_one_sentence(name, arguments, complaint, tmp_path, capsys):
     assert main(["chart", name, *arguments, "--out", str(tmp_path / "some" / "out")]) == 2
     said = capsys.readouterr().err
     assert complaint in said
     assert said.count("\n") == 1
 
 
-def test_an_unwritable_folder_is_reported_before_anything_is_measured(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unwritable_folder_is_reported_before_anything_is_measured(monkeypatch, capsys):
     # Were anything read, it would be what fails.
     monkeypatch.setattr("shearloop.daemon.analysis.charts.sources.splits", None)
     for name in NAMES:
@@ -156,9 +152,7 @@ def test_an_unwritable_folder_is_reported_before_anything_is_measured(
         assert said == "shearloop chart: /dev/null: the chart cannot be written: File exists; choose another --out\n"
 
 
-def test_doubts_about_a_design_are_printed_with_its_chart(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_doubts_about_a_design_are_printed_with_its_chart(monkeypatch, tmp_path, capsys):
     t_s, frames = np.arange(12.0), np.random.default_rng(1).normal(0.0, 0.01, (12, 1, N_CHANNELS))
     series = FrameSeries("difference", ("right",), t_s, frames, t_s, t_s, np.full(12, np.nan))
     parts = [Split(f"{name}, slices, first 60%", series, series, series) for name in ("good", "bad")]
@@ -178,9 +172,7 @@ def test_doubts_about_a_design_are_printed_with_its_chart(
 
 
 @pytest.mark.parametrize("there", [True, False])
-def test_pyeit_is_measured_where_it_is_installed_and_cited_where_it_is_not(
-    there: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pyeit_is_measured_where_it_is_installed_and_cited_where_it_is_not(there, monkeypatch):
     solved: list[int] = []
 
     def solver(mesh: Mesh) -> Callable[[object], object] | None:
@@ -211,7 +203,7 @@ ROW = [(each, 1.0, f"some method,\n{number} triangles") for number, each in enum
 
 @pytest.mark.usefixtures("fonts")
 @pytest.mark.parametrize("points", [CROWD, ROW])
-def test_names_of_points_that_crowd_cover_neither_each_other_nor_a_mark(points: list[tuple[float, float, str]]) -> None:
+def test_names_of_points_that_crowd_cover_neither_each_other_nor_a_mark(points):
     made = figure(6, 4)
     axes = made.subplots()
     plain_log(axes)

@@ -67,7 +67,7 @@ def estimate(torque: float, half: float = 0.01) -> Estimate:
     return Estimate(valid=True, torque_nm=torque, torque_low_nm=torque - half, torque_high_nm=torque + half)
 
 
-def test_figures_count_what_is_valid_and_wrong() -> None:
+def test_figures_count_what_is_valid_and_wrong():
     truth = np.array([0.1, 0.1, 0.1, 0.1, np.nan])
     found = judge_level(
         [estimate(0.105), estimate(0.145), Estimate(valid=False), estimate(0.1), estimate(9.0)], truth, 2.0
@@ -86,12 +86,12 @@ def test_figures_count_what_is_valid_and_wrong() -> None:
 @pytest.mark.parametrize(
     ("levels", "expected"), [((-0.5, -0.2, 0.0, 0.1, 0.5), 0.1), ((0.6, 0.4, 0.2), 0.6), ((1.0, 2.0), 1.0)]
 )
-def test_an_estimator_breaks_at_the_mildest_level_in_either_direction(levels, expected) -> None:
+def test_an_estimator_breaks_at_the_mildest_level_in_either_direction(levels, expected):
     wrong = [FaultLevel(level, 0.0, 0.0, 1.0, 0.5 if level else 0.0) for level in levels]
     assert fault_curve("fault", "unit", "motion_regression", wrong).breaks_at == expected
 
 
-def test_a_stream_is_judged_by_as_many_loaded_frames_as_free_ones() -> None:
+def test_a_stream_is_judged_by_as_many_loaded_frames_as_free_ones():
     truth = np.r_[np.zeros(90), np.full(10, 0.1)]
     kept = balanced(truth)
     assert np.isfinite(kept).sum() == 20
@@ -100,7 +100,7 @@ def test_a_stream_is_judged_by_as_many_loaded_frames_as_free_ones() -> None:
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
 @pytest.mark.parametrize("kind", ["difference", "raw"])
-def test_every_sweep_begins_with_no_fault_and_then_changes_the_frames(fault, kind, parts, bank) -> None:
+def test_every_sweep_begins_with_no_fault_and_then_changes_the_frames(fault, kind, parts, bank):
     scene = scene_for(next(one for one in parts if one.past.kind == kind), bank)
     none, most = (fault.apply(scene, level, np.random.default_rng(1)) for level in (fault.levels[0], fault.levels[-1]))
     np.testing.assert_array_equal(none.series.channels, scene.series.channels)
@@ -109,11 +109,11 @@ def test_every_sweep_begins_with_no_fault_and_then_changes_the_frames(fault, kin
         assert (most.series.channels >= 0).all()
 
 
-def test_an_electrode_touches_its_own_injections_and_pairs() -> None:
+def test_an_electrode_touches_its_own_injections_and_pairs():
     assert 28 * 2 < lost_channels(np.array([3])).sum() < 28 * 5
 
 
-def test_unreported_lost_electrodes_never_pass_silently(parts, bank) -> None:
+def test_unreported_lost_electrodes_never_pass_silently(parts, bank):
     stream = next(one for one in parts if one.past.kind == "raw")
     (calibration,) = fitted(stream, ("regression",), Physics(bank, None))
     scene = scene_for(stream, bank)
@@ -125,7 +125,7 @@ def test_unreported_lost_electrodes_never_pass_silently(parts, bank) -> None:
 
 
 @pytest.mark.usefixtures("fonts", "few_mixtures")
-def test_the_mean_of_similar_cells_does_not_hop_and_the_rims_are_swept(parts, bank, scratch) -> None:
+def test_the_mean_of_similar_cells_does_not_hop_and_the_rims_are_swept(parts, bank, scratch):
     slices = parts[0]
     calibrations = fitted(slices, ("bank", "motion_regression"), Physics(bank, None))
     found = walks(slices, bank, calibrations)
@@ -151,7 +151,7 @@ def drifting(n: int, seed: int) -> FrameSeries:
 
 
 @pytest.mark.usefixtures("fonts")
-def test_the_passing_share_of_a_foreign_frame_follows_from_its_size() -> None:
+def test_the_passing_share_of_a_foreign_frame_follows_from_its_size():
     """Off the slices' directions nothing but the foreign part stands out: its square adds to that of the noise."""
     series = drifting(100, 4)
     found = detect_mixtures(series, origins=(0.6,))
@@ -182,9 +182,7 @@ def test_the_passing_share_of_a_foreign_frame_follows_from_its_size() -> None:
     assert len(detectability_figure("slices", found).axes) == 2
 
 
-def test_a_recording_that_no_estimator_can_be_calibrated_on_is_one_sentence(
-    bank: Bank, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_recording_that_no_estimator_can_be_calibrated_on_is_one_sentence(bank, tmp_path, capsys):
     slices = next(one for one in splits([], 0.6, tmp_path) if one.past.kind == "difference")
     one = Split(slices.title, slices.past.between(0, 1), slices.future, slices.whole)
     with pytest.raises(UserError, match="no estimator can be calibrated on it"):
@@ -197,7 +195,7 @@ def slices(parts: list[Split]) -> FrameSeries:
     return next(one.whole for one in parts if one.past.kind == "difference")
 
 
-def test_limits_are_quantiles_and_each_slice_is_either_calibrated_on_or_judged() -> None:
+def test_limits_are_quantiles_and_each_slice_is_either_calibrated_on_or_judged():
     torque_nm = np.random.default_rng(3).permutation(np.linspace(0.0, 0.1, 101))
     found = calibration_parts(torque_nm)
     assert [part.limit_nm for part in found[SMALLER]] == pytest.approx([0.08, 0.065, 0.05, 0.04, 0.03])
@@ -209,13 +207,13 @@ def test_limits_are_quantiles_and_each_slice_is_either_calibrated_on_or_judged()
             assert (sign * torque_nm[part.others] > sign * part.limit_nm).all()
 
 
-def test_of_few_torques_each_limit_is_there_once_and_none_leaves_nothing_to_judge() -> None:
+def test_of_few_torques_each_limit_is_there_once_and_none_leaves_nothing_to_judge():
     found = calibration_parts(np.repeat([0.02, 0.06, 0.1], [20, 2, 40]))
     assert [part.limit_nm for part in found[SMALLER]] == [0.02]
     assert [part.limit_nm for part in found[LARGER]] == [0.06, 0.1]
 
 
-def test_chosen_slices_keep_their_own_torques(slices: FrameSeries) -> None:
+def test_chosen_slices_keep_their_own_torques(slices):
     rows = np.array([1, 7, 8, 30])
     chosen = select_rows(slices, rows)
     np.testing.assert_array_equal(chosen.torque_at_frames(), slices.torque_at_frames()[rows])
@@ -223,9 +221,7 @@ def test_chosen_slices_keep_their_own_torques(slices: FrameSeries) -> None:
 
 
 @pytest.mark.usefixtures("few_mixtures")
-def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(
-    slices: FrameSeries, bank: Bank, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(slices, bank, monkeypatch, capsys):
     # A twentieth is too few for an estimator.
     monkeypatch.setattr(stability, "CALIBRATED_SHARES", (0.5, 0.05))
     some = slices.between(0, 40)
@@ -263,7 +259,7 @@ def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(
 
 
 @pytest.mark.usefixtures("fonts")
-def test_the_picture_marks_what_breaks_and_writes_how_many_slices_were_calibrated_on() -> None:
+def test_the_picture_marks_what_breaks_and_writes_how_many_slices_were_calibrated_on():
     levels = [FaultLevel(limit, 0.0, 0.01, 1.0, missed) for limit, missed in ((0.14, 0.0), (0.08, 0.1), (0.05, 0.9))]
     found = [
         Extrapolation(fault_curve(which, "N·m", name, levels), (29, 24, 14), (0.08, 0.04, None))

@@ -4,6 +4,7 @@ import asyncio
 import math
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -43,7 +44,7 @@ class Robot(UrRobot):
         self.gone_for = 0
 
     def send(self, command: Command) -> asyncio.Future[CommandReply]:
-        self.commands.append(command)
+        self.commands.append(replace(command, decided_ns=0) if isinstance(command, WristSpeed) else command)
         if self.dies_of is not None:
             raise self.dies_of
         replied: asyncio.Future[CommandReply] = asyncio.get_running_loop().create_future()
@@ -105,7 +106,6 @@ class Robot(UrRobot):
 
     @property
     def end_m(self) -> float:
-        assert self._goal is not None
         return self._goal.pose[2]
 
     @property
@@ -181,9 +181,9 @@ class Cell:
         self.runner = ControlLoopRunner(
             self.control_loop,
             self.robot,
-            self.gripper,  # type: ignore[arg-type]
+            self.gripper,
             (),
-            self.published,  # type: ignore[arg-type]
+            self.published,
             StepClock(self.robot.flight),
             self.died,
         )
@@ -194,7 +194,6 @@ class Cell:
 
     async def loop_died(self) -> None:
         """Wait for the loop's end, which `no_tick` brings about."""
-        assert self.task is not None
         with pytest.raises(ZeroDivisionError):
             await self.task
 
@@ -226,12 +225,10 @@ class Cell:
 
     @property
     def phase(self) -> ExperimentPhase:
-        assert self.control_loop.experiment is not None
         return self.control_loop.experiment.phase
 
     @property
     def why(self) -> str:
-        assert self.control_loop.experiment is not None
         return self.control_loop.experiment.stop_reason
 
     @property
@@ -245,13 +242,16 @@ def no_tick(*_: object) -> ControlOutput:
 
 
 @asynccontextmanager
-async def driven() -> AsyncIterator[Cell]:
+async def driven(*steps: Mapping[str, Any], cycles: int = 0) -> AsyncIterator[Cell]:
+    """Yield a cell that has begun an experiment of these steps, if any, so many cycles ago."""
     cell = Cell()
     cell.drive()
     await cell.cycles(10)
     try:
+        if steps:
+            await cell.start(*steps)
+        await cell.cycles(cycles)
         yield cell
     finally:
-        assert cell.task is not None
         cell.task.cancel()
         await asyncio.gather(cell.task, return_exceptions=True)

@@ -114,5 +114,4 @@ def started(rig: Rig, *steps: dict[str, Any], **keys: Any) -> Rig:
 
 
 def phase(rig: Rig) -> ExperimentPhase:
-    assert rig.control_loop.experiment is not None
     return rig.control_loop.experiment.phase

@@ -13,7 +13,7 @@ from tests.daemon.control.loop_rig import EIT, GRIP, TICK_S, Rig, new_loop, phas
 
 
 @pytest.mark.parametrize("drive", ["right", "load_cell"])
-def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive: str) -> None:
+def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive):
     rig = started(
         Rig(new_loop()),
         {"do": "approach", "pose_m_rad": [0.4, 0, 0.3, 0, 3.1, 0]},
@@ -25,7 +25,6 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive: str) -> Non
         torque_source=drive,
     )
     rig.run(200)
-    assert rig.control_loop.experiment is not None
     assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
     assert [type(action) for action in rig.begun] == [ApproachStep, GripTo, TareStep, GripTo]
     held = np.array(rig.true_nm)[-round(15 / TICK_S) - 110 : -110]
@@ -33,15 +32,14 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive: str) -> Non
     assert held.std() < 0.006
 
 
-def test_a_set_point_without_identification_is_refused_with_the_cure() -> None:
+def test_a_set_point_without_identification_is_refused_with_the_cure():
     rig = started(Rig(new_loop()), GRIP, {"do": "hold_torque", "torque_nm": 0.1})
     rig.run(20)
     assert phase(rig) is ExperimentPhase.STOPPED
-    assert rig.control_loop.experiment is not None
     assert "put an `identify` step before" in rig.control_loop.experiment.stop_reason
 
 
-def test_a_pause_is_refused_with_the_reason() -> None:
+def test_a_pause_is_refused_with_the_reason():
     rig = started(Rig(new_loop()), {"do": "wait", "wait_s": 60})
     rig.step()
     assert rig.control_loop.pause() is None
@@ -55,7 +53,7 @@ TWIST = {"do": "twist", "angles_rad": [0.2]}
 
 
 @pytest.mark.parametrize("step", [GRIP, {**GRIP, "expect_object": False}, {"do": "release", "width_mm": 20}])
-def test_a_tool_that_is_taken_away_is_noticed_though_nobody_expected_it(step: dict[str, Any]) -> None:
+def test_a_tool_that_is_taken_away_is_noticed_though_nobody_expected_it(step):
     rig = Rig(new_loop())
     rig.meets = True
     started(rig, step, {"do": "twist", "angles_rad": [0.2], "hold_s": 60})
@@ -75,9 +73,7 @@ def test_a_tool_that_is_taken_away_is_noticed_though_nobody_expected_it(step: di
     ],
 )
 @pytest.mark.parametrize("turning", [TWIST, {"do": "turn_to", "angle_rad": 0.4}, {"do": "identify"}])
-def test_nothing_turns_a_tool_that_the_gripper_may_hold_and_does_not_tell_of(
-    sense: dict[str, Any], what: str, turning: dict[str, Any]
-) -> None:
+def test_nothing_turns_a_tool_that_the_gripper_may_hold_and_does_not_tell_of(sense, what, turning):
     """After a stop in the middle of a grip the wrist turned, and nothing watched torque, angle or grip."""
     rig = Rig(new_loop())
     for _ in range(70):
@@ -101,14 +97,11 @@ def test_nothing_turns_a_tool_that_the_gripper_may_hold_and_does_not_tell_of(
 
 @pytest.mark.parametrize("sense", [{"uncertain": True}, {"moving": True}])
 @pytest.mark.parametrize("turning", [TWIST, {"do": "turn_to", "angle_rad": 0.4}, {"do": "identify"}])
-def test_a_gripper_that_tells_only_after_the_start_that_it_does_not_know_stops_what_turns(
-    sense: dict[str, Any], turning: dict[str, Any]
-) -> None:
+def test_a_gripper_that_tells_only_after_the_start_that_it_does_not_know_stops_what_turns(sense, turning):
     """It is asked ten times a second: started right after a stop, an experiment was judged by what was before that."""
     rig = started(Rig(new_loop()), {"do": "wait", "wait_s": 0.1}, turning, GRIP)
     rig.hand = replace(rig.hand, **sense)
     rig.run(1)
-    assert rig.control_loop.experiment is not None
     assert not rig.control_loop.experiment.running
     assert (
         f"step 2 ({turning['do']}) cannot be done: the gripper does not say" in rig.control_loop.experiment.stop_reason
@@ -117,7 +110,7 @@ def test_a_gripper_that_tells_only_after_the_start_that_it_does_not_know_stops_w
     assert rig.speed == 0.0
 
 
-def test_a_silent_board_holds_the_wrist_and_then_stops_it() -> None:
+def test_a_silent_board_holds_the_wrist_and_then_stops_it():
     rig = started(Rig(new_loop()), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
     rig.run(5)
     assert rig.speed > 0
@@ -131,7 +124,7 @@ def test_a_silent_board_holds_the_wrist_and_then_stops_it() -> None:
     assert not rig.orders.release, "the grip is kept"
 
 
-def test_a_board_that_speaks_again_in_time_lets_the_twist_go_on() -> None:
+def test_a_board_that_speaks_again_in_time_lets_the_twist_go_on():
     rig = started(Rig(new_loop()), GRIP, {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.02, "hold_s": 1})
     rig.run(4)
     rig.silent.add("right")
@@ -142,7 +135,7 @@ def test_a_board_that_speaks_again_in_time_lets_the_twist_go_on() -> None:
     assert phase(rig) is ExperimentPhase.DONE
 
 
-def test_the_torque_limit_stops_and_releases_once() -> None:
+def test_the_torque_limit_stops_and_releases_once():
     rig = started(Rig(new_loop(), noise_nm=0.0), GRIP, {"do": "twist", "angles_rad": [1.0]}, limits={"torque_nm": 0.1})
     releases = 0
     for _ in range(2000):
@@ -154,7 +147,7 @@ def test_the_torque_limit_stops_and_releases_once() -> None:
     assert max(rig.true_nm) < 0.1 + 0.3 * 0.2 * 0.2, "no farther than one reading of the load cell"
 
 
-def test_a_protective_stop_ends_the_experiment_until_it_is_acknowledged() -> None:
+def test_a_protective_stop_ends_the_experiment_until_it_is_acknowledged():
     rig = started(Rig(new_loop()), GRIP, {"do": "wait", "wait_s": 60})
     rig.run(2)
     rig.arm = replace(rig.arm, protective_stop=True)
@@ -164,7 +157,6 @@ def test_a_protective_stop_ends_the_experiment_until_it_is_acknowledged() -> Non
     rig.run(1)
     file = ExperimentFile.model_validate({"name": "again", "steps": [{"do": "wait", "wait_s": 1}]})
     refused = rig.control_loop.start(file, rig.t_ns)
-    assert refused is not None
     assert "protective stop" in refused
     rig.control_loop.acknowledge()
     assert rig.control_loop.start(file, rig.t_ns) is None
@@ -178,7 +170,7 @@ def test_a_protective_stop_ends_the_experiment_until_it_is_acknowledged() -> Non
         ({"blocked": "the robot's process was started again"}, FaultCode.ROBOT_BLOCKED),
     ],
 )
-def test_what_the_robot_reports_ends_a_running_experiment_at_once(sense: dict[str, Any], event: FaultCode) -> None:
+def test_what_the_robot_reports_ends_a_running_experiment_at_once(sense, event):
     rig = started(Rig(new_loop()), GRIP, {"do": "twist", "angles_rad": [0.3]})
     rig.run(2)
     rig.arm = replace(rig.arm, **sense)
@@ -188,7 +180,7 @@ def test_what_the_robot_reports_ends_a_running_experiment_at_once(sense: dict[st
     assert event in {trouble.code for trouble in rig.control_loop.status.decision.faults}
 
 
-def test_a_supervising_sensor_that_is_gone_holds_the_wrist_at_once_and_says_which() -> None:
+def test_a_supervising_sensor_that_is_gone_holds_the_wrist_at_once_and_says_which():
     rig = started(Rig(new_loop()), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
     rig.run(5)
     rig.control_loop.on_link("load_cell", "/dev/ttyUSB3 was unplugged.", up=False)
@@ -200,7 +192,7 @@ def test_a_supervising_sensor_that_is_gone_holds_the_wrist_at_once_and_says_whic
     assert rig.speed > 0.0, "it goes on by itself"
 
 
-def test_a_task_that_died_stops_the_wrist_and_says_of_what() -> None:
+def test_a_task_that_died_stops_the_wrist_and_says_of_what():
     rig = started(Rig(new_loop()), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
     rig.run(5)
     rig.died = {"right": "ValueError: no number"}
@@ -209,13 +201,12 @@ def test_a_task_that_died_stops_the_wrist_and_says_of_what() -> None:
     assert "right: ValueError: no number" in rig.control_loop.status.decision.reasons[0]
 
 
-def test_a_single_torque_that_disagrees_holds_until_the_next_one_and_stops_nothing() -> None:
+def test_a_single_torque_that_disagrees_holds_until_the_next_one_and_stops_nothing():
     """Of the slower sensor: what it says stands until it says something else."""
     rig = started(Rig(new_loop(), noise_nm=0.0), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01})
     rig.run(5)
     while (spiked := rig.control_loop.inputs.torques["right"]).t_ns != rig.t_ns:
         rig.step()
-    assert spiked.torque_nm is not None
     spike = replace(spiked, torque_nm=spiked.torque_nm + 0.07, t_mid_ns=spiked.t_mid_ns + 1)
     rig.control_loop.on_torque(spike)
     held = 0
@@ -229,7 +220,7 @@ def test_a_single_torque_that_disagrees_holds_until_the_next_one_and_stops_nothi
     assert rig.speed > 0.0
 
 
-def test_a_wrist_angle_that_is_not_a_number_turns_nothing() -> None:
+def test_a_wrist_angle_that_is_not_a_number_turns_nothing():
     rig = started(Rig(new_loop()), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
     rig.run(5)
     assert rig.speed > 0

@@ -14,9 +14,7 @@ FAULTS = st.sampled_from(["right", "load_cell", "arm", "hand", "protective", "pa
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(st.integers(1, 200), FAULTS), max_size=8), st.integers(0, 1000))
-def test_no_fault_at_any_time_makes_the_wrist_faster_than_its_limit_or_move_after_a_stop(
-    story: list[tuple[int, str]], seed: int
-) -> None:
+def test_no_fault_at_any_time_makes_the_wrist_faster_than_its_limit_or_move_after_a_stop(story, seed):
     rig = started(
         Rig(new_loop(), seed), GRIP, {"do": "identify"}, {"do": "hold_torque", "torque_nm": 0.08, "hold_s": 5}
     )
@@ -49,9 +47,7 @@ WRONG = st.sampled_from(["right", "load_cell", "arm", "hand", "void", "late", "a
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.tuples(st.lists(WRONG, max_size=2), st.integers(10, 250)), max_size=30), st.integers(0, 1000))
 @example([([name], 60) for name in ("void", "apart", "late", "arm") * 6], 0)
-def test_whatever_holds_the_wrist_however_it_takes_turns_it_is_stopped_in_time(
-    story: list[tuple[list[str], int]], seed: int
-) -> None:
+def test_whatever_holds_the_wrist_however_it_takes_turns_it_is_stopped_in_time(story, seed):
     """Held counts whole, free counts half against it: never more than 5 s, and nothing moves while it is held."""
     rig = started(
         Rig(new_loop(), seed),

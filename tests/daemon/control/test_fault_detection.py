@@ -53,23 +53,23 @@ def found(
     return {each.code: each.sentence for each in events}
 
 
-def test_nothing_is_wrong_while_all_torques_are_new_valid_and_alike() -> None:
+def test_nothing_is_wrong_while_all_torques_are_new_valid_and_alike():
     assert found(torque(EIT, 0.1), torque(LOAD, 0.1), torque(WRENCH, 0.1)) == {}
 
 
-def test_a_supervising_sensor_whose_torque_is_void_holds_the_wrist_and_says_why() -> None:
+def test_a_supervising_sensor_whose_torque_is_void_holds_the_wrist_and_says_why():
     saturated = torque(LOAD, None, why="the reading is at the end of its range")
     events = found(torque(EIT, 0.1), saturated)
     assert set(events) == {FaultCode.ESTIMATE_INVALID}
     assert "load_cell says: the reading is at the end of its range" in events[FaultCode.ESTIMATE_INVALID]
 
 
-def test_a_driving_sensor_whose_torque_is_void_is_named_too() -> None:
+def test_a_driving_sensor_whose_torque_is_void_is_named_too():
     events = found(torque(EIT, None, why="no signal"), torque(LOAD, 0.1))
     assert "right says: no signal" in events[FaultCode.ESTIMATE_INVALID]
 
 
-def test_what_measures_no_torque_is_watched_for_silence_alone() -> None:
+def test_what_measures_no_torque_is_watched_for_silence_alone():
     left = TorqueSource(name="left", period_s=0.5412, measures_torque=False)
     heard = torque(EIT, 0.1), torque(LOAD, 0.1)
     supervising = (LOAD, left)
@@ -78,12 +78,12 @@ def test_what_measures_no_torque_is_watched_for_silence_alone() -> None:
     assert "the last torque of left came 2.0 s ago" in silent[FaultCode.ESTIMATE_STALE]
 
 
-def test_the_wrench_is_watched_with_the_state_that_it_comes_with() -> None:
+def test_the_wrench_is_watched_with_the_state_that_it_comes_with():
     assert found(torque(EIT, 0.1), torque(LOAD, 0.1), torque(WRENCH, None)) == {}
 
 
 @pytest.mark.parametrize("source", [EIT, LOAD])
-def test_a_torque_that_comes_in_time_but_is_of_long_ago_is_stale(source: TorqueSource) -> None:
+def test_a_torque_that_comes_in_time_but_is_of_long_ago_is_stale(source):
     """As from an estimator that has fallen behind: eight frames wait for it, and one comes in each period."""
     fresh = {one.name: torque(one, 0.1) for one in (EIT, LOAD)}
     late = torque(source, 0.1, way_s=8 * source.period_s)
@@ -94,13 +94,13 @@ def test_a_torque_that_comes_in_time_but_is_of_long_ago_is_stale(source: TorqueS
 
 
 @pytest.mark.parametrize("source", [EIT, LOAD, replace(EIT, window_s=5 * EIT.period_s)])
-def test_a_frame_that_is_missed_and_a_mean_of_several_are_borne(source: TorqueSource) -> None:
+def test_a_frame_that_is_missed_and_a_mean_of_several_are_borne(source):
     """Half an acquisition, a tenth of a period on the way, and two periods since: one frame was missed."""
     patient = torque(source, 0.1, came_s=2.0 * source.period_s, way_s=0.1 * source.period_s)
     assert found(patient, driving=source, supervising=()) == {}
 
 
-def test_a_torque_that_counts_as_new_is_held_against_its_limit() -> None:
+def test_a_torque_that_counts_as_new_is_held_against_its_limit():
     """Beyond 2.5 of its short periods, and younger than `stale_after_s`."""
     quick = replace(LOAD, period_s=0.005)
     beyond = torque(quick, 0.9, came_s=0.05)
@@ -108,7 +108,7 @@ def test_a_torque_that_counts_as_new_is_held_against_its_limit() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [10.9, 80.0, 1000.0])
-def test_torques_are_compared_for_as_long_as_the_slower_one_counts_as_new(rate_hz: float) -> None:
+def test_torques_are_compared_for_as_long_as_the_slower_one_counts_as_new(rate_hz):
     """Else a disagreement would come and go with every frame, and a hold would never become a stop."""
     quick = replace(LOAD, period_s=1.0 / rate_hz)
     kept_s = compared_for_s((EIT, quick), fresh_for_s((EIT, quick), LoopConfig()))
@@ -134,13 +134,13 @@ def devices(
     return [(each.code, each.detail) for each in detect_faults(senses, idle, LoopConfig(), NOW_NS)]
 
 
-def test_devices_that_were_never_there_are_awaited_in_one_sentence() -> None:
+def test_devices_that_were_never_there_are_awaited_in_one_sentence():
     assert devices({}) == [(FaultCode.DEVICE_AWAITED, "robot; gripper")]
     both = "robot, No UR controller at 10.0.0.1. Check that it is on; gripper, There is no gripper socket"
     assert devices(LOST) == [(FaultCode.DEVICE_AWAITED, both)]
 
 
-def test_a_device_that_was_there_is_gone_beside_one_that_was_never_there() -> None:
+def test_a_device_that_was_there_is_gone_beside_one_that_was_never_there():
     arm, hand = ArmStatus(0.0, NOW_NS), GripperStatus(NOW_NS, 30.0, holding=False, moving=False)
     assert devices(LOST, arm=arm, hand=hand) == [
         (FaultCode.ROBOT_LOST, LOST["robot"]),
@@ -152,7 +152,7 @@ def test_a_device_that_was_there_is_gone_beside_one_that_was_never_there() -> No
     assert [event for event, _ in devices(LOST, hand=hand)] == [FaultCode.DEVICE_AWAITED, FaultCode.DEVICE_LOST]
 
 
-def test_a_robot_that_is_gone_or_does_not_move_is_not_plugged_in_again() -> None:
+def test_a_robot_that_is_gone_or_does_not_move_is_not_plugged_in_again():
     """Its process, killed, was "gone" and to be plugged in; what comes back is blocked until it is unlocked."""
     died = "The robot's process died of SIGKILL while controlling. The process is started again with motion disabled."
     blocked = ArmStatus(0.0, NOW_NS, blocked="Motion has not been enabled since the robot's process was started.")
@@ -166,7 +166,7 @@ def test_a_robot_that_is_gone_or_does_not_move_is_not_plugged_in_again() -> None
         assert "lug" not in trouble.sentence
 
 
-def test_a_sensor_that_was_never_there_is_not_gone() -> None:
+def test_a_sensor_that_was_never_there_is_not_gone():
     senses = LoopInputs(10.0, arm=ArmStatus(0.0, NOW_NS), lost={"right": "There is no port."})
     (trouble,) = detect_faults(senses, watched(EIT, ()), LoopConfig(), NOW_NS)
     assert trouble.detail == "right is not connected yet: There is no port."
@@ -178,7 +178,7 @@ def test_a_sensor_that_was_never_there_is_not_gone() -> None:
     assert trouble.detail == "right is gone: ", "though it does not say why"
 
 
-def test_a_loop_that_was_away_for_long_was_not_too_slow() -> None:
+def test_a_loop_that_was_away_for_long_was_not_too_slow():
     senses = LoopInputs(10.0, arm=ArmStatus(0.0, NOW_NS))
     for late_s, event in ((0.2, FaultCode.LOOP_LATE), (3.0, FaultCode.DAEMON_PAUSED)):
         away = replace(watched(EIT, ()), torque_needed=False, late_s=late_s)
@@ -188,7 +188,7 @@ def test_a_loop_that_was_away_for_long_was_not_too_slow() -> None:
     assert "overload" in trouble.rule.cure, "what follows from it is not told, and may be all that would say so"
 
 
-def test_states_that_come_late_for_good_are_stale_for_long_enough_to_stop_the_wrist() -> None:
+def test_states_that_come_late_for_good_are_stale_for_long_enough_to_stop_the_wrist():
     """A fifth of a second late, until it is taken for the controller's clock."""
     age, stale_s = SampleAge(), 0.0
     for number in range(2000):
@@ -201,7 +201,7 @@ def test_states_that_come_late_for_good_are_stale_for_long_enough_to_stop_the_wr
 
 @pytest.mark.parametrize("rate_hz", [100.0, 125.0, 500.0])
 @pytest.mark.parametrize("slow_hz", [8.0, 10.0, 10.9])
-def test_each_sample_is_compared_with_a_wrench(rate_hz: float, slow_hz: float) -> None:
+def test_each_sample_is_compared_with_a_wrench(rate_hz, slow_hz):
     """A slower sensor that disagrees does so at each of its samples: else the wrist would turn on until the next."""
     wrench, slow = wrench_source(rate_hz), TorqueSource(name="load_cell", period_s=1 / slow_hz)
     senses, sample = LoopInputs(10.0), 0.5

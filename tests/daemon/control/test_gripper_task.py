@@ -1,7 +1,6 @@
 """The gripper's task over the real driver and the emulated gripper, on both connections."""
 
 import asyncio
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -33,11 +32,11 @@ class Felt(list[GripperStatus]):
 
 def task_of(rig: Rig, *, measures_diameters: bool = True) -> GripperTask:
     publisher: Any = Silent()
-    return GripperTask(rig.driver, publisher, Felt(), measures_diameters=measures_diameters)  # type: ignore[arg-type]
+    return GripperTask(rig.driver, publisher, Felt(), measures_diameters=measures_diameters)
 
 
 @WAYS
-async def test_cancelled_grip_can_be_released(way: str, tmp_path: Path) -> None:
+async def test_cancelled_grip_can_be_released(way, tmp_path):
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
         rig.model.put_between(40.0)
         task = task_of(rig)
@@ -56,11 +55,11 @@ async def test_cancelled_grip_can_be_released(way: str, tmp_path: Path) -> None:
 
 
 @WAYS
-async def test_cancelled_grip_is_halted_and_stays_connected(way: str, tmp_path: Path) -> None:
+async def test_cancelled_grip_is_halted_and_stays_connected(way, tmp_path):
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
         felt = Felt()
         publisher: Any = Silent()
-        task = GripperTask(rig.driver, publisher, felt)  # type: ignore[arg-type]
+        task = GripperTask(rig.driver, publisher, felt)
         read = tasks.create_task(task.run())
         while rig.driver.latest is None:  # noqa: ASYNC110 - the driver is asked, as the loop is
             await asyncio.sleep(0)
@@ -87,7 +86,7 @@ async def test_cancelled_grip_is_halted_and_stays_connected(way: str, tmp_path: 
 
 
 @WAYS
-async def test_halt_stops_the_fingers_after_a_reconnection(way: str, tmp_path: Path) -> None:
+async def test_halt_stops_the_fingers_after_a_reconnection(way, tmp_path):
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
         task = task_of(rig)
         read = tasks.create_task(task.run())
@@ -111,7 +110,7 @@ async def test_halt_stops_the_fingers_after_a_reconnection(way: str, tmp_path: P
 
 
 @WAYS
-async def test_cancelled_activation_stops_the_fingers(way: str, tmp_path: Path) -> None:
+async def test_cancelled_activation_stops_the_fingers(way, tmp_path):
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S):
         task = task_of(rig)
         await rig.driver.connect()
@@ -132,7 +131,7 @@ async def test_cancelled_activation_stops_the_fingers(way: str, tmp_path: Path) 
 
 
 @WAYS
-async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way: str, tmp_path: Path) -> None:
+async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way, tmp_path):
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S):
         rig.model.put_between(40.0)
         task = task_of(rig)
@@ -151,7 +150,7 @@ async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way: str, tm
 
 
 @WAYS
-async def test_unlock_handles_a_fault_newer_than_the_state(way: str, tmp_path: Path) -> None:
+async def test_unlock_handles_a_fault_newer_than_the_state(way, tmp_path):
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S):
         await rig.driver.connect()
         await rig.driver.activate()
@@ -161,7 +160,7 @@ async def test_unlock_handles_a_fault_newer_than_the_state(way: str, tmp_path: P
         assert not (await rig.driver.read()).fault.needs_activation
 
 
-async def test_held_tool_has_a_diameter_while_states_are_new(tmp_path: Path) -> None:
+async def test_held_tool_has_a_diameter_while_states_are_new(tmp_path):
     async with a_rig("socket", tmp_path) as rig, asyncio.timeout(DEADLINE_S):
         rig.model.put_between(40.0)
         task = task_of(rig)
@@ -170,7 +169,6 @@ async def test_held_tool_has_a_diameter_while_states_are_new(tmp_path: Path) -> 
         assert await task.grip(GRIP) == ""
         state = await rig.driver.read()
         tool = task.held_tool(state.t_ns)
-        assert tool is not None
         assert tool.half_width == pytest.approx(TWO_SIDED_95 * state.width_std_mm)
         assert abs(tool.value - 40.0) < tool.half_width
         assert task.held_tool(state.t_ns + round(HAND_STALE_S * 1e9) + 1) is None
@@ -179,7 +177,7 @@ async def test_held_tool_has_a_diameter_while_states_are_new(tmp_path: Path) -> 
         assert task.held_tool((await rig.driver.read()).t_ns) is None
 
 
-async def test_absent_gripper_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_absent_gripper_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(gripper_task, "TRIED_FOR_S", 0.2)
     async with a_rig("socket", tmp_path) as rig:
         assert "There is no connection to the gripper" in await task_of(rig).release()

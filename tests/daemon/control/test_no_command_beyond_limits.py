@@ -182,7 +182,7 @@ class WholeRig:
         self.action = (self.number + 30, action)
         if isinstance(action, ApproachStep):
             pose = action.pose_m_rad or along_tool(self.arm.reading.tcp_pose, action.along_tool_m or 0.0)
-            self._ask(MoveLinear(pose, action.speed_m_per_s, 0.3))  # type: ignore[arg-type]
+            self._ask(MoveLinear(pose, action.speed_m_per_s, 0.3))
 
     def _finish(self, action: Action) -> None:
         self.action = None
@@ -204,9 +204,7 @@ class WholeRig:
     st.floats(0.05, 2.0),
 )
 @example([{"do": "turn_to", "angle_rad": 1.0, "speed_rad_per_s": 1.0}], [(32, "protective")], "right", 1.0)
-def test_whatever_is_asked_and_whatever_happens_no_command_is_outside_the_limits(
-    steps: list[dict[str, Any]], story: list[tuple[int, str]], drive: str, torque_limit_nm: float
-) -> None:
+def test_whatever_is_asked_and_whatever_happens_no_command_is_outside_the_limits(steps, story, drive, torque_limit_nm):
     rig = WholeRig()
     for _ in range(40):
         rig.cycle()
@@ -224,7 +222,6 @@ def test_whatever_is_asked_and_whatever_happens_no_command_is_outside_the_limits
             assert abs(speed) <= LIMITS.wrist_speed_rad_per_s.hard
         rig.befall(fault)
     experiment = rig.control_loop.experiment
-    assert experiment is not None
     if experiment.phase is ExperimentPhase.STOPPED:
         for _ in range(60):
             rig.cycle()

@@ -23,15 +23,13 @@ from tests.drivers.ur.flight import SETTINGS
         ((0.0, math.pi / 2, 0.0), (0.03, 0.0, 0.0)),
     ],
 )
-def test_along_the_tool_is_where_its_own_axis_points(
-    turned: tuple[float, ...], moved: tuple[float, float, float]
-) -> None:
+def test_along_the_tool_is_where_its_own_axis_points(turned, moved):
     x, y, z, *same = along_tool((0.4, -0.1, 0.3, *turned), 0.03)
     assert (x - 0.4, y + 0.1, z - 0.3) == pytest.approx(moved, abs=1e-12)
     assert tuple(same) == turned
 
 
-async def test_an_action_that_dies_fails_its_step_and_is_told() -> None:
+async def test_an_action_that_dies_fails_its_step_and_is_told():
     async with driven() as cell:
         cell.gripper.answers = RuntimeError("no such register")
         await cell.start(GRIP)
@@ -40,11 +38,8 @@ async def test_an_action_that_dies_fails_its_step_and_is_told() -> None:
 
 
 @pytest.mark.parametrize("answer", ["the gripper does not answer", OSError("the gripper does not answer")])
-async def test_a_gripper_that_does_not_open_after_a_stop_is_told_until_the_operator_says_unlock(
-    answer: str | Exception,
-) -> None:
-    async with driven() as cell:
-        await cell.start({"do": "wait", "wait_s": 60})
+async def test_a_gripper_that_does_not_open_after_a_stop_is_told_until_the_operator_says_unlock(answer):
+    async with driven({"do": "wait", "wait_s": 60}) as cell:
         cell.gripper.answers = answer
         cell.exceed_torque()
         await cell.until_ended(10)
@@ -58,10 +53,8 @@ async def test_a_gripper_that_does_not_open_after_a_stop_is_told_until_the_opera
         assert cell.published.reasons == ""
 
 
-async def test_a_command_that_dies_ends_the_experiment() -> None:
-    async with driven() as cell:
-        await cell.start(TWIST)
-        await cell.cycles(50)
+async def test_a_command_that_dies_ends_the_experiment():
+    async with driven(TWIST, cycles=50) as cell:
         assert cell.state.motion == "wrist"
         cell.robot.dies_of = ValueError("not a float")
         await cell.until_ended(10)
@@ -71,10 +64,8 @@ async def test_a_command_that_dies_ends_the_experiment() -> None:
         assert cell.state.rests
 
 
-async def test_a_straight_move_that_is_paused_brakes_and_goes_on_to_its_end() -> None:
-    async with driven() as cell:
-        await cell.start(MOVE)
-        await cell.cycles(40)
+async def test_a_straight_move_that_is_paused_brakes_and_goes_on_to_its_end():
+    async with driven(MOVE, cycles=40) as cell:
         end_m = cell.robot.end_m
         assert cell.control_loop.pause() is None
         await cell.cycles(5)
@@ -90,7 +81,7 @@ async def test_a_straight_move_that_is_paused_brakes_and_goes_on_to_its_end() ->
         assert cell.robot.z_m == pytest.approx(end_m), "where it was to go from the start"
 
 
-async def test_a_straight_move_is_not_begun_while_the_experiment_is_paused() -> None:
+async def test_a_straight_move_is_not_begun_while_the_experiment_is_paused():
     async with driven() as cell:
         starting = asyncio.create_task(cell.runner.start(experiment(MOVE)))
         while not starting.done():
@@ -103,9 +94,8 @@ async def test_a_straight_move_is_not_begun_while_the_experiment_is_paused() -> 
         assert cell.phase is ExperimentPhase.DONE, cell.why
 
 
-async def test_who_waits_for_an_experiments_end_is_told_of_that_one() -> None:
-    async with driven() as cell:
-        await cell.start({"do": "wait", "wait_s": 60})
+async def test_who_waits_for_an_experiments_end_is_told_of_that_one():
+    async with driven({"do": "wait", "wait_s": 60}) as cell:
         first = cell.control_loop.experiment
         waiting = asyncio.create_task(cell.runner.experiment_ended())
         await cell.cycles(5)
@@ -120,12 +110,8 @@ async def test_who_waits_for_an_experiments_end_is_told_of_that_one() -> None:
         assert await waiting is first
 
 
-async def test_a_loop_that_dies_stops_the_arm_and_when_begun_again_the_experiment(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    async with driven() as cell:
-        await cell.start(MOVE)
-        await cell.cycles(40)
+async def test_a_loop_that_dies_stops_the_arm_and_when_begun_again_the_experiment(monkeypatch):
+    async with driven(MOVE, cycles=40) as cell:
         assert cell.state.motion == "linear"
 
         monkeypatch.setattr(cell.control_loop, "tick", no_tick)
@@ -143,10 +129,9 @@ async def test_a_loop_that_dies_stops_the_arm_and_when_begun_again_the_experimen
         assert FaultCode.TASK_DIED in {trouble.code for trouble in cell.control_loop.status.decision.faults}
 
 
-async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch):
     """Before the gripper has heard of it there is nothing that would open by itself."""
-    async with driven() as cell:
-        await cell.start({"do": "wait", "wait_s": 60})
+    async with driven({"do": "wait", "wait_s": 60}) as cell:
         heard, answered = asyncio.Event(), asyncio.Event()
 
         async def at_length() -> str:
@@ -166,7 +151,6 @@ async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch
 
         monkeypatch.setattr(cell.control_loop, "tick", dies_once)
         await cell.cycles(20)
-        assert cell.task is not None
         assert not cell.task.done(), "it waits for the gripper"
         answered.set()
         await cell.loop_died()
@@ -176,9 +160,7 @@ async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch
         assert "it did not open" in cell.published.reasons
 
 
-async def test_a_loop_that_dies_as_a_straight_move_is_to_begin_leaves_the_arm_at_rest(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_a_loop_that_dies_as_a_straight_move_is_to_begin_leaves_the_arm_at_rest(monkeypatch):
     """The loop dies of the state that also wakes the move which waits for it."""
     for _ in range(2):
         async with driven() as cell:
@@ -196,10 +178,8 @@ async def test_a_loop_that_dies_as_a_straight_move_is_to_begin_leaves_the_arm_at
             assert cell.state.motion == "idle", cell.robot.commands
 
 
-async def test_what_stopped_the_arm_is_not_enabled_again_by_a_start_that_is_refused() -> None:
-    async with driven() as cell:
-        await cell.start(TWIST)
-        await cell.cycles(10)
+async def test_what_stopped_the_arm_is_not_enabled_again_by_a_start_that_is_refused():
+    async with driven(TWIST, cycles=10) as cell:
         before = len(cell.robot.commands)
         file = experiment(MOVE)
         assert "is still running" in (await cell.runner.start(file) or "")
@@ -207,9 +187,7 @@ async def test_what_stopped_the_arm_is_not_enabled_again_by_a_start_that_is_refu
 
 
 @pytest.mark.parametrize("running", [False, True])
-async def test_each_state_is_decided_upon_and_every_fifth_published(
-    monkeypatch: pytest.MonkeyPatch, running: bool
-) -> None:
+async def test_each_state_is_decided_upon_and_every_fifth_published(monkeypatch, running):
     async with driven() as cell:
         if running:
             await cell.start({"do": "wait", "wait_s": 60})
@@ -222,19 +200,16 @@ async def test_each_state_is_decided_upon_and_every_fifth_published(
         assert sum(one.topic == "robot.state" for one in cell.published.messages) == 10
 
 
-async def test_a_zero_is_taken_after_a_turn() -> None:
+async def test_a_zero_is_taken_after_a_turn():
     """A wrist that turned is the robot's to move until its last speed, zero, has run out."""
-    async with driven() as cell:
-        await cell.start({"do": "turn_to", "angle_rad": 0.2}, {"do": "tare"})
+    async with driven({"do": "turn_to", "angle_rad": 0.2}, {"do": "tare"}) as cell:
         await cell.until_ended()
         assert cell.phase is ExperimentPhase.DONE, cell.why
 
 
 @pytest.mark.parametrize("cycles", [1, 2, 3])
-async def test_a_straight_move_goes_on_though_the_pause_was_shorter_than_its_braking(cycles: int) -> None:
-    async with driven() as cell:
-        await cell.start(MOVE)
-        await cell.cycles(40)
+async def test_a_straight_move_goes_on_though_the_pause_was_shorter_than_its_braking(cycles):
+    async with driven(MOVE, cycles=40) as cell:
         end_m = cell.robot.end_m
         cell.robot.brakes_for = 20
         assert cell.control_loop.pause() is None
@@ -245,10 +220,8 @@ async def test_a_straight_move_goes_on_though_the_pause_was_shorter_than_its_bra
         assert cell.robot.z_m == pytest.approx(end_m)
 
 
-async def test_a_straight_move_that_met_something_is_not_begun_again_after_a_pause_in_the_same_moment() -> None:
-    async with driven() as cell:
-        await cell.start(MOVE)
-        await cell.cycles(40)
+async def test_a_straight_move_that_met_something_is_not_begun_again_after_a_pause_in_the_same_moment():
+    async with driven(MOVE, cycles=40) as cell:
         arm, flight = cell.robot.flight.arm, cell.robot.flight
         # The pause is said while the state that tells of the force is on its way.
         arm.be(wrench=(0.0, 0.0, SETTINGS.limits.force_n.inner + 5.0, 0.0, 0.0, 0.0))
@@ -263,7 +236,7 @@ async def test_a_straight_move_that_met_something_is_not_begun_again_after_a_pau
         assert sum(isinstance(command, MoveLinear) for command in cell.robot.commands) == 1
 
 
-async def test_a_paused_program_that_could_not_be_stopped_is_counted_in_health() -> None:
+async def test_a_paused_program_that_could_not_be_stopped_is_counted_in_health():
     async with driven() as cell:
         cell.robot.losses["hung"] = 2
         assert cell.robot.diagnostics()["errors"] == {"hung": 2}
@@ -276,20 +249,17 @@ async def test_a_paused_program_that_could_not_be_stopped_is_counted_in_health()
 TURN = WristSpeed(0.3, 4.0)
 
 
-async def test_a_wrist_speed_is_sent_at_each_state() -> None:
-    async with driven() as cell:
-        await cell.start(TWIST)
-        await cell.cycles(20)
+async def test_a_wrist_speed_is_sent_at_each_state():
+    async with driven(TWIST, cycles=20) as cell:
         cell.robot.commands.clear()
         await cell.cycles(50)
         assert cell.robot.commands == [TURN] * 50
         assert cell.robot.flight.wrist_speed == pytest.approx(0.3)
 
 
-async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none() -> None:
+async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none():
     """Nobody has sent one that could be mended; what helps is told instead."""
-    async with driven() as cell:
-        await cell.start(TWIST)
+    async with driven(TWIST) as cell:
         # What is clipped is told in each cycle, so that one is unanswered whenever the process dies.
         cell.robot.flight.arm.be(wrench=(0.0, 0.0, 0.9 * SETTINGS.limits.force_n.hard, 0.0, 0.0, 0.0))
         await cell.cycles(20)

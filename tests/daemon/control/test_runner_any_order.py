@@ -31,7 +31,6 @@ class Story:
 
     async def go(self, cycles: int) -> None:
         for _ in range(cycles):
-            assert self.cell.task is not None
             self.dead = self.dead + 1 if self.cell.task.done() else 0
             if self.dead > BEGUN_AGAIN_AFTER:
                 assert isinstance(self.cell.task.exception(), ZeroDivisionError)
@@ -73,10 +72,10 @@ class Story:
         tick = self.cell.control_loop.tick
 
         def once(*_: object) -> Any:
-            self.cell.control_loop.tick = tick  # type: ignore[method-assign]
+            self.cell.control_loop.tick = tick
             raise ZeroDivisionError("a tick went wrong")
 
-        self.cell.control_loop.tick = once  # type: ignore[method-assign]
+        self.cell.control_loop.tick = once
 
     def protective_stop(self) -> None:
         if self.arm.reading.safety_mode == 1:
@@ -139,12 +138,12 @@ async def told(happenings: Sequence[str]) -> bool:
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.sampled_from([*HAPPENINGS]), max_size=25))
-def test_nothing_moves_that_no_experiment_moves(happenings: list[str]) -> None:
+def test_nothing_moves_that_no_experiment_moves(happenings):
     asyncio.run(told(happenings))
 
 
 @pytest.mark.parametrize("begun", ["turn", "move", "twist"])
-def test_whatever_befalls_a_motion_and_then_again_it_stands(begun: str) -> None:
+def test_whatever_befalls_a_motion_and_then_again_it_stands(begun):
     others = [name for name in HAPPENINGS if name not in ("turn", "move", "twist", "mend", "wait long")]
     for first, second in itertools.permutations(others, 2):
         assert asyncio.run(told(["mend", begun, first, second])), "it moved at first"

@@ -18,7 +18,7 @@ async def gripping() -> AsyncIterator[Cell]:
         yield cell
 
 
-async def test_a_stop_in_the_middle_of_a_grip_stops_the_fingers_once() -> None:
+async def test_a_stop_in_the_middle_of_a_grip_stops_the_fingers_once():
     async with gripping() as cell:
         assert cell.gripper.asked == ["grip"]
         cell.control_loop.stop("the operator said stop")
@@ -27,7 +27,7 @@ async def test_a_stop_in_the_middle_of_a_grip_stops_the_fingers_once() -> None:
 
 
 @pytest.mark.parametrize("answer", ["the connection to the gripper broke", RuntimeError("no such register")])
-async def test_a_grip_that_has_failed_stops_the_fingers_once(answer: str | Exception) -> None:
+async def test_a_grip_that_has_failed_stops_the_fingers_once(answer):
     """Where its connection is lost in the middle, the experiment ends, and they go on to where they were sent."""
     async with driven() as cell:
         cell.gripper.answers = answer
@@ -43,23 +43,21 @@ async def test_a_grip_that_has_failed_stops_the_fingers_once(answer: str | Excep
         assert cell.gripper.asked == ["grip", "halt", "grip"]
 
 
-async def test_a_stop_after_a_grip_leaves_the_fingers_alone() -> None:
-    async with driven() as cell:
-        await cell.start(GRIP, {"do": "wait", "wait_s": 60})
-        await cell.cycles(50)
+async def test_a_stop_after_a_grip_leaves_the_fingers_alone():
+    async with driven(GRIP, {"do": "wait", "wait_s": 60}, cycles=50) as cell:
         cell.control_loop.stop("the operator said stop")
         await cell.cycles(20)
         assert cell.gripper.asked == ["grip"]
 
 
-async def test_a_stop_that_lets_the_tool_go_in_the_middle_of_a_grip_opens_the_fingers() -> None:
+async def test_a_stop_that_lets_the_tool_go_in_the_middle_of_a_grip_opens_the_fingers():
     async with gripping() as cell:
         cell.exceed_torque()
         await cell.cycles(20)
         assert cell.gripper.asked == ["grip", "grip"], "the second one wide open"
 
 
-async def test_a_loop_that_dies_in_the_middle_of_a_grip_stops_the_fingers(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_loop_that_dies_in_the_middle_of_a_grip_stops_the_fingers(monkeypatch):
     async with gripping() as cell:
         monkeypatch.setattr(cell.control_loop, "tick", no_tick)
         await cell.cycles(2)
@@ -67,13 +65,13 @@ async def test_a_loop_that_dies_in_the_middle_of_a_grip_stops_the_fingers(monkey
         assert cell.gripper.asked == ["grip", "halt"]
 
 
-async def test_a_daemon_that_ends_in_the_middle_of_a_grip_stops_the_fingers_first() -> None:
+async def test_a_daemon_that_ends_in_the_middle_of_a_grip_stops_the_fingers_first():
     async with gripping() as cell:
         await cell.runner.released()
         assert cell.gripper.asked == ["grip", "halt"]
 
 
-async def test_fingers_that_could_not_be_stopped_are_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_fingers_that_could_not_be_stopped_are_told_of(monkeypatch):
     async with gripping() as cell:
 
         async def does_not() -> str:

@@ -10,10 +10,8 @@ from tests.daemon.control.cell import TWIST, driven
 from tests.drivers.ur.flight import CYCLE_NS
 
 
-async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with driven() as cell:
-        await cell.start(TWIST)
-        await cell.cycles(50)
+async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch):
+    async with driven(TWIST, cycles=50) as cell:
         decide = cell.control_loop.tick
 
         def at_length(*given: Any) -> Any:
@@ -28,10 +26,9 @@ async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch: pytes
 
 
 @pytest.mark.parametrize(("missed", "read"), [(24, 1), (18, 2), (12, 1)])
-async def test_a_loop_that_is_late_again_and_again_is_stopped(missed: int, read: int) -> None:
+async def test_a_loop_that_is_late_again_and_again_is_stopped(missed, read):
     """Though it then reads many states at once, or decides in time before it is late again."""
-    async with driven() as cell:
-        await cell.start({"do": "wait", "wait_s": 60})
+    async with driven({"do": "wait", "wait_s": 60}) as cell:
         for _ in range(60):
             for _ in range(missed):
                 cell.robot.cycle(read=False)
@@ -41,11 +38,9 @@ async def test_a_loop_that_is_late_again_and_again_is_stopped(missed: int, read:
         assert "loop ran" in cell.why
 
 
-async def test_a_daemon_that_was_paused_says_so_first_and_not_what_follows_from_it() -> None:
+async def test_a_daemon_that_was_paused_says_so_first_and_not_what_follows_from_it():
     """Of as many as eight sentences the cause was the last: torques and states are old to one who was away."""
-    async with driven() as cell:
-        await cell.start(TWIST)
-        await cell.cycles(50)
+    async with driven(TWIST, cycles=50) as cell:
         for _ in range(6_000_000_000 // CYCLE_NS):
             cell.robot.cycle(read=False)
         await cell.cycles(1)
@@ -53,9 +48,8 @@ async def test_a_daemon_that_was_paused_says_so_first_and_not_what_follows_from_
         assert cell.why == Fault(FaultCode.DAEMON_PAUSED, "it stood still for 6.0 s").sentence
 
 
-async def test_a_loop_that_decides_before_the_last_state_is_stale_is_in_time() -> None:
-    async with driven() as cell:
-        await cell.start({"do": "wait", "wait_s": 60})
+async def test_a_loop_that_decides_before_the_last_state_is_stale_is_in_time():
+    async with driven({"do": "wait", "wait_s": 60}) as cell:
         for _ in range(100):
             for _ in range(11):
                 cell.robot.cycle(read=False)
@@ -63,14 +57,12 @@ async def test_a_loop_that_decides_before_the_last_state_is_stale_is_in_time() -
             assert cell.control_loop.status.decision.faults == ()
 
 
-async def test_of_states_that_are_read_at_once_the_newest_is_decided_upon(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with driven() as cell:
-        await cell.start({"do": "wait", "wait_s": 60})
+async def test_of_states_that_are_read_at_once_the_newest_is_decided_upon(monkeypatch):
+    async with driven({"do": "wait", "wait_s": 60}) as cell:
         decided: list[int] = []
         decide = cell.control_loop.tick
 
         def tick(*given: Any) -> Any:
-            assert cell.control_loop.inputs.arm is not None
             decided.append(cell.control_loop.inputs.arm.t_ns)
             return decide(*given)
 

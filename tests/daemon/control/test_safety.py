@@ -14,7 +14,7 @@ def trouble(event: FaultCode) -> Fault:
     return Fault(event, "on the bench")
 
 
-def test_every_event_has_a_row_with_a_sentence_and_a_cure() -> None:
+def test_every_event_has_a_row_with_a_sentence_and_a_cure():
     assert set(TABLE) == set(FaultCode)
     for rule in TABLE.values():
         fields = [name for _, name, _, _ in string.Formatter().parse(rule.sentence) if name]
@@ -24,14 +24,14 @@ def test_every_event_has_a_row_with_a_sentence_and_a_cure() -> None:
         assert rule.response is not Response.HOLD or rule.hold_at_most_s is not None, "a hold may not last for ever"
 
 
-def test_a_hold_goes_with_its_cause() -> None:
+def test_a_hold_goes_with_its_cause():
     gate = SafetyMonitor()
     assert gate.judge([trouble(FaultCode.ESTIMATE_STALE)], 0).response is Response.HOLD
     assert gate.judge([], SECOND).response is Response.NOTE
 
 
 @pytest.mark.parametrize("event", [event for event, rule in TABLE.items() if rule.response is Response.HOLD])
-def test_a_hold_that_lasts_too_long_becomes_a_stop(event: FaultCode) -> None:
+def test_a_hold_that_lasts_too_long_becomes_a_stop(event):
     gate = SafetyMonitor()
     longest_s = TABLE[event].hold_at_most_s
     assert longest_s is not None
@@ -59,10 +59,9 @@ OF_THE_MOMENT = [(event, longest_s) for event, longest_s in HOLDS if not TABLE[e
 
 @pytest.mark.parametrize(("event", "longest_s"), OF_THE_MOMENT)
 @pytest.mark.parametrize(("held", "gone"), [(1, 1), (50, 50), (125, 125), (125, 12)])
-def test_a_hold_that_flaps_becomes_a_stop(event: FaultCode, longest_s: float, held: int, gone: int) -> None:
+def test_a_hold_that_flaps_becomes_a_stop(event, longest_s, held, gone):
     """Of each cycle's time so much is held and half of the rest forgotten, until it is as long as it may be."""
     stopped_s = flapping(event, held, gone)
-    assert stopped_s is not None
     cycle_s, gained_s = (held + gone) * TICK_S, (held - 0.5 * gone) * TICK_S
     cycles_before = (longest_s - held * TICK_S) / gained_s
     assert stopped_s == pytest.approx(cycle_s * cycles_before, abs=cycle_s + held * TICK_S + 4 * TICK_S)
@@ -70,9 +69,7 @@ def test_a_hold_that_flaps_becomes_a_stop(event: FaultCode, longest_s: float, he
 
 @pytest.mark.parametrize(("event", "longest_s"), OF_THE_MOMENT)
 @pytest.mark.parametrize(("held", "gone"), [(1, 3), (12, 36), (125, 260)])
-def test_a_hold_that_is_gone_for_more_than_two_thirds_of_the_time_stays_one(
-    event: FaultCode, longest_s: float, held: int, gone: int
-) -> None:
+def test_a_hold_that_is_gone_for_more_than_two_thirds_of_the_time_stays_one(event, longest_s, held, gone):
     assert held * TICK_S < longest_s
     assert flapping(event, held, gone) is None
 
@@ -88,10 +85,9 @@ def taking_turns(*turns: tuple[FaultCode, float], for_s: float = 60.0) -> tuple[
 
 @pytest.mark.parametrize("each_s", [0.008, 0.1, 1.0])
 @pytest.mark.parametrize("count", [3, 4, 6])
-def test_causes_that_take_turns_hold_the_wrist_no_longer_than_one_alone_may(count: int, each_s: float) -> None:
+def test_causes_that_take_turns_hold_the_wrist_no_longer_than_one_alone_may(count, each_s):
     events = [event for event, _ in HOLDS][:count]
     stopped = taking_turns(*((event, each_s) for event in events))
-    assert stopped is not None
     stopped_s, gate = stopped
     assert stopped_s == pytest.approx(HELD_AT_MOST_S, abs=2 * TICK_S)
     told = gate.report([]).reasons[-1]
@@ -99,13 +95,12 @@ def test_causes_that_take_turns_hold_the_wrist_no_longer_than_one_alone_may(coun
     assert all(f"{event.text} for " in told for event in events[:4])
 
 
-def test_one_cause_alone_is_told_alone() -> None:
+def test_one_cause_alone_is_told_alone():
     stopped = taking_turns((FaultCode.ESTIMATE_STALE, 1.0))
-    assert stopped is not None
     assert [found.code for found in stopped[1].report([]).faults] == [FaultCode.ESTIMATE_STALE]
 
 
-def test_what_does_not_hold_is_not_counted_as_a_hold() -> None:
+def test_what_does_not_hold_is_not_counted_as_a_hold():
     notes = [event for event, rule in TABLE.items() if rule.response < Response.HOLD]
     assert taking_turns(*((event, 0.1) for event in notes)) is None
 
@@ -114,7 +109,7 @@ LATE = [trouble(FaultCode.LOOP_LATE)]
 
 
 @pytest.mark.parametrize(("stall_s", "decisions"), [(0.15, 1), (0.15, 10), (0.3, 60), (1.0, 1)])
-def test_a_loop_that_is_away_for_more_than_a_third_of_the_time_is_stopped(stall_s: float, decisions: int) -> None:
+def test_a_loop_that_is_away_for_more_than_a_third_of_the_time_is_stopped(stall_s, decisions):
     """It is found late when it is back, and in time at the next decision: what counts is the time between."""
     gate, t_ns = SafetyMonitor(), SECOND
     gate.judge([], t_ns)
@@ -127,12 +122,11 @@ def test_a_loop_that_is_away_for_more_than_a_third_of_the_time_is_stopped(stall_
             assert gate.judge([], t_ns).response not in STOPS
     held_s, gone_s = stall_s + TICK_S, (decisions - 1) * TICK_S
     longest_s = TABLE[FaultCode.LOOP_LATE].hold_at_most_s
-    assert longest_s is not None
     cycles = (longest_s - held_s) / (held_s - 0.5 * gone_s)
     assert t_ns / SECOND - 1.0 == pytest.approx(cycles * (held_s + gone_s), abs=2 * (held_s + gone_s))
 
 
-def test_a_loop_that_is_late_now_and_then_is_held_and_goes_on() -> None:
+def test_a_loop_that_is_late_now_and_then_is_held_and_goes_on():
     gate, t_ns = SafetyMonitor(), 0
     for _ in range(100):
         t_ns += 150_000_000
@@ -142,7 +136,7 @@ def test_a_loop_that_is_late_now_and_then_is_held_and_goes_on() -> None:
             assert gate.judge([], t_ns).response is Response.NOTE
 
 
-def test_what_was_before_the_first_judgement_does_not_count() -> None:
+def test_what_was_before_the_first_judgement_does_not_count():
     gate = SafetyMonitor()
     assert gate.judge(LATE, 3600 * SECOND).response is Response.HOLD
     gate.report([])
@@ -154,9 +148,7 @@ STRETCHES = st.tuples(CAUSES, st.integers(1, 3 * SECOND))
 
 
 @given(st.lists(STRETCHES, min_size=1, max_size=60))
-def test_whatever_holds_a_wrist_for_more_than_a_third_of_the_time_ends_in_a_stop(
-    story: list[tuple[list[FaultCode], int]],
-) -> None:
+def test_whatever_holds_a_wrist_for_more_than_a_third_of_the_time_ends_in_a_stop(story):
     gate, t_ns, held_ns = SafetyMonitor(), 0, 0.0
     for events, lasts_ns in story:
         if gate.judge([trouble(event) for event in events], t_ns).response in STOPS:
@@ -166,7 +158,7 @@ def test_whatever_holds_a_wrist_for_more_than_a_third_of_the_time_ends_in_a_stop
         held_ns = held_ns + lasts_ns if events else max(0.0, held_ns - 0.5 * lasts_ns)
 
 
-def test_a_hold_begins_anew_with_the_next_experiment_and_after_the_operators_word() -> None:
+def test_a_hold_begins_anew_with_the_next_experiment_and_after_the_operators_word():
     for ends in (SafetyMonitor.acknowledge, lambda gate: gate.report([trouble(FaultCode.STATE_STALE)])):
         gate = SafetyMonitor()
         gate.judge([trouble(FaultCode.STATE_STALE)], 0)
@@ -176,7 +168,7 @@ def test_a_hold_begins_anew_with_the_next_experiment_and_after_the_operators_wor
         assert gate.judge([trouble(FaultCode.STATE_STALE)], 3603 * SECOND).response is Response.STOP_AND_KEEP_GRIP
 
 
-def test_a_stop_outlives_its_cause_until_it_is_acknowledged() -> None:
+def test_a_stop_outlives_its_cause_until_it_is_acknowledged():
     gate = SafetyMonitor()
     gate.judge([trouble(FaultCode.PROTECTIVE_STOP)], 0)
     later = gate.judge([], 100 * SECOND)
@@ -189,9 +181,7 @@ def test_a_stop_outlives_its_cause_until_it_is_acknowledged() -> None:
 
 
 @given(st.lists(st.tuples(st.lists(st.sampled_from(FaultCode), max_size=4), st.integers(0, 10 * SECOND)), max_size=20))
-def test_no_sequence_of_events_weakens_a_stop_or_answers_less_than_the_table(
-    story: list[tuple[list[FaultCode], int]],
-) -> None:
+def test_no_sequence_of_events_weakens_a_stop_or_answers_less_than_the_table(story):
     gate, t_ns, strongest = SafetyMonitor(), 0, Response.NOTE
     for events, pause_ns in story:
         t_ns += pause_ns
@@ -204,14 +194,14 @@ def test_no_sequence_of_events_weakens_a_stop_or_answers_less_than_the_table(
         assert gate.stopped == (strongest in STOPS)
 
 
-def test_two_things_of_one_kind_are_both_told() -> None:
+def test_two_things_of_one_kind_are_both_told():
     both = [Fault(FaultCode.DEVICE_LOST, "the gripper"), Fault(FaultCode.DEVICE_LOST, "the load cell")]
     gate = SafetyMonitor()
     for seen in (gate.judge(both, 0), gate.judge([], SECOND), gate.report([])):
         assert [found.detail for found in seen.faults] == ["the gripper", "the load cell"]
 
 
-def test_a_pause_of_the_daemon_is_told_first_until_nothing_is_wrong_and_what_it_leads_to_is_not_repeated() -> None:
+def test_a_pause_of_the_daemon_is_told_first_until_nothing_is_wrong_and_what_it_leads_to_is_not_repeated():
     """Torques and states are old to one who was away, boards are thought to be gone, the robot's process was ended."""
     paused, old = (
         Fault(FaultCode.DAEMON_PAUSED, "it stood still for 3.0 s"),
@@ -243,9 +233,7 @@ def test_a_pause_of_the_daemon_is_told_first_until_nothing_is_wrong_and_what_it_
 
 
 @pytest.mark.parametrize("event", [FaultCode.RECORDING_FAILED, FaultCode.COMMAND_REFUSED])
-def test_what_neither_holds_the_wrist_nor_comes_of_a_pause_is_told_and_does_not_keep_the_pause(
-    event: FaultCode,
-) -> None:
+def test_what_neither_holds_the_wrist_nor_comes_of_a_pause_is_told_and_does_not_keep_the_pause(event):
     """A refusal is told once, and was never; a disk that stays full had the pause told first of a stop hours later."""
     paused, other, limit = trouble(FaultCode.DAEMON_PAUSED), trouble(event), trouble(FaultCode.TORQUE_LIMIT)
     gate = SafetyMonitor()
@@ -263,7 +251,7 @@ MOMENTS = st.lists(st.tuples(TIMES, st.sets(st.sampled_from(list(FaultCode)), ma
 
 
 @given(MOMENTS)
-def test_what_explains_changes_what_is_told_and_never_what_is_done(moments: list[tuple[int, set[FaultCode]]]) -> None:
+def test_what_explains_changes_what_is_told_and_never_what_is_done(moments):
     """Beside a gate that takes a pause of the daemon for a loop that is late, which explains nothing."""
     explaining, plain, t_ns = SafetyMonitor(), SafetyMonitor(), 0
     for passed_ns, events in moments:

@@ -64,7 +64,7 @@ class Bench:
             most -= 1
 
 
-def test_the_steps_are_carried_out_in_order_to_the_end() -> None:
+def test_the_steps_are_carried_out_in_order_to_the_end():
     bench = Bench(
         experiment(
             {"do": "approach", "pose_m_rad": [0.4, 0, 0.3, 0, 3.1, 0]},
@@ -85,7 +85,7 @@ def test_the_steps_are_carried_out_in_order_to_the_end() -> None:
     assert {wish.activity.split(": ")[1].split(",")[1] for wish in holds} == {" repeat 1 of 2", " repeat 2 of 2"}
 
 
-def test_absolute_angles_are_the_wrists_own() -> None:
+def test_absolute_angles_are_the_wrists_own():
     machine = experiment({"do": "twist", "angles_rad": [1.5], "absolute": True})
     machine.update(TICK_NS, 0.0, 0.0, gripped_at_rad=1.4)
     wish = machine.update(2 * TICK_NS, 0.0, 0.0, gripped_at_rad=1.4)
@@ -93,7 +93,7 @@ def test_absolute_angles_are_the_wrists_own() -> None:
     assert wish.wrist.angle_rad == pytest.approx(0.1)
 
 
-def test_tighten_ends_at_the_torque_or_at_the_angle_whichever_comes_first() -> None:
+def test_tighten_ends_at_the_torque_or_at_the_angle_whichever_comes_first():
     for angle_rad, reached_rad in ((3.0, 0.5), (0.25, 0.25)):
         bench = Bench(experiment({"do": "tighten", "until_torque_nm": 0.1, "until_angle_rad": angle_rad}))
         bench.run()
@@ -101,7 +101,7 @@ def test_tighten_ends_at_the_torque_or_at_the_angle_whichever_comes_first() -> N
         assert bench.wrist_rad == pytest.approx(-reached_rad, abs=0.002), "clockwise is negative"
 
 
-def test_a_failed_action_stops_the_experiment_with_its_reason() -> None:
+def test_a_failed_action_stops_the_experiment_with_its_reason():
     machine = experiment({"do": "grip"}, {"do": "release"})
     assert not machine.end_action("of the step before")
     assert machine.begin_action()
@@ -113,7 +113,7 @@ def test_a_failed_action_stops_the_experiment_with_its_reason() -> None:
     assert machine.stop_reason == "step 1 (grip) failed: nothing was between the fingers"
 
 
-def test_while_paused_or_held_the_wrist_stands_and_no_time_passes() -> None:
+def test_while_paused_or_held_the_wrist_stands_and_no_time_passes():
     bench = Bench(experiment({"do": "twist", "angles_rad": [0.5], "hold_s": 5.0}))
     for _ in range(100):
         bench.tick()
@@ -130,7 +130,7 @@ def test_while_paused_or_held_the_wrist_stands_and_no_time_passes() -> None:
     assert bench.machine.phase is ExperimentPhase.DONE
 
 
-def test_a_step_that_takes_too_long_is_said_to_be_overdue() -> None:
+def test_a_step_that_takes_too_long_is_said_to_be_overdue():
     machine = experiment({"do": "grip", "timeout_s": 2.0})
     machine.update(2_000_000_000, 0.0, None)
     assert not machine.overdue
@@ -138,7 +138,7 @@ def test_a_step_that_takes_too_long_is_said_to_be_overdue() -> None:
     assert machine.overdue == "step 1 (grip) has taken 2.1 s of at most 2 s"
 
 
-def test_a_steps_limits_only_tighten_the_experiments() -> None:
+def test_a_steps_limits_only_tighten_the_experiments():
     step = {"do": "wait", "wait_s": 1, "limits": {"torque_nm": 0.4, "angle_rad": 0.1}}
     machine = experiment(step, limits={"torque_nm": 0.2, "angle_rad": 1.0})
     assert (machine.limits.torque_nm, machine.limits.angle_rad) == (0.2, 0.1)
@@ -156,7 +156,7 @@ def test_a_steps_limits_only_tighten_the_experiments() -> None:
         ({"do": "grip", "widht_mm": 20}, "not permitted"),
     ],
 )
-def test_a_mistake_in_a_step_is_told_with_the_cure(step: dict[str, Any], part: str) -> None:
+def test_a_mistake_in_a_step_is_told_with_the_cure(step, part):
     with pytest.raises(ValidationError, match=part):
         experiment(step)
 
@@ -178,9 +178,7 @@ STEPS = st.one_of(
 @given(
     st.lists(STEPS, min_size=1, max_size=4), st.lists(st.sampled_from(["pause", "resume", "hold", "tick"]), max_size=40)
 )
-def test_any_experiment_ends_whatever_interrupts_it_and_never_moves_after_its_end(
-    steps: list[dict[str, Any]], interruptions: list[str]
-) -> None:
+def test_any_experiment_ends_whatever_interrupts_it_and_never_moves_after_its_end(steps, interruptions):
     bench = Bench(experiment(*steps))
     for what in interruptions:
         if what == "pause":
@@ -197,7 +195,7 @@ def test_any_experiment_ends_whatever_interrupts_it_and_never_moves_after_its_en
 
 
 @pytest.mark.parametrize("path", sorted(Path("config/experiments").glob("*.yaml")), ids=lambda path: path.stem)
-def test_the_experiments_that_are_shipped_are_in_order_and_end(path: Path) -> None:
+def test_the_experiments_that_are_shipped_are_in_order_and_end(path):
     file = load_yaml_model(path, ExperimentFile)
     bench = Bench(Experiment(file, 0), tick_ns=100_000_000)
     bench.run()

@@ -2,16 +2,13 @@
 
 import asyncio
 from types import SimpleNamespace
-from typing import cast
 
 import pytest
 
-from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
 from shearloop.daemon.control.runner import VelocityCommandSender
 from shearloop.daemon.control.step_runner import MoveToAngle
 from shearloop.daemon.control.wrist_controller import WristController
-from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply, WristSpeed
 from tests.drivers.ur.flight import SETTINGS, flying
 
@@ -27,12 +24,12 @@ def wrist(config: LoopConfig = AT_ONCE) -> WristController:
     return WristController(TorqueSource(name="load_cell", period_s=0.1), config)
 
 
-def test_a_wrist_that_stands_sets_out_for_however_little() -> None:
+def test_a_wrist_that_stands_sets_out_for_however_little():
     turn = wrist().turn(MoveToAngle(0.1 * CLOSE_RAD, 0.2), 10**9, 0.0, 0.0)
     assert turn.speed_rad_per_s == pytest.approx(0.1 * CLOSE_RAD * CONFIG.angle_bandwidth_per_s)
 
 
-def test_a_held_angle_is_kept() -> None:
+def test_a_held_angle_is_kept():
     one, angle_rad, errors_rad = wrist(), 0.0, []
     for cycle in range(1000):
         speed = one.turn(MoveToAngle(0.15, 0.2), 10**9 + cycle * CYCLE_NS, angle_rad, 0.0).speed_rad_per_s
@@ -45,9 +42,7 @@ def test_a_held_angle_is_kept() -> None:
 
 @pytest.mark.parametrize("allowed_rad_per_s", [1e-5, 4e-5, 1e-3, 0.2])
 @pytest.mark.parametrize("bandwidth_per_s", [0.02, 5.0, 40.0])
-def test_however_slow_it_turns_to_an_angle_and_back_and_stays_there(
-    allowed_rad_per_s: float, bandwidth_per_s: float
-) -> None:
+def test_however_slow_it_turns_to_an_angle_and_back_and_stays_there(allowed_rad_per_s, bandwidth_per_s):
     one, angle_rad, t_ns = wrist(AT_ONCE.model_copy(update={"angle_bandwidth_per_s": bandwidth_per_s})), 0.0, 10**9
     way_rad = 200 * CYCLE_NS / 1e9 * allowed_rad_per_s
     # As long as the way takes, and as its last part does at this bandwidth.
@@ -83,7 +78,7 @@ async def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500
 
     robot = SimpleNamespace(settings=SETTINGS, state=None, send=send)
     brain = SimpleNamespace(on_speed_sent=wrist.on_speed_sent, on_command_refused=pytest.fail, on_crash=pytest.fail)
-    commands = VelocityCommandSender(cast(UrRobot, robot), cast(ControlLoop, brain))
+    commands = VelocityCommandSender(robot, brain)
     origin_rad, errors = flight.state.wrist_rad, []
     for _ in range(cycles):
         flight.fly(1)
@@ -101,7 +96,5 @@ async def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500
 
 @pytest.mark.parametrize("angle_rad", [0.01, 0.03, 0.1])
 @pytest.mark.parametrize("bandwidth_per_s", [5.0, FASTEST_PER_S])
-async def test_wrist_comes_to_rest_at_an_angle_however_fast_it_may_be_asked_to(
-    angle_rad: float, bandwidth_per_s: float
-) -> None:
+async def test_wrist_comes_to_rest_at_an_angle_however_fast_it_may_be_asked_to(angle_rad, bandwidth_per_s):
     assert max(map(abs, (await errors_rad(angle_rad, bandwidth_per_s))[-150:])) < 1e-4

@@ -8,16 +8,16 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import AsyncMock
 
-import pytest
 import zmq
 import zmq.asyncio
 
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.health import resident_memory_mb
 from shearloop.daemon.messaging import command_server
 from shearloop.daemon.messaging.command_server import RateLimit
 from shearloop.daemon.messaging.messages import decode, encode
+from shearloop.daemon.supervisor import resident_memory_mb
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import CommandReply
 from tests.daemon.conftest import running_daemon
@@ -80,27 +80,11 @@ def malformed_frames(count: int) -> Iterator[bytes]:
             yield chance.randbytes(chance.randrange(80)).replace(b"\n", b"") + b"\n"
 
 
-class Arm:
-    """A robot that would do whatever it is told, and remembers it."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.told: list[Any] = []
-        arm = self
-
-        async def waits(_robot: UrRobot) -> Any:
-            await asyncio.Event().wait()
-
-        async def send(_robot: UrRobot, command: Any) -> CommandReply:
-            arm.told.append(command)
-            return CommandReply()
-
-        monkeypatch.setattr(UrRobot, "run", waits)
-        monkeypatch.setattr(UrRobot, "next_state", waits)
-        monkeypatch.setattr(UrRobot, "send", send)
-
-
 async def test_a_flood_of_malformed_frames_and_requests(config, tiny_bank, monkeypatch):
-    arm = Arm(monkeypatch)
+    arm = AsyncMock(return_value=CommandReply())
+    monkeypatch.setattr(UrRobot, "send", arm)
+    for name in ("run", "next_state"):
+        monkeypatch.setattr(UrRobot, name, lambda _: asyncio.Event().wait())
     board, port = os.openpty()
     tty.setraw(port)
     fingertip = {"device": {"path": os.ttyname(port)}, "bank": str(tiny_bank)}
@@ -130,7 +114,7 @@ async def test_a_flood_of_malformed_frames_and_requests(config, tiny_bank, monke
         assert set(refusals) <= {"malformed request", "unknown command", "too many requests"}
         assert refused <= FRAMES
         assert published["eit.estimate"] == published["eit.frame"] == 0
-        assert arm.told == [], "nothing was asked of the robot"
+        assert not arm.called, "nothing was asked of the robot"
         assert daemon._rig.control_loop.experiment is None
         assert not daemon.supervisor.dead
         assert all(record.restarts == 0 for record in daemon.supervisor.records.values())

@@ -24,7 +24,7 @@ def recording(tmp_path: Path) -> Path:
     return path
 
 
-def test_info_shows_the_content(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_shows_the_content(recording, capsys):
     assert main(["recording", "info", str(recording)]) == 0
     told = capsys.readouterr().out
     assert "a bench" in told
@@ -36,9 +36,7 @@ def test_info_shows_the_content(recording: Path, capsys: pytest.CaptureFixture[s
     assert (told["closed"], told["same_code"], told["size_bytes"]) == (True, True, recording.stat().st_size)
 
 
-def test_a_torn_recording_is_refused_and_repaired(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_torn_recording_is_refused_and_repaired(recording, tmp_path, capsys):
     whole = recording.read_bytes()
     torn = tmp_path / "torn.mcap.partial"
     torn.write_bytes(whole[: len(whole) - 400])
@@ -57,9 +55,7 @@ def test_a_torn_recording_is_refused_and_repaired(
     assert "exists already" in capsys.readouterr().err
 
 
-def test_a_damaged_chunk_is_left_out_and_counted(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_damaged_chunk_is_left_out_and_counted(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("shearloop.daemon.recording.writer._FLUSH_EVERY", 1)
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, "a bench") as writer:
@@ -77,9 +73,7 @@ def test_a_damaged_chunk_is_left_out_and_counted(
     assert len(kept) == told["messages"] >= 24
 
 
-def test_csv_parquet_and_matlab_exports_agree(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_csv_parquet_and_matlab_exports_agree(recording, tmp_path, capsys):
     pyarrow_parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
     for form in ("csv", "parquet", "mat"):
         assert main(["recording", "export", str(recording), "--format", form, "--json"]) == 0
@@ -111,9 +105,7 @@ def test_csv_parquet_and_matlab_exports_agree(
         ),
     ],
 )
-def test_mistakes_end_in_one_sentence(
-    arguments: list[str], message: str, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_end_in_one_sentence(arguments, message, recording, tmp_path, capsys):
     (tmp_path / "text.mcap").write_text("not a recording at all")
     given = [one.format(folder=tmp_path, recording=recording) for one in arguments]
     assert main(["recording", *given]) == 2

@@ -85,15 +85,9 @@ def sound(content: bytes, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
 
 @settings(max_examples=200, deadline=None)
 @given(where=st.floats(0, 0.9999), length=st.integers(1, 30), cut=st.booleans(), reader=st.sampled_from(READERS))
-def test_damage_is_an_error_that_names_the_file_or_harmless(
-    content: bytes,
-    sound: dict[str, Any],
-    tmp_path_factory: pytest.TempPathFactory,
-    where: float,
-    length: int,
-    cut: bool,
-    reader: Callable[[Path], Any],
-) -> None:
+def test_damage_is_an_error_with_the_files_name_or_harmless(
+    content, sound, tmp_path_factory, where, length, cut, reader
+):
     at = int(where * len(content))
     spoilt = bytes(255 - byte for byte in content[at : at + length])
     path = tmp_path_factory.mktemp("damaged") / "x.mcap"
@@ -135,9 +129,7 @@ def spoilt(content: bytes, what: str) -> bytes:
         (["calibrate", "{path}", "--out", "{out}"], ["chunk", "cut", "short"]),
     ],
 )
-def test_each_command_exits_with_status_2(
-    arguments: list[str], damages: list[str], content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_each_command_exits_with_status_2(arguments, damages, content, tmp_path, capsys):
     path = tmp_path / "x.mcap"
     places = {"path": path, "address": f"ipc://{tmp_path}/replay", "out": tmp_path / "out.cal"}
     for what in damages:
@@ -149,9 +141,7 @@ def test_each_command_exits_with_status_2(
         assert "Traceback" not in said
 
 
-def test_a_check_without_a_comparison_fails(
-    config: Callable[..., Path], imported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_check_without_a_comparison_fails(config, imported, tmp_path, capsys):
     arguments = ["--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--config", str(config())]
     assert main(["replay", str(imported), *arguments]) == 0
     assert "Nothing was compared" in capsys.readouterr().err

@@ -52,10 +52,7 @@ def disks(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[SmallDisk]]:
     return make
 
 
-Disks = Callable[..., list[SmallDisk]]
-
-
-def test_a_full_disk_keeps_all_flushed_data(tmp_path: Path, disks: Disks) -> None:
+def test_a_full_disk_keeps_all_flushed_data(tmp_path, disks):
     for n, room in enumerate(np.random.default_rng(3).integers(2_000, 40_000, 50)):
         disks(int(room))
         recorder = Recorder(tmp_path / str(n), IDENTITY, Clock())
@@ -76,7 +73,7 @@ def test_a_full_disk_keeps_all_flushed_data(tmp_path: Path, disks: Disks) -> Non
         assert numbers == list(range(safe + 1))
 
 
-def test_no_data_is_missing_when_the_disk_has_room_again(tmp_path: Path, disks: Disks) -> None:
+def test_no_data_is_missing_when_the_disk_has_room_again(tmp_path, disks):
     opened = disks(20_000)
     recorder = Recorder(tmp_path, IDENTITY, Clock())
     for number in range(20):
@@ -98,9 +95,7 @@ def test_no_data_is_missing_when_the_disk_has_room_again(tmp_path: Path, disks: 
     assert count_messages(path)["eit.frame.right"] == 20, "the checksums are those of one write"
 
 
-def test_a_file_that_cannot_be_started_is_removed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disks: Disks
-) -> None:
+def test_a_file_that_cannot_be_started_is_removed(tmp_path, monkeypatch, disks):
     disks(0, 100_000, 0, 0, 0, 100_000)
     with pytest.raises(UserError, match="cannot record there: No space left on device"):
         Recorder(tmp_path, IDENTITY, Clock())
@@ -120,9 +115,7 @@ def test_a_file_that_cannot_be_started_is_removed(
     assert [[one["seq"] for one in topics(path)["load.torque"]] for path in recorder.finished] == [[0, 1, 2], [3]]
 
 
-def test_the_queue_is_bounded_and_drops_are_counted_in_their_own_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_queue_is_bounded_and_drops_are_counted_in_their_own_file(tmp_path, monkeypatch):
     monkeypatch.setattr(recorder_module, "MAX_WAITING_BYTES", 100_000)
     recorder = Recorder(tmp_path, IDENTITY, Clock())
     for number in range(20):
@@ -147,7 +140,7 @@ def test_the_queue_is_bounded_and_drops_are_counted_in_their_own_file(
 
 
 @pytest.mark.parametrize("small_disk", ["64k"], indirect=True)
-async def test_a_real_full_disk_is_reported_and_the_file_can_be_repaired(small_disk: Path, tmp_path: Path) -> None:
+async def test_a_real_full_disk_is_reported_and_the_file_can_be_repaired(small_disk, tmp_path):
     recorder = Recorder(small_disk, IDENTITY, Clock())
     why, number = "", 0
     async with deadline("the recorder did not report the full disk"):
@@ -166,7 +159,7 @@ async def test_a_real_full_disk_is_reported_and_the_file_can_be_repaired(small_d
     assert len(kept) > 1
 
 
-def test_an_unwritable_folder_is_an_error(tmp_path: Path) -> None:
+def test_an_unwritable_folder_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot record there"):
         Recorder(tmp_path / "file", IDENTITY, Clock())

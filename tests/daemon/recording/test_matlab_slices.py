@@ -72,7 +72,7 @@ class Sweep:
         self.recorder.close()
 
 
-def test_each_hold_becomes_a_slice_for_reproduce(tmp_path: Path) -> None:
+def test_each_hold_becomes_a_slice_for_reproduce(tmp_path):
     sweep = Sweep(tmp_path)
     for number, torque_nm in enumerate((0.05, 0.1, 0.15), start=1):
         sweep.hold(number, torque_nm)
@@ -86,7 +86,7 @@ def test_each_hold_becomes_a_slice_for_reproduce(tmp_path: Path) -> None:
     assert sweep.recorder.summary == "3 torque slices"
 
 
-def test_a_second_sweep_continues_the_numbers(tmp_path: Path) -> None:
+def test_a_second_sweep_continues_the_numbers(tmp_path):
     for diameter_mm in (10.2, 20.4):
         sweep = Sweep(tmp_path, "diameter")
         sweep.gripped(diameter_mm)
@@ -97,7 +97,7 @@ def test_a_second_sweep_continues_the_numbers(tmp_path: Path) -> None:
     np.testing.assert_allclose(slices.diameter_mm, [10, 10, 20, 20])
 
 
-def test_a_second_sweep_keeps_the_first_raw_frame(tmp_path: Path) -> None:
+def test_a_second_sweep_keeps_the_first_raw_frame(tmp_path):
     """One raw frame a run, of its largest torque; that of another run is nowhere else."""
     for torques_nm in ((0.05, 0.15), (0.1, 0.2)):
         sweep = Sweep(tmp_path)
@@ -114,7 +114,7 @@ def test_a_second_sweep_keeps_the_first_raw_frame(tmp_path: Path) -> None:
     )
 
 
-def test_frames_and_torques_are_smoothed_around_the_same_middle(tmp_path: Path) -> None:
+def test_frames_and_torques_are_smoothed_around_the_same_middle(tmp_path):
     """The gel relaxes while it is held: what is said of its frame has to be said of its torque."""
     sweep = Sweep(tmp_path)
     sweep._loop(hold=1)
@@ -131,7 +131,7 @@ def test_frames_and_torques_are_smoothed_around_the_same_middle(tmp_path: Path) 
     np.testing.assert_allclose(slices.torque_nm[0], slices.differences[0].mean(), rtol=0.02)
 
 
-def test_the_frame_before_the_tare_is_not_homogeneous(tmp_path: Path) -> None:
+def test_the_frame_before_the_tare_is_not_homogeneous(tmp_path):
     sweep = Sweep(tmp_path, tared=False)
     sweep.frames(0.3, 4.0)
     sweep.t_s += 0.3 * PERIOD_S
@@ -145,7 +145,7 @@ def test_the_frame_before_the_tare_is_not_homogeneous(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_torque_slices(tmp_path / "torque_slices").differences, 0.1, atol=1e-6)
 
 
-def test_frames_of_a_hold_may_arrive_after_its_end(tmp_path: Path) -> None:
+def test_frames_of_a_hold_may_arrive_after_its_end(tmp_path):
     sweep = Sweep(tmp_path)
     sweep._loop(hold=1)
     sweep.frames(0.1, 1.0)
@@ -158,7 +158,7 @@ def test_frames_of_a_hold_may_arrive_after_its_end(tmp_path: Path) -> None:
     assert sweep.recorder.diagnostics()["slices"] == 1, sweep.recorder.summary
 
 
-def test_the_raw_frame_is_clipped_like_the_papers(tmp_path: Path) -> None:
+def test_the_raw_frame_is_clipped_like_the_papers(tmp_path):
     sweep = Sweep(tmp_path)
     sweep.hold(1, 0.3)
     sweep.done()
@@ -167,7 +167,7 @@ def test_the_raw_frame_is_clipped_like_the_papers(tmp_path: Path) -> None:
     np.testing.assert_allclose(raw, np.minimum(sweep.rest + 0.3, 0.45), atol=1e-6)
 
 
-def test_closing_writes_the_last_slice(tmp_path: Path) -> None:
+def test_closing_writes_the_last_slice(tmp_path):
     sweep = Sweep(tmp_path)
     sweep._loop(hold=1)
     sweep.frames(0.1, 5.0)
@@ -176,7 +176,7 @@ def test_closing_writes_the_last_slice(tmp_path: Path) -> None:
     assert sweep.recorder.diagnostics()["slices"] == 1
 
 
-def test_a_hold_with_a_safety_interruption_is_one_slice(tmp_path: Path) -> None:
+def test_a_hold_with_a_safety_interruption_is_one_slice(tmp_path):
     sweep = Sweep(tmp_path)
     for phase, for_s in (("running", 2.0), ("held", 1.0), ("running", 2.0)):
         sweep._loop(hold=1, phase=phase)
@@ -196,9 +196,7 @@ def test_a_hold_with_a_safety_interruption_is_one_slice(tmp_path: Path) -> None:
     ],
     ids=["no tare", "short hold", "repeated frames", "invalid load"],
 )
-def test_a_missed_slice_is_counted_with_its_reason(
-    tmp_path: Path, tared: bool, for_s: float, frames: dict[str, bool], reason: str
-) -> None:
+def test_a_missed_slice_is_counted_with_its_reason(tmp_path, tared, for_s, frames, reason):
     sweep = Sweep(tmp_path, tared=tared)
     sweep.hold(1, 0.1, for_s, **frames)
     sweep.done()
@@ -206,14 +204,14 @@ def test_a_missed_slice_is_counted_with_its_reason(
     assert reason in sweep.recorder.summary
 
 
-def test_slices_need_a_request_of_the_experiment(tmp_path: Path) -> None:
+def test_slices_need_a_request_of_the_experiment(tmp_path):
     sweep = Sweep(tmp_path, "")
     sweep.hold(1, 0.1)
     sweep.done()
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot be made"):
         SliceRecorder(tmp_path / "file" / "slices")
@@ -234,7 +232,7 @@ def unwritable(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pyte
     return tmp_path
 
 
-def test_an_unwritable_folder_is_reported(unwritable: Path) -> None:
+def test_an_unwritable_folder_is_reported(unwritable):
     sweep = Sweep(unwritable)
     sweep.hold(1, 0.1)
     sweep.hold(2, 0.1)
@@ -247,7 +245,7 @@ def test_an_unwritable_folder_is_reported(unwritable: Path) -> None:
     assert not list(unwritable.glob("torque_slices/*")), "nothing half written is left"
 
 
-def test_messages_do_not_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_do_not_wait_for_the_disk(tmp_path, monkeypatch):
     let_go, threads = threading.Event(), set()
 
     def slow(_file: object, _arrays: object) -> None:

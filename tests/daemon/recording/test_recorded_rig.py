@@ -43,9 +43,7 @@ def check_recordings(disk: Path, torques: int) -> None:
 
 
 @pytest.mark.parametrize("small_disk", ["8m"], indirect=True)
-async def test_a_full_disk_refuses_only_the_next_experiment(
-    recorded_rig: Path, tiny_bank: Path, tmp_path: Path, small_disk: Path
-) -> None:
+async def test_a_full_disk_refuses_only_the_next_experiment(recorded_rig, tiny_bank, tmp_path, small_disk):
     async with running_rig(recorded_rig, tiny_bank) as (_, watcher, _fault, command):
         path = experiment(tmp_path, TWIST)
         await started(command, path)

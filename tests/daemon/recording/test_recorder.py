@@ -6,7 +6,6 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +54,7 @@ def topics(path: Path) -> dict[str, list[dict]]:
     return found
 
 
-def test_messages_are_recorded_with_schema_and_time(tmp_path: Path) -> None:
+def test_messages_are_recorded_with_schema_and_time(tmp_path):
     clock = Clock()
     recorder = Recorder(tmp_path / "new" / "folder", IDENTITY, clock)
     recorder.input_recorder("right").record(RawEvent(InputKind.OPENED, 5))
@@ -84,7 +83,7 @@ def test_messages_are_recorded_with_schema_and_time(tmp_path: Path) -> None:
     assert told.metadata["source"] == "a test"
 
 
-def test_a_live_recording_is_read_like_an_import(tmp_path: Path) -> None:
+def test_a_live_recording_is_read_like_an_import(tmp_path):
     recorder = Recorder(tmp_path, IDENTITY, Clock())
     frames = [frame(n) for n in range(3)]
     for n, one in enumerate(frames):
@@ -99,7 +98,7 @@ def test_a_live_recording_is_read_like_an_import(tmp_path: Path) -> None:
     assert found.torque_nm.tolist() == [0.1] * 3, "what is not valid is no truth"
 
 
-def test_a_repeated_frame_is_read_once(tmp_path: Path) -> None:
+def test_a_repeated_frame_is_read_once(tmp_path):
     clock = Clock()
     recorder = Recorder(tmp_path, IDENTITY, clock)
     frames = [frame(n) for n in range(2)]
@@ -110,7 +109,7 @@ def test_a_repeated_frame_is_read_once(tmp_path: Path) -> None:
     assert found.t_mid_ns.tolist() == [one["t_mono_ns"] + clock.offset_ns for one in frames]
 
 
-def test_each_experiment_has_a_file_with_its_name(tmp_path: Path) -> None:
+def test_each_experiment_has_a_file_with_its_name(tmp_path):
     recorder = Recorder(tmp_path, IDENTITY, Clock())
     recorder.record_message("load.torque", torque(0))
     recorder.record_experiment("Hold 0.10 N·m", (AttachedFile("hold.yaml", "application/yaml", b"name: hold"),))
@@ -129,7 +128,7 @@ def test_each_experiment_has_a_file_with_its_name(tmp_path: Path) -> None:
     assert topics(second)["input.clock"], "each can be replayed by itself"
 
 
-def test_a_new_file_begins_after_an_hour_without_experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_new_file_begins_after_an_hour_without_experiment(tmp_path, monkeypatch):
     recorder = Recorder(tmp_path, IDENTITY, Clock())
     recorder.record_experiment("one")
     recorder.record_message("load.torque", torque(0))
@@ -143,12 +142,12 @@ def test_a_new_file_begins_after_an_hour_without_experiment(tmp_path: Path, monk
     assert [[one["seq"] for one in topics(path)["load.torque"]] for path in recorder.finished] == [[0, 1], [2]]
 
 
-def test_a_daemon_without_a_message_leaves_no_file(tmp_path: Path) -> None:
+def test_a_daemon_without_a_message_leaves_no_file(tmp_path):
     Recorder(tmp_path, IDENTITY, Clock()).close()
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path: Path) -> None:
+def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path):
     """Fifty recorders, each killed at a random moment of its first two seconds."""
     killed = subprocess.run(
         [sys.executable, "-m", "tests.daemon.recording.killed_writers", str(tmp_path), "50", "2"],
@@ -198,7 +197,7 @@ ENDLESS["itself"] = ENDLESS
     ],
     ids=["object", "no UTF-8", "500", "5000", "endless"],
 )
-def test_a_message_without_a_json_form_is_counted(raw: object, why: str, tmp_path: Path) -> None:
+def test_a_message_without_a_json_form_is_counted(raw, why, tmp_path):
     recorder = Recorder(tmp_path, IDENTITY, Clock())
     recorder.record_experiment("first")
     recorder.record_message("load.torque", {**torque(0), "raw": nested(100)})
@@ -220,9 +219,7 @@ def test_a_message_without_a_json_form_is_counted(raw: object, why: str, tmp_pat
     assert [summarise(path).dropped for path in (first, second)] == [1, 0]
 
 
-async def test_a_recorder_that_fails_to_close_leaves_no_socket_open(
-    config: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_recorder_that_fails_to_close_leaves_no_socket_open(config, tmp_path, monkeypatch):
     with zmq.asyncio.Context() as context:
         daemon = Daemon(load_daemon_config(config(recording={"folder": "recordings"})), context)
         daemon.stop()

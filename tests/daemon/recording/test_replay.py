@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +19,6 @@ from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import main
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
-from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import EitEstimate, wire_map
 from shearloop.daemon.messaging.publisher import Publisher
@@ -35,11 +34,9 @@ from shearloop.daemon.recording.replay import (
 from shearloop.daemon.recording.schema import message_json, with_missing_keys
 from shearloop.daemon.sensing.estimators import LiveEstimator
 from shearloop.daemon.sensing.fingertip_task import FingertipEstimates
-from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.daemon.conftest import DEADLINE_S, emulated_kit, running_daemon
 from tests.daemon.sample_messages import sample
-from tests.daemon.test_run import recording
 
-Write = Callable[..., Path]
 Messages = list[tuple[str, dict[str, Any]]]
 # Of the real recording's estimates with the tests' bank: what they were when it was last looked at with care.
 REFERENCE = Path(__file__).parents[2] / "data" / "replayed_stream.json"
@@ -91,16 +88,10 @@ async def recording_daemon(
             news.clear()
             await news.wait()
 
-    folder = config.parent
-    play = ("--recording", recording(folder, 60), "--once", "--speed", "20", "--link", folder / "eit-right", *faults)
-    with zmq.asyncio.Context() as context:
-        daemon = Daemon(load_daemon_config(config), context)
+    async with running_daemon(config) as daemon:
         daemon.publisher.add_listener(listen)
-        async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
-            group.create_task(daemon.run())
-            async with shearloop("emulate", "eit-kit", *map(str, play), stdin=asyncio.subprocess.PIPE):
-                yield daemon, published, until
-            daemon.stop()
+        async with emulated_kit(config.parent, 60, "--once", *faults):
+            yield daemon, published, until
 
 
 async def record(config: Path) -> Messages:
@@ -114,9 +105,7 @@ async def record(config: Path) -> Messages:
     return published
 
 
-def test_a_replay_equals_the_recording_at_any_speed(
-    config: Write, tmp_path: Path, tiny_calibration: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_replay_equals_the_recording_at_any_speed(config, tmp_path, tiny_calibration, capsys):
     live = asyncio.run(record(config(recording={"folder": "recordings"})))
     (path,) = (tmp_path / "recordings").iterdir()
     # The recording holds the calibration that was used, whatever becomes of it.
@@ -155,7 +144,7 @@ def _same_at_any_speed(path: Path, live: list[Any], tmp_path: Path, capsys: pyte
     assert f"eit.estimate: {comparison.compared['eit.estimate']} of {comparison.compared['eit.estimate']}" in told
 
 
-def test_a_real_recording_gives_the_stored_estimates(shared: Path, config: Write, tmp_path: Path) -> None:
+def test_a_real_recording_gives_the_stored_estimates(shared, config, tmp_path):
     """Guards parser, frame clock, baseline and matching. Renew: run with SHEARLOOP_RENEW=1, and say why it changed."""
     path = tmp_path / "stream.mcap"
     folder = shared / "recordings" / "streams" / "2024-12-03_16-09"
@@ -197,14 +186,12 @@ def test_a_real_recording_gives_the_stored_estimates(shared: Path, config: Write
         (["{imported}", "--speed", "fast"], "--speed must be a number above 0, or max, not 'fast'"),
     ],
 )
-def test_mistakes_end_in_one_sentence(
-    arguments: list[str], message: str, imported: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_end_in_one_sentence(arguments, message, imported, capsys):
     assert main(["replay", *(one.format(imported=imported) for one in arguments)]) == 2
     assert message in capsys.readouterr().err
 
 
-def test_nan_is_restored() -> None:
+def test_nan_is_restored():
     on_wire = restored_wire_map({"seq": 3, "joints_rad": [1.5, None, 2.5], "reason": ""})
     assert on_wire["joints_rad_shape"] == [3]
     np.testing.assert_array_equal(np.frombuffer(on_wire["joints_rad"], "<f4"), np.float32([1.5, np.nan, 2.5]))
@@ -236,7 +223,7 @@ def recorded(content: dict[str, Any]) -> RecordedEvent:
         ({"reason": ""}, {"reason": "no grip"}, "reason was"),
     ],
 )
-def test_a_difference_is_described(then: dict[str, Any], now: dict[str, Any], told: str) -> None:
+def test_a_difference_is_described(then, now, told):
     comparison = ReplayComparison(("eit.estimate.right",))
     comparison.add_computed(TOPIC, estimate(**now))
     comparison.compare(recorded(estimate(**then)))
@@ -246,7 +233,7 @@ def test_a_difference_is_described(then: dict[str, Any], now: dict[str, Any], to
     assert comparison.unrecorded == 0
 
 
-def test_a_missing_message_is_a_difference() -> None:
+def test_a_missing_message_is_a_difference():
     comparison = ReplayComparison(("eit.estimate.right", "eit.estimate.left"))
     comparison.add_computed(TOPIC, estimate(source="left"))
     comparison.compare(recorded(estimate()))
@@ -255,7 +242,7 @@ def test_a_missing_message_is_a_difference() -> None:
     assert comparison.unrecorded == 1, "the left one has no message beside it"
 
 
-def test_messages_of_unrecorded_topics_are_only_counted() -> None:
+def test_messages_of_unrecorded_topics_are_only_counted():
     comparison = ReplayComparison(("eit.estimate.right",))
     for _ in range(3):
         comparison.add_computed(TOPIC, estimate(source="left"))
@@ -273,8 +260,7 @@ async def record_experiments(config: Path) -> list[dict[str, Any]]:
     """Run a daemon through two experiments; return what was published as estimates."""
     async with recording_daemon(config) as (daemon, published, until):
         recorder, right = daemon.recorder, daemon.sensors.fingertips["right"].estimates
-        assert recorder is not None
-        right._gripper = cast(GripperTask, Gripper(right, OTHER_TOOL, range(HELD, 10 * ENOUGH)))
+        right._gripper = Gripper(right, OTHER_TOOL, range(HELD, 10 * ENOUGH))
         recorder.record_experiment("first")
         await until(BEGUN)
         recorder.record_experiment("second")
@@ -284,9 +270,7 @@ async def record_experiments(config: Path) -> list[dict[str, Any]]:
     return [content for topic, content in published if topic == "eit.estimate"]
 
 
-def test_a_later_file_replays_frame_numbers_tares_and_tools(
-    config: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_later_file_replays_frame_numbers_tares_and_tools(config, tmp_path, monkeypatch):
     live = asyncio.run(record_experiments(config(recording={"folder": "recordings"})))
     (later,) = (path for path in (tmp_path / "recordings").iterdir() if "second" in path.name)
     ((zeroed,),) = RecordedRun(later).replay_events().tares.values()

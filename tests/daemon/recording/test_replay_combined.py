@@ -3,23 +3,18 @@
 import asyncio
 import math
 from collections import Counter
-from collections.abc import Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-import zmq.asyncio
 from scipy.io import savemat
 
 from shearloop.bank.eit.channels import channels_of_line, line_of_channels
 from shearloop.bank.estimation import FrameSeries, Measured, fit
-from shearloop.daemon.app import Daemon
-from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.drivers.eit_kit import ADC_STEP_V
-from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.daemon.conftest import DEADLINE_S, running_daemon, shearloop
 from tests.daemon.recording.test_replay import Gripper, Messages, measured, replayed
 
 N_FRAMES = 120
@@ -85,26 +80,17 @@ async def record(config: Path, boards: dict[str, Path]) -> Messages:
                 shearloop("emulate", "eit-kit", *play, *link, stdin=asyncio.subprocess.PIPE)
             )
             # Both are there before the daemon is, which starts them in the same moment.
-            assert board.stdout is not None
             await board.stdout.readline()
-        with zmq.asyncio.Context() as context:
-            daemon = Daemon(load_daemon_config(config), context)
+        async with running_daemon(config) as daemon:
             daemon.publisher.add_listener(listen)
             right = daemon.sensors.fingertips["right"].estimates
-            right._gripper = cast(GripperTask, Gripper(right, Measured(OTHER_MM, 0.5), OTHER_TOOL))
-            running = asyncio.create_task(daemon.run())
-            try:
-                await enough.wait()
-            finally:
-                daemon.stop()
-                await running
+            right._gripper = Gripper(right, Measured(OTHER_MM, 0.5), OTHER_TOOL)
+            await enough.wait()
     return published
 
 
 @pytest.mark.real_time
-def test_combined_fingertips_are_replayed_at_any_speed(
-    config: Callable[..., Path], tiny_bank: Path, twists: Twists, tmp_path: Path
-) -> None:
+def test_combined_fingertips_are_replayed_at_any_speed(config, tiny_bank, twists, tmp_path):
     fingertips = {
         side: {"device": {"path": f"eit-{side}"}, "bank": str(tiny_bank), "frame_period_s": PERIOD_S / PLAYED}
         for side in SIDES

@@ -60,12 +60,12 @@ def without_values(message: Message) -> Message:
 
 
 @pytest.mark.parametrize("name", schemas())
-def test_each_schema_is_valid_for_foxglove(name: str) -> None:
+def test_each_schema_is_valid_for_foxglove(name):
     Draft202012Validator.check_schema(schemas()[name])
     assert refused(schemas()[name]) == []
 
 
-def test_the_check_for_foxglove_refuses() -> None:
+def test_the_check_for_foxglove_refuses():
     several = {"type": "object", "properties": {"torque_nm": {"type": ["number", "null"]}}}
     assert refused(several) == [".torque_nm: ['number', 'null']"]
     assert refused({"type": "object", "properties": {"tasks": {"type": "object"}}}) == [
@@ -74,7 +74,7 @@ def test_the_check_for_foxglove_refuses() -> None:
 
 
 @pytest.mark.parametrize("topic", TOPICS)
-def test_each_message_matches_its_schema(topic: str) -> None:
+def test_each_message_matches_its_schema(topic):
     full = sample(TOPICS[topic])
     # A frame's age makes its time of arrival: there is always one.
     for message in (full,) if topic == EitFrame.topic else (full, without_values(full)):
@@ -92,24 +92,24 @@ def test_each_message_matches_its_schema(topic: str) -> None:
                 assert restored[item.name] == (None if missing else value), item.name
 
 
-def test_raw_input_matches_its_schema_and_round_trips() -> None:
+def test_raw_input_matches_its_schema_and_round_trips():
     event = RawEvent(InputKind.DATA, 123456789012345678, bytes(range(256)))
     written = json.loads(input_json(event))
     Draft202012Validator(schemas()[INPUT]).validate(written)
     assert input_event(written) == event
 
 
-def test_array_elements_are_rounded_to_a_millionth_and_null_if_not_finite() -> None:
+def test_array_elements_are_rounded_to_a_millionth_and_null_if_not_finite():
     values = np.array([0.1234567, -1e6, 1e30, np.nan, np.inf, -np.inf], "<f4")
     message = {"t_mono_ns": 0, "source": "right", "wrench": values.tobytes(), "wrench_shape": [6]}
     written = json.loads(message_json("robot.state", message, 0))["wrench"]
     assert written == [0.123457, -1e6, float(np.float32(1e30)), None, None, None]
 
 
-def test_an_alias_of_an_array_type_is_an_array() -> None:
+def test_an_alias_of_an_array_type_is_an_array():
     """NumPy 2.5 on Python 3.12 makes NDArray a TypeAliasType, whose origin is the alias itself."""
     element = TypeVar("element", bound=np.generic)
-    alias = TypeAliasType("alias", np.ndarray[Any, np.dtype[element]], type_params=(element,))  # type: ignore[misc,valid-type]
+    alias = TypeAliasType("alias", np.ndarray[Any, np.dtype[element]], type_params=(element,))
     array = {"type": "array", "items": {"type": "number"}}
     assert json_type(alias[np.float64]) == json_type(NDArray[np.float64]) == json_type(tuple[float, ...]) == array
     assert json_type(float | None) == {"type": "number"}
@@ -140,11 +140,11 @@ def read(value: Any) -> Any:
 @given(st.dictionaries(texts, values))
 @example({"torque_nm": math.nan})
 @example({"whole": [math.inf, -0.0, 5e-324, 0.1 + 0.2, 1e22]})
-def test_json_round_trips(content: dict[str, Any]) -> None:
+def test_json_round_trips(content):
     assert read(json.loads(as_json(content), parse_constant=not_json)) == read(content)
 
 
-def test_other_mappings_are_written_like_a_dict() -> None:
+def test_other_mappings_are_written_like_a_dict():
     assert as_json(MappingProxyType({"tasks": MappingProxyType({"loop": (1, math.nan)})})) == (
         b'{"tasks":{"loop":[1,null]}}'
     )

@@ -109,7 +109,6 @@ def test_cylinders_that_turn_differently_give_a_diameter_and_no_torque(cylinders
         assert len(found) > 100
         assert abs(np.mean(found) - mm) < 2
     # Each was gripped once only: how far the diameter of a tool is off that was not among them is what it says.
-    assert calibration.diameter is not None
     assert 8 < calibration.diameter.regressor.intervals.half_widths[0] < 25
     # A session that begins gripped does not know where the gel stood before.
     later = estimate_series(calibration, part_of(cylinders[10], 0.5, 0.8)).estimates
@@ -280,7 +279,6 @@ def test_later_slices_of_the_cylinders(shared):
 def test_the_load_goes_with_the_frames_and_a_quarter_of_a_second_beside_is_refused(twists, stop):
     part = part_of(twists, 0, stop)
     found = find_load_delay(part)
-    assert found is not None
     assert found.delay_s == pytest.approx(0.26, abs=0.03)
     assert found.error_s < 0.08
     assert is_filtered(part.torque_nm)

@@ -42,7 +42,7 @@ async def recorded(folder: Path, *, socket: bool) -> list[tuple[str, dict[str, A
 
 
 @pytest.mark.parametrize("socket", [False, True])
-def test_a_skin_replay_gives_equal_forces(tmp_path: Path, socket: bool, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_skin_replay_gives_equal_forces(tmp_path, socket, capsys):
     live = asyncio.run(recorded(tmp_path, socket=socket))
     (path,) = (tmp_path / "recordings").iterdir()
     assert {"skin.shear", "input.skin", "input.skin.source", "input.skin.daq"} <= set(count_messages(path))

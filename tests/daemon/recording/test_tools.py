@@ -52,7 +52,7 @@ def recorded(folder: Path, *held: tuple[int, Measured | None], named_mm: float |
     return recorder.finished[0]
 
 
-def test_the_experiment_names_its_tool(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_experiment_names_its_tool(tmp_path, capsys):
     path = recorded(tmp_path, (5, Measured(20.4, 1.2)), (35, None), named_mm=20.0)
     (series,) = read_series(path)
     assert series.tool_mm == Measured(20.0, 0.0), "and the gripper, which is not as exact, agrees"
@@ -63,7 +63,7 @@ def test_the_experiment_names_its_tool(tmp_path: Path, capsys: pytest.CaptureFix
     assert "  tool     20 mm\n" in capsys.readouterr().out
 
 
-def test_the_gripper_says_which_tool_it_held(tmp_path: Path) -> None:
+def test_the_gripper_says_which_tool_it_held(tmp_path):
     # Something in its way for a moment is no other tool; nor is one that comes by a count nearer.
     path = recorded(tmp_path, (5, TWENTY), (20, TEN), (21, Measured(19.6, 1.2)), (35, None))
     (series,) = read_series(path)
@@ -73,7 +73,7 @@ def test_the_gripper_says_which_tool_it_held(tmp_path: Path) -> None:
     assert read_series(path, tool_mm=20.0)[0].tool_mm == Measured(20.0, 0.0)
 
 
-def test_a_gripper_that_told_nothing_leaves_the_tool_unknown(tmp_path: Path) -> None:
+def test_a_gripper_that_told_nothing_leaves_the_tool_unknown(tmp_path):
     for number, held in enumerate(((), ((5, None),), ((39, TEN), (40, TWENTY)))):
         (series,) = read_series(recorded(tmp_path / str(number), *held))
         assert series.tool_mm == (TEN if number == 2 else None)
@@ -86,9 +86,7 @@ def test_a_gripper_that_told_nothing_leaves_the_tool_unknown(tmp_path: Path) -> 
         (None, ((5, TEN), (20, TWENTY)), "the gripper held tools of 20.1 and 10.2 mm"),
     ],
 )
-def test_who_disagrees_about_the_tool_is_told_unless_somebody_knows(
-    tmp_path: Path, named_mm: float | None, held: tuple[tuple[int, Measured]], why: str
-) -> None:
+def test_who_disagrees_about_the_tool_is_told_unless_somebody_knows(tmp_path, named_mm, held, why):
     recording = read_recording(recorded(tmp_path, *held, named_mm=named_mm))
     with pytest.raises(UserError, match=why):
         series_of(recording)

@@ -10,11 +10,11 @@ from types import SimpleNamespace
 import pytest
 import zmq
 
-from shearloop.daemon import health
+from shearloop.daemon import supervisor as supervision
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.realtime import lock_memory
+from shearloop.daemon.process import lock_memory
 from shearloop.daemon.service import notify
 from shearloop.daemon.supervisor import Supervisor, TaskRecord
 from tests.daemon.conftest import DEADLINE_S, shearloop
@@ -67,11 +67,11 @@ async def test_the_daemon_notifies_ready_alive_and_stopping(manager, config):
 
 
 async def test_the_watchdog_is_fed_only_while_all_tasks_are_alive(manager, tmp_path, monkeypatch):
-    monkeypatch.setattr(health, "HEALTH_PERIOD_S", 0.0)
+    monkeypatch.setattr(supervision, "HEALTH_PERIOD_S", 0.0)
     supervisor = Supervisor({"right": TaskRecord(alive=True), "experiment": TaskRecord(done=True)})
     with zmq.Context() as context:
         publisher = Publisher(context, f"ipc://{tmp_path}/publish", Clock())
-        reporter = health.HealthReporter(publisher, supervisor, Clock())
+        reporter = supervision.HealthReporter(publisher, supervisor, Clock())
         running = asyncio.create_task(reporter.run())
         said = await asyncio.to_thread(manager.recv, 4096)
         assert said == b"WATCHDOG=1\nSTATUS=2 tasks are alive", "an experiment that has ended is not dead"

@@ -26,11 +26,9 @@ from shearloop.daemon.messaging.command_server import CommandRefusedError, Comma
 from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import EitHeatmap, LoadTorque
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.web import bridge as bridge_module
 from shearloop.daemon.web import server as server_module
-from shearloop.daemon.web.bridge import Bridge, DaemonAddress
 from shearloop.daemon.web.message_store import MessageStore
-from shearloop.daemon.web.server import HEADERS, NEEDS_TOKEN, make_app, serve
+from shearloop.daemon.web.server import HEADERS, NEEDS_TOKEN, Bridge, DaemonAddress, make_app, serve
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.sample_messages import sample
 
@@ -187,7 +185,7 @@ async def test_messages_reach_open_pages_and_heatmaps_need_one(tmp_path):
 
 
 async def test_many_stops_share_one_request_and_overtake_hanging_commands(tmp_path, monkeypatch):
-    monkeypatch.setattr(bridge_module, "COMMAND_TIMEOUT_S", 30.0)
+    monkeypatch.setattr(server_module, "COMMAND_TIMEOUT_S", 30.0)
     released, all_in, stops, wanted = asyncio.Event(), asyncio.Event(), 0, 0
 
     async def hang(_: Mapping[str, Any]) -> dict[str, Any]:
@@ -221,7 +219,7 @@ async def test_many_stops_share_one_request_and_overtake_hanging_commands(tmp_pa
 
 
 async def test_a_stop_without_a_daemon_is_reported(tmp_path, monkeypatch):
-    monkeypatch.setattr(bridge_module, "COMMAND_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(server_module, "COMMAND_TIMEOUT_S", 0.05)
     async with served(tmp_path) as page:
         page.bridge._address = DaemonAddress("", f"ipc://{tmp_path}/nobody")
         status, reply = await post(page, "/stop")

@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 import pytest
 
-from shearloop.daemon.signals import raise_ending_signals
+from shearloop.daemon.process import raise_ending_signals
 from shearloop.daemon.workers import ProcessExecutor
 
 # From a signal and what it interrupts to the process in which a task was.

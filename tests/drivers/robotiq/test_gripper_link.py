@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,7 +15,7 @@ from tests.drivers.robotiq.gripper_rig import WAYS, a_rig
 
 
 @WAYS
-async def test_silence_is_a_loss_and_clears_the_state(way: str, tmp_path: Path) -> None:
+async def test_silence_is_a_loss_and_clears_the_state(way, tmp_path):
     async with a_rig(way, tmp_path) as rig:
         await rig.driver.connect()
         assert rig.driver.latest is not None
@@ -34,9 +33,7 @@ async def test_silence_is_a_loss_and_clears_the_state(way: str, tmp_path: Path) 
         assert (await rig.driver.connect()).seq > 0
 
 
-async def test_cancellation_that_arrives_with_an_answer_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_cancellation_that_arrives_with_an_answer_is_kept(tmp_path, monkeypatch):
     """Otherwise the reading task never ends, and the daemon waits for it on exit."""
     answered = asyncio.Event()
     read = AsyncModbusSerialClient.read_holding_registers
@@ -62,7 +59,7 @@ async def test_cancellation_that_arrives_with_an_answer_is_kept(
 
 
 @WAYS
-async def test_lost_gripper_reconnects_and_reports_it(way: str, tmp_path: Path) -> None:
+async def test_lost_gripper_reconnects_and_reports_it(way, tmp_path):
     async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
         first = await anext(states)
         assert rig.driver.latest == first
@@ -90,7 +87,7 @@ async def test_lost_gripper_reconnects_and_reports_it(way: str, tmp_path: Path) 
 
 
 @WAYS
-async def test_loss_during_a_command_is_reported(way: str, tmp_path: Path) -> None:
+async def test_loss_during_a_command_is_reported(way, tmp_path):
     async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
         await anext(states)
         await rig.driver.activate()
@@ -108,7 +105,7 @@ async def test_loss_during_a_command_is_reported(way: str, tmp_path: Path) -> No
 
 
 @WAYS
-async def test_states_are_polled_while_a_command_runs(way: str, tmp_path: Path) -> None:
+async def test_states_are_polled_while_a_command_runs(way, tmp_path):
     async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
         await anext(states)
         activating = asyncio.create_task(rig.driver.activate())
@@ -121,7 +118,7 @@ async def test_states_are_polled_while_a_command_runs(way: str, tmp_path: Path) 
 
 
 @WAYS
-async def test_cancelled_call_leaves_no_stale_answer(way: str, tmp_path: Path) -> None:
+async def test_cancelled_call_leaves_no_stale_answer(way, tmp_path):
     async with a_rig(way, tmp_path) as rig:
         await rig.driver.connect()
         rig.silence(True)
@@ -137,14 +134,14 @@ async def test_cancelled_call_leaves_no_stale_answer(way: str, tmp_path: Path) -
 
 
 @WAYS
-async def test_absent_gripper_is_explained(way: str, tmp_path: Path) -> None:
+async def test_absent_gripper_is_explained(way, tmp_path):
     async with a_rig(way, tmp_path) as rig:
         await rig.server.disconnect()
         with pytest.raises(DeviceNotFoundError, match="There is no"):
             await rig.driver.connect()
 
 
-async def test_gripper_without_power_is_not_read_as_zero(tmp_path: Path) -> None:
+async def test_gripper_without_power_is_not_read_as_zero(tmp_path):
     async with a_rig("socket", tmp_path) as rig:
         await rig.driver.connect()
         rig.model.cut_power()
@@ -152,7 +149,7 @@ async def test_gripper_without_power_is_not_read_as_zero(tmp_path: Path) -> None
             await rig.driver.read()
 
 
-async def test_damaged_modbus_reply_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_damaged_modbus_reply_is_rejected(tmp_path, monkeypatch):
     feed = ModbusSlave.feed
 
     def damaged(slave: ModbusSlave, data: bytes) -> bytes:
@@ -168,7 +165,7 @@ async def test_damaged_modbus_reply_is_rejected(tmp_path: Path, monkeypatch: pyt
         await rig.driver.connect()
 
 
-async def test_gripper_reports_a_silent_master(tmp_path: Path) -> None:
+async def test_gripper_reports_a_silent_master(tmp_path):
     async with a_rig("modbus", tmp_path) as rig:
         await rig.driver.connect()
         rig.stopped = True

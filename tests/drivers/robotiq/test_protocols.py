@@ -15,7 +15,7 @@ from shearloop.drivers.robotiq.socket_client import readout_of, set_lines, take_
 byte = st.integers(0, 255)
 
 
-def test_requests_are_the_manuals_registers() -> None:
+def test_requests_are_the_manuals_registers():
     # Instruction manual, "Modbus RTU": reset 0000 0000 0000, close at full speed and force 0900 00FF FFFF.
     last = messages.GripperMove(0, 0, 0)
     assert modbus_client.command_registers(messages.Reset(), last) == [0, 0, 0]
@@ -28,7 +28,7 @@ def test_requests_are_the_manuals_registers() -> None:
     ]
 
 
-def test_replies_are_read_as_the_manual_explains_them() -> None:
+def test_replies_are_read_as_the_manual_explains_them():
     # The manual's three examples: closing under way, object gripped, opened completely.
     moving = modbus_client.readout_of([0x3900, 0x0000, 0xBB10])
     assert moving == messages.Readout(
@@ -43,14 +43,14 @@ def test_replies_are_read_as_the_manual_explains_them() -> None:
 
 
 @given(st.binary(min_size=6, max_size=6))
-def test_every_status_is_either_read_whole_or_refused(content: bytes) -> None:
+def test_every_status_is_either_read_whole_or_refused(content):
     readout = modbus_client.readout_of([int.from_bytes(content[n : n + 2], "big") for n in (0, 2, 4)])
     status = readout.act | readout.gto << 3 | readout.sta << 4 | readout.obj << 6
     assert status == content[0] & 0b11111001
     assert (readout.flt, readout.pre, readout.pos, readout.current) == (content[2] & 15, *content[3:6])
 
 
-def test_socket_lines_are_those_that_the_urcap_takes() -> None:
+def test_socket_lines_are_those_that_the_urcap_takes():
     assert set_lines(messages.GripperMove(100, 255, 50)) == ["SET POS 100 SPE 255 FOR 50 GTO 1"]
     assert set_lines(messages.Reset()) == ["SET ACT 0", "SET ATR 0"]
     assert set_lines(messages.Activate()) == ["SET ACT 1"]
@@ -59,7 +59,7 @@ def test_socket_lines_are_those_that_the_urcap_takes() -> None:
 
 @pytest.mark.parametrize("line", ["SET GTO 0", "GET POS"])
 @given(sliced=st.integers(0, 5), value=byte)
-def test_socket_answer_is_awaited_until_it_is_whole(line: str, sliced: int, value: int) -> None:
+def test_socket_answer_is_awaited_until_it_is_whole(line, sliced, value):
     sent = b"ack" if line.startswith("SET") else b"POS %d\n" % value
     assert take_answer(line, sent[: min(sliced, len(sent) - 1)]) is None
     assert take_answer(line, sent) == (sent.decode().removeprefix("POS ").strip(), b"")
@@ -67,7 +67,7 @@ def test_socket_answer_is_awaited_until_it_is_whole(line: str, sliced: int, valu
 
 
 @given(st.binary(min_size=1, max_size=80))
-def test_foreign_answer_is_refused_or_awaited(answer: bytes) -> None:
+def test_foreign_answer_is_refused_or_awaited(answer):
     for line in ("SET GTO 0", "GET POS"):
         try:
             taken = take_answer(line, answer)
@@ -77,12 +77,12 @@ def test_foreign_answer_is_refused_or_awaited(answer: bytes) -> None:
 
 
 @pytest.mark.parametrize("text", ["256", "-1", "1.5", "", "²", "0x10"])
-def test_value_that_is_not_a_byte_is_refused(text: str) -> None:
+def test_value_that_is_not_a_byte_is_refused(text):
     with pytest.raises(ProtocolError, match="POS"):
         value_of("POS", text)
 
 
-def test_missing_values_are_a_lost_gripper_except_for_the_current() -> None:
+def test_missing_values_are_a_lost_gripper_except_for_the_current():
     assert value_of("COU", "?") is None
     with pytest.raises(DeviceLostError, match="no data of the gripper"):
         value_of("POS", "?")
@@ -92,7 +92,7 @@ def test_missing_values_are_a_lost_gripper_except_for_the_current() -> None:
         readout_of(values | {"OBJ": 7})
 
 
-def test_every_fault_code_has_a_sentence_and_its_cure() -> None:
+def test_every_fault_code_has_a_sentence_and_its_cure():
     for code in range(1, 16):
         fault = messages.fault_of(code)
         assert fault.code == code
@@ -104,7 +104,7 @@ def test_every_fault_code_has_a_sentence_and_its_cure() -> None:
 
 
 @given(st.floats(0, 20), st.floats(200, 255), st.floats(-20, 140))
-def test_width_round_trips_within_half_a_count(opened: float, closed: float, width: float) -> None:
+def test_width_round_trips_within_half_a_count(opened, closed, width):
     calibration = WidthCalibration(open_counts=opened, open_mm=140.0, closed_counts=closed, std_mm=0.5)
     counts = calibration.counts(width)
     step = abs(calibration.mm_per_count)
@@ -116,7 +116,7 @@ def test_width_round_trips_within_half_a_count(opened: float, closed: float, wid
     assert calibration.width_std_mm**2 == pytest.approx(0.25 + step**2 / 12)
 
 
-def test_gauges_give_the_line_they_were_measured_on_and_its_scatter() -> None:
+def test_gauges_give_the_line_they_were_measured_on_and_its_scatter():
     truth = WidthCalibration(open_counts=5.0, open_mm=140.0, closed_counts=225.0, std_mm=1.0)
     gauges = [(truth.closed_counts + width / truth.mm_per_count, width) for width in (10.0, 20.0, 30.0, 40.0)]
     found = WidthCalibration.of_gauges(gauges)
@@ -140,12 +140,12 @@ def test_gauges_give_the_line_they_were_measured_on_and_its_scatter() -> None:
         ([(100.0, 80.0), (190.0, 20.0), (160.0, 25.0)], "scatter"),
     ],
 )
-def test_gauges_that_make_no_line_are_refused(gauges: list[tuple[float, float]], said: str) -> None:
+def test_gauges_that_make_no_line_are_refused(gauges, said):
     with pytest.raises(DeviceCalibrationError, match=said):
         WidthCalibration.of_gauges(gauges)
 
 
-def test_pymodbus_logs_nothing() -> None:
+def test_pymodbus_logs_nothing():
     said = "import shearloop.drivers.robotiq.modbus_client; from pymodbus.logging import Log; Log.error('received pdu')"
     # Where pytest listens to every logger, nobody would print it anyway.
     done = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, check=True)

@@ -58,7 +58,7 @@ def connect(monkeypatch: pytest.MonkeyPatch) -> Connect:
     return gripper
 
 
-async def test_activation_is_a_reset_a_pause_and_a_rising_edge(connect: Connect) -> None:
+async def test_activation_is_a_reset_a_pause_and_a_rising_edge(connect):
     # Silent during the pause is no obstacle, and the old active state is not the new one.
     client = Client(ACTIVE, ACTIVE, *[RESET] * 6, replace(ACTIVATING, flt=9), ACTIVATING, ACTIVE)
     state = await connect(client).activate(operator_confirmed=True)
@@ -77,15 +77,13 @@ async def test_activation_is_a_reset_a_pause_and_a_rising_edge(connect: Connect)
         ((ACTIVE, *[RESET] * 6, ACTIVATING), "does not end"),
     ],
 )
-async def test_activation_that_hangs_or_fails_is_reported(
-    connect: Connect, readouts: tuple[messages.Readout, ...], failure: str
-) -> None:
+async def test_activation_that_hangs_or_fails_is_reported(connect, readouts, failure):
     with pytest.raises(messages.GripperFaultError, match=failure):
         await connect(Client(*readouts)).activate(operator_confirmed=True)
 
 
 @given(st.sampled_from([status for status in messages.ObjectStatus if status >= 0]), st.integers(0, 255), st.booleans())
-def test_object_status_counts_only_for_the_last_target(obj: messages.ObjectStatus, pre: int, gto: bool) -> None:
+def test_object_status_counts_only_for_the_last_target(obj, pre, gto):
     readout = replace(ACTIVE, obj=obj, pre=pre, gto=gto)
     believed = object_status(readout, GO)
     assert believed is (obj if gto and pre == GO.position else messages.ObjectStatus.MOVING)
@@ -95,7 +93,7 @@ def test_object_status_counts_only_for_the_last_target(obj: messages.ObjectStatu
 @pytest.mark.parametrize(
     "sta", [one for one in messages.ActivationStatus if one is not messages.ActivationStatus.ACTIVE]
 )
-def test_inactive_gripper_holds_nothing(sta: messages.ActivationStatus) -> None:
+def test_inactive_gripper_holds_nothing(sta):
     """After a power failure the fingers stay in place without force."""
     held = replace(ACTIVE, obj=messages.ObjectStatus.CONTACT_CLOSING, pre=GO.position, gto=True)
     for last in (GO, None):
@@ -104,7 +102,7 @@ def test_inactive_gripper_holds_nothing(sta: messages.ActivationStatus) -> None:
 
 
 @pytest.mark.parametrize("obj", [messages.ObjectStatus.CONTACT_CLOSING, messages.ObjectStatus.AT_TARGET])
-async def test_motion_ends_at_its_target_or_on_an_object(connect: Connect, obj: messages.ObjectStatus) -> None:
+async def test_motion_ends_at_its_target_or_on_an_object(connect, obj):
     client = Client(ACTIVE)
     gripper = connect(client)
     sent = await gripper.move(messages.GripperCommand(50.0))
@@ -124,7 +122,7 @@ async def test_motion_ends_at_its_target_or_on_an_object(connect: Connect, obj: 
         (ACTIVATING, "still activating"),
     ],
 )
-async def test_motion_without_an_end_is_reported(connect: Connect, readout: messages.Readout, failure: str) -> None:
+async def test_motion_without_an_end_is_reported(connect, readout, failure):
     client = Client(ACTIVE)
     gripper = connect(client)
     sent = await gripper.move(messages.GripperCommand(50.0))

@@ -60,7 +60,7 @@ async def connected(peer: Peer, deadline_s: float = 20.0) -> AsyncIterator[Socke
             await asyncio.gather(*peer.serving)
 
 
-async def test_requests_are_answered_in_order() -> None:
+async def test_requests_are_answered_in_order():
     peer = Peer(usual)
     async with connected(peer) as client:
         assert (await client.read()).pos == 100
@@ -80,9 +80,7 @@ async def test_requests_are_answered_in_order() -> None:
         (lambda line: usual(line) * 2, ProtocolError, "without a request"),
     ],
 )
-async def test_invalid_answer_ends_the_connection(
-    answer: Callable[[str], bytes | None], error: type[Exception], says: str
-) -> None:
+async def test_invalid_answer_ends_the_connection(answer, error, says):
     async with connected(Peer(answer)) as client:
         with pytest.raises(error, match=says):
             await client.read()
@@ -91,7 +89,7 @@ async def test_invalid_answer_ends_the_connection(
         await client.connect()
 
 
-async def test_unrequested_bytes_are_not_taken_as_an_answer() -> None:
+async def test_unrequested_bytes_are_not_taken_as_an_answer():
     peer = Peer(usual)
     async with connected(peer) as client:
         peer.unasked = b"ack"
@@ -100,7 +98,7 @@ async def test_unrequested_bytes_are_not_taken_as_an_answer() -> None:
             await client.read()
 
 
-async def test_cancelled_request_leaves_no_answer_behind() -> None:
+async def test_cancelled_request_leaves_no_answer_behind():
     async with connected(Peer(lambda _: b"")) as client:
         asking = asyncio.create_task(client.read())
         await asyncio.sleep(0)
@@ -111,13 +109,13 @@ async def test_cancelled_request_leaves_no_answer_behind() -> None:
             await client.read()
 
 
-async def test_late_answer_is_named() -> None:
+async def test_late_answer_is_named():
     async with connected(Peer(lambda line: usual(line) if "ACT" in line else b""), deadline_s=0.05) as client:
         with pytest.raises(DeviceLostError, match=r"'GET STA' within 0\.05 s"):
             await client.read()
 
 
-async def test_answer_at_the_deadline_counts() -> None:
+async def test_answer_at_the_deadline_counts():
     """After a pause of this process both the answer and the timer are due."""
     client, reader, now_s = SocketClient("127.0.0.1"), asyncio.StreamReader(), asyncio.get_running_loop().time()
     receiving = asyncio.create_task(client._receive(reader, "GET ACT", now_s + 0.01))

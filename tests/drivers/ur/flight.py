@@ -21,7 +21,7 @@ LIMITS = UrLimits(
     force_n=Bound(40.0, 60.0),
     torque_nm=Bound(4.0, 6.0),
 )
-SETTINGS = UrSettings(host="10.0.0.1", limits=LIMITS)
+SETTINGS = UrSettings(host="10.0.0.1", limits=LIMITS, command_timeout_s=0.3, silence_timeout_s=0.3)
 AT_REST = messages.RtdeSample(
     t_mono_ns=0,
     timestamp_s=0.0,
@@ -77,7 +77,7 @@ class FakeArm:
         )
 
     def be(self, **changes: object) -> None:
-        self.reading = dataclasses.replace(self.reading, **changes)  # type: ignore[arg-type]
+        self.reading = dataclasses.replace(self.reading, **changes)
 
     def read(self) -> messages.RtdeSample:
         return self.reading

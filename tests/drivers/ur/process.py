@@ -56,7 +56,7 @@ class CyclingArm(FakeArm):
 
 def fly(daemon: Daemon, arm: CyclingArm) -> None:
     with pytest.raises(ExitedError):
-        worker._control(daemon.pipe, Configure(SETTINGS), arm)  # type: ignore[arg-type]  # an arm in all that counts
+        worker._control(daemon.pipe, Configure(SETTINGS), arm)  # an arm in all that counts
 
 
 class Time:

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[3]
 
 def settings_for(host: str, **changes: object) -> UrSettings:
     delivered = read_settings(ROOT / "config" / "ur.yaml")
-    return dataclasses.replace(delivered, host=host, **changes)  # type: ignore[arg-type]
+    return dataclasses.replace(delivered, host=host, **changes)
 
 
 @contextlib.asynccontextmanager
@@ -49,7 +49,6 @@ async def enable(robot: UrRobot) -> None:
 
 def pid_of(robot: UrRobot) -> int:
     """Return the worker's process id."""
-    assert robot._connection is not None
     pid = robot._connection._process.get_pid()
     assert pid is not None
     return pid

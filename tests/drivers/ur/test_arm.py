@@ -50,7 +50,7 @@ def arm(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     del sys.modules["shearloop.drivers.ur.arm"]
 
 
-def test_sample_that_waited_in_the_socket_is_old(arm: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sample_that_waited_in_the_socket_is_old(arm, monkeypatch):
     reader, now_ns = arm.UrArm(SETTINGS, VERSION), 10**12
     monkeypatch.setattr(arm.time, "monotonic_ns", lambda: now_ns)
     monkeypatch.setattr(reader, "_control", SimpleNamespace(isConnected=lambda: True))
@@ -62,18 +62,14 @@ def test_sample_that_waited_in_the_socket_is_old(arm: ModuleType, monkeypatch: p
         assert reader.read().age_ns == pytest.approx(waited_ns, abs=3_000_000)
 
 
-def test_refused_timer_slack_does_not_prevent_connecting(
-    arm: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_refused_timer_slack_does_not_prevent_connecting(arm, monkeypatch, capsys):
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: SimpleNamespace(prctl=lambda *_: -1))
     assert arm.UrArm(SETTINGS, VERSION)._control.connected
     assert "wake more often than needed" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("watchdog_hz", "slack_ms"), [(2.0, 16), (10.0, 16), (40.0, 4)])
-def test_timer_slack_is_a_fraction_of_the_watchdog_time(
-    arm: ModuleType, monkeypatch: pytest.MonkeyPatch, watchdog_hz: float, slack_ms: int
-) -> None:
+def test_timer_slack_is_a_fraction_of_the_watchdog_time(arm, monkeypatch, watchdog_hz, slack_ms):
     asked: list[int] = []
 
     def prctl(_option: int, slack: ctypes.c_ulong, *_: int) -> int:
@@ -105,7 +101,7 @@ class Controlled(Client):
         return SimpleNamespace(isAsyncOperationRunning=lambda: True)
 
 
-def test_progress_is_queried_only_for_a_linear_move(arm: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_is_queried_only_for_a_linear_move(arm, monkeypatch):
     monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Controlled)
     times_s = iter(range(1, 100))
     monkeypatch.setattr(
@@ -144,7 +140,7 @@ class Hanging(Client):
         return not self.knows_of_the_end
 
 
-def test_no_call_blocks_when_no_program_runs(arm: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_call_blocks_when_no_program_runs(arm, monkeypatch):
     """The watchdog has ended the program before it was ready for the next command."""
     monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Hanging)
     one = arm.UrArm(SETTINGS, VERSION)
@@ -160,9 +156,7 @@ def test_no_call_blocks_when_no_program_runs(arm: ModuleType, monkeypatch: pytes
     assert one._control.calls == ["zeroFtSensor"]
 
 
-def test_register_is_cleared_once_the_client_knows_that_no_program_runs(
-    arm: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_register_is_cleared_once_the_client_knows_that_no_program_runs(arm, monkeypatch):
     """Before that, the client would wait for the program."""
     monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Hanging)
     one = arm.UrArm(SETTINGS, VERSION)
@@ -173,7 +167,7 @@ def test_register_is_cleared_once_the_client_knows_that_no_program_runs(
     assert one._control.calls == ["kickWatchdog"]
 
 
-def test_silently_reopened_connection_is_lost(arm: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silently_reopened_connection_is_lost(arm, monkeypatch):
     """ur-rtde reopens it silently, on the same descriptor."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = server.getsockname()
@@ -202,7 +196,7 @@ def test_silently_reopened_connection_is_lost(arm: ModuleType, monkeypatch: pyte
             assert not one.read().connected
 
 
-def test_sent_script_arms_its_watchdog(arm: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sent_script_arms_its_watchdog(arm, monkeypatch):
     class Sending(Client):
         sent = ""
 
@@ -224,9 +218,7 @@ def test_sent_script_arms_its_watchdog(arm: ModuleType, monkeypatch: pytest.Monk
     assert other._control.sent == "its own"
 
 
-def test_connection_that_takes_no_script_is_lost(
-    arm: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_connection_that_takes_no_script_is_lost(arm, monkeypatch, capsys):
     """Only a new worker opens the connection again."""
 
     class Closed(Controlled):

@@ -49,7 +49,7 @@ def stopped_after_s(event: dict[str, int], since_ns: int) -> float:
     return (event["t_mono_ns"] - since_ns) / 1e9
 
 
-async def test_states_arrive_and_replies_hold_the_sent_command(controller: ControllerProcess) -> None:
+async def test_states_arrive_and_replies_hold_the_sent_command(controller):
     async with running(settings_for(controller.host)) as robot:
         assert "not connected" in (await robot.send(Enable())).refusal
         await until(robot, lambda state: state.program_running and not state.recovering)
@@ -80,7 +80,7 @@ async def test_states_arrive_and_replies_hold_the_sent_command(controller: Contr
         assert state.tcp_pose[2] == pytest.approx(z - 0.02, abs=1e-5)
 
 
-async def test_linear_move_is_stopped_and_repeated(controller: ControllerProcess) -> None:
+async def test_linear_move_is_stopped_and_repeated(controller):
     async with running(settings_for(controller.host)) as robot:
         await enable(robot)
         x, y, z, *turned = (await robot.next_state()).tcp_pose
@@ -96,7 +96,7 @@ async def test_linear_move_is_stopped_and_repeated(controller: ControllerProcess
         assert (await robot.next_state()).tcp_pose[2] == pytest.approx(z + 0.04, abs=1e-4)
 
 
-async def test_state_comes_125_times_a_second_with_the_controllers_own_time(controller: ControllerProcess) -> None:
+async def test_state_comes_125_times_a_second_with_the_controllers_own_time(controller):
     async with running(settings_for(controller.host)) as robot:
         first = await until(robot, lambda state: not state.recovering)
         states = [await robot.next_state() for _ in range(100)]
@@ -108,7 +108,7 @@ async def test_state_comes_125_times_a_second_with_the_controllers_own_time(cont
 
 
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSEGV])
-async def test_twist_stops_when_the_client_is_killed(controller: ControllerProcess, end: signal.Signals) -> None:
+async def test_twist_stops_when_the_client_is_killed(controller, end):
     link = LinkEvents()
     async with turning(controller, link) as robot:
         killed_ns = time.monotonic_ns()
@@ -129,7 +129,7 @@ async def test_twist_stops_when_the_client_is_killed(controller: ControllerProce
         await turn(robot, controller)
 
 
-async def test_stalled_samples_end_the_motion(controller: ControllerProcess) -> None:
+async def test_stalled_samples_end_the_motion(controller):
     """Longer than `state_timeout_s`, shorter than the watchdog's time: the wrist must not turn on."""
     async with turning(controller) as robot:
         stalled_ns = await controller.fault(f"silence {robot.settings.state_timeout_s + 0.04}")
@@ -144,7 +144,7 @@ async def test_stalled_samples_end_the_motion(controller: ControllerProcess) -> 
         await turn(robot, controller)
 
 
-async def test_protective_stop_is_reported_and_unlocked_by_the_same_worker(controller: ControllerProcess) -> None:
+async def test_protective_stop_is_reported_and_unlocked_by_the_same_worker(controller):
     async with turning(controller) as robot:
         pid = pid_of(robot)
         asked_ns = await controller.fault("protective-stop")
@@ -161,7 +161,7 @@ async def test_protective_stop_is_reported_and_unlocked_by_the_same_worker(contr
         assert pid_of(robot) == pid
 
 
-async def test_emergency_stop_is_reported_and_recovered_from(controller: ControllerProcess) -> None:
+async def test_emergency_stop_is_reported_and_recovered_from(controller):
     async with turning(controller) as robot:
         asked_ns = await controller.fault("emergency-stop")
         state = await until(robot, lambda state: state.emergency_stop)
@@ -174,7 +174,7 @@ async def test_emergency_stop_is_reported_and_recovered_from(controller: Control
         await turn(robot, controller)
 
 
-async def test_lost_rtde_ends_the_worker_and_the_next_moves_nothing(controller: ControllerProcess) -> None:
+async def test_lost_rtde_ends_the_worker_and_the_next_moves_nothing(controller):
     link = LinkEvents()
     async with turning(controller, link) as robot:
         dropped_ns = await controller.fault("drop-rtde")
@@ -189,7 +189,7 @@ async def test_lost_rtde_ends_the_worker_and_the_next_moves_nothing(controller: 
         assert not controller.happened("motion-started", dropped_ns)
 
 
-async def test_hung_worker_is_replaced(controller: ControllerProcess) -> None:
+async def test_hung_worker_is_replaced(controller):
     link = LinkEvents()
     async with turning(controller, link, hang_timeout_s=0.3) as robot:
         hung_ns = time.monotonic_ns()
@@ -204,7 +204,7 @@ async def test_hung_worker_is_replaced(controller: ControllerProcess) -> None:
         assert not controller.happened("motion-started", hung_ns)
 
 
-async def test_silent_controller_is_reported_and_the_robot_stops(controller: ControllerProcess) -> None:
+async def test_silent_controller_is_reported_and_the_robot_stops(controller):
     link = LinkEvents()
     async with turning(controller, link, connect_timeout_s=1.5) as robot:
         silent_ns = await controller.fault("silence 3600")
@@ -228,9 +228,7 @@ async def test_silent_controller_is_reported_and_the_robot_stops(controller: Con
         ("refuse-protocol", "version", "PolyScope 3.10 or 5.4"),
     ],
 )
-async def test_connection_that_is_refused_is_explained(
-    controller: ControllerProcess, fault: str, kind: str, said: str
-) -> None:
+async def test_connection_that_is_refused_is_explained(controller, fault, kind, said):
     await controller.fault(fault)
     link = LinkEvents()
     async with running(settings_for(controller.host), link) as robot:
@@ -241,9 +239,7 @@ async def test_connection_that_is_refused_is_explained(
 
 
 @pytest.mark.parametrize("told", [None, signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-async def test_leaving_stops_the_arm_and_ends_the_program(
-    told: signal.Signals | None, controller: ControllerProcess
-) -> None:
+async def test_leaving_stops_the_arm_and_ends_the_program(told, controller):
     """Also when a terminal or service manager signals every process."""
     async with turning(controller) as robot:
         left_ns = time.monotonic_ns()
@@ -276,11 +272,10 @@ asyncio.run(main())
 """
 
 
-async def test_killed_daemon_leaves_a_resting_robot_and_no_process(controller: ControllerProcess) -> None:
+async def test_killed_daemon_leaves_a_resting_robot_and_no_process(controller):
     daemon = await asyncio.create_subprocess_exec(
         sys.executable, "-c", DAEMON, controller.host, stdout=asyncio.subprocess.PIPE, cwd=ROOT
     )
-    assert daemon.stdout is not None
     worker = os.pidfd_open(int(await daemon.stdout.readline()))
     killed_ns = time.monotonic_ns()
     daemon.kill()

@@ -17,7 +17,7 @@ from tests.drivers.ur.robots import ROOT, running, settings_for
 from tests.running import LinkEvents
 
 
-async def test_absent_controller_is_explained() -> None:
+async def test_absent_controller_is_explained():
     pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
     link = LinkEvents()
     async with running(settings_for("127.0.0.254"), link) as robot:
@@ -50,9 +50,7 @@ def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Non
         ),
     ],
 )  # fmt: skip
-async def test_error_output_of_an_ended_worker_is_quoted_and_shortened(
-    play: Callable[[str], None], commands: str, kind: str, cause: str, words: str
-) -> None:
+async def test_error_output_of_an_ended_worker_is_quoted_and_shortened(play, commands, kind, cause, words):
     play(commands)
     link = LinkEvents()
     async with running(settings_for("127.0.0.254"), link) as robot:
@@ -97,7 +95,7 @@ with open(sys.argv[1], "a") as told:
 """
 
 
-async def test_disconnects_and_refuses_what_is_unanswered(play: Callable[[str], None], tmp_path: Path) -> None:
+async def test_disconnects_and_refuses_what_is_unanswered(play, tmp_path):
     told = tmp_path / "told"
     play(f"cd '{ROOT}' && exec '{sys.executable}' -c '{DISCONNECTS}' '{told}'")
     async with asyncio.timeout(60):
@@ -111,9 +109,7 @@ async def test_disconnects_and_refuses_what_is_unanswered(play: Callable[[str], 
 
 # In the first cycle the register is cleared, in the second the program is sent.
 @pytest.mark.parametrize(("cycles", "may_stop"), [(0, "False"), (1, "False"), (2, "True"), (5, "True")])
-async def test_next_worker_may_stop_the_program_left_behind(
-    play: Callable[[str], None], tmp_path: Path, cycles: int, may_stop: str
-) -> None:
+async def test_next_worker_may_stop_the_program_left_behind(play, tmp_path, cycles, may_stop):
     told = tmp_path / "told"
     briefly = BRIEFLY.replace("CYCLES", str(cycles))
     play(f"cd '{ROOT}' && exec '{sys.executable}' -c '{briefly}' '{told}'")
@@ -140,14 +136,12 @@ def lost_after(*readings: dict[str, int], flight: Flight) -> UrRobot:
 @pytest.mark.parametrize("cycles", [1, 500], ids=["just connected", "for long"])
 @pytest.mark.parametrize("last", [{}, STALE, PAUSED], ids=["playing", "silent", "paused"])
 @pytest.mark.parametrize("first", [{"runtime_state": 2}, PAUSED], ids=["played", "was paused"])
-async def test_earlier_program_does_not_count_as_left_behind(
-    first: dict[str, int], last: dict[str, int], cycles: int
-) -> None:
+async def test_earlier_program_does_not_count_as_left_behind(first, last, cycles):
     assert not lost_after(*[first] * cycles, last, flight=Flight()).takes_over
 
 
 @pytest.mark.parametrize("last", [{}, STALE, PAUSED], ids=["playing", "silent", "paused"])
-async def test_our_program_counts_as_left_behind(last: dict[str, int]) -> None:
+async def test_our_program_counts_as_left_behind(last):
     flight = flying()
     flight.arm.stoppable = False
     assert lost_after({}, *[last] * 5, flight=flight).takes_over
@@ -158,13 +152,13 @@ async def test_our_program_counts_as_left_behind(last: dict[str, int]) -> None:
     assert lost_after(*[{}] * 5, flight=after).takes_over
 
 
-async def test_program_started_after_ours_ended_is_foreign() -> None:
+async def test_program_started_after_ours_ended_is_foreign():
     flight = flying()
     flight.arm.end_program()
     assert not lost_after({}, PAUSED, flight=flight).takes_over
 
 
-async def test_failed_stops_are_counted_across_workers() -> None:
+async def test_failed_stops_are_counted_across_workers():
     robot = UrRobot(SETTINGS)
     for counts in ((0, 1, 1, 2), (0, 3)):
         for count in counts:
@@ -173,7 +167,7 @@ async def test_failed_stops_are_counted_across_workers() -> None:
     assert robot.failed_program_stops == 5
 
 
-async def test_unretrieved_loss_causes_no_asyncio_complaint() -> None:
+async def test_unretrieved_loss_causes_no_asyncio_complaint():
     complaints: list[dict[str, Any]] = []
     asyncio.get_running_loop().set_exception_handler(lambda _loop, context: complaints.append(context))
     connection = WorkerConnection(SETTINGS, UrRobot(SETTINGS))
@@ -183,9 +177,7 @@ async def test_unretrieved_loss_causes_no_asyncio_complaint() -> None:
     assert complaints == []
 
 
-async def test_worker_that_ends_during_shutdown_is_awaited(
-    play: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_worker_that_ends_during_shutdown_is_awaited(play, monkeypatch):
     play("exit 1")
     begun, may_end = asyncio.Event(), asyncio.Event()
     real, ended = WorkerConnection.end, []
@@ -206,9 +198,7 @@ async def test_worker_that_ends_during_shutdown_is_awaited(
     assert len(ended) == 1
 
 
-async def test_worker_lost_during_shutdown_is_not_restarted(
-    play: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_worker_lost_during_shutdown_is_not_restarted(play, monkeypatch):
     """The cancellation must not get lost, also when it comes together with the loss."""
     play("exec cat")
     listened: list[WorkerConnection] = []

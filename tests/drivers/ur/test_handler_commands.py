@@ -4,17 +4,17 @@ import dataclasses
 
 import pytest
 
-from shearloop.drivers.ur.messages import Command, Enable, MoveLinear, RtdeSample, Stop, WristSpeed, ZeroForceTorque
+from shearloop.drivers.ur.messages import Enable, MoveLinear, RtdeSample, Stop, WristSpeed, ZeroForceTorque
 from tests.drivers.ur.flight import POSE, Flight, flying, turning
 
 
-def test_start_clears_the_last_command_uploads_and_arms_the_watchdog_in_this_order() -> None:
+def test_start_clears_the_last_command_uploads_and_arms_the_watchdog_in_this_order():
     flight = Flight()
     flight.fly(5)
     assert flight.arm.calls == ["clear_command", "upload", "arm_watchdog", "send_heartbeat", "send_heartbeat"]
 
 
-def test_nothing_moves_before_it_is_enabled() -> None:
+def test_nothing_moves_before_it_is_enabled():
     flight = Flight()
     assert "made ready" in flight.ask(WristSpeed(0.1, 1.0)).refusal
     flight.fly(5)
@@ -28,7 +28,7 @@ def test_nothing_moves_before_it_is_enabled() -> None:
     assert {"wrist", "move"}.isdisjoint(flight.arm.calls)
 
 
-def test_clipped_command_is_returned_and_reported() -> None:
+def test_clipped_command_is_returned_and_reported():
     flight = flying()
     reply = flight.ask(WristSpeed(3.0, 2.0))
     assert reply.sent == WristSpeed(0.8, 2.0)
@@ -40,13 +40,13 @@ def test_clipped_command_is_returned_and_reported() -> None:
 @pytest.mark.parametrize(
     "command", [WristSpeed(0.1, 0.0), MoveLinear(POSE, 0.0, 0.1), MoveLinear(POSE, 0.1, -1.0), Stop(0.0)]
 )
-def test_invalid_numbers_are_refused(command: Command) -> None:
+def test_invalid_numbers_are_refused(command):
     flight = flying()
     assert "above 0" in flight.ask(command).refusal
     assert not flight.arm.calls
 
 
-def test_wrench_is_zeroed_at_rest_and_within_its_limits_only() -> None:
+def test_wrench_is_zeroed_at_rest_and_within_its_limits_only():
     flight = turning()
     assert "only at rest" in flight.ask(ZeroForceTorque()).refusal
     flight.fly_until(lambda state: state.motion == "idle")
@@ -58,7 +58,7 @@ def test_wrench_is_zeroed_at_rest_and_within_its_limits_only() -> None:
     assert flight.arm.calls[-1] == "zero_wrench"
 
 
-def test_sample_is_part_of_the_state() -> None:
+def test_sample_is_part_of_the_state():
     flight = flying()
     for field in dataclasses.fields(RtdeSample):
         assert getattr(flight.state, field.name) == getattr(flight.arm.reading, field.name)

@@ -7,7 +7,7 @@ from tests.drivers.ur.flight import POSE, SETTINGS, Flight, flying, turning
 
 
 @pytest.mark.parametrize("command", [WristSpeed(0.1, 1.0), Stop(4.0)])
-def test_robot_that_rejects_a_command_is_left_to_its_watchdog(command: WristSpeed | Stop) -> None:
+def test_robot_that_rejects_a_command_is_left_to_its_watchdog(command):
     flight = turning()
     flight.arm.accepts = False
     assert "does not answer" in flight.ask(command).refusal
@@ -21,7 +21,7 @@ def test_robot_that_rejects_a_command_is_left_to_its_watchdog(command: WristSpee
     assert flight.ask(WristSpeed(0.1, 1.0)).accepted
 
 
-def test_linear_move_that_does_not_stop_is_left_to_the_watchdog() -> None:
+def test_linear_move_that_does_not_stop_is_left_to_the_watchdog():
     flight = flying()
     flight.ask(MoveLinear(POSE, 0.1, 0.5))
     flight.fly(3)
@@ -32,7 +32,7 @@ def test_linear_move_that_does_not_stop_is_left_to_the_watchdog() -> None:
     assert not flight.arm.reading.program_running
 
 
-def test_linear_move_that_rejects_its_stop_is_left_to_the_watchdog() -> None:
+def test_linear_move_that_rejects_its_stop_is_left_to_the_watchdog():
     flight = flying()
     flight.ask(MoveLinear(POSE, 0.1, 0.5))
     flight.fly(3)
@@ -43,7 +43,7 @@ def test_linear_move_that_rejects_its_stop_is_left_to_the_watchdog() -> None:
     assert "silent" in flight.state.end_reason
 
 
-def test_arm_that_moves_without_a_command_is_left_to_the_watchdog() -> None:
+def test_arm_that_moves_without_a_command_is_left_to_the_watchdog():
     flight = flying()
     flight.arm.target = 0.1
     flight.fly(20)
@@ -55,7 +55,7 @@ def test_arm_that_moves_without_a_command_is_left_to_the_watchdog() -> None:
     assert "unlock" in flight.ask(WristSpeed(0.1, 1.0)).refusal.lower()
 
 
-def test_resumed_program_gets_no_heartbeats() -> None:
+def test_resumed_program_gets_no_heartbeats():
     flight = turning()
     # Resumed before it could be stopped.
     flight.arm.protective_stop()
@@ -73,7 +73,7 @@ def test_resumed_program_gets_no_heartbeats() -> None:
 
 
 @pytest.mark.parametrize("takes_over", [False, True], ids=["daemon", "process"])
-def test_program_left_behind_ends_before_ours_starts(takes_over: bool) -> None:
+def test_program_left_behind_ends_before_ours_starts(takes_over):
     flight = Flight(takes_over=takes_over)
     flight.arm.be(runtime_state=2)
     flight.fly(60)
@@ -84,7 +84,7 @@ def test_program_left_behind_ends_before_ours_starts(takes_over: bool) -> None:
 
 
 @pytest.mark.parametrize("takes_over", [False, True], ids=["daemon", "process"])
-def test_foreign_program_is_stopped_only_on_unlock(takes_over: bool) -> None:
+def test_foreign_program_is_stopped_only_on_unlock(takes_over):
     """A program of a lost worker would have ended by its watchdog."""
     flight = Flight(takes_over=takes_over)
     flight.arm.be(runtime_state=2)
@@ -98,7 +98,7 @@ def test_foreign_program_is_stopped_only_on_unlock(takes_over: bool) -> None:
     assert "stop" in flight.arm.calls
 
 
-def test_foreign_program_gets_no_commands() -> None:
+def test_foreign_program_gets_no_commands():
     flight = Flight()
     flight.arm.be(safety_mode=3)
     flight.fly(5)
@@ -110,13 +110,12 @@ def test_foreign_program_gets_no_commands() -> None:
     assert flight.arm.calls[:4] == ["close popup", "stop", "clear_command", "upload"]
 
 
-def test_program_after_an_abandoned_start_may_be_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_program_after_an_abandoned_start_may_be_ours(monkeypatch):
     """The upload may take effect after the recovery was given up."""
     flight = Flight()
     monkeypatch.setattr(flight.arm, "upload", lambda: True)
     flight.fly(5)
     recovery = flight.handler._recovery
-    assert recovery is not None
     recovery.give_up("The recovery is given up.")
     flight.fly(5)
     assert not flight.state.recovering
@@ -128,7 +127,7 @@ def test_program_after_an_abandoned_start_may_be_ours(monkeypatch: pytest.Monkey
         assert flight.arm.reading.program_running == program_running
 
 
-def test_hard_limit_stops_until_enabled_again() -> None:
+def test_hard_limit_stops_until_enabled_again():
     flight = turning()
     flight.arm.be(wrench=(0.0, 0.0, 0.0, 0.0, 0.0, 6.5))
     flight.fly(1)
@@ -142,7 +141,7 @@ def test_hard_limit_stops_until_enabled_again() -> None:
     assert flight.ask(WristSpeed(0.1, 1.0)).accepted
 
 
-def test_protective_stop_is_unlocked_only_by_the_operator() -> None:
+def test_protective_stop_is_unlocked_only_by_the_operator():
     flight = turning()
     flight.arm.be(safety_mode=3, runtime_state=4)
     flight.arm.target = 0.0
@@ -164,7 +163,7 @@ def test_protective_stop_is_unlocked_only_by_the_operator() -> None:
     assert flight.ask(WristSpeed(0.1, 1.0)).accepted
 
 
-def test_recovery_from_an_emergency_stop_needs_the_button_released() -> None:
+def test_recovery_from_an_emergency_stop_needs_the_button_released():
     flight = turning()
     flight.arm.end_program()
     flight.arm.be(safety_mode=7, robot_mode=3)
@@ -181,7 +180,7 @@ def test_recovery_from_an_emergency_stop_needs_the_button_released() -> None:
     ]  # fmt: skip
 
 
-def test_connecting_to_a_robot_in_a_protective_stop_waits_for_the_operator() -> None:
+def test_connecting_to_a_robot_in_a_protective_stop_waits_for_the_operator():
     flight = Flight()
     flight.arm.be(safety_mode=3)
     flight.fly(100)
@@ -190,7 +189,7 @@ def test_connecting_to_a_robot_in_a_protective_stop_waits_for_the_operator() -> 
     assert flight.ask(WristSpeed(0.1, 1.0)).accepted
 
 
-def test_ended_program_is_reported_and_restarted_on_unlock() -> None:
+def test_ended_program_is_reported_and_restarted_on_unlock():
     flight = turning()
     flight.arm.end_program()
     flight.fly(50)
@@ -199,10 +198,10 @@ def test_ended_program_is_reported_and_restarted_on_unlock() -> None:
     assert flight.ask(Unlock()).accepted
 
 
-def test_recovery_times_out_and_reports_the_modes() -> None:
+def test_recovery_times_out_and_reports_the_modes():
     flight = flying()
     flight.arm.end_program()
-    flight.arm.upload = lambda: True  # type: ignore[method-assign]  # an upload that never takes
+    flight.arm.upload = lambda: True  # an upload that never takes
     begun_ns = flight.now_ns
     reply = flight.ask(Unlock())
     assert "within 30 s" in reply.refusal
@@ -210,7 +209,7 @@ def test_recovery_times_out_and_reports_the_modes() -> None:
     assert flight.now_ns - begun_ns == pytest.approx(30e9, rel=0.01)
 
 
-def test_old_samples_block_motion() -> None:
+def test_old_samples_block_motion():
     flight = turning()
     flight.arm.be(age_ns=300_000_000)
     flight.arm.calls.clear()
@@ -223,7 +222,7 @@ def test_old_samples_block_motion() -> None:
     assert flight.wrist_speed == 0, "the program must not be kept going"
 
 
-def test_old_samples_at_rest_need_only_an_enable() -> None:
+def test_old_samples_at_rest_need_only_an_enable():
     flight = flying()
     flight.arm.be(age_ns=300_000_000)
     flight.fly(10)
@@ -235,7 +234,7 @@ def test_old_samples_at_rest_need_only_an_enable() -> None:
 
 
 @pytest.mark.parametrize("command", [Disconnect(), Stop(4.0)])
-def test_unlocking_is_ended_by_disconnecting_and_by_a_stop(command: Disconnect | Stop) -> None:
+def test_unlocking_is_ended_by_disconnecting_and_by_a_stop(command):
     flight = flying()
     flight.arm.be(robot_mode=3, runtime_state=1)
     flight.fly(1)
@@ -248,7 +247,7 @@ def test_unlocking_is_ended_by_disconnecting_and_by_a_stop(command: Disconnect |
     assert not flight.decided[98].accepted
 
 
-def test_starting_the_program_is_ended_by_disconnecting() -> None:
+def test_starting_the_program_is_ended_by_disconnecting():
     flight = Flight()
     assert flight.ask(Disconnect()).accepted
     flight.fly(300)
@@ -258,7 +257,7 @@ def test_starting_the_program_is_ended_by_disconnecting() -> None:
         assert "disconnects" in flight.ask(command).refusal
 
 
-def test_unlocking_with_old_samples_times_out() -> None:
+def test_unlocking_with_old_samples_times_out():
     flight = turning()
     flight.arm.protective_stop()
     flight.fly(10)
@@ -273,7 +272,7 @@ def test_unlocking_with_old_samples_times_out() -> None:
     assert flight.arm.calls == [], "nothing is unlocked so long after the operator's word"
 
 
-def test_slowly_starting_program_gets_heartbeats(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slowly_starting_program_gets_heartbeats(monkeypatch):
     """The program arms its watchdog when it starts."""
     flight = Flight()
     upload = flight.arm.upload

@@ -3,7 +3,7 @@
 import pytest
 
 from shearloop.drivers.ur.messages import Disconnect, MoveLinear, Stop, WristSpeed
-from tests.drivers.ur.flight import LIMITS, POSE, Flight, flying, turning
+from tests.drivers.ur.flight import CYCLE_NS, LIMITS, POSE, Flight, flying, turning
 
 
 def cycles_with_calls(flight: Flight, cycles: int) -> list[int]:
@@ -16,19 +16,33 @@ def cycles_with_calls(flight: Flight, cycles: int) -> list[int]:
     return said
 
 
-def test_wrist_speed_ends_when_it_is_not_renewed() -> None:
+def test_wrist_speed_ends_when_it_is_not_renewed():
     flight = turning(0.5)
     state = flight.fly_until(lambda state: state.motion == "idle")
     assert state.end_reason == "the wrist speed was not renewed within 0.3 s"
     assert flight.wrist_speed == 0
-    # 0.3 s of turning, then 0.5/4 s of braking, then the speed thread is ended and the watchdog kicked.
+    # 0.3 s of turning, then 0.5/8 s of braking, then the speed thread is ended and the watchdog kicked.
     assert state.wrist_rad == pytest.approx(0.5 * 0.3, abs=0.03)
     assert flight.arm.calls[-1] == "end_speed"
     flight.fly(3)
     assert flight.arm.calls[-1] == "send_heartbeat"
 
 
-def test_something_is_sent_in_each_cycle_of_a_motion() -> None:
+def test_wrist_speed_holds_from_its_decision_and_not_from_its_arrival() -> None:
+    flight = flying()
+    late = WristSpeed(0.5, 4.0, decided_ns=flight.now_ns - 60_000_000)
+    assert flight.ask(late).accepted
+    decided_ns = flight.now_ns - 60_000_000
+    flight.fly_until(lambda _: flight.arm.target == 0.0)
+    assert flight.now_ns - decided_ns <= 300_000_000 + 2 * CYCLE_NS
+    flight.fly_until(lambda state: state.motion == "idle")
+    refused = flight.ask(WristSpeed(0.5, 4.0, decided_ns=flight.now_ns - 301_000_000))
+    assert refused.refusal == "The wrist speed was decided 0.30 s ago: the computer is too busy."
+    flight.fly(1)
+    assert flight.state.motion == "idle"
+
+
+def test_something_is_sent_in_each_cycle_of_a_motion():
     flight = flying()
     assert flight.ask(WristSpeed(0.1, 4.0)).accepted
     assert cycles_with_calls(flight, 30) == [*range(30)]
@@ -41,7 +55,7 @@ def test_something_is_sent_in_each_cycle_of_a_motion() -> None:
 
 
 @pytest.mark.parametrize("repeated", [False, True])
-def test_speed_changed_by_a_limit_is_sent_in_the_same_cycle(repeated: bool) -> None:
+def test_speed_changed_by_a_limit_is_sent_in_the_same_cycle(repeated):
     """In any cycle after the last command, repeated or not."""
     for cycles in range(1, 7):
         flight = flying()
@@ -54,7 +68,7 @@ def test_speed_changed_by_a_limit_is_sent_in_the_same_cycle(repeated: bool) -> N
         assert flight.arm.target == pytest.approx(0.4), "half of the fastest, half way to the hard limit"
 
 
-def test_same_speed_with_another_acceleration_is_sent_at_once() -> None:
+def test_same_speed_with_another_acceleration_is_sent_at_once():
     flight = flying()
     for acceleration in (4.0, 1.0, 2.0):
         assert flight.ask(WristSpeed(0.1, acceleration)).accepted
@@ -63,7 +77,7 @@ def test_same_speed_with_another_acceleration_is_sent_at_once() -> None:
 
 @pytest.mark.parametrize("cycles", [3, 4, 5])
 @pytest.mark.parametrize("stopped", [False, True])
-def test_last_cycle_of_a_linear_move_sends_a_heartbeat(cycles: int, stopped: bool) -> None:
+def test_last_cycle_of_a_linear_move_sends_a_heartbeat(cycles, stopped):
     """Independent of the age of the last one."""
     flight = flying()
     assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
@@ -78,7 +92,7 @@ def test_last_cycle_of_a_linear_move_sends_a_heartbeat(cycles: int, stopped: boo
     assert flight.arm.calls == ["send_heartbeat"]
 
 
-def test_same_speed_after_another_motion_is_sent() -> None:
+def test_same_speed_after_another_motion_is_sent():
     flight = flying()
     assert flight.ask(WristSpeed(0.0, 4.0)).accepted
     flight.fly(2)
@@ -92,7 +106,7 @@ def test_same_speed_after_another_motion_is_sent() -> None:
     assert flight.arm.calls[-1] == "wrist"
 
 
-def test_silent_daemon_ends_the_motion() -> None:
+def test_silent_daemon_ends_the_motion():
     flight = flying()
     assert flight.ask(MoveLinear(POSE, 0.05, 0.1)).accepted
     flight.fly(30, daemon_alive=False)
@@ -103,7 +117,7 @@ def test_silent_daemon_ends_the_motion() -> None:
     assert "stop_move" in flight.arm.calls
 
 
-def test_linear_move_gets_heartbeats_and_reports_its_arrival() -> None:
+def test_linear_move_gets_heartbeats_and_reports_its_arrival():
     flight = flying()
     reply = flight.ask(MoveLinear((-2.0, *POSE[1:]), 9.0, 0.1))
     assert reply.sent == MoveLinear((-0.78, *POSE[1:]), 0.1, 0.1)
@@ -118,7 +132,7 @@ def test_linear_move_gets_heartbeats_and_reports_its_arrival() -> None:
     assert (flight.state.motion, flight.state.end_reason) == ("idle", "arrived")
 
 
-def test_linear_move_has_a_deadline_and_inner_limits() -> None:
+def test_linear_move_has_a_deadline_and_inner_limits():
     flight = flying()
     flight.ask(MoveLinear(POSE, 0.1, 0.5))
     state = flight.fly_until(lambda state: state.motion == "idle")
@@ -131,7 +145,7 @@ def test_linear_move_has_a_deadline_and_inner_limits() -> None:
     assert flight.arm.calls.count("stop_move") == 2
 
 
-def test_stop_is_sent_at_once_and_ends_before_another_motion_begins() -> None:
+def test_stop_is_sent_at_once_and_ends_before_another_motion_begins():
     flight = turning(0.5)
     flight.arm.calls.clear()
     assert flight.ask(Stop(2.0)).sent == Stop(2.0)
@@ -145,7 +159,7 @@ def test_stop_is_sent_at_once_and_ends_before_another_motion_begins() -> None:
     assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
 
 
-def test_gentle_stop_becomes_a_hard_one_when_the_daemon_falls_silent() -> None:
+def test_gentle_stop_becomes_a_hard_one_when_the_daemon_falls_silent():
     flight = turning(0.5)
     assert flight.ask(Stop(0.6)).accepted
     flight.fly(1)
@@ -154,7 +168,7 @@ def test_gentle_stop_becomes_a_hard_one_when_the_daemon_falls_silent() -> None:
     assert flight.arm.acceleration == LIMITS.wrist_acceleration_rad_per_s2.hard
 
 
-def test_harder_of_two_stops_counts() -> None:
+def test_harder_of_two_stops_counts():
     flight = turning(0.5)
     assert flight.ask(Stop(4.0)).sent == Stop(4.0)
     assert flight.ask(Stop(1.0)).sent == Stop(4.0)
@@ -162,7 +176,7 @@ def test_harder_of_two_stops_counts() -> None:
     assert flight.arm.acceleration == 6.0
 
 
-def test_gentlest_stop_ends_within_a_second() -> None:
+def test_gentlest_stop_ends_within_a_second():
     flight = turning(0.5)
     assert flight.ask(Stop(1e-3)).sent == Stop(0.5)
     flight.fly(130)
@@ -170,7 +184,7 @@ def test_gentlest_stop_ends_within_a_second() -> None:
     assert flight.wrist_speed == 0
 
 
-def test_disconnecting_stops_first() -> None:
+def test_disconnecting_stops_first():
     flight = turning()
     flight.arm.calls.clear()
     assert flight.ask(Disconnect()).accepted

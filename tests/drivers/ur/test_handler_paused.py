@@ -21,7 +21,7 @@ def stop_requests_s(flight: Flight, seconds: float) -> list[float]:
     return times
 
 
-def test_paused_program_of_the_last_worker_is_stopped() -> None:
+def test_paused_program_of_the_last_worker_is_stopped():
     flight = Flight(takes_over=True)
     flight.arm.target = 0.5
     flight.arm.be(runtime_state=2)
@@ -34,7 +34,7 @@ def test_paused_program_of_the_last_worker_is_stopped() -> None:
     assert flight.wrist_speed == 0.0
 
 
-def test_failed_program_stop_does_not_prevent_unlocking() -> None:
+def test_failed_program_stop_does_not_prevent_unlocking():
     flight = Flight(takes_over=True)
     flight.arm.stoppable = False
     flight.arm.be(safety_mode=3, runtime_state=4)
@@ -46,7 +46,7 @@ def test_failed_program_stop_does_not_prevent_unlocking() -> None:
 
 
 @pytest.mark.parametrize("takes_over", [False, True], ids=["ours", "of the process before"])
-def test_silent_dashboard_is_retried_with_growing_pauses(takes_over: bool) -> None:
+def test_silent_dashboard_is_retried_with_growing_pauses(takes_over):
     flight = Flight(takes_over=True) if takes_over else turning()
     flight.arm.be(runtime_state=2)
     flight.arm.stoppable = False
@@ -60,7 +60,7 @@ def test_silent_dashboard_is_retried_with_growing_pauses(takes_over: bool) -> No
     assert flight.state.blocked.startswith("Protective stop")
 
 
-def test_ineffective_stop_is_retried_and_reported() -> None:
+def test_ineffective_stop_is_retried_and_reported():
     flight = turning()
     flight.arm.stop_fails_silently = True
     flight.arm.protective_stop()
@@ -76,7 +76,7 @@ def test_ineffective_stop_is_retried_and_reported() -> None:
     assert len(flight.state.blocked) > 0
 
 
-def test_long_cycles_are_announced() -> None:
+def test_long_cycles_are_announced():
     flight = turning()
     flight.arm.stoppable = False
     flight.arm.protective_stop()
@@ -86,7 +86,7 @@ def test_long_cycles_are_announced() -> None:
         assert announced == (flight.arm.calls.count(STOP_REQUEST) > before)
 
 
-def test_each_pause_gets_new_requests() -> None:
+def test_each_pause_gets_new_requests():
     flight = turning()
     flight.arm.stoppable = False
     flight.arm.protective_stop()
@@ -101,7 +101,7 @@ def test_each_pause_gets_new_requests() -> None:
 
 
 @pytest.mark.parametrize(("runtime_state", "times"), [(0, 0), (1, 0), (3, 1), (4, 1), (5, 1)])
-def test_only_paused_programs_are_stopped(runtime_state: int, times: int) -> None:
+def test_only_paused_programs_are_stopped(runtime_state, times):
     """Runtime states: 0 stopping, 1 stopped, 3 pausing, 4 paused, 5 resuming."""
     flight = turning()
     flight.arm.stoppable = False
@@ -109,7 +109,7 @@ def test_only_paused_programs_are_stopped(runtime_state: int, times: int) -> Non
     assert len(stop_requests_s(flight, 0.5)) == times
 
 
-def test_old_sample_causes_no_program_stop() -> None:
+def test_old_sample_causes_no_program_stop():
     """Another client's program may be there by now."""
     flight = turning()
     flight.arm.protective_stop()
@@ -117,7 +117,7 @@ def test_old_sample_causes_no_program_stop() -> None:
     assert stop_requests_s(flight, 5.0) == []
 
 
-def test_program_started_at_the_pendant_after_ours_is_left_alone() -> None:
+def test_program_started_at_the_pendant_after_ours_is_left_alone():
     flight = flying()
     flight.arm.end_program()
     flight.fly(3)
@@ -129,7 +129,7 @@ def test_program_started_at_the_pendant_after_ours_is_left_alone() -> None:
     assert STOP_REQUEST not in flight.arm.calls
 
 
-def test_paused_program_left_behind_is_left_to_the_exit() -> None:
+def test_paused_program_left_behind_is_left_to_the_exit():
     flight = Flight(takes_over=True)
     flight.arm.stoppable = False
     flight.arm.be(safety_mode=3, runtime_state=4)
@@ -141,7 +141,7 @@ def test_paused_program_left_behind_is_left_to_the_exit() -> None:
     assert flight.arm.calls[-1] == STOP_REQUEST
 
 
-def test_stopped_program_restarts_only_on_unlock() -> None:
+def test_stopped_program_restarts_only_on_unlock():
     flight = turning()
     flight.arm.protective_stop()
     flight.fly(100)
@@ -154,7 +154,7 @@ def test_stopped_program_restarts_only_on_unlock() -> None:
     assert flight.ask(Unlock()).accepted
 
 
-def test_program_being_started_is_ours_during_an_unlock() -> None:
+def test_program_being_started_is_ours_during_an_unlock():
     flight = Flight()
     flight.fly(2)
     assert flight.arm.calls == ["clear_command", "upload"]
@@ -163,7 +163,7 @@ def test_program_being_started_is_ours_during_an_unlock() -> None:
 
 
 @pytest.mark.parametrize(("played_s", "times"), [(0.5, 1), (4.0, 0)])
-def test_program_that_plays_without_heartbeats_is_foreign(played_s: float, times: int) -> None:
+def test_program_that_plays_without_heartbeats_is_foreign(played_s, times):
     """Our program may end while the dashboard hangs and no sample is read."""
     flight = turning()
     flight.arm.stoppable = False
@@ -177,14 +177,14 @@ def test_program_that_plays_without_heartbeats_is_foreign(played_s: float, times
     assert len(stop_requests_s(flight, 1.5)) == times
 
 
-def test_our_program_stays_ours_while_it_plays() -> None:
+def test_our_program_stays_ours_while_it_plays():
     flight = flying()
     flight.fly(500)
     flight.arm.protective_stop()
     assert len(stop_requests_s(flight, 0.5)) == 1
 
 
-def test_old_samples_do_not_make_a_program_foreign() -> None:
+def test_old_samples_do_not_make_a_program_foreign():
     flight = turning()
     # Its last state, which is repeated.
     flight.arm._watched = False
@@ -194,7 +194,7 @@ def test_old_samples_do_not_make_a_program_foreign() -> None:
     assert len(stop_requests_s(flight, 0.5)) == 1
 
 
-def test_paused_program_of_unknown_owner_is_reported_and_left_alone() -> None:
+def test_paused_program_of_unknown_owner_is_reported_and_left_alone():
     """If resumed at the pendant, it would turn the wrist."""
     flight = Flight()
     flight.arm.be(safety_mode=3, runtime_state=4)

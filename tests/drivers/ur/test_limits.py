@@ -32,7 +32,7 @@ readings = st.builds(reading, st.floats(-2.5, 2.5), st.floats(-1.5, 1.5), st.flo
 
 
 @given(commands, readings)
-def test_wrist_command_is_within_the_limits_and_reports_clipping(asked: WristSpeed, now: RtdeSample) -> None:
+def test_wrist_command_is_within_the_limits_and_reports_clipping(asked, now):
     sent, reasons = clip_wrist(asked, now, SETTINGS)
     assert abs(sent.rad_per_s) <= min(LIMITS.wrist_speed_rad_per_s.inner, abs(asked.rad_per_s))
     assert sent.rad_per_s * asked.rad_per_s >= 0
@@ -53,9 +53,7 @@ def test_wrist_command_is_within_the_limits_and_reports_clipping(asked: WristSpe
 )
 @example([(WristSpeed(1e9, 0.01), 400), (WristSpeed(-0.01, 1e-6), 60)], 1.0, 3)
 @example([(WristSpeed(0.8, 4.0), 60), (WristSpeed(0.79, 1e-6), 60), (WristSpeed(0.0, 1e-6), 60)], 1.7, 3)
-def test_arm_that_follows_stays_within_its_inner_range(
-    asked: list[tuple[WristSpeed, int]], begin_rad: float, cycles_late: int
-) -> None:
+def test_arm_that_follows_stays_within_its_inner_range(asked, begin_rad, cycles_late):
     """The arm follows as with speedJ; commands take effect some cycles late."""
     wrist_rad, speed = begin_rad, 0.0
     under_way = [WristSpeed(0.0, 4.0)] * cycles_late
@@ -72,7 +70,7 @@ def test_arm_that_follows_stays_within_its_inner_range(
 
 
 @given(above_0, st.floats(-1.9, 1.9), st.floats(-0.8, 0.8))
-def test_stop_brakes_within_the_range(asked: float, wrist_rad: float, speed: float) -> None:
+def test_stop_brakes_within_the_range(asked, wrist_rad, speed):
     room = 1.9 - abs(wrist_rad) if wrist_rad * speed > 0 else 1.9 + abs(wrist_rad)
     sent = clip_stop(asked, reading(wrist_rad, speed), SETTINGS)
     assert 0 < sent <= LIMITS.wrist_acceleration_rad_per_s2.hard
@@ -84,7 +82,7 @@ poses = st.tuples(*[anything] * 3, *[st.floats(-math.pi, math.pi)] * 3)
 
 
 @given(st.builds(MoveLinear, poses, above_0, above_0))
-def test_linear_move_ends_within_the_workspace_and_reports_clipping(asked: MoveLinear) -> None:
+def test_linear_move_ends_within_the_workspace_and_reports_clipping(asked):
     sent, reasons = clip_linear(asked, LIMITS)
     box = LIMITS.workspace
     for value, low, high in zip(sent.pose[:3], box.lower_m, box.upper_m, strict=True):
@@ -98,7 +96,7 @@ def test_linear_move_ends_within_the_workspace_and_reports_clipping(asked: MoveL
     assert len(reasons) == changes
 
 
-def test_every_hard_limit_is_named() -> None:
+def test_every_hard_limit_is_named():
     assert violation(AT_REST, LIMITS) == ""
     assert "Joint 3" in violation(dataclasses.replace(AT_REST, q_rad=(0.0, 0.0, 3.01, 0.0, 0.0, 0.0)), LIMITS)
     assert "z = -0.010 m" in violation(dataclasses.replace(AT_REST, tcp_pose=(0.0, 0.0, -0.01, 0.0, 0.0, 0.0)), LIMITS)
@@ -108,7 +106,7 @@ def test_every_hard_limit_is_named() -> None:
     assert "no numbers" in violation(reading(force_n=math.nan), LIMITS)
 
 
-def test_linear_move_is_watched_at_the_inner_limits() -> None:
+def test_linear_move_is_watched_at_the_inner_limits():
     assert line_violation(AT_REST, LIMITS) == ""
     assert "force" in line_violation(reading(force_n=41.0), LIMITS)
     towards = dataclasses.replace(
@@ -120,9 +118,7 @@ def test_linear_move_is_watched_at_the_inner_limits() -> None:
 
 
 @given(st.tuples(*[st.floats(-1, 1)] * 3), st.floats(0, math.pi), st.tuples(*[st.floats(-9, 9)] * 3))
-def test_torque_about_the_tool_axis_agrees_with_scipy(
-    direction: tuple[float, float, float], angle: float, torque: tuple[float, float, float]
-) -> None:
+def test_torque_about_the_tool_axis_agrees_with_scipy(direction, angle, torque):
     length = math.hypot(*direction) or 1.0
     vector = np.array(direction) / length * angle
     now = dataclasses.replace(AT_REST, tcp_pose=(0.0, 0.0, 0.0, *vector.tolist()), wrench=(0.0, 0.0, 0.0, *torque))
@@ -140,17 +136,13 @@ def test_torque_about_the_tool_axis_agrees_with_scipy(
         ((0.0, 0.0, 0.0), (0.0, 0.003, 0.0), False),
     ],
 )
-def test_half_a_turn_is_the_same_either_way(
-    one: tuple[float, float, float], other: tuple[float, float, float], same: bool
-) -> None:
+def test_half_a_turn_is_the_same_either_way(one, other, same):
     assert is_close((0.4, 0.1, 0.3, *one), (0.4, 0.1, 0.3, *other), 2e-3) is same
     assert not is_close((0.4, 0.1, 0.3, *one), (0.4, 0.103, 0.3, *other), 2e-3)
 
 
 @given(st.tuples(*[st.floats(-1, 1)] * 3), st.floats(1e-3, math.pi), st.tuples(*[st.floats(-2e-3, 2e-3)] * 3))
-def test_closeness_agrees_with_scipy(
-    direction: tuple[float, float, float], angle: float, turned: tuple[float, float, float]
-) -> None:
+def test_closeness_agrees_with_scipy(direction, angle, turned):
     one = np.array(direction) / (math.hypot(*direction) or 1.0) * angle
     rotation = Rotation.from_rotvec(turned) * Rotation.from_rotvec(one)
     close = is_close((0.0, 0.0, 0.0, *one.tolist()), (0.0, 0.0, 0.0, *rotation.as_rotvec().tolist()), 2e-3)

@@ -37,7 +37,7 @@ async def kill(robot: UrRobot, link: LinkEvents) -> None:
     await robot.next_state()
 
 
-async def test_foreign_paused_program_outlives_a_lost_worker(controller: ControllerProcess) -> None:
+async def test_foreign_paused_program_outlives_a_lost_worker(controller):
     """It was paused before we connected."""
     await begin_foreign_program(controller)
     since_ns = await controller.fault("protective-stop")
@@ -53,7 +53,7 @@ async def test_foreign_paused_program_outlives_a_lost_worker(controller: Control
     assert not controller.happened("program-ended", since_ns)
 
 
-async def test_program_started_after_a_lost_worker_is_left_alone(controller: ControllerProcess) -> None:
+async def test_program_started_after_a_lost_worker_is_left_alone(controller):
     link = LinkEvents()
     async with running(settings_for(controller.host), link) as robot:
         await enable(robot)
@@ -70,7 +70,7 @@ async def test_program_started_after_a_lost_worker_is_left_alone(controller: Con
 
 
 @pytest.mark.parametrize("hangs", [0, 1])
-async def test_our_paused_program_is_stopped_by_the_next_worker(controller: ControllerProcess, hangs: int) -> None:
+async def test_our_paused_program_is_stopped_by_the_next_worker(controller, hangs):
     link = LinkEvents()
     async with running(settings_for(controller.host), link) as robot:
         await enable(robot)
@@ -83,7 +83,7 @@ async def test_our_paused_program_is_stopped_by_the_next_worker(controller: Cont
         assert robot.failed_program_stops == hangs
 
 
-async def test_hanging_dashboard_is_retried_and_reported(controller: ControllerProcess) -> None:
+async def test_hanging_dashboard_is_retried_and_reported(controller):
     async with running(settings_for(controller.host)) as robot:
         await enable(robot)
         await controller.fault("stop-hangs 1")

@@ -32,7 +32,7 @@ def text(length: int) -> bytes:
     return package(b"M", bytes(length))
 
 
-def test_sample_has_the_values_in_their_order() -> None:
+def test_sample_has_the_values_in_their_order():
     sample = SampleParser().feed(data(3))
     assert sample == ReceivedSample(
         timestamp_s=3.0,
@@ -49,7 +49,7 @@ def test_sample_has_the_values_in_their_order() -> None:
 
 
 @given(st.lists(st.one_of(st.none(), st.integers(0, 40)), max_size=8), st.lists(st.integers(1, 300), max_size=20))
-def test_newest_sample_is_found_however_the_stream_is_cut(kinds: list[int | None], cuts: list[int]) -> None:
+def test_newest_sample_is_found_however_the_stream_is_cut(kinds, cuts):
     """None is a sample, a number the length of a text message."""
     packages = [data(index) if kind is None else text(kind) for index, kind in enumerate(kinds)]
     ends = [sum(map(len, packages[: index + 1])) for index in range(len(packages))]
@@ -65,7 +65,7 @@ def test_newest_sample_is_found_however_the_stream_is_cut(kinds: list[int | None
 
 
 @pytest.mark.parametrize("bad", [package(b"U", bytes(8)), b"\x00\x02U", data(1)[:-1] + b"\x00" + data(2)])
-def test_invalid_package_is_refused(bad: bytes) -> None:
+def test_invalid_package_is_refused(bad):
     with pytest.raises(ProtocolError):
         SampleParser().feed(bad + bytes(300))
 
@@ -123,7 +123,7 @@ def arrived(receiver: RtdeReceiver, timestamp_s: float) -> bool:
     return receiver.latest().timestamp_s == timestamp_s
 
 
-def test_outputs_are_requested_at_the_rate_and_the_newest_kept(play: Callable[..., Controller]) -> None:
+def test_outputs_are_requested_at_the_rate_and_the_newest_kept(play):
     controller = play()
     receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
     assert controller.asked[b"O"].startswith(struct.pack(">d", 125.0) + b"timestamp,actual_q,")
@@ -140,7 +140,7 @@ def test_outputs_are_requested_at_the_rate_and_the_newest_kept(play: Callable[..
 
 
 @pytest.mark.parametrize("last", [b"", package(b"U", bytes(8))])
-def test_closed_or_invalid_stream_is_a_lost_connection(play: Callable[..., Controller], last: bytes) -> None:
+def test_closed_or_invalid_stream_is_a_lost_connection(play, last):
     controller = play()
     receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
     controller.send(data(2) + last)
@@ -153,7 +153,7 @@ def test_closed_or_invalid_stream_is_a_lost_connection(play: Callable[..., Contr
 
 
 @pytest.mark.parametrize("number", [errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ECONNRESET])
-def test_network_error_is_a_lost_connection(play: Callable[..., Controller], number: int) -> None:
+def test_network_error_is_a_lost_connection(play, number):
     play()
     receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
     receiver.close()
@@ -169,9 +169,7 @@ def test_network_error_is_a_lost_connection(play: Callable[..., Controller], num
     ("answers", "told"),
     [((TYPES.replace(b"UINT32", b"NOT_FOUND"),), "NOT_FOUND"), ((TYPES, b"\x00"), "does not send its state")],
 )
-def test_controller_without_the_needed_outputs_is_refused(
-    play: Callable[..., Controller], answers: tuple[bytes, ...], told: str
-) -> None:
+def test_controller_without_the_needed_outputs_is_refused(play, answers, told):
     play(*answers)
     with pytest.raises(ProbeError, match=told):
         RtdeReceiver("127.0.0.1", 125.0, 5.0)

@@ -22,27 +22,27 @@ def ages_s(waits_s: list[float], *, drift: float = 0.0) -> list[float]:
     return ages
 
 
-def test_late_stream_stays_late_until_it_catches_up() -> None:
+def test_late_stream_stays_late_until_it_catches_up():
     ages = ages_s([0.001] * 100 + [0.2] * 125 + [0.001])
     assert min(ages[100:225]) > 0.185
     assert ages[225] == pytest.approx(0.0, abs=1e-5)
 
 
-def test_unchanged_sample_grows_older() -> None:
+def test_unchanged_sample_grows_older():
     age = SampleAge()
     assert age.age_ns(5.0, STARTED_NS) == 0
     assert age.age_ns(5.0, STARTED_NS + 300_000_000) == 300_000_000
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_timestamp_that_is_not_finite_is_ignored(bad: float) -> None:
+def test_timestamp_that_is_not_finite_is_ignored(bad):
     age = SampleAge()
     age.age_ns(5.0, STARTED_NS)
     assert age.age_ns(bad, STARTED_NS + 300_000_000) == 300_000_000
     assert age.age_ns(5.3, STARTED_NS + 310_000_000) == pytest.approx(10_000_000, abs=1.01 * _OFFSET_RISE * 310_000_000)
 
 
-def test_restarted_controller_has_a_new_clock() -> None:
+def test_restarted_controller_has_a_new_clock():
     age = SampleAge()
     age.age_ns(5000.0, STARTED_NS)
     assert age.age_ns(0.5, STARTED_NS + 10**9) == 0
@@ -50,17 +50,17 @@ def test_restarted_controller_has_a_new_clock() -> None:
 
 
 @pytest.mark.parametrize("drift", [-1e-4, 1e-4, 5e-4, 5e-3])
-def test_clocks_that_drift_apart_do_not_make_samples_old(drift: float) -> None:
+def test_clocks_that_drift_apart_do_not_make_samples_old(drift):
     assert max(ages_s([0.001] * 50_000, drift=drift)) < 1e-4
 
 
-def test_samples_of_a_slow_clock_become_old() -> None:
+def test_samples_of_a_slow_clock_become_old():
     ages = ages_s([0.001] * 900, drift=0.05)
     old_s = next(number * PERIOD_NS / 1e9 for number, age_s in enumerate(ages) if age_s > 0.25)
     assert old_s == pytest.approx(6.25, abs=0.1), "as docs/safety.md says: it cannot be told from a network's delay"
 
 
-def test_controller_clock_pause_is_forgotten_in_time() -> None:
+def test_controller_clock_pause_is_forgotten_in_time():
     ages = ages_s([0.001] * 10 + [0.101] * round(1.01 * 0.1 / _OFFSET_RISE / 0.008))
     assert ages[10] > 0.09
     assert ages[-1] == 0.0
@@ -68,7 +68,7 @@ def test_controller_clock_pause_is_forgotten_in_time() -> None:
 
 @given(st.lists(st.floats(0.0, 0.5), min_size=1, max_size=60))
 @example([0.0, 0.234375, 0.4765625, 0.5])
-def test_age_is_the_wait_beyond_the_shortest_one(waits_s: list[float]) -> None:
+def test_age_is_the_wait_beyond_the_shortest_one(waits_s):
     # What was sent later comes later.
     for number in range(1, len(waits_s)):
         waits_s[number] = max(waits_s[number], waits_s[number - 1] - 0.008)

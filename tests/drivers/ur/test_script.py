@@ -7,7 +7,6 @@ import pytest
 
 from shearloop.drivers.ur.arm import arm_watchdog_in
 from tests.drivers.ur.robots import ROOT
-from tests.emulator_process import EmulatorProcess as ControllerProcess
 
 # Uploads the script, and is gone before the watchdog is armed by a command.
 DIES_TOO_SOON = """
@@ -22,7 +21,7 @@ os._exit(0)
 """
 
 
-def test_script_differs_by_one_line_before_its_loop() -> None:
+def test_script_differs_by_one_line_before_its_loop():
     script_client = pytest.importorskip("script_client", reason="ur-rtde has wheels for CPython up to 3.12 only")
     text = script_client.ScriptClient("", 5, 17).getScript()
     program = arm_watchdog_in(text, 10.0)
@@ -37,15 +36,13 @@ def test_script_differs_by_one_line_before_its_loop() -> None:
     assert program.endswith("\nend\n")
 
 
-def test_unknown_script_is_not_changed() -> None:
+def test_unknown_script_is_not_changed():
     assert not arm_watchdog_in("def other():\n  sync()\nend\n", 10.0)
     assert not arm_watchdog_in("        keep_running = True\n" * 2, 10.0)
 
 
 @pytest.mark.real_time
-async def test_program_of_a_worker_killed_before_arming_ends(
-    controller: ControllerProcess,
-) -> None:
+async def test_program_of_a_worker_killed_before_arming_ends(controller):
     """Nothing moves: the register was cleared before."""
     pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
     process = await asyncio.create_subprocess_exec(

@@ -31,13 +31,13 @@ class Samples:
         return seconds >= 0.008
 
 
-def test_no_wait_without_a_command(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_wait_without_a_command(monkeypatch):
     samples = Samples(monkeypatch, (DONE, STOPPED))
     assert ScriptReadiness(samples, 0.1).wait()
     assert samples.taken == 0
 
 
-def test_only_a_later_sample_shows_readiness(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_a_later_sample_shows_readiness(monkeypatch):
     samples = Samples(monkeypatch, (READY, PLAYING), (DONE, PLAYING), (DONE, PLAYING), (READY, PLAYING))
     ready = ScriptReadiness(samples, 0.1)
     ready.command_sent()
@@ -48,7 +48,7 @@ def test_only_a_later_sample_shows_readiness(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("runtime_state", [STOPPED, PAUSED])
-def test_ended_or_paused_program_is_not_awaited(monkeypatch: pytest.MonkeyPatch, runtime_state: int) -> None:
+def test_ended_or_paused_program_is_not_awaited(monkeypatch, runtime_state):
     """After a long pause of the computer the watchdog ends the program during a command."""
     samples = Samples(monkeypatch, (DONE, PLAYING), (DONE, PLAYING), (DONE, runtime_state))
     ready = ScriptReadiness(samples, 0.1)
@@ -58,7 +58,7 @@ def test_ended_or_paused_program_is_not_awaited(monkeypatch: pytest.MonkeyPatch,
     assert not ready.wait()
 
 
-def test_wait_for_readiness_has_a_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wait_for_readiness_has_a_timeout(monkeypatch):
     samples = Samples(monkeypatch, (DONE, PLAYING))
     ready = ScriptReadiness(samples, 0.1)
     ready.command_sent()
@@ -66,7 +66,7 @@ def test_wait_for_readiness_has_a_timeout(monkeypatch: pytest.MonkeyPatch) -> No
     assert samples.now_s == pytest.approx(5.1, abs=0.01)
 
 
-def test_lost_connection_never_means_ready(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lost_connection_never_means_ready(monkeypatch):
     samples = Samples(monkeypatch, (READY, PLAYING))
     ready = ScriptReadiness(samples, 0.1)
     ready.command_sent()

@@ -20,13 +20,13 @@ def changed(folder: Path, *changes: tuple[str, str]) -> Path:
     return path
 
 
-def test_delivered_settings_are_complete() -> None:
+def test_delivered_settings_are_complete():
     settings = read_settings(DELIVERED)
     assert settings.limits.torque_nm.inner < settings.limits.torque_nm.hard
     assert len(settings.limits.joints.lower_rad) == 6
 
 
-def test_all_mistakes_are_reported_together(tmp_path: Path) -> None:
+def test_all_mistakes_are_reported_together(tmp_path):
     path = changed(
         tmp_path,
         ("torque_nm: {inner: 4.0, hard: 6.0}", "torque_nm: {inner: 7.0, hard: 6.0}"),
@@ -67,11 +67,18 @@ def test_all_mistakes_are_reported_together(tmp_path: Path) -> None:
         ("host: 192.168.1.10", "? [1, 2]\n: 3", "column 3: found unhashable key"),
     ],
 )
-def test_mistake_is_reported(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_mistake_is_reported(tmp_path, old, new, said):
     with pytest.raises(DriverError, match=said):
         read_settings(changed(tmp_path, (old, new)))
 
 
-def test_missing_file_is_reported(tmp_path: Path) -> None:
+def test_missing_file_is_reported(tmp_path):
     with pytest.raises(DriverError, match="nowhere"):
         read_settings(tmp_path / "nowhere.yaml")
+
+
+def test_a_wrist_without_decisions_stands_within_0_2_s() -> None:
+    settings = read_settings(Path("config/ur.yaml"))
+    limits = settings.limits
+    braking_s = limits.wrist_speed_rad_per_s.inner / limits.wrist_acceleration_rad_per_s2.hard
+    assert settings.command_timeout_s + 2 / settings.rate_hz + braking_s <= 0.2

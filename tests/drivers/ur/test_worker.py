@@ -14,7 +14,7 @@ from tests.drivers.ur.process import CyclingArm, Daemon, fly
 ROOT = Path(__file__).parents[3]
 
 
-def test_unlocking_ended_by_a_disconnection_is_answered(daemon: Daemon) -> None:
+def test_unlocking_ended_by_a_disconnection_is_answered(daemon):
     arm = CyclingArm()
     arm.be(robot_mode=3)
     daemon.send(Unlock(), Disconnect())
@@ -25,7 +25,7 @@ def test_unlocking_ended_by_a_disconnection_is_answered(daemon: Daemon) -> None:
     assert replies[2].accepted
 
 
-def test_commands_after_a_disconnection_are_refused(daemon: Daemon) -> None:
+def test_commands_after_a_disconnection_are_refused(daemon):
     arm = CyclingArm()
     daemon.send(Disconnect(), Enable(), WristSpeed(0.5, 4.0), Unlock())
     fly(daemon, arm)
@@ -57,7 +57,7 @@ class Uploading(CyclingArm):
         return super().read()
 
 
-def test_program_started_by_a_late_upload_is_ended(daemon: Daemon) -> None:
+def test_program_started_by_a_late_upload_is_ended(daemon):
     """The state at the exit counts, not the one at the last cycle's start."""
     # The next cycle's reading still shows none; that by which the process leaves shows it.
     arm = Uploading(daemon, Disconnect(), reads=2)
@@ -66,7 +66,7 @@ def test_program_started_by_a_late_upload_is_ended(daemon: Daemon) -> None:
     assert not arm.reading.program_running
 
 
-def test_our_program_is_ended_on_exit(daemon: Daemon) -> None:
+def test_our_program_is_ended_on_exit(daemon):
     class Ready(CyclingArm):
         def arm_watchdog(self) -> bool:
             daemon.send(Disconnect())
@@ -83,7 +83,7 @@ def test_our_program_is_ended_on_exit(daemon: Daemon) -> None:
 
 
 @pytest.mark.parametrize("runtime_state", [2, 4], ids=["playing", "paused"])
-def test_foreign_program_is_left_alone_on_exit(daemon: Daemon, runtime_state: int) -> None:
+def test_foreign_program_is_left_alone_on_exit(daemon, runtime_state):
     """For example the program of another daemon."""
     arm = CyclingArm()
     arm.be(runtime_state=runtime_state)
@@ -93,7 +93,7 @@ def test_foreign_program_is_left_alone_on_exit(daemon: Daemon, runtime_state: in
     assert arm.reading.runtime_state == runtime_state
 
 
-def test_our_paused_program_is_stopped_on_exit(daemon: Daemon) -> None:
+def test_our_paused_program_is_stopped_on_exit(daemon):
     """If resumed later, it would turn the wrist on."""
 
     class Stopped(CyclingArm):
@@ -128,14 +128,14 @@ worker.main()
 """
 
 
-def test_exception_ends_the_process_and_is_printed() -> None:
+def test_exception_ends_the_process_and_is_printed():
     command = [sys.executable, "-c", CRASHING]
     ended = subprocess.run(command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, timeout=30, check=False)
     assert ended.returncode == worker.EXIT_FAILED
     assert b"ValueError: an unforeseen error" in ended.stderr
 
 
-def test_state_is_dropped_while_others_are_unsent(daemon: Daemon) -> None:
+def test_state_is_dropped_while_others_are_unsent(daemon):
     state = Flight().state
     while not daemon.pipe._unsent:
         daemon.pipe.send(state)
@@ -147,7 +147,7 @@ def test_state_is_dropped_while_others_are_unsent(daemon: Daemon) -> None:
     assert not daemon.pipe._unsent
 
 
-def test_each_command_is_answered_at_once(daemon: Daemon) -> None:
+def test_each_command_is_answered_at_once(daemon):
     flight = flying()
     for acceleration, accepted in ((4.0, True), (-4.0, False)):
         daemon.send(WristSpeed(0.1, acceleration))
@@ -155,7 +155,7 @@ def test_each_command_is_answered_at_once(daemon: Daemon) -> None:
         assert [message.accepted for _, message in daemon.receive() if isinstance(message, CommandReply)] == [accepted]
 
 
-def test_unsent_output_is_bounded(daemon: Daemon) -> None:
+def test_unsent_output_is_bounded(daemon):
     state = Flight().state
     for _ in range(10_000):
         daemon.pipe.send(state)

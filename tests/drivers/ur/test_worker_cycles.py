@@ -1,6 +1,5 @@
 """The worker's cycles in their own time."""
 
-from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
@@ -8,17 +7,17 @@ import pytest
 from shearloop.drivers.ur import worker
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.messages import CommandReply, Disconnect, Enable, RtdeSample, Unlock, WristSpeed
-from tests.drivers.ur.process import Timed, TimedArm
+from tests.drivers.ur.process import TimedArm
 
 
-def test_each_state_is_sent_and_the_robot_kept_awake_in_each_cycle(timed: Callable[..., Timed]) -> None:
+def test_each_state_is_sent_and_the_robot_kept_awake_in_each_cycle(timed):
     run = timed((0.405, Disconnect()))
     assert [state.cycle for state in run.states] == [0, 0, 1, 1, 2, 2, *range(3, 52)]
     assert run.arm.read_s[:51] == pytest.approx([0.008 * cycle for cycle in range(51)])
     assert run.arm.calls.count("send_heartbeat") == 49
 
 
-def test_late_cycle_starts_at_once_and_missed_ones_are_skipped(timed: Callable[..., Timed]) -> None:
+def test_late_cycle_starts_at_once_and_missed_ones_are_skipped(timed):
     class Slow(TimedArm):
         def read(self) -> RtdeSample:
             if len(self.read_s) == 10:
@@ -30,7 +29,7 @@ def test_late_cycle_starts_at_once_and_missed_ones_are_skipped(timed: Callable[.
     assert [state.cycle for state in run.states[12:16]] == [9, 10, 11, 12]
 
 
-def test_command_is_sent_on_arrival_and_in_each_cycle(timed: Callable[..., Timed]) -> None:
+def test_command_is_sent_on_arrival_and_in_each_cycle(timed):
     sent_s: list[float] = []
 
     class Turned(TimedArm):
@@ -44,7 +43,7 @@ def test_command_is_sent_on_arrival_and_in_each_cycle(timed: Callable[..., Timed
 
 
 @pytest.mark.parametrize("stopped_s", [0.2001, 0.2005, 0.2079])
-def test_protective_stop_seen_late_is_reported_as_such(timed: Callable[..., Timed], stopped_s: float) -> None:
+def test_protective_stop_seen_late_is_reported_as_such(timed, stopped_s):
     class Late(TimedArm):
         def wrist(self, command: WristSpeed) -> bool:
             self.accepts = worker.time.monotonic() < 1000.0 + stopped_s
@@ -62,7 +61,7 @@ def test_protective_stop_seen_late_is_reported_as_such(timed: Callable[..., Time
 
 
 @pytest.mark.parametrize("cycle", [31, 32, 34])
-def test_protective_stop_is_reported_in_its_cycle(timed: Callable[..., Timed], cycle: int) -> None:
+def test_protective_stop_is_reported_in_its_cycle(timed, cycle):
     class Stopping(TimedArm):
         def read(self) -> RtdeSample:
             if worker.time.monotonic() > 1000.0 + 0.008 * cycle - 1e-6 and self.reading.safety_mode == 1:
@@ -74,7 +73,7 @@ def test_protective_stop_is_reported_in_its_cycle(timed: Callable[..., Timed], c
     assert next(state.cycle for state in run.states if state.protective_stop) == cycle
 
 
-def test_end_of_a_recovery_is_reported_at_once(timed: Callable[..., Timed], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_end_of_a_recovery_is_reported_at_once(timed, monkeypatch):
     """The recovery is announced and given up in the same cycle."""
     arm = TimedArm()
     arm.be(robot_mode=3)

@@ -24,13 +24,10 @@ class ConfiguredExperiment:
         """Take the experiment's file; its end sets `stop`."""
         self.path = path
         self.done = False
-        self.begun = False
-        # Only the operator may start it.
-        self.left_to_operator = False
         self._rig = rig
         self._stop = stop
         self._awaited = self._called_off = False
-        self._has_begun = asyncio.Event()
+        self.has_begun = asyncio.Event()
         # Cleared while a running experiment has not reported its end.
         self._end_reported = asyncio.Event()
         self._end_reported.set()
@@ -42,7 +39,7 @@ class ConfiguredExperiment:
         If only the operator may start it, return at once, or at its end where the daemon ends with it.
         """
         await self._start_once()
-        if self.begun or self._stop is not None:
+        if self.has_begun.is_set() or self._stop is not None:
             await self.wait_for_end()
         if self._stop is not None:
             self._stop.set()
@@ -56,7 +53,7 @@ class ConfiguredExperiment:
             )
             self._called_off = True
         # After a crash of this task, an experiment that has begun or was called off is not started again.
-        self._awaited = not (self.begun or self._called_off)
+        self._awaited = not (self.has_begun.is_set() or self._called_off)
         while self._awaited:
             reason = await self._rig.start(self.path)
             if reason is None:
@@ -66,13 +63,12 @@ class ConfiguredExperiment:
                     log.info("waiting to start", reason=reason)
                     logged = reason
                 await asyncio.sleep(START_RETRY_S)
-        self.left_to_operator = not self.begun
-        if self.left_to_operator:
+        if not self.has_begun.is_set():
             log.info("it starts by `shearloop command start` only")
 
     async def wait_for_end(self) -> None:
         """Wait until it has begun, automatically or by hand, and has ended."""
-        await self._has_begun.wait()
+        await self.has_begun.wait()
         self._end_reported.clear()
         try:
             experiment = await self._rig.runner.experiment_ended()
@@ -95,8 +91,7 @@ class ConfiguredExperiment:
         self._crash_marker.set()
         self._awaited, self._called_off = False, True
         if path.resolve() == self.path.resolve():
-            self.begun = True
-            self._has_begun.set()
+            self.has_begun.set()
 
     def call_off(self) -> Path | None:
         """Cancel the automatic start; return the experiment, or None if it was not awaited."""

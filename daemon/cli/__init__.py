@@ -10,7 +10,7 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
-from typing import NamedTuple, NoReturn, Protocol
+from typing import NamedTuple, NoReturn
 
 from shearloop.daemon.process import raise_ending_signals, report_interrupt
 
@@ -69,29 +69,20 @@ class Parser(argparse.ArgumentParser):
         self.exit(EXIT_USAGE, f"{self.prog}: {message}; see `{self.prog} --help`\n")
 
 
-class CommandModule(Protocol):
-    """The interface of a command's module."""
-
-    def configure(self, parser: argparse.ArgumentParser) -> None:
-        """Add the command's arguments to its parser."""
-
-    def run(self, args: argparse.Namespace) -> int:
-        """Run the command and return the exit status."""
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; print a user's mistake as one sentence on stderr and return status 2."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     name = _overview().parse_args(arguments[:1]).command
     command = COMMANDS[name]
-    module: CommandModule = importlib.import_module(command.module)
+    module = importlib.import_module(command.module)
     parser = Parser(prog=f"shearloop {name}", description=command.summary)
     module.configure(parser)
     expand = getattr(module, "expand_default_command", list)
     args = parser.parse_args(expand(arguments[1:]))
     try:
         with raise_ending_signals():
-            return module.run(args)
+            status: int = module.run(args)
+            return status
     except _user_errors() as error:
         print(f"shearloop {name}: {error}", file=sys.stderr)
         return EXIT_USAGE

@@ -46,9 +46,8 @@ def run(args: argparse.Namespace) -> int:
     parts |= _rig(config)
     experiment = check_experiment(config, torque_sources(config, estimators, combined))
     if experiment is not None:
-        parts["experiment"] = (
-            f"{experiment.name!r}, {len(experiment.steps)} steps, driven by {experiment.torque_source}"
-        )
+        steps = f"{len(experiment.steps)} steps, driven by {experiment.torque_source}"
+        parts["experiment"] = f"{experiment.name!r}, {steps}"
     if args.json:
         print(json.dumps({"config": str(args.config), "parts": parts}, ensure_ascii=False))
         return 0

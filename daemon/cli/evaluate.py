@@ -5,28 +5,22 @@ import json
 import sys
 from pathlib import Path
 
-from shearloop.daemon.cli.options import add_cluster
+from shearloop.daemon.cli.options import add_cluster, add_json, add_option, writing
 
 _FIGURES = (".png", ".svg", ".pdf")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument("calibration", type=Path, metavar="CAL", help="made by `shearloop calibrate`")
-    parser.add_argument(
-        "recordings", nargs="+", type=Path, metavar="REC", help="recordings (.mcap) or folders of slices"
-    )
-    parser.add_argument("--bank", type=Path, metavar="FILE", help="the bank of the calibration, if any")
-    parser.add_argument(
-        "--time-range",
-        metavar="FROM:TO",
-        default="0:1",
-        help="share of each recording to use, e.g. 0.6:1 after calibrating on 0:0.6 (default: all)",
-    )
+    add_option(parser, "calibration", Path, "CAL", "made by `shearloop calibrate`")
+    add_option(parser, "recordings", Path, "REC", "recordings (.mcap) or folders of slices", nargs="+")
+    add_option(parser, "--bank", Path, "FILE", "the bank of the calibration, if any")
+    text = "share of each recording to use, e.g. 0.6:1 after calibrating on 0:0.6 (default: all)"
+    add_option(parser, "--time-range", str, "FROM:TO", text, default="0:1")
     add_cluster(parser)
-    parser.add_argument("--json", action="store_true", help="print the figures as JSON, and nothing else, on stdout")
+    add_json(parser)
     parser.add_argument("--plot", action="store_true", help="draw truth and estimate over time into --out")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="figure to draw (default with --plot: CAL.png)")
+    add_option(parser, "--out", Path, "FILE", "figure to draw (default with --plot: CAL.png)")
     parser.epilog = (
         "Prints for valid estimates with a known truth: correlation (r), root mean square error and bias in N·m, the "
         "share of truths within the 95 % intervals (coverage_95), and the median width of the intervals from end to "
@@ -68,12 +62,12 @@ def run(args: argparse.Namespace) -> int:
     if args.plot or args.out:
         out = args.out or args.calibration.with_suffix(".png")
         titles = [f"{path.name}, {' and '.join(part.sides)}" for (path, _), part in zip(named, parts, strict=True)]
+        title = f"{calibration.estimator.name}, fitted to {calibration.source}"
         try:
-            draw_tracks(tracks, titles, f"{calibration.estimator.name}, fitted to {calibration.source}", out)
+            with writing(out, "the figure"):
+                draw_tracks(tracks, titles, title, out)
         except ModuleNotFoundError as error:
             raise UserError(f"the figure needs {error.name}: `pip install 'shearloop[plot]'`") from error
-        except OSError as error:
-            raise UserError(f"{out}: the figure cannot be written: {error.strerror}; choose another --out") from error
         print(f"The figure is in {out}.", file=sys.stderr)
     if args.json:
         print(json.dumps(figures))

@@ -3,14 +3,9 @@
 import argparse
 import json
 import os
-from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_json, add_option
-
-if TYPE_CHECKING:
-    from shearloop.daemon.service import Step
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -27,24 +22,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Install the service, or remove all that `install` added, and print each step."""
+    """Print and run each step, or only print it with --dry-run."""
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.service import find_program, install_steps, uninstall_steps
 
     root = args.root.absolute()
     running = root == Path("/") and Path("/run/systemd/system").is_dir()
-    if not args.installs:
-        return _run_steps(uninstall_steps(root, running=running), root, args)
-    program = find_program() if args.program is None else args.program.absolute()
-    if not program.is_file():
-        raise UserError(f"--program {args.program} is not a file; give the path of the installed `shearloop`")
-    return _run_steps(install_steps(root, program, real_time=args.real_time, running=running), root, args)
-
-
-def _run_steps(steps: "Iterable[Step]", root: Path, args: argparse.Namespace) -> int:
-    """Print and run each step, or only print it with --dry-run."""
-    from shearloop.daemon.errors import UserError
-
+    steps = uninstall_steps(root, running=running)
+    if args.installs:
+        program = find_program() if args.program is None else args.program.absolute()
+        if not program.is_file():
+            raise UserError(f"--program {args.program} is not a file; give the path of the installed `shearloop`")
+        steps = install_steps(root, program, real_time=args.real_time, running=running)
     if not args.dry_run and root == Path("/") and os.geteuid() != 0:
         raise UserError("this changes the system: run it with sudo, or see what it would do with --dry-run")
     done = []

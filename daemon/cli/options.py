@@ -104,6 +104,13 @@ def checked_jobs(jobs: int | None) -> int:
     return count
 
 
+def check_calibration_file(out: Path) -> None:
+    """Raise UserError, before anything is measured, unless `out` can become a calibration file."""
+    if not out.parent.is_dir():
+        raise UserError(f"--out {out} cannot be written: the folder {out.parent} does not exist")
+    check_overwrite(out, "a calibration file")
+
+
 @contextmanager
 def writing(out: Path, what: str) -> Iterator[None]:
     """Raise UserError where writing `out` raises OSError."""

@@ -58,10 +58,16 @@ def local_stop_address(address: str) -> str:
 def stop_address(address: str) -> str:
     """Return where to send `stop` without a key: the local stop socket if it exists, else the address itself."""
     local = local_stop_address(address)
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.setblocking(False)
-        error = probe.connect_ex("\0" + local.removeprefix("ipc://@"))
-    return local if error in (0, errno.EAGAIN) else address
+    return local if probe("\0" + local.removeprefix("ipc://@")) == 0 else address
+
+
+def probe(path: str) -> int:
+    """Return the error number of a connection to a Unix socket, 0 where a program listens."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+        # A listener whose queue is full must not block.
+        client.setblocking(False)
+        error = client.connect_ex(path)
+    return 0 if error == errno.EAGAIN else error
 
 
 def network_refusal(address: str, key: str) -> str:

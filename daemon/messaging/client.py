@@ -8,12 +8,11 @@ import zmq
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import LARGEST_PORT, has_valid_port, needs_keys
 from shearloop.daemon.messaging.keys import ClientKeys
-from shearloop.daemon.messaging.messages import decode, encode
+from shearloop.daemon.messaging.messages import ENVELOPE, decode, encode
 
 # A running daemon sends `health` every second.
 QUIET_S = 3.0
 LONGEST_TIMEOUT_S = 86_400
-_ENVELOPE = frozenset({"timestamp", "t_mono_ns", "seq", "source"})
 
 
 def receive_messages(
@@ -46,7 +45,7 @@ def receive_messages(
             try:
                 name, payload = parts
                 content = decode(payload)
-                if missing := _ENVELOPE - content.keys():
+                if missing := ENVELOPE - content.keys():
                     raise ValueError(f"it lacks {', '.join(sorted(missing))}")
             except ValueError as error:
                 raise UserError(

@@ -18,6 +18,8 @@ Scalar: TypeAlias = float | int | str | bool | None
 
 # A message older than this many periods of its topic is stale.
 STALE_AFTER_PERIODS = 2.5
+# Keys of every map.
+ENVELOPE = frozenset({"timestamp", "t_mono_ns", "seq", "source"})
 _FLOAT32 = np.dtype("<f4")
 
 

@@ -2,7 +2,6 @@
 
 import errno
 import os
-import socket as sockets
 import stat
 from collections import Counter
 from collections.abc import Callable
@@ -12,7 +11,7 @@ import zmq
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.addresses import LARGEST_PORT, has_valid_port, is_local, network_refusal
+from shearloop.daemon.messaging.addresses import LARGEST_PORT, has_valid_port, is_local, network_refusal, probe
 from shearloop.daemon.messaging.keys import KeyPair
 from shearloop.daemon.messaging.messages import TOPICS, Message, encode, wire_map
 
@@ -129,11 +128,7 @@ def _check_ipc_path(address: str, key: str) -> None:
         return
     if not stat.S_ISSOCK(mode):
         raise UserError(f"`{key}: {address}` cannot be bound: {path} exists and is no socket; choose another address")
-    with sockets.socket(sockets.AF_UNIX, sockets.SOCK_STREAM) as probe:
-        # A listener whose queue is full must not block.
-        probe.setblocking(False)
-        error = probe.connect_ex(path)
-    if error in (0, errno.EAGAIN):
+    if (error := probe(path)) == 0:
         raise _in_use(address, key)
     # A killed daemon leaves the socket behind.
     if error != errno.ECONNREFUSED:

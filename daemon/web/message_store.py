@@ -12,7 +12,7 @@ import numpy as np
 from shearloop.bank.eit.matching import best_match
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import MatchingError
-from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitHeatmap
+from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS, EitEstimate, EitHeatmap
 
 # Pairs of topic and source. A rig has nine topics and two fingertips.
 MAX_STREAMS = 64
@@ -29,7 +29,6 @@ CHARTED: Mapping[str, tuple[str, ...]] = {
 }
 # Points of a conductivity profile: finer than a pixel of the drawing.
 HEIGHTS = 145
-_ENVELOPE = frozenset({"timestamp", "t_mono_ns", "seq", "source"})
 
 
 class StoredMessage(NamedTuple):
@@ -57,7 +56,7 @@ class MessageStore:
         source = content.get("source")
         if topic not in TOPICS:
             self.refused["unknown topic"] += 1
-        elif not isinstance(source, str) or not content.keys() >= _ENVELOPE:
+        elif not isinstance(source, str) or not content.keys() >= ENVELOPE:
             self.refused["incomplete message"] += 1
         elif (topic, source) not in self._stored and len(self._stored) >= MAX_STREAMS:
             self.refused["too many sources"] += 1

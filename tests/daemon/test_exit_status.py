@@ -97,7 +97,7 @@ async def test_a_manually_started_experiment_is_followed_to_its_end(crashed, tmp
     experiment = ConfiguredExperiment(path, SimpleNamespace(start=not_yet, runner=RUNNER))
     async with deadline("the experiment was not seen to its end"), asyncio.TaskGroup() as group:
         await experiment.run()
-        assert experiment.left_to_operator
+        assert not experiment.has_begun.is_set()
         running = group.create_task(experiment.wait_for_end())
         experiment.on_begun(tmp_path / "another.yaml")
         await asyncio.sleep(0)
@@ -125,8 +125,7 @@ async def test_a_cancelled_experiment_stays_cancelled_after_a_crash_of_its_task(
     else:
         experiment.on_begun(tmp_path / "another.yaml")
     await experiment.run()
-    assert experiment.left_to_operator
-    assert not experiment.begun
+    assert not experiment.has_begun.is_set()
 
 
 def test_no_crash_marker_without_a_service_manager(monkeypatch):

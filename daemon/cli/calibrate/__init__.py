@@ -8,7 +8,10 @@ import argparse
 import importlib
 from collections.abc import Sequence
 
-_PACKAGE = "shearloop.daemon.cli.calibrate"
+from shearloop.daemon.cli.options import add_action, run_action
+
+run = run_action
+
 THINGS = {
     "recording": "an estimator, on recordings or folders of slices",
     "creep": "the gel's creep under a held twist, on recordings",
@@ -35,12 +38,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.description = "Measure a known quantity and write a calibration file."
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
-    things = parser.add_subparsers(
-        dest="thing", metavar="THING", required=True, help="`shearloop calibrate THING --help` explains one"
-    )
+    explained = "`shearloop calibrate THING --help` explains one"
+    things = parser.add_subparsers(dest="thing", metavar="THING", required=True, help=explained)
     for name, summary in THINGS.items():
-        part = things.add_parser(name, help=summary, description=f"Calibrate {summary}.")
-        importlib.import_module(f"{_PACKAGE}.{name}").configure(part)
+        module = importlib.import_module(f"{__name__}.{name}")
+        module.configure(add_action(things, name, f"calibrate {summary}", module.run))
 
 
 def expand_default_command(arguments: Sequence[str]) -> list[str]:
@@ -48,9 +50,3 @@ def expand_default_command(arguments: Sequence[str]) -> list[str]:
     if not arguments or arguments[0] in (*THINGS, "-h", "--help"):
         return list(arguments)
     return ["recording", *arguments]
-
-
-def run(args: argparse.Namespace) -> int:
-    """Calibrate the thing."""
-    status: int = importlib.import_module(f"{_PACKAGE}.{args.thing}").run(args)
-    return status

@@ -3,19 +3,15 @@
 import argparse
 from pathlib import Path
 
-from shearloop.daemon.cli.options import add_json
+from shearloop.daemon.cli.options import add_json, add_option
 from shearloop.daemon.cli.terminal import print_result
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument(
-        "recordings", nargs="+", type=Path, metavar="REC", help="recordings (.mcap) of held twists, best ten"
-    )
-    parser.add_argument(
-        "--calibration", type=Path, required=True, metavar="CAL", help="calibration of the estimator for the loop"
-    )
-    parser.add_argument("--bank", type=Path, metavar="FILE", help="the bank of the calibration, if any")
+    add_option(parser, "recordings", Path, "REC", "recordings (.mcap) of held twists, best ten", nargs="+")
+    add_option(parser, "--calibration", Path, "CAL", "calibration of the estimator for the loop", required=True)
+    add_option(parser, "--bank", Path, "FILE", "the bank of the calibration, if any")
     add_json(parser)
     parser.epilog = "Prints the line `creep:` for the fingertip, or for `combined`, in the configuration."
 
@@ -57,5 +53,4 @@ def run(args: argparse.Namespace) -> int:
         "The line above does not correct scale and zero. If the scale is far from 1, calibrate the estimator again; if "
         "the shift is far from 0, tare untouched.",
     ]
-    print_result(result, sentences, as_json=args.json)
-    return 0
+    return print_result(result, sentences, as_json=args.json)

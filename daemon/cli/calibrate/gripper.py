@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.options import add_json
+from shearloop.daemon.cli.options import add_json, add_option, check_calibration_file
 from shearloop.daemon.cli.terminal import Operator, print_result
 
 if TYPE_CHECKING:
@@ -24,25 +24,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
     way.add_argument("--host", metavar="ADDRESS", help="the robot's controller, for the URCap's socket")
     way.add_argument("--serial-number", metavar="NUMBER", help="the USB adapter's serial number, for Modbus RTU")
     way.add_argument("--port", metavar="PATH", help="the USB adapter's port, for Modbus RTU")
-    parser.add_argument(
-        "--socket-port", type=int, default=63352, metavar="PORT", help="the URCap's (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--diameter-mm",
-        type=float,
-        action="append",
-        required=True,
-        metavar="MM",
-        help="an object's diameter; give it once per object, of at least two",
-    )
-    parser.add_argument("--force-n", type=float, default=10.0, metavar="N", help="to grip with (default: %(default)s)")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the calibration file to write")
+    add_option(parser, "--socket-port", int, "PORT", "the URCap's (default: %(default)s)", default=63352)
+    text = "an object's diameter; give it once per object, of at least two"
+    add_option(parser, "--diameter-mm", float, "MM", text, action="append", required=True)
+    add_option(parser, "--force-n", float, "N", "to grip with (default: %(default)s)", default=10.0)
+    add_option(parser, "--out", Path, "FILE", "the calibration file to write", required=True)
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Grip each object and write the calibration."""
-    from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
     from shearloop.drivers.calibration_files import save_calibration
     from shearloop.drivers.robotiq.gripper import STROKE_MM, RobotiqGripper, WidthCalibration
@@ -52,9 +43,7 @@ def run(args: argparse.Namespace) -> int:
 
     if any(not 0 < diameter < STROKE_MM for diameter in args.diameter_mm) or len(set(args.diameter_mm)) < 2:
         raise UserError(f"give at least two different --diameter-mm between 0 and {STROKE_MM:g}")
-    if not args.out.parent.is_dir():
-        raise UserError(f"--out {args.out} cannot be written: the folder {args.out.parent} does not exist")
-    check_overwrite(args.out, "a calibration file")
+    check_calibration_file(args.out)
     client: GripperClient
     if args.host is not None:
         client = SocketClient(args.host, args.socket_port)
@@ -76,8 +65,7 @@ def run(args: argparse.Namespace) -> int:
         f"One count is {-calibration.mm_per_count:.3f} mm; a diameter is good to {calibration.width_std_mm:.2f} mm.",
         f"Written to {args.out}.",
     ]
-    print_result(report, sentences, as_json=args.json)
-    return 0
+    return print_result(report, sentences, as_json=args.json)
 
 
 async def _grip(
@@ -86,9 +74,8 @@ async def _grip(
     async with operator:
         try:
             await gripper.connect()
-            await operator.ask(
-                "The fingers will open and close. Keep clear, take out what they hold, then press Enter."
-            )
+            warning = "The fingers will open and close. Keep clear, take out what they hold, then press Enter."
+            await operator.ask(warning)
             await gripper.activate(operator_confirmed=True)
             gauges: list[tuple[float, float]] = []
             while len(gauges) < len(diameters_mm):

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.options import add_json
+from shearloop.daemon.cli.options import add_json, add_option, check_calibration_file
 from shearloop.daemon.cli.terminal import Operator, print_result
 
 if TYPE_CHECKING:
@@ -25,31 +25,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
     port = parser.add_mutually_exclusive_group(required=True)
     port.add_argument("--serial-number", metavar="NUMBER", help="the board's USB serial number")
     port.add_argument("--port", metavar="PATH", help="the board's serial port")
-    parser.add_argument(
-        "--mass-g",
-        type=float,
-        action="append",
-        required=True,
-        metavar="G",
-        help="a known mass to put on the cell; give it once per mass: several show whether they agree",
-    )
-    parser.add_argument(
-        "--lever-arm-mm",
-        type=float,
-        default=35.0,
-        metavar="MM",
-        help="from the shaft to the cell (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--reverse", action="store_true", help="the turn that presses on the cell counts as negative torque"
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the calibration file to write")
+    text = "a known mass to put on the cell; give it once per mass: several show whether they agree"
+    add_option(parser, "--mass-g", float, "G", text, action="append", required=True)
+    add_option(parser, "--lever-arm-mm", float, "MM", "from the shaft to the cell (default: %(default)s)", default=35.0)
+    text = "the turn that presses on the cell counts as negative torque"
+    parser.add_argument("--reverse", action="store_true", help=text)
+    add_option(parser, "--out", Path, "FILE", "the calibration file to write", required=True)
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure each load and write the calibration."""
-    from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
     from shearloop.drivers.calibration_files import save_calibration
     from shearloop.drivers.connection import SerialPort, find_port
@@ -58,9 +44,7 @@ def run(args: argparse.Namespace) -> int:
 
     if not 0 < args.lever_arm_mm < 1000:
         raise UserError(f"--lever-arm-mm {args.lever_arm_mm:g} is no lever arm; give millimetres above 0")
-    if not args.out.parent.is_dir():
-        raise UserError(f"--out {args.out} cannot be written: the folder {args.out.parent} does not exist")
-    check_overwrite(args.out, "a calibration file")
+    check_calibration_file(args.out)
     calibrator = LoadCalibrator(args.mass_g, args.lever_arm_mm * 1e-3, -1 if args.reverse else 1)
     with SerialPort(find_port(serial_number=args.serial_number, path=args.port), BAUD_RATE) as port:
         asyncio.run(_measure(port, calibrator, Operator(stdout_is_for_json=args.json)))
@@ -73,8 +57,7 @@ def run(args: argparse.Namespace) -> int:
         "residual_nm": result.residual_nm,
         "remarks": list(result.sentences),
     }
-    print_result(report, [*result.sentences, f"Written to {args.out}."], as_json=args.json)
-    return 0
+    return print_result(report, [*result.sentences, f"Written to {args.out}."], as_json=args.json)
 
 
 async def _measure(port: "SerialPort", calibrator: "LoadCalibrator", operator: Operator) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.bank.estimators import DEFAULT, ESTIMATORS
-from shearloop.daemon.cli.options import add_json, check_overwrite
+from shearloop.daemon.cli.options import add_json, add_option, check_overwrite
 from shearloop.daemon.cli.terminal import print_result
 
 if TYPE_CHECKING:
@@ -19,36 +19,20 @@ _LARGEST_DELAY_S = 600.0
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument(
-        "recordings", nargs="+", type=Path, metavar="REC", help="recordings (.mcap) or folders of slices, oldest first"
-    )
-    parser.add_argument(
-        "--estimator", choices=ESTIMATORS, default=DEFAULT, help="estimator to calibrate (default: %(default)s)"
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="CAL", help="calibration to write")
-    parser.add_argument("--bank", type=Path, metavar="FILE", help="a bank, which the estimators paper and bank need")
-    parser.add_argument("--mesh", type=Path, metavar="FILE", help="a mesh, which the estimator reconstruction needs")
+    add_option(parser, "recordings", Path, "REC", "recordings (.mcap) or folders of slices, oldest first", nargs="+")
+    text = "estimator to calibrate (default: %(default)s)"
+    parser.add_argument("--estimator", choices=ESTIMATORS, default=DEFAULT, help=text)
+    add_option(parser, "--out", Path, "CAL", "calibration to write", required=True)
+    add_option(parser, "--bank", Path, "FILE", "a bank, which the estimators paper and bank need")
+    add_option(parser, "--mesh", Path, "FILE", "a mesh, which the estimator reconstruction needs")
     parser.add_argument("--sides", metavar="SIDE[,SIDE]", help="sides to use, e.g. right (default: all)")
-    parser.add_argument(
-        "--time-range", metavar="FROM:TO", default="0:1", help="share of each recording to use, e.g. 0:0.5"
-    )
-    parser.add_argument(
-        "--load-cell-delay-s",
-        type=float,
-        metavar="S",
-        help="delay of the load cell's timestamps, which is subtracted; 0 accepts them unchecked",
-    )
-    parser.add_argument(
-        "--assume-full-range",
-        action="store_true",
-        help="no torque will exceed the slices: intervals do not extend beyond them",
-    )
-    parser.add_argument(
-        "--tool-mm",
-        type=float,
-        metavar="MM",
-        help="diameter of the tool in recordings that do not name it; on another tool there is no torque",
-    )
+    add_option(parser, "--time-range", str, "FROM:TO", "share of each recording to use, e.g. 0:0.5", default="0:1")
+    text = "delay of the load cell's timestamps, which is subtracted; 0 accepts them unchecked"
+    add_option(parser, "--load-cell-delay-s", float, "S", text)
+    text = "no torque will exceed the slices: intervals do not extend beyond them"
+    parser.add_argument("--assume-full-range", action="store_true", help=text)
+    text = "diameter of the tool in recordings that do not name it; on another tool there is no torque"
+    add_option(parser, "--tool-mm", float, "MM", text)
     add_json(parser)
     parser.epilog = (
         "A recording has to hold some seconds idle, the grip, several twists (best ten) with the load cell recorded, "
@@ -91,8 +75,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError("--assume-full-range is about torques, and these slices have diameters only; leave it out")
     result.calibration.save(args.out)
     sentences = [*sentences_of(result), f"Written to {args.out}."]
-    print_result({"path": str(args.out), **result.figures()}, sentences, as_json=args.json)
-    return 0
+    return print_result({"path": str(args.out), **result.figures()}, sentences, as_json=args.json)
 
 
 def _check_options(args: argparse.Namespace) -> None:

@@ -52,17 +52,6 @@ class Commanded(Protocol):
         """Execute a command; ValueError, with a sentence, for an unknown one."""
 
 
-@dataclass(frozen=True, slots=True)
-class Pace:
-    """Speeds relative to real time: of gel, fingers and boards, and of the arm.
-
-    The answers of controller and gripper, their samples and the watchdog stay in real time, as their clients are.
-    """
-
-    devices: float = 1.0
-    arm: float = 1.0
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigSettings:
     """The rig's devices and addresses."""
@@ -72,7 +61,10 @@ class RigSettings:
     gripper: Literal["socket", "modbus"] = "socket"
     twin: TwinSettings = field(default_factory=TwinSettings)
     diameter_mm: float | None = 20.0
-    pace: Pace = Pace()
+    # Relative to real time: of gel, fingers and boards, and of the arm. The answers of controller and gripper, their
+    # samples and the watchdog stay in real time, as their clients are.
+    speed: float = 1.0
+    arm_speed: float = 1.0
     rate_hz: float = 500.0
     make: ControllerSpec = field(default_factory=ControllerSpec)
     sketch: Sketch = field(default_factory=lambda: Sketch(noise_counts=NOISE_NM * Sketch().counts_per_nm))
@@ -102,10 +94,10 @@ class EmulatedRig:
     """
 
     def __init__(self, settings: RigSettings, synthesiser: FrameSynthesiser, skin: RigSkin | None = None) -> None:
-        run_dir, speed, seed = settings.run_dir, settings.pace.devices, settings.seed
+        run_dir, speed, seed = settings.run_dir, settings.speed, settings.seed
         gripper = Gripper()
         self.scene = Scene(gripper, settings.twin, speed)
-        robot = Robot(settings.make, RigPlant(self.scene, skin), settings.pace.arm)
+        robot = Robot(settings.make, RigPlant(self.scene, skin), settings.arm_speed)
         self.controller = Controller(robot, host=settings.host, rate_hz=settings.rate_hz)
         player = GripperPlayer(
             gripper,

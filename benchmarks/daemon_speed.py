@@ -5,6 +5,7 @@
 Each figure is measured on a daemon in its own process, through a pseudo-terminal and a subscriber's socket. Latency
 counts from before the last byte is written until the subscriber has the estimate. `--rig` is the folder of
 `shearloop.daemon.cli.calibrate_demo`, with the default estimator's recording and calibrations, and the rig's bank.
+Needs the extra `bench`.
 """
 
 import argparse
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import zmq
 
 from benchmarks import common
@@ -42,24 +44,10 @@ def receive(subscriber: "zmq.Socket[bytes]") -> tuple[int, dict[str, Any]]:
     return time.monotonic_ns(), decode(payload)
 
 
-def process_tree(pid: int) -> list[int]:
-    """Return a process and its descendants."""
-    found = [pid]
-    for each in found:
-        for task in Path(f"/proc/{each}/task").glob("*/children"):
-            found += [int(child) for child in task.read_text().split()]
-    return found
-
-
-def cpu_s(pid: int) -> float:
+def cpu_s(process: psutil.Process) -> float:
     """Return the processor time of a process."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def resident_mb(pid: int) -> float:
-    """Return the resident memory of a process."""
-    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+    times = process.cpu_times()
+    return float(times.user + times.system)
 
 
 def recorded_lines(rig: Path, side: str, n: int) -> list[bytes]:
@@ -149,7 +137,8 @@ def flood(args: argparse.Namespace, n_frames: int) -> dict[str, Any]:
     """Return the losses and the load at five hundred frames a second."""
     lines = recorded_lines(args.rig, "right", n_frames)
     with played(by_bank(args, "zero_lag"), 1 / FLOOD_HZ) as (boards, pid, _, estimates):
-        before, begun = cpu_s(pid), time.monotonic()
+        process = psutil.Process(pid)
+        before, begun = cpu_s(process), time.monotonic()
 
         def play() -> None:
             for number, line in enumerate(lines):
@@ -161,7 +150,7 @@ def flood(args: argparse.Namespace, n_frames: int) -> dict[str, Any]:
         frames = [receive(estimates)[1]["frame"] for _ in lines]
         took_s = time.monotonic() - begun
         player.join()
-        busy = (cpu_s(pid) - before) / took_s
+        busy = (cpu_s(process) - before) / took_s
     return {
         "estimates_hz": n_frames / took_s,
         "lost": n_frames - len(set(frames)),
@@ -186,17 +175,18 @@ def rated(bank: Path, rig_bank: Path, seconds: float) -> dict[str, float]:
         daemon, ready_s = opened.enter_context(common.running_daemon(config))
         health = opened.enter_context(common.subscription(folder, "health"))
         _listen(health, SETTLING_S)
-        before, begun = {each: cpu_s(each) for each in process_tree(daemon.pid)}, time.monotonic()
+        own = psutil.Process(daemon.pid)
+        before, begun = {each: cpu_s(each) for each in (own, *own.children(recursive=True))}, time.monotonic()
         _listen(health, seconds)
         took_s = time.monotonic() - begun
         shares = {each: (cpu_s(each) - cpu) / took_s for each, cpu in before.items()}
-        memory = {each: resident_mb(each) for each in before}
+        memory = {each: each.memory_info().rss / 2**20 for each in before}
     return {
         "ready_s": ready_s,
-        "core_share_of_daemon": shares[daemon.pid],
-        "core_share_of_robot_worker": sum(shares.values()) - shares[daemon.pid],
-        "memory_mb_of_daemon": memory[daemon.pid],
-        "memory_mb_of_robot_worker": sum(memory.values()) - memory[daemon.pid],
+        "core_share_of_daemon": shares[own],
+        "core_share_of_robot_worker": sum(shares.values()) - shares[own],
+        "memory_mb_of_daemon": memory[own],
+        "memory_mb_of_robot_worker": sum(memory.values()) - memory[own],
     }
 
 

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from benchmarks.common import parser_of, table_head, table_row, write_figures
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.mesh import load_mesh
@@ -36,12 +38,7 @@ _WARM_UP = 0.015
 STREAMS = {"3 December": "2024-12-03_16-09", "2 December": "20241202_153632"}
 FINGERTIPS: tuple[tuple[str, ...], ...] = (("right",), ("left",), ("right", "left"))
 # Sets of cylinders to calibrate on, and the tools to judge.
-CYLINDERS_MM = (
-    (10.0, 25.0, 40.0),
-    (10.0, 20.0, 30.0, 40.0),
-    (10.0, 17.5, 25.0, 32.5, 40.0),
-    (10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0),
-)
+CYLINDERS_MM = [tuple(np.linspace(10.0, 40.0, n).tolist()) for n in (3, 4, 5, 7)]
 TOOLS_MM = (12.0, 18.0, 22.0, 28.0, 38.0)
 
 

@@ -12,12 +12,10 @@ from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.messaging import addresses
 
 # Names of other tasks, sources and recordings; a fingertip needs a different one.
-TAKEN_NAMES = frozenset(
-    (
-        *("load_cell", "wrench", "skin", "combined", "robot", "gripper", "loop", "experiment", "recording", "slices"),
-        *("commands", "open_stop", "keys", "health", "log", "shown", "daemon", "clock"),
-    )
-)
+TAKEN_NAMES = {
+    *("load_cell", "wrench", "skin", "combined", "robot", "gripper", "loop", "experiment", "recording", "slices"),
+    *("commands", "open_stop", "keys", "health", "log", "shown", "daemon", "clock"),
+}
 
 
 def _known_transport(address: str) -> str:
@@ -31,6 +29,8 @@ def _known_transport(address: str) -> str:
 
 
 Address = Annotated[str, AfterValidator(_known_transport)]
+Channel = Annotated[int, Field(ge=1)]
+FingertipName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
 
 
 class CurveConfig(ConfigModel):
@@ -60,22 +60,16 @@ class FingertipConfig(ConfigModel):
     """One EIT fingertip: its board, its bank and its calibration."""
 
     device: SerialDevice
-    bank: Path | None = Field(
-        None, description="made by `shearloop bank build`; for k, sigma, heatmaps and the paper's estimator"
-    )
+    bank: Path | None = Field(None, description="of `shearloop bank build`; for k, sigma, heatmaps, estimator `paper`")
     calibration: Path | None = Field(None, description="without one, k and sigma are published, but no torque")
     estimator: EstimatorName | None = Field(None, description="default: the calibration's")
     matching: Literal["all_lags", "zero_lag"] = "all_lags"
     baseline_frames: int = Field(10, ge=2, le=1000, description="frames averaged into the homogeneous frame")
     average_frames: int = Field(1, ge=1, le=100, description="latest frames averaged before matching")
-    creep: CreepConfig | None = Field(
-        None, description="of the gel, if the calibration gives its shear; subtracted from the loop's torque"
-    )
+    creep: CreepConfig | None = Field(None, description="of the gel; subtracted from the loop's torque")
     # shearloop.drivers.eit_kit.FRAME_PERIOD_S, which comes with NumPy: a configuration is read without.
     frame_period_s: float = Field(0.5408, gt=0, le=60, description="the board's frame period before it is measured")
-    heatmap: Literal["on_request", "always"] = Field(
-        "on_request", description="whether eit.heatmap is computed only for subscribers"
-    )
+    heatmap: Literal["on_request", "always"] = Field("on_request", description="when to compute eit.heatmap")
 
 
 class CombinedConfig(ConfigModel):
@@ -90,9 +84,7 @@ class LoadCellConfig(ConfigModel):
     """The load cell on the lever."""
 
     device: SerialDevice
-    calibration: Path | None = Field(
-        None, description="made by `shearloop calibrate load`; without one the board's lines are torques in N·m"
-    )
+    calibration: Path | None = Field(None, description="default: the board sends torques in N·m")
     rate_hz: float = Field(10.9, gt=0, le=1000, description="lines per second")
 
 
@@ -119,9 +111,7 @@ class ScannerConfig(ConfigModel):
     """A scanning multimeter on a socket."""
 
     socket: InstrumentSocket
-    channels: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = Field(
-        (101, 102), description="the channels of gauge 1 and gauge 2"
-    )
+    channels: tuple[Channel, Channel] = Field((101, 102), description="of gauge 1 and 2")
     range_v: float = Field(1.0, gt=0, le=300)
 
     @model_validator(mode="after")
@@ -156,7 +146,7 @@ class SkinConfig(ConfigModel):
     calibration: Path = Field(description="made by `shearloop skin calibrate`")
     normal_n: float = Field(1.0, ge=0, le=100, description="normal force on the skin, for its friction")
     tool_radius_mm: float | None = Field(
-        None, gt=0, le=200, description="from the wrist's axis to the skin; converts shear force into torque"
+        None, gt=0, le=200, description="from the wrist's axis to the skin, for torque"
     )
     zero_samples: int = Field(20, ge=10, le=1000, description="readings averaged into the zero")
     drift_per_hour: float = Field(2.9e-4, ge=0, le=1, description="95 % bound on the response's drift; the paper's")
@@ -174,9 +164,7 @@ class GripperConfig(ConfigModel):
 
     socket: GripperSocket | None = None
     modbus: SerialDevice | None = None
-    calibration: Path | None = Field(
-        None, description="made by `shearloop calibrate gripper`; default: the maker's data"
-    )
+    calibration: Path | None = Field(None, description="default: the maker's data")
 
     _one_way_in = either("socket", "modbus")
 
@@ -192,9 +180,7 @@ class EventConfig(ConfigModel):
 
     step: int = Field(ge=1, description="number of the experiment's step, from 1")
     held_for_s: float = Field(0.0, ge=0, description="delay after the step begins to hold its torque or angle")
-    command: str = Field(
-        min_length=1, pattern=r"^[^\n]*$", description="one of the emulator's commands, see its --help"
-    )
+    command: str = Field(min_length=1, pattern=r"^[^\n]*$", description="see the emulator's --help")
 
 
 class EmulatorConfig(ConfigModel):
@@ -212,12 +198,8 @@ class DaemonConfig(ConfigModel):
     publish: Address = addresses.PUBLISH_ADDRESS
     commands: Address = addresses.COMMAND_ADDRESS
     curve: CurveConfig | None = Field(None, description="keys for addresses that are open to the network")
-    fingertips: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], FingertipConfig] = Field(
-        default_factory=dict
-    )
-    combined: CombinedConfig | None = Field(
-        None, description="one estimate from both fingertips, published as `combined`"
-    )
+    fingertips: dict[FingertipName, FingertipConfig] = Field(default_factory=dict)
+    combined: CombinedConfig | None = Field(None, description="one estimate of both fingertips")
     skin: SkinConfig | None = None
     load_cell: LoadCellConfig | None = None
     robot: Path | None = Field(None, description="the robot's settings, a file such as config/ur.yaml")

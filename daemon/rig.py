@@ -87,13 +87,11 @@ def make_loop(config: DaemonConfig, sources: Mapping[str, TorqueSource]) -> Cont
     robot = robot_settings(config.robot)
     sources = {**sources, WRENCH: wrench_source(robot.rate_hz)}
     # Controller, identification and commands plan with what the robot's process lets through.
-    top, most = robot.limits.wrist_speed_rad_per_s.inner, robot.limits.wrist_acceleration_rad_per_s2.inner
-    loop = config.loop.model_copy(
-        update={
-            "wrist_speed_rad_per_s": min(config.loop.wrist_speed_rad_per_s, top),
-            "wrist_acceleration_rad_per_s2": min(config.loop.wrist_acceleration_rad_per_s2, most),
-        }
-    )
+    limited = {
+        name: min(getattr(config.loop, name), getattr(robot.limits, name).inner)
+        for name in ("wrist_speed_rad_per_s", "wrist_acceleration_rad_per_s2")
+    }
+    loop = config.loop.model_copy(update=limited)
     required = ("robot", "gripper") if config.gripper is not None else ("robot",)
     gels = {
         name: Creep(fingertip.creep.share, fingertip.creep.time_s)
@@ -110,13 +108,9 @@ def make_gripper(
     if config.gripper is None:
         return None
     client, calibration = make_gripper_client(config.gripper), gripper_calibration(config.gripper)
-    return GripperTask(
-        RobotiqGripper(client, calibration, monitor=LinkMonitor(DeviceLink("gripper", loop))),
-        publisher,
-        loop,
-        diameters=diameters,
-        measures_diameters=config.gripper.calibration is not None,
-    )
+    hand = RobotiqGripper(client, calibration, monitor=LinkMonitor(DeviceLink("gripper", loop)))
+    measures = config.gripper.calibration is not None
+    return GripperTask(hand, publisher, loop, diameters=diameters, measures_diameters=measures)
 
 
 class Rig:

@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from shearloop.bank.eit.channels import ZERO_SLOTS
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.config import DaemonConfig, SerialDevice
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.messaging.publisher import Publisher
@@ -102,27 +103,13 @@ class SensorBuilder:
 
     def _eit_kit(self, name: str) -> EitKit:
         own = self.config.fingertips[name]
-        return EitKit(
-            path=own.device.path,
-            serial_number=own.device.serial_number,
-            zero_slots=ZERO_SLOTS,
-            frame_period_s=own.frame_period_s,
-            monitor=LinkMonitor(DeviceLink(name, self.loop)),
-            inputs=self._inputs(name),
-        )
+        return EitKit(zero_slots=ZERO_SLOTS, frame_period_s=own.frame_period_s, **self._link(name, own.device))
 
     def _load_cell(self) -> LoadCellTask | None:
         own = self.config.load_cell
         if own is None:
             return None
-        board = LoadCell(
-            load_cell_calibration(own),
-            serial_number=own.device.serial_number,
-            path=own.device.path,
-            rate_hz=own.rate_hz,
-            monitor=LinkMonitor(DeviceLink(LOAD_CELL, self.loop)),
-            inputs=self._inputs(LOAD_CELL),
-        )
+        board = LoadCell(load_cell_calibration(own), rate_hz=own.rate_hz, **self._link(LOAD_CELL, own.device))
         return LoadCellTask(board, self.publisher, self.clock, self.loop, own.rate_hz)
 
     def _skin(self) -> SkinTask | None:
@@ -130,6 +117,11 @@ class SensorBuilder:
             return None
         inputs = {name: self._inputs(name) for name in RecordedSkin.sources}
         return SkinTask(self.config.skin, self.publisher, self.clock, self.loop, inputs)
+
+    def _link(self, name: str, device: SerialDevice) -> dict[str, Any]:
+        """Return the name of a board's port, its monitor and its recorder."""
+        monitor = LinkMonitor(DeviceLink(name, self.loop))
+        return {**device.model_dump(), "monitor": monitor, "inputs": self._inputs(name)}
 
     def _inputs(self, source: str) -> InputRecorder | None:
         return self.recorder.input_recorder(source) if self.recorder is not None else None

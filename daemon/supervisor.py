@@ -134,16 +134,15 @@ class HealthReporter:
                 notify(f"STATUS=dead, restarting: {', '.join(dead)}")
             else:
                 notify("WATCHDOG=1", f"STATUS={len(self._supervisor.records)} tasks are alive")
-            self._publisher.publish(
-                Health(
-                    source="daemon",
-                    t_mono_ns=self._clock.now_ns(),
-                    tasks=self.tasks(),
-                    loop_lag_s=lag_s,
-                    memory_mb=resident_memory_mb(),
-                    cpu_percent=100.0 * used_s / passed_s,
-                )
+            health = Health(
+                source="daemon",
+                t_mono_ns=self._clock.now_ns(),
+                tasks=self.tasks(),
+                loop_lag_s=lag_s,
+                memory_mb=resident_memory_mb(),
+                cpu_percent=100.0 * used_s / passed_s,
             )
+            self._publisher.publish(health)
 
 
 def resident_memory_mb() -> float:

@@ -180,8 +180,8 @@ class LoadCalibrator:
         if abs(residuals[worst]) > MAX_RESIDUAL_FRACTION * float(np.ptp(means)):
             raise DeviceCalibrationError(
                 f"The masses do not lie on a straight line: with {self.levels[worst].mass_g:g} g the reading is off by "
-                f"{abs(residuals[worst]) / abs(counts_per_n) / STANDARD_GRAVITY * 1e3:.1f} g. Check the masses that were "
-                "given and that each pressed on the cell alone, at the lever arm's place."
+                f"{abs(residuals[worst]) / abs(counts_per_n) / STANDARD_GRAVITY * 1e3:.1f} g. Check the masses that "
+                "were given and that each pressed on the cell alone, at the lever arm's place."
             )
         residual_nm = float(abs(residuals[worst] * calibration.nm_per_count))
         noise_nm = max(level.std for level in self.levels) * abs(calibration.nm_per_count)

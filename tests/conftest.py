@@ -35,7 +35,7 @@ hypothesis.settings.load_profile("shearloop")
 # Files of more than some five seconds, the longest first (`make test PYTEST_ARGS=--durations=60` shows them).
 LONGEST = (
     *("test_shared_recordings.py", "test_run.py", "test_page_controls.py", "test_page.py", "test_pruned_matching.py"),
-    *("test_skin_run.py", "test_under_systemd.py", "test_charts.py", "test_calibrate.py", "test_filling.py"),
+    *("test_skin_run.py", "test_under_systemd.py", "test_calibrate.py", "test_filling.py"),
     *("test_workers_commands.py", "test_stability_map.py", "test_batch_forward.py", "test_load_delay.py"),
     *("test_emulate.py", "test_cli_reproduce.py", "test_runner_any_order.py", "test_client_process.py"),
     *("test_workers.py", "test_with_keys.py", "test_replay_combined.py", "test_cli_recordings.py", "test_mixtures.py"),
@@ -66,7 +66,7 @@ def fonts() -> None:
 
 
 @pytest.fixture(scope="session")
-def tiny_bank(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tiny_bank(tmp_path_factory) -> Path:
     """A bank of 8 × 8 random signals: scored in a millisecond."""
     import numpy as np
 
@@ -87,7 +87,7 @@ def tiny_bank(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def few_mixtures(monkeypatch: pytest.MonkeyPatch) -> None:
+def few_mixtures(monkeypatch) -> None:
     """Have slices mixed with two foreign frames in place of fifteen: most of a fit, where no interval is judged."""
     from shearloop.bank.estimation import fitting
 
@@ -137,7 +137,7 @@ def _open_files() -> dict[str, str]:
 
 
 @pytest.fixture(autouse=True)
-def nothing_left_over(request: pytest.FixtureRequest) -> Iterator[None]:
+def nothing_left_over(request) -> Iterator[None]:
     """Fail a test that leaves threads or file handles; session fixtures requested here are made beforehand."""
     for name in request.fixturenames:
         if name != "nothing_left_over" and _is_shared(request, name):

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 from typing import NamedTuple, NoReturn
 
+from shearloop.daemon.errors import UserError
 from shearloop.daemon.process import raise_ending_signals, report_interrupt
 
 # Our products are small: a BLAS with one thread is faster. Must be set before numpy is imported.
@@ -96,7 +97,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _user_errors() -> tuple[type[Exception], ...]:
     from shearloop.bank.errors import BankError
-    from shearloop.daemon.errors import UserError
     from shearloop.drivers.errors import DriverError
 
     return (BankError, DriverError, UserError)

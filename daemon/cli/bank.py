@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +24,7 @@ from shearloop.daemon.process import report_interrupt
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from shearloop.bank.eit.bank_file import BankDefinition
+    from shearloop.bank.eit.bank_file import Bank, BankDefinition
     from shearloop.bank.eit.build import BankRow
     from shearloop.bank.eit.mesh import Mesh
     from shearloop.daemon.bank_config import BankPlan
@@ -75,7 +76,7 @@ def _build(args: argparse.Namespace) -> int:
 
 
 def _build_all(args: argparse.Namespace) -> int:
-    from shearloop.bank.eit.bank_file import BANK_MAGIC
+    from shearloop.bank.eit.bank_file import BANK_MAGIC, Bank
     from shearloop.bank.eit.build import build_bank, solve_row
     from shearloop.bank.errors import EmptyBankError
     from shearloop.daemon.bank_config import load_bank_plans
@@ -116,7 +117,7 @@ def _build_all(args: argparse.Namespace) -> int:
                 if path == paths[-1] and not built:
                     raise
                 print(f"{error}. It is left out", file=sys.stderr)
-    results = [_result(path) for path in built]
+    results = [_result(path, Bank.open(path)) for path in built]
     if args.json:
         print(json.dumps(results[0] if args.out == paths[0] else {"banks": results}))
     else:
@@ -150,10 +151,7 @@ def _is_built(path: Path, plan: "BankPlan") -> bool:
         return False
 
 
-def _result(path: Path) -> dict[str, Any]:
-    from shearloop.bank.eit.bank_file import Bank
-
-    bank = Bank.open(path)
+def _result(path: Path, bank: "Bank") -> dict[str, Any]:
     return {
         "path": str(path),
         "identity": bank.identity,
@@ -184,8 +182,6 @@ def _design(args: argparse.Namespace) -> int:
 
 
 def _info(args: argparse.Namespace) -> int:
-    from dataclasses import asdict
-
     import numpy as np
 
     from shearloop.bank.eit.bank_file import FORMAT_VERSION, Bank
@@ -196,21 +192,15 @@ def _info(args: argparse.Namespace) -> int:
     model = MODELS[bank.model]
     grids = ("k", bank.k_grid, model.k_unit), ("sigma", bank.sigma_grid, model.sigma_unit)
     facts: dict[str, object] = {
-        "path": str(args.path),
+        **_result(args.path, bank),
         "format_version": FORMAT_VERSION,
-        "identity": bank.identity,
-        "model": bank.model,
         "variation": asdict(bank.definition.variation),
         "geometry_hash": bank.geometry_hash,
         "channel_table_hash": CHANNEL_TABLE_HASH,
         "signals_sha256": bank.signals_sha256,
-        "shape": list(bank.signals.shape),
         **{name: {"low": grid[0], "high": grid[-1], "count": len(grid), "unit": unit} for name, grid, unit in grids},
-        "cells": bank.valid.size,
-        "valid_cells": int(bank.valid.sum()),
         "not_positive_cells": int((bank.min_conductivity <= 0).sum()),
         "homogeneous_norm": float(np.linalg.norm(bank.homogeneous)),
-        "bytes": args.path.stat().st_size,
     }
     lines = [f"{name.replace('_', ' '):<20}{_text(value)}" for name, value in facts.items()]
     return print_result(facts, [*lines, "all checksums agree"], as_json=args.json)

@@ -62,15 +62,8 @@ class RecordedTwists:
         """Return the series that a reader makes of the recording."""
         t_s = np.array(self.frame_s)
         channels = np.array([[channels_of_line(line) for line in pair] for pair in self.lines])
-        return FrameSeries(
-            "raw",
-            tuple(SIDES),
-            t_s,
-            channels,
-            np.array(self.torque_s),
-            np.array(self.torque_nm),
-            np.full(len(t_s), diameter_mm),
-        )
+        torque = np.array(self.torque_s), np.array(self.torque_nm)
+        return FrameSeries("raw", tuple(SIDES), t_s, channels, *torque, np.full(len(t_s), diameter_mm))
 
     def write(self, path: Path, diameter_mm: float) -> None:
         """Write a recording that begins at the Unix time 0."""

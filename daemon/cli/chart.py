@@ -35,6 +35,7 @@ def run(args: argparse.Namespace) -> int:
         import matplotlib as _  # noqa: F401 - its absence is reported before anything is measured
     except ModuleNotFoundError as error:
         raise UserError("charts need matplotlib: `pip install 'shearloop[plot]'`") from error
+    from shearloop.daemon.analysis.charts import scene, speed_accuracy, stability
     from shearloop.daemon.analysis.charts.drawing import check_takes_pictures
     from shearloop.daemon.analysis.charts.sources import bank_of, mesh_of, splits
     from shearloop.daemon.workers import open_executor
@@ -42,25 +43,17 @@ def run(args: argparse.Namespace) -> int:
     check_takes_pictures(args.out)
     scratch = args.out / "banks"
     parts = splits(args.recordings, args.split, scratch)
-    if args.name == "scene":
-        from shearloop.daemon.analysis.charts import scene
-
-        with open_executor(args.cluster, args.jobs) as executor:
+    with open_executor(args.cluster, args.jobs) as executor:
+        if args.name == "scene":
             paths = scene.chart(parts, args.out, executor)
-    else:
-        mesh = mesh_of(args.mesh)
-        bank = bank_of(args.bank, mesh, scratch)
-        if args.name == "speed-accuracy":
-            from shearloop.daemon.analysis.charts import speed_accuracy
-
-            paths = speed_accuracy.chart(parts, bank, mesh, mesh if args.mesh else None, args.out, args.rounds)
         else:
-            from shearloop.daemon.analysis.charts import stability
-
-            with open_executor(args.cluster, args.jobs) as executor:
+            mesh = mesh_of(args.mesh)
+            bank = bank_of(args.bank, mesh, scratch)
+            if args.name == "stability":
                 paths = stability.chart(parts, bank, mesh, scratch, args.out, executor)
-    for path in paths:
-        print(path)
+            else:
+                paths = speed_accuracy.chart(parts, bank, mesh, mesh if args.mesh else None, args.out, args.rounds)
+    print(*paths, sep="\n")
     return 0
 
 

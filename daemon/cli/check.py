@@ -1,6 +1,8 @@
 """`shearloop check`: check a configuration and the files it names."""
 
 import argparse
+import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,7 +22,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Load everything that `run` loads, without opening a device."""
-    import json
 
     from shearloop.daemon.cli.emulated_devices import check_emulators
     from shearloop.daemon.config import load_daemon_config
@@ -68,14 +69,13 @@ def _rig(config: "DaemonConfig") -> dict[str, str]:
     from shearloop.daemon.rig import gripper_calibration, load_cell_calibration, robot_settings
 
     parts = {}
-    if config.load_cell is not None:
-        path = config.load_cell.calibration
-        load_cell_calibration(config.load_cell)
-        parts["load_cell"] = "torques in N·m from the board" if path is None else f"calibration {path}"
-    if config.gripper is not None:
-        path = config.gripper.calibration
-        gripper_calibration(config.gripper)
-        parts["gripper"] = "widths by the manufacturer's figures" if path is None else f"calibration {path}"
+    if (cell := config.load_cell) is not None:
+        load_cell_calibration(cell)
+        parts["load_cell"] = f"calibration {cell.calibration}" if cell.calibration else "torques in N·m from the board"
+    if (hand := config.gripper) is not None:
+        gripper_calibration(hand)
+        own = f"calibration {hand.calibration}" if hand.calibration else "widths by the manufacturer's figures"
+        parts["gripper"] = own
     if config.robot is not None:
         parts["robot"] = f"{robot_settings(config.robot).host}, limits of {config.robot}"
     return parts
@@ -89,8 +89,6 @@ def _clients(curve: "CurveConfig") -> str:
 
 
 def _skin(config: "SkinConfig") -> str:
-    import math
-
     from shearloop.bank.skin.calibration import load_calibration
     from shearloop.daemon.sensing.skin_estimator import MAX_CHANGE
     from shearloop.daemon.sensing.skin_task import check_circuit

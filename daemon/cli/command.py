@@ -1,6 +1,8 @@
 """`shearloop command`: send a command to a running daemon."""
 
 import argparse
+import json
+import sys
 from pathlib import Path
 
 from shearloop.daemon.cli.options import add_connection, add_option, client_keys
@@ -48,8 +50,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Send one command and print its reply; status 1 if the daemon refused it."""
-    import json
-    import sys
 
     from shearloop.daemon.messaging.client import check_timeout_s, send_command
 

@@ -1,9 +1,14 @@
 """`shearloop doctor`: check computer, files and devices, and name the next step for each fault."""
 
 import argparse
+import json
+import logging
+import math
+from dataclasses import asdict
 from pathlib import Path
 
 from shearloop.daemon.cli.options import add_option
+from shearloop.daemon.errors import UserError
 
 MARKS = {"good": "ok   ", "note": "note ", "trouble": "WRONG"}
 
@@ -20,13 +25,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print all findings; return 1 if something is wrong."""
-    import json
-    import logging
-    import math
-    from dataclasses import asdict
 
     from shearloop.daemon.doctor import examine
-    from shearloop.daemon.errors import UserError
     from shearloop.daemon.logs import logging_to_stderr
 
     if not (math.isfinite(args.seconds) and 0 < args.seconds <= 600):

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 import structlog
 
+from shearloop.daemon.errors import UserError
+
 if TYPE_CHECKING:
     from shearloop.daemon.config import EmulatorConfig, EventConfig
     from shearloop.daemon.run_summary import TorqueSeries
@@ -25,7 +27,6 @@ STOP_S = 0.5
 def check_emulators(emulators: "tuple[EmulatorConfig, ...]", config: Path) -> list[argparse.Namespace]:
     """Return the parsed arguments of each emulator; raise UserError for an unknown device or invalid arguments."""
     from shearloop.daemon.cli.emulate import DEVICES, checked_arguments
-    from shearloop.daemon.errors import UserError
 
     options = []
     for number, emulator in enumerate(emulators):

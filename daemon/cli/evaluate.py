@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 from shearloop.daemon.cli.options import add_cluster, add_json, add_option, writing
+from shearloop.daemon.errors import UserError
 
 _FIGURES = (".png", ".svg", ".pdf")
 
@@ -37,7 +38,6 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.analysis.evaluate import draw_tracks, estimate_in_worker, figures_of, invalid_reasons
     from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, part_of, read_series
     from shearloop.daemon.cli.options import check_kind, parse_time_range
-    from shearloop.daemon.errors import UserError
     from shearloop.daemon.workers import in_order, open_executor
 
     if args.out is not None and args.out.suffix not in _FIGURES:

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from shearloop.daemon.cli.options import add_json, add_option
+from shearloop.daemon.errors import UserError
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -23,7 +24,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print and run each step, or only print it with --dry-run."""
-    from shearloop.daemon.errors import UserError
     from shearloop.daemon.service import find_program, install_steps, uninstall_steps
 
     root = args.root.absolute()

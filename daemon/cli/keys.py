@@ -1,11 +1,13 @@
 """`shearloop keys`: make and manage the CURVE keys of daemon and clients for network addresses."""
 
 import argparse
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 from shearloop.daemon.cli.options import add_action, add_json, add_option, run_action, user_key_folder
 from shearloop.daemon.cli.terminal import print_result
+from shearloop.daemon.errors import UserError
 
 run = run_action
 
@@ -67,7 +69,6 @@ def _client(args: argparse.Namespace) -> int:
 
 
 def _allow(args: argparse.Namespace) -> int:
-    from shearloop.daemon.errors import UserError
     from shearloop.daemon.messaging.keys import allowed_clients, load_public_key, write_error, write_public_key
 
     public = load_public_key(args.key)
@@ -88,7 +89,6 @@ def _allow(args: argparse.Namespace) -> int:
 
 
 def _revoke(args: argparse.Namespace) -> int:
-    from shearloop.daemon.errors import UserError
     from shearloop.daemon.messaging.keys import allowed_clients, write_error
 
     clients = args.dir / "clients"
@@ -116,9 +116,5 @@ def _list(args: argparse.Namespace) -> int:
 
 
 def _check_name(name: str) -> None:
-    import re
-
-    from shearloop.daemon.errors import UserError
-
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", name):
         raise UserError(f"{name!r} is not a client's name; use letters, digits, `-`, `_` and `.`")

@@ -4,6 +4,7 @@ import argparse
 import sys
 
 from shearloop.daemon.cli.options import add_connection, add_option, client_keys
+from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.process import interrupt_status
 
@@ -31,7 +32,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print messages until Ctrl-C, or up to `--count`."""
     from shearloop.daemon.cli.terminal import message_json, message_line
-    from shearloop.daemon.errors import UserError
     from shearloop.daemon.messaging.client import QUIET_S, check_timeout_s, receive_messages
     from shearloop.daemon.messaging.messages import TOPICS
 
@@ -45,12 +45,9 @@ def run(args: argparse.Namespace) -> int:
     write = message_json if args.json else message_line
 
     def print_hint() -> None:
-        print(
-            f"shearloop listen: no message came from {args.connect} in {QUIET_S:g} s; waiting. Is a daemon running "
-            f"there (`shearloop run CONFIG`), and does it publish {' or '.join(args.topics) or 'anything'}?",
-            file=sys.stderr,
-            flush=True,
-        )
+        nothing = f"shearloop listen: no message came from {args.connect} in {QUIET_S:g} s; waiting"
+        asked = f"there (`shearloop run CONFIG`), and does it publish {' or '.join(args.topics) or 'anything'}?"
+        print(f"{nothing}. Is a daemon running {asked}", file=sys.stderr, flush=True)
 
     try:
         received = receive_messages(args.connect, args.topics, args.timeout, client_keys(args), print_hint)

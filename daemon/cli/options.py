@@ -20,12 +20,7 @@ _HEAD_BYTES = 512
 
 
 def add_option(
-    parser: argparse._ActionsContainer,
-    name: str,
-    kind: type,
-    metavar: str | tuple[str, str] | None,
-    text: str,
-    **more: Any,
+    parser: argparse._ActionsContainer, name: str, kind: type, metavar: str | tuple[str, str], text: str, **more: Any
 ) -> None:
     """Add an option with a value, or a positional argument, to a parser or a group."""
     parser.add_argument(name, type=kind, metavar=metavar, help=text, **more)
@@ -53,14 +48,8 @@ def add_json(parser: argparse._ActionsContainer) -> None:
 
 def add_cluster(parser: argparse.ArgumentParser) -> None:
     """Add `--cluster`, which runs heavy work on other processes or computers."""
-    parser.add_argument(
-        "--cluster",
-        nargs="?",
-        const="local",
-        metavar="ADDRESS",
-        help="run on the Dask scheduler at this address, such as tcp://host:8786; without an address: on processes of "
-        "this computer",
-    )
+    text = "run on the Dask scheduler at this address, such as tcp://host:8786; without one on processes here"
+    parser.add_argument("--cluster", nargs="?", const="local", metavar="ADDRESS", help=text)
 
 
 def add_connection(parser: argparse.ArgumentParser, default: str, purpose: str) -> None:

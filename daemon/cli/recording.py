@@ -3,11 +3,13 @@
 import argparse
 import json
 from dataclasses import asdict
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_action, add_json, add_option, check_overwrite, run_action
 from shearloop.daemon.cli.terminal import print_result, progress_bar
+from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.daemon.recording.reader import RecordingSummary
@@ -53,8 +55,6 @@ def _info(args: argparse.Namespace) -> int:
 
 
 def _summary_text(found: "RecordingSummary") -> str:
-    from datetime import datetime
-
     from shearloop.daemon.recording.schema import software_version
 
     lines = [found.path]
@@ -96,7 +96,6 @@ def _repair(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace) -> int:
-    from shearloop.daemon.errors import UserError
     from shearloop.daemon.recording.export import count_messages, export
 
     stem = args.recording.name.partition(".mcap")[0]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_json, add_option
 from shearloop.daemon.cli.terminal import print_result
+from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 
 if TYPE_CHECKING:
@@ -53,8 +54,6 @@ def run(args: argparse.Namespace) -> int:
 
 def parse_speed(text: str) -> float:
     """Return a speed; raises UserError unless it is a number above 0 or max."""
-    from shearloop.daemon.errors import UserError
-
     if text == "max":
         return math.inf
     try:

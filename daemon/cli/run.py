@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_option
+from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig
@@ -85,10 +86,9 @@ def _run(
         listeners.append(emulated)
         if config.emulators:
             # The daemon does not know about emulation and will report missing devices.
-            structlog.get_logger().info(
-                "emulated devices are starting; the daemon misses them for a second",
-                devices=[emulator.device for emulator in config.emulators],
-            )
+            names = [emulator.device for emulator in config.emulators]
+            sentence = "emulated devices are starting; the daemon misses them for a second"
+            structlog.get_logger().info(sentence, devices=names)
         if args.show:
             listeners += [EstimatePrinter(out), RunSummary(out, emulated)]
         finished = asyncio.run(run_daemon(config, tuple(listeners), reporters, on_ready))
@@ -101,7 +101,6 @@ def _config(args: argparse.Namespace) -> "DaemonConfig":
     """Return the configuration with the arguments' changes, after checking its emulators."""
     from shearloop.daemon.cli.emulated_devices import check_emulators
     from shearloop.daemon.config import RecordingConfig, load_daemon_config
-    from shearloop.daemon.errors import UserError
 
     config = load_daemon_config(args.config)
     options = check_emulators(config.emulators, args.config)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_action, add_json, add_option, check_overwrite, run_action
 from shearloop.daemon.cli.terminal import print_result
+from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.bank.skin.characterisation import FigureOfMerit
@@ -68,7 +69,6 @@ def _table(rows: "tuple[FigureOfMerit, ...]") -> str:
 def _calibrate(args: argparse.Namespace) -> int:
     from shearloop.bank.errors import CalibrationError
     from shearloop.bank.skin.calibration import fit_calibration, read_table, save_calibration
-    from shearloop.daemon.errors import UserError
 
     if args.friction is not None and not 0 <= args.friction <= 1:
         raise UserError(f"--friction is {args.friction}; a coefficient of friction lies between 0 and 1.")
@@ -80,16 +80,12 @@ def _calibrate(args: argparse.Namespace) -> int:
         raise UserError(f"{args.table}: {error}") from error
     save_calibration(calibration, args.out)
     source = "fitted" if args.friction is None else "given"
+    named = ("friction", "slope_per_n", "prediction_half_width_n", "linear_to_n", "rows", "rows_beyond")
     result = {
         "path": str(args.out),
-        "friction": calibration.friction,
         "friction_given": args.friction is not None,
-        "slope_per_n": calibration.slope_per_n,
-        "prediction_half_width_n": calibration.prediction_half_width_n,
-        "linear_to_n": calibration.linear_to_n,
         "tension_n": [calibration.tension_n[0], calibration.tension_n[-1]],
-        "rows": calibration.rows,
-        "rows_beyond": calibration.rows_beyond,
+        **{name: getattr(calibration, name) for name in named},
     }
     sentences = [
         f"friction coefficient ({source})        {calibration.friction:.4f}",

@@ -10,12 +10,13 @@ from contextlib import contextmanager
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, Self, TextIO
 
+from shearloop.daemon.errors import UserError
+
 if TYPE_CHECKING:
     from shearloop.daemon.logs import NonBlockingWriter
 
 STDIN = 0
 READ_BYTES = 4096
-_ENVELOPE = ("timestamp", "t_mono_ns", "seq", "source", "topic")
 
 
 def print_result(result: Mapping[str, object], sentences: Iterable[str], *, as_json: bool) -> int:
@@ -82,7 +83,6 @@ class Operator:
 
     async def ask(self, prompt: str) -> str:
         """Print the prompt and return the next line; raise UserError at the end of the input."""
-        from shearloop.daemon.errors import UserError
 
         self.say(prompt)
         line = await self._lines.get()
@@ -156,13 +156,12 @@ def _health(_: str, content: Mapping[str, Any]) -> str:
 
 
 def _columns(topic: str, content: Mapping[str, Any]) -> str:
-    from shearloop.daemon.messaging.messages import TOPICS
+    from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS
 
     fields = dataclasses.fields(TOPICS[topic]) if topic in TOPICS else ()
     units = {item.name: f" {item.metadata['unit']}" for item in fields if item.metadata.get("unit")}
-    return "  ".join(
-        f"{key} {_value(value)}{units.get(key, '')}" for key, value in content.items() if key not in _ENVELOPE
-    )
+    own = {key: value for key, value in content.items() if key not in (*ENVELOPE, "topic")}
+    return "  ".join(f"{key} {_value(value)}{units.get(key, '')}" for key, value in own.items())
 
 
 def _value(value: object) -> str:

@@ -1,9 +1,14 @@
 """`shearloop view`: show a running daemon as a page in the browser."""
 
 import argparse
+import asyncio
+import json
+from importlib import resources
+from importlib.util import find_spec
 from pathlib import Path
 
 from shearloop.daemon.cli.options import add_connection, add_option, client_keys
+from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS
 
 PORT = 7760
@@ -26,13 +31,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until SIGINT, SIGTERM or SIGHUP."""
-    import asyncio
-    import json
-    from importlib import resources
-    from importlib.util import find_spec
-
-    from shearloop.daemon.errors import UserError
-
     if find_spec("aiohttp") is None:
         raise UserError("the live view needs aiohttp; install it with `pip install 'shearloop[view]'`")
     if not 0 <= args.port <= 65535:

@@ -141,12 +141,7 @@ async def _check_fingertip(name: str, config: FingertipConfig, seconds: float) -
     port = check_port(name, config.device)
     if port.state == "trouble":
         return [port]
-    board = EitKit(
-        zero_slots=ZERO_SLOTS,
-        serial_number=config.device.serial_number,
-        path=config.device.path,
-        frame_period_s=config.frame_period_s,
-    )
+    board = EitKit(zero_slots=ZERO_SLOTS, frame_period_s=config.frame_period_s, **config.device.model_dump())
     frames = await _received(board.readings(), seconds)
     facts = board.diagnostics()
     if not frames and facts["last_loss"]:
@@ -170,12 +165,7 @@ async def _check_load_cell(config: LoadCellConfig, seconds: float) -> list[Findi
     port = check_port("load_cell", config.device)
     if port.state == "trouble":
         return [port]
-    cell = LoadCell(
-        LoadCalibration.of_torque_lines(),
-        serial_number=config.device.serial_number,
-        path=config.device.path,
-        rate_hz=config.rate_hz,
-    )
+    cell = LoadCell(LoadCalibration.of_torque_lines(), rate_hz=config.rate_hz, **config.device.model_dump())
     samples = await _received(cell.readings(), seconds)
     measured_hz = _rate_hz([sample.t_arrival_ns for sample in samples])
     findings = [port, check_rate("rate of load_cell", measured_hz, config.rate_hz)]

@@ -263,16 +263,13 @@ class _Page:
     def __init__(self, bridge: Bridge, token: str, fingertip: dict[str, Any], publish: str) -> None:
         self._bridge = bridge
         self._token = token
+        regular = [topic for topic, kind in messages.TOPICS.items() if kind.rate_hz is not None]
         self._settings = {
             "fingertip": fingertip,
             "publish": publish,
             "dead_after_s": DEAD_AFTER_S,
             "stale_after_periods": messages.STALE_AFTER_PERIODS,
-            "stale_after_s": {
-                topic: max(messages.stale_after_s(topic), MIN_STALE_S)
-                for topic, kind in messages.TOPICS.items()
-                if kind.rate_hz is not None
-            },
+            "stale_after_s": {topic: max(messages.stale_after_s(topic), MIN_STALE_S) for topic in regular},
         }
         self._open: set[web.WebSocketResponse] = set()
         # Only these files are ever sent: no name from a request becomes a path.

@@ -1,7 +1,5 @@
 """A small fingertip that every test here can solve on in milliseconds, and the reference solutions."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -40,21 +38,21 @@ def fingertip() -> Mesh:
 
 
 @pytest.fixture(scope="session")
-def forward(fingertip: Mesh) -> ForwardModel:
+def forward(fingertip) -> ForwardModel:
     return ForwardModel(fingertip)
 
 
 @pytest.fixture(scope="session")
-def paper_mesh(shared: Path) -> Mesh:
+def paper_mesh(shared) -> Mesh:
     return load_mesh(shared / "reference" / "fingertip_mesh.npz")
 
 
 @pytest.fixture(scope="session")
-def paper_forward(paper_mesh: Mesh) -> ForwardModel:
+def paper_forward(paper_mesh) -> ForwardModel:
     return ForwardModel(paper_mesh)
 
 
 @pytest.fixture(scope="session")
-def eidors(shared: Path) -> dict[str, NDArray[np.float64]]:
+def eidors(shared) -> dict[str, NDArray[np.float64]]:
     with np.load(shared / "reference" / "eidors_forward.npz") as archive:
         return dict(archive)

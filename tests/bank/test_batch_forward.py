@@ -7,14 +7,14 @@ from hypothesis import strategies as st
 
 from shearloop.bank.eit.elimination import LANES, Elimination
 from shearloop.bank.eit.forward import MAX_LEAK, BatchForwardModel, rounding_leaks
-from shearloop.bank.eit.mesh import Mesh, Terms
+from shearloop.bank.eit.mesh import Terms
 from shearloop.bank.eit.models import MODELS, conductivity
 from shearloop.bank.errors import ConductivityError
 from tests.bank.conftest import relative
 
 
 @pytest.fixture(scope="module")
-def batch(fingertip: Mesh) -> BatchForwardModel:
+def batch(fingertip) -> BatchForwardModel:
     return BatchForwardModel(fingertip)
 
 

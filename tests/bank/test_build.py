@@ -44,7 +44,7 @@ if __name__ == "__main__":
 
 
 @pytest.fixture(scope="module")
-def finished(fingertip: Mesh, tmp_path_factory) -> Path:
+def finished(fingertip, tmp_path_factory) -> Path:
     """Return a bank built in one go by one process."""
     path = tmp_path_factory.mktemp("finished") / "one.bank"
     build_bank(fingertip, defined(fingertip), path)

@@ -44,7 +44,7 @@ def fingertip() -> Fingertip:
 
 
 @pytest.fixture(scope="module")
-def clean(fingertip: Fingertip) -> np.ndarray:
+def clean(fingertip) -> np.ndarray:
     return np.abs(simulated_signals(ForwardModel(fingertip.mesh()), "gaussian_derivative", PLACES)) * 0.01
 
 

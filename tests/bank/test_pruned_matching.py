@@ -239,7 +239,7 @@ def recorded_differences(shared: Path) -> Iterator[np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def recorded_frames(shared: Path) -> list[np.ndarray]:
+def recorded_frames(shared) -> list[np.ndarray]:
     return list(recorded_differences(shared))
 
 

@@ -1,7 +1,5 @@
 """The bench of matching_speed: what it compares agrees, and ratios are of one turn."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,7 @@ from tests.bank.conftest import small_fingertip
 
 
 @pytest.fixture(scope="module")
-def bank(tiny_bank: Path) -> Bank:
+def bank(tiny_bank) -> Bank:
     return Bank.open(tiny_bank)
 
 

@@ -20,7 +20,7 @@ from shearloop.daemon.analysis.charts.simulated_loop import (
 
 
 @pytest.fixture(scope="module")
-def bank(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bank(tmp_path_factory) -> Path:
     """A bank whose signals are smooth in k and sigma."""
     path = tmp_path_factory.mktemp("bank") / "smooth.bank"
     random = np.random.default_rng(3)

@@ -26,7 +26,7 @@ DEADLINE_S = 60
 
 
 @pytest.fixture(scope="session")
-def tiny_calibration(tiny_bank: Path) -> Path:
+def tiny_calibration(tiny_bank) -> Path:
     """A calibration of the whole tiny bank."""
     grid = np.linspace(0.9, 2.1, 30)
     path = tiny_bank.with_name("tiny.cal")
@@ -38,7 +38,7 @@ def tiny_calibration(tiny_bank: Path) -> Path:
 
 
 @pytest.fixture
-def config(tmp_path: Path, tiny_bank: Path, tiny_calibration: Path) -> Callable[..., Path]:
+def config(tmp_path, tiny_bank, tiny_calibration) -> Callable[..., Path]:
     """Write a configuration of one fingertip, with changes to it, and return its path."""
 
     def write(**changes: Any) -> Path:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import GeometryError
 from shearloop.daemon.bank_config import ModelName, load_bank_plan, load_bank_plans, load_geometry
@@ -58,8 +59,6 @@ def test_the_papers_fingertip_gives_the_papers_voltages_within_the_error_of_its_
 
 
 def test_the_papers_electrodes_are_where_the_papers_mesh_has_them(shared):
-    from shearloop.bank.eit.mesh import load_mesh
-
     ours = load_geometry(CONFIG / "fingertips" / "paper.yaml")
     theirs = load_mesh(shared / "reference" / "fingertip_mesh.npz")
     for electrode in range(32):
@@ -94,24 +93,15 @@ def test_a_plan_has_the_grids_and_the_mesh(config):
         ("high: 3", "high: 0.5", r"`k` low must be below high, but low is 0\.5 and high is 0\.5"),
         ("low: 0.9", "low: 0", r"`sigma\.low` must be above 0 for the model gaussian_derivative, not 0"),
         ("gaussian_derivative", "square", "`model` should be 'step', 'linear'"),
-    ],
-)
-def test_mistakes_in_a_bank_are_named(config, before, after, sentence):
-    config.write_text(BANK.replace(before, after))
-    with pytest.raises((UserError, GeometryError), match=sentence):
-        load_bank_plan(config)
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "sentence"),
-    [
         ("mesh_size_cm: 0.4", "mesh_size_cm: 0", r"tip\.yaml: `mesh_size_cm` should be .* allowed: from 0\.005 to 10"),
         ("side: top", "side: front", r"tip\.yaml: `electrodes\[1\]\.side` should be 'left'"),
         ("[0.1, 0.5,", "[0.1, 0.2,", r"tip\.yaml: electrodes 0 and 1 on the left side touch or overlap"),
         ("[0.1, 0.5,", "[0.5,", r"tip\.yaml: the fingertip has 30 electrodes, expected 32"),
     ],
 )
-def test_mistakes_in_a_fingertip_are_named(config, before, after, sentence):
+def test_mistakes_in_a_bank_and_its_fingertip_are_named(config, before, after, sentence):
+    assert before in BANK + FINGERTIP
+    config.write_text(BANK.replace(before, after))
     (config.parent / "tip.yaml").write_text(FINGERTIP.replace(before, after))
     with pytest.raises((UserError, GeometryError), match=sentence):
         load_bank_plan(config)

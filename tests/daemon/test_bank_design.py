@@ -23,7 +23,7 @@ from shearloop.daemon.recording.writer import RecordingWriter
 
 
 @pytest.fixture(scope="session")
-def built(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def built(shared, tmp_path_factory) -> Path:
     """Return a folder with a design and the bank built by it, before any test is watched: tqdm keeps a thread."""
     folder = tmp_path_factory.mktemp("design")
     config = folder / "design.yaml"

@@ -185,7 +185,6 @@ def test_a_closed_terminal_causes_no_traceback(monkeypatch, capsys):
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_during_a_callback_from_compiled_code_is_not_lost(number, status, monkeypatch, capsys):
-    """So numba calls us for each function that it loads: the command went on after a traceback."""
 
     def loads(_: object) -> int:
         ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))()

@@ -11,7 +11,7 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.eit.models import conductivity
-from shearloop.daemon.bank_config import load_bank_plans
+from shearloop.daemon.bank_config import load_bank_plans, load_geometry
 from shearloop.daemon.cli import bank as bank_command
 from shearloop.daemon.cli import main
 from tests.daemon.test_bank_config import BANK, FINGERTIP
@@ -79,7 +79,7 @@ def test_banks_that_are_interrupted_in_a_folder_say_what_is_there(folder, tmp_pa
     (folder / "over.yaml").write_text(f"{BANK}over: {{amplitude: {{low: 0.5, high: 1, count: 2}}}}\n")
     capsys.readouterr()
 
-    def interrupted(_):
+    def interrupted(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(bank_command, "_result", interrupted)
@@ -263,23 +263,16 @@ def test_mistakes_of_the_others_are_one_sentence(folder, capsys, arguments, part
     assert not (folder / "v").exists()
 
 
-def test_a_bank_is_of_the_mesh_file_that_the_configuration_names(fingertip_file, tmp_path):
-    (tmp_path / "bank.yaml").write_text(BANK.replace("fingertip: tip.yaml", f"mesh: {{file: {fingertip_file.name}}}"))
+def test_a_bank_is_of_the_mesh_file_that_the_configuration_names(folder, tmp_path):
+    mesh, file = load_geometry(folder / "tip.yaml").refined(), tmp_path / "mesh.npz"
+    names = ("nodes", "triangles", "electrode_edges", "electrode_of_edge", "contact_impedance")
+    np.savez(file, **{name: getattr(mesh, name) for name in names})
+    (tmp_path / "bank.yaml").write_text(BANK.replace("fingertip: tip.yaml", f"mesh: {{file: {file.name}}}"))
     build = ["bank", "build", "--config", f"{tmp_path}/bank.yaml", "--out", f"{tmp_path}/m.bank", "--jobs", "1"]
     assert main(build) == 0
-    mesh = load_mesh(fingertip_file)
+    mesh = load_mesh(file)
     bank = Bank.open(tmp_path / "m.bank")
     assert bank.geometry_hash == mesh.digest
     forward = ForwardModel(mesh)
     expected = forward.voltages(conductivity(mesh, bank.model, 1.75, 2.0)) - forward.homogeneous()
     np.testing.assert_array_equal(bank.signals[1, 1], expected.astype(np.float32))
-
-
-@pytest.fixture
-def fingertip_file(folder, tmp_path):
-    from shearloop.daemon.bank_config import load_geometry
-
-    mesh = load_geometry(folder / "tip.yaml").refined()
-    names = ("nodes", "triangles", "electrode_edges", "electrode_of_edge", "contact_impedance")
-    np.savez(tmp_path / "mesh.npz", **{name: getattr(mesh, name) for name in names})
-    return tmp_path / "mesh.npz"

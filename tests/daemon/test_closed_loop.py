@@ -38,7 +38,7 @@ def torque_of(sigma: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture
-def rig_config(config: Write, tiny_bank: Path, tmp_path: Path) -> Path:
+def rig_config(config, tiny_bank, tmp_path) -> Path:
     """Write the configuration of a whole rig whose boards are SPEED times as fast."""
     sigma = np.linspace(0.95, 2.05, 40)
     calibration = tmp_path / "rig.cal"

@@ -11,16 +11,7 @@ import pytest
 
 from shearloop.daemon import doctor
 from shearloop.daemon.cli import main
-from shearloop.daemon.doctor import (
-    Finding,
-    check_bank,
-    check_clock,
-    check_disk,
-    check_keys,
-    check_ports,
-    clock_state,
-    examine,
-)
+from shearloop.daemon.config import CurveConfig, load_daemon_config
 from shearloop.daemon.doctor.devices import check_channels, check_rate, check_task, from_error
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.keys import make_key_pair
@@ -34,7 +25,7 @@ SPEED = 8
 
 
 @pytest.fixture
-def rig_config(config: Write, tiny_bank: Path, tmp_path: Path) -> Path:
+def rig_config(config, tiny_bank, tmp_path) -> Path:
     """A whole rig whose boards are SPEED times as fast; its gripper is on the robot's address."""
     robot_at(HOST, tmp_path)
     device = {"path": "eit-right"}
@@ -46,8 +37,8 @@ def rig_config(config: Write, tiny_bank: Path, tmp_path: Path) -> Path:
     )
 
 
-async def examined(path: Path, seconds: float) -> dict[str, Finding]:
-    findings = await asyncio.to_thread(lambda: list(examine(path, seconds)))
+async def examined(path: Path, seconds: float) -> dict[str, doctor.Finding]:
+    findings = await asyncio.to_thread(lambda: list(doctor.examine(path, seconds)))
     for finding in findings:
         assert finding.found
         assert bool(finding.means) == bool(finding.next_step) == (finding.state != "good"), finding
@@ -105,16 +96,16 @@ def test_doctor_stops_at_an_invalid_configuration(tmp_path, capsys):
 
 
 def test_the_clock():
-    assert check_clock(1e9, 0).state == "trouble"
-    assert check_clock(1.8e9, 5).state == "note"
-    assert check_clock(1.8e9, 0).state == "good"
-    assert clock_state() in range(-1, 6)
+    assert doctor.check_clock(1e9, 0).state == "trouble"
+    assert doctor.check_clock(1.8e9, 5).state == "note"
+    assert doctor.check_clock(1.8e9, 0).state == "good"
+    assert doctor.clock_state() in range(-1, 6)
 
 
 def test_the_disk(tmp_path, monkeypatch):
     for free, state in ((1e8, "trouble"), (1e9, "note"), (1e11, "good")):
         monkeypatch.setattr(doctor.shutil, "disk_usage", lambda _, free=free: SimpleNamespace(free=free))
-        assert check_disk(tmp_path / "not/yet/there").state == state
+        assert doctor.check_disk(tmp_path / "not/yet/there").state == state
 
 
 @pytest.mark.parametrize(
@@ -143,28 +134,24 @@ def test_rates_and_channels():
 
 
 def test_a_bank_of_another_geometry_is_reported(config):
-    from shearloop.daemon.config import load_daemon_config
-
     fingertip = load_daemon_config(config()).fingertips["right"]
-    assert check_bank("right", fingertip).state == "good"
-    other = check_bank("right", fingertip, Path("config/fingertips/paper.yaml"))
+    assert doctor.check_bank("right", fingertip).state == "good"
+    other = doctor.check_bank("right", fingertip, Path("config/fingertips/paper.yaml"))
     assert (other.state, "another fingertip" in other.means) == ("trouble", True)
-    assert check_bank("right", fingertip, Path("no.yaml")).state == "trouble"
+    assert doctor.check_bank("right", fingertip, Path("no.yaml")).state == "trouble"
 
 
 def test_a_secret_key_that_others_can_read_is_reported(tmp_path):
-    from shearloop.daemon.config import CurveConfig
-
     _, secret = make_key_pair(tmp_path, "server")
     (tmp_path / "clients").mkdir()
     curve = CurveConfig(server_key=secret, clients=tmp_path / "clients")
-    assert "no client could connect" in check_keys(curve, {}).found
+    assert "no client could connect" in doctor.check_keys(curve, {}).found
     make_key_pair(tmp_path / "clients", "ada")
-    assert check_keys(curve, {"publish": "tcp://0.0.0.0:1"}).found == "ada may connect to tcp://0.0.0.0:1"
-    assert check_keys(curve, {}).state == "note"
+    assert doctor.check_keys(curve, {"publish": "tcp://0.0.0.0:1"}).found == "ada may connect to tcp://0.0.0.0:1"
+    assert doctor.check_keys(curve, {}).state == "note"
     secret.chmod(0o644)
-    assert "mode 644" in check_keys(curve, {}).found
-    assert check_keys(None, {}).state == "good"
+    assert "mode 644" in doctor.check_keys(curve, {}).found
+    assert doctor.check_keys(None, {}).state == "good"
 
 
 def test_an_error_sentence_becomes_a_finding_with_its_cure():
@@ -210,5 +197,5 @@ def test_each_denied_port_is_reported_with_its_reason(monkeypatch):
         port("/dev/ttyUSB1", "no right"),
     ]
     monkeypatch.setattr("shearloop.daemon.doctor.list_serial_ports", lambda: there)
-    found = check_ports()
+    found = doctor.check_ports()
     assert (found.state, found.means) == ("note", "/dev/ttyUSB0: another program holds it; /dev/ttyUSB1: no right")

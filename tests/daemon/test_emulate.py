@@ -1,17 +1,19 @@
 import asyncio
 import os
 import signal
-import sys
 from collections.abc import AsyncIterator
 from contextlib import aclosing, asynccontextmanager
 
 import numpy as np
 import pytest
+from scipy.io import loadmat
 
+from shearloop.bank.eit.bank_file import BankDefinition, write_bank
 from shearloop.bank.eit.channels import CHANNELS, ZERO_SLOTS
 from shearloop.daemon.cli import EXIT_USAGE, main
 from shearloop.drivers.eit_kit import EitKit, Frame
-from tests.daemon.conftest import DEADLINE_S, recording, shearloop
+from shearloop.drivers.emulators.boards import EitKitBoard
+from tests.daemon.conftest import recording, shearloop
 from tests.running import take
 
 PERIOD_S = 0.5408
@@ -27,8 +29,6 @@ async def emulator(*arguments: str) -> AsyncIterator[tuple[asyncio.subprocess.Pr
 
 
 async def test_a_recording_at_a_hundred_times_its_pace_arrives_whole_and_in_order(shared):
-    from scipy.io import loadmat
-
     folder = shared / "recordings" / "streams" / "2024-12-03_16-09"
     expected = loadmat(folder / "device1.mat")["Right_Data"][:, 1:]
     async with emulator("--recording", str(folder / "device1.mat"), "--speed", "100", "--once") as (_, path):
@@ -86,8 +86,6 @@ async def test_faults_are_switched_on_by_argument_and_by_standard_input(tmp_path
 
 
 async def test_twists_are_synthesised_from_a_bank(tmp_path):
-    from shearloop.bank.eit.bank_file import BankDefinition, write_bank
-
     definition = BankDefinition("0" * 64, "gaussian_derivative", np.array([3.0, 3.5]), np.array([1.0, 2.0]))
     homogeneous = 0.5 * np.sin(CHANNELS @ [0.1, 0.2, 0.3, 0.4]) + 0.7
     signals = np.broadcast_to(np.cos(CHANNELS @ [0.3, 0.1, 0.2, 0.5]), (2, 2, len(CHANNELS))).astype(np.float32)
@@ -140,8 +138,6 @@ def test_a_mistake_is_one_sentence_and_status_two(device, arguments, sentence, c
 
 
 def test_help_names_every_fault(capsys):
-    from shearloop.drivers.emulators.boards import EitKitBoard
-
     with pytest.raises(SystemExit) as ended:
         main(["emulate", "eit-kit", "--help"])
     assert ended.value.code == 0
@@ -149,16 +145,9 @@ def test_help_names_every_fault(capsys):
     assert [name for name in EitKitBoard.faults if name not in told] == []
 
 
-def test_the_command_runs_without_a_terminal(tmp_path):
-    import subprocess
-
+async def test_the_command_runs_without_a_terminal(tmp_path):
     path, _ = recording(tmp_path, 1)
-    with subprocess.Popen(
-        [sys.executable, "-m", "shearloop", "emulate", "eit-kit", "--recording", str(path)],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-    ) as process:
-        port = process.stdout.readline().decode().strip()
-        assert os.path.exists(port)
+    async with shearloop("emulate", "eit-kit", "--recording", str(path), stdin=asyncio.subprocess.DEVNULL) as process:
+        assert os.stat((await process.stdout.readline()).strip()), "the port is there"
         process.terminate()
-        assert process.wait(DEADLINE_S) == 0
+        assert await process.wait() == 0

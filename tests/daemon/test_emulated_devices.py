@@ -2,7 +2,6 @@ import json
 import os
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -27,7 +26,7 @@ def held(t_s: float, step: int = 7, hold: int = 1, phase: str = "running") -> di
 
 
 @pytest.fixture
-def played(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Devices:
+def played(tmp_path, monkeypatch) -> Devices:
     """Return devices whose processes run these programs."""
 
     def devices(emulators: tuple[EmulatorConfig, ...], *programs: str) -> EmulatedDevices:

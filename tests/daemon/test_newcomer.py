@@ -106,7 +106,7 @@ class Tree:
 
 
 @pytest.fixture
-def tree(tmp_path: Path) -> Iterator[Tree]:
+def tree(tmp_path) -> Iterator[Tree]:
     """A tree whose demo is quick, and at addresses of its own."""
     tree = Tree(tmp_path)
 

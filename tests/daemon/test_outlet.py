@@ -11,13 +11,12 @@ from shearloop.daemon.logs import NonBlockingWriter
 PROGRAM = """
 import os, sys
 from contextlib import closing
-from shearloop.daemon.logs import logging_to_stderr
-from shearloop.daemon.logs import NonBlockingWriter as Outlet
+from shearloop.daemon.logs import NonBlockingWriter, logging_to_stderr
 import structlog
 read, write = os.pipe()
 os.close(read)
 os.dup2(write, 1)
-with logging_to_stderr(), closing(Outlet(sys.stdout)) as out:
+with logging_to_stderr(), closing(NonBlockingWriter(sys.stdout)) as out:
     for number in range(3):
         out.write(f"{number}\\n")
 """

@@ -14,6 +14,7 @@ import zmq.asyncio
 
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
+from shearloop.daemon.sensing.estimators import LiveEstimator
 from tests.daemon.conftest import (
     DEADLINE_S,
     collector,
@@ -115,7 +116,7 @@ async def test_a_heatmap_is_computed_only_with_a_subscriber(config, tmp_path, su
 
 
 @pytest.fixture
-def robotless(config: Write, tmp_path: Path) -> Path:
+def robotless(config, tmp_path) -> Path:
     """Write a configuration with an experiment, and with a robot that is not there."""
     robot_at(own_address(7), tmp_path)
     rig = {
@@ -156,8 +157,6 @@ async def test_a_lost_board_reconnects_and_health_counts_refused_lines(config, t
 
 
 async def test_a_crashed_estimator_restarts_and_is_reported(config, tmp_path, monkeypatch):
-    from shearloop.daemon.sensing.estimators import LiveEstimator
-
     estimate = LiveEstimator.estimate
     deaths = iter([True])
 

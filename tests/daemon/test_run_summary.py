@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from io import StringIO
 from types import SimpleNamespace
 from typing import Any
@@ -8,6 +9,7 @@ import pytest
 from shearloop.daemon.run_summary import RunSummary, TorqueSeries
 
 S = 1_000_000_000
+TOPICS = {"loop": "loop.state", "robot": "robot.state", "load_cell": "load.torque"}
 
 
 def loop_state(t_s: float, **changes: Any) -> dict[str, Any]:
@@ -33,18 +35,25 @@ def loop_state(t_s: float, **changes: Any) -> dict[str, Any]:
     }
 
 
-def told(truth: TorqueSeries | None, happened: list[tuple[int, str]], *more: dict[str, Any]) -> str:
+def summary_of(
+    *messages: dict[str, Any], truth: TorqueSeries | None = None, sent: Sequence[tuple[int, str]] = ()
+) -> str:
+    """Return what is told of these messages, each of the topic of its source."""
     out = StringIO()
-    summary = RunSummary(out, SimpleNamespace(torques=lambda: truth, sent=happened))
-    first = {"step": 1, "step_name": "identify", "set_point_nm": None}
-    for content in (loop_state(0, **first), loop_state(10), loop_state(14, hold=1), *more):
-        summary("loop.state", content)
-    for t_s in np.arange(14.0, 44.0, 0.5):
-        reading = {"source": "right", "t_mono_ns": round(t_s * S), "torque_nm": 0.098, "valid": True, "diameter_mm": 20}
-        summary("eit.estimate", reading)
-    summary("eit.estimate", {"source": "right", "t_mono_ns": 44 * S, "torque_nm": None, "valid": False})
-    summary("loop.state", loop_state(44, phase="done", hold=0))
+    summary = RunSummary(out, SimpleNamespace(torques=lambda: truth, sent=sent))
+    for content in messages:
+        summary(TOPICS.get(content["source"], "eit.estimate"), content)
     return out.getvalue()
+
+
+def told(truth: TorqueSeries | None, happened: list[tuple[int, str]], *more: dict[str, Any]) -> str:
+    first = {"step": 1, "step_name": "identify", "set_point_nm": None}
+    messages = [loop_state(0, **first), loop_state(10), loop_state(14, hold=1), *more]
+    for t_s in np.arange(14.0, 44.0, 0.5):
+        values = {"torque_nm": 0.098, "valid": True, "diameter_mm": 20}
+        messages.append({"source": "right", "t_mono_ns": round(t_s * S), **values})
+    messages.append({"source": "right", "t_mono_ns": 44 * S, "torque_nm": None, "valid": False})
+    return summary_of(*messages, loop_state(44, phase="done", hold=0), truth=truth, sent=happened)
 
 
 def truth_that_falls_at(t_s: float, for_s: float) -> TorqueSeries:
@@ -75,11 +84,8 @@ def test_without_a_truth_nothing_is_said_of_it():
 
 
 def test_a_tool_that_the_experiment_names_is_told():
-    out = StringIO()
-    summary = RunSummary(out)
-    for phase in ("running", "done"):
-        summary("loop.state", loop_state(0, tool_mm=20.0, phase=phase))
-    assert "  tool diameter 20 mm, from the experiment\n" in out.getvalue()
+    text = summary_of(*(loop_state(0, tool_mm=20.0, phase=phase) for phase in ("running", "done")))
+    assert "  tool diameter 20 mm, from the experiment\n" in text
     assert "tool diameter" not in told(None, [])
 
 
@@ -95,17 +101,14 @@ def test_a_last_moment_in_the_band_is_no_way_back():
     ("others", "judge"), [(("left", "load_cell"), "load_cell"), (("left", "combined"), "combined")]
 )
 def test_without_a_truth_who_judges_is_the_load_cell_and_is_named(others, judge):
-    out = StringIO()
-    summary = RunSummary(out)
-    for content in (loop_state(0), loop_state(4, hold=1)):
-        summary("loop.state", content)
+    messages = [loop_state(0), loop_state(4, hold=1)]
     for t_s in np.arange(0.0, 20.0, 0.5):
         for source in ("right", *others):
             torque_nm = 0.1 if source != judge or t_s >= 3.0 else 0.0
             reading = {"source": source, "t_mono_ns": round(t_s * S), "torque_nm": torque_nm, "valid": True}
-            summary("eit.estimate", reading)
-    summary("loop.state", loop_state(20, phase="done"))
-    assert f"    within ± 10% 3.0 s after the set point changed, by {judge}\n" in out.getvalue()
+            messages.append(reading)
+    text = summary_of(*messages, loop_state(20, phase="done"))
+    assert f"    within ± 10% 3.0 s after the set point changed, by {judge}\n" in text
 
 
 def test_holds_and_refusals_are_counted_by_their_kind():
@@ -123,11 +126,8 @@ def test_holds_and_refusals_are_counted_by_their_kind():
 
 
 def test_an_experiment_that_was_stopped_says_why():
-    out = StringIO()
-    summary = RunSummary(out)
-    summary("loop.state", loop_state(0))
-    summary("loop.state", loop_state(5, phase="stopped", activity="the operator said stop"))
-    assert out.getvalue().splitlines()[1:3] == [
+    stopped = loop_state(5, phase="stopped", activity="the operator said stop")
+    assert summary_of(loop_state(0), stopped).splitlines()[1:3] == [
         "What happened: 'hold' was STOPPED before its end, after 5 s.",
         "  the operator said stop",
     ]
@@ -135,22 +135,17 @@ def test_an_experiment_that_was_stopped_says_why():
 
 @pytest.mark.parametrize("phase", ["done", "stopped", "idle"])
 def test_nothing_is_told_of_what_was_not_heard_from_its_beginning(phase):
-    out = StringIO()
-    RunSummary(out)("loop.state", loop_state(0, phase=phase))
-    assert not out.getvalue()
+    assert summary_of(loop_state(0, phase=phase)) == ""
 
 
 def test_where_a_screw_ended_and_what_it_took_is_told():
-    out = StringIO()
     truth = TorqueSeries(np.array([10.0, 11.0, 12.0]) * S, np.array([-0.05, -0.18, -0.119]))
-    summary = RunSummary(out, SimpleNamespace(torques=lambda: truth, sent=[]))
     turning = {"step_name": "tighten", "torque_source": "load_cell", "set_point_nm": None}
-    summary("loop.state", loop_state(10, **turning))
+    messages = [loop_state(10, **turning)]
     for t_s, wrist_rad, torque_nm in ((10.0, 0.4, -0.05), (11.0, 0.2, -0.176), (12.0, -0.1, -0.121)):
-        summary("robot.state", {"source": "robot", "wrist_rad": wrist_rad})
-        summary("load.torque", {"source": "load_cell", "t_mono_ns": round(t_s * S), "torque_nm": torque_nm})
-    summary("loop.state", loop_state(12.1, phase="done", **turning))
-    told = out.getvalue()
-    assert "    turned by -0.500 rad; torque source: load_cell" in told
-    assert "    true       -0.1190 N·m at the end, -0.1800 at most" in told
-    assert "    load_cell  -0.1210 N·m at the end, -0.1760 at most" in told
+        messages.append({"source": "robot", "wrist_rad": wrist_rad})
+        messages.append({"source": "load_cell", "t_mono_ns": round(t_s * S), "torque_nm": torque_nm})
+    text = summary_of(*messages, loop_state(12.1, phase="done", **turning), truth=truth)
+    assert "    turned by -0.500 rad; torque source: load_cell" in text
+    assert "    true       -0.1190 N·m at the end, -0.1800 at most" in text
+    assert "    load_cell  -0.1210 N·m at the end, -0.1760 at most" in text

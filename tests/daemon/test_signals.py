@@ -28,7 +28,6 @@ def test_sighup_ends_a_process_unless_it_is_ignored():
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_second_signal_does_not_kill_the_daemon(number, config, monkeypatch):
-    """It killed the process, as soon as the event loop was closed, before all was written that there was to show."""
     came = []
 
     @contextmanager

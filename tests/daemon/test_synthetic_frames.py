@@ -7,7 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, ZERO_SLOTS, channels_of_line
+from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.mesh import load_mesh
+from shearloop.bank.eit.models import conductivity
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording.matlab import read_torque_slices
 from shearloop.daemon.synthetic_frames import INJECTIONS, Synthesiser, TwistProgramme, twist_frames
 from shearloop.drivers.eit_kit import FrameParser
 from shearloop.drivers.emulators.boards import format_line
@@ -128,11 +132,6 @@ def test_the_same_seed_gives_the_same_frames():
 
 
 def test_a_grip_changes_the_frame_by_as_much_as_the_recorded_torques_do(shared):
-    from shearloop.bank.eit.forward import ForwardModel
-    from shearloop.bank.eit.mesh import load_mesh
-    from shearloop.bank.eit.models import conductivity
-    from shearloop.daemon.recording.matlab import read_torque_slices
-
     mesh = load_mesh(shared / "reference" / "fingertip_mesh.npz")
     forward = ForwardModel(mesh)
     homogeneous = forward.voltages(np.ones(len(mesh.triangles)))

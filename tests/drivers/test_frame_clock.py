@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.io import loadmat
 
 from shearloop.drivers.eit_kit import FrameClock, slope_below
 
@@ -105,8 +106,6 @@ def test_the_slope_is_that_of_the_best_line_below(heights):
 
 
 def test_the_stamps_of_a_recording_are_straightened(shared):
-    from scipy.io import loadmat
-
     folder = shared / "recordings" / "streams" / "2024-12-03_16-09"
     for name, variable in (("device1.mat", "Right_Data"), ("device2.mat", "Left_Data")):
         days = loadmat(folder / name)[variable][:, 0]

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.io import loadmat
 
 from shearloop.bank.eit.channels import LINE_SLOTS, ZERO_SLOTS, channels_of_line, line_of_channels
 from shearloop.drivers import eit_kit
@@ -252,8 +253,6 @@ def test_a_repeated_line_is_flagged_and_makes_no_channel_dead(monkeypatch):
 
 
 def test_the_recorded_frames_pass_and_show_what_the_flags_are_for(shared):
-    from scipy.io import loadmat
-
     folder = shared / "recordings" / "streams" / "2024-12-03_16-09"
     right = loadmat(folder / "device1.mat")["Right_Data"][:100, 1:]
     left = loadmat(folder / "device2.mat")["Left_Data"][:, 1:]

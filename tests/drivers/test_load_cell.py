@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.io import loadmat
 
 from shearloop.drivers import load_cell
 from shearloop.drivers.calibration_files import load_calibration, save_calibration
@@ -39,8 +40,6 @@ def feed_lines(parser: LoadParser, lines: list[str]) -> list[load_cell.LoadSampl
 
 
 def recorded(shared: Path, name: str) -> list[tuple[int, float]]:
-    from scipy.io import loadmat
-
     rows = loadmat(shared / "recordings/streams" / name)[STREAMS[name]]
     return [(round((datenum - rows[0, 0]) * 86400e9), value) for datenum, value in rows.tolist()]
 

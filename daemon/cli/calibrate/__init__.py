@@ -19,25 +19,13 @@ THINGS = {
     "gripper": "the gripper's width, with objects of known diameter",
 }
 
-_EPILOG = """
-the first time, in this order (docs/first-calibration.md):
-  shearloop calibrate load --serial-number NUMBER --mass-g 100 --mass-g 200 --out load.yaml
-  shearloop calibrate gripper --host ADDRESS --diameter-mm 10 --diameter-mm 20 --out gripper.yaml
-  shearloop calibrate recording REC.mcap --out right.cal
-  shearloop calibrate creep HELD.mcap --calibration right.cal
-
-Name each file as the `calibration` of its device or fingertip in the configuration;
-`creep` prints its line. Without a THING, recordings are calibrated on:
-`shearloop calibrate REC.mcap --out right.cal`. For the shear skin use
-`shearloop skin calibrate`.
-"""
-
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add a sub-parser per thing."""
-    parser.description = "Measure a known quantity and write a calibration file."
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _EPILOG
+    parser.epilog = (
+        "The first time, follow docs/first-calibration.md: load, gripper, recording, creep. Without a THING, it "
+        "calibrates on recordings: `shearloop calibrate REC.mcap --out right.cal`. See also `shearloop skin calibrate`."
+    )
     explained = "`shearloop calibrate THING --help` explains one"
     things = parser.add_subparsers(dest="thing", metavar="THING", required=True, help=explained)
     for name, summary in THINGS.items():

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_json, add_option, check_calibration_file
 from shearloop.daemon.cli.terminal import Operator, print_result
+from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.drivers.robotiq.gripper import RobotiqGripper
@@ -34,7 +35,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Grip each object and write the calibration."""
-    from shearloop.daemon.errors import UserError
     from shearloop.drivers.calibration_files import save_calibration
     from shearloop.drivers.robotiq.gripper import STROKE_MM, RobotiqGripper, WidthCalibration
     from shearloop.drivers.robotiq.messages import GripperClient

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_json, add_option, check_calibration_file
 from shearloop.daemon.cli.terminal import Operator, print_result
+from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.drivers.connection import SerialPort
@@ -36,7 +37,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure each load and write the calibration."""
-    from shearloop.daemon.errors import UserError
     from shearloop.drivers.calibration_files import save_calibration
     from shearloop.drivers.connection import SerialPort, find_port
     from shearloop.drivers.load_calibration import LoadCalibrator

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from shearloop.bank.estimators import DEFAULT, ESTIMATORS
 from shearloop.daemon.cli.options import add_json, add_option, check_overwrite
 from shearloop.daemon.cli.terminal import print_result
+from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.bank.estimation import Calibration
@@ -48,7 +49,6 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.estimation.calibration import ARCHIVE_MAGIC
     from shearloop.daemon.analysis.calibrate import CalibrationOptions, calibrate
     from shearloop.daemon.cli.options import parse_sides, parse_time_range
-    from shearloop.daemon.errors import UserError
     from shearloop.daemon.recording.schema import LARGEST_DIAMETER_MM
 
     options = CalibrationOptions(
@@ -80,8 +80,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_options(args: argparse.Namespace) -> None:
     """Raise UserError for an option that has no effect on these recordings or folders of slices."""
-    from shearloop.daemon.errors import UserError
-
     folders = [path.is_dir() for path in args.recordings]
     if args.assume_full_range and not all(folders):
         raise UserError("--assume-full-range is for slices; leave it out for recordings")
@@ -116,12 +114,9 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
             "--load-cell-delay-s 0."
         )
     if calibration.kind == "raw":
-        sentences.append(
-            "The recordings do not name one tool's diameter, and on another tool the torque would be wrong: name it "
-            "with --tool-mm."
-            if result.tool_mm is None
-            else f"The tool's diameter is {result.tool_mm:.3g} mm."
-        )
+        unnamed = "The recordings do not name one tool's diameter, and on another tool the torque would be wrong"
+        named = f"{unnamed}: name it with --tool-mm." if result.tool_mm is None else ""
+        sentences.append(named or f"The tool's diameter is {result.tool_mm:.3g} mm.")
     return sentences
 
 

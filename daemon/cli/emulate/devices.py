@@ -60,13 +60,8 @@ def _run_eit_kit(args: argparse.Namespace) -> int:
 
     console.check_positive(args, "speed")
     link, fault_at = console.checked_link(args.link), dict(_numbered_fault(text) for text in args.fault)
-    board = EitKitBoard(
-        _frames(args, FRAME_PERIOD_S),
-        period_s=FRAME_PERIOD_S / args.speed,
-        link=link,
-        fault_at=fault_at,
-        seed=args.seed,
-    )
+    frames, period_s = _frames(args, FRAME_PERIOD_S), FRAME_PERIOD_S / args.speed
+    board = EitKitBoard(frames, period_s=period_s, link=link, fault_at=fault_at, seed=args.seed)
     return console.play(board.run(), board.command, {"": board.port.appearances})
 
 
@@ -131,13 +126,9 @@ def _run_hx711(args: argparse.Namespace) -> int:
     if not math.isfinite(args.torque_nm):
         raise UserError("--torque-nm must be finite")
     held_nm = args.torque_nm
-    board = Hx711Board(
-        (held_nm for _ in repeat(None)),
-        PAPER_SKETCH if args.paper_sketch else Sketch(),
-        period_s=LOAD_PERIOD_S / args.speed,
-        link=console.checked_link(args.link),
-        seed=args.seed,
-    )
+    sketch, period_s = PAPER_SKETCH if args.paper_sketch else Sketch(), LOAD_PERIOD_S / args.speed
+    link = console.checked_link(args.link)
+    board = Hx711Board((held_nm for _ in repeat(None)), sketch, period_s=period_s, link=link, seed=args.seed)
 
     def on_command(line: str) -> None:
         nonlocal held_nm
@@ -176,13 +167,8 @@ def robot_make(args: argparse.Namespace) -> "ControllerSpec":
 
 def print_robot_event(event: "RobotEvent") -> None:
     """Print an event of the robot."""
-    console.print_event(
-        event.name,
-        detail=event.detail,
-        time_s=round(event.time_s, 6),
-        since_command_s=round(event.since_command_s, 6),
-        q_rad=[round(angle, 9) for angle in event.q_rad],
-    )
+    times = {"time_s": round(event.time_s, 6), "since_command_s": round(event.since_command_s, 6)}
+    console.print_event(event.name, detail=event.detail, **times, q_rad=[round(angle, 9) for angle in event.q_rad])
 
 
 def _configure_ur(parser: argparse.ArgumentParser) -> None:

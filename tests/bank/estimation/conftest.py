@@ -152,7 +152,7 @@ def recorded() -> FrameSeries:
 
 
 @pytest.fixture(scope="session")
-def motion_calibration(recorded: FrameSeries) -> Calibration:
+def motion_calibration(recorded) -> Calibration:
     """An estimator calibrated on the shared recording."""
     return fit("motion_regression", [recorded], "rig")
 

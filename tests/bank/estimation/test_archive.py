@@ -109,7 +109,6 @@ def test_assumptions_are_kept(motion_calibration, recorded, sliced, tmp_path):
     ],
 )
 def test_an_unknown_value_is_refused_by_name(motion_calibration, tmp_path, name, value):
-    """One of a newer version ended `run` in a KeyError, and raw frames were taken for slices of another kind."""
     other = tmp_path / "other.cal"
     _with_header(motion_calibration, other, {name: value})
     with pytest.raises(CalibrationError, match=name):

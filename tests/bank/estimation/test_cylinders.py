@@ -85,7 +85,6 @@ def test_places_that_have_no_noise_still_make_a_line(known):
 
 @pytest.mark.parametrize("frames", [1, N_FRAMES])
 def test_one_recording_under_three_diameters_reads_none_of_them_apart(known, frames):
-    """Nothing tells them apart but rounding, which was divided by."""
     one = replace(known[0], frames=known[0].frames[:frames])
     reader = fit_cylinders([replace(one, diameter_mm=mm) for mm in KNOWN_MM])
     value, below, above = reader.predict(one.means[-1])
@@ -116,7 +115,6 @@ def test_a_diameter_is_of_this_grip_alone(twisting):
 
 
 def test_the_first_frames_of_a_grip_have_the_interval_of_a_mean_of_few(twisting):
-    """Of one frame the interval was that of a mean of sixty: on the played rig it held 0.7 of the tools."""
     of = partial(cylinder, twisting, (1, 2), 2e-5)
     calibration = fit("motion_regression", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "rig", timing=TRUSTED)
     inside, widths = [], []

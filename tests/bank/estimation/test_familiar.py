@@ -156,7 +156,6 @@ def test_a_load_that_an_estimator_does_not_see_lies_in_its_interval():
 
 
 def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
-    """Intervals that hold what is measured beside a frame cover more loads, by which a blind reader passed for none."""
     rng = np.random.default_rng(3)
     torque = np.where(np.arange(600) % 40 < 5, rng.uniform(0.02, 0.06, 600), 0.0)
     blind = rng.normal(0, 1, (600, 2)) + torque[:, None]
@@ -174,7 +173,6 @@ def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
 
 
 def test_a_slice_is_measured_against_the_calibration_once(sliced, sliced_calibration, monkeypatch):
-    """What lets it pass and its interval go by the same misfits: looked for twice they were a third of the time."""
     series, looked = sliced(), []
     for kind, name in ((NoveltyDetector, "q_residual"), (ReciprocityCheck, "residual")):
         found = getattr(kind, name)

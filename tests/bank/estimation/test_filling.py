@@ -45,7 +45,6 @@ def _n_valid_of_whole(calibration: Calibration, bank: Bank) -> int:
 @pytest.mark.parametrize("start", [0, DEATH])
 @pytest.mark.parametrize("dead", list(DEAD))
 def test_what_died_after_the_calibration_is_told_by_the_others(calibration, bank, twisting, dead, start):
-    """It stayed what it was when it died: up to 62 % of the torques were false-valid."""
     series = twisting(seed=3, cycles=3)
     whole = _n_valid_of_whole(calibration, bank)
     found = judged(without(DEAD[dead], start, series, EstimatorSession(calibration, bank)), series)
@@ -55,7 +54,6 @@ def test_what_died_after_the_calibration_is_told_by_the_others(calibration, bank
 
 
 def test_what_an_estimate_was_made_from_holds_nothing_of_dead_channels(calibration, bank, twisting):
-    """A heatmap of them showed where they were when they died."""
     series, tracker, seen = twisting(seed=3, cycles=3), EstimatorSession(calibration, bank), []
     for t_s, channels in zip(series.t_s, series.channels, strict=True):
         usable = np.ones(channels.shape, dtype=np.bool_)
@@ -69,7 +67,6 @@ def test_what_an_estimate_was_made_from_holds_nothing_of_dead_channels(calibrati
 
 @pytest.mark.parametrize("start", [0, DEATH])
 def test_torques_that_the_dead_channels_alone_told_of_are_refused(twisting, monkeypatch, start):
-    """What the others say of them is a guess then: nine of ten torques lay outside of their intervals."""
     tip = conftest.tip
 
     def felt_by_one_electrode(number: int) -> conftest.Tip:

@@ -17,7 +17,6 @@ def with_a_nan(values):
 
 @pytest.mark.parametrize("name", ["t_s", "channels", "torque_nm"])
 def test_values_that_are_no_numbers_are_told(recorded, name):
-    """They made the whole recording look gripped from the first frame on, or stamped at another time."""
     spoilt = replace(recorded, **{name: with_a_nan(getattr(recorded, name))})
     with pytest.raises(CalibrationError, match="recording 2 of 2 holds 1 values that are not finite numbers"):
         fit("motion_regression", [recorded, spoilt], "rig", timing=TRUSTED)

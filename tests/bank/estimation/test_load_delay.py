@@ -129,7 +129,6 @@ def test_times_are_unchecked_where_no_recording_tells_or_only_roughly(recorded, 
 
 
 def test_a_board_beside_that_was_dead_garbled_or_away_spoils_no_times(recorded):
-    """One of zeros alone was a singular matrix, and of one not a number intervals were four times as wide."""
     dead = replace(recorded, channels=np.zeros_like(recorded.channels))
     garbled = replace(recorded, channels=np.where(np.arange(896) == 3, np.nan, recorded.channels))
     away = recorded.between(0, 12)

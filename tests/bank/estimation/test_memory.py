@@ -48,7 +48,6 @@ def test_a_grip_a_third_as_strong_as_the_one_before_the_zero_is_one(motion_calib
 
 
 def test_a_zero_during_which_a_tool_is_let_go_begins_anew(motion_calibration, like):
-    """The mean of gripped and idle frames was taken for an idle one, and what was gripped next was read from there."""
     memory = SessionState(motion_calibration.validators, motion_calibration.estimator.motion, idle_frames=8)
     told = [memory.process(like(0.5 * i, share)).reasons for i, share in enumerate([1, 1, 1, 1, 1, *np.zeros(9)])]
     assert [why[0] for why in told[2:5]] == [f"taking the homogeneous frame, {n} of 8" for n in (3, 4, 5)]
@@ -63,7 +62,6 @@ def test_a_zero_during_which_a_tool_is_let_go_begins_anew(motion_calibration, li
 @pytest.mark.parametrize(("first", "then"), [(1.0, 0.0), (0.0, 1.0)])
 @pytest.mark.parametrize("step_s", [1.5, 20.0, -5.0])
 def test_a_zero_in_whose_gap_a_tool_is_let_go_or_gripped_begins_anew(motion_calibration, like, first, then, step_s):
-    """After frames that were lost the next one was compared with none before, and half of the zero was of a tool."""
     memory = SessionState(motion_calibration.validators, motion_calibration.estimator.motion, idle_frames=8)
     for i in range(5):
         memory.process(like(0.5 * i, first))
@@ -81,7 +79,6 @@ def test_a_zero_with_a_gap_in_which_nothing_happens_goes_on(motion_calibration, 
 
 
 def test_a_zero_of_two_frames_is_a_baseline_for_a_weak_grip(motion_calibration, like):
-    """With fewer than five idle frames only an outright grip was one, and others were taken for idle."""
     memory = SessionState(motion_calibration.validators, motion_calibration.estimator.motion, idle_frames=2)
     seen = [memory.process(like(0.5 * i, share)) for i, share in enumerate([0, 0, *np.full(18, 0.3)])]
     assert not seen[-1].reasons
@@ -92,7 +89,6 @@ def test_a_zero_of_two_frames_is_a_baseline_for_a_weak_grip(motion_calibration, 
 @pytest.mark.parametrize("kind", ["garbled", "saturated"])
 @pytest.mark.parametrize("spoilt", [1, 3, 4])
 def test_up_to_three_spoilt_frames_are_left_out_and_more_end_the_memory(motion_calibration, like, spoilt, kind):
-    """One garbled frame in a hundred left a quarter of the estimates void: each was taken for another fingertip."""
     tracker, rng = EstimatorSession(motion_calibration), np.random.default_rng(4)
     shares = [*np.zeros(12), *UP, *np.ones(14)]
     for i, share in enumerate(shares):

@@ -254,7 +254,6 @@ def test_single_lost_frames_cost_little_and_are_not_invented_in_numbers(motion_c
 
 @pytest.mark.parametrize("lost", [(2, {1}), (5, {1, 3}), (7, {1, 3, 5})])
 def test_of_a_board_that_leaves_out_half_of_its_frames_no_torque_is_read(motion_calibration, twisting, lost):
-    """What is remembered is twice as long ago as calibrated: 27 times the error, and intervals that tell nothing."""
     whole = twisting(seed=5)
     every, left_out = lost
     part = kept(whole, ~np.isin(np.arange(len(whole.t_s)) % every, list(left_out)))
@@ -273,7 +272,6 @@ def test_a_board_that_is_faster_than_configured_is_followed_all_the_same(motion_
 
 @pytest.mark.parametrize("spoilt", [2, 3])
 def test_after_frames_left_out_the_interval_holds_a_load_that_rises_meanwhile(motion_calibration, twisting, spoilt):
-    """The gel was remembered where it had been before them, as if all of its motion were of the last step."""
     inside, rng = [], np.random.default_rng(0)
     for seed in range(1, 5):
         series = twisting(seed=seed)
@@ -291,7 +289,6 @@ def test_after_frames_left_out_the_interval_holds_a_load_that_rises_meanwhile(mo
 
 @pytest.mark.parametrize("sides", [[0, 1], [1]])
 def test_a_frame_that_a_board_sends_again_is_no_new_one(motion_calibration, twisting, sides):
-    """A board that hung told the torque of long ago, valid for ever; the next frame is read as if it had not been."""
     whole = twisting(seed=5)
     frozen, expected = whole.channels.copy(), follow(motion_calibration, whole)
     hung = np.flatnonzero([one.valid for one in expected])[10]

@@ -1,6 +1,5 @@
 """Calibrations from recorded tables, and direction and force from noisy responses, against forces that are known."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -256,16 +255,8 @@ def test_a_table_with_a_mistake_is_refused_by_line_and_column(text, named, tmp_p
     assert "table.csv" in str(refused.value)
 
 
-CALIBRATION = SkinCalibration(
-    friction=MEMBRANE.friction,
-    gauge_angle_deg=math.degrees(MEMBRANE.gauge_angle_rad),
-    linear_to_n=1.2,
-    tension_n=(-5.0, -1.2, 1.2, 5.0),
-    response=(-0.44, -0.1056, 0.1056, 0.44),
-    response_half_width=3e-4,
-    rows=100,
-    rows_beyond=0,
-    rest_ohm=(24.6, 25.3),
+CALIBRATION = exact_calibration().model_copy(
+    update={"response": (-0.44, -0.1056, 0.1056, 0.44), "response_half_width": 3e-4}
 )
 NOISE, NORMAL_N = 1.4e-4, 1.0
 HOLD_N = MEMBRANE.friction * NORMAL_N

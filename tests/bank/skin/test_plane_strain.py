@@ -141,7 +141,7 @@ Loadings = dict[float, list[ContactState]]
 
 
 @pytest.fixture(scope="session")
-def loadings(skin_112: CondensedSkin) -> Loadings:
+def loadings(skin_112) -> Loadings:
     """The paper's four cases: normal force first, then shear in 0.1 N steps up to it."""
     return {normal_n: states_along(skin_112, normal_n, loading(normal_n)) for normal_n in NORMAL_FORCES}
 

@@ -40,7 +40,7 @@ from shearloop.daemon.workers import SerialExecutor
 
 
 @pytest.fixture(scope="module")
-def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scratch(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp("charts")
 
 

@@ -12,35 +12,8 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNELS
 from shearloop.bank.estimation import Estimate, EstimatorSession, FrameSeries, Physics, fit
 from shearloop.bank.estimation.novelty import ReciprocityCheck
-from shearloop.daemon.analysis.charts import stability
-from shearloop.daemon.analysis.charts.fault_sweeps import (
-    FAULTS,
-    FaultLevel,
-    balanced,
-    fault_curve,
-    fitted,
-    judge_level,
-    lost_channels,
-    scene_for,
-    sweep,
-)
+from shearloop.daemon.analysis.charts import fault_sweeps, stability
 from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits
-from shearloop.daemon.analysis.charts.stability import (
-    LARGER,
-    SMALLER,
-    Extrapolation,
-    calibration_parts,
-    chart,
-    continuity_figure,
-    detect_mixtures,
-    detectability_figure,
-    extrapolate,
-    extrapolation_figure,
-    select_rows,
-    sweep_rims,
-    sweeps_figure,
-    walks,
-)
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.reproduce.banks import Grid
 from shearloop.daemon.errors import UserError
@@ -48,17 +21,17 @@ from shearloop.daemon.workers import SerialExecutor
 
 
 @pytest.fixture(scope="module")
-def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scratch(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp("stability")
 
 
 @pytest.fixture(scope="module")
-def parts(scratch: Path) -> list[Split]:
+def parts(scratch) -> list[Split]:
     return splits([], 0.6, scratch)
 
 
 @pytest.fixture(scope="module")
-def bank(scratch: Path) -> Bank:
+def bank(scratch) -> Bank:
     grid = Grid(np.linspace(3.0, 3.6, 13), np.linspace(1.0, 2.1, 30))
     return bank_of(None, own_fingertip(0.4).mesh(), scratch, grid)
 
@@ -69,15 +42,15 @@ def estimate(torque: float, half: float = 0.01) -> Estimate:
 
 def test_figures_count_what_is_valid_and_wrong():
     truth = np.array([0.1, 0.1, 0.1, 0.1, np.nan])
-    found = judge_level(
+    found = fault_sweeps.judge_level(
         [estimate(0.105), estimate(0.145), Estimate(valid=False), estimate(0.1), estimate(9.0)], truth, 2.0
     )
     assert found.valid == 0.75
     assert found.false_valid == 0.25
     assert found.bias_nm == pytest.approx(0.05 / 3)
     assert (
-        fault_curve(
-            "fault", "unit", "motion_regression", [judge_level([estimate(0.1)], truth[:1], 0.0), found]
+        fault_sweeps.fault_curve(
+            "fault", "unit", "motion_regression", [fault_sweeps.judge_level([estimate(0.1)], truth[:1], 0.0), found]
         ).breaks_at
         == 2.0
     )
@@ -87,21 +60,21 @@ def test_figures_count_what_is_valid_and_wrong():
     ("levels", "expected"), [((-0.5, -0.2, 0.0, 0.1, 0.5), 0.1), ((0.6, 0.4, 0.2), 0.6), ((1.0, 2.0), 1.0)]
 )
 def test_an_estimator_breaks_at_the_mildest_level_in_either_direction(levels, expected):
-    wrong = [FaultLevel(level, 0.0, 0.0, 1.0, 0.5 if level else 0.0) for level in levels]
-    assert fault_curve("fault", "unit", "motion_regression", wrong).breaks_at == expected
+    wrong = [fault_sweeps.FaultLevel(level, 0.0, 0.0, 1.0, 0.5 if level else 0.0) for level in levels]
+    assert fault_sweeps.fault_curve("fault", "unit", "motion_regression", wrong).breaks_at == expected
 
 
 def test_a_stream_is_judged_by_as_many_loaded_frames_as_free_ones():
     truth = np.r_[np.zeros(90), np.full(10, 0.1)]
-    kept = balanced(truth)
+    kept = fault_sweeps.balanced(truth)
     assert np.isfinite(kept).sum() == 20
     assert np.isfinite(kept[90:]).all()
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+@pytest.mark.parametrize("fault", fault_sweeps.FAULTS, ids=lambda fault: fault.name)
 @pytest.mark.parametrize("kind", ["difference", "raw"])
 def test_every_sweep_begins_with_no_fault_and_then_changes_the_frames(fault, kind, parts, bank):
-    scene = scene_for(next(one for one in parts if one.past.kind == kind), bank)
+    scene = fault_sweeps.scene_for(next(one for one in parts if one.past.kind == kind), bank)
     none, most = (fault.apply(scene, level, np.random.default_rng(1)) for level in (fault.levels[0], fault.levels[-1]))
     np.testing.assert_array_equal(none.series.channels, scene.series.channels)
     assert not np.array_equal(most.series.channels, scene.series.channels)
@@ -110,15 +83,15 @@ def test_every_sweep_begins_with_no_fault_and_then_changes_the_frames(fault, kin
 
 
 def test_an_electrode_touches_its_own_injections_and_pairs():
-    assert 28 * 2 < lost_channels(np.array([3])).sum() < 28 * 5
+    assert 28 * 2 < fault_sweeps.lost_channels(np.array([3])).sum() < 28 * 5
 
 
 def test_unreported_lost_electrodes_never_pass_silently(parts, bank):
     stream = next(one for one in parts if one.past.kind == "raw")
-    (calibration,) = fitted(stream, ("regression",), Physics(bank, None))
-    scene = scene_for(stream, bank)
-    lost = next(fault for fault in FAULTS if fault.name == "lost electrodes, unreported")
-    found = sweep(EstimatorSession(calibration, bank), scene, lost)
+    (calibration,) = fault_sweeps.fitted(stream, ("regression",), Physics(bank, None))
+    scene = fault_sweeps.scene_for(stream, bank)
+    lost = next(fault for fault in fault_sweeps.FAULTS if fault.name == "lost electrodes, unreported")
+    found = fault_sweeps.sweep(EstimatorSession(calibration, bank), scene, lost)
     assert found.levels[0].valid > 0.7
     assert found.breaks_at is None
     assert found.levels[-1].valid == 0.0
@@ -127,14 +100,14 @@ def test_unreported_lost_electrodes_never_pass_silently(parts, bank):
 @pytest.mark.usefixtures("fonts", "few_mixtures")
 def test_the_mean_of_similar_cells_does_not_hop_and_the_rims_are_swept(parts, bank, scratch):
     slices = parts[0]
-    calibrations = fitted(slices, ("bank", "motion_regression"), Physics(bank, None))
-    found = walks(slices, bank, calibrations)
+    calibrations = fault_sweeps.fitted(slices, ("bank", "motion_regression"), Physics(bank, None))
+    found = stability.walks(slices, bank, calibrations)
     paper, alone, mean = (one.largest_hop_nm for one in found[:3])
     assert mean < 0.5 * min(paper, alone)
-    rims = list(sweep_rims(calibrations, bank, scratch))
+    rims = list(stability.sweep_rims(calibrations, bank, scratch))
     assert {one.estimator for one in rims} == {"bank", "motion_regression"}
     assert all(one.levels[0].valid > 0.5 for one in rims)
-    for figure in (sweeps_figure("rims", rims), continuity_figure("slices", found)):
+    for figure in (stability.sweeps_figure("rims", rims), stability.continuity_figure("slices", found)):
         assert len(figure.axes) >= 2
     assert json.dumps([one.hops for one in found])
 
@@ -154,7 +127,7 @@ def drifting(n: int, seed: int) -> FrameSeries:
 def test_the_passing_share_of_a_foreign_frame_follows_from_its_size():
     """Off the slices' directions nothing but the foreign part stands out: its square adds to that of the noise."""
     series = drifting(100, 4)
-    found = detect_mixtures(series, origins=(0.6,))
+    found = stability.detect_mixtures(series, origins=(0.6,))
     past, later = series.channels[:60, 0], series.channels[60:, 0]
     opposite = CHANNELS[:, 0] >= 16
     order = np.lexsort((CHANNELS[:, 2], CHANNELS[:, 0] % 16, opposite)).reshape(2, 448)
@@ -179,28 +152,28 @@ def test_the_passing_share_of_a_foreign_frame_follows_from_its_size():
     assert own[0].passing == 1.0
     assert {one.passing for one in own if one.share >= 0.2} == {0.0}
     assert {one.passing_best for one in own if one.share >= 0.2} == {0.0}
-    assert len(detectability_figure("slices", found).axes) == 2
+    assert len(stability.detectability_figure("slices", found).axes) == 2
 
 
 def test_a_recording_that_no_estimator_can_be_calibrated_on_is_one_sentence(bank, tmp_path, capsys):
     slices = next(one for one in splits([], 0.6, tmp_path) if one.past.kind == "difference")
     one = Split(slices.title, slices.past.between(0, 1), slices.future, slices.whole)
     with pytest.raises(UserError, match="no estimator can be calibrated on it"):
-        chart([one], bank, own_fingertip(0.4).mesh(), tmp_path, tmp_path, SerialExecutor())
+        stability.chart([one], bank, own_fingertip(0.4).mesh(), tmp_path, tmp_path, SerialExecutor())
     assert "motion_regression is left out" in capsys.readouterr().out
 
 
 @pytest.fixture(scope="module")
-def slices(parts: list[Split]) -> FrameSeries:
+def slices(parts) -> FrameSeries:
     return next(one.whole for one in parts if one.past.kind == "difference")
 
 
 def test_limits_are_quantiles_and_each_slice_is_either_calibrated_on_or_judged():
     torque_nm = np.random.default_rng(3).permutation(np.linspace(0.0, 0.1, 101))
-    found = calibration_parts(torque_nm)
-    assert [part.limit_nm for part in found[SMALLER]] == pytest.approx([0.08, 0.065, 0.05, 0.04, 0.03])
-    assert [part.limit_nm for part in found[LARGER]] == pytest.approx([0.02, 0.035, 0.05, 0.06, 0.07])
-    for which, sign in ((SMALLER, 1), (LARGER, -1)):
+    found = stability.calibration_parts(torque_nm)
+    assert [part.limit_nm for part in found[stability.SMALLER]] == pytest.approx([0.08, 0.065, 0.05, 0.04, 0.03])
+    assert [part.limit_nm for part in found[stability.LARGER]] == pytest.approx([0.02, 0.035, 0.05, 0.06, 0.07])
+    for which, sign in ((stability.SMALLER, 1), (stability.LARGER, -1)):
         for part in found[which]:
             assert sorted([*part.fitted, *part.others]) == list(range(101))
             assert (sign * torque_nm[part.fitted]).max() == sign * part.limit_nm
@@ -208,14 +181,14 @@ def test_limits_are_quantiles_and_each_slice_is_either_calibrated_on_or_judged()
 
 
 def test_of_few_torques_each_limit_is_there_once_and_none_leaves_nothing_to_judge():
-    found = calibration_parts(np.repeat([0.02, 0.06, 0.1], [20, 2, 40]))
-    assert [part.limit_nm for part in found[SMALLER]] == [0.02]
-    assert [part.limit_nm for part in found[LARGER]] == [0.06, 0.1]
+    found = stability.calibration_parts(np.repeat([0.02, 0.06, 0.1], [20, 2, 40]))
+    assert [part.limit_nm for part in found[stability.SMALLER]] == [0.02]
+    assert [part.limit_nm for part in found[stability.LARGER]] == [0.06, 0.1]
 
 
 def test_chosen_slices_keep_their_own_torques(slices):
     rows = np.array([1, 7, 8, 30])
-    chosen = select_rows(slices, rows)
+    chosen = stability.select_rows(slices, rows)
     np.testing.assert_array_equal(chosen.torque_at_frames(), slices.torque_at_frames()[rows])
     np.testing.assert_array_equal(chosen.channels, slices.channels[rows])
 
@@ -230,14 +203,14 @@ def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(sli
     torque_nm[3] = np.nan
     whole = replace(some, torque_nm=torque_nm)
     split = Split("slices", whole.between(0, 30), whole.between(30, 40), whole)
-    found = extrapolate(split, ("regression",), bank, None, SerialExecutor())
-    assert [one.curve.fault for one in found] == [SMALLER, LARGER]
+    found = stability.extrapolate(split, ("regression",), bank, None, SerialExecutor())
+    assert [one.curve.fault for one in found] == [stability.SMALLER, stability.LARGER]
     assert capsys.readouterr().out.count("is left out") == 2
     known = np.delete(np.arange(40), 3)
     torque_nm = whole.torque_nm[known]
     for one in found:
         limit = one.curve.levels[1].level
-        inside = (torque_nm <= limit) if one.curve.fault == SMALLER else (torque_nm >= limit)
+        inside = (torque_nm <= limit) if one.curve.fault == stability.SMALLER else (torque_nm >= limit)
         assert limit == pytest.approx(np.median(torque_nm), abs=0.001)
         assert one.slices[:2] == (29, inside.sum())
         for level, width_nm, past, future in (
@@ -245,7 +218,8 @@ def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(sli
             (one.curve.levels[1], one.width_nm[1], known[inside], known[~inside]),
         ):
             track = estimate_series(
-                fit("regression", [select_rows(slices, past)], "", Physics()), select_rows(slices, future)
+                fit("regression", [stability.select_rows(slices, past)], "", Physics()),
+                stability.select_rows(slices, future),
             )
             figures = figures_of([track])
             assert level.valid == figures["valid_fraction"]
@@ -254,19 +228,22 @@ def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(sli
             widths = [each.torque_high_nm - each.torque_low_nm for each in track.estimates if each.valid]
             assert width_nm == pytest.approx(np.median(widths))
         assert one.times_good[:2] == (1.0, one.width_nm[1] / one.width_nm[0])
-        assert one.curve.levels[2] == FaultLevel(one.curve.levels[2].level, None, None, 0.0, 0.0)
+        assert one.curve.levels[2] == fault_sweeps.FaultLevel(one.curve.levels[2].level, None, None, 0.0, 0.0)
         assert one.width_nm[2] is one.times_good[2] is None
 
 
 @pytest.mark.usefixtures("fonts")
 def test_the_picture_marks_what_breaks_and_writes_how_many_slices_were_calibrated_on():
-    levels = [FaultLevel(limit, 0.0, 0.01, 1.0, missed) for limit, missed in ((0.14, 0.0), (0.08, 0.1), (0.05, 0.9))]
+    levels = [
+        fault_sweeps.FaultLevel(limit, 0.0, 0.01, 1.0, missed)
+        for limit, missed in ((0.14, 0.0), (0.08, 0.1), (0.05, 0.9))
+    ]
     found = [
-        Extrapolation(fault_curve(which, "N·m", name, levels), (29, 24, 14), (0.08, 0.04, None))
-        for which in (SMALLER, LARGER)
+        stability.Extrapolation(fault_sweeps.fault_curve(which, "N·m", name, levels), (29, 24, 14), (0.08, 0.04, None))
+        for which in (stability.SMALLER, stability.LARGER)
         for name in ("motion_regression", "bank")
     ]
-    made = extrapolation_figure("slices", found)
+    made = stability.extrapolation_figure("slices", found)
     assert len(made.axes) == 8
     for false, widths in zip(made.axes[2::4], made.axes[3::4], strict=True):
         crosses = [line for line in false.lines if line.get_marker() == "x"]

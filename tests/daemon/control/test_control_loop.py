@@ -52,6 +52,15 @@ def test_a_pause_is_refused_with_the_reason():
 TWIST = {"do": "twist", "angles_rad": [0.2]}
 
 
+def twisting() -> Rig:
+    """Return a rig in the middle of a slow twist."""
+    slowly = {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60}
+    rig = started(Rig(new_loop()), GRIP, slowly)
+    rig.run(5)
+    assert rig.speed > 0
+    return rig
+
+
 @pytest.mark.parametrize("step", [GRIP, {**GRIP, "expect_object": False}, {"do": "release", "width_mm": 20}])
 def test_a_tool_that_is_taken_away_is_noticed_though_nobody_expected_it(step):
     rig = Rig(new_loop())
@@ -74,7 +83,6 @@ def test_a_tool_that_is_taken_away_is_noticed_though_nobody_expected_it(step):
 )
 @pytest.mark.parametrize("turning", [TWIST, {"do": "turn_to", "angle_rad": 0.4}, {"do": "identify"}])
 def test_nothing_turns_a_tool_that_the_gripper_may_hold_and_does_not_tell_of(sense, what, turning):
-    """After a stop in the middle of a grip the wrist turned, and nothing watched torque, angle or grip."""
     rig = Rig(new_loop())
     for _ in range(70):
         rig.step()
@@ -98,7 +106,6 @@ def test_nothing_turns_a_tool_that_the_gripper_may_hold_and_does_not_tell_of(sen
 @pytest.mark.parametrize("sense", [{"uncertain": True}, {"moving": True}])
 @pytest.mark.parametrize("turning", [TWIST, {"do": "turn_to", "angle_rad": 0.4}, {"do": "identify"}])
 def test_a_gripper_that_tells_only_after_the_start_that_it_does_not_know_stops_what_turns(sense, turning):
-    """It is asked ten times a second: started right after a stop, an experiment was judged by what was before that."""
     rig = started(Rig(new_loop()), {"do": "wait", "wait_s": 0.1}, turning, GRIP)
     rig.hand = replace(rig.hand, **sense)
     rig.run(1)
@@ -111,8 +118,7 @@ def test_a_gripper_that_tells_only_after_the_start_that_it_does_not_know_stops_w
 
 
 def test_a_silent_board_holds_the_wrist_and_then_stops_it():
-    rig = started(Rig(new_loop()), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
-    rig.run(5)
+    rig = twisting()
     assert rig.speed > 0
     rig.silent.add("right")
     rig.run(2.5 * EIT.period_s + 0.7)
@@ -181,8 +187,7 @@ def test_what_the_robot_reports_ends_a_running_experiment_at_once(sense, event):
 
 
 def test_a_supervising_sensor_that_is_gone_holds_the_wrist_at_once_and_says_which():
-    rig = started(Rig(new_loop()), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
-    rig.run(5)
+    rig = twisting()
     rig.control_loop.on_link("load_cell", "/dev/ttyUSB3 was unplugged.", up=False)
     rig.step()
     assert rig.speed == 0.0
@@ -193,8 +198,7 @@ def test_a_supervising_sensor_that_is_gone_holds_the_wrist_at_once_and_says_whic
 
 
 def test_a_task_that_died_stops_the_wrist_and_says_of_what():
-    rig = started(Rig(new_loop()), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
-    rig.run(5)
+    rig = twisting()
     rig.died = {"right": "ValueError: no number"}
     rig.step()
     assert phase(rig) is ExperimentPhase.STOPPED
@@ -221,8 +225,6 @@ def test_a_single_torque_that_disagrees_holds_until_the_next_one_and_stops_nothi
 
 
 def test_a_wrist_angle_that_is_not_a_number_turns_nothing():
-    rig = started(Rig(new_loop()), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
-    rig.run(5)
-    assert rig.speed > 0
+    rig = twisting()
     rig.wrist_rad = float("nan")
     rig._sense(0.0)

@@ -1,7 +1,10 @@
 """The gripper's task over the real driver and the emulated gripper, on both connections."""
 
 import asyncio
-from typing import Any
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -17,32 +20,34 @@ from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
 GRIP = GripTo(0.0, 60.0, 40.0, expect_object=True)
 
 
-class Silent:
-    """A publisher without subscribers."""
-
-    def publish(self, _message: Any) -> None:
-        """Send nothing."""
-
-
 class Felt(list[GripperStatus]):
     """A control loop that keeps the states of the gripper."""
 
     on_gripper = list.append
 
 
-def task_of(rig: Rig, *, measures_diameters: bool = True) -> GripperTask:
-    publisher: Any = Silent()
-    return GripperTask(rig.driver, publisher, Felt(), measures_diameters=measures_diameters)
+def task_of(rig: Rig, felt: Felt | None = None, *, measures_diameters: bool = True) -> GripperTask:
+    silent = SimpleNamespace(publish=lambda _: None)
+    return GripperTask(rig.driver, silent, Felt() if felt is None else felt, measures_diameters=measures_diameters)
+
+
+@asynccontextmanager
+async def reading(way: str, folder: Path) -> AsyncIterator[tuple[Rig, GripperTask, Felt]]:
+    """Yield a rig and a task that reads its gripper."""
+    async with a_rig(way, folder) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
+        felt = Felt()
+        task = task_of(rig, felt)
+        read = tasks.create_task(task.run())
+        while rig.driver.latest is None:  # noqa: ASYNC110 - the driver is asked, as the loop is
+            await asyncio.sleep(0)
+        yield rig, task, felt
+        read.cancel()
 
 
 @WAYS
 async def test_cancelled_grip_can_be_released(way, tmp_path):
-    async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
+    async with reading(way, tmp_path) as (rig, task, _):
         rig.model.put_between(40.0)
-        task = task_of(rig)
-        read = tasks.create_task(task.run())
-        while rig.driver.latest is None:  # noqa: ASYNC110 - the driver is asked, as the loop is
-            await asyncio.sleep(0)
         for turns in range(1, 30, 3):
             grip = asyncio.create_task(task.grip(GRIP))
             # A question is under way now and then: broken off, it takes the connection with it.
@@ -51,18 +56,11 @@ async def test_cancelled_grip_can_be_released(way, tmp_path):
             grip.cancel()
             assert await task.release() == ""
             assert rig.model.width_mm > 130.0
-        read.cancel()
 
 
 @WAYS
 async def test_cancelled_grip_is_halted_and_stays_connected(way, tmp_path):
-    async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
-        felt = Felt()
-        publisher: Any = Silent()
-        task = GripperTask(rig.driver, publisher, felt)
-        read = tasks.create_task(task.run())
-        while rig.driver.latest is None:  # noqa: ASYNC110 - the driver is asked, as the loop is
-            await asyncio.sleep(0)
+    async with reading(way, tmp_path) as (rig, task, felt):
         assert felt[-1].uncertain, "a gripper without power may hold a tool"
         await rig.driver.activate()
         for turns in range(1, 40, 3):
@@ -82,16 +80,11 @@ async def test_cancelled_grip_is_halted_and_stays_connected(way, tmp_path):
             assert felt[-1].uncertain
             assert not felt[-1].holding
         assert rig.driver.diagnostics()["connections"] == 1
-        read.cancel()
 
 
 @WAYS
 async def test_halt_stops_the_fingers_after_a_reconnection(way, tmp_path):
-    async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
-        task = task_of(rig)
-        read = tasks.create_task(task.run())
-        while rig.driver.latest is None:  # noqa: ASYNC110 - the driver is asked, as the loop is
-            await asyncio.sleep(0)
+    async with reading(way, tmp_path) as (rig, task, _):
         assert await task.release() == ""
         grip = asyncio.create_task(task.grip(GRIP))
         while rig.model.width_mm > 120.0:  # noqa: ASYNC110 - the model is looked at, as it moves
@@ -106,14 +99,12 @@ async def test_halt_stops_the_fingers_after_a_reconnection(way, tmp_path):
         rig.model.step(STEP_S)
         assert not rig.model.taken.gto
         assert rig.model.width_mm > 110.0
-        read.cancel()
 
 
 @WAYS
 async def test_cancelled_activation_stops_the_fingers(way, tmp_path):
-    async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S):
+    async with a_rig(way, tmp_path, connected=True) as rig, asyncio.timeout(DEADLINE_S):
         task = task_of(rig)
-        await rig.driver.connect()
         grip = asyncio.create_task(task.grip(GRIP))
         while rig.model.width_mm < 100.0:  # noqa: ASYNC110 - the model is looked at, as it moves
             await asyncio.sleep(0)
@@ -132,10 +123,9 @@ async def test_cancelled_activation_stops_the_fingers(way, tmp_path):
 
 @WAYS
 async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way, tmp_path):
-    async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S):
+    async with a_rig(way, tmp_path, connected=True) as rig, asyncio.timeout(DEADLINE_S):
         rig.model.put_between(40.0)
         task = task_of(rig)
-        await rig.driver.connect()
         assert await task.grip(GRIP) == ""
         held_mm = rig.model.width_mm
         rig.driver.latest = None
@@ -151,9 +141,7 @@ async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way, tmp_pat
 
 @WAYS
 async def test_unlock_handles_a_fault_newer_than_the_state(way, tmp_path):
-    async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S):
-        await rig.driver.connect()
-        await rig.driver.activate()
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
         assert not (await rig.driver.read()).fault.needs_activation
         rig.model.fail(12)
         assert await task_of(rig).unlock() == ""

@@ -1,32 +1,17 @@
 """The loop's task over the real pilot, with an arm and a gripper of this process: what it does when things go wrong."""
 
 import asyncio
-import math
 from typing import Any
 
 import pytest
 
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.runner import WRENCH, along_tool
+from shearloop.daemon.control.runner import WRENCH
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.control.step_runner import ExperimentPhase
 from shearloop.drivers.ur.messages import MoveLinear, Stop, WristSpeed
 from tests.daemon.control.cell import GRIP, MOVE, TWIST, driven, experiment, no_tick
 from tests.drivers.ur.flight import SETTINGS
-
-
-@pytest.mark.parametrize(
-    ("turned", "moved"),
-    [
-        ((0.0, 0.0, 0.0), (0.0, 0.0, 0.03)),
-        ((0.0, math.pi, 0.0), (0.0, 0.0, -0.03)),
-        ((0.0, math.pi / 2, 0.0), (0.03, 0.0, 0.0)),
-    ],
-)
-def test_along_the_tool_is_where_its_own_axis_points(turned, moved):
-    x, y, z, *same = along_tool((0.4, -0.1, 0.3, *turned), 0.03)
-    assert (x - 0.4, y + 0.1, z - 0.3) == pytest.approx(moved, abs=1e-12)
-    assert tuple(same) == turned
 
 
 async def test_an_action_that_dies_fails_its_step_and_is_told():

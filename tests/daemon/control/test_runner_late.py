@@ -39,7 +39,6 @@ async def test_a_loop_that_is_late_again_and_again_is_stopped(missed, read):
 
 
 async def test_a_daemon_that_was_paused_says_so_first_and_not_what_follows_from_it():
-    """Of as many as eight sentences the cause was the last: torques and states are old to one who was away."""
     async with driven(TWIST, cycles=50) as cell:
         for _ in range(6_000_000_000 // CYCLE_NS):
             cell.robot.cycle(read=False)

@@ -234,7 +234,6 @@ def test_a_pause_of_the_daemon_is_told_first_until_nothing_is_wrong_and_what_it_
 
 @pytest.mark.parametrize("event", [FaultCode.RECORDING_FAILED, FaultCode.COMMAND_REFUSED])
 def test_what_neither_holds_the_wrist_nor_comes_of_a_pause_is_told_and_does_not_keep_the_pause(event):
-    """A refusal is told once, and was never; a disk that stays full had the pause told first of a stop hours later."""
     paused, other, limit = trouble(FaultCode.DAEMON_PAUSED), trouble(event), trouble(FaultCode.TORQUE_LIMIT)
     gate = SafetyMonitor()
     assert gate.judge([other, paused], 0).reasons == (paused.sentence, other.sentence)

@@ -10,7 +10,7 @@ from tests.daemon.emulate_rig.rig import HOMOGENEOUS, PACE, PATTERN, RigProcess
 
 
 @pytest.fixture(scope="session")
-def bank(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bank(tmp_path_factory) -> Path:
     """A bank whose signals grow with σ along a known pattern."""
     path = tmp_path_factory.mktemp("bank") / "rig.bank"
     sigma = np.array([0.9, 2.3])
@@ -21,7 +21,7 @@ def bank(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def rig_process(bank: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RigProcess]:
+def rig_process(bank, tmp_path_factory) -> Iterator[RigProcess]:
     run_dir = tmp_path_factory.mktemp("run")
     process = RigProcess("rig", "--bank", str(bank), "--run-dir", str(run_dir), *PACE, module=2, ready="rig ready")
     process.run_dir = run_dir
@@ -31,7 +31,7 @@ def rig_process(bank: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
 
 
 @pytest.fixture
-def rig(rig_process: RigProcess) -> Iterator[RigProcess]:
+def rig(rig_process) -> Iterator[RigProcess]:
     """The module's rig, without faults after the test."""
     yield rig_process
     asyncio.run(rig_process.fault("normal"))

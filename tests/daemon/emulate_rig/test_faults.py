@@ -12,17 +12,7 @@ from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import ObjectStatus
 from shearloop.drivers.ur.messages import Unlock
-from tests.daemon.emulate_rig.rig import (
-    COUNTS,
-    DEADLINE_S,
-    Reader,
-    arm_at,
-    grip,
-    kit_at,
-    open_gripper_at,
-    torque_of,
-    until,
-)
+from tests.daemon.emulate_rig import rig as played
 from tests.running import LinkEvents
 
 pytestmark = pytest.mark.real_time
@@ -30,26 +20,28 @@ pytestmark = pytest.mark.real_time
 
 async def test_disturbances_reach_the_tool_and_robot_faults_the_robot(rig):
     async with AsyncExitStack() as stack:
-        gripper = await stack.enter_async_context(open_gripper_at(rig))
-        load = await stack.enter_async_context(Reader(LoadCell(COUNTS, path=rig.run_dir / "load-cell").readings()))
-        await grip(gripper)
+        gripper = await stack.enter_async_context(played.open_gripper_at(rig))
+        load = await stack.enter_async_context(
+            played.Reader(LoadCell(played.COUNTS, path=rig.run_dir / "load-cell").readings())
+        )
+        await played.grip(gripper)
         await rig.fault("kick 0.05")
         truth = await rig.truth(lambda truth: bool(truth["torque_nm"]))
         assert truth["torque_nm"] == pytest.approx(0.05, rel=0.05)
-        assert await torque_of(load) == pytest.approx(0.05, rel=0.08)
+        assert await played.torque_of(load) == pytest.approx(0.05, rel=0.08)
         link = LinkEvents()
-        async with arm_at(rig, link) as arm:
-            await until(arm, lambda state: state.wrist_torque_nm < -0.04)
+        async with played.arm_at(rig, link) as arm:
+            await played.until(arm, lambda state: state.wrist_torque_nm < -0.04)
             await rig.fault("slip 0.01")
-            await until(arm, lambda state: -0.02 < state.wrist_torque_nm < 0.0)
+            await played.until(arm, lambda state: -0.02 < state.wrist_torque_nm < 0.0)
             assert (await rig.truth())["slipped_rad"] > 0.02
             await rig.fault("protective-stop")
-            await until(arm, lambda state: state.protective_stop)
+            await played.until(arm, lambda state: state.protective_stop)
             await rig.event("protective-stop", 0)
             await rig.fault("robot emergency-stop")
-            await until(arm, lambda state: state.emergency_stop)
+            await played.until(arm, lambda state: state.emergency_stop)
             await rig.fault("release")
-            async with asyncio.timeout(DEADLINE_S):
+            async with asyncio.timeout(played.DEADLINE_S):
                 while not (await arm.send(Unlock())).accepted:
                     await arm.next_state()
             await rig.fault("drop-rtde")
@@ -60,8 +52,8 @@ async def test_disturbances_reach_the_tool_and_robot_faults_the_robot(rig):
 
 
 async def test_gripper_faults_reach_the_gripper(rig):
-    async with asyncio.timeout(DEADLINE_S), open_gripper_at(rig) as gripper:
-        await grip(gripper)
+    async with asyncio.timeout(played.DEADLINE_S), played.open_gripper_at(rig) as gripper:
+        await played.grip(gripper)
         await rig.fault("gripper drop")
         while (await gripper.read()).object is not ObjectStatus.AT_TARGET:
             continue
@@ -71,7 +63,7 @@ async def test_gripper_faults_reach_the_gripper(rig):
         state = await gripper.read()
         assert (state.fault.code, state.fault.needs_activation) == (12, True)
         await gripper.activate(operator_confirmed=True)
-        assert (await grip(gripper)).diameter_mm == pytest.approx(30.0, abs=1.0)
+        assert (await played.grip(gripper)).diameter_mm == pytest.approx(30.0, abs=1.0)
         await rig.fault("unplug gripper")
         with pytest.raises(DeviceLostError):
             await _read_on(gripper)
@@ -93,17 +85,17 @@ async def _read_on(gripper: RobotiqGripper) -> None:
 async def test_boards_fall_silent_vanish_and_come_back(rig):
     async with AsyncExitStack() as stack:
         told, losses = LinkEvents(), LinkEvents()
-        kit, other = kit_at(rig, "right", told), kit_at(rig, "left")
-        cell = LoadCell(COUNTS, path=rig.run_dir / "load-cell", monitor=LinkMonitor(losses))
-        right = await stack.enter_async_context(Reader(kit.readings()))
-        left = await stack.enter_async_context(Reader(other.readings()))
-        load = await stack.enter_async_context(Reader(cell.readings()))
+        kit, other = played.kit_at(rig, "right", told), played.kit_at(rig, "left")
+        cell = LoadCell(played.COUNTS, path=rig.run_dir / "load-cell", monitor=LinkMonitor(losses))
+        right = await stack.enter_async_context(played.Reader(kit.readings()))
+        left = await stack.enter_async_context(played.Reader(other.readings()))
+        load = await stack.enter_async_context(played.Reader(cell.readings()))
         for each in (right, left, load):
             await each.take(1)
         assert [event.up for event in (*told.events, *losses.events)] == [True, True]
         for line in ("unplug right", "silence left", "silence load"):
             await rig.fault(line)
-        async with asyncio.timeout(DEADLINE_S):
+        async with asyncio.timeout(played.DEADLINE_S):
             await told.down()
             assert "has sent nothing" in (await losses.down()).sentence
             # A silent board is started again by its driver, without being lost.

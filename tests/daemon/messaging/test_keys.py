@@ -23,7 +23,7 @@ SILENCE_MS = 300
 
 
 @pytest.fixture
-def keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+def keys(tmp_path, capsys) -> Path:
     """A server and one client who knows it, made as a user makes them."""
     server, client = str(tmp_path / "keys"), str(tmp_path / "ada")
     assert main(["keys", "server", "--dir", server]) == 0

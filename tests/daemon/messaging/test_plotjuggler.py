@@ -7,7 +7,6 @@ take the first of two frames as the topic, which names the series; a third would
 """
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -46,7 +45,7 @@ def plotted(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
 
 
 @pytest.fixture
-def frames(tmp_path: Path) -> dict[str, list[bytes]]:
+def frames(tmp_path) -> dict[str, list[bytes]]:
     """The frames of one message of each topic, received one by one by a plain SUB socket."""
     address = f"ipc://{tmp_path}/publish"
     received: dict[str, list[bytes]] = {}

@@ -1,7 +1,6 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from pathlib import Path
 
 import pytest
 import zmq
@@ -25,13 +24,13 @@ def until(is_so: Callable[[], bool]) -> None:
 
 
 @pytest.fixture
-def publisher(tmp_path: Path) -> Iterator[Publisher]:
+def publisher(tmp_path) -> Iterator[Publisher]:
     with zmq.Context() as context, closing(Publisher(context, f"ipc://{tmp_path}/publish", Clock())) as bound:
         yield bound
 
 
 @pytest.fixture
-def connect(tmp_path: Path) -> Iterator[Connect]:
+def connect(tmp_path) -> Iterator[Connect]:
     """Connects a socket to the publisher, with a subscription."""
     with zmq.Context() as context:
 

@@ -46,7 +46,7 @@ def mat_folder(tmp_path) -> Callable[..., Path]:
 
 
 @pytest.fixture
-def imported(mat_folder: Callable[..., Path], tmp_path: Path) -> Path:
+def imported(mat_folder, tmp_path) -> Path:
     """The recording of two sides and a load, imported."""
     import_mat([mat_folder()], tmp_path / "imported.mcap")
     return tmp_path / "imported.mcap"
@@ -74,7 +74,7 @@ def slices_folder(tmp_path) -> Path:
 
 
 @pytest.fixture
-def small_disk(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Path]:
+def small_disk(request, tmp_path) -> Iterator[Path]:
     """A file system of the size in the test's parameter."""
     folder = tmp_path / "disk"
     folder.mkdir()

@@ -15,7 +15,7 @@ LINES = line_of_channels(np.round(np.random.default_rng(0).uniform(0, 1, (4, 896
 
 
 @pytest.fixture
-def recording(tmp_path: Path) -> Path:
+def recording(tmp_path) -> Path:
     path = tmp_path / "twist.mcap"
     with RecordingWriter(path, "a bench") as writer:
         for i, line in enumerate(LINES):

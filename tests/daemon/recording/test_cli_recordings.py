@@ -140,7 +140,6 @@ def test_a_stream_is_imported_and_cannot_be_judged_by_slices(mat_folder, slices_
 
 
 def test_reasons_are_told_by_a_true_example_with_all_that_differ_in_numbers_alone():
-    """The numbers stood as #, and what follows from them was left out."""
     said = [
         "outside the calibration: the Q residual is 2.1 (at most 1.5)",
         "right fingertip: 7 % of the channels jumped since the last frame; it was touched",

@@ -25,7 +25,7 @@ CONFIGURATION = {"fingertips": {"right": {"device": {"path": "eit-right"}}}}
 
 
 @pytest.fixture(scope="module")
-def content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def content(tmp_path_factory) -> bytes:
     """Return a recording as the daemon's own recorder makes it, of two chunks, with inputs and a configuration."""
     folder = tmp_path_factory.mktemp("whole")
     attached = AttachedFile("configuration.json", "application/json", json.dumps(CONFIGURATION).encode())
@@ -77,7 +77,7 @@ READERS: list[Callable[[Path], Any]] = [happened, exported, calibrated, told, re
 
 
 @pytest.fixture(scope="module")
-def sound(content: bytes, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def sound(content, tmp_path_factory) -> dict[str, Any]:
     path = tmp_path_factory.mktemp("sound") / "x.mcap"
     path.write_bytes(content)
     return {read.__name__: read(path) for read in READERS}

@@ -34,7 +34,7 @@ class SmallDisk(io.FileIO):
 
 
 @pytest.fixture
-def disks(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[SmallDisk]]:
+def disks(monkeypatch) -> Callable[..., list[SmallDisk]]:
     """Lets the next files of recorders be on disks with so much room, one after the other; returns the list of them."""
 
     def make(*rooms: int) -> list[SmallDisk]:

@@ -150,7 +150,7 @@ def test_foreign_files_are_refused(tmp_path, content, says):
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["compressed", "plain"])
-def recording(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> bytes:
+def recording(tmp_path_factory, request) -> bytes:
     path = tmp_path_factory.mktemp("recording") / "Data_Slice_1.mat"
     noise = np.random.default_rng(1).integers(0, 5, (1, 896)) * 0.00215
     savemat(path, {"torque_value": 0.1, "data_diff": noise}, do_compression=request.param)

@@ -218,7 +218,7 @@ def test_a_folder_that_cannot_be_made_is_an_error(tmp_path):
 
 
 @pytest.fixture(params=["full", "gone"])
-def unwritable(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def unwritable(request, tmp_path, monkeypatch) -> Path:
     """Return a folder in which nothing can be written, or not to its end."""
     if request.param == "gone":
         # Whoever runs the tests may write everywhere, but in no folder that is none.

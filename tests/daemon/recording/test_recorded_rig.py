@@ -15,7 +15,7 @@ TWIST = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.01, "hold_s": 
 
 
 @pytest.fixture
-def recorded_rig(rig_config: Path, small_disk: Path) -> Path:
+def recorded_rig(rig_config, small_disk) -> Path:
     """The whole rig's configuration, with recording on the small disk."""
     config = yaml.safe_load(rig_config.read_text())
     rig_config.write_text(yaml.safe_dump({**config, "recording": {"folder": str(small_disk)}}))

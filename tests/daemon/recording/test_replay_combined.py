@@ -37,7 +37,7 @@ class Twists(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def twists(tmp_path_factory: pytest.TempPathFactory) -> Twists:
+def twists(tmp_path_factory) -> Twists:
     folder = tmp_path_factory.mktemp("twists")
     random = np.random.default_rng(4)
     t_s = PERIOD_S * np.arange(N_FRAMES)

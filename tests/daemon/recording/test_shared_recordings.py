@@ -234,7 +234,6 @@ def test_a_tenth_of_a_foreign_frame_in_later_slices_lies_within_the_intervals(na
 
 
 def test_where_slices_tell_little_intervals_reach_to_what_may_be_hidden_in_them(slices, earlier):
-    """Of ten slices after the narrowest calibration, with a tenth of the own ones mirrored, four were false-valid."""
     calibration, later = earlier("motion_regression", 39), slices.between(39, 49)
     mirrored = ElectrodeNumbering(5, True, score=1.0, runner_up=0.0).model_channels()
     foreign = later.channels.mean(axis=0)[:, mirrored]
@@ -252,7 +251,6 @@ def _believing(calibration: Calibration) -> Calibration:
 
 @pytest.mark.parametrize("name", ["motion_regression", "regression"])
 def test_a_fifth_of_a_recorded_cylinder_in_later_slices_lies_within_the_intervals(name, slices, earlier, shared):
-    """A cylinder responds weakly: 21 of 100 of these were false-valid with the default, 16 with `regression`."""
     (cylinders,) = read_series(shared / "recordings/diameter_slices")
     missed = []
     for n in (19, 29, 39):
@@ -302,7 +300,6 @@ THIRD = 1 / 3
 @pytest.mark.parametrize("sides", [("right",), ("left",), ("right", "left")])
 @pytest.mark.parametrize("late_s", [-0.54, 0.54])
 def test_a_load_half_a_second_off_in_a_short_recording_lies_within_the_intervals(twists, sides, late_s):
-    """Of as many loaded as free frames up to 41 % were false-valid; of the loaded ones, up to 77 %."""
     past = part_of(twists.select_sides(sides), 0, THIRD)
     late = replace(past, torque_t_s=past.torque_t_s + late_s)
     future = part_of(twists.select_sides(sides), THIRD - 0.02, 1)

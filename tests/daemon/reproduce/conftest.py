@@ -19,12 +19,12 @@ K, SIGMA = np.linspace(2.6, 3.6, 7), np.linspace(1.0, 2.0, 8)
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _drawing(fonts: None) -> None:
+def _drawing(fonts) -> None:
     """Have the fonts open for all tests here."""
 
 
 @pytest.fixture(scope="session")
-def coarse_fingertip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def coarse_fingertip(tmp_path_factory) -> Path:
     text = banks.OWN_FINGERTIP.read_text()
     assert "mesh_size_cm: 0.07" in text
     path = tmp_path_factory.mktemp("fingertip") / "coarse.yaml"
@@ -33,19 +33,19 @@ def coarse_fingertip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def coarse_mesh(coarse_fingertip: Path) -> Mesh:
+def coarse_mesh(coarse_fingertip) -> Mesh:
     return load_geometry(coarse_fingertip)
 
 
 @pytest.fixture(scope="session")
-def signals(coarse_mesh: Mesh) -> NDArray[np.float32]:
+def signals(coarse_mesh) -> NDArray[np.float32]:
     """(7, 8, 896) signals over K and SIGMA, as a bank has them."""
     solver = RowSolver(coarse_mesh, BankDefinition(coarse_mesh.digest, banks.MODEL, K, SIGMA))
     return np.stack([solver.solve(row).signals for row in range(len(K))])
 
 
 @pytest.fixture
-def small_grids(monkeypatch: pytest.MonkeyPatch) -> None:
+def small_grids(monkeypatch) -> None:
     for name in banks.GRIDS:
         monkeypatch.setitem(banks.GRIDS, name, Grid(K, SIGMA))
 
@@ -54,7 +54,7 @@ MakeRecordings = Callable[..., Path]
 
 
 @pytest.fixture
-def make_recordings(tmp_path: Path, signals: NDArray[np.float32]) -> MakeRecordings:
+def make_recordings(tmp_path, signals) -> MakeRecordings:
     """Return a function that writes slices: of three series, sigma falls with torque; k falls with diameter."""
 
     def make(torque: bool = True, diameter: bool = True, raw: bool = True) -> Path:

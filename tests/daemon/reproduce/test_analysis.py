@@ -10,7 +10,7 @@ from shearloop.bank.eit.bank_file import BankDefinition
 from shearloop.bank.eit.build import RowSolver
 from shearloop.bank.eit.channels import smoothed_along_channels
 from shearloop.bank.eit.matching import ReferenceMatcher, best_match
-from shearloop.bank.eit.mesh import Mesh, load_mesh
+from shearloop.bank.eit.mesh import load_mesh
 from shearloop.daemon.analysis.reproduce.analysis import (
     TorqueResult,
     analyse_diameter,
@@ -28,7 +28,7 @@ from tests.daemon.reproduce.conftest import SIGMA, K
 
 
 @pytest.fixture(scope="module")
-def bank(coarse_mesh: Mesh, tmp_path_factory: pytest.TempPathFactory):
+def bank(coarse_mesh, tmp_path_factory):
     return cached_bank("small", Grid(K, SIGMA), coarse_mesh, tmp_path_factory.mktemp("banks"))
 
 

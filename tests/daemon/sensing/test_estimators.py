@@ -28,12 +28,12 @@ def recorded() -> FrameSeries:
 
 
 @pytest.fixture(scope="module")
-def calibration(recorded: FrameSeries) -> Calibration:
+def calibration(recorded) -> Calibration:
     return fit(NAME, [recorded], "rig")
 
 
 @pytest.fixture(scope="module")
-def files(recorded: FrameSeries, calibration: Calibration, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def files(recorded, calibration, tmp_path_factory) -> dict[str, Path]:
     """Save a calibration of both sides and one of the right alone."""
     folder = tmp_path_factory.mktemp("calibrations")
     calibration.save(folder / "combined.cal")

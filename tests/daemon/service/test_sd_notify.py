@@ -4,7 +4,6 @@ import resource
 import signal
 import socket
 from collections.abc import Iterator
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -21,7 +20,7 @@ from tests.daemon.conftest import DEADLINE_S, shearloop
 
 
 @pytest.fixture
-def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
+def manager(tmp_path, monkeypatch) -> Iterator[socket.socket]:
     """What systemd listens with."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
         listening.bind(str(tmp_path / "notify"))

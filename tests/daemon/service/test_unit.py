@@ -25,7 +25,7 @@ def analyze(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["plain", "real-time"])
-def unit(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def unit(request, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("unit") / UNIT
     path.write_text(unit_for(PROGRAM))
     if request.param:

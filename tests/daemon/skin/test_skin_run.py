@@ -11,6 +11,7 @@ import yaml
 import zmq
 import zmq.asyncio
 
+from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import main
 from shearloop.daemon.config import load_daemon_config
@@ -270,8 +271,6 @@ def test_a_mistake_in_the_skin_s_section_is_one_sentence_and_status_2(tmp_path, 
 
 
 def test_a_calibration_that_is_none_is_told_before_anything_is_opened(tmp_path):
-    from shearloop.bank.errors import CalibrationError
-
     path = written(tmp_path, {"skin": section(ADC, calibration="none.yaml")})
     with zmq.asyncio.Context() as context, pytest.raises(CalibrationError, match=r"none\.yaml: the calibration cannot"):
         Daemon(load_daemon_config(path), context)

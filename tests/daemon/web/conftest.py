@@ -166,7 +166,7 @@ class Browsed:
 
 
 @pytest.fixture
-def fresh(browsed: Browsed) -> Iterator[None]:
+def fresh(browsed) -> Iterator[None]:
     """Every test begins with all messages, and ends without a complaint of the browser or a call to elsewhere."""
     browsed.daemon.say()
     browsed.daemon.forget()
@@ -180,7 +180,7 @@ def fresh(browsed: Browsed) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def browsed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browsed]:
+def browsed(tmp_path_factory) -> Iterator[Browsed]:
     """A page before a viewer before a daemon's sockets: one browser for all tests of a module."""
     chromium = shutil.which("chromium")
     if chromium is None:

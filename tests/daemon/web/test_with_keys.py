@@ -46,7 +46,7 @@ def free_port() -> int:
 
 
 @pytest.fixture
-def places(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
+def places(tmp_path, capsys) -> dict[str, str]:
     """A daemon's addresses, on the network; its keys, and those of ada, who is allowed, and of eve, who is not."""
     for who in ("ada", "eve"):
         assert main(["keys", "client", "--dir", str(tmp_path / who)]) == 0

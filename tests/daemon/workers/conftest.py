@@ -24,7 +24,7 @@ def lasting() -> None:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def importable_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def importable_tests(tmp_path_factory) -> Iterator[str]:
     """Let worker processes import the tasks of these tests as `tests.…`, and nothing else of the repository."""
     folder = tmp_path_factory.mktemp("path")
     (folder / "tests").symlink_to(ROOT / "tests")
@@ -69,7 +69,7 @@ def dask(folder: Path, *workers: str, path: str = "") -> Iterator[tuple[str, lis
 
 
 @pytest.fixture(scope="module")
-def scheduler(tmp_path_factory: pytest.TempPathFactory, importable_tests: str) -> Iterator[str]:
+def scheduler(tmp_path_factory, importable_tests) -> Iterator[str]:
     """Start a scheduler and two workers, all processes of their own, and return the address."""
     with dask(tmp_path_factory.mktemp("dask"), "--nworkers", "2", "--nthreads", "1", path=importable_tests) as found:
         yield found[0]

@@ -89,7 +89,6 @@ def test_a_killed_worker_costs_only_its_own_tasks(scheduler, tmp_path):
 
 
 def test_unfinished_results_are_dropped_quietly(scheduler):
-    """So ends what is interrupted where a result is used; a traceback told of it after the sentence."""
     with open_executor(scheduler) as cluster:
         found = cluster.map(square, {"factor": 0.37}, range(3))
         next(found)
@@ -103,7 +102,6 @@ def size(_: None, item: Any) -> int:
 
 
 def test_a_large_recording_is_sent_to_a_cluster_without_a_warning(scheduler):
-    """Dask warned of what is over 10 MB, in six lines; warnings are errors here."""
     with open_executor(scheduler) as cluster:
         assert list(cluster.map(size, None, [np.zeros(1_500_000)])) == [(0, 1_500_000)]
 
@@ -128,7 +126,7 @@ def test_a_server_that_is_no_scheduler_times_out(monkeypatch):
 
 
 @pytest.fixture
-def lonely(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+def lonely(tmp_path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
     """Start a scheduler without workers, and return its address and its process."""
     with dask(tmp_path) as found:
         yield found

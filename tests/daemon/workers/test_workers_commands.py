@@ -17,7 +17,7 @@ from tests.daemon.workers.conftest import STARTED_S
 
 
 @pytest.fixture(scope="module")
-def banks(scheduler: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def banks(scheduler, tmp_path_factory) -> tuple[Path, Path]:
     """Return a bank built here, and the same one built on the cluster; before any test is watched (tqdm's thread)."""
     folder = tmp_path_factory.mktemp("banks")
     (folder / "tip.yaml").write_text(FINGERTIP)
@@ -35,7 +35,7 @@ def test_a_bank_has_the_same_bytes_from_a_cluster(banks):
 
 
 @pytest.fixture(scope="module")
-def varied(banks: tuple[Path, Path], scheduler: str) -> tuple[Path, Path]:
+def varied(banks, scheduler) -> tuple[Path, Path]:
     """Return folders of banks over tilt and amplitude, built here and on the cluster."""
     folder = banks[0].parent
     over = "over: {tilt_deg: {low: -5, high: 5, count: 2}, amplitude: {low: 0.5, high: 1, count: 2}}"
@@ -53,7 +53,7 @@ def test_banks_over_more_parameters_have_the_same_bytes_from_a_cluster(varied):
 
 
 @pytest.fixture
-def killed(scheduler: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+def killed(scheduler, monkeypatch) -> Iterator[list[int]]:
     """Kill a worker as soon as the first result of anything is here, and give the numbers of those killed.
 
     Its nanny starts another one, which is waited for at the end.

@@ -33,7 +33,7 @@ def test_worker_processes_ignore_the_terminals_signals():
 
 
 @pytest.fixture
-def interrupted_once_it_works(tmp_path: Path) -> Interrupted:
+def interrupted_once_it_works(tmp_path) -> Interrupted:
     """Interrupts this process as soon as a task `waits`, and returns the process that the task was in."""
     os.mkfifo(tmp_path / "told")
     running: list[int] = []
@@ -57,10 +57,6 @@ def interrupted_once_it_works(tmp_path: Path) -> Interrupted:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("more", ["", "x" * (1 << 20)], ids=["small", "large"])
 def test_worker_processes_end_on_an_interrupt(number, more, interrupted_once_it_works, tmp_path):
-    """They were waited for until their tasks were done; of SIGTERM they did not hear, and stayed.
-
-    Tasks that no pipe holds were waited for as well, for ever and deaf to more signals (Python 3.11.2, Debian 12).
-    """
     shared = str(tmp_path / "told"), more
     process = interrupted_once_it_works(number, lambda: list(ProcessExecutor(1).map(waits, shared, [0, 1, 2])))
     assert active_children() == []

@@ -17,7 +17,7 @@ from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.emulators.gripper import Gripper, GripperMechanics, ModbusSlave, UrcapSession
 from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
-from shearloop.drivers.robotiq.messages import GripperClient, GripperCommand, GripperState
+from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.modbus_client import ModbusClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from tests.running import LinkEvents
@@ -44,17 +44,12 @@ class Rig:
         self.steps_left = MOST_STEPS
         return round(self.t_s * 1e9)
 
-    async def hold(self, object_mm: float) -> GripperState:
-        """Grip an object and return the state."""
-        self.model.put_between(object_mm)
-        return await self.driver.finish(await self.driver.move(GripperCommand(0.0)))
-
     def silence(self, silent: bool) -> None:
         self.server.command("silence" if silent else "normal")
 
 
 @contextlib.asynccontextmanager
-async def a_rig(way: str, tmp_path: Path, *, active: bool = False) -> AsyncIterator[Rig]:
+async def a_rig(way: str, tmp_path: Path, *, connected: bool = False, active: bool = False) -> AsyncIterator[Rig]:
     model = Gripper(MECHANICS)
     server: Server
     client: GripperClient
@@ -68,12 +63,8 @@ async def a_rig(way: str, tmp_path: Path, *, active: bool = False) -> AsyncItera
         await server.restore()
         client = ModbusClient(path=str(link), reply_deadline_s=0.2)
     rig = Rig(model, server)
-    driver = rig.driver = RobotiqGripper(
-        client,
-        CALIBRATION,
-        poll_s=0.0,
-        monitor=LinkMonitor(rig.link, 0.001, 0.002),
-    )
+    driver = RobotiqGripper(client, CALIBRATION, poll_s=0.0, monitor=LinkMonitor(rig.link, 0.001, 0.002))
+    rig.driver = driver
 
     async def pass_time() -> None:
         while True:
@@ -86,8 +77,9 @@ async def a_rig(way: str, tmp_path: Path, *, active: bool = False) -> AsyncItera
     tasks = [asyncio.create_task(pass_time()), asyncio.create_task(server.run())]
     try:
         with patch("shearloop.drivers.robotiq.gripper.time", rig):
-            if active:
+            if connected or active:
                 await driver.connect()
+            if active:
                 await driver.activate()
             yield rig
     finally:

@@ -53,7 +53,8 @@ async def test_gripper_activates_moves_and_measures_an_object(way, tmp_path):
 @WAYS
 async def test_old_contact_is_ignored_until_the_command_is_taken_up(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig:
-        await rig.hold(20.0)
+        rig.model.put_between(20.0)
+        await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
         rig.stopped = True
         sent = await rig.driver.move(messages.GripperCommand(100.0))
         # The registers still say "contact closing" of the motion before.
@@ -111,7 +112,8 @@ async def test_overheating_passes_without_activation(way, tmp_path):
 @WAYS
 async def test_activating_an_active_gripper_moves_nothing(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig:
-        held = await rig.hold(25.0)
+        rig.model.put_between(25.0)
+        held = await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
         again = await rig.driver.activate()
         assert again.position_counts == held.position_counts
         assert again.diameter_mm == held.diameter_mm
@@ -142,7 +144,8 @@ async def test_command_of_another_master_is_seen_at_the_next_poll(way, tmp_path,
     async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
         await anext(states)
         await rig.driver.activate()
-        await rig.hold(20.0)
+        rig.model.put_between(20.0)
+        await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
         rig.stopped = True
         while (await anext(states)).object is not messages.ObjectStatus.CONTACT_CLOSING:
             pass

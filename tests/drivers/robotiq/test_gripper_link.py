@@ -16,8 +16,7 @@ from tests.drivers.robotiq.gripper_rig import WAYS, a_rig
 
 @WAYS
 async def test_silence_is_a_loss_and_clears_the_state(way, tmp_path):
-    async with a_rig(way, tmp_path) as rig:
-        await rig.driver.connect()
+    async with a_rig(way, tmp_path, connected=True) as rig:
         assert rig.driver.latest is not None
         rig.silence(True)
         with pytest.raises(DeviceLostError, match=r"within 0\.2 s"):
@@ -46,8 +45,7 @@ async def test_cancellation_that_arrives_with_an_answer_is_kept(tmp_path, monkey
             await asyncio.Event().wait()
         return response
 
-    async with a_rig("modbus", tmp_path) as rig, asyncio.timeout(20):
-        await rig.driver.connect()
+    async with a_rig("modbus", tmp_path, connected=True) as rig, asyncio.timeout(20):
         monkeypatch.setattr(AsyncModbusSerialClient, "read_holding_registers", with_the_answer)
         reading = asyncio.create_task(rig.driver.read())
         await answered.wait()
@@ -119,8 +117,7 @@ async def test_states_are_polled_while_a_command_runs(way, tmp_path):
 
 @WAYS
 async def test_cancelled_call_leaves_no_stale_answer(way, tmp_path):
-    async with a_rig(way, tmp_path) as rig:
-        await rig.driver.connect()
+    async with a_rig(way, tmp_path, connected=True) as rig:
         rig.silence(True)
         reading = asyncio.create_task(rig.driver.read())
         await asyncio.sleep(0)
@@ -142,8 +139,7 @@ async def test_absent_gripper_is_explained(way, tmp_path):
 
 
 async def test_gripper_without_power_is_not_read_as_zero(tmp_path):
-    async with a_rig("socket", tmp_path) as rig:
-        await rig.driver.connect()
+    async with a_rig("socket", tmp_path, connected=True) as rig:
         rig.model.cut_power()
         with pytest.raises(DeviceLostError, match="no data of the gripper"):
             await rig.driver.read()
@@ -156,8 +152,7 @@ async def test_damaged_modbus_reply_is_rejected(tmp_path, monkeypatch):
         *reply, last = feed(slave, data)
         return bytes([*reply, last ^ 0xFF])
 
-    async with a_rig("modbus", tmp_path) as rig:
-        await rig.driver.connect()
+    async with a_rig("modbus", tmp_path, connected=True) as rig:
         with monkeypatch.context() as patched:
             patched.setattr(ModbusSlave, "feed", damaged)
             with pytest.raises(DeviceLostError):
@@ -166,8 +161,7 @@ async def test_damaged_modbus_reply_is_rejected(tmp_path, monkeypatch):
 
 
 async def test_gripper_reports_a_silent_master(tmp_path):
-    async with a_rig("modbus", tmp_path) as rig:
-        await rig.driver.connect()
+    async with a_rig("modbus", tmp_path, connected=True) as rig:
         rig.stopped = True
         rig.model.fail(9)
         assert (await rig.driver.read()).fault.code == 9

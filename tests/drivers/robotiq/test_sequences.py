@@ -48,7 +48,7 @@ Connect = Callable[[Client], RobotiqGripper]
 
 
 @pytest.fixture
-def connect(monkeypatch: pytest.MonkeyPatch) -> Connect:
+def connect(monkeypatch) -> Connect:
     """Return a gripper behind a client, in the client's time."""
 
     def gripper(client: Client) -> RobotiqGripper:

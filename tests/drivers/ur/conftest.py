@@ -20,14 +20,14 @@ def controller_process() -> Iterator[ControllerProcess]:
 
 
 @pytest.fixture
-def controller(controller_process: ControllerProcess) -> Iterator[ControllerProcess]:
+def controller(controller_process) -> Iterator[ControllerProcess]:
     """The module's controller without faults, before the test and after it."""
     yield controller_process
     asyncio.run(controller_process.fault("normal"))
 
 
 @pytest.fixture
-def daemon(monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
+def daemon(monkeypatch) -> Iterator[Daemon]:
     """The daemon of a worker that neither exits nor sets alarms."""
     daemon = Daemon(monkeypatch)
     yield daemon
@@ -35,6 +35,6 @@ def daemon(monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
 
 
 @pytest.fixture
-def timed(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Timed]:
+def timed(daemon, monkeypatch) -> Callable[..., Timed]:
     """Run a worker in its own time."""
     return partial(Timed, daemon, monkeypatch)

@@ -235,6 +235,14 @@ def flying(settings: UrSettings = SETTINGS) -> Flight:
     return flight
 
 
+def moving(cycles: int) -> Flight:
+    """Return a flight that has begun a linear move so many cycles ago."""
+    flight = flying()
+    assert flight.ask(messages.MoveLinear(POSE, 0.1, 0.1)).accepted
+    flight.fly(cycles)
+    return flight
+
+
 def turning(speed: float = 0.5) -> Flight:
     flight = flying()
     assert flight.ask(messages.WristSpeed(speed, 4.0)).accepted

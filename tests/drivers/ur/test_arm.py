@@ -36,7 +36,7 @@ class Client:
 
 
 @pytest.fixture
-def arm(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+def arm(monkeypatch) -> Iterator[ModuleType]:
     """The module `shearloop.drivers.ur.arm` over fake clients."""
     for name, kind in (("rtde_control", "RTDEControlInterface"), ("script_client", "ScriptClient")):
         module = ModuleType(name)
@@ -54,9 +54,8 @@ def test_sample_that_waited_in_the_socket_is_old(arm, monkeypatch):
     reader, now_ns = arm.UrArm(SETTINGS, VERSION), 10**12
     monkeypatch.setattr(arm.time, "monotonic_ns", lambda: now_ns)
     monkeypatch.setattr(reader, "_control", SimpleNamespace(isConnected=lambda: True))
-    six = (0.0,) * 6
     for number, waited_ns in enumerate([0, 0, 200_000_000]):
-        sample = ReceivedSample(50.0 + 0.008 * number, six, six, six, six, 7, 1, 2, 1.0, 1)
+        sample = ReceivedSample(50.0 + 0.008 * number, SIX, SIX, SIX, SIX, 7, 1, 2, 1.0, 1)
         monkeypatch.setattr(reader, "_receiver", SimpleNamespace(latest=lambda it=sample: it, connected=True))
         now_ns = 10**12 + 8_000_000 * number + waited_ns
         assert reader.read().age_ns == pytest.approx(waited_ns, abs=3_000_000)

@@ -5,7 +5,6 @@ import gc
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -28,7 +27,7 @@ async def test_absent_controller_is_explained():
 
 
 @pytest.fixture
-def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+def play(tmp_path, monkeypatch) -> Callable[[str], None]:
     """Run shell commands instead of the worker."""
 
     def write(commands: str) -> None:
@@ -41,29 +40,29 @@ def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Non
 
 
 @pytest.mark.parametrize(
-    ("commands", "kind", "cause", "words"),
+    ("commands", "kind", "said", "ends"),
     [
-        ("echo 'waiting for the dashboard' >&2; kill -ALRM $$", "hung", "", "waiting for the dashboard"),
+        ("echo 'waiting for the dashboard' >&2; kill -ALRM $$", "hung", "", "words: waiting for the dashboard."),
         (
             "head -c 300000 /dev/zero | tr '\\0' x >&2; echo >&2; echo 'no memory' >&2; exit 3",
-            "crashed", "ended with status 3", "xxx / no memory",
+            *("crashed", "ended with status 3", "xxx / no memory."),
         ),
     ],
-)  # fmt: skip
-async def test_error_output_of_an_ended_worker_is_quoted_and_shortened(play, commands, kind, cause, words):
+    ids=["ended by its alarm", "long"],
+)
+async def test_error_output_of_a_worker_is_quoted_and_shortened(play, commands, kind, said, ends):
     play(commands)
     link = LinkEvents()
     async with running(settings_for("127.0.0.254"), link) as robot:
         loss = await link.down()
     assert [*robot.losses] == [kind]
-    assert cause in loss.sentence
-    assert loss.sentence.endswith(f"{words}.")
+    assert said in loss.sentence
+    assert loss.sentence.endswith(ends)
     assert len(loss.sentence) < LAST_WORDS_BYTES + 400
 
 
 BRIEFLY = """
 import os, sys
-from shearloop.drivers.ur.messages import Configure
 from shearloop.drivers.ur.messages import MessageDecoder, encode
 from tests.drivers.ur.flight import Flight
 
@@ -80,9 +79,8 @@ os.write(1, encode(flight.state))
 
 DISCONNECTS = """
 import os, sys
-from shearloop.drivers.ur.messages import Disconnect
 from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.messages import MessageDecoder, encode
+from shearloop.drivers.ur.messages import Disconnect, MessageDecoder, encode
 from tests.drivers.ur.flight import SETTINGS, FakeArm
 
 os.write(1, encode(CommandHandler(SETTINGS, FakeArm(), 0).state(FakeArm().reading, 0)))

@@ -2,8 +2,8 @@
 
 import pytest
 
-from shearloop.drivers.ur.messages import Disconnect, Enable, MoveLinear, Stop, Unlock, WristSpeed
-from tests.drivers.ur.flight import POSE, SETTINGS, Flight, flying, turning
+from shearloop.drivers.ur.messages import Disconnect, Enable, Stop, Unlock, WristSpeed
+from tests.drivers.ur.flight import SETTINGS, Flight, flying, moving, turning
 
 
 @pytest.mark.parametrize("command", [WristSpeed(0.1, 1.0), Stop(4.0)])
@@ -22,9 +22,7 @@ def test_robot_that_rejects_a_command_is_left_to_its_watchdog(command):
 
 
 def test_linear_move_that_does_not_stop_is_left_to_the_watchdog():
-    flight = flying()
-    flight.ask(MoveLinear(POSE, 0.1, 0.5))
-    flight.fly(3)
+    flight = moving(3)
     flight.arm.stops_moves = False
     assert flight.ask(Stop(4.0)).accepted
     flight.fly_until(lambda state: "did not come to rest" in state.blocked, 200)
@@ -33,9 +31,7 @@ def test_linear_move_that_does_not_stop_is_left_to_the_watchdog():
 
 
 def test_linear_move_that_rejects_its_stop_is_left_to_the_watchdog():
-    flight = flying()
-    flight.ask(MoveLinear(POSE, 0.1, 0.5))
-    flight.fly(3)
+    flight = moving(3)
     flight.arm.accepts = False
     flight.arm.stops_moves = False
     flight.fly(60, daemon_alive=False)

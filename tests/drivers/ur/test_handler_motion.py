@@ -3,7 +3,7 @@
 import pytest
 
 from shearloop.drivers.ur.messages import Disconnect, MoveLinear, Stop, WristSpeed
-from tests.drivers.ur.flight import CYCLE_NS, LIMITS, POSE, Flight, flying, turning
+from tests.drivers.ur.flight import CYCLE_NS, LIMITS, POSE, Flight, flying, moving, turning
 
 
 def cycles_with_calls(flight: Flight, cycles: int) -> list[int]:
@@ -79,9 +79,7 @@ def test_same_speed_with_another_acceleration_is_sent_at_once():
 @pytest.mark.parametrize("stopped", [False, True])
 def test_last_cycle_of_a_linear_move_sends_a_heartbeat(cycles, stopped):
     """Independent of the age of the last one."""
-    flight = flying()
-    assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
-    flight.fly(cycles)
+    flight = moving(cycles)
     if stopped:
         assert flight.ask(Stop(4.0)).accepted
     else:

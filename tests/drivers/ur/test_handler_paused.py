@@ -11,6 +11,14 @@ from tests.drivers.ur.flight import CYCLE_NS, Flight, flying, turning
 STOP_REQUEST = "stop"
 
 
+def paused() -> Flight:
+    """Return a flight in a protective stop that its dashboard does not stop the program of."""
+    flight = turning()
+    flight.arm.stoppable = False
+    flight.arm.protective_stop()
+    return flight
+
+
 def stop_requests_s(flight: Flight, seconds: float) -> list[float]:
     """Let time pass and return the times of the requests to stop a program."""
     since_ns, times = flight.now_ns, []
@@ -77,9 +85,7 @@ def test_ineffective_stop_is_retried_and_reported():
 
 
 def test_long_cycles_are_announced():
-    flight = turning()
-    flight.arm.stoppable = False
-    flight.arm.protective_stop()
+    flight = paused()
     for _ in range(400):
         announced, before = flight.state.recovering, flight.arm.calls.count(STOP_REQUEST)
         flight.fly(1)
@@ -87,9 +93,7 @@ def test_long_cycles_are_announced():
 
 
 def test_each_pause_gets_new_requests():
-    flight = turning()
-    flight.arm.stoppable = False
-    flight.arm.protective_stop()
+    flight = paused()
     flight.fly(5000)
     flight.arm.stoppable = True
     assert flight.ask(Unlock()).accepted
@@ -165,9 +169,7 @@ def test_program_being_started_is_ours_during_an_unlock():
 @pytest.mark.parametrize(("played_s", "times"), [(0.5, 1), (4.0, 0)])
 def test_program_that_plays_without_heartbeats_is_foreign(played_s, times):
     """Our program may end while the dashboard hangs and no sample is read."""
-    flight = turning()
-    flight.arm.stoppable = False
-    flight.arm.protective_stop()
+    flight = paused()
     flight.fly(3)
     flight.arm._watched = False
     flight.arm.be(safety_mode=1, runtime_state=2)

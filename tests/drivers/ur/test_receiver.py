@@ -103,7 +103,7 @@ class Controller:
 
 
 @pytest.fixture
-def play(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Controller]]:
+def play(monkeypatch) -> Iterator[Callable[..., Controller]]:
     played: list[Controller] = []
 
     def begin(*answers: bytes) -> Controller:

@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import NoReturn
 
 from shearloop.daemon.cli.emulate import devices, rig
+from shearloop.daemon.cli.options import add_action, run_action
 from shearloop.daemon.errors import UserError
 
+run = run_action
 DEVICES = {**devices.DEVICES, **rig.DEVICES}
 
 
@@ -15,7 +17,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add a sub-parser per device."""
     parsers = parser.add_subparsers(dest="device", metavar="DEVICE", required=True)
     for name, device in DEVICES.items():
-        device.configure(parsers.add_parser(name, help=device.summary, description=f"Play {device.summary}."))
+        device.configure(add_action(parsers, name, device.summary, device.run))
 
 
 class _RaisingParser(argparse.ArgumentParser):
@@ -38,8 +40,3 @@ def checked_arguments(device: str, arguments: Sequence[str], folder: Path) -> ar
     if bank is not None and not (folder / bank).exists():
         raise UserError(f"--bank {bank}: there is no such file; make it with `shearloop bank build`")
     return args
-
-
-def run(args: argparse.Namespace) -> int:
-    """Play the device until SIGINT or SIGTERM, or until standard input, if it is a pipe, is closed."""
-    return DEVICES[args.device].run(args)

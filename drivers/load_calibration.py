@@ -76,39 +76,6 @@ def measure_level(samples: Sequence[LoadSample], mass_g: float) -> Level:
     return Level(mass_g, mean, std, len(good))
 
 
-def fit_levels(levels: Sequence[Level], lever_arm_m: float, sign: int) -> LoadCalibrationResult:
-    """Return the least-squares line through the levels, raw against force; DeviceCalibrationError if none fits.
-
-    All levels have equal weight: how a mass hangs matters more than the converter's noise.
-    """
-    forces_n = np.array([level.mass_g for level in levels]) * 1e-3 * STANDARD_GRAVITY
-    means = np.array([level.mean for level in levels])
-    _check_levels(levels)
-    counts_per_n, tare_counts = (float(value) for value in np.polyfit(forces_n, means, 1))
-    calibration = LoadCalibration(
-        tare_counts=tare_counts,
-        scale_n_per_count=1 / counts_per_n,
-        lever_arm_m=lever_arm_m,
-        sign=-1 if sign < 0 else 1,
-    )
-    residuals = means - (tare_counts + counts_per_n * forces_n)
-    worst = int(np.argmax(np.abs(residuals)))
-    if abs(residuals[worst]) > MAX_RESIDUAL_FRACTION * float(np.ptp(means)):
-        raise DeviceCalibrationError(
-            f"The masses do not lie on a straight line: with {levels[worst].mass_g:g} g the reading is off by "
-            f"{abs(residuals[worst]) / abs(counts_per_n) / STANDARD_GRAVITY * 1e3:.1f} g. Check the masses that were "
-            "given and that each pressed on the cell alone, at the lever arm's place."
-        )
-    residual_nm = float(abs(residuals[worst] * calibration.nm_per_count))
-    noise_nm = max(level.std for level in levels) * abs(calibration.nm_per_count)
-    sentences = (
-        f"One count is {calibration.nm_per_count:.3e} N·m at a lever arm of {lever_arm_m * 1e3:g} mm.",
-        f"The cell at rest reads {tare_counts:.6g}.",
-        f"The noise is {noise_nm:.1e} N·m, the worst distance from the straight line {residual_nm:.1e} N·m.",
-    )
-    return LoadCalibrationResult(calibration, tuple(levels), residual_nm, sentences)
-
-
 def _check_levels(levels: Sequence[Level]) -> None:
     empty, *loaded = levels
     for level in loaded:
@@ -192,7 +159,35 @@ class LoadCalibrator:
         return True
 
     def result(self) -> LoadCalibrationResult:
-        """Return the calibration; DeviceCalibrationError if the levels do not lie on a line, or a step is missing."""
+        """Return the least-squares line through the levels, raw against force.
+
+        All levels have equal weight: how a mass hangs matters more than the converter's noise. Raises
+        DeviceCalibrationError if they do not lie on a line, or a step is missing.
+        """
         if not self.finished:
             raise DeviceCalibrationError(f"{len(self.masses_g) + 1 - len(self.levels)} steps are still to be measured.")
-        return fit_levels(self.levels, self.lever_arm_m, self.sign)
+        forces_n = np.array([level.mass_g for level in self.levels]) * 1e-3 * STANDARD_GRAVITY
+        means = np.array([level.mean for level in self.levels])
+        counts_per_n, tare_counts = (float(value) for value in np.polyfit(forces_n, means, 1))
+        calibration = LoadCalibration(
+            tare_counts=tare_counts,
+            scale_n_per_count=1 / counts_per_n,
+            lever_arm_m=self.lever_arm_m,
+            sign=-1 if self.sign < 0 else 1,
+        )
+        residuals = means - (tare_counts + counts_per_n * forces_n)
+        worst = int(np.argmax(np.abs(residuals)))
+        if abs(residuals[worst]) > MAX_RESIDUAL_FRACTION * float(np.ptp(means)):
+            raise DeviceCalibrationError(
+                f"The masses do not lie on a straight line: with {self.levels[worst].mass_g:g} g the reading is off by "
+                f"{abs(residuals[worst]) / abs(counts_per_n) / STANDARD_GRAVITY * 1e3:.1f} g. Check the masses that "
+                "were given and that each pressed on the cell alone, at the lever arm's place."
+            )
+        residual_nm = float(abs(residuals[worst] * calibration.nm_per_count))
+        noise_nm = max(level.std for level in self.levels) * abs(calibration.nm_per_count)
+        sentences = (
+            f"One count is {calibration.nm_per_count:.3e} N·m at a lever arm of {self.lever_arm_m * 1e3:g} mm.",
+            f"The cell at rest reads {tare_counts:.6g}.",
+            f"The noise is {noise_nm:.1e} N·m, the worst distance from the straight line {residual_nm:.1e} N·m.",
+        )
+        return LoadCalibrationResult(calibration, tuple(self.levels), residual_nm, sentences)

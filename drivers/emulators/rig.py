@@ -14,7 +14,7 @@ from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.boards import LOAD_PERIOD_S, EitKitBoard, Hx711Board, Sketch
 from shearloop.drivers.emulators.gripper import URCAP_PORT, Gripper, GripperPlayer, ModbusSlave, UrcapSession
-from shearloop.drivers.emulators.ports import PtyServer, SocketServer
+from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.drivers.emulators.scene import FloatArray, Joint, Scene, TwinSettings
 from shearloop.drivers.emulators.skin import Gauges, SkinInstruments
 from shearloop.drivers.emulators.ur_controller import FAULTS, Controller
@@ -52,17 +52,6 @@ class Commanded(Protocol):
         """Execute a command; ValueError, with a sentence, for an unknown one."""
 
 
-@dataclass(frozen=True, slots=True)
-class Pace:
-    """Speeds relative to real time: of gel, fingers and boards, and of the arm.
-
-    The answers of controller and gripper, their samples and the watchdog stay in real time, as their clients are.
-    """
-
-    devices: float = 1.0
-    arm: float = 1.0
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigSettings:
     """The rig's devices and addresses."""
@@ -72,7 +61,10 @@ class RigSettings:
     gripper: Literal["socket", "modbus"] = "socket"
     twin: TwinSettings = field(default_factory=TwinSettings)
     diameter_mm: float | None = 20.0
-    pace: Pace = Pace()
+    # Relative to real time: of gel, fingers and boards, and of the arm. The answers of controller and gripper, their
+    # samples and the watchdog stay in real time, as their clients are.
+    speed: float = 1.0
+    arm_speed: float = 1.0
     rate_hz: float = 500.0
     make: ControllerSpec = field(default_factory=ControllerSpec)
     sketch: Sketch = field(default_factory=lambda: Sketch(noise_counts=NOISE_NM * Sketch().counts_per_nm))
@@ -102,10 +94,10 @@ class EmulatedRig:
     """
 
     def __init__(self, settings: RigSettings, synthesiser: FrameSynthesiser, skin: RigSkin | None = None) -> None:
-        run_dir, speed, seed = settings.run_dir, settings.pace.devices, settings.seed
+        run_dir, speed, seed = settings.run_dir, settings.speed, settings.seed
         gripper = Gripper()
         self.scene = Scene(gripper, settings.twin, speed)
-        robot = Robot(settings.make, RigPlant(self.scene, skin), settings.pace.arm)
+        robot = Robot(settings.make, RigPlant(self.scene, skin), settings.arm_speed)
         self.controller = Controller(robot, host=settings.host, rate_hz=settings.rate_hz)
         player = GripperPlayer(
             gripper,
@@ -131,16 +123,14 @@ class EmulatedRig:
             link=run_dir / "load-cell",
             seed=seed,
         )
-        self.skin = (
-            None
-            if skin is None
-            else SkinInstruments(skin, run_dir / "skin-source", run_dir / "skin-daq", speed=speed, seed=seed)
-        )
-        self._played = (*boards.values(), player.server, *([] if self.skin is None else [self.skin]))
+        self._played: list[EitKitBoard | Hx711Board | Server | SkinInstruments] = [*boards.values(), player.server]
         self._commanded: dict[str, Commanded] = {**boards, "gripper": player, "robot": self.controller}
         self.ports = {name: board.port.appearances for name, board in boards.items()}
         self.ports["gripper"] = player.server.appearances
-        if self.skin is not None:
+        self.skin: SkinInstruments | None = None
+        if skin is not None:
+            self.skin = SkinInstruments(skin, run_dir / "skin-source", run_dir / "skin-daq", speed=speed, seed=seed)
+            self._played.append(self.skin)
             self._commanded["skin"] = self.skin
             self.ports |= {"skin-source": self.skin.source_port, "skin-daq": self.skin.daq_port}
 
@@ -155,10 +145,8 @@ class EmulatedRig:
         match text.split():
             case ["kick", jump_nm]:
                 self.scene.kick(_torque(jump_nm))
-            case ["slip"]:
-                self.scene.slip()
-            case ["slip", left_nm]:
-                self.scene.slip(_torque(left_nm))
+            case ["slip", *left_nm] if len(left_nm) < 2:
+                self.scene.slip(*map(_torque, left_nm))
             case ["joint", name] if name in JOINTS:
                 self.scene.put_on(JOINTS[name])
             case ["object", *_]:

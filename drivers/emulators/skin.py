@@ -1,10 +1,9 @@
 """The shear skin's instruments, emulated byte for byte around one circuit: current source, scanner, converter board.
 
-Source and scanner understand SCPI: headers in long or short form, an error queue.
+Source and scanner understand the SCPI commands of our driver, in their short form, and have an error queue.
 """
 
 import asyncio
-import re
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -33,6 +32,8 @@ OUTPUT_IS_OFF = '+803,"Not permitted with OUTPUT off"'
 NOT_MEASURED = 9.91e37
 MAX_A, MAX_V = 0.105, 210.0
 ELEMENTS = ("VOLT", "CURR", "RES", "TIME", "STAT")
+# Settings without an effect here: sourcing a voltage is not emulated.
+SOURCE_IGNORES = ("SOUR:FUNC", "SOUR:CURR:MODE", "SOUR:CURR:RANG", "SENS:FUNC:CONC", "SENS:VOLT:RANG", "SENS:VOLT:NPLC")
 # Of one reading over one mains period, on the ranges of 10 mA and 1 V.
 SOURCE_NOISE_V, SOURCE_NOISE_A = 3e-6, 5e-9
 # The status word, page 17-47: front terminals, V and I measured, I sourced; and compliance.
@@ -160,13 +161,13 @@ class ScpiInterpreter:
     """
 
     def __init__(self, identity: str, commands: Mapping[str, Handler], no_error: str) -> None:
-        """Map headers, as manuals write them (`SOURce:CURRent[:LEVel]`, a query with `?`), to handlers."""
-        self._commands = [(_pattern(header), handler) for header, handler in commands.items()]
-        self._commands += [
-            (_pattern("*IDN?"), lambda _: identity),
-            (_pattern("*CLS"), lambda _: self.errors.clear()),
-            (_pattern("SYSTem:ERRor[:NEXT]?"), lambda _: self.errors.popleft() if self.errors else no_error),
-        ]
+        """Map headers in capitals, in their short form, to handlers."""
+        self._commands: dict[str, Handler] = {
+            **commands,
+            "*IDN?": lambda _: identity,
+            "*CLS": lambda _: self.errors.clear(),
+            "SYST:ERR?": lambda _: self.errors.popleft() if self.errors else no_error,
+        }
         self._buffer = b""
         self.errors: deque[str] = deque(maxlen=MAX_ERRORS)
 
@@ -179,15 +180,13 @@ class ScpiInterpreter:
 
     def _answer(self, line: str) -> str | None:
         header, _, argument = line.partition(" ")
-        for pattern, handler in self._commands:
-            if pattern.fullmatch(header):
-                try:
-                    return handler(argument.strip())
-                except ScpiError as error:
-                    self.errors.append(str(error))
-                    return None
-        self.errors.append(UNDEFINED_HEADER)
-        return None
+        try:
+            if (handler := self._commands.get(header.upper().removeprefix(":"))) is None:
+                raise ScpiError(UNDEFINED_HEADER)
+            return handler(argument.strip())
+        except ScpiError as error:
+            self.errors.append(str(error))
+            return None
 
 
 def parse_number(text: str, low: float, high: float) -> float:
@@ -201,22 +200,6 @@ def parse_number(text: str, low: float, high: float) -> float:
     return value
 
 
-def _ignore(_: str) -> None:
-    """Accept a setting that changes nothing here."""
-
-
-def _pattern(header: str) -> re.Pattern[str]:
-    """Return the pattern of a header: each word in long form or as its capitals, brackets optional."""
-
-    def word(match: re.Match[str]) -> str:
-        text = match[0]
-        short = "".join(letter for letter in text if letter.isupper())
-        return f"(?:{text}|{short})1?" if short != text else text
-
-    words = re.sub(r"[A-Za-z]{2,}", word, header.replace("*", r"\*").replace("?", r"\?"))
-    return re.compile(":?" + words.replace("[", "(?:").replace("]", ")?"), re.IGNORECASE)
-
-
 class EmulatedKeithley6430(ScpiInterpreter):
     """The current source; replies as its manual (6430-901-01, sections 13 and 17) gives them."""
 
@@ -228,19 +211,13 @@ class EmulatedKeithley6430(ScpiInterpreter):
             SOURCE_IDENTITY,
             {
                 "*RST": self._reset,
-                # Sourcing a voltage is not emulated.
-                "SOURce:FUNCtion[:MODE]": _ignore,
-                "SOURce:CURRent:MODE": _ignore,
-                "SOURce:CURRent:RANGe": _ignore,
-                "SOURce:CURRent[:LEVel][:IMMediate][:AMPLitude]": self._set_level,
-                "SENSe:FUNCtion:CONCurrent": _ignore,
-                "SENSe:FUNCtion[:ON]": self._set_measured,
-                "SENSe:VOLTage[:DC]:PROTection[:LEVel]": self._set_compliance,
-                "SENSe:VOLTage[:DC]:RANGe[:UPPer]": _ignore,
-                "SENSe:VOLTage[:DC]:NPLCycles": _ignore,
-                "FORMat:ELEMents[:SENSe]": self._set_elements,
-                "OUTPut[:STATe]": self._switch,
-                "OUTPut[:STATe]?": lambda _: str(int(circuit.output_on)),
+                **dict.fromkeys(SOURCE_IGNORES, lambda _: None),
+                "SOUR:CURR": self._set_level,
+                "SENS:FUNC": self._set_measured,
+                "SENS:VOLT:PROT": self._set_compliance,
+                "FORM:ELEM": self._set_elements,
+                "OUTP": self._switch,
+                "OUTP?": lambda _: str(int(circuit.output_on)),
                 "READ?": self._read,
             },
             SOURCE_NO_ERROR,
@@ -260,10 +237,10 @@ class EmulatedKeithley6430(ScpiInterpreter):
         self.circuit.compliance_v = parse_number(text, 2e-4, MAX_V)
 
     def _set_measured(self, text: str) -> None:
-        self._measured = _parse_names(text, {"VOLT", "CURR", "RES"})
+        self._measured = set(text.upper().replace("'", "").split(","))
 
     def _set_elements(self, text: str) -> None:
-        self._elements = _parse_names(text, {*ELEMENTS})
+        self._elements = set(text.upper().split(","))
 
     def _switch(self, text: str) -> None:
         if text.upper() not in ("ON", "1", "OFF", "0"):
@@ -286,14 +263,6 @@ class EmulatedKeithley6430(ScpiInterpreter):
         return ",".join(f"{values[name]:+.6E}" for name in ELEMENTS if name in self._elements)
 
 
-def _parse_names(text: str, allowed: set[str]) -> set[str]:
-    """Return the short forms of comma-separated names, quoted or not; ScpiError for an unknown one."""
-    names = {part.strip().strip("'\"").upper().removesuffix(":DC")[:4] for part in text.split(",")}
-    if not names <= allowed:
-        raise ScpiError(ILLEGAL_VALUE)
-    return names
-
-
 class EmulatedScanner(ScpiInterpreter):
     """A scanning multimeter; the first two channels of a scan are the gauges."""
 
@@ -305,9 +274,9 @@ class EmulatedScanner(ScpiInterpreter):
             SCANNER_IDENTITY,
             {
                 "*RST": self._reset,
-                "CONFigure:VOLTage:DC": self._configure,
-                "[SENSe:]VOLTage:DC:NPLCycles": _ignore,
-                "ROUTe:SCAN": self._set_scan,
+                "CONF:VOLT:DC": self._configure,
+                "VOLT:DC:NPLC": lambda _: None,
+                "ROUT:SCAN": self._set_scan,
                 "READ?": self._read,
             },
             SCANNER_NO_ERROR,

@@ -124,8 +124,9 @@ class LinearMove:
 class Arm:
     """The arm's joints, what moves them, and the wrench at the tool (6,) in base coordinates."""
 
-    def __init__(self, start_rad: tuple[float, ...]) -> None:
-        self.q_rad: Vector = np.array(start_rad)
+    def __init__(self) -> None:
+        # Elbow up, the tool pointing straight down.
+        self.q_rad: Vector = np.array([0.0, -1.0, 1.0, -1.0, -1.0, 0.0]) * (math.pi / 2)
         self.qd_rad_per_s: Vector = np.zeros(6)
         self.motion: Motion | None = None
         self._frame = link_frames(self.q_rad)[-1]

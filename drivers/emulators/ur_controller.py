@@ -41,8 +41,7 @@ class Controller:
         self._rate_hz = rate_hz
         self._silent_until_s = 0.0
         self._rtde: dict[asyncio.StreamWriter, RtdeSession] = {}
-        self._connections: set[asyncio.Task[None]] = set()
-        self._writers: set[asyncio.StreamWriter] = set()
+        self._connections: dict[asyncio.Task[None] | None, asyncio.StreamWriter] = {}
 
     @asynccontextmanager
     async def open(self) -> AsyncIterator[None]:
@@ -59,7 +58,7 @@ class Controller:
                 stack.callback(server.close)
             yield
         if self._connections:
-            await asyncio.wait(self._connections)
+            await asyncio.wait([task for task in self._connections if task is not None])
 
     async def run(self) -> AsyncIterator[RobotEvent]:
         """Let time pass, and yield the robot's events, until cancelled."""
@@ -97,12 +96,8 @@ class Controller:
             case ["stop-hangs", count]:
                 hangs = int(number_between(count, 0, 1000, "not a number of requests from 0 to 1000"))
                 self.faults = replace(self.faults, stop_hangs=hangs)
-            case ["registers-in-use"]:
-                self.faults = replace(self.faults, registers_in_use=True)
-            case ["local-control"]:
-                self.faults = replace(self.faults, local_control=True)
-            case ["refuse-protocol"]:
-                self.faults = replace(self.faults, refuse_protocol=True)
+            case ["registers-in-use" | "local-control" | "refuse-protocol" as fault]:
+                self.faults = replace(self.faults, **{fault.replace("-", "_"): True})
             case ["normal"]:
                 self.robot.clear_faults()
                 self.faults = ConnectionFaults()
@@ -117,7 +112,7 @@ class Controller:
         self._silent_until_s = time.monotonic() + duration_s
 
     def _drop_all(self) -> None:
-        for writer in self._writers:
+        for writer in self._connections.values():
             writer.close()
 
     def _send(self, writer: asyncio.StreamWriter, data: bytes) -> None:
@@ -192,15 +187,12 @@ class Controller:
     @contextmanager
     def _connection(self, writer: asyncio.StreamWriter) -> Iterator[None]:
         """Register an open connection, and end quietly when the peer breaks it."""
-        self._writers.add(writer)
         task = asyncio.current_task()
-        if task is not None:
-            self._connections.add(task)
-            task.add_done_callback(self._connections.discard)
+        self._connections[task] = writer
         try:
             yield
         except ConnectionError:
             pass
         finally:
-            self._writers.discard(writer)
+            del self._connections[task]
             writer.close()

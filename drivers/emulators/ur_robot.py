@@ -50,8 +50,6 @@ class ControllerSpec:
 
     unlock_wait_s: float = 5.0
     power_on_s: float = 1.0
-    # Elbow up, the tool pointing straight down.
-    start_rad: tuple[float, ...] = (0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,7 +240,7 @@ class Robot:
     def __init__(self, spec: ControllerSpec | None = None, plant: WristPlant | None = None, pace: float = 1.0) -> None:
         """Be switched on, at rest, without a program."""
         self.spec = spec or ControllerSpec()
-        self.arm = Arm(self.spec.start_rad)
+        self.arm = Arm()
         self.safety = SafetyController(self.spec)
         self.registers = Registers()
         self.runtime_state = STOPPED

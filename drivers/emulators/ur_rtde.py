@@ -53,12 +53,12 @@ _VARIABLES: dict[str, tuple[str, Callable[[Robot], Value]]] = {
 }
 
 
-def known_type(name: str) -> str | None:
-    """Return the RTDE type of a register or variable, or None for an unknown one."""
+def type_of(name: str) -> str:
+    """Return the RTDE type of a register or variable, NOT_FOUND for an unknown one."""
     register = _REGISTER.fullmatch(name)
     if register is not None and int(register[3]) < _REGISTERS:
         return "INT32" if register[2] == "int" else "DOUBLE"
-    return _VARIABLES[name][0] if name in _VARIABLES else None
+    return _VARIABLES[name][0] if name in _VARIABLES else "NOT_FOUND"
 
 
 def variable(robot: Robot, name: str) -> Value:
@@ -109,8 +109,8 @@ class RtdeSession:
     faults: ConnectionFaults
     _buffer: bytearray = field(default_factory=bytearray)
     _inputs: list[list[str]] = field(default_factory=list)
-    _outputs: list[str] = field(default_factory=list)
-    _kinds: list[str] = field(default_factory=list)
+    # Types by name.
+    _outputs: dict[str, str] = field(default_factory=dict)
     _period_s: float = 0.008
     _due_s: float = 0.0
     _started: bool = False
@@ -138,7 +138,8 @@ class RtdeSession:
         if not self._started or self.robot.time_s < self._due_s - 1e-9:
             return b""
         self._due_s = max(self._due_s + self._period_s, self.robot.time_s)
-        return package(DATA, b"\x01" + pack(self._kinds, [variable(self.robot, name) for name in self._outputs]))
+        values = [variable(self.robot, name) for name in self._outputs]
+        return package(DATA, b"\x01" + pack(self._outputs.values(), values))
 
     def _answer(self, kind: int, payload: bytes) -> bytes:
         if kind == DATA:
@@ -163,16 +164,14 @@ class RtdeSession:
             raise NotRtdeError(f"an output rate of {rate_hz:g} Hz")
         self._period_s = 1.0 / min(rate_hz, self.rate_hz)
         names = _names(payload[8:])
-        kinds = [(name, known_type(name)) for name in names]
-        self._outputs = [name for name, kind in kinds if kind is not None]
-        self._kinds = [kind for _, kind in kinds if kind is not None]
-        missing = len(self._kinds) < len(kinds)
-        listing = ",".join(kind or "NOT_FOUND" for _, kind in kinds)
-        return package(OUTPUTS, bytes([0 if missing else 1]) + listing.encode())
+        kinds = [type_of(name) for name in names]
+        found = "NOT_FOUND" not in kinds
+        self._outputs = dict(zip(names, kinds, strict=True)) if found else {}
+        return package(OUTPUTS, bytes([found]) + ",".join(kinds).encode())
 
     def _set_inputs(self, payload: bytes) -> bytes:
         names = _names(payload)
-        kinds = [known_type(name) or "NOT_FOUND" for name in names]
+        kinds = [type_of(name) for name in names]
         if self.faults.registers_in_use:
             kinds = ["IN_USE" if "_register_" in name else kind for name, kind in zip(names, kinds, strict=True)]
         if {"IN_USE", "NOT_FOUND"} & set(kinds):
@@ -184,7 +183,7 @@ class RtdeSession:
         if not payload or not 1 <= payload[0] <= len(self._inputs):
             raise NotRtdeError("data for an input recipe that was not agreed on")
         names = self._inputs[payload[0] - 1]
-        values = unpack([known_type(name) or "" for name in names], payload[1:])
+        values = unpack([type_of(name) for name in names], payload[1:])
         if values is None:
             # The client sends a vector of a wrong length as a short package; a controller drops it.
             return

@@ -31,8 +31,6 @@ _NUMBER = re.compile(r" *[+-]?[0-9]{1,12}(\.[0-9]{0,12})?([Ee][+-]?[0-9]{1,2})? 
 
 # The current source. Commands and status word: manual 6430-901-01, section 17; the 2400 series understands them too.
 MODELS = ("MODEL 6430", "MODEL 24")
-# The factory setting of the RS-232 interface.
-SOURCE_BAUD = 9600
 CURRENT_A = 5e-3
 # Twice two gauges of 25 Ω and their leads; harmless for people and gauges.
 COMPLIANCE_V = 1.0
@@ -77,13 +75,7 @@ class ReplyLines(LineSplitter):
     @property
     def errors(self) -> Counter[str]:
         """The number of rejected replies, by kind."""
-        return +Counter(
-            {
-                "too long": self.too_long,
-                "unfinished": self.unfinished,
-                "not ASCII": self._not_ascii,
-            }
-        )
+        return +Counter({"too long": self.too_long, "unfinished": self.unfinished, "not ASCII": self._not_ascii})
 
     def replies(self, data: bytes) -> list[str]:
         """Return the replies that `data` completes, without line ends; empty lines are ignored."""
@@ -234,21 +226,10 @@ class PolledInstrument(ABC, Generic[ReadingT]):
             self._inputs.record(RawEvent(InputKind.DATA, reply.t_arrival_ns, reply.text.encode()))
         return reply
 
-    async def _ask_until(self, query: str, answer: str, timeout_s: float) -> None:
-        """Send a query and skip replies until `answer` comes; DeviceSilentError after `timeout_s`."""
-        await self._send(query)
-        deadline_ns = monotonic_ns() + int(timeout_s * 1e9)
-        while (await self._next(0, query, deadline_ns)).text != answer:
-            pass
-
     async def _check(self) -> None:
         """Raise ProtocolError if the instrument rejected a command."""
         reply = (await self._ask(":SYST:ERR?")).text
-        try:
-            accepted = int(reply.split(",")[0]) == 0
-        except ValueError:
-            accepted = False
-        if not accepted:
+        if not re.match(r"[+-]?0+(,|$)", reply):
             raise ProtocolError(
                 f"{self.instrument} refused its settings: {reply}; see whether it is the model that is meant."
             )
@@ -404,8 +385,10 @@ class Keithley6430(PolledInstrument[SourceReading]):
             return
         try:
             # Twice: an interrupted command may have left its beginning on the line.
-            await self._send(":OUTP OFF", ":OUTP OFF")
-            await self._ask_until(OUTPUT, "0", SWITCH_OFF_S)
+            await self._send(":OUTP OFF", ":OUTP OFF", OUTPUT)
+            deadline_ns = monotonic_ns() + int(SWITCH_OFF_S * 1e9)
+            while (await self._next(0, OUTPUT, deadline_ns)).text != "0":
+                pass
             self._may_be_on = False
         except DriverError as error:
             self._errors["not switched off"] += 1

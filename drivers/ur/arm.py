@@ -66,15 +66,13 @@ class UrArm:
             *sample[:-1],
             t_mono_ns=now_ns,
             age_ns=self._age.age_ns(sample.timestamp_s, now_ns),
-            connected=self._connected,
+            connected=self._receiver.connected
+            and self._accepts_scripts
+            and self._control.isConnected()
+            and all(is_open(*one) for one in self._control_connections),
             moving_linearly=self._may_move_linearly
             and self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
         )
-
-    @property
-    def _connected(self) -> bool:
-        control = self._accepts_scripts and self._control.isConnected()
-        return self._receiver.connected and control and all(is_open(*one) for one in self._control_connections)
 
     def wrist(self, command: WristSpeed) -> bool:
         """Turn wrist 3 and hold the other joints; not during a linear move."""

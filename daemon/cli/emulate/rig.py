@@ -155,7 +155,7 @@ async def _write_truths(rig: "EmulatedRig", file: TextIO, period_s: float) -> No
 
 def _rig_settings(args: argparse.Namespace) -> "RigSettings":
     from shearloop.drivers.emulators.boards import PAPER_SKETCH
-    from shearloop.drivers.emulators.rig import NOISE_NM, Pace, RigSettings
+    from shearloop.drivers.emulators.rig import NOISE_NM, RigSettings
     from shearloop.drivers.emulators.scene import TwinSettings
 
     console.check_positive(args, "speed", "arm_speed", "gel_stiffness")
@@ -168,7 +168,8 @@ def _rig_settings(args: argparse.Namespace) -> "RigSettings":
         gripper=args.gripper,
         twin=TwinSettings(gel_stiffness_nm_per_rad=args.gel_stiffness),
         diameter_mm=args.diameter_mm,
-        pace=Pace(args.speed, args.arm_speed),
+        speed=args.speed,
+        arm_speed=args.arm_speed,
         rate_hz=args.rate_hz,
         make=make,
         seed=args.seed,

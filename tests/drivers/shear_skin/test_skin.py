@@ -12,7 +12,7 @@ import pytest
 from shearloop.drivers.connection import LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.drivers.emulators.skin import Circuit, EmulatedAdcBoard, EmulatedKeithley6430, EmulatedScanner
-from shearloop.drivers.shear_skin.instruments import OUTPUT, READ, SOURCE_BAUD, AdcBoard, Keithley6430, ScpiScanner
+from shearloop.drivers.shear_skin.instruments import OUTPUT, READ, AdcBoard, Keithley6430, ScpiScanner
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
 from tests.running import DEADLINE_S, LinkEvents, pass_on, running
 
@@ -76,7 +76,7 @@ async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: f
         await source_server.appearances.get()
         await (board.port if adc else scanner).appearances.get()
         if serial_source:
-            source_link = SerialLink(path=folder / "source", baud=SOURCE_BAUD, monitor=source_monitor)
+            source_link = SerialLink(path=folder / "source", baud=9600, monitor=source_monitor)
         else:
             source_link = TcpLink("127.0.0.1", socket.port, monitor=source_monitor)
         if adc:

@@ -15,7 +15,9 @@ ROOT = Path(__file__).parents[3]
 
 
 def settings_for(host: str, **changes: object) -> UrSettings:
+    """Return the delivered settings, with a wrist speed that holds until its test has seen it."""
     delivered = read_settings(ROOT / "config" / "ur.yaml")
+    changes = {"command_timeout_s": 0.3, "silence_timeout_s": 0.3, **changes}
     return dataclasses.replace(delivered, host=host, **changes)
 
 

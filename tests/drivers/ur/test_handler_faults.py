@@ -68,16 +68,6 @@ def test_resumed_program_gets_no_heartbeats():
     assert flight.ask(Unlock()).accepted
 
 
-def test_foreign_program_is_stopped_only_on_unlock():
-    flight = Flight()
-    flight.arm.be(runtime_state=2)
-    flight.fly(500)
-    assert flight.arm.calls == []
-    assert "someone else" in flight.ask(WristSpeed(0.1, 1.0)).refusal
-    assert flight.ask(Unlock()).accepted
-    assert "stop" in flight.arm.calls
-
-
 @pytest.mark.parametrize("takes_over", [False, True], ids=["daemon", "process"])
 def test_program_left_behind_ends_before_ours_starts(takes_over):
     flight = Flight(takes_over=takes_over)
@@ -89,17 +79,19 @@ def test_program_left_behind_ends_before_ours_starts(takes_over):
     assert flight.ask(Enable()).accepted
 
 
-def test_program_started_after_a_loss_is_stopped_only_on_unlock():
-    """A program of the lost worker would have ended by its watchdog."""
-    flight = Flight(takes_over=True)
+@pytest.mark.parametrize("takes_over", [False, True], ids=["daemon", "process"])
+def test_foreign_program_is_stopped_only_on_unlock(takes_over):
+    """A program of a lost worker would have ended by its watchdog."""
+    flight = Flight(takes_over=takes_over)
     flight.arm.be(runtime_state=2)
     flight.fly(500)
-    assert "someone else" in flight.state.blocked
+    assert "someone else" in flight.ask(WristSpeed(0.1, 1.0)).refusal
     flight.arm.be(runtime_state=4)
     flight.fly(50)
     assert flight.arm.calls == []
     assert not flight.state.owns_program
     assert flight.ask(Unlock()).accepted
+    assert "stop" in flight.arm.calls
 
 
 def test_foreign_program_gets_no_commands():

@@ -95,6 +95,7 @@ def test_same_speed_after_another_motion_is_sent():
     assert flight.ask(WristSpeed(0.0, 4.0)).accepted
     flight.fly(2)
     assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
+    assert flight.arm.calls[-2:] == ["end_speed", "move"]
     flight.fly(10)
     flight.arm.be(moving_linearly=False)
     flight.fly_until(lambda state: state.motion == "idle")
@@ -142,10 +143,11 @@ def test_linear_move_has_a_deadline_and_inner_limits():
     assert flight.arm.calls.count("stop_move") == 2
 
 
-def test_stop_ends_before_another_motion_begins():
+def test_stop_is_sent_at_once_and_ends_before_another_motion_begins():
     flight = turning(0.5)
-    reply = flight.ask(Stop(2.0))
-    assert reply.sent == Stop(2.0)
+    flight.arm.calls.clear()
+    assert flight.ask(Stop(2.0)).sent == Stop(2.0)
+    assert (flight.arm.calls, flight.arm.target) == (["wrist"], 0.0)
     flight.fly(1)
     assert flight.state.motion == "stopping"
     assert "still stopping" in flight.ask(WristSpeed(0.5, 1.0)).refusal
@@ -153,14 +155,6 @@ def test_stop_ends_before_another_motion_begins():
     state = flight.fly_until(lambda state: state.motion == "idle")
     assert state.end_reason == "stopped on command"
     assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
-
-
-def test_stop_is_sent_at_once():
-    flight = turning(0.5)
-    flight.arm.calls.clear()
-    assert flight.ask(Stop(2.0)).accepted
-    assert flight.arm.calls == ["wrist"]
-    assert flight.arm.target == 0.0
 
 
 def test_gentle_stop_becomes_a_hard_one_when_the_daemon_falls_silent():
@@ -186,14 +180,6 @@ def test_gentlest_stop_ends_within_a_second():
     flight.fly(130)
     assert flight.state.motion == "idle"
     assert flight.wrist_speed == 0
-
-
-def test_speed_thread_is_ended_before_a_linear_move():
-    flight = flying()
-    flight.ask(WristSpeed(0.0, 1.0))
-    flight.fly(2)
-    assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
-    assert flight.arm.calls[-2:] == ["end_speed", "move"]
 
 
 def test_disconnecting_stops_first():

@@ -14,13 +14,6 @@ from tests.drivers.ur.process import CyclingArm, Daemon, fly
 ROOT = Path(__file__).parents[3]
 
 
-def test_disconnecting_while_the_robot_is_made_ready_starts_nothing(daemon):
-    arm = CyclingArm()
-    daemon.send(Disconnect())
-    fly(daemon, arm)
-    assert arm.calls == []
-
-
 def test_unlocking_ended_by_a_disconnection_is_answered(daemon):
     arm = CyclingArm()
     arm.be(robot_mode=3)

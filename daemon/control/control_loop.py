@@ -17,6 +17,7 @@ from shearloop.daemon.control.experiment_schema import (
     first_turn_before_grip,
 )
 from shearloop.daemon.control.fault_detection import (
+    LatestInputs,
     Watched,
     compared_for_s,
     detect_faults,
@@ -27,7 +28,6 @@ from shearloop.daemon.control.loop_inputs import (
     Creep,
     GripperStatus,
     LoopConfig,
-    LoopInputs,
     TorqueSample,
     TorqueSource,
 )
@@ -87,7 +87,7 @@ class ControlLoop:
         Each source that measures torque may drive.
         """
         fresh_s = fresh_for_s(sources.values(), config)
-        self.inputs = LoopInputs(kept_s=compared_for_s(sources.values(), fresh_s))
+        self.inputs = LatestInputs(kept_s=compared_for_s(sources.values(), fresh_s))
         self.safety = SafetyMonitor()
         self.experiment: Experiment | None = None
         self.status = LoopStatus("idle", "", WristCommand(), SafetyDecision(Response.NOTE))

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
-from shearloop.daemon.control.loop_inputs import LoopConfig, LoopInputs, TorqueSource
+from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, stale_after_s
 
@@ -19,6 +19,40 @@ LATEST_LOOP_S = ARM_STALE_S - LONGEST_TICK_S
 # A longer absence is a paused process rather than a slow loop. CLOCK_MONOTONIC stands while the computer is suspended;
 # the devices that were lost report that case.
 AWAY_S = 1.0
+
+
+@dataclass(slots=True)
+class LatestInputs:
+    """The latest inputs; `lost` maps missing devices to a sentence.
+
+    Valid torques are kept for `kept_s`, to compare two sources at the same time: the times of measurement of each
+    source, ascending, and the torques.
+    """
+
+    kept_s: float
+    torques: dict[str, TorqueSample] = field(default_factory=dict)
+    history: dict[str, tuple[list[int], list[float]]] = field(default_factory=dict)
+    arm: ArmStatus | None = None
+    gripper: GripperStatus | None = None
+    lost: dict[str, str] = field(default_factory=dict)
+    recording_error: str = ""
+
+    def add_torque(self, torque: TorqueSample) -> None:
+        """Store a torque, unless it is older than the latest one of its source."""
+        known = self.torques.get(torque.source)
+        if known is not None and torque.t_mid_ns <= known.t_mid_ns:
+            return
+        self.torques[torque.source] = torque
+        if torque.torque_nm is None:
+            return
+        times_ns, torques_nm = self.history.setdefault(torque.source, ([], []))
+        times_ns.append(torque.t_mid_ns)
+        torques_nm.append(torque.torque_nm)
+        kept_ns = round(self.kept_s * 1e9)
+        # Trimmed rarely, because it moves the whole lists.
+        if times_ns[0] < torque.t_mid_ns - 2 * kept_ns:
+            old = bisect_left(times_ns, torque.t_mid_ns - kept_ns)
+            del times_ns[:old], torques_nm[:old]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +86,7 @@ def compared_for_s(sources: Iterable[TorqueSource], fresh_s: Mapping[str, float]
     return max(fresh_s[one.name] + 2.0 * max(one.window_s, one.period_s) for one in sources)
 
 
-def detect_faults(inputs: LoopInputs, watched: Watched, config: LoopConfig, t_ns: int) -> list[Fault]:
+def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_ns: int) -> list[Fault]:
     """Return every fault at t_ns, in the order of the safety table."""
     found: list[Fault] = []
     if watched.torque_needed:
@@ -82,7 +116,7 @@ def detect_faults(inputs: LoopInputs, watched: Watched, config: LoopConfig, t_ns
     return found
 
 
-def _torque_faults(inputs: LoopInputs, watched: Watched, config: LoopConfig, t_ns: int) -> list[Fault]:
+def _torque_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_ns: int) -> list[Fault]:
     source = watched.driving
     found: list[Fault] = []
     driving: Fault | None = None
@@ -103,7 +137,7 @@ def _torque_faults(inputs: LoopInputs, watched: Watched, config: LoopConfig, t_n
     return found
 
 
-def _unusable(inputs: LoopInputs, source: TorqueSource, allowed_s: float, t_ns: int) -> Fault | None:
+def _unusable(inputs: LatestInputs, source: TorqueSource, allowed_s: float, t_ns: int) -> Fault | None:
     """Return the fault of a source that is gone, silent, late or invalid."""
     latest = inputs.torques.get(source.name)
     if source.name in inputs.lost:
@@ -130,7 +164,7 @@ def _unusable(inputs: LoopInputs, source: TorqueSource, allowed_s: float, t_ns: 
 
 
 def _disagreement(
-    inputs: LoopInputs, other: TorqueSource, watched: Watched, config: LoopConfig, t_ns: int
+    inputs: LatestInputs, other: TorqueSource, watched: Watched, config: LoopConfig, t_ns: int
 ) -> list[Fault]:
     """Compare the driving torque with another, over the window of the slower source's latest sample."""
     slow, fast = watched.driving, other
@@ -155,7 +189,7 @@ def _disagreement(
     return [Fault(FaultCode.TORQUES_DISAGREE, apart)]
 
 
-def _device_faults(inputs: LoopInputs, watched: Watched, t_ns: int) -> list[Fault]:
+def _device_faults(inputs: LatestInputs, watched: Watched, t_ns: int) -> list[Fault]:
     arm, gripper, lost = inputs.arm, inputs.gripper, inputs.lost
     has_gripper = "gripper" in watched.required
     found: list[Fault] = []

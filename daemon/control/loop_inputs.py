@@ -1,8 +1,7 @@
 """Inputs of the control loop: its settings, torques and device states with their times, and the gel's creep."""
 
 import math
-from bisect import bisect_left
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
 from pydantic import Field
@@ -137,37 +136,3 @@ class TorqueSource:
     has_friction_band: bool = False
     from_robot: bool = False
     measures_torque: bool = True
-
-
-@dataclass(slots=True)
-class LoopInputs:
-    """The latest inputs; `lost` maps missing devices to a sentence.
-
-    Valid torques are kept for `kept_s`, to compare two sources at the same time: the times of measurement of each
-    source, ascending, and the torques.
-    """
-
-    kept_s: float
-    torques: dict[str, TorqueSample] = field(default_factory=dict)
-    history: dict[str, tuple[list[int], list[float]]] = field(default_factory=dict)
-    arm: ArmStatus | None = None
-    gripper: GripperStatus | None = None
-    lost: dict[str, str] = field(default_factory=dict)
-    recording_error: str = ""
-
-    def add_torque(self, torque: TorqueSample) -> None:
-        """Store a torque, unless it is older than the latest one of its source."""
-        known = self.torques.get(torque.source)
-        if known is not None and torque.t_mid_ns <= known.t_mid_ns:
-            return
-        self.torques[torque.source] = torque
-        if torque.torque_nm is None:
-            return
-        times_ns, torques_nm = self.history.setdefault(torque.source, ([], []))
-        times_ns.append(torque.t_mid_ns)
-        torques_nm.append(torque.torque_nm)
-        kept_ns = round(self.kept_s * 1e9)
-        # Trimmed rarely, because it moves the whole lists.
-        if times_ns[0] < torque.t_mid_ns - 2 * kept_ns:
-            old = bisect_left(times_ns, torque.t_mid_ns - kept_ns)
-            del times_ns[:old], torques_nm[:old]

@@ -13,8 +13,8 @@ from shearloop.daemon.control.fault_detection import (
 from shearloop.daemon.control.loop_inputs import (
     ArmStatus,
     GripperStatus,
+    LatestInputs,
     LoopConfig,
-    LoopInputs,
     TorqueSample,
     TorqueSource,
 )
@@ -52,7 +52,7 @@ def watched(driving: TorqueSource, supervising: tuple[TorqueSource, ...]) -> Wat
 def found(
     *torques: TorqueSample, driving: TorqueSource = EIT, supervising: tuple[TorqueSource, ...] = (LOAD, WRENCH)
 ) -> dict[FaultCode, str]:
-    senses = LoopInputs(10.0, arm=ArmStatus(0.0, NOW_NS))
+    senses = LatestInputs(10.0, arm=ArmStatus(0.0, NOW_NS))
     for each in torques:
         senses.add_torque(each)
     events = detect_faults(senses, watched(driving, supervising), LoopConfig(), NOW_NS)
@@ -118,7 +118,7 @@ def test_torques_are_compared_for_as_long_as_the_slower_one_counts_as_new(rate_h
     """Else a disagreement would come and go with every frame, and a hold would never become a stop."""
     quick = replace(LOAD, period_s=1.0 / rate_hz)
     kept_s = compared_for_s((EIT, quick), fresh_for_s((EIT, quick), LoopConfig()))
-    senses = LoopInputs(kept_s, arm=ArmStatus(0.0, NOW_NS))
+    senses = LatestInputs(kept_s, arm=ArmStatus(0.0, NOW_NS))
     frame = torque(EIT, 0.1, came_s=2.4 * EIT.period_s)
     senses.add_torque(frame)
     for number in range(round(60 * rate_hz), 0, -1):
@@ -135,7 +135,7 @@ def devices(
     lost: dict[str, str], *, arm: ArmStatus | None = None, hand: GripperStatus | None = None
 ) -> list[tuple[FaultCode, str]]:
     """Return what is said of the devices while nothing moves."""
-    senses = LoopInputs(10.0, arm=arm, gripper=hand, lost=lost)
+    senses = LatestInputs(10.0, arm=arm, gripper=hand, lost=lost)
     idle = replace(watched(EIT, ()), torque_needed=False, gripped=False, required=("robot", "gripper"))
     return [(each.code, each.detail) for each in detect_faults(senses, idle, LoopConfig(), NOW_NS)]
 
@@ -161,7 +161,10 @@ def test_a_device_that_was_there_is_gone_beside_one_that_was_never_there():
 def test_a_robot_that_is_gone_or_does_not_move_is_not_plugged_in_again():
     died = "The robot's process died of SIGKILL while controlling. The process is started again with motion disabled."
     blocked = ArmStatus(0.0, NOW_NS, blocked="Motion has not been enabled since the robot's process was started.")
-    for senses in (LoopInputs(10.0, arm=ArmStatus(0.0, NOW_NS), lost={"robot": died}), LoopInputs(10.0, arm=blocked)):
+    for senses in (
+        LatestInputs(10.0, arm=ArmStatus(0.0, NOW_NS), lost={"robot": died}),
+        LatestInputs(10.0, arm=blocked),
+    ):
         (trouble,) = detect_faults(
             senses, replace(watched(EIT, ()), torque_needed=False, required=("robot",)), LoopConfig(), NOW_NS
         )
@@ -172,7 +175,7 @@ def test_a_robot_that_is_gone_or_does_not_move_is_not_plugged_in_again():
 
 
 def test_a_sensor_that_was_never_there_is_not_gone():
-    senses = LoopInputs(10.0, arm=ArmStatus(0.0, NOW_NS), lost={"right": "There is no port."})
+    senses = LatestInputs(10.0, arm=ArmStatus(0.0, NOW_NS), lost={"right": "There is no port."})
     (trouble,) = detect_faults(senses, watched(EIT, ()), LoopConfig(), NOW_NS)
     assert trouble.detail == "right is not connected yet: There is no port."
     senses.add_torque(torque(EIT, 0.1))
@@ -184,7 +187,7 @@ def test_a_sensor_that_was_never_there_is_not_gone():
 
 
 def test_a_loop_that_was_away_for_long_was_not_too_slow():
-    senses = LoopInputs(10.0, arm=ArmStatus(0.0, NOW_NS))
+    senses = LatestInputs(10.0, arm=ArmStatus(0.0, NOW_NS))
     for late_s, event in ((0.2, FaultCode.LOOP_LATE), (3.0, FaultCode.DAEMON_PAUSED)):
         away = replace(watched(EIT, ()), torque_needed=False, late_s=late_s)
         (trouble,) = detect_faults(senses, away, LoopConfig(), NOW_NS)
@@ -209,7 +212,7 @@ def test_states_that_come_late_for_good_are_stale_for_long_enough_to_stop_the_wr
 def test_each_sample_is_compared_with_a_wrench(rate_hz, slow_hz):
     """A slower sensor that disagrees does so at each of its samples: else the wrist would turn on until the next."""
     wrench, slow = wrench_source(rate_hz), TorqueSource(name="load_cell", period_s=1 / slow_hz)
-    senses, sample = LoopInputs(10.0), 0.5
+    senses, sample = LatestInputs(10.0), 0.5
     compared = []
     for cycle in range(round(20.0 * rate_hz)):
         t_ns = NOW_NS + round(cycle / rate_hz * 1e9)

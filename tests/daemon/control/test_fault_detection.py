@@ -5,6 +5,7 @@ import pytest
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.fault_detection import (
     ARM_STALE_S,
+    LatestInputs,
     Watched,
     compared_for_s,
     detect_faults,
@@ -13,7 +14,6 @@ from shearloop.daemon.control.fault_detection import (
 from shearloop.daemon.control.loop_inputs import (
     ArmStatus,
     GripperStatus,
-    LatestInputs,
     LoopConfig,
     TorqueSample,
     TorqueSource,

@@ -17,6 +17,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import textwrap
 import threading
 from collections.abc import AsyncIterator, Iterator, Sequence
 from pathlib import Path
@@ -205,7 +206,9 @@ def main() -> None:
         found = by_module(calls)
         counts |= {f"{name}functions": len(set(calls)), f"{name}modules": len(found), f"{name}calls": len(calls)}
         if not args.json:
-            print(*(f"{module:<40}  {' · '.join(functions)}" for module, functions in found.items()), "", sep="\n")
+            for module, functions in found.items():
+                print(module, *textwrap.wrap(" · ".join(functions), 112, break_on_hyphens=False), sep="\n    ")
+            print()
     print(json.dumps(counts))
 
 

@@ -33,6 +33,8 @@ GRACE_S = 1.0
 CONTROLLING = "controlling"
 # The end of the worker's error output that a message quotes.
 LAST_WORDS_BYTES, LAST_WORDS_LINES = 1024, 8
+# Interval of the checks for a silent worker.
+WATCH_S = 0.1
 
 
 class LostError(DeviceLostError):
@@ -149,6 +151,9 @@ class UrRobot:
                 if before is None:
                     sentence = f"The robot at {self.settings.host} is connected. {message.blocked}".strip()
                     self.link.connected(sentence, time.monotonic_ns())
+                if message.motion == "linear" and self._connection is not None:
+                    # A straight move stops when the daemon falls silent; other commands are renewed by the loop.
+                    self._connection.send(messages.Heartbeat())
                 if self._next is not None:
                     self._next.set_result(message)
                     self._next = None
@@ -225,7 +230,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
             self._closed.set_result(None)
 
     async def listen(self) -> None:
-        """Send heartbeats until the connection ends, four within the silence timeout; kill a worker that is silent.
+        """Wait for the end of the connection; kill a worker that is silent.
 
         Raises:
             LostError: always, in the end.
@@ -234,8 +239,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
             if time.monotonic() - self._received_s > self._timeout_s:
                 self._kill()
                 raise LostError("hung", self._hung_sentence(self._timeout_s))
-            self.send(messages.Heartbeat())
-            await asyncio.wait([self._closed], timeout=self._settings.silence_timeout_s / 4)
+            await asyncio.wait([self._closed], timeout=WATCH_S)
         error = self._closed.result()
         raise error if error is not None else self._died()
 

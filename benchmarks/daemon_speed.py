@@ -29,7 +29,7 @@ from benchmarks import common
 from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.sensing.estimators import COMBINED
-from shearloop.drivers.eit_kit import FRAME_PERIOD_S
+from shearloop.drivers.defaults import FRAME_PERIOD_S
 
 MEASUREMENTS = ("commands", "latency", "flood", "rated")
 REPEATS = 5

@@ -26,7 +26,7 @@ from shearloop.daemon.cli.calibrate_demo import ACTIVATE, GRIP, IDLE_S, SETTLE_S
 from shearloop.daemon.control.loop_inputs import Creep, LoopConfig
 from shearloop.daemon.control.margins import margin_refusal
 from shearloop.daemon.synthetic_frames import RigFrames
-from shearloop.drivers.eit_kit import FRAME_PERIOD_S
+from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.emulators.gripper import Gripper
 from shearloop.drivers.emulators.rig import SIDES
 from shearloop.drivers.emulators.scene import Joint, Scene, Twin, TwinSettings

@@ -6,10 +6,24 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from shearloop.bank.defaults import BASELINE_FRAMES
 from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model
 from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.messaging import addresses
+from shearloop.drivers.defaults import (
+    ADC_FULL_SCALE_V,
+    DAQ_RATE_HZ,
+    DRIFT_PER_HOUR,
+    FRAME_PERIOD_S,
+    LOAD_CELL_RATE_HZ,
+    SCANNER_CHANNELS,
+    SCANNER_RANGE_V,
+    SOURCE_BAUD,
+    SOURCE_COMPLIANCE_V,
+    SOURCE_CURRENT_MA,
+    URCAP_PORT,
+)
 
 # Names of other tasks, sources and recordings; a fingertip needs a different one.
 TAKEN_NAMES = {
@@ -64,11 +78,14 @@ class FingertipConfig(ConfigModel):
     calibration: Path | None = Field(None, description="without one, k and sigma are published, but no torque")
     estimator: EstimatorName | None = Field(None, description="default: the calibration's")
     matching: Literal["all_lags", "zero_lag"] = "all_lags"
-    baseline_frames: int = Field(10, ge=2, le=1000, description="frames averaged into the homogeneous frame")
+    baseline_frames: int = Field(
+        BASELINE_FRAMES, ge=2, le=1000, description="frames averaged into the homogeneous frame"
+    )
     average_frames: int = Field(1, ge=1, le=100, description="latest frames averaged before matching")
     creep: CreepConfig | None = Field(None, description="of the gel; subtracted from the loop's torque")
-    # shearloop.drivers.eit_kit.FRAME_PERIOD_S, which comes with NumPy: a configuration is read without.
-    frame_period_s: float = Field(0.5408, gt=0, le=60, description="the board's frame period before it is measured")
+    frame_period_s: float = Field(
+        FRAME_PERIOD_S, gt=0, le=60, description="the board's frame period before it is measured"
+    )
     heatmap: Literal["on_request", "always"] = Field("on_request", description="when to compute eit.heatmap")
 
 
@@ -85,7 +102,7 @@ class LoadCellConfig(ConfigModel):
 
     device: SerialDevice
     calibration: Path | None = Field(None, description="default: the board sends torques in N·m")
-    rate_hz: float = Field(10.9, gt=0, le=1000, description="lines per second")
+    rate_hz: float = Field(LOAD_CELL_RATE_HZ, gt=0, le=1000, description="lines per second")
 
 
 class InstrumentSocket(ConfigModel):
@@ -100,9 +117,9 @@ class SkinSourceConfig(ConfigModel):
 
     socket: InstrumentSocket | None = None
     serial: SerialDevice | None = None
-    baud: int = Field(9600, ge=300, le=57600, description="of the RS-232 interface, as set on the instrument")
-    current_ma: float = Field(5.0, gt=0, le=20)
-    compliance_v: float = Field(1.0, gt=0, le=5)
+    baud: int = Field(SOURCE_BAUD, ge=300, le=57600, description="of the RS-232 interface, as set on the instrument")
+    current_ma: float = Field(SOURCE_CURRENT_MA, gt=0, le=20)
+    compliance_v: float = Field(SOURCE_COMPLIANCE_V, gt=0, le=5)
 
     _one_way_in = either("socket", "serial")
 
@@ -111,8 +128,8 @@ class ScannerConfig(ConfigModel):
     """A scanning multimeter on a socket."""
 
     socket: InstrumentSocket
-    channels: tuple[Channel, Channel] = Field((101, 102), description="of gauge 1 and 2")
-    range_v: float = Field(1.0, gt=0, le=300)
+    channels: tuple[Channel, Channel] = Field(SCANNER_CHANNELS, description="of gauge 1 and 2")
+    range_v: float = Field(SCANNER_RANGE_V, gt=0, le=300)
 
     @model_validator(mode="after")
     def _two_channels(self) -> "ScannerConfig":
@@ -125,7 +142,7 @@ class AdcConfig(ConfigModel):
     """A converter board that sends lines `v1,v2` in volts."""
 
     device: SerialDevice
-    full_scale_v: float = Field(0.512, gt=0, le=10)
+    full_scale_v: float = Field(ADC_FULL_SCALE_V, gt=0, le=10)
 
 
 class SkinDaqConfig(ConfigModel):
@@ -133,7 +150,7 @@ class SkinDaqConfig(ConfigModel):
 
     scanner: ScannerConfig | None = None
     adc: AdcConfig | None = None
-    rate_hz: float = Field(10.0, ge=1, le=1000)
+    rate_hz: float = Field(DAQ_RATE_HZ, ge=1, le=1000)
 
     _one_way_in = either("scanner", "adc")
 
@@ -149,14 +166,16 @@ class SkinConfig(ConfigModel):
         None, gt=0, le=200, description="from the wrist's axis to the skin, for torque"
     )
     zero_samples: int = Field(20, ge=10, le=1000, description="readings averaged into the zero")
-    drift_per_hour: float = Field(2.9e-4, ge=0, le=1, description="95 % bound on the response's drift; the paper's")
+    drift_per_hour: float = Field(
+        DRIFT_PER_HOUR, ge=0, le=1, description="95 % bound on the response's drift; the paper's"
+    )
 
 
 class GripperSocket(ConfigModel):
     """The gripper behind the URCap's socket."""
 
     host: str = Field(min_length=1)
-    port: int = Field(63352, ge=1, le=65535)
+    port: int = Field(URCAP_PORT, ge=1, le=65535)
 
 
 class GripperConfig(ConfigModel):

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.drivers.connection import Diagnostics, LinkMonitor, Port, SerialLink
+from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.errors import DeviceLostError
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, LineSplitter, RawEvent, SerialSensor
 
@@ -31,10 +32,8 @@ LINE_BYTES = N_VALUES * CELL_BYTES
 MAX_LINE_BYTES = 2 * LINE_BYTES
 EXCERPT_BYTES = 60
 
-# The mean over two recordings of 832 frames each.
-FRAME_PERIOD_S = 0.5408
-# The board's nominal period, 1.85 frames/s; the clock learns the real one.
-NOMINAL_PERIOD_NS = 541_000_000
+# The board's period until the clock has learned the real one.
+NOMINAL_PERIOD_NS = round(1e9 * FRAME_PERIOD_S)
 # A line of 8 kB over the high-speed USB of a Teensy 4.
 TRANSFER_NS = 1_000_000
 ADC_REFERENCE_V = 2.2
@@ -391,7 +390,7 @@ class EitKit(SerialSensor[Frame]):
         zero_slots: NDArray[np.bool_],
         serial_number: str | None = None,
         path: str | os.PathLike[str] | None = None,
-        frame_period_s: float = NOMINAL_PERIOD_NS / 1e9,
+        frame_period_s: float = FRAME_PERIOD_S,
         monitor: LinkMonitor | None = None,
         inputs: InputRecorder | None = None,
     ) -> None:

@@ -15,11 +15,10 @@ from typing import Literal, Self
 from shearloop.drivers import serial_sensor
 from shearloop.drivers.calibration_files import CalibrationModel, Finite, Positive
 from shearloop.drivers.connection import Diagnostics, LinkMonitor, SerialLink
+from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ
 
 BAUD_RATE = 115200
-# Measured on the paper's rig (4882 lines in 447 s); the data sheet says 10 samples a second.
-RATE_HZ = 10.9
-PERIOD_NS = round(1e9 / RATE_HZ)
+PERIOD_NS = round(1e9 / LOAD_CELL_RATE_HZ)
 # The ends of the converter's range (HX711 data sheet, "Output data": 24 bits, two's complement).
 COUNTS_MAX, COUNTS_MIN = 8388607, -8388608
 # "-8388608" has 8 characters, a float printed by an Uno at most 15.
@@ -126,9 +125,9 @@ class SpikeFilter:
 class LoadParser:
     """Turns the board's bytes, however they are sliced, into samples; counts rejected lines by kind. No I/O."""
 
-    def __init__(self, calibration: LoadCalibration, rate_hz: float = RATE_HZ) -> None:
+    def __init__(self, calibration: LoadCalibration, rate_hz: float = LOAD_CELL_RATE_HZ) -> None:
         self._period_ns = round(1e9 / rate_hz)
-        self._stuck_after = max(STUCK_AFTER, round(STUCK_AFTER * rate_hz / RATE_HZ))
+        self._stuck_after = max(STUCK_AFTER, round(STUCK_AFTER * rate_hz / LOAD_CELL_RATE_HZ))
         self._lines = serial_sensor.TimedLines(MAX_LINE_BYTES, BAUD_RATE, rate_hz)
         self._errors: Counter[str] = Counter()
         self._seq = 0
@@ -207,13 +206,13 @@ class LoadCell(serial_sensor.SerialSensor[LoadSample]):
         *,
         serial_number: str | None = None,
         path: str | os.PathLike[str] | None = None,
-        rate_hz: float = RATE_HZ,
+        rate_hz: float = LOAD_CELL_RATE_HZ,
         monitor: LinkMonitor | None = None,
         inputs: serial_sensor.InputRecorder | None = None,
     ) -> None:
         link = SerialLink(serial_number=serial_number, path=path, baud=BAUD_RATE, monitor=monitor)
         # A fast board may seem silent to a busy computer; reopening would reset it.
-        super().__init__(link, 1.0 / min(rate_hz, RATE_HZ), inputs)
+        super().__init__(link, 1.0 / min(rate_hz, LOAD_CELL_RATE_HZ), inputs)
         self._parser = LoadParser(calibration, rate_hz)
         self._samples = 0
         self._flagged = 0

@@ -13,6 +13,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.bank.defaults import BASELINE_FRAMES
 from shearloop.bank.eit.channels import N_CHANNELS, smoothed_along_channels
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatch
@@ -42,7 +43,7 @@ from shearloop.bank.estimation.interval_regressor import (
 )
 from shearloop.bank.estimation.novelty import fitted_parts, reciprocal_means
 from shearloop.bank.estimation.regressors import InverseCalibration
-from shearloop.bank.estimation.session_state import BASELINE_FRAMES, Motion
+from shearloop.bank.estimation.session_state import Motion
 from shearloop.bank.polynomial import TWO_SIDED_95
 
 # Directions of motion per fingertip, and frames back: 13 frames are 7 s, about twice the gel's creep.

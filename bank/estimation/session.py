@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.bank.defaults import BASELINE_FRAMES
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatch, BankMatcher
@@ -15,7 +16,6 @@ from shearloop.bank.estimation.estimator import NO_ERRORS, OutputModel, Quantity
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.novelty import FAMILIAR, Novelty
 from shearloop.bank.estimation.session_state import (
-    BASELINE_FRAMES,
     PaperState,
     ProcessedFrame,
     SessionState,

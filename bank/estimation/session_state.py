@@ -13,6 +13,7 @@ from typing import Self
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.bank.defaults import BASELINE_FRAMES
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.matching import signal_above_noise
 from shearloop.bank.estimation.fingertip_validator import (
@@ -25,8 +26,6 @@ from shearloop.bank.estimation.fingertip_validator import (
 )
 from shearloop.bank.estimation.values import TactileFrame
 
-# Frames in the mean of the idle baseline.
-BASELINE_FRAMES = 10
 # Frames (half a minute) in the mean difference of a grip: twists come and go within it.
 _HELD_FRAMES = 60
 # Longest step between frames while the period is unknown: two frames of 0.54 s are missing.

@@ -22,7 +22,7 @@ from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.schema import DIAMETER_NOTE
 from shearloop.daemon.recording.writer import RecordingWriter
 from shearloop.daemon.synthetic_frames import RigFrames
-from shearloop.drivers.eit_kit import FRAME_PERIOD_S
+from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.emulators.boards import LOAD_PERIOD_S
 from shearloop.drivers.emulators.gripper import Gripper, GripperRegisters
 from shearloop.drivers.emulators.rig import NOISE_NM, SIDES

@@ -22,6 +22,7 @@ from shearloop.bank.estimation.values import LARGEST_TORQUE_NM
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, SIDES
 from shearloop.daemon.recording.writer import RecordingWriter
+from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import slope_below
 
 # The recording scripts changed these names over time.
@@ -38,7 +39,6 @@ _DATENUM_OF_UNIX_EPOCH = 719529
 _SECONDS_PER_DAY = 86400.0
 _TORQUE_SLICE = re.compile(r"Data_Slice_(\d+)\.mat")
 _DIAMETER_SLICE = re.compile(r"(\d+(?:\.\d+)?)mm_Data_(\d+)\.mat")
-NOMINAL_PERIOD_NS = 541_200_000
 # Among this many frames on either side, at least one should have been read without delay.
 _NEIGHBOURS = 12
 # The load cell's board sends a line every 91.6 ms.
@@ -239,7 +239,7 @@ def frame_middles(arrivals_ns: Sequence[int]) -> list[int]:
     board that paused.
     """
     numbered = list(enumerate(arrivals_ns))
-    period = slope_below(numbered) if len(numbered) > 1 else float(NOMINAL_PERIOD_NS)
+    period = slope_below(numbered) if len(numbered) > 1 else 1e9 * FRAME_PERIOD_S
     height = np.array([float(arrival - arrivals_ns[0]) - n * period for n, arrival in numbered])
     lowest = minimum_filter1d(height, 2 * _NEIGHBOURS + 1, mode="nearest")
     return [arrivals_ns[0] + round(low + (n - 0.5) * period) for n, low in enumerate(lowest)]

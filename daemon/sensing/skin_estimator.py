@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 # scipy.stats would cost the daemon 40 MB and half of its start-up time.
 from scipy.special import chdtri
 
-from shearloop.bank.polynomial import TWO_SIDED_95
 from shearloop.bank.skin.calibration import DirectionFinder, ForceFollower, SkinCalibration
 from shearloop.bank.skin.membrane import Direction, ShearInterval
+from shearloop.drivers.defaults import DRIFT_PER_HOUR
 from shearloop.drivers.shear_skin.skin import SkinSample
 
 # The slack gauge is compressed by at most this share of the other's stretch (0.125 in the 2-D reference, see
@@ -23,8 +23,6 @@ from shearloop.drivers.shear_skin.skin import SkinSample
 MAX_COMPRESSION = 0.15
 # A larger deviation from that makes the zero invalid.
 MAX_DEVIATION = 0.02
-# The paper's drift, 1.48e-4 over an hour, as a 95 % bound.
-DRIFT_PER_HOUR = TWO_SIDED_95 * 1.48e-4
 # A larger trend while the zero is taken means that the skin was touched or drifts (the paper's noise: 1e-4).
 MAX_TREND = 1e-3
 MAX_NOISE = 5e-3

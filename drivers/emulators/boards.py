@@ -14,7 +14,8 @@ from random import Random
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.drivers.eit_kit import FRAME_PERIOD_S, N_VALUES
+from shearloop.drivers.defaults import FRAME_PERIOD_S
+from shearloop.drivers.eit_kit import N_VALUES
 from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.ports import PtyPort
 from shearloop.drivers.load_cell import COUNTS_MAX, COUNTS_MIN

@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol
 
-from shearloop.drivers.eit_kit import FRAME_PERIOD_S
+from shearloop.drivers.defaults import FRAME_PERIOD_S, URCAP_PORT
 from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.boards import LOAD_PERIOD_S, EitKitBoard, Hx711Board, Sketch
-from shearloop.drivers.emulators.gripper import URCAP_PORT, Gripper, GripperPlayer, ModbusSlave, UrcapSession
+from shearloop.drivers.emulators.gripper import Gripper, GripperPlayer, ModbusSlave, UrcapSession
 from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.drivers.emulators.scene import FloatArray, Joint, Scene, TwinSettings
 from shearloop.drivers.emulators.skin import Gauges, SkinInstruments

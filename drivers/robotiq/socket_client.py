@@ -7,10 +7,10 @@ or with `POS ?` when the controller has no value, for example because the grippe
 import asyncio
 from contextlib import suppress
 
+from shearloop.drivers.defaults import URCAP_PORT
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, ProtocolError
 from shearloop.drivers.robotiq import messages
 
-PORT = 63352
 CONNECT_DEADLINE_S = 2.0
 # A reply takes some milliseconds; the controller serves the socket with a low priority.
 REPLY_DEADLINE_S = 0.5
@@ -91,7 +91,7 @@ def readout_of(values: dict[str, int | None]) -> messages.Readout:
 class SocketClient:
     """One connection to the URCap. Any failure closes it: afterwards a reply could belong to another request."""
 
-    def __init__(self, host: str, port: int = PORT, *, reply_deadline_s: float = REPLY_DEADLINE_S) -> None:
+    def __init__(self, host: str, port: int = URCAP_PORT, *, reply_deadline_s: float = REPLY_DEADLINE_S) -> None:
         """Name the controller; nothing is opened yet."""
         self._host = host
         self._port = port

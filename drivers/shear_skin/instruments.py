@@ -14,6 +14,14 @@ from time import monotonic_ns
 from typing import Generic, TypeAlias, TypeVar
 
 from shearloop.drivers.connection import Diagnostics, Link, Port
+from shearloop.drivers.defaults import (
+    ADC_FULL_SCALE_V,
+    DAQ_RATE_HZ,
+    SCANNER_CHANNELS,
+    SCANNER_RANGE_V,
+    SOURCE_COMPLIANCE_V,
+    SOURCE_CURRENT_MA,
+)
 from shearloop.drivers.errors import DeviceLostError, DeviceSilentError, DriverError, ProtocolError
 from shearloop.drivers.load_cell import describe_errors
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, LineSplitter, RawEvent, SerialSensor, TimedLines
@@ -31,9 +39,7 @@ _NUMBER = re.compile(r" *[+-]?[0-9]{1,12}(\.[0-9]{0,12})?([Ee][+-]?[0-9]{1,2})? 
 
 # The current source. Commands and status word: manual 6430-901-01, section 17; the 2400 series understands them too.
 MODELS = ("MODEL 6430", "MODEL 24")
-CURRENT_A = 5e-3
-# Twice two gauges of 25 Ω and their leads; harmless for people and gauges.
-COMPLIANCE_V = 1.0
+CURRENT_A = SOURCE_CURRENT_MA * 1e-3
 SOURCE_PERIOD_S = 0.5
 # Stopping the daemon waits this long for a reading in progress and its reply.
 SWITCH_OFF_S = 1.0
@@ -42,16 +48,10 @@ OUTPUT, READ = ":OUTP?", ":READ?"
 _OVERFLOW, _COMPLIANCE, _OVERVOLTAGE, _RANGE_COMPLIANCE = 1 << 0, 1 << 3, 1 << 4, 1 << 16
 
 # The voltages.
-DAQ_RATE_HZ = 10.0
 SCAN = "READ?"
-SCANNER_CHANNELS = (101, 102)
-# The range above 5 mA × 25 Ω; its overrange covers the source's compliance.
-SCANNER_RANGE_V = 1.0
 ADC_BAUD = 115200
 # "-0.123456,-0.123456" has 19 characters.
 MAX_PAIR_BYTES = 40
-# The range of an ADS1220 at gain 4 with its own reference.
-ADC_FULL_SCALE_V = 0.512
 # Values above this share of the range are at its end.
 _END_OF_RANGE = 0.9995
 _PAIR = re.compile(rb"([+-]?[0-9]{1,3}\.[0-9]{1,9}), ?([+-]?[0-9]{1,3}\.[0-9]{1,9})")
@@ -324,7 +324,7 @@ class Keithley6430(PolledInstrument[SourceReading]):
         self,
         link: Link,
         current_a: float = CURRENT_A,
-        compliance_v: float = COMPLIANCE_V,
+        compliance_v: float = SOURCE_COMPLIANCE_V,
         period_s: float = SOURCE_PERIOD_S,
         timeout_s: float = REPLY_TIMEOUT_S,
         inputs: InputRecorder | None = None,

@@ -19,7 +19,8 @@ from shearloop.bank.eit.channels import LINE_SLOTS, line_of_channels
 from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
-from shearloop.drivers.eit_kit import ADC_STEP_V, FRAME_PERIOD_S
+from shearloop.drivers.defaults import FRAME_PERIOD_S
+from shearloop.drivers.eit_kit import ADC_STEP_V
 
 # Guards against a test that hangs; none waits for so long.
 DEADLINE_S = 60

@@ -10,6 +10,7 @@ from scipy.io import loadmat
 
 from shearloop.drivers import load_cell
 from shearloop.drivers.calibration_files import load_calibration, save_calibration
+from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ
 from shearloop.drivers.errors import DeviceCalibrationError
 from shearloop.drivers.load_cell import (
     COUNTS_MAX,
@@ -125,7 +126,7 @@ def test_a_board_of_another_rate_is_stamped_and_found_stuck_by_its_own(rate_hz):
     assert [s.t_arrival_ns for s in samples] == [8 * period_ns, 9 * period_ns, 10 * period_ns]
     assert samples[-1].t_arrival_ns - samples[-1].t_mid_ns == pytest.approx(period_ns / 2 + 0.35e6, abs=0.02e6)
     stuck = [s.stuck for s in feed_lines(LoadParser(TORQUE_LINES, rate_hz), ["0.01"] * 200)]
-    assert stuck.index(True) + 1 == max(STUCK_AFTER, round(STUCK_AFTER * rate_hz / load_cell.RATE_HZ))
+    assert stuck.index(True) + 1 == max(STUCK_AFTER, round(STUCK_AFTER * rate_hz / LOAD_CELL_RATE_HZ))
 
 
 torques = st.floats(-1.7, 1.7)

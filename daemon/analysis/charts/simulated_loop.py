@@ -21,7 +21,7 @@ from shearloop.daemon.control.identification import ExciteSettings, StiffnessExc
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
 from shearloop.daemon.control.margins import integral_gain
 from shearloop.daemon.control.wrist_controller import controller_settings
-from shearloop.drivers.eit_kit import FRAME_PERIOD_S
+from shearloop.drivers.defaults import FRAME_PERIOD_S
 
 PERIOD_S = 0.008
 # The standard deviation of torque that noise may cause; it sets the gain.

@@ -17,7 +17,7 @@ from shearloop.daemon.analysis.series import part_of, read_series
 from shearloop.daemon.bank_config import FingertipGeometryConfig, load_geometry
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.synthetic_frames import Synthesiser, TwistProgramme
-from shearloop.drivers.eit_kit import FRAME_PERIOD_S
+from shearloop.drivers.defaults import FRAME_PERIOD_S
 
 # Frames before the judged part of a stream that fill an estimator's memory.
 WARM_UP_FRAMES = 15

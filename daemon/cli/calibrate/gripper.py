@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from shearloop.daemon.cli.options import add_json, add_option, check_calibration_file
 from shearloop.daemon.cli.terminal import Operator, print_result
 from shearloop.daemon.errors import UserError
+from shearloop.drivers.defaults import URCAP_PORT
 
 if TYPE_CHECKING:
     from shearloop.drivers.robotiq.gripper import RobotiqGripper
@@ -25,7 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     way.add_argument("--host", metavar="ADDRESS", help="the robot's controller, for the URCap's socket")
     way.add_argument("--serial-number", metavar="NUMBER", help="the USB adapter's serial number, for Modbus RTU")
     way.add_argument("--port", metavar="PATH", help="the USB adapter's port, for Modbus RTU")
-    add_option(parser, "--socket-port", int, "PORT", "the URCap's (default: %(default)s)", default=63352)
+    add_option(parser, "--socket-port", int, "PORT", "the URCap's (default: %(default)s)", default=URCAP_PORT)
     text = "an object's diameter; give it once per object, of at least two"
     add_option(parser, "--diameter-mm", float, "MM", text, action="append", required=True)
     add_option(parser, "--force-n", float, "N", "to grip with (default: %(default)s)", default=10.0)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from shearloop.daemon.cli.emulate import console
 from shearloop.daemon.cli.options import add_option
 from shearloop.daemon.errors import UserError
+from shearloop.drivers.defaults import URCAP_PORT
 
 if TYPE_CHECKING:
     import numpy as np
@@ -55,7 +56,7 @@ def _configure_eit_kit(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_eit_kit(args: argparse.Namespace) -> int:
-    from shearloop.drivers.eit_kit import FRAME_PERIOD_S
+    from shearloop.drivers.defaults import FRAME_PERIOD_S
     from shearloop.drivers.emulators.boards import EitKitBoard
 
     console.check_positive(args, "speed")
@@ -213,7 +214,7 @@ def _configure_gripper(parser: argparse.ArgumentParser, printed: str) -> None:
 def _configure_gripper_socket(parser: argparse.ArgumentParser) -> None:
     _configure_gripper(parser, "its address")
     add_option(parser, "--bind", str, "ADDRESS", "address to listen on (default: %(default)s)", default="127.0.0.1")
-    parser.add_argument("--port", type=int, default=63352, help="0 for a free one (default: %(default)s)")
+    parser.add_argument("--port", type=int, default=URCAP_PORT, help="0 for a free one (default: %(default)s)")
 
 
 def _configure_gripper_modbus(parser: argparse.ArgumentParser) -> None:

@@ -18,7 +18,8 @@ from shearloop.daemon.sensing.fingertip_task import (
     FingertipPipeline,
     FingertipTask,
 )
-from shearloop.drivers.eit_kit import FRAME_PERIOD_S, Frame
+from shearloop.drivers.defaults import FRAME_PERIOD_S
+from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.running import running
 

@@ -2,3 +2,5 @@
 
 # Frames in the mean of the idle baseline.
 BASELINE_FRAMES = 10
+# A longer gap restarts the average of frames.
+MAX_GAP_S = 3.0

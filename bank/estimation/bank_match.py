@@ -13,7 +13,7 @@ import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES, smoothed_along_channels
+from shearloop.bank.eit.channels import ChannelTable, smoothed_along_channels
 from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class PaperMatcher:
         self._matcher = PrunedMatcher.from_bank(bank) if isinstance(bank, Bank) else bank
 
     def match(self, difference: FloatArray) -> BankMatch:
-        """Return the position of the heatmap's maximum for a (896,) difference of any sign."""
+        """Return the position of the heatmap's maximum for a (c,) difference of any sign."""
         found = self._matcher.match(difference)
         size = float(np.log(np.linalg.norm(difference)))
         return BankMatch(found.k, found.sigma, size, found.score, found.runner_up, ambiguous=False)
@@ -76,44 +76,47 @@ class ElectrodeNumbering:
     score: float = 1.0
     runner_up: float = 0.0
 
-    def model_channels(self) -> IntArray:
-        """Return (896,) the number of the model's channel for each of the board's channels."""
-        sink, _, positive, negative = CHANNELS.T
+    def model_channels(self, table: ChannelTable) -> IntArray:
+        """Return (c,) the number of the model's channel for each of the board's channels."""
+        sink, source, positive, negative = table.electrodes.T
         turn = -1 if self.reflected else 1
 
-        def electrode(number: IntArray) -> FloatArray:
-            return np.asarray((self.rotation + turn * number) % N_ELECTRODES)
+        def electrode(number: IntArray) -> IntArray:
+            return np.asarray((self.rotation + turn * number) % table.n_electrodes)
 
-        # A reflected pair is measured the other way round.
+        # A reflected pair is driven and measured the other way round; opposite electrodes stay opposite.
         first = electrode(negative if self.reflected else positive)
-        position = np.full((N_ELECTRODES, N_ELECTRODES), -1)
-        position[sink, positive] = np.arange(N_CHANNELS)
-        return np.asarray(position[electrode(sink).astype(int), first.astype(int)])
+        driven = electrode(source if self.reflected and table.injection == "adjacent" else sink)
+        position = np.full((table.n_electrodes, table.n_electrodes), -1)
+        position[sink, positive] = np.arange(table.n_channels)
+        return np.asarray(position[driven, first])
 
 
 NOT_TURNED = ElectrodeNumbering(0, reflected=False)
 
 
-def find_numbering(idle: FloatArray, homogeneous: FloatArray) -> ElectrodeNumbering:
-    """Return the numbering under which a (896,) idle frame correlates best with the homogeneous voltages."""
+def find_numbering(idle: FloatArray, homogeneous: FloatArray, table: ChannelTable) -> ElectrodeNumbering:
+    """Return the numbering under which a (c,) idle frame correlates best with the homogeneous voltages."""
     model, measured = np.abs(homogeneous), np.abs(idle)
     scores = {}
     for reflected in (False, True):
-        for rotation in range(N_ELECTRODES):
-            turned = ElectrodeNumbering(rotation, reflected).model_channels()
+        for rotation in range(table.n_electrodes):
+            turned = ElectrodeNumbering(rotation, reflected).model_channels(table)
             scores[rotation, reflected] = float(np.corrcoef(model[turned], measured)[0, 1])
     best = max(scores, key=lambda key: (round(scores[key], 9), -key[0]))
     # Half a turn swaps the two ends of every injection and changes no magnitude of a symmetric tip.
-    other = [score for key, score in scores.items() if key[1] != best[1] or (key[0] - best[0]) % 16]
+    other = [
+        score for key, score in scores.items() if key[1] != best[1] or (key[0] - best[0]) % (table.n_electrodes // 2)
+    ]
     return ElectrodeNumbering(best[0], best[1], scores[best], max(other))
 
 
 def resolve_half_turn(found: ElectrodeNumbering, touch: FloatArray, bank: Bank) -> ElectrodeNumbering:
     """Return the numbering or its half turn, choosing the better match of a touch; idle frames cannot decide.
 
-    touch (896,) is the change of the idle frame by a grip, in volts.
+    touch (c,) is the change of the idle frame by a grip, in volts.
     """
-    turned = replace(found, rotation=(found.rotation + N_ELECTRODES // 2) % N_ELECTRODES)
+    turned = replace(found, rotation=(found.rotation + bank.table.n_electrodes // 2) % bank.table.n_electrodes)
     scores = [RefinedMatcher(bank, one).match(touch).score for one in (found, turned)]
     return turned if scores[1] > scores[0] + _ALIKE else found
 
@@ -126,14 +129,15 @@ class RefinedMatcher:
         self._coarse = _COARSE if mean_of_alike else -np.inf
         self._k_grid, self._sigma_grid = bank.k_grid, bank.sigma_grid
         self._valid = np.asarray(bank.valid).ravel()
-        signals = np.abs(bank.signals.reshape(-1, N_CHANNELS)[self._valid][:, numbering.model_channels()])
+        signals = bank.signals.reshape(-1, bank.table.n_channels)[self._valid]
+        signals = np.abs(signals[:, numbering.model_channels(bank.table)])
         smooth = smoothed_along_channels(signals.astype(np.float64))
         self._norms = np.linalg.norm(smooth, axis=1)
         self._shapes = (smooth / self._norms[:, None]).astype(np.float32)
         self._cells = np.flatnonzero(self._valid)
 
     def match(self, difference: FloatArray) -> BankMatch:
-        """Return the refined position of the best cell for a (896,) difference of any sign."""
+        """Return the refined position of the best cell for a (c,) difference of any sign."""
         (x,) = smoothed_along_channels(np.abs(difference)[None])
         norm = float(np.linalg.norm(x))
         scores = np.full(len(self._valid), -np.inf)
@@ -172,8 +176,8 @@ class RefinedMatcher:
 BankMatcher: TypeAlias = PaperMatcher | RefinedMatcher
 
 
-def image_matrix(mesh: "Mesh") -> FloatArray:
-    """Return the (p, 896) matrix from a difference of voltages to the change of p pixels' log conductivity.
+def image_matrix(mesh: "Mesh", table: ChannelTable) -> FloatArray:
+    """Return the (p, c) matrix from a difference of voltages to the change of p pixels' log conductivity.
 
     One Gauss–Newton step, (JᵀJ + 0.05 · diag(JᵀJ))⁻¹ Jᵀ, with J by central differences of whole pixels. Pixels are
     squares of the mesh's bounding box with at least one triangle.
@@ -181,7 +185,7 @@ def image_matrix(mesh: "Mesh") -> FloatArray:
     # Imported here because only fitting needs it: it would slow the daemon's start.
     from shearloop.bank.eit.forward import ForwardModel
 
-    model = ForwardModel(mesh)
+    model = ForwardModel(mesh, table)
     centres = mesh.nodes[mesh.triangles].mean(axis=1)
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     size = float((high - low).max()) / _PIXELS_ALONG

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shearloop.bank.eit.fingertip import ElectrodePlace, Fingertip
+from shearloop.bank.eit.fingertip import ElectrodePlace, RectangularFingertip
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import boundary_edges, doubled_areas
 from shearloop.bank.eit.models import conductivity
@@ -15,7 +15,7 @@ from shearloop.bank.errors import GeometryError
 
 CENTRES = 0.1 + 0.4 * np.arange(8)
 # A square with eight electrodes on each side, in order around it from the lower left corner.
-SQUARE = Fingertip(
+SQUARE = RectangularFingertip(
     width_cm=3.2,
     height_cm=3.2,
     electrode_width_cm=0.2,

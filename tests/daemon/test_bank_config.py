@@ -59,7 +59,7 @@ def test_the_papers_fingertip_gives_the_papers_voltages_within_the_error_of_its_
 
 
 def test_the_papers_electrodes_are_where_the_papers_mesh_has_them(shared):
-    ours = load_geometry(CONFIG / "fingertips" / "paper.yaml")
+    ours = load_geometry(CONFIG / "fingertips" / "paper.yaml").mesh
     theirs = load_mesh(shared / "reference" / "fingertip_mesh.npz")
     for electrode in range(32):
         ends = [

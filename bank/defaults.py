@@ -2,3 +2,5 @@
 
 # Frames in the mean of the idle baseline.
 BASELINE_FRAMES = 10
+# Frames with at least this torque are loaded, where accuracy is judged.
+LOADED_NM = 0.005

@@ -4,3 +4,5 @@
 BASELINE_FRAMES = 10
 # Frames with at least this torque are loaded, where accuracy is judged.
 LOADED_NM = 0.005
+# A longer gap restarts the average of frames.
+MAX_GAP_S = 3.0

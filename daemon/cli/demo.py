@@ -60,7 +60,7 @@ def _prepare(config: Path, data: Path) -> None:
     """Make the bank and the calibrations that are missing or outdated."""
     from shearloop.daemon.bank_config import load_bank_plans
 
-    with writing(data, "the folder", "--folder"):
+    with writing(data, "the folder"):
         data.mkdir(exist_ok=True)
     definition, signals = config / "banks" / "demo.yaml", data / "demo.bank"
     if not bank.is_built(signals, load_bank_plans(definition)[""]):

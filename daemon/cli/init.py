@@ -37,6 +37,6 @@ def packaged_files() -> dict[Path, bytes]:
 def write_files(folder: Path, files: dict[Path, bytes]) -> None:
     """Write the files below a folder; raises UserError where that fails."""
     for path, content in files.items():
-        with writing(folder / path, "the file", "folder"):
+        with writing(folder / path, "the file"):
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             (folder / path).write_bytes(content)

@@ -101,12 +101,12 @@ def check_calibration_file(out: Path) -> None:
 
 
 @contextmanager
-def writing(out: Path, what: str, option: str = "--out") -> Iterator[None]:
+def writing(out: Path, what: str) -> Iterator[None]:
     """Raise UserError where writing `out` raises OSError."""
     try:
         yield
     except OSError as error:
-        raise UserError(f"{out}: {what} cannot be written: {error.strerror}; choose another {option}") from error
+        raise UserError(f"{out}: {what} cannot be written: {error.strerror}; choose another path") from error
 
 
 def parse_time_range(text: str) -> tuple[float, float]:

@@ -63,7 +63,7 @@ def test_init_writes_files_that_load_and_changes_none(tmp_path, capsys):
     assert (folder / "rig.yaml").read_text() == "mine"
     assert not (folder / "ur.yaml").exists()
     assert main(["init", str(folder / "rig.yaml")]) == 2
-    assert "cannot be written: Not a directory; choose another folder" in capsys.readouterr().err
+    assert "cannot be written: Not a directory; choose another path" in capsys.readouterr().err
 
 
 def test_the_demos_page_lasts_as_long_as_the_demo(tmp_path, monkeypatch, capsys):

@@ -84,8 +84,8 @@ async def test_the_python_subscriber_prints_estimates(tmp_path):
                     await asyncio.wait([seen], timeout=0.05)
                 assert b"text 0.5 " in seen.result()
                 publisher.publish(frame)
-                while b"text 5.0" not in await process.stdout.readline():
-                    pass
+                while b"text 5.0" not in (line := await process.stdout.readline()):
+                    assert line, "the program has ended"
         finally:
             process.kill()
             await process.communicate()

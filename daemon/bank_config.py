@@ -27,9 +27,9 @@ Measure = Annotated[float, Field(gt=0, le=100)]
 class GridConfig(ConfigModel):
     """`count` values from `low` to `high`, both included; a single one where the two are the same."""
 
-    low: Annotated[float, Field(ge=-1000, le=1000)]
-    high: Annotated[float, Field(ge=-1000, le=1000)]
-    count: Annotated[int, Field(ge=1, le=2000)]
+    low: float = Field(ge=-1000, le=1000, description="the first value")
+    high: float = Field(ge=-1000, le=1000, description="the last value")
+    count: int = Field(ge=1, le=2000, description="number of values")
 
     @model_validator(mode="after")
     def _ascends(self) -> Self:
@@ -47,7 +47,7 @@ class GridConfig(ConfigModel):
 class MeshFileConfig(ConfigModel):
     """A mesh file (.npz or EIDORS .mat), and how its electrodes are driven."""
 
-    file: Path
+    file: Path = Field(description="the mesh: .npz or EIDORS .mat")
     injection: Injection = Field("opposite", description="the electrode that an injection's current comes from")
 
 
@@ -58,13 +58,13 @@ class OverConfig(ConfigModel):
     replace the fingertip's.
     """
 
-    amplitude: GridConfig | None = None
-    offset: GridConfig | None = None
-    tilt_deg: GridConfig | None = None
-    width_cm: GridConfig | None = None
-    height_cm: GridConfig | None = None
-    electrode_width_cm: GridConfig | None = None
-    contact_impedance: GridConfig | None = None
+    amplitude: GridConfig | None = Field(None, description="factor of the basis model f")
+    offset: GridConfig | None = Field(None, description="change of the whole conductivity")
+    tilt_deg: GridConfig | None = Field(None, description="angle of the axis of f")
+    width_cm: GridConfig | None = Field(None, description="width of the fingertip")
+    height_cm: GridConfig | None = Field(None, description="height of the fingertip")
+    electrode_width_cm: GridConfig | None = Field(None, description="width of each electrode")
+    contact_impedance: GridConfig | None = Field(None, description="of each contact, in cm over the conductivity")
 
     @field_validator("tilt_deg")
     @classmethod
@@ -92,13 +92,13 @@ class BankConfig(ConfigModel):
     With `over`, a folder of banks.
     """
 
-    mesh: MeshFileConfig | None = None
-    fingertip: Path | None = None
-    mesh_size_cm: MeshSize | None = None
-    model: ModelName
-    k: GridConfig
-    sigma: GridConfig
-    over: OverConfig | None = None
+    mesh: MeshFileConfig | None = Field(None, description="a mesh from a file; else `fingertip`")
+    fingertip: Path | None = Field(None, description="the fingertip's dimensions, a file; else `mesh`")
+    mesh_size_cm: MeshSize | None = Field(None, description="largest distance of mesh lines (default: the fingertip's)")
+    model: ModelName = Field(description="basis model of the conductivity's change")
+    k: GridConfig = Field(description="the model's first parameter, in cm")
+    sigma: GridConfig = Field(description="the model's second parameter, in cm")
+    over: OverConfig | None = Field(None, description="further parameters: one bank for each combination")
 
     @model_validator(mode="after")
     def _is_of_one_geometry(self) -> Self:
@@ -124,24 +124,26 @@ class BankConfig(ConfigModel):
 class ElectrodeRunConfig(ConfigModel):
     """Successive electrodes: on one side of a rectangle by their centres along it, or around a disc by their angles."""
 
-    side: Side | None = None
-    centres_cm: list[Annotated[float, Field(ge=0, le=100)]] | None = Field(None, min_length=1)
+    side: Side | None = Field(None, description="side of a rectangle")
+    centres_cm: list[Annotated[float, Field(ge=0, le=100)]] | None = Field(
+        None, min_length=1, description="electrodes' centres along the side"
+    )
     angles_deg: list[Annotated[float, Field(ge=-360, le=360)]] | None = Field(
-        None, min_length=1, description="anticlockwise from the right"
+        None, min_length=1, description="electrodes' centres around a disc, anticlockwise from the right"
     )
 
 
 class FingertipGeometryConfig(ConfigModel):
     """A fingertip with electrodes along its edge: a rectangle (width_cm, height_cm) or a disc (diameter_cm)."""
 
-    width_cm: Measure | None = None
-    height_cm: Measure | None = None
-    diameter_cm: Measure | None = None
-    electrode_width_cm: Measure
-    contact_impedance: Annotated[float, Field(gt=0, le=1000)]
-    mesh_size_cm: MeshSize
+    width_cm: Measure | None = Field(None, description="width of a rectangle")
+    height_cm: Measure | None = Field(None, description="height of a rectangle")
+    diameter_cm: Measure | None = Field(None, description="diameter of a disc")
+    electrode_width_cm: Measure = Field(description="width of each electrode")
+    contact_impedance: float = Field(gt=0, le=1000, description="of each contact, in cm over the conductivity")
+    mesh_size_cm: MeshSize = Field(description="largest distance of mesh lines")
     injection: Injection = Field("opposite", description="the electrode that an injection's current comes from")
-    electrodes: list[ElectrodeRunConfig]
+    electrodes: list[ElectrodeRunConfig] = Field(description="the electrodes in order")
 
     @model_validator(mode="after")
     def _has_one_outline(self) -> Self:
@@ -149,9 +151,8 @@ class FingertipGeometryConfig(ConfigModel):
         if is_round in (self.width_cm is not None, self.height_cm is not None):
             raise ValueError("give either `diameter_cm`, or `width_cm` and `height_cm`")
         for run in self.electrodes:
-            if is_round != (run.angles_deg is not None) or is_round == (
-                run.side is not None and run.centres_cm is not None
-            ):
+            given = run.side is not None, run.centres_cm is not None, run.angles_deg is not None
+            if given != (not is_round, not is_round, is_round):
                 wanted = "`angles_deg`" if is_round else "`side` and `centres_cm`"
                 raise ValueError(f"each entry of `electrodes` needs {wanted}, and nothing else")
         return self

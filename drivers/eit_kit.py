@@ -3,7 +3,7 @@
 The board sends a line per frame: values with four decimals, each followed by `, `, then a newline. L electrodes have
 L² values (v), some of them channels (c). The board computes each from 10-bit samples as floor(√(mean of (sample −
 512)²)) × 2.2 V / 1024 (`read_signal` of the EIT-kit's open-source firmware), hence the steps of 2.2/1024 V. It writes 0
-where the measuring pair touches a driven electrode. All values are below 10 V, so a valid line has cells of eight bytes.
+where the measuring pair touches a driven electrode. Values are below 10 V, so a line has cells of eight bytes.
 """
 
 import math

@@ -233,6 +233,8 @@ Fingertip: TypeAlias = RectangularFingertip | RoundFingertip
 
 
 def _check_measures(fingertip: Fingertip, lengths: tuple[str, ...]) -> None:
+    # The table checks the number of electrodes.
+    _ = fingertip.table
     for name in (*lengths, "electrode_width_cm", "contact_impedance", "mesh_size_cm"):
         value = getattr(fingertip, name)
         if not (np.isfinite(value) and value > 0):

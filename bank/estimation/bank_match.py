@@ -7,6 +7,7 @@ step from the homogeneous conductivity with the NOSER prior (Cheney et al. 1990)
 """
 
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -28,6 +29,8 @@ _SCORE_SCALE, _LEAST_WEIGHT = 0.0005, 1e-9
 # A weighted mean finds a sampled Gaussian peak if its standard deviation is at least 0.6 cells, so weights reach this
 # share of the drop to the next cell. On grids with a larger drop than _COARSE a parabola through the maximum is used.
 _RESOLVED, _COARSE = 0.7, 0.005
+# Numberings correlate alike, by the symmetry of the fingertip, within this difference.
+_SYMMETRIC = 0.01
 _PIXELS_ALONG = 12
 _STEP, _SMOOTHING = 1e-3, 0.05
 
@@ -67,14 +70,12 @@ class PaperMatcher:
 class ElectrodeNumbering:
     """The model's electrode for each of the board's: e becomes rotation + e, or rotation − e when reflected.
 
-    score and runner_up are the correlations of the idle frame with the homogeneous voltages, for this numbering and
-    for the best one that is not equal by symmetry.
+    score is the correlation of the idle frame with the homogeneous voltages.
     """
 
     rotation: int
     reflected: bool
     score: float = 1.0
-    runner_up: float = 0.0
 
     def model_channels(self, table: ChannelTable) -> IntArray:
         """Return (c,) the number of the model's channel for each of the board's channels."""
@@ -95,30 +96,31 @@ class ElectrodeNumbering:
 NOT_TURNED = ElectrodeNumbering(0, reflected=False)
 
 
-def find_numbering(idle: FloatArray, homogeneous: FloatArray, table: ChannelTable) -> ElectrodeNumbering:
-    """Return the numbering under which a (c,) idle frame correlates best with the homogeneous voltages."""
+def find_numberings(idle: FloatArray, homogeneous: FloatArray, table: ChannelTable) -> list[ElectrodeNumbering]:
+    """Return the numberings under which a (c,) idle frame correlates best with the homogeneous voltages, best first.
+
+    A symmetric fingertip has several: half a turn changes no magnitude of a rectangle's, any turn none of a disc's.
+    """
     model, measured = np.abs(homogeneous), np.abs(idle)
-    scores = {}
-    for reflected in (False, True):
-        for rotation in range(table.n_electrodes):
-            turned = ElectrodeNumbering(rotation, reflected).model_channels(table)
-            scores[rotation, reflected] = float(np.corrcoef(model[turned], measured)[0, 1])
-    best = max(scores, key=lambda key: (round(scores[key], 9), -key[0]))
-    # Half a turn swaps the two ends of every injection and changes no magnitude of a symmetric tip.
-    other = [
-        score for key, score in scores.items() if key[1] != best[1] or (key[0] - best[0]) % (table.n_electrodes // 2)
-    ]
-    return ElectrodeNumbering(best[0], best[1], scores[best], max(other))
+    found = []
+    for reflected, rotation in product((False, True), range(table.n_electrodes)):
+        turned = ElectrodeNumbering(rotation, reflected)
+        score = float(np.corrcoef(model[turned.model_channels(table)], measured)[0, 1])
+        found.append(replace(turned, score=score))
+    best = max(found, key=lambda one: (round(one.score, 9), -one.rotation))
+    half_turn = best.reflected, (best.rotation + table.n_electrodes // 2) % table.n_electrodes
+    alike = [one for one in found if one.score > best.score - _SYMMETRIC or (one.reflected, one.rotation) == half_turn]
+    return sorted(alike, key=lambda one: one is not best)
 
 
-def resolve_half_turn(found: ElectrodeNumbering, touch: FloatArray, bank: Bank) -> ElectrodeNumbering:
-    """Return the numbering or its half turn, choosing the better match of a touch; idle frames cannot decide.
+def resolve_symmetry(numberings: list[ElectrodeNumbering], touch: FloatArray, bank: Bank) -> ElectrodeNumbering:
+    """Return the numbering under which a touch matches best, the first unless another is clearly better.
 
     touch (c,) is the change of the idle frame by a grip, in volts.
     """
-    turned = replace(found, rotation=(found.rotation + bank.table.n_electrodes // 2) % bank.table.n_electrodes)
-    scores = [RefinedMatcher(bank, one).match(touch).score for one in (found, turned)]
-    return turned if scores[1] > scores[0] + _ALIKE else found
+    scores = [RefinedMatcher(bank, one).match(touch).score for one in numberings]
+    best = int(np.argmax(scores))
+    return numberings[best] if scores[best] > scores[0] + _ALIKE else numberings[0]
 
 
 class RefinedMatcher:

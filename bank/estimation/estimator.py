@@ -20,9 +20,9 @@ from shearloop.bank.estimation.bank_match import (
     ElectrodeNumbering,
     PaperMatcher,
     RefinedMatcher,
-    find_numbering,
+    find_numberings,
     image_matrix,
-    resolve_half_turn,
+    resolve_symmetry,
 )
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.interval_regressor import (
@@ -315,8 +315,8 @@ class BankEstimator(_OnBank):
         if not material.validators or bank is None:
             return cls(material.scale, material.table)
         first = material.validators[0]
-        found = find_numbering(first.idle, bank.homogeneous, material.table)
-        return cls(material.scale, material.table, numbering=resolve_half_turn(found, first.gripped - first.idle, bank))
+        found = find_numberings(first.idle, bank.homogeneous, material.table)
+        return cls(material.scale, material.table, numbering=resolve_symmetry(found, first.gripped - first.idle, bank))
 
     def matcher(self, bank: Bank) -> BankMatcher:
         """Return the refined match on the bank."""

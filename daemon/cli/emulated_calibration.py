@@ -47,7 +47,7 @@ Sides = tuple[str, ...]
 
 
 def lines_of(scene: Scene, frames: RigFrames) -> list[NDArray[np.float64]]:
-    """Return the lines of both boards, (1024,) in volts, for frames that end now."""
+    """Return the lines of both boards, (v,) in volts, for frames that end now."""
     gel = scene.frame(FRAME_PERIOD_S)
     return [frames.line(gel.grip, sign * gel.shear_torque_nm, gel.diameter_mm) for sign in SIDES.values()]
 
@@ -74,7 +74,7 @@ class RecordedTwists:
     def write(self, path: Path, diameter_mm: float) -> None:
         """Write a recording that begins at the Unix time 0."""
         notes = {DIAMETER_NOTE: f"{diameter_mm:g}"}
-        with RecordingWriter(path, SOURCE, notes) as writer:
+        with RecordingWriter(path, SOURCE, notes, self.table) as writer:
             for t_s, pair in zip(self.frame_s, self.lines, strict=True):
                 for side, line in zip(SIDES, pair, strict=True):
                     writer.add_frame(side, round(t_s * 1e9), round((t_s + FRAME_PERIOD_S / 2) * 1e9), line)

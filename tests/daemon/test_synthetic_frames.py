@@ -26,6 +26,7 @@ def small_bank() -> SimpleNamespace:
     valid = np.ones((2, 3), bool)
     valid[1, 2] = False
     return SimpleNamespace(
+        table=PAPER_TABLE,
         k_grid=k,
         sigma_grid=sigma,
         homogeneous=0.5 * np.sin(PAPER_TABLE.electrodes @ [0.1, 0.2, 0.3, 0.4]) + 0.7,
@@ -140,7 +141,7 @@ def test_a_grip_changes_the_frame_by_as_much_as_the_recorded_torques_do(shared):
     k, sigma = np.array([3.25]), np.array([1.25, 1.85])
     signals = [[forward.voltages(conductivity(mesh, "gaussian_derivative", k[0], s)) - homogeneous for s in sigma]]
     arrays = {"signals": np.array(signals, np.float32), "valid": np.ones((1, 2), bool)}
-    bank = SimpleNamespace(k_grid=k, sigma_grid=sigma, homogeneous=homogeneous, **arrays)
+    bank = SimpleNamespace(table=PAPER_TABLE, k_grid=k, sigma_grid=sigma, homogeneous=homogeneous, **arrays)
     synthesiser = Synthesiser(bank)
     idle, gripped = (
         np.mean([PAPER_TABLE.channels_of_line(synthesiser.line(3.25, 1.55, grip)) for _ in range(60)], axis=0)

@@ -236,7 +236,7 @@ def test_a_tenth_of_a_foreign_frame_in_later_slices_lies_within_the_intervals(na
 
 def test_where_slices_tell_little_intervals_reach_to_what_may_be_hidden_in_them(slices, earlier):
     calibration, later = earlier("motion_regression", 39), slices.between(39, 49)
-    mirrored = ElectrodeNumbering(5, True, score=1.0, runner_up=0.0).model_channels(PAPER_TABLE)
+    mirrored = ElectrodeNumbering(5, True).model_channels(PAPER_TABLE)
     foreign = later.channels.mean(axis=0)[:, mirrored]
     spoilt = replace(later, channels=0.9 * later.channels + 0.1 * foreign)
     assert figures_of([estimate_series(calibration, spoilt)])["coverage_95"] >= 0.9

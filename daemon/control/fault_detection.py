@@ -68,6 +68,8 @@ class Watched:
     # The wrist is driven by the torque, or twists under its limit.
     torque_needed: bool = False
     gripped: bool = False
+    # The fingers open or close: a fingertip measures their motion then, and no torque.
+    regripping: bool = False
     twisted_rad: float = 0.0
     expected_nm: float | None = None
     overdue: str = ""
@@ -95,6 +97,8 @@ def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_
     for source in (watched.driving, *watched.supervising):
         torque = inputs.torques.get(source.name)
         if torque is None or torque.torque_nm is None or abs(torque.torque_nm) <= limit_nm:
+            continue
+        if watched.regripping and source.warm_up_s:
             continue
         if t_ns - torque.t_ns <= watched.fresh_s[source.name] * 1e9:
             beyond = f"{source.name} measured {torque.torque_nm:+.3f} N·m, the limit is {limit_nm:g} N·m"

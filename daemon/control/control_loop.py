@@ -26,6 +26,7 @@ from shearloop.daemon.control.experiment_schema import (
     first_turn_before_grip,
 )
 from shearloop.daemon.control.fault_detection import (
+    Grip,
     LatestInputs,
     Watched,
     compared_for_s,
@@ -241,13 +242,12 @@ class ControlLoop:
             watched = replace(watched, limits=experiment.limits)
         if experiment is not None and active:
             command, controller = experiment.command, self.wrist.controller
-            regripping = isinstance(command.action, GripTo)
-            gripped = grip.expected and not regripping
-            needed = gripped and _turns(command) and not self._awaited_torques(experiment, t_ns)
+            state = Grip.HELD if grip.expected else Grip.NONE
+            state = Grip.CHANGING if isinstance(command.action, GripTo) else state
+            needed = state is Grip.HELD and _turns(command) and not self._awaited_torques(experiment, t_ns)
             watched = replace(
                 watched,
-                gripped=gripped,
-                regripping=regripping,
+                grip=state,
                 torque_needed=needed and experiment.phase is ExperimentPhase.RUNNING,
                 twisted_rad=0.0 if arm is None or grip.origin_rad is None else arm.wrist_rad - grip.origin_rad,
                 expected_nm=controller.torque_nm if controller is not None else None,

@@ -219,6 +219,8 @@ def _device_faults(inputs: LatestInputs, watched: Watched, t_ns: int) -> list[Fa
             found.append(Fault(FaultCode.EMERGENCY_STOP, arm.blocked or "the controller reports it"))
         elif arm.protective_stop:
             found.append(Fault(FaultCode.PROTECTIVE_STOP, arm.blocked or "the controller reports it"))
+        elif arm.blocked and arm.starting:
+            found.append(Fault(FaultCode.ROBOT_STARTING, "safety, power and control program are made ready"))
         elif arm.blocked:
             found.append(Fault(FaultCode.ROBOT_BLOCKED, arm.blocked))
     if gripper is not None and has_gripper:

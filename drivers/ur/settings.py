@@ -102,6 +102,11 @@ class UrSettings(_Checked):
 
     host: str
     limits: UrLimits
+    # What the pendant must have for motion: the load, its centre of gravity, and the tool centre point (m, rotation
+    # vector in rad), both at the flange. None: not compared.
+    payload_kg: float | None = None
+    payload_cog_m: Three | None = None
+    tcp_offset: Six | None = None
     rate_hz: float = 125.0
     # The robot ends its program when it receives nothing for 1/watchdog_hz.
     watchdog_hz: float = 10.0
@@ -124,8 +129,10 @@ class UrSettings(_Checked):
             raise ValueError("host is empty; give the robot's address")
         for name in self.__dataclass_fields__:
             value = getattr(self, name)
-            if isinstance(value, float | int) and not 0 < value < math.inf:
+            if name != "payload_kg" and isinstance(value, float | int) and not 0 < value < math.inf:
                 raise ValueError(f"{name} must be above 0, not {value:g}")
+        if self.payload_kg is not None and self.payload_kg < 0:
+            raise ValueError(f"payload_kg must be at least 0, not {self.payload_kg:g}")
         for name, longest_s in _LONGEST_S.items():
             value = getattr(self, name)
             if value > longest_s:

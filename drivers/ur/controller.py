@@ -128,7 +128,7 @@ def untested_sentence(version: str) -> str:
     if numbers <= newest:
         return ""
     tested = ".".join(map(str, newest))
-    return f"PolyScope {version} is newer than {tested}, the newest that ur-rtde 1.6 is tested on: move slowly at first."
+    return f"PolyScope {version} is newer than {tested}, the newest that ur-rtde 1.6 is tested on: move slowly first."
 
 
 def query_controller(host: str, timeout_s: float) -> ControllerInfo:

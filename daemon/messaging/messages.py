@@ -206,6 +206,18 @@ class LoopState(Message):
     reasons: str = column("", "every reason for holding or stopping, in sentences")
 
 
+@message("loop.stop", rate_hz=None)
+class LoopStop(Message):
+    """One stop of an experiment, with the times since its cause; its own time is the cause's."""
+
+    experiment: str = column("", "name of the experiment")
+    cause: str = column("", "why it stopped, in sentences")
+    response: str = column("", "the safety response")
+    decided_after_s: float = column("s", "from the measurement or request that caused it to the decision")
+    sent_after_s: float | None = column("s", "until the robot's process had sent the stop; nil if it did not answer")
+    stands_after_s: float | None = column("s", "until the robot measured a standstill; nil if it did not within 5 s")
+
+
 @message("health", rate_hz=1.0)
 class Health(Message):
     """The state of the process and of each of its tasks."""

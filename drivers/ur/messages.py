@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 import msgpack
 
 from shearloop.drivers.errors import ProtocolError
-from shearloop.drivers.ur.settings import Bound, JointRange, Six, Three, UrLimits, UrSettings, Workspace
+from shearloop.drivers.ur.settings import Bound, InstalledTool, JointRange, Six, Three, UrLimits, UrSettings, Workspace
 
 MotionKind = Literal["idle", "wrist", "linear", "stopping"]
 FailureKind = Literal["unreachable", "silent", "version", "registers-in-use", "local-control", "lost"]
@@ -254,7 +254,7 @@ LARGEST_MESSAGE: Final = 1 << 16
 _MOTIONS: Final = (WristSpeed, MoveLinear, Stop)
 _TYPES: Final[tuple[Any, ...]] = (
     *_MOTIONS, ZeroForceTorque, Enable, Unlock, Disconnect, CommandReply, RobotState, Configure, Heartbeat, WorkerPhase,
-    ControllerVersion, Failed, UrSettings, UrLimits, Bound, JointRange, Workspace,
+    ControllerVersion, Failed, UrSettings, UrLimits, Bound, InstalledTool, JointRange, Workspace,
 )  # fmt: skip
 _CODES: Final = {kind: code for code, kind in enumerate(_TYPES)}
 

@@ -21,7 +21,7 @@ from shearloop.drivers.ur.messages import (
     Stop,
     WristSpeed,
 )
-from shearloop.drivers.ur.settings import Bound, Six, UrLimits, UrSettings
+from shearloop.drivers.ur.settings import Bound, InstalledTool, Six, UrLimits, UrSettings
 
 if TYPE_CHECKING:
     from shearloop.drivers.ur.arm import UrArm
@@ -472,18 +472,17 @@ def violation(sample: RtdeSample, settings: UrSettings) -> str:
     for one in (*speeds, tool, *_loads(sample, limits)):
         if beyond := _beyond(*one):
             return beyond
-    return tool_difference(sample, settings)
+    return tool_difference(sample, settings.tool)
 
 
-def tool_difference(sample: RtdeSample, settings: UrSettings) -> str:
+def tool_difference(sample: RtdeSample, tool: InstalledTool) -> str:
     """Return how payload, centre of gravity or tool centre point differ from the settings, or the empty string.
 
     A value that the controller does not report is NaN and differs.
     """
-    cog, tcp = settings.payload_cog_m, settings.tcp_offset
+    load, cog, tcp = tool.payload_kg, tool.payload_cog_m, tool.tcp_offset
     checks = (
-        ("payload_kg", settings.payload_kg, sample.payload_kg,
-         settings.payload_kg is None or abs(sample.payload_kg - settings.payload_kg) < PAYLOAD_KG),
+        ("payload_kg", load, sample.payload_kg, load is None or abs(sample.payload_kg - load) < PAYLOAD_KG),
         ("payload_cog_m", cog, sample.payload_cog_m, cog is None or math.dist(sample.payload_cog_m, cog) < TOOL_M_RAD),
         ("tcp_offset", tcp, sample.tcp_offset, tcp is None or is_close(sample.tcp_offset, tcp, TOOL_M_RAD)),
     )  # fmt: skip

@@ -97,16 +97,29 @@ class UrLimits(_Checked):
 
 
 @dataclass(frozen=True, slots=True)
+class InstalledTool(_Checked):
+    """What the pendant must have for motion: load, its centre of gravity, tool centre point; None: not compared.
+
+    Both points are given at the flange, in m; the rotation vector of `tcp_offset` is in rad.
+    """
+
+    payload_kg: float | None = None
+    payload_cog_m: Three | None = None
+    tcp_offset: Six | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a negative load."""
+        if self.payload_kg is not None and self.payload_kg < 0:
+            raise ValueError(f"payload_kg must be at least 0, not {self.payload_kg:g}")
+
+
+@dataclass(frozen=True, slots=True)
 class UrSettings(_Checked):
     """The robot's address, its limits, and the deadlines of the driver."""
 
     host: str
     limits: UrLimits
-    # What the pendant must have for motion: the load, its centre of gravity, and the tool centre point (m, rotation
-    # vector in rad), both at the flange. None: not compared.
-    payload_kg: float | None = None
-    payload_cog_m: Three | None = None
-    tcp_offset: Six | None = None
+    tool: InstalledTool = InstalledTool()
     rate_hz: float = 125.0
     # The robot ends its program when it receives nothing for 1/watchdog_hz.
     watchdog_hz: float = 10.0
@@ -129,10 +142,8 @@ class UrSettings(_Checked):
             raise ValueError("host is empty; give the robot's address")
         for name in self.__dataclass_fields__:
             value = getattr(self, name)
-            if name != "payload_kg" and isinstance(value, float | int) and not 0 < value < math.inf:
+            if isinstance(value, float | int) and not 0 < value < math.inf:
                 raise ValueError(f"{name} must be above 0, not {value:g}")
-        if self.payload_kg is not None and self.payload_kg < 0:
-            raise ValueError(f"payload_kg must be at least 0, not {self.payload_kg:g}")
         for name, longest_s in _LONGEST_S.items():
             value = getattr(self, name)
             if value > longest_s:

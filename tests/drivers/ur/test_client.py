@@ -13,6 +13,7 @@ import pytest
 from shearloop.drivers.connection import LinkObserver
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed, ZeroForceTorque
+from shearloop.drivers.ur.settings import InstalledTool
 from tests.drivers.ur.robots import ROOT, enable, pid_of, running, settings_for, until
 from tests.emulator_process import EmulatorProcess as ControllerProcess
 from tests.running import LinkEvents
@@ -262,7 +263,9 @@ async def test_controller_that_is_newer_than_the_tested_ones_is_driven_with_a_wa
 
 
 async def test_another_payload_than_the_configured_one_refuses_motion(controller):
-    async with running(settings_for(controller.host, payload_kg=1.0, tcp_offset=(0.0,) * 6)) as robot:
+    async with running(
+        settings_for(controller.host, tool=InstalledTool(payload_kg=1.0, tcp_offset=(0.0,) * 6))
+    ) as robot:
         await enable(robot)
         await controller.fault("payload 1.4")
         state = await until(robot, lambda state: state.payload_kg == 1.4)

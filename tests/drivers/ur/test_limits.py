@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
 from shearloop.drivers.ur.motion import clip_linear, clip_stop, clip_wrist, is_close, line_violation, violation
+from shearloop.drivers.ur.settings import InstalledTool
 from tests.drivers.ur.flight import AT_REST, LIMITS, POSE, SETTINGS, flying
 
 CYCLE_S = 0.008
@@ -183,7 +184,9 @@ def test_a_stop_may_brake_harder_than_a_motion_may_accelerate():
     ],
 )
 def test_tool_must_be_as_configured(configured, reported, differs):
-    found = violation(dataclasses.replace(AT_REST, **reported), dataclasses.replace(SETTINGS, **configured))
+    found = violation(
+        dataclasses.replace(AT_REST, **reported), dataclasses.replace(SETTINGS, tool=InstalledTool(**configured))
+    )
     assert differs in found if differs else not found
 
 

@@ -120,8 +120,8 @@ def open_recording(path: Path) -> Iterator[OpenRecording]:
         except schema.UnknownTopicError as error:
             written = recording.metadata().get(schema.METADATA, {}).get("software", "unknown")
             raise UserError(
-                f"{path}: shearloop {schema.software_version()} has no topic {str(error)!r}; version {written} wrote this "
-                "recording: read it with that version, or export other topics"
+                f"{path}: shearloop {schema.software_version()} has no topic {str(error)!r}; version {written} wrote "
+                "this recording: read it with that version, or export other topics"
             ) from error
 
 

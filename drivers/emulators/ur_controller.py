@@ -8,7 +8,7 @@ from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from dataclasses import replace
 
 from shearloop.drivers.emulators import number_between
-from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, Robot, RobotEvent, armed_hz
+from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, Robot, RobotEvent
 from shearloop.drivers.emulators.ur_rtde import VERSION_NUMBERS, ConnectionFaults, NotRtdeError, RtdeSession
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
@@ -137,7 +137,7 @@ class Controller:
             while data := await reader.read(65536):
                 text += data
                 if text.endswith(SCRIPT_END):
-                    self.robot.upload(armed_hz(text))
+                    self.robot.upload(text.decode("utf-8", "replace"))
                     text.clear()
                 elif len(text) > LARGEST_SCRIPT:
                     log.warning("a script without an end was dropped after %d bytes", len(text))

@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 
 from shearloop.drivers.errors import DriverError, ProtocolError
 from shearloop.drivers.ur.messages import RUNTIME_PLAYING, FailureKind
+from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER
 from shearloop.drivers.ur.settings import Six
 
 RTDE_PORT, DASHBOARD_PORT = 30004, 29999
@@ -24,8 +25,8 @@ HEADER: Final = struct.Struct(">HB")
 _PROTOCOL, _CONTROLLER_VERSION, _OUTPUTS, _INPUTS, _START, _DATA = b"VvOISU"
 _OTHER_PACKAGES = 20
 _LONGEST_LINE = 1024
-# The command registers of ur-rtde's control script.
-_REGISTERS = ("input_int_register_0", "input_double_register_0")
+# The command registers of ur-rtde's control script, and ours.
+_REGISTERS = ("input_int_register_0", "input_double_register_0", DEADLINE_REGISTER)
 # The outputs and their types, in the order of a sample's fields.
 _TYPES: Final = {
     "timestamp": "DOUBLE",
@@ -38,10 +39,13 @@ _TYPES: Final = {
     "runtime_state": "UINT32",
     "speed_scaling": "DOUBLE",
     "output_int_register_0": "INT32",
+    CLOCK_REGISTER: "DOUBLE",
 }
 # The same outputs, after the header and the recipe's number.
-_VALUES: Final = struct.Struct(">d24d2iIdi")
+_VALUES: Final = struct.Struct(">d24d2iIdid")
 _PACKAGE_BYTES: Final = HEADER.size + 1 + _VALUES.size
+# An input package: the header, the recipe's number and one value.
+_DEADLINE: Final = struct.Struct(">HBBd")
 # One second of samples.
 _READ_BYTES = 1 << 15
 # The smallest clock offset may rise by this share of the time. Clocks drift by up to 500 ppm, and a simulator's may be
@@ -80,8 +84,9 @@ class ReceivedSample(NamedTuple):
     safety_mode: int
     runtime_state: int
     speed_scaling: float
-    # Of ur-rtde's control script: 1 when ready, 2 when done with a command.
+    # Of the control script: 1 when ready, 2 when done with a command; and its own clock.
     script_state: int
+    script_s: float = 0.0
 
 
 def probe_controller(host: str, timeout_s: float) -> str:
@@ -161,6 +166,15 @@ def explain_failure(host: str, timeout_s: float, activity: str) -> Iterator[None
         ) from error
 
 
+def registers_in_use(host: str) -> ProbeError:
+    """Return the error about input registers that another client writes."""
+    return ProbeError(
+        "registers-in-use",
+        f"The input registers of the robot at {host} are already in use by another RTDE client, EtherNet/IP or "
+        "PROFINET: end the other program, or disable the adapter under Installation → Fieldbus.",
+    )
+
+
 def silent_sentence(host: str, seconds: float, activity: str) -> str:
     """Return the message about a controller that did not answer."""
     return (
@@ -226,7 +240,7 @@ class SampleParser:
 
 
 class RtdeReceiver:
-    """A connection that receives the controller's samples; `connected` is False once it has ended.
+    """A connection for the controller's samples and our register; `connected` is False once it has ended.
 
     Samples wait in the kernel until `latest` takes the newest one. ur-rtde's interface polls its socket instead, which
     takes a third of the worker's processor time at rest.
@@ -236,8 +250,9 @@ class RtdeReceiver:
         """Connect and wait for the first sample.
 
         Raises:
-            ProbeError: the controller is absent or silent, or does not send the outputs.
+            ProbeError: the controller is absent or silent, does not send the outputs, or our register is in use.
         """
+        self._host = host
         self._parser = SampleParser()
         self.connected = True
         with explain_failure(host, timeout_s, "asking for its state"):
@@ -260,6 +275,10 @@ class RtdeReceiver:
         types = answer[1:].decode(errors="replace")
         if types != ",".join(_TYPES.values()):
             raise OSError(f"its outputs are of the types {types}")
+        answer = _request(self._connection, _INPUTS, DEADLINE_REGISTER.encode())
+        if b"IN_USE" in answer:
+            raise registers_in_use(self._host)
+        self._recipe = answer[0]
         if _request(self._connection, _START) != b"\x01":
             raise OSError("it does not send its state")
         while self.connected:
@@ -273,6 +292,14 @@ class RtdeReceiver:
         if self.connected:
             self._sample = self._receive() or self._sample
         return self._sample
+
+    def write_deadline(self, script_s: float) -> None:
+        """Write when the wrist has to stop, by the script's clock."""
+        try:
+            self._connection.send(_DEADLINE.pack(_DEADLINE.size, _DATA, self._recipe, script_s))
+        except OSError:
+            # Also where the socket is full: the controller has read nothing for long.
+            self.connected = False
 
     def wait(self, seconds: float) -> bool:
         """Wait for data, at most this long, and return whether there is any."""

@@ -15,7 +15,7 @@ from shearloop.drivers.errors import ProtocolError
 from shearloop.drivers.ur import controller as receiver_module
 from shearloop.drivers.ur.controller import ProbeError, ReceivedSample, RtdeReceiver, SampleParser
 
-TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,INT32"
+TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,INT32,DOUBLE"
 
 
 def package(kind: bytes, payload: bytes) -> bytes:
@@ -25,7 +25,7 @@ def package(kind: bytes, payload: bytes) -> bytes:
 def data(number: int) -> bytes:
     """Return the package of a sample with this timestamp."""
     values = [number + 0.01 * index for index in range(24)]
-    return package(b"U", b"\x01" + struct.pack(">d24diiIdi", number, *values, 7, -1, 2, 0.5, 1))
+    return package(b"U", b"\x01" + struct.pack(">d24diiIdid", number, *values, 7, -1, 2, 0.5, 1, 9.5))
 
 
 def text(length: int) -> bytes:
@@ -45,6 +45,7 @@ def test_sample_has_the_values_in_their_order():
         runtime_state=2,
         speed_scaling=0.5,
         script_state=1,
+        script_s=9.5,
     )
 
 
@@ -73,10 +74,10 @@ def test_invalid_package_is_refused(bad):
 class Controller:
     """A controller's port with scripted answers."""
 
-    def __init__(self, types: bytes = TYPES, started: bytes = b"\x01") -> None:
+    def __init__(self, types: bytes = TYPES, started: bytes = b"\x01", inputs: bytes = b"\x01DOUBLE") -> None:
         self._listening = socket.create_server(("127.0.0.1", 0))
         self.port = self._listening.getsockname()[1]
-        self._answers = {b"V": b"\x01", b"O": b"\x01" + types, b"S": started}
+        self._answers = {b"V": b"\x01", b"O": b"\x01" + types, b"I": inputs, b"S": started}
         self.asked: dict[bytes, bytes] = {}
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
@@ -91,6 +92,10 @@ class Controller:
             self.asked[kind] = self._peer.recv(size - 3, socket.MSG_WAITALL)
             self._peer.sendall(package(kind, self._answers[kind]))
         self._peer.sendall(data(1))
+
+    def receive(self, size: int) -> bytes:
+        self._thread.join()
+        return self._peer.recv(size, socket.MSG_WAITALL)
 
     def send(self, stream: bytes) -> None:
         self._thread.join()
@@ -139,6 +144,17 @@ def test_outputs_are_requested_at_the_rate_and_the_newest_kept(play):
     assert not receiver.wait(5.0)
 
 
+def test_deadline_is_written_to_its_register(play):
+    controller = play(TYPES, b"\x01", b"\x05DOUBLE")
+    receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
+    assert controller.asked[b"I"] == b"input_double_register_24"
+    receiver.write_deadline(20.25)
+    assert controller.receive(12) == package(b"U", b"\x05" + struct.pack(">d", 20.25))
+    receiver.close()
+    receiver.write_deadline(20.5)
+    assert not receiver.connected
+
+
 @pytest.mark.parametrize("last", [b"", package(b"U", bytes(8))])
 def test_closed_or_invalid_stream_is_a_lost_connection(play, last):
     controller = play()
@@ -167,7 +183,11 @@ def test_network_error_is_a_lost_connection(play, number):
 
 @pytest.mark.parametrize(
     ("answers", "told"),
-    [((TYPES.replace(b"UINT32", b"NOT_FOUND"),), "NOT_FOUND"), ((TYPES, b"\x00"), "does not send its state")],
+    [
+        ((TYPES.replace(b"UINT32", b"NOT_FOUND"),), "NOT_FOUND"),
+        ((TYPES, b"\x00"), "does not send its state"),
+        ((TYPES, b"\x01", b"\x00IN_USE"), "already in use by another RTDE client"),
+    ],
 )
 def test_controller_without_the_needed_outputs_is_refused(play, answers, told):
     play(*answers)

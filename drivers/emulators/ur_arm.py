@@ -134,9 +134,16 @@ class Arm:
         self.q_rad: Vector = np.array([0.0, -1.0, 1.0, -1.0, -1.0, 0.0]) * (math.pi / 2)
         self.qd_rad_per_s: Vector = np.zeros(6)
         self.motion: Motion | None = None
-        self._frame = link_frames(self.q_rad)[-1]
+        self._framed_q_rad, self._last_frame = self.q_rad, link_frames(self.q_rad)[-1]
         self._wrench = np.zeros(6)
         self._wrench_zero = np.zeros(6)
+
+    @property
+    def _frame(self) -> Matrix:
+        # Only where it is needed: it takes longer than all else in a cycle. A motion makes new angles.
+        if self._framed_q_rad is not self.q_rad:
+            self._framed_q_rad, self._last_frame = self.q_rad, link_frames(self.q_rad)[-1]
+        return self._last_frame
 
     @property
     def moving(self) -> bool:
@@ -179,7 +186,6 @@ class Arm:
         if self.motion is not None:
             self.q_rad, self.qd_rad_per_s, finished = self.motion.advance(self.q_rad, self.qd_rad_per_s, dt_s)
             self.motion = None if finished else self.motion
-            self._frame = link_frames(self.q_rad)[-1]
 
     def load(self, torque_nm: float) -> None:
         """Take a torque about the tool's axis."""

@@ -69,13 +69,14 @@ class _Expressions(ast.NodeTransformer):
         """Wait for a function that may use up cycles."""
         self.generic_visit(node)
         waits = isinstance(node.func, ast.Name) and node.func.id in self._lasting
-        return ast.YieldFrom(node) if waits else node
+        return ast.copy_location(ast.YieldFrom(node), node) if waits else node
 
     def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
         """Tell a pose, `p[x, y, z, rx, ry, rz]`, from an entry of a variable p."""
         self.generic_visit(node)
-        is_pose = isinstance(node.value, ast.Name) and node.value.id == "p" and isinstance(node.slice, ast.Tuple)
-        return ast.List(node.slice.elts, ast.Load()) if is_pose and isinstance(node.slice, ast.Tuple) else node
+        if isinstance(node.value, ast.Name) and node.value.id == "p" and isinstance(node.slice, ast.Tuple):
+            return ast.copy_location(ast.List(node.slice.elts, ast.Load()), node)
+        return node
 
 
 @lru_cache(maxsize=8)
@@ -102,7 +103,7 @@ def translate(text: str) -> tuple[CodeType, str]:
     if depth != 0:
         raise SyntaxError("a block has no end")
     tree = _Expressions({*functions, *_LASTING}).visit(ast.parse("\n".join(lines)))
-    return compile(ast.fix_missing_locations(tree), "URScript", "exec"), functions[0]
+    return compile(tree, "URScript", "exec"), functions[0]
 
 
 def _statement(line: str) -> str:

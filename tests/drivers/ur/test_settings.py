@@ -59,10 +59,10 @@ def test_all_mistakes_are_reported_together(tmp_path):
         (
             "margin_rad: 0.1",
             "margin_rad: 0.1\n    margin_rad: 0.01",
-            r"line 9, column 5: the key `margin_rad` is given twice",
+            r"line 10, column 5: the key `margin_rad` is given twice",
         ),
         ("margin_rad: 0.1", "margin_rad: -1", "`limits.joints` the margin must be above 0, not -1"),
-        ("limits:", "limits", "ur.yaml: line 5, column 9: could not find expected ':'"),
+        ("limits:", "limits", "ur.yaml: line 6, column 9: could not find expected ':'"),
         ("host: 192.168.1.10", "host: &itself [*itself]", "an alias stands within its anchor"),
         ("host: 192.168.1.10", "? [1, 2]\n: 3", "column 3: found unhashable key"),
     ],

@@ -156,6 +156,11 @@ class Arm:
         return np.concatenate([self._frame[:3, 3], Rotation.from_matrix(self._frame[:3, :3]).as_rotvec()])
 
     @property
+    def speed(self) -> Vector:
+        """The tool's linear and angular velocity (6,) in base coordinates."""
+        return np.asarray(jacobian(link_frames(self.q_rad)) @ self.qd_rad_per_s)
+
+    @property
     def wrench(self) -> Vector:
         """Force and torque at the tool, relative to the zero."""
         return self._wrench - self._wrench_zero

@@ -31,6 +31,10 @@ class ControllerSpec:
 
     unlock_wait_s: float = 5.0
     power_on_s: float = 1.0
+    version: tuple[int, int, int, int] = (5, 17, 3, 0)
+    # A gripper's; the arm's own pose is the flange's, so that the tool centre point is not moved.
+    payload_kg: float = 1.0
+    payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.06)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +94,7 @@ class Robot:
 
     def __init__(self, spec: ControllerSpec | None = None, plant: WristPlant | None = None, pace: float = 1.0) -> None:
         """Be switched on, at rest, without a program."""
-        self.spec = spec or ControllerSpec()
+        self.spec = self._first_spec = spec or ControllerSpec()
         self.arm = Arm()
         self.safety = SafetyController(self.spec)
         self.registers = Registers()
@@ -197,9 +201,14 @@ class Robot:
             self._note("protective-stop-unlocked")
         return unlocked
 
+    def change(self, spec: ControllerSpec) -> None:
+        """Have another version or payload from now on."""
+        self.spec = spec
+
     def clear_faults(self) -> None:
-        """Be safe and powered, without a program."""
+        """Be safe and powered, without a program, as it was at first."""
         self.end_program("the faults are cleared")
+        self.spec = self._first_spec
         self.safety = SafetyController(self.spec)
         self._note("faults-cleared")
 

@@ -73,7 +73,7 @@ class UrArm:
         sample = self._receiver.latest()
         now_ns = time.monotonic_ns()
         return RtdeSample(
-            *sample[:9],
+            *sample[:-2],
             t_mono_ns=now_ns,
             age_ns=self._age.age_ns(sample.timestamp_s, now_ns),
             connected=self._receiver.connected

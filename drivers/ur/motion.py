@@ -5,6 +5,7 @@ robot's watchdog: nothing more is sent to the program, and only a new program ma
 """
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -20,7 +21,7 @@ from shearloop.drivers.ur.messages import (
     Stop,
     WristSpeed,
 )
-from shearloop.drivers.ur.settings import Bound, Six, UrLimits, UrSettings
+from shearloop.drivers.ur.settings import Bound, InstalledTool, Six, UrLimits, UrSettings
 
 if TYPE_CHECKING:
     from shearloop.drivers.ur.arm import UrArm
@@ -35,6 +36,10 @@ _NO_OVERSHOOT = math.e
 CLOSE, ARRIVED_AFTER_S = 2e-3, 0.2
 # An idle arm may tremble, but not move this fast for this long.
 ASTRAY_RAD_PER_S, ASTRAY_S = 0.02, 0.2
+# Accelerations are means over this time by the controller's clock: the difference of two samples is mostly noise.
+ACCELERATION_S = 0.04
+# The pendant shows grams, tenths of a millimetre and thousandths of a radian.
+PAYLOAD_KG, TOOL_M_RAD = 0.01, 1e-3
 # The time allowed for a motion to end: nominal time × factor + constant.
 MOVE_SLACK_S, STOP_SLACK_S, SLACK = 2.0, 1.0, 1.5
 # The pendant's speed slider slows everything; below this a motion would have no end.
@@ -97,6 +102,7 @@ class MotionExecutor:
         # The script's thread for speeds runs; it has to be ended before a linear move.
         self._speed_thread = False
         self._rested_ns = now_ns
+        self._accelerations = Accelerations()
 
     @property
     def motion(self) -> MotionKind:
@@ -190,9 +196,20 @@ class MotionExecutor:
         self.disabled_reason = disabled_reason
 
     def watch(self, sample: RtdeSample, now_ns: int) -> None:
-        """Note whether an idle arm rests; call this in every cycle."""
+        """Note the arm's accelerations, and whether an idle arm rests; call this in every cycle."""
         if self._motion is not None or sample.fastest_rad_per_s < ASTRAY_RAD_PER_S:
             self._rested_ns = now_ns
+        if isinstance(self._motion, _Braking):
+            # A stop may brake harder than a motion may accelerate.
+            self._accelerations.clear()
+        self._accelerations.add(sample)
+
+    def violation(self, sample: RtdeSample) -> str:
+        """Return a sentence that names the limit that the sample or the present motion exceeds, or the empty string."""
+        beyond = violation(sample, self._settings)
+        if not beyond and isinstance(self._motion, _Turn | _Move):
+            beyond = self._accelerations.violation(self._settings.limits)
+        return beyond
 
     def keep(self, sample: RtdeSample, now_ns: int) -> None:
         """Send what this cycle needs."""
@@ -399,10 +416,46 @@ _SAFETY = {
 }
 
 
-def violation(sample: RtdeSample, limits: UrLimits) -> str:
-    """Return a sentence that names the hard limit that the sample exceeds, or the empty string."""
-    if not all(map(math.isfinite, (*sample.q_rad, *sample.qd_rad_per_s, *sample.tcp_pose, *sample.wrench))):
+class Accelerations:
+    """The measured accelerations of wrist and tool: the changes of their speeds over `ACCELERATION_S`. No clock."""
+
+    def __init__(self) -> None:
+        self._samples: deque[RtdeSample] = deque()
+
+    def clear(self) -> None:
+        """Begin anew with the next sample."""
+        self._samples.clear()
+
+    def add(self, sample: RtdeSample) -> None:
+        """Take a sample; one without a later timestamp begins anew, unless it is the latest again."""
+        samples = self._samples
+        if samples and sample.timestamp_s <= samples[-1].timestamp_s:
+            if sample.timestamp_s == samples[-1].timestamp_s:
+                return
+            samples.clear()
+        samples.append(sample)
+        while len(samples) > 2 and sample.timestamp_s - samples[1].timestamp_s > ACCELERATION_S - 1e-6:
+            samples.popleft()
+
+    def violation(self, limits: UrLimits) -> str:
+        """Return a sentence that names the hard limit that an acceleration exceeds, or the empty string."""
+        first, last = self._samples[0], self._samples[-1]
+        span_s = last.timestamp_s - first.timestamp_s
+        if span_s < ACCELERATION_S - 1e-6:
+            return ""
+        wrist = abs(last.qd_rad_per_s[WRIST] - first.qd_rad_per_s[WRIST]) / span_s
+        tool = math.dist(last.tcp_speed[:3], first.tcp_speed[:3]) / span_s
+        return _beyond("wrist acceleration", wrist, limits.wrist_acceleration_rad_per_s2, "rad/s²") or _beyond(
+            "tool acceleration", tool, limits.linear_acceleration_m_per_s2, "m/s²"
+        )
+
+
+def violation(sample: RtdeSample, settings: UrSettings) -> str:
+    """Return a sentence that names the hard limit or the setting that the sample contradicts, or the empty string."""
+    measured = (*sample.q_rad, *sample.qd_rad_per_s, *sample.tcp_pose, *sample.tcp_speed, *sample.wrench)
+    if not all(map(math.isfinite, measured)):
         return "The controller reports values that are no numbers."
+    limits = settings.limits
     joints, box = limits.joints, limits.workspace
     for number, (q, low, high) in enumerate(zip(sample.q_rad, joints.lower_rad, joints.upper_rad, strict=True), 1):
         if not low <= q <= high:
@@ -410,11 +463,47 @@ def violation(sample: RtdeSample, limits: UrLimits) -> str:
     for axis, value, low, high in zip("xyz", sample.tcp_pose[:3], box.lower_m, box.upper_m, strict=True):
         if not low <= value <= high:
             return f"The tool is at {axis} = {value:.3f} m, beyond the workspace's {low:g} to {high:g} m."
-    speed = ("wrist speed", abs(sample.qd_rad_per_s[WRIST]), limits.wrist_speed_rad_per_s, "rad/s")
-    for name, value, bound, unit in (speed, *_loads(sample, limits)):
-        if value > bound.hard:
-            return f"{name.capitalize()} is {value:.2f} {unit}, beyond the hard limit of {bound.hard:g} {unit}."
+    speeds = [
+        (f"joint {number} speed" if number <= WRIST else "wrist speed", abs(qd), limits.wrist_speed_rad_per_s, "rad/s")
+        for number, qd in enumerate(sample.qd_rad_per_s, 1)
+    ]
+    tool = ("tool speed", sample.tcp_speed_m_per_s, limits.linear_speed_m_per_s, "m/s")
+    for one in (*speeds, tool, *_loads(sample, limits)):
+        if beyond := _beyond(*one):
+            return beyond
+    return tool_difference(sample, settings.tool)
+
+
+def tool_difference(sample: RtdeSample, tool: InstalledTool) -> str:
+    """Return how payload, centre of gravity or tool centre point differ from the settings, or the empty string.
+
+    A value that the controller does not report is NaN and differs.
+    """
+    load, cog, tcp = tool.payload_kg, tool.payload_cog_m, tool.tcp_offset
+    checks = (
+        ("payload_kg", load, sample.payload_kg, load is None or abs(sample.payload_kg - load) < PAYLOAD_KG),
+        ("payload_cog_m", cog, sample.payload_cog_m, cog is None or math.dist(sample.payload_cog_m, cog) < TOOL_M_RAD),
+        ("tcp_offset", tcp, sample.tcp_offset, tcp is None or is_close(sample.tcp_offset, tcp, TOOL_M_RAD)),
+    )  # fmt: skip
+    for name, configured, found, same in checks:
+        if not same:
+            return (
+                f"The controller has {name} {_rounded(found)}, the robot's settings have {_rounded(configured)}: "
+                "correct the payload and the tool centre point at the teach pendant, or the settings."
+            )
     return ""
+
+
+def _rounded(value: float | tuple[float, ...] | None) -> str:
+    values = value if isinstance(value, tuple) else (value,)
+    return ", ".join("unknown" if one is None or math.isnan(one) else f"{one:.4g}" for one in values)
+
+
+def _beyond(name: str, value: float, bound: Bound, unit: str) -> str:
+    # Rounding errors do not count.
+    if round(value, 9) <= bound.hard:
+        return ""
+    return f"{name.capitalize()} is {value:.2f} {unit}, beyond the hard limit of {bound.hard:g} {unit}."
 
 
 def line_violation(sample: RtdeSample, limits: UrLimits) -> str:

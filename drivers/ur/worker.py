@@ -117,6 +117,7 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
     try:
         pipe.send(messages.WorkerPhase("greeting the controller"))
         version = probe_controller(host, settings.connect_timeout_s / 3)
+        pipe.send(messages.ControllerVersion(version))
         pipe.send(messages.WorkerPhase("connecting"))
         return UrArm(settings, version)
     except ProbeError as error:

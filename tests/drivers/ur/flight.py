@@ -30,11 +30,15 @@ AT_REST = messages.RtdeSample(
     q_rad=(0.0, -1.5, 1.5, -1.5, -1.5, 0.0),
     qd_rad_per_s=(0.0,) * 6,
     tcp_pose=(-0.5, -0.1, 0.5, 0.0, math.pi, 0.0),
+    tcp_speed=(0.0,) * 6,
     wrench=(0.0,) * 6,
     robot_mode=7,
     safety_mode=1,
     runtime_state=2,
     speed_scaling=1.0,
+    payload_kg=1.0,
+    payload_cog_m=(0.0, 0.0, 0.06),
+    tcp_offset=(0.0,) * 6,
     moving_linearly=False,
 )
 CYCLE_NS, WATCHDOG_NS = 8_000_000, 100_000_000
@@ -72,6 +76,7 @@ class FakeArm:
         self.reading = dataclasses.replace(
             self.reading,
             t_mono_ns=self.reading.t_mono_ns + CYCLE_NS,
+            timestamp_s=self.reading.timestamp_s + CYCLE_NS / 1e9,
             q_rad=(*self.reading.q_rad[:5], wrist),
             qd_rad_per_s=(0.0, 0.0, 0.0, 0.0, 0.0, now),
         )

@@ -16,6 +16,8 @@ from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
 from tests.drivers.ur.flight import SETTINGS
 
 SIX = (0.0,) * 6
+FIVE = (SIX,) * 5
+TOOL = (1.0, (0.0, 0.0, 0.06), SIX)
 VERSION = "5.17.3.0"
 
 
@@ -35,7 +37,7 @@ class Client:
 
     def latest(self) -> ReceivedSample:
         """Return a sample of a program that ended during a command."""
-        return ReceivedSample(1.0, SIX, SIX, SIX, SIX, 7, 1, 1, 1.0, 2)
+        return ReceivedSample(1.0, *FIVE, 7, 1, 1, 1.0, *TOOL, 2)
 
 
 @pytest.fixture
@@ -58,7 +60,7 @@ def test_sample_that_waited_in_the_socket_is_old(arm, monkeypatch):
     monkeypatch.setattr(arm.time, "monotonic_ns", lambda: now_ns)
     monkeypatch.setattr(reader, "_control", SimpleNamespace(isConnected=lambda: True))
     for number, waited_ns in enumerate([0, 0, 200_000_000]):
-        sample = ReceivedSample(50.0 + 0.008 * number, SIX, SIX, SIX, SIX, 7, 1, 2, 1.0, 1)
+        sample = ReceivedSample(50.0 + 0.008 * number, *FIVE, 7, 1, 2, 1.0, *TOOL, 1)
         monkeypatch.setattr(reader, "_receiver", SimpleNamespace(latest=lambda it=sample: it, connected=True))
         now_ns = 10**12 + 8_000_000 * number + waited_ns
         assert reader.read().age_ns == pytest.approx(waited_ns, abs=3_000_000)
@@ -111,7 +113,7 @@ def test_progress_is_queried_only_for_a_linear_move(arm, monkeypatch):
         "RtdeReceiver",
         lambda *_: SimpleNamespace(
             connected=True,
-            latest=lambda: ReceivedSample(float(next(times_s)), SIX, SIX, SIX, SIX, 7, 1, 2, 1.0, 1),
+            latest=lambda: ReceivedSample(float(next(times_s)), *FIVE, 7, 1, 2, 1.0, *TOOL, 1),
             write_deadline=lambda _: None,
         ),
     )
@@ -222,7 +224,7 @@ def test_unknown_script_is_refused(arm, monkeypatch):
 
 def test_deadline_counts_from_the_latest_sample(arm, monkeypatch):
     written: list[float] = []
-    sample = ReceivedSample(1.0, SIX, SIX, SIX, SIX, 7, 1, 2, 1.0, 1, 20.0)
+    sample = ReceivedSample(1.0, *FIVE, 7, 1, 2, 1.0, *TOOL, 1, 20.0)
     receiver = SimpleNamespace(latest=lambda: sample, write_deadline=written.append, connected=True)
     monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Controlled)
     monkeypatch.setattr(arm, "RtdeReceiver", lambda *_: receiver)

@@ -93,6 +93,8 @@ class RunSummary:
         """Handle one message."""
         if topic == "loop.state":
             self._on_loop_state(content)
+        elif topic == "loop.stop":
+            self._out.write(f"{stop_sentence(content)}\n")
         elif self._run is not None:
             _on_sample(self._run, topic, content)
 
@@ -110,6 +112,15 @@ class RunSummary:
             self.text = "\n".join(lines)
             if self._out is not None:
                 self._out.write(f"\n{self.text}\n\n")
+
+
+def stop_sentence(content: Mapping[str, Any]) -> str:
+    """Return the times of a `loop.stop` message in words."""
+    sent, stands = (
+        f"{after} {content[key]:.3f} s" if content[key] is not None else f"{after} an unknown time"
+        for key, after in (("sent_after_s", "sent after"), ("stands_after_s", "standstill after"))
+    )
+    return f"The stop, from its cause: decided after {content['decided_after_s']:.3f} s, {sent}, {stands}."
 
 
 def _on_sample(run: _Run, topic: str, content: Mapping[str, Any]) -> None:

@@ -60,6 +60,9 @@ def test_every_block_is_valid(block, tmp_path):
         check_yaml(block, tmp_path)
     elif block.startswith("import "):
         compile(block, "block", "exec")  # test_newcomer runs it
+    elif block.startswith("#"):
+        (schema,) = re.findall(r"\$schema=(\S+)", block)
+        assert (ROOT / "config" / schema).exists()
     elif "─" not in block and "drivers/connection.py" not in block:
         for line in block.splitlines():
             for command in re.split(r" && | & ", re.sub(r" +#.*| &$", "", line)):

@@ -93,7 +93,7 @@ class RunSummary:
         """Handle one message."""
         if topic == "loop.state":
             self._on_loop_state(content)
-        elif topic == "loop.stop":
+        elif topic == "loop.stop" and self._out is not None:
             self._out.write(f"{stop_sentence(content)}\n")
         elif self._run is not None:
             _on_sample(self._run, topic, content)

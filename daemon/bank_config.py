@@ -10,7 +10,7 @@ from pydantic import Field, field_validator, model_validator
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import BankDefinition
-from shearloop.bank.eit.channels import ChannelTable, Injection
+from shearloop.bank.eit.channels import INJECTION, ChannelTable, Injection
 from shearloop.bank.eit.fingertip import ElectrodePlace, Fingertip, RectangularFingertip, RoundFingertip, Side
 from shearloop.bank.eit.mesh import Mesh, load_mesh
 from shearloop.bank.eit.models import QUARTER_DEG, Variation
@@ -48,7 +48,7 @@ class MeshFileConfig(ConfigModel):
     """A mesh file (.npz or EIDORS .mat), and how its electrodes are driven."""
 
     file: Path = Field(description="the mesh: .npz or EIDORS .mat")
-    injection: Injection = Field("opposite", description="the electrode that an injection's current comes from")
+    injection: Injection = Field(INJECTION, description="the electrode that an injection's current comes from")
 
 
 class OverConfig(ConfigModel):
@@ -142,7 +142,7 @@ class FingertipGeometryConfig(ConfigModel):
     electrode_width_cm: Measure = Field(description="width of each electrode")
     contact_impedance: float = Field(gt=0, le=1000, description="of each contact, in cm over the conductivity")
     mesh_size_cm: MeshSize = Field(description="largest distance of mesh lines")
-    injection: Injection = Field("opposite", description="the electrode that an injection's current comes from")
+    injection: Injection = Field(INJECTION, description="the electrode that an injection's current comes from")
     electrodes: list[ElectrodeRunConfig] = Field(description="the electrodes in order")
 
     @model_validator(mode="after")

@@ -16,6 +16,8 @@ from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import GeometryError
 
 Injection = Literal["opposite", "adjacent"]
+# The paper's.
+INJECTION: Injection = "opposite"
 # In the model's unit of current, as the reference solutions have it.
 STIMULATION_CURRENT = 5.0
 # Fewer electrodes leave too few pairs that touch no driven electrode; the EIT-kit has no more.
@@ -34,7 +36,7 @@ class ChannelTable:
     """
 
     n_electrodes: int = 32
-    injection: Injection = "opposite"
+    injection: Injection = INJECTION
 
     def __post_init__(self) -> None:
         """Check the number of electrodes."""

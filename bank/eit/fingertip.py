@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 from shearloop.bank.arrays import FloatArray, IntArray
-from shearloop.bank.eit.channels import ChannelTable, Injection
+from shearloop.bank.eit.channels import INJECTION, ChannelTable, Injection
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.errors import GeometryError
 
@@ -60,7 +60,7 @@ class RectangularFingertip:
     contact_impedance: float
     mesh_size_cm: float
     electrodes: tuple[ElectrodePlace, ...]
-    injection: Injection = "opposite"
+    injection: Injection = INJECTION
 
     def __post_init__(self) -> None:
         """Check the measures."""
@@ -160,7 +160,7 @@ class RoundFingertip:
     contact_impedance: float
     mesh_size_cm: float
     angles_deg: tuple[float, ...]
-    injection: Injection = "opposite"
+    injection: Injection = INJECTION
 
     def __post_init__(self) -> None:
         """Check the measures."""

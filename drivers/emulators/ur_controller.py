@@ -24,7 +24,7 @@ _SAFETY_MODES = {1: "NORMAL", 3: "PROTECTIVE_STOP", 7: "ROBOT_EMERGENCY_STOP"}
 
 FAULTS = (
     *("protective-stop", "emergency-stop", "release", "drop-rtde", "silence", "stop-hangs"),
-    *("registers-in-use", "local-control", "refuse-protocol", "normal"),
+    *("registers-in-use", "local-control", "refuse-protocol", "mute-dashboard", "normal"),
 )
 
 log = logging.getLogger(__name__)
@@ -96,7 +96,7 @@ class Controller:
             case ["stop-hangs", count]:
                 hangs = int(number_between(count, 0, 1000, "not a number of requests from 0 to 1000"))
                 self.faults = replace(self.faults, stop_hangs=hangs)
-            case ["registers-in-use" | "local-control" | "refuse-protocol" as fault]:
+            case ["registers-in-use" | "local-control" | "refuse-protocol" | "mute-dashboard" as fault]:
                 self.faults = replace(self.faults, **{fault.replace("-", "_"): True})
             case ["normal"]:
                 self.robot.clear_faults()
@@ -145,8 +145,11 @@ class Controller:
 
     async def _serve_dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with self._connection(writer):
-            self._send(writer, BANNER.encode() + b"\n")
+            if not self.faults.mute_dashboard:
+                self._send(writer, BANNER.encode() + b"\n")
             while line := await reader.readline():
+                if self.faults.mute_dashboard:
+                    continue
                 request, hangs = line.decode("utf-8", "replace").strip(), self.faults.stop_hangs
                 if request == "stop" and hangs:
                     self.faults = replace(self.faults, stop_hangs=hangs - 1)

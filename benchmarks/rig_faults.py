@@ -6,7 +6,7 @@ The real daemon in its own process and the real drivers, with the rig emulated o
 the middle of a slow twist. Measured is the time until `loop.state` reports the response, in periods of the failed
 sensor's or device's topic, and whether the next experiment completes once the fault is gone. Finally the daemon is
 killed with SIGKILL in the middle of a fast twist, and the emulated robot reports when it stood still. `--rig` is the
-folder of `shearloop.daemon.cli.calibrate_demo`, with demo.bank and rig-right.cal.
+folder `run` of `shearloop demo --prepare`, with demo.bank and rig-right.cal.
 """
 
 import json

@@ -91,6 +91,8 @@ class RunSummary:
         """Handle one message."""
         if topic == "loop.state":
             self._on_loop_state(content)
+        elif topic == "loop.stop":
+            self._out.write(f"{stop_sentence(content)}\n")
         elif self._run is not None:
             _on_sample(self._run, topic, content)
 
@@ -106,6 +108,15 @@ class RunSummary:
             rig = self._emulated
             lines = _lines(run, None, ()) if rig is None else _lines(run, rig.torques(), rig.sent)
             self._out.write("\n".join(("", *lines, "", "")))
+
+
+def stop_sentence(content: Mapping[str, Any]) -> str:
+    """Return the times of a `loop.stop` message in words."""
+    sent, stands = (
+        f"{after} {content[key]:.3f} s" if content[key] is not None else f"{after} an unknown time"
+        for key, after in (("sent_after_s", "sent after"), ("stands_after_s", "standstill after"))
+    )
+    return f"The stop, from its cause: decided after {content['decided_after_s']:.3f} s, {sent}, {stands}."
 
 
 def _on_sample(run: _Run, topic: str, content: Mapping[str, Any]) -> None:

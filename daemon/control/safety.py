@@ -5,7 +5,7 @@ the task that meets it, and `TASK_DIED` is a row.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum
 
 
@@ -193,6 +193,8 @@ class Fault:
     code: FaultCode
     detail: str
     is_consequence: bool = False
+    # When its cause was measured (CLOCK_MONOTONIC), if a measurement shows it.
+    t_ns: int | None = field(default=None, compare=False)
 
     @property
     def rule(self) -> Rule:

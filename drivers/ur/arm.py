@@ -17,16 +17,22 @@ import rtde_control
 import script_client
 
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.ur.controller import RTDE_PORT, RtdeReceiver, SampleAge, ScriptReadiness, ask_dashboard
+from shearloop.drivers.ur.controller import (
+    RTDE_PORT,
+    ProbeError,
+    RtdeReceiver,
+    SampleAge,
+    ScriptReadiness,
+    ask_dashboard,
+)
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, WristSpeed
+from shearloop.drivers.ur.script import guard_script
 from shearloop.drivers.ur.settings import UrSettings
 
 # A thread of ur-rtde polls its socket every 0.1 ms, which takes 5 % of a core. With this timer slack it wakes once per
 # two samples. One-time commands wait for that thread, so that the slack is at most a sixth of the watchdog's time.
 _LONGEST_POLL_SLACK_NS, _SLACKS_PER_WATCHDOG = 16_000_000, 6
 _PR_SET_TIMERSLACK = 29
-# The line before the loop in ur-rtde 1.6.5's control script.
-_BEFORE_LOOP = "        keep_running = True\n"
 
 
 class UrArm:
@@ -37,13 +43,17 @@ class UrArm:
 
         Raises:
             RuntimeError: ur-rtde failed.
-            ProbeError: the controller does not send its state.
+            ProbeError: the controller does not send its state, or ur-rtde's script is unknown.
         """
         self._settings = settings
         major, minor = map(int, version.split(".")[:2])
-        self._script = arm_watchdog_in(script_client.ScriptClient("", major, minor).getScript(), settings.watchdog_hz)
+        self._script = guard_script(script_client.ScriptClient("", major, minor).getScript(), settings)
         if not self._script:
-            sys.stderr.write("This ur-rtde has an unknown control script: only a command arms the script's watchdog.\n")
+            raise ProbeError(
+                "version",
+                "The control script of the installed ur-rtde is unknown, so that its limits cannot be added: install "
+                "ur-rtde 1.6.5.",
+            )
         self._receiver = RtdeReceiver(settings.host, settings.rate_hz, settings.connect_timeout_s / 3)
         kind, ours = rtde_control.RTDEControlInterface, connections_to(RTDE_PORT)
         watchdog_ns = 1e9 / settings.watchdog_hz
@@ -63,7 +73,7 @@ class UrArm:
         sample = self._receiver.latest()
         now_ns = time.monotonic_ns()
         return RtdeSample(
-            *sample[:-1],
+            *sample[:-2],
             t_mono_ns=now_ns,
             age_ns=self._age.age_ns(sample.timestamp_s, now_ns),
             connected=self._receiver.connected
@@ -74,9 +84,11 @@ class UrArm:
             and self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
         )
 
-    def wrist(self, command: WristSpeed) -> bool:
-        """Turn wrist 3 and hold the other joints; not during a linear move."""
+    def wrist(self, command: WristSpeed, left_s: float) -> bool:
+        """Turn wrist 3 for `left_s` at most, and hold the other joints; not during a linear move."""
         self._may_move_linearly = False
+        # The latest sample is older than now, so that the deadline is never late.
+        self._receiver.write_deadline(self._receiver.latest().script_s + left_s)
         speeds = [0.0, 0.0, 0.0, 0.0, 0.0, command.rad_per_s]
         return self._script_readiness.wait() and bool(
             self._control.speedJ(speeds, command.acceleration_rad_per_s2, 0.0)
@@ -120,13 +132,10 @@ class UrArm:
     def upload(self) -> bool:
         """Send the control script; the program starts by itself, and ends when it receives nothing."""
         try:
-            if self._script:
-                with open(os.memfd_create("control.script"), "w") as file:
-                    file.write(self._script)
-                    file.flush()
-                    self._control.setCustomScriptFile(f"/proc/self/fd/{file.fileno()}")
-            else:
-                self._control.reuploadScript()
+            with open(os.memfd_create("control.script"), "w") as file:
+                file.write(self._script)
+                file.flush()
+                self._control.setCustomScriptFile(f"/proc/self/fd/{file.fileno()}")
         except RuntimeError as error:
             # The controller closed the script connection, and ur-rtde does not reopen it.
             sys.stderr.write(f"The control script could not be sent: {error}.\n")
@@ -156,18 +165,6 @@ class UrArm:
         answers = ask_dashboard(self._settings.host, 2.5, requests)
         if requests == ("unlock protective stop",) and answers != ["Protective stop releasing"]:
             raise DriverError(f"The controller refused: {answers[0]}")
-
-
-def arm_watchdog_in(script: str, watchdog_hz: float) -> str:
-    """Return ur-rtde's script with its watchdog armed before the loop, or "" when the place is not found.
-
-    ur-rtde arms the watchdog by a command once the script runs. Until then a script would outlive its client. URScript
-    manual, `rtde_set_watchdog`: a program's watchdogs end with it.
-    """
-    if script.count(_BEFORE_LOOP) != 1:
-        return ""
-    armed = f'        rtde_set_watchdog("input_int_register_0", {watchdog_hz:g}, "stop")\n'
-    return f"def rtde_control():\n{script.replace(_BEFORE_LOOP, armed + _BEFORE_LOOP)}end\n"
 
 
 def connections_to(port: int) -> set[tuple[int, int]]:

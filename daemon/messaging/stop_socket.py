@@ -19,14 +19,14 @@ from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import encode
 
 LARGEST_DATAGRAM_BYTES = 1024
-# A name has at most 107 bytes (unix(7)).
+# Of the path; a whole name has at most 107 bytes (unix(7)).
 _NAME_BYTES = 80
 _LARGEST_REPLY_BYTES = 1 << 18
 
 
-def stop_name(address: str) -> str:
+def stop_name(address: str) -> bytes:
     """Return the abstract name of the stop socket of a daemon, by the port or the path of its `commands`."""
-    return f"\0shearloop-stop-{address.rpartition(':')[2][-_NAME_BYTES:]}"
+    return b"\0shearloop-stop-" + os.fsencode(address.rpartition(":")[2])[-_NAME_BYTES:]
 
 
 class StopSocket:

@@ -89,10 +89,11 @@ async def test_the_stop_socket_answers_in_a_flood_of_datagrams():
         stop.close()
         flood.join()
     assert send_to_stop_socket(address, {"command": "stop"}, DEADLINE_S) is None
+    assert send_to_stop_socket("ipc:///" + "ä" * 500, {"command": "stop"}, DEADLINE_S) is None
     assert stop_name("tcp://0.0.0.0:7762") == stop_name("tcp://127.0.0.1:7762")
 
 
-def send_garbage(name: str, flooding: threading.Event) -> None:
+def send_garbage(name: bytes, flooding: threading.Event) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
         client.bind("")
         client.setblocking(False)

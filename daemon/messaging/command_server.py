@@ -186,5 +186,5 @@ class CommandServer:
 
     def close(self) -> None:
         """Close the socket after the last replies are sent."""
-        self._socket.close()
         self._connections.close()
+        self._socket.close()

@@ -54,6 +54,7 @@ class Connections:
 
     def __init__(self, context: "zmq.Context[Any]", bound: "zmq.Socket[Any]", address: str, refusals: Refusals) -> None:
         """Bind the socket; raises zmq.ZMQError."""
+        self._bound = bound
         self._refusals = refusals
         self._limit = most_connections(resource.getrlimit(resource.RLIMIT_NOFILE)[0])
         self._open: set[int] = set()
@@ -69,7 +70,7 @@ class Connections:
         try:
             bound.bind(address)
         except zmq.ZMQError:
-            self._events.close()
+            self._stop_counting()
             raise
         _, descriptor = _EVENT.unpack(self._events.recv_multipart()[0])
         self._listener = socket.socket(fileno=os.dup(descriptor))
@@ -109,9 +110,14 @@ class Connections:
                 client.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """Close what counts; the bound socket is closed by its owner first."""
-        self._events.close()
+        """End the counting; the bound socket's owner closes it afterwards."""
+        self._stop_counting()
         self._listener.close()
+
+    def _stop_counting(self) -> None:
+        # In this order: libzmq's thread waits forever for a queue that has no reader.
+        self._bound.disable_monitor()
+        self._events.close()
 
 
 def _port(one: socket.socket) -> Any:

@@ -18,6 +18,8 @@ LARGEST_SUBSCRIPTION_BYTES = 512
 # A client that subscribes to more topics that do not exist is disconnected. libzmq keeps some 40 bytes of memory for
 # each byte of a subscription.
 MAX_UNKNOWN_TOPICS = 16
+# The last messages may wait this long for their subscribers.
+LINGER_MS = 200
 # Subscriptions read at a time, so that a subscriber that keeps changing them cannot block the publisher.
 SUBSCRIPTIONS_AT_ONCE = 100
 Listener: TypeAlias = Callable[[str, dict[str, Any]], None]
@@ -88,9 +90,9 @@ class Publisher:
         return bool(self._prefixes)
 
     def close(self) -> None:
-        """Close the socket; unsent messages are dropped."""
-        self._socket.close()
+        """Close the socket; subscribers have a moment to take the last messages."""
         self._connections.close()
+        self._socket.close(linger=LINGER_MS)
 
     def _read_subscriptions(self) -> None:
         for _ in range(SUBSCRIPTIONS_AT_ONCE):

@@ -32,7 +32,17 @@ _LASTING = ("sync", "speedj", "movel", "stopj", "stopl")
 _IMMEDIATE = (
     *("read_input_float_register", "read_input_integer_register", "write_output_float_register"),
     *("write_output_integer_register", "get_actual_joint_positions", "get_tcp_force", "get_steptime", "norm"),
-    *("zero_ftsensor", "rtde_set_watchdog", "run", "kill", "enter_critical", "exit_critical", "put", "count_loop"),
+    *(
+        "zero_ftsensor",
+        "rtde_set_watchdog",
+        "run",
+        "kill",
+        "enter_critical",
+        "exit_critical",
+        "halt",
+        "put",
+        "count_loop",
+    ),
     *("textmsg", "force_mode_set_gain_scaling", "force_mode_set_damping"),
 )
 _SAME_KEYWORDS = {"and", "or", "not", "if", "elif", "else", "while", "def", "return", "break", "continue", "global"}
@@ -109,7 +119,7 @@ def translate(text: str) -> tuple[CodeType, str]:
 def _statement(line: str) -> str:
     """Return a statement in Python; expressions stay."""
     line = re.sub(r"^thread ", "def ", re.sub(r"^global ", "", line))
-    line = re.sub(r"^(enter_critical|exit_critical)$", r"\1()", re.sub(r"^kill (\w+)$", r"kill(\1)", line))
+    line = re.sub(r"^(enter_critical|exit_critical|halt)$", r"\1()", re.sub(r"^kill (\w+)$", r"kill(\1)", line))
     # Lists are values: to set an entry makes a new list.
     line = re.sub(r"^(\w+)\[(\w+)\] = (.+)$", r"\1 = put(\1, \2, \3)", line)
     return re.sub(r"\brun (\w+)\(\)", r"run(\1)", line)
@@ -189,6 +199,10 @@ class Program:
     def exit_critical(self) -> None:
         """Let all threads run."""
         self._critical = 0
+
+    def halt(self) -> None:
+        """End the program."""
+        raise ProgramEndedError("it has halted itself")
 
     def count_loop(self) -> None:
         """End a program whose loop uses up no cycle."""

@@ -87,8 +87,7 @@ class UrArm:
     def wrist(self, command: WristSpeed, left_s: float) -> bool:
         """Turn wrist 3 for `left_s` at most, and hold the other joints; not during a linear move."""
         self._may_move_linearly = False
-        # The latest sample is older than now, so that the deadline is never late.
-        self._receiver.write_deadline(self._receiver.latest().script_s + left_s)
+        self._write_deadline(left_s)
         speeds = [0.0, 0.0, 0.0, 0.0, 0.0, command.rad_per_s]
         return self._script_readiness.wait() and bool(
             self._control.speedJ(speeds, command.acceleration_rad_per_s2, 0.0)
@@ -101,17 +100,20 @@ class UrArm:
     def move(self, command: MoveLinear) -> bool:
         """Begin a linear move; `RtdeSample.moving_linearly` shows its end."""
         self._may_move_linearly = True
+        self._write_deadline(self._settings.silence_timeout_s)
         speed, acceleration = command.speed_m_per_s, command.acceleration_m_per_s2
         return self._send_once(self._control.moveL, [*command.pose], speed, acceleration, asynchronous=True)
 
     def stop_move(self, deceleration_rad_per_s2: float) -> bool:
-        """Begin to end a linear move."""
+        """Begin to end a linear move; ur-rtde's script takes the deceleration of an asynchronous stop in m/s²."""
         # ur-rtde does not report whether the stop was accepted; the heartbeat after it does.
         self._send_once(self._control.stopJ, deceleration_rad_per_s2, asynchronous=True)
         return self.send_heartbeat()
 
-    def send_heartbeat(self) -> bool:
-        """Feed the robot's watchdog."""
+    def send_heartbeat(self, left_s: float | None = None) -> bool:
+        """Feed the robot's watchdog; a linear move goes on for `left_s` at most."""
+        if left_s is not None:
+            self._write_deadline(left_s)
         return self._script_readiness.wait() and bool(self._control.kickWatchdog())
 
     def clear_command(self) -> bool:
@@ -151,6 +153,10 @@ class UrArm:
         """End the control script; one that is not ready is left to its watchdog."""
         if self._script_readiness.wait():
             self._control.stopScript()
+
+    def _write_deadline(self, left_s: float) -> None:
+        # The latest sample is older than now, so that the deadline is never late.
+        self._receiver.write_deadline(self._receiver.latest().script_s + left_s)
 
     def _send_once(self, call: Callable[..., object], *arguments: object, **options: object) -> bool:
         """Send a command that the script carries out once."""

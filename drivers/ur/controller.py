@@ -326,7 +326,7 @@ class RtdeReceiver:
         return self._sample
 
     def write_deadline(self, script_s: float) -> None:
-        """Write when the wrist has to stop, by the script's clock."""
+        """Write when the motion has to end, by the script's clock."""
         try:
             self._connection.send(_DEADLINE.pack(_DEADLINE.size, _DATA, self._recipe, script_s))
         except OSError:

@@ -211,15 +211,15 @@ class MotionExecutor:
             beyond = self._accelerations.violation(self._settings.limits)
         return beyond
 
-    def keep(self, sample: RtdeSample, now_ns: int) -> None:
-        """Send what this cycle needs."""
+    def keep(self, sample: RtdeSample, now_ns: int, daemon_alive_ns: int) -> None:
+        """Send what this cycle needs; the daemon's last message came at `daemon_alive_ns`."""
         if self.disabled_reason:
             return
         match self._motion:
             case _Turn() as turn:
                 self._keep_turning(turn, sample, now_ns)
             case _Move() as move:
-                self._keep_moving(move, sample, now_ns)
+                self._keep_moving(move, sample, now_ns, daemon_alive_ns)
             case _Braking() as braking:
                 self._keep_stopping(braking, sample, now_ns)
             case None if now_ns - self._rested_ns > ASTRAY_S * 1e9:
@@ -242,7 +242,7 @@ class MotionExecutor:
             self.sent, self.clipped = clip_wrist(turn.asked, sample, self._settings)
             self._send_speed(self.sent, left_s)
 
-    def _keep_moving(self, move: _Move, sample: RtdeSample, now_ns: int) -> None:
+    def _keep_moving(self, move: _Move, sample: RtdeSample, now_ns: int, daemon_alive_ns: int) -> None:
         move.seen = move.seen or sample.moving_linearly
         reason = line_violation(sample, self._settings.limits)
         if now_ns > move.deadline_ns:
@@ -255,7 +255,7 @@ class MotionExecutor:
         elif reason:
             self.stop(sample, now_ns, reason)
             return
-        self._arm.send_heartbeat()
+        self._arm.send_heartbeat(self._settings.silence_timeout_s - (now_ns - daemon_alive_ns) / 1e9)
 
     def _keep_stopping(self, braking: _Braking, sample: RtdeSample, now_ns: int) -> None:
         if now_ns > braking.deadline_ns:

@@ -1,7 +1,8 @@
 """The control script on the robot: ur-rtde's own, with a watchdog and limits that need no client.
 
-The client gives each wrist speed a deadline, by the script's own clock, in an input register that ur-rtde leaves free.
-The script turns the wrist no further than its deadline, its range and its largest force and torque allow.
+The client gives each motion a deadline, by the script's own clock, in an input register that ur-rtde leaves free, and
+extends it. The script turns the wrist no further than the deadline, its range and its largest force and torque allow. A
+linear move that its client does not stop ends with the program.
 """
 
 import re
@@ -12,6 +13,8 @@ from shearloop.drivers.ur.settings import UrSettings
 DEADLINE_REGISTER, CLOCK_REGISTER = "input_double_register_24", "output_double_register_24"
 # A deadline lies this much further ahead at most: a cycle of the slowest controller, for rounding.
 _SLACK_S = 0.008
+# The client has this time to stop a linear move after its deadline.
+_GRACE_S = 0.05
 
 # ur-rtde 1.6.5: the line before the main loop, and the thread that carries out speeds.
 _BEFORE_LOOP = "        keep_running = True\n"
@@ -26,6 +29,9 @@ _GUARD = """\
         while (True):
             guard_s = guard_s + {step}
             write_output_float_register(24, guard_s)
+            if move_thrd != 0 and guard_s > read_input_float_register(24) + {grace}:
+                halt
+            end
             sync()
         end
     end
@@ -101,6 +107,7 @@ def guard_script(script: str, settings: UrSettings) -> str:
         # CB3 controllers do not have the function; their cycle takes 8 ms.
         "step": "get_steptime()" if "get_steptime()" in script else "0.008",
         "watchdog_hz": settings.watchdog_hz,
+        "grace": _GRACE_S,
         "longest": settings.command_timeout_s + _SLACK_S,
         "lower": limits.joints.lower_rad[5] + margin,
         "upper": limits.joints.upper_rad[5] - margin,

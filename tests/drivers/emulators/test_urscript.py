@@ -64,6 +64,7 @@ def test_program_computes(text, written):
     [
         ("while True:\nx = 1\nend", "without sync"),
         ("freedrive_mode()", "freedrive_mode"),
+        ("halt\nwhile True:\nsync()\nend", "halted itself"),
         ("x = [1, 2]\ny = x[5]", "index"),
         ("thread t():\nspeedj([0, 0, 0, 0, 0, 1], a=1)\nend\nh = run t()\nsync()\nsync()\nstopj(1)", "another thread"),
         ('rtde_set_watchdog("input_int_register_0", 100, "stop")\nwhile True:\nsync()\nend', "watchdog"),

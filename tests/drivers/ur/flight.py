@@ -128,7 +128,7 @@ class FakeArm:
             self.be(moving_linearly=False)
         return self.accepts
 
-    def send_heartbeat(self) -> bool:
+    def send_heartbeat(self, _left_s: float | None = None) -> bool:
         self.note("send_heartbeat")
         return True
 

@@ -6,7 +6,7 @@ import itertools
 import pytest
 
 from shearloop.drivers.emulators.ur_robot import Robot
-from shearloop.drivers.ur.messages import RtdeSample, Stop, WristSpeed
+from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
 from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER
 from tests.drivers.emulators.test_urscript import VERSIONS
 from tests.drivers.ur.flight import AT_REST, CYCLE_NS, FakeArm, Flight, flying
@@ -17,7 +17,7 @@ FASTEST = LIMITS.wrist_speed_rad_per_s.inner
 HARDEST = LIMITS.wrist_acceleration_rad_per_s2.hard
 PROMISED_S = 0.2
 STEP_S, STEPS = 0.002, 4
-SPEED_J, SPEED_STOP, SET_WATCHDOG = 9, 15, 35
+MOVE_L, SPEED_J, SPEED_STOP, STOP_J, SET_WATCHDOG = 3, 9, 15, 34, 35
 
 
 class ScriptedArm(FakeArm):
@@ -39,6 +39,7 @@ class ScriptedArm(FakeArm):
             qd_rad_per_s=tuple(arm.qd_rad_per_s),
             wrench=tuple(arm.wrench),
             runtime_state=self.robot.runtime_state,
+            moving_linearly=bool(int(self.robot.registers["output_int_register_2"]) & 1 << 15),
         )
 
     def _write(self, command: int, *values: float) -> bool:
@@ -47,9 +48,12 @@ class ScriptedArm(FakeArm):
         self.robot.registers.write("input_int_register_0", command, self.robot.time_s)
         return True
 
-    def wrist(self, command: WristSpeed, left_s: float) -> bool:
+    def _write_deadline(self, left_s: float) -> None:
         until_s = self.robot.registers[CLOCK_REGISTER] + left_s
         self.robot.registers.write(DEADLINE_REGISTER, until_s, self.robot.time_s)
+
+    def wrist(self, command: WristSpeed, left_s: float) -> bool:
+        self._write_deadline(left_s)
         return self.repeat(command)
 
     def repeat(self, command: WristSpeed) -> bool:
@@ -59,7 +63,25 @@ class ScriptedArm(FakeArm):
     def end_speed(self, deceleration_rad_per_s2: float) -> bool:
         return self._write(SPEED_STOP, deceleration_rad_per_s2)
 
-    def send_heartbeat(self) -> bool:
+    def _run_once(self, command: int, *values: float) -> bool:
+        """Run an asynchronous command as ur-rtde does: until it is done, and until the script is ready again."""
+        self.robot.registers.write("input_int_register_1", 1, self.robot.time_s)
+        for written, state in ((command, 2), (0, 1)):
+            self._write(written, *values)
+            while self.robot.registers["output_int_register_0"] != state:
+                self.robot.step(STEP_S)
+        return True
+
+    def move(self, command: MoveLinear) -> bool:
+        self._write_deadline(DELIVERED.silence_timeout_s)
+        return self._run_once(MOVE_L, *command.pose, command.speed_m_per_s, command.acceleration_m_per_s2)
+
+    def stop_move(self, deceleration_rad_per_s2: float) -> bool:
+        return self._run_once(STOP_J, deceleration_rad_per_s2)
+
+    def send_heartbeat(self, left_s: float | None = None) -> bool:
+        if left_s is not None:
+            self._write_deadline(left_s)
         return self._write(0)
 
     def clear_command(self) -> bool:
@@ -131,6 +153,45 @@ def test_script_alone_stops_the_wrist_in_time(guarded):
         # A new decision turns it again.
         turn(arm, command, 0.3)
         assert arm.reading.qd_rad_per_s[5] == pytest.approx(FASTEST)
+
+
+def moving_at_full_speed(script: str) -> Flight:
+    """Return a flight in a linear move at its largest speed, at the moment of the daemon's last message."""
+    flight = flying(DELIVERED, ScriptedArm(script))
+    flight.fly(1)
+    x, y, z, *turn = flight.arm.robot.arm.pose
+    inner = LIMITS.linear_speed_m_per_s.inner
+    assert flight.ask(MoveLinear((x, y, z - 0.2, *turn), inner, LIMITS.linear_acceleration_m_per_s2.inner)).accepted
+    flight.fly(60)
+    assert flight.state.motion == "linear"
+    assert not flight.arm.reading.rests
+    return flight
+
+
+def test_worker_alone_stops_a_linear_move_in_time():
+    flight = moving_at_full_speed(control_script())
+    flight.fly(round(PROMISED_S * 1e9 / CYCLE_NS), daemon_alive=False)
+    assert flight.arm.reading.rests
+    assert "was silent" in flight.state.end_reason
+
+
+@pytest.mark.parametrize("guarded", [True, False], ids=["guarded", "own"])
+def test_script_alone_ends_a_linear_move_in_time(guarded):
+    """The worker feeds the watchdog for ever, and does not stop."""
+    flight = moving_at_full_speed(control_script(DELIVERED if guarded else None))
+    for _ in range(round(PROMISED_S * 1e9 / CYCLE_NS)):
+        flight.arm.send_heartbeat()
+        flight.arm.cycle()
+    assert flight.arm.reading.rests == guarded
+    assert flight.arm.reading.program_running != guarded
+
+
+@pytest.mark.parametrize("guarded", [True, False], ids=["guarded", "own"])
+def test_linear_move_of_a_living_daemon_arrives(guarded):
+    flight = moving_at_full_speed(control_script(DELIVERED if guarded else None))
+    state = flight.fly_until(lambda state: state.motion != "linear")
+    assert state.end_reason == "arrived"
+    assert not state.blocked
 
 
 def test_killed_worker_stops_the_wrist_in_time():

@@ -6,11 +6,10 @@ import pytest
 from mcap.writer import Writer
 from scipy.io import savemat
 
-from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.config import RecordingConfig, load_daemon_config
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.export import count_messages
 from shearloop.daemon.recording.matlab import import_mat
 from shearloop.daemon.recording.reader import read_recording
@@ -61,19 +60,15 @@ def test_an_unfinished_recording_stays_partial(tmp_path):
 
 
 @pytest.mark.parametrize("read", [read_recording, RecordedRun, count_messages])
-def test_foreign_and_outdated_files_are_refused(tmp_path, monkeypatch, read):
+def test_foreign_and_outdated_files_are_refused(tmp_path, read):
     (tmp_path / "text.mcap").write_text("hello")
     with (tmp_path / "other.mcap").open("wb") as file:
         other = Writer(file)
         other.start()
         other.finish()
-    for name, owner, key, value in (
-        ("stale", ChannelTable, "digest", "0" * 64),
-        ("old", schema, "FORMAT_VERSION", "1"),
-    ):
-        with monkeypatch.context() as outdated:
-            outdated.setattr(owner, key, value)
-            written(tmp_path / f"{name}.mcap")
+    for name, key, value in (("stale", "channel_table_hash", "0" * 64), ("old", "format_version", "1")):
+        with RecordingWriter(tmp_path / f"{name}.mcap", "x", {key: value}):
+            pass
     for name, why in (
         ("text", r"text\.mcap: this is not an MCAP file"),
         ("other", "not a recording of shearloop"),

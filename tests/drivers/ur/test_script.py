@@ -5,8 +5,11 @@ import sys
 
 import pytest
 
-from shearloop.drivers.ur.arm import arm_watchdog_in
 from tests.drivers.ur.robots import ROOT
+
+arm_watchdog_in = pytest.importorskip(
+    "shearloop.drivers.ur.arm", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only"
+).arm_watchdog_in
 
 # Uploads the script, and is gone before the watchdog is armed by a command.
 DIES_TOO_SOON = """
@@ -22,7 +25,8 @@ os._exit(0)
 
 
 def test_script_differs_by_one_line_before_its_loop():
-    script_client = pytest.importorskip("script_client", reason="ur-rtde has wheels for CPython up to 3.12 only")
+    import script_client
+
     text = script_client.ScriptClient("", 5, 17).getScript()
     program = arm_watchdog_in(text, 10.0)
     lines, its = program.splitlines(), ["def rtde_control():", *text.splitlines(), "end"]
@@ -44,7 +48,6 @@ def test_unknown_script_is_not_changed():
 @pytest.mark.real_time
 async def test_program_of_a_worker_killed_before_arming_ends(controller):
     """Nothing moves: the register was cleared before."""
-    pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-c", DIES_TOO_SOON, controller.host, cwd=ROOT, stdout=asyncio.subprocess.DEVNULL
     )

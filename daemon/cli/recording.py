@@ -33,7 +33,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         add_option(mat, "sources", Path, "SRC", ".mat files of one recording, or its folder", nargs="+")
         add_option(mat, "--out", Path, "REC", "recording to write, e.g. twist.mcap", required=True)
         add_json(mat)
-        mat.epilog = PAPERS_RECORDINGS
+        parser.epilog = PAPERS_RECORDINGS
         return
     parts = parser.add_subparsers(dest="part", metavar="WHAT", required=True)
     info = add_action(parts, "info", "show the content of recordings, closed or not", _info)

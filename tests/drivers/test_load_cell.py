@@ -191,7 +191,7 @@ def test_a_calibration_survives_its_file(tmp_path):
         ("tare_counts: .nan\nscale_n_per_count: 2.0e-5\n", "tare_counts"),
         ("tare_counts: 1.0\nscale_n_per_count: 2.0e-5\nsign: 0\n", "sign"),
         ("tare_counts: 1.0\nscale_n_per_count: 2.0e-5\nlever_arm_m: -0.035\n", "lever_arm_m"),
-        ("[1, 2", "line 1, column 6: "),
+        ("[1, 2", ":1:6: a list is not closed"),
         ("", "the calibration is empty"),
     ],
 )

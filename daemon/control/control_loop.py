@@ -259,6 +259,8 @@ class ControlLoop:
             found.append(Fault(FaultCode.NOT_RELEASED, grip.release_error))
         if experiment is None or not active:
             # Nothing moves: faults are reported, and only a stop of an experiment waits for the operator.
+            if arm is not None and arm.enabled_by_start:
+                found = [fault for fault in found if fault.code is not FaultCode.ROBOT_BLOCKED]
             return self._ended(self.safety.report(found))
         decision = self.safety.judge(found, t_ns)
         if decision.response >= Response.STOP_AND_KEEP_GRIP:
@@ -325,17 +327,18 @@ class ControlLoop:
         since_ns = self._grip.unmeasured_since_ns
         if since_ns is None or not (self._grip.expected and _turns(experiment.command)):
             return ""
-        awaited = []
+        awaited, reason = [], ""
         for name, source in self._sources.items():
             latest = self.inputs.torques.get(name)
             measured = latest is not None and latest.torque_nm is not None and latest.t_mid_ns >= since_ns
             due = t_ns - since_ns < source.warm_up_s * 1e9 and name not in self.inputs.lost
             if due and source.measures_torque and not measured:
-                awaited.append(f"{name}, {latest.reason}" if latest is not None and latest.reason else name)
+                awaited.append(name)
+                reason = latest.reason if latest is not None else ""
         if not awaited:
             self._grip.unmeasured_since_ns = None
             return ""
-        return f"waiting for the first torque after the grip: {'; '.join(awaited)}"
+        return f"waiting for the first torque of {', '.join(awaited)}{f': {reason}' if reason else ''}"
 
     def _forget_tool(self) -> None:
         self.wrist.reset()

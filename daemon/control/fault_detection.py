@@ -221,6 +221,9 @@ def _device_faults(inputs: LatestInputs, watched: Watched, t_ns: int) -> list[Fa
             found.append(Fault(FaultCode.EMERGENCY_STOP, arm.blocked or "the controller reports it", t_ns=arm.t_ns))
         elif arm.protective_stop:
             found.append(Fault(FaultCode.PROTECTIVE_STOP, arm.blocked or "the controller reports it", t_ns=arm.t_ns))
+        elif arm.blocked and arm.starting:
+            starting = "safety, power and control program are made ready"
+            found.append(Fault(FaultCode.ROBOT_STARTING, starting, t_ns=arm.t_ns))
         elif arm.blocked:
             found.append(Fault(FaultCode.ROBOT_BLOCKED, arm.blocked, t_ns=arm.t_ns))
     if gripper is not None and has_gripper:

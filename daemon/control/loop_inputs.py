@@ -105,6 +105,10 @@ class ArmStatus:
     protective_stop: bool = False
     emergency_stop: bool = False
     blocked: str = ""
+    # The robot is being unlocked, powered or started.
+    starting: bool = False
+    # Nothing but the start of an experiment is missing: it enables the arm.
+    enabled_by_start: bool = False
 
 
 @dataclass(frozen=True, slots=True)

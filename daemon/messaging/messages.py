@@ -63,8 +63,8 @@ def message(topic: str, *, rate_hz: float | None) -> Callable[[type[M]], type[M]
 class EitFrame(Message):
     """One frame of a fingertip; its time is the middle of the acquisition."""
 
-    channels: NDArray[np.floating] = column("V", "the 896 channels in the order of the channel table")
-    line: NDArray[np.floating] = column("V", "the 1024 values of the raw line")
+    channels: NDArray[np.floating] = column("V", "the channels in the order of the channel table")
+    line: NDArray[np.floating] = column("V", "the values of the raw line")
     frame: int = column("", "number of the frame since the board was connected")
     age_s: float = column("s", "from the middle of the acquisition to the arrival of the last byte")
     saturated: int = column("", "channels at the converter's full scale")
@@ -228,6 +228,14 @@ class Health(Message):
     loop_lag_s: float = column("s", "how late the event loop woke this message's task")
     memory_mb: float = column("MB", "resident memory")
     cpu_percent: float = column("%", "of one core since the message before")
+
+
+@message("daemon.end", rate_hz=None)
+class DaemonEnd(Message):
+    """The last message of a daemon that ends on request or with its experiment; a crashed one sends none."""
+
+    finished: bool = column("", "whether the experiment of `stop_when_done` is done; true without one")
+    summary: str = column("", "summary of the last experiment, in lines; empty without one")
 
 
 def stale_after_s(topic: str) -> float:

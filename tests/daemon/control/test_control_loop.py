@@ -140,7 +140,7 @@ def test_a_step_that_turns_the_tool_waits_for_the_first_torque_after_the_grip(st
         rig.step()
         assert rig.speed == 0.0
         assert rig.control_loop.status.phase == "running"
-    assert rig.control_loop.status.activity.startswith("waiting for the first torque after the grip: right")
+    assert rig.control_loop.status.activity.startswith("waiting for the first torque of right: too recently")
     rig.run(120)
     assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
 
@@ -152,6 +152,15 @@ def test_a_torque_that_does_not_come_after_the_grip_is_a_fault():
     rig.run(5)
     assert phase(rig) is ExperimentPhase.STOPPED
     assert "right says: too recently" in rig.control_loop.experiment.stop_reason
+
+
+def test_an_arm_that_a_start_enables_is_no_fault_until_then():
+    rig = Rig(new_loop())
+    rig.arm = replace(rig.arm, blocked="Motion has not been enabled.", enabled_by_start=True)
+    rig.run(1)
+    assert rig.control_loop.status.decision.reasons == ()
+    file = ExperimentFile.model_validate({"name": "one", "steps": [{"do": "wait", "wait_s": 1}]})
+    assert "Motion has not been enabled" in rig.control_loop.start(file, rig.t_ns)
 
 
 def test_fingers_that_open_are_no_torque_of_a_fingertip():

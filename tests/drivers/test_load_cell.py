@@ -93,7 +93,7 @@ def test_a_line_that_is_no_decimal_is_refused_by_kind_with_a_sentence(line, kind
     parser = LoadParser(TORQUE_LINES)
     assert feed_lines(parser, [line]) == []
     assert dict(parser.errors) == {kind: 1}
-    assert load_cell.describe_errors(parser.errors).count("(1 times)") == 1
+    assert load_cell.describe_errors(parser.errors).count("(once)") == 1
 
 
 def test_the_ends_of_the_converters_range_are_flagged_and_their_neighbours_are_not():

@@ -12,6 +12,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Any, Self, TextIO
 
 from shearloop.daemon.errors import UserError
+from shearloop.drivers.errors import times
 
 if TYPE_CHECKING:
     from shearloop.daemon.logs import NonBlockingWriter
@@ -225,11 +226,6 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     every = [tuple(head), *map(tuple, rows)]
     widths = [max(map(len, column)) for column in zip(*every, strict=True)]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in every]
-
-
-def times(count: int) -> str:
-    """Return how often: once, twice, 3 times."""
-    return {1: "once", 2: "twice"}.get(count, f"{count} times")
 
 
 def _columns(topic: str, content: Mapping[str, Any]) -> str:

@@ -110,5 +110,5 @@ def test_a_tool_of_which_nothing_is_known_is_not_held(tmp_path, between):
 def test_a_file_that_is_none_is_told_with_its_name(tmp_path):
     daemon = config(tmp_path, {})
     (tmp_path / "experiment.yaml").unlink()
-    with pytest.raises(UserError, match=r"experiment\.yaml: the configuration cannot be read: No such file"):
+    with pytest.raises(UserError, match=r"experiment\.yaml: the experiment cannot be read: No such file"):
         check_experiment(daemon, SOURCES)

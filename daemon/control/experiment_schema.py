@@ -209,18 +209,17 @@ def first_turn_before_grip(file: ExperimentFile) -> int | None:
     return None
 
 
-def check_limits(file: ExperimentFile) -> str:
-    """Return a sentence on the first step that exceeds its limits, or an empty string."""
+def check_limits(file: ExperimentFile) -> list[str]:
+    """Return a sentence on each step that exceeds its limits."""
+    found = []
     for number, step in enumerate(file.steps):
         limits, (torque_nm, angle_rad) = file.limits_of(step), _reach(step)
         torque = torque_nm, limits.torque_nm, "N·m", "torque_nm"
         for value, limit, unit, key in (torque, (angle_rad, limits.angle_rad, "rad", "angle_rad")):
             if value >= limit:
-                return (
-                    f"`steps[{number}]` ({step.do}) asks for {value:g} {unit}, and its limit is {limit:g} {unit}; "
-                    f"raise `limits.{key}`, or ask for less"
-                )
-    return ""
+                asks = f"steps[{number}]: {step.do} asks for {value:g} {unit}, and its limit is {limit:g} {unit}"
+                found.append(f"{asks}; raise limits.{key}, or ask for less")
+    return found
 
 
 def _reach(step: Step) -> tuple[float, float]:

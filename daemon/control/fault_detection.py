@@ -3,6 +3,7 @@
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from enum import Enum
 
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopConfig, TorqueSample, TorqueSource
@@ -19,6 +20,14 @@ LATEST_LOOP_S = ARM_STALE_S - LONGEST_TICK_S
 # A longer absence is a paused process rather than a slow loop. CLOCK_MONOTONIC stands while the computer is suspended;
 # the devices that were lost report that case.
 AWAY_S = 1.0
+
+
+class Grip(Enum):
+    """What the fingers do with the tool."""
+
+    NONE = "none"
+    CHANGING = "changing"  # they open or close: a fingertip measures their motion, and no torque
+    HELD = "held"
 
 
 @dataclass(slots=True)
@@ -67,7 +76,7 @@ class Watched:
     required: tuple[str, ...] = ()
     # The wrist is driven by the torque, or twists under its limit.
     torque_needed: bool = False
-    gripped: bool = False
+    grip: Grip = Grip.NONE
     twisted_rad: float = 0.0
     expected_nm: float | None = None
     overdue: str = ""
@@ -96,10 +105,12 @@ def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_
         torque = inputs.torques.get(source.name)
         if torque is None or torque.torque_nm is None or abs(torque.torque_nm) <= limit_nm:
             continue
+        if watched.grip is Grip.CHANGING and source.warm_up_s:
+            continue
         if t_ns - torque.t_ns <= watched.fresh_s[source.name] * 1e9:
             beyond = f"{source.name} measured {torque.torque_nm:+.3f} N·m, the limit is {limit_nm:g} N·m"
             found.append(Fault(FaultCode.TORQUE_LIMIT, beyond, t_ns=torque.t_mid_ns))
-    if watched.gripped and abs(watched.twisted_rad) > limit_rad:
+    if watched.grip is Grip.HELD and abs(watched.twisted_rad) > limit_rad:
         turned = f"turned by {watched.twisted_rad:+.3f} rad since the grip, the limit is {limit_rad:g} rad"
         found.append(Fault(FaultCode.ANGLE_LIMIT, turned, t_ns=inputs.arm.t_ns if inputs.arm is not None else None))
     found += _device_faults(inputs, watched, t_ns)
@@ -210,6 +221,9 @@ def _device_faults(inputs: LatestInputs, watched: Watched, t_ns: int) -> list[Fa
             found.append(Fault(FaultCode.EMERGENCY_STOP, arm.blocked or "the controller reports it", t_ns=arm.t_ns))
         elif arm.protective_stop:
             found.append(Fault(FaultCode.PROTECTIVE_STOP, arm.blocked or "the controller reports it", t_ns=arm.t_ns))
+        elif arm.blocked and arm.starting:
+            starting = "safety, power and control program are made ready"
+            found.append(Fault(FaultCode.ROBOT_STARTING, starting, t_ns=arm.t_ns))
         elif arm.blocked:
             found.append(Fault(FaultCode.ROBOT_BLOCKED, arm.blocked, t_ns=arm.t_ns))
     if gripper is not None and has_gripper:
@@ -219,7 +233,7 @@ def _device_faults(inputs: LatestInputs, watched: Watched, t_ns: int) -> list[Fa
             found.append(Fault(FaultCode.STATE_STALE, silent, t_ns=gripper.t_ns))
         elif gripper.fault:
             found.append(Fault(FaultCode.GRIPPER_FAULT, gripper.fault, t_ns=gripper.t_ns))
-        elif watched.gripped and not gripper.holding:
+        elif watched.grip is Grip.HELD and not gripper.holding:
             empty = f"its fingers are {gripper.width_mm:.1f} mm apart with nothing between them"
             found.append(Fault(FaultCode.GRIP_LOST, empty, t_ns=gripper.t_ns))
     for name, reason in lost.items():

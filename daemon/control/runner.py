@@ -20,6 +20,7 @@ from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH
 from shearloop.daemon.taring import LONGEST_TARE_S, Tareable, tare_all
 from shearloop.drivers.ur.client import UrRobot
+from shearloop.drivers.ur.command_handler import NOT_ENABLED
 from shearloop.drivers.ur.messages import (
     ARRIVED,
     STOPPED_ON_COMMAND,
@@ -181,6 +182,8 @@ class ControlLoopRunner:
                 protective_stop=state.protective_stop,
                 emergency_stop=state.emergency_stop,
                 blocked=state.blocked,
+                starting=state.recovering,
+                enabled_by_start=state.blocked == NOT_ENABLED,
             )
         )
         if self._states.publish_robot(state):

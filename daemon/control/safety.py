@@ -113,6 +113,9 @@ class FaultCode(Enum):
         "a device that the experiment needs is not connected yet: {detail}.",
         "Switch it on and connect it; it is found automatically. `shearloop doctor CONFIG` examines it.",
     )
+    ROBOT_STARTING = Rule(
+        _KEEP, "the robot is not ready yet: {detail}.", "Wait a few seconds, then start the experiment again."
+    )
     DEVICE_LOST = Rule(
         _KEEP,
         "a device that the experiment needs is gone: {detail}.",

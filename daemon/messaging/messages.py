@@ -230,6 +230,14 @@ class Health(Message):
     cpu_percent: float = column("%", "of one core since the message before")
 
 
+@message("daemon.end", rate_hz=None)
+class DaemonEnd(Message):
+    """The last message of a daemon that ends on request or with its experiment; a crashed one sends none."""
+
+    finished: bool = column("", "whether the experiment of `stop_when_done` is done; true without one")
+    summary: str = column("", "summary of the last experiment, in lines; empty without one")
+
+
 def stale_after_s(topic: str) -> float:
     """Return the age in seconds that makes a topic's latest message stale.
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 
 from shearloop.drivers.emulators.ur_arm import Vector
 from shearloop.drivers.emulators.ur_robot import (
-    COMMAND,
     MODE_RUNNING,
     SAFETY_EMERGENCY_STOP,
     SAFETY_NORMAL,
     SAFETY_PROTECTIVE_STOP,
     Robot,
 )
+from shearloop.drivers.emulators.urscript import COMMAND
 
 Value = int | float | Sequence[float] | Vector
 

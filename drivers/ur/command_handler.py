@@ -342,7 +342,7 @@ class CommandHandler:
         elif now_ns - self._daemon_alive_ns > self._settings.silence_timeout_s * 1e9:
             silent = f"the daemon was silent for {self._settings.silence_timeout_s:g} s"
             self._executor.stop(sample, now_ns, silent)
-        self._executor.keep(sample, now_ns)
+        self._executor.keep(sample, now_ns, self._daemon_alive_ns)
         return None
 
     def state(self, sample: RtdeSample, cycle: int) -> RobotState:

@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 
 from shearloop.drivers.errors import DriverError, ProtocolError
 from shearloop.drivers.ur.messages import RUNTIME_PLAYING, FailureKind
+from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER
 from shearloop.drivers.ur.settings import Six, Three
 
 RTDE_PORT, DASHBOARD_PORT = 30004, 29999
@@ -27,8 +28,8 @@ OLDEST: Final = {3: (3, 10), 5: (5, 4)}
 NEWEST_TESTED: Final = {3: (3, 15, 8), 5: (5, 17, 3)}
 _OTHER_PACKAGES = 20
 _LONGEST_LINE = 1024
-# The command registers of ur-rtde's control script.
-_REGISTERS = ("input_int_register_0", "input_double_register_0")
+# The command registers of ur-rtde's control script, and ours.
+_REGISTERS = ("input_int_register_0", "input_double_register_0", DEADLINE_REGISTER)
 # The outputs and their types, in the order of a sample's fields.
 _TYPES: Final = {
     "timestamp": "DOUBLE",
@@ -42,15 +43,18 @@ _TYPES: Final = {
     "runtime_state": "UINT32",
     "speed_scaling": "DOUBLE",
     "output_int_register_0": "INT32",
+    CLOCK_REGISTER: "DOUBLE",
 }
 # Outputs that controllers have from PolyScope 3.12 and 5.5.1 on.
 _TOOL_TYPES: Final = {"payload": "DOUBLE", "payload_cog": "VECTOR3D", "tcp_offset": "VECTOR6D"}
 # The same outputs, after the header and the recipe's number.
-_VALUES: Final = struct.Struct(">d30d2iIdi")
+_VALUES: Final = struct.Struct(">d30d2iIdid")
 _TOOL_VALUES: Final = struct.Struct(">d3d6d")
 _PACKAGE_BYTES: Final = HEADER.size + 1 + _VALUES.size
 _PACKAGE_SIZES: Final = (_PACKAGE_BYTES, _PACKAGE_BYTES + _TOOL_VALUES.size)
 _NO_TOOL: Final = (math.nan,) * 10
+# An input package: the header, the recipe's number and one value.
+_DEADLINE: Final = struct.Struct(">HBBd")
 # One second of samples.
 _READ_BYTES = 1 << 15
 # The smallest clock offset may rise by this share of the time. Clocks drift by up to 500 ppm, and a simulator's may be
@@ -78,7 +82,7 @@ class ControllerInfo:
 
 
 class ReceivedSample(NamedTuple):
-    """The outputs in one package, all but the last as in `RtdeSample`."""
+    """The outputs in one package, all but the last two as in `RtdeSample`."""
 
     timestamp_s: float
     q_rad: Six
@@ -94,8 +98,9 @@ class ReceivedSample(NamedTuple):
     payload_kg: float
     payload_cog_m: Three
     tcp_offset: Six
-    # Of ur-rtde's control script: 1 when ready, 2 when done with a command.
+    # Of the control script: 1 when ready, 2 when done with a command; and its own clock.
     script_state: int
+    script_s: float = 0.0
 
 
 def probe_controller(host: str, timeout_s: float) -> str:
@@ -186,6 +191,15 @@ def explain_failure(host: str, timeout_s: float, activity: str) -> Iterator[None
         ) from error
 
 
+def registers_in_use(host: str) -> ProbeError:
+    """Return the error about input registers that another client writes."""
+    return ProbeError(
+        "registers-in-use",
+        f"The input registers of the robot at {host} are already in use by another RTDE client, EtherNet/IP or "
+        "PROFINET: end the other program, or disable the adapter under Installation → Fieldbus.",
+    )
+
+
 def silent_sentence(host: str, seconds: float, activity: str) -> str:
     """Return the message about a controller that did not answer."""
     return (
@@ -250,11 +264,11 @@ class SampleParser:
         v = _VALUES.unpack_from(data, start)
         tool = _NO_TOOL if size == _PACKAGE_BYTES else _TOOL_VALUES.unpack_from(data, start + _VALUES.size)
         motion = v[0], v[1:7], v[7:13], v[13:19], v[19:25], v[25:31]
-        return ReceivedSample(*motion, v[31], v[32], v[33], v[34], tool[0], tool[1:4], tool[4:], v[35])
+        return ReceivedSample(*motion, v[31], v[32], v[33], v[34], tool[0], tool[1:4], tool[4:], v[35], v[36])
 
 
 class RtdeReceiver:
-    """A connection that receives the controller's samples; `connected` is False once it has ended.
+    """A connection for the controller's samples and our register; `connected` is False once it has ended.
 
     Samples wait in the kernel until `latest` takes the newest one. ur-rtde's interface polls its socket instead, which
     takes a third of the worker's processor time at rest.
@@ -264,8 +278,9 @@ class RtdeReceiver:
         """Connect and wait for the first sample.
 
         Raises:
-            ProbeError: the controller is absent or silent, or does not send the outputs.
+            ProbeError: the controller is absent or silent, does not send the outputs, or our register is in use.
         """
+        self._host = host
         self._parser = SampleParser()
         self.connected = True
         with explain_failure(host, timeout_s, "asking for its state"):
@@ -291,6 +306,10 @@ class RtdeReceiver:
                 break
         else:
             raise OSError(f"its outputs are of the types {types}")
+        answer = _request(self._connection, _INPUTS, DEADLINE_REGISTER.encode())
+        if b"IN_USE" in answer:
+            raise registers_in_use(self._host)
+        self._recipe = answer[0]
         if _request(self._connection, _START) != b"\x01":
             raise OSError("it does not send its state")
         while self.connected:
@@ -304,6 +323,14 @@ class RtdeReceiver:
         if self.connected:
             self._sample = self._receive() or self._sample
         return self._sample
+
+    def write_deadline(self, script_s: float) -> None:
+        """Write when the motion has to end, by the script's clock."""
+        try:
+            self._connection.send(_DEADLINE.pack(_DEADLINE.size, _DATA, self._recipe, script_s))
+        except OSError:
+            # Also where the socket is full: the controller has read nothing for long.
+            self.connected = False
 
     def wait(self, seconds: float) -> bool:
         """Wait for data, at most this long, and return whether there is any."""

@@ -124,7 +124,7 @@ class MotionExecutor:
     def begin(self, motion_id: int, asked: WristSpeed | MoveLinear, sample: RtdeSample, now_ns: int) -> str:
         """Turn the wrist at a speed from now on, or begin a linear move; return why not, or the empty string."""
         match asked, self._motion:
-            case WristSpeed(decided_ns=decided_ns), _ if decided_ns and self._is_too_old(decided_ns, now_ns):
+            case WristSpeed(decided_ns=decided_ns), _ if decided_ns and self._left_s(decided_ns, now_ns) < 0:
                 return f"The wrist speed was decided {(now_ns - decided_ns) / 1e9:.2f} s ago: the computer is too busy."
             case WristSpeed(_, acceleration), _ if acceleration <= 0:
                 return f"An acceleration of {acceleration:g} rad/s² is not above 0."
@@ -139,7 +139,7 @@ class MotionExecutor:
         self.motion_id, self.end_reason = motion_id, ""
         if isinstance(asked, WristSpeed):
             self._motion = _Turn(asked, asked.decided_ns or now_ns)
-            self._send_clipped_speed(asked, sample)
+            self._keep_turning(self._motion, sample, now_ns)
         else:
             self._end_speed_thread()
             sent, self.clipped = clip_linear(asked, self._settings.limits)
@@ -211,15 +211,15 @@ class MotionExecutor:
             beyond = self._accelerations.violation(self._settings.limits)
         return beyond
 
-    def keep(self, sample: RtdeSample, now_ns: int) -> None:
-        """Send what this cycle needs."""
+    def keep(self, sample: RtdeSample, now_ns: int, daemon_alive_ns: int) -> None:
+        """Send what this cycle needs; the daemon's last message came at `daemon_alive_ns`."""
         if self.disabled_reason:
             return
         match self._motion:
             case _Turn() as turn:
                 self._keep_turning(turn, sample, now_ns)
             case _Move() as move:
-                self._keep_moving(move, sample, now_ns)
+                self._keep_moving(move, sample, now_ns, daemon_alive_ns)
             case _Braking() as braking:
                 self._keep_stopping(braking, sample, now_ns)
             case None if now_ns - self._rested_ns > ASTRAY_S * 1e9:
@@ -228,17 +228,21 @@ class MotionExecutor:
             case None:
                 self._arm.send_heartbeat()
 
-    def _is_too_old(self, decided_ns: int, now_ns: int) -> bool:
-        return now_ns - decided_ns > self._settings.command_timeout_s * 1e9
+    def _left_s(self, decided_ns: int, now_ns: int) -> float:
+        """Return how long a wrist speed still holds."""
+        return self._settings.command_timeout_s - (now_ns - decided_ns) / 1e9
 
     def _keep_turning(self, turn: _Turn, sample: RtdeSample, now_ns: int) -> None:
-        if self._is_too_old(turn.decided_ns, now_ns):
+        left_s = self._left_s(turn.decided_ns, now_ns)
+        if left_s < 0:
             late = f"the wrist speed was not renewed within {self._settings.command_timeout_s:g} s"
             self.stop_now(sample, now_ns, late)
         else:
-            self._send_clipped_speed(turn.asked, sample)
+            # The one check of all speeds that turn the wrist.
+            self.sent, self.clipped = clip_wrist(turn.asked, sample, self._settings)
+            self._send_speed(self.sent, left_s)
 
-    def _keep_moving(self, move: _Move, sample: RtdeSample, now_ns: int) -> None:
+    def _keep_moving(self, move: _Move, sample: RtdeSample, now_ns: int, daemon_alive_ns: int) -> None:
         move.seen = move.seen or sample.moving_linearly
         reason = line_violation(sample, self._settings.limits)
         if now_ns > move.deadline_ns:
@@ -251,14 +255,14 @@ class MotionExecutor:
         elif reason:
             self.stop(sample, now_ns, reason)
             return
-        self._arm.send_heartbeat()
+        self._arm.send_heartbeat(self._settings.silence_timeout_s - (now_ns - daemon_alive_ns) / 1e9)
 
     def _keep_stopping(self, braking: _Braking, sample: RtdeSample, now_ns: int) -> None:
         if now_ns > braking.deadline_ns:
             self.leave_to_watchdog(NOT_STOPPING)
         elif self._speed_thread:
             deceleration = clip_stop(braking.deceleration_rad_per_s2, sample, self._settings)
-            if self._send_speed(WristSpeed(0.0, deceleration)) and sample.rests:
+            if self._send_speed(WristSpeed(0.0, deceleration), 0.0) and sample.rests:
                 self._end_speed_thread()
                 self._motion = None
         else:
@@ -266,14 +270,9 @@ class MotionExecutor:
                 self._motion = None
             self._arm.send_heartbeat()
 
-    def _send_clipped_speed(self, asked: WristSpeed, sample: RtdeSample) -> None:
-        """Send the speed within the limits of this moment: the one check of all speeds that turn the wrist."""
-        self.sent, self.clipped = clip_wrist(asked, sample, self._settings)
-        self._send_speed(self.sent)
-
-    def _send_speed(self, command: WristSpeed) -> bool:
+    def _send_speed(self, command: WristSpeed, left_s: float) -> bool:
         self._speed_thread = True
-        accepted = self._arm.wrist(command)
+        accepted = self._arm.wrist(command, left_s)
         if not accepted:
             # An earlier speed may still hold.
             self._reject("wrist speed")

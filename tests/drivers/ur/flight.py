@@ -105,7 +105,7 @@ class FakeArm:
         self.calls.append(call)
         self._since_call_ns = 0
 
-    def wrist(self, command: messages.WristSpeed) -> bool:
+    def wrist(self, command: messages.WristSpeed, _left_s: float) -> bool:
         self.note("wrist")
         if self.accepts:
             self.target, self.acceleration = command.rad_per_s, command.acceleration_rad_per_s2
@@ -128,7 +128,7 @@ class FakeArm:
             self.be(moving_linearly=False)
         return self.accepts
 
-    def send_heartbeat(self) -> bool:
+    def send_heartbeat(self, _left_s: float | None = None) -> bool:
         self.note("send_heartbeat")
         return True
 
@@ -176,8 +176,10 @@ class FakeArm:
 class Flight:
     """A handler, its arm and the time."""
 
-    def __init__(self, settings: UrSettings = SETTINGS, *, takes_over: bool = False) -> None:
-        self.arm = FakeArm()
+    def __init__(
+        self, settings: UrSettings = SETTINGS, *, arm: FakeArm | None = None, takes_over: bool = False
+    ) -> None:
+        self.arm = arm or FakeArm()
         self.now_ns = 10**12
         self.number = self.cycle = 0
         self.decided: dict[int, messages.CommandReply] = {}
@@ -232,8 +234,8 @@ class Flight:
         return self.arm.reading.qd_rad_per_s[5]
 
 
-def flying(settings: UrSettings = SETTINGS) -> Flight:
-    flight = Flight(settings)
+def flying(settings: UrSettings = SETTINGS, arm: FakeArm | None = None) -> Flight:
+    flight = Flight(settings, arm=arm)
     flight.fly(5)
     assert flight.ask(messages.Enable()).accepted
     flight.arm.calls.clear()

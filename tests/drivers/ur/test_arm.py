@@ -11,7 +11,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from shearloop.drivers.ur.controller import ReceivedSample
+from shearloop.drivers.ur.controller import ProbeError, ReceivedSample
 from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
 from tests.drivers.ur.flight import SETTINGS
 
@@ -30,7 +30,10 @@ class Client:
         self.connected = True
 
     def getScript(self) -> str:  # noqa: N802 - ur-rtde's name
-        return "        keep_running = True\n"
+        return "    thread speed_thread():\n    end\n        keep_running = True\n"
+
+    def write_deadline(self, script_s: float) -> None:
+        """Take it."""
 
     def latest(self) -> ReceivedSample:
         """Return a sample of a program that ended during a command."""
@@ -109,14 +112,16 @@ def test_progress_is_queried_only_for_a_linear_move(arm, monkeypatch):
         arm,
         "RtdeReceiver",
         lambda *_: SimpleNamespace(
-            connected=True, latest=lambda: ReceivedSample(float(next(times_s)), *FIVE, 7, 1, 2, 1.0, *TOOL, 1)
+            connected=True,
+            latest=lambda: ReceivedSample(float(next(times_s)), *FIVE, 7, 1, 2, 1.0, *TOOL, 1),
+            write_deadline=lambda _: None,
         ),
     )
     one = arm.UrArm(SETTINGS, VERSION)
     assert not one.read().moving_linearly
     one.move(MoveLinear(SIX, 0.1, 0.1))
     assert [one.read().moving_linearly for _ in range(3)] == [True] * 3
-    one.wrist(WristSpeed(0.1, 1.0))
+    one.wrist(WristSpeed(0.1, 1.0), 0.1)
     assert not one.read().moving_linearly
     assert one._control.asked == 3
 
@@ -147,7 +152,7 @@ def test_no_call_blocks_when_no_program_runs(arm, monkeypatch):
     one = arm.UrArm(SETTINGS, VERSION)
     assert one.zero_wrench()
     assert not one.send_heartbeat()
-    assert not one.wrist(WristSpeed(0.1, 1.0))
+    assert not one.wrist(WristSpeed(0.1, 1.0), 0.1)
     assert not one.move(MoveLinear(SIX, 0.1, 0.1))
     assert not one.stop_move(1.0)
     assert not one.end_speed(1.0)
@@ -204,19 +209,28 @@ def test_sent_script_arms_its_watchdog(arm, monkeypatch):
         def setCustomScriptFile(self, path: str) -> None:  # noqa: N802 - ur-rtde's name
             self.sent = Path(path).read_text()
 
-        def reuploadScript(self) -> bool:  # noqa: N802
-            self.sent = "its own"
-            return True
-
     monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Sending)
     one = arm.UrArm(SETTINGS, VERSION)
     assert one.upload()
     assert 'rtde_set_watchdog("input_int_register_0", 10, "stop")' in one._control.sent
 
+
+def test_unknown_script_is_refused(arm, monkeypatch):
+    """Without its deadline the wrist could turn on."""
     monkeypatch.setattr(arm.script_client.ScriptClient, "getScript", lambda _: "of another form\n")
-    other = arm.UrArm(SETTINGS, VERSION)
-    assert other.upload()
-    assert other._control.sent == "its own"
+    with pytest.raises(ProbeError, match="unknown, so that its limits"):
+        arm.UrArm(SETTINGS, VERSION)
+
+
+def test_deadline_counts_from_the_latest_sample(arm, monkeypatch):
+    written: list[float] = []
+    sample = ReceivedSample(1.0, *FIVE, 7, 1, 2, 1.0, *TOOL, 1, 20.0)
+    receiver = SimpleNamespace(latest=lambda: sample, write_deadline=written.append, connected=True)
+    monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Controlled)
+    monkeypatch.setattr(arm, "RtdeReceiver", lambda *_: receiver)
+    one = arm.UrArm(SETTINGS, VERSION)
+    assert one.wrist(WristSpeed(0.1, 1.0), 0.07)
+    assert written == [pytest.approx(20.07)]
 
 
 def test_connection_that_takes_no_script_is_lost(arm, monkeypatch, capsys):

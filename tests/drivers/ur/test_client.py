@@ -286,7 +286,7 @@ async def test_leaving_stops_the_arm_and_ends_the_program(told, controller):
     stopped = await controller.event("motion-stopped", left_ns)
     ended = await controller.event("program-ended", left_ns)
     assert ended["t_mono_ns"] >= stopped["t_mono_ns"]
-    assert ended["detail"] == "the client ended it"
+    assert ended["detail"] == "it has run to its end"
 
 
 DAEMON = """
@@ -327,5 +327,5 @@ async def test_killed_daemon_leaves_a_resting_robot_and_no_process(controller):
     finally:
         asyncio.get_running_loop().remove_reader(worker)
         os.close(worker)
-    assert (await controller.event("program-ended", killed_ns))["detail"] == "the client ended it"
+    assert (await controller.event("program-ended", killed_ns))["detail"] == "it has run to its end"
     await daemon.communicate()

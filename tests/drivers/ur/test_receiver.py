@@ -17,7 +17,7 @@ from shearloop.drivers.errors import ProtocolError
 from shearloop.drivers.ur import controller as receiver_module
 from shearloop.drivers.ur.controller import ProbeError, ReceivedSample, RtdeReceiver, SampleParser
 
-TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,INT32"
+TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,INT32,DOUBLE"
 TOOL_TYPES = TYPES + b",DOUBLE,VECTOR3D,VECTOR6D"
 # The answer of a controller before PolyScope 5.5.1.
 WITHOUT_TOOL = TYPES + b",NOT_FOUND,NOT_FOUND,NOT_FOUND"
@@ -31,7 +31,7 @@ def package(kind: bytes, payload: bytes) -> bytes:
 def data(number: int, *, tool: bool = True) -> bytes:
     """Return the package of a sample with this timestamp."""
     values = [round(number + 0.01 * index, 2) for index in range(30)]
-    content = struct.pack(">d30diiIdi", number, *values, 7, -1, 2, 0.5, 1)
+    content = struct.pack(">d30diiIdid", number, *values, 7, -1, 2, 0.5, 1, 9.5)
     return package(b"U", b"\x01" + content + (struct.pack(">10d", *TOOL) if tool else b""))
 
 
@@ -56,6 +56,7 @@ def test_sample_has_the_values_in_their_order():
         payload_cog_m=(0.1, 0.2, 0.3),
         tcp_offset=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0),
         script_state=1,
+        script_s=9.5,
     )
 
 
@@ -84,10 +85,12 @@ def test_invalid_package_is_refused(bad):
 class Controller:
     """A controller's port with scripted answers."""
 
-    def __init__(self, types: tuple[bytes, ...] = (TOOL_TYPES,), started: bytes = b"\x01") -> None:
+    def __init__(
+        self, types: tuple[bytes, ...] = (TOOL_TYPES,), started: bytes = b"\x01", inputs: bytes = b"\x01DOUBLE"
+    ) -> None:
         self._listening = socket.create_server(("127.0.0.1", 0))
         self.port = self._listening.getsockname()[1]
-        self._answers = {b"V": [b"\x01"], b"O": [b"\x01" + one for one in types], b"S": [started]}
+        self._answers = {b"V": [b"\x01"], b"O": [b"\x01" + one for one in types], b"I": [inputs], b"S": [started]}
         self.asked: dict[bytes, bytes] = {}
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
@@ -102,6 +105,10 @@ class Controller:
             self.asked[kind] = self._peer.recv(size - 3, socket.MSG_WAITALL)
             self._peer.sendall(package(kind, self._answers[kind].pop(0)))
         self._peer.sendall(data(1, tool=self.asked[b"O"].endswith(b"tcp_offset")))
+
+    def receive(self, size: int) -> bytes:
+        self._thread.join()
+        return self._peer.recv(size, socket.MSG_WAITALL)
 
     def send(self, stream: bytes) -> None:
         self._thread.join()
@@ -150,6 +157,17 @@ def test_outputs_are_requested_at_the_rate_and_the_newest_kept(play):
     assert not receiver.wait(5.0)
 
 
+def test_deadline_is_written_to_its_register(play):
+    controller = play((TOOL_TYPES,), b"\x01", b"\x05DOUBLE")
+    receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
+    assert controller.asked[b"I"] == b"input_double_register_24"
+    receiver.write_deadline(20.25)
+    assert controller.receive(12) == package(b"U", b"\x05" + struct.pack(">d", 20.25))
+    receiver.close()
+    receiver.write_deadline(20.5)
+    assert not receiver.connected
+
+
 def test_controller_without_payload_and_tool_centre_point_is_accepted(play):
     play((WITHOUT_TOOL, TYPES))
     receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
@@ -191,6 +209,7 @@ def test_network_error_is_a_lost_connection(play, number):
     [
         (((TOOL_TYPES.replace(b"UINT32", b"NOT_FOUND"), TYPES.replace(b"UINT32", b"NOT_FOUND")),), "NOT_FOUND"),
         (((TOOL_TYPES,), b"\x00"), "does not send its state"),
+        (((TOOL_TYPES,), b"\x01", b"\x00IN_USE"), "already in use by another RTDE client"),
     ],
 )
 def test_controller_without_the_needed_outputs_is_refused(play, answers, told):

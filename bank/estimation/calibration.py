@@ -183,6 +183,9 @@ def _read_members(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Return header and arrays after checking each array's checksum."""
     try:
         with zipfile.ZipFile(path) as archive:
+            # Stored members are no larger than the file; compressed or overlapping ones may fill the memory.
+            if sum(member.file_size for member in archive.infolist()) > path.stat().st_size:
+                raise ValueError("its members are larger than the file")
             found = {name: archive.read(name) for name in archive.namelist()}
     except OSError as error:
         raise CalibrationError(f"{path}: the calibration cannot be read: {error.strerror or error}") from error
@@ -202,9 +205,15 @@ def _read_members(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     for name, data in found.items():
         if hashlib.sha256(data).hexdigest() != checksums[name]:
             raise CalibrationError(f"{path}: the calibration is damaged: {name} has changed; calibrate again")
-    return header, {
-        name.removesuffix(".npy"): np.load(io.BytesIO(data), allow_pickle=False) for name, data in found.items()
-    }
+    try:
+        return header, {name.removesuffix(".npy"): _array(data) for name, data in found.items()}
+    except (ValueError, EOFError, MemoryError) as error:
+        raise CalibrationError(f"{path}: the calibration holds a member that is no array; calibrate again") from error
+
+
+def _array(data: bytes) -> NDArray[Any]:
+    array: NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
+    return array
 
 
 def _npy_bytes(array: NDArray[Any]) -> bytes:

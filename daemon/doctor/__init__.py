@@ -30,7 +30,6 @@ from shearloop.daemon.doctor.devices import (
     trouble,
 )
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.addresses import stop_address
 from shearloop.daemon.sensing.estimators import open_combined, open_estimator
 from shearloop.daemon.serial_ports import list_serial_ports
 from shearloop.drivers.errors import DriverError
@@ -64,8 +63,7 @@ def examine(config_path: Path | None, seconds: float, geometry: Path | None = No
     yield good("configuration", f"{config_path} is in order")
     yield check_disk(Path() if config.recording is None else config.recording.folder)
     yield from check_files(config, geometry)
-    on_network = "commands" in config.network_addresses
-    tasks = daemon_tasks(stop_address(config.commands) if on_network else config.commands)
+    tasks = daemon_tasks(config.commands)
     if tasks is not None:
         yield good("daemon", f"answers at {config.commands}; it holds the devices and reports on them")
         received = {} if "publish" in config.network_addresses else listen(config.publish, seconds)

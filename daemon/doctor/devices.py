@@ -18,6 +18,7 @@ from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.messages import TOPICS
+from shearloop.daemon.messaging.stop_socket import send_to_stop_socket
 from shearloop.daemon.rig import make_gripper_client
 from shearloop.daemon.serial_ports import access_error
 from shearloop.drivers.connection import find_port
@@ -237,7 +238,9 @@ def _rate_hz(times_ns: list[int]) -> float | None:
 def daemon_tasks(address: str) -> Mapping[str, Mapping[str, Any]] | None:
     """Return the status of a running daemon's tasks; None when no daemon answers."""
     try:
-        tasks = send_command(address, {"command": "status"}, DAEMON_TIMEOUT_S).get("tasks")
+        request = {"command": "status"}
+        reply = send_to_stop_socket(address, request, DAEMON_TIMEOUT_S)
+        tasks = (reply or send_command(address, request, DAEMON_TIMEOUT_S)).get("tasks")
     except UserError:
         return None
     return tasks if isinstance(tasks, dict) else {}

@@ -5,8 +5,8 @@
 The real daemon in its own process and the real drivers, with the rig emulated over its real ports. The wrist turns a
 gripped tool at 0.5 rad/s when a process is killed, stopped or blocked, or a device fails. The emulated robot reports
 when its true wrist stands. The promise is 0.2 s, and for a device's fault what the daemon needs to notice it: a period
-of a sensor that is unplugged, two of a value that is polled, 2.5 of a sensor that falls silent. `--busy` runs that many
-busy processes.
+of a sensor that is unplugged and of the polled gripper, two of the load cell for a jump within a reading, 2.5 of a
+sensor that falls silent. `--busy` runs that many busy processes.
 
 Writes JSON and a chart.
 """
@@ -87,8 +87,8 @@ CAUSES = (
     Cause("EIT board silent", command="silence right 5", noticed_s=_periods_s("eit.frame", STALE_AFTER_PERIODS)),
     Cause("load cell unplugged", command="unplug load", noticed_s=_periods_s("load.torque", 1)),
     Cause("load cell silent", command="silence load 3", noticed_s=_periods_s("load.torque", STALE_AFTER_PERIODS)),
-    Cause("gripper fault", command="gripper fault 14", noticed_s=_periods_s("gripper.state", 2)),
-    Cause("tool dropped", command="gripper drop", noticed_s=_periods_s("gripper.state", 2)),
+    Cause("gripper fault", command="gripper fault 14", noticed_s=_periods_s("gripper.state", 1)),
+    Cause("tool dropped", command="gripper drop", noticed_s=_periods_s("gripper.state", 1)),
     Cause("torque beyond its limit", command="kick 0.4", noticed_s=_periods_s("load.torque", 2)),
 )
 

@@ -88,8 +88,9 @@ def _run(
         if args.slices is not None:
             # Imports scipy.io, which takes long.
             from shearloop.daemon.recording.matlab_slices import SliceRecorder
+            from shearloop.daemon.sensing.estimators import channel_table
 
-            slices = SliceRecorder(args.slices)
+            slices = SliceRecorder(args.slices, channel_table(config))
             stack.callback(slices.close)
             listeners.append(slices)
             reporters["slices"] = slices

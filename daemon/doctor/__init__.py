@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS
 from shearloop.bank.errors import BankError
 from shearloop.bank.skin.calibration import load_calibration
 from shearloop.daemon.config import CombinedConfig, CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
@@ -188,14 +187,14 @@ def check_bank(name: str, fingertip: FingertipConfig, geometry: Path | None = No
         return from_error(subject, error, "no frame can be matched")
     found = (
         f"{fingertip.bank} is intact, {int(bank.valid.sum())} of {bank.valid.size} cells valid, channel table "
-        f"{CHANNEL_TABLE_HASH[:12]} with {N_CHANNELS} channels, geometry {bank.geometry_hash[:12]}"
+        f"{bank.table.digest[:12]} with {bank.table.n_channels} channels, geometry {bank.geometry_hash[:12]}"
     )
     if geometry is None:
         return good(subject, found)
     from shearloop.daemon.bank_config import load_geometry
 
     try:
-        digest = load_geometry(geometry).digest
+        digest = load_geometry(geometry).mesh.digest
     except (UserError, BankError) as error:
         return from_error(subject, error, "the bank cannot be compared with it")
     if digest != bank.geometry_hash:

@@ -200,7 +200,7 @@ async def serve(
     signals = ending_signals()
     with zmq.asyncio.Context() as context:
         bridge = Bridge(context, address, MessageStore(fingertip.height_cm))
-        app = make_app(bridge, token, asdict(fingertip), address.publish)
+        app = make_app(bridge, token, asdict(fingertip.outline()), address.publish)
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=SHUTDOWN_S)
         receiving = asyncio.create_task(bridge.run(), name="messages")
         try:

@@ -122,9 +122,7 @@ class RunningRig:
 
 def _experiment(folder: Path, name: str, *steps: dict[str, Any]) -> Path:
     path = folder / f"{name}.yaml"
-    # The estimator needs seven seconds of the grip.
-    grip = [{"do": "grip", "width_mm": 5, "force_n": 60}, {"do": "wait", "wait_s": 8}]
-    begin = [{"do": "release"}, {"do": "tare"}, *grip]
+    begin = [{"do": "release"}, {"do": "tare"}, {"do": "grip", "width_mm": 5, "force_n": 60}]
     content = {"name": name, "torque_source": "load_cell", "limits": {"torque_nm": 0.3}, "steps": [*begin, *steps]}
     path.write_text(yaml.safe_dump(content))
     return path

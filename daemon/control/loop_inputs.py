@@ -105,6 +105,10 @@ class ArmStatus:
     protective_stop: bool = False
     emergency_stop: bool = False
     blocked: str = ""
+    # The robot is being unlocked, powered or started.
+    starting: bool = False
+    # Nothing but the start of an experiment is missing: it enables the arm.
+    enabled_by_start: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +133,8 @@ class TorqueSource:
 
     `has_friction_band`: friction hides the torque within a band; the wrist turns through it without a change.
     `from_robot`: the torque comes with the robot's state, so its age is checked there. `measures_torque` is False for a
-    fingertip without a calibration; a silent one is a fault all the same.
+    fingertip without a calibration; a silent one is a fault all the same. `warm_up_s`: the longest time from a grip to
+    the first torque; 0 for a source that measures without a grip.
     """
 
     name: str
@@ -138,3 +143,4 @@ class TorqueSource:
     has_friction_band: bool = False
     from_robot: bool = False
     measures_torque: bool = True
+    warm_up_s: float = 0.0

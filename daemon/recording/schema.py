@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from pydantic_core import to_json
 
-from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH
+from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
 from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitFrame, EitHeatmap, LoadTorque
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
@@ -54,15 +54,21 @@ _SCALARS = {float: "number", int: "integer", str: "string", bool: "boolean"}
 _TIME = {"type": "integer", "description": "CLOCK_MONOTONIC in ns"}
 
 
+class UnknownTopicError(Exception):
+    """A recording has a topic that this version does not have."""
+
+
 class NoJsonError(ValueError):
     """A value cannot be written as JSON."""
 
 
-def basic_identity(source: str) -> dict[str, str]:
+def basic_identity(source: str, table: ChannelTable = PAPER_TABLE) -> dict[str, str]:
     """Return the metadata of every recording; `source` describes the origin of the data."""
     return {
         "format_version": FORMAT_VERSION,
-        "channel_table_hash": CHANNEL_TABLE_HASH,
+        "channel_table_hash": table.digest,
+        "electrodes": str(table.n_electrodes),
+        "injection": table.injection,
         "source": source,
         "software": software_version(),
         "code_sha256": code_digest(),
@@ -100,7 +106,7 @@ def input_topic(source: str) -> str:
 
 
 def schema_name(topic: str) -> str:
-    """Return the name of a recorded topic's schema; raises KeyError for an unknown topic."""
+    """Return the name of a recorded topic's schema; raises UnknownTopicError for another."""
     if topic == CLOCK_TOPIC or topic in TOPICS:
         return topic
     if topic.startswith(f"{INPUT}."):
@@ -108,7 +114,7 @@ def schema_name(topic: str) -> str:
     for live in _FINGERTIP_TOPICS:
         if topic.startswith(f"{live}."):
             return live
-    raise KeyError(topic)
+    raise UnknownTopicError(topic)
 
 
 @cache

@@ -113,6 +113,23 @@ class UrLimits(_Checked):
 
 
 @dataclass(frozen=True, slots=True)
+class InstalledTool(_Checked):
+    """Payload and tool centre point that the pendant must have for motion; a key that is absent is not compared."""
+
+    payload_kg: float | None = None
+    """Mass of the load."""
+    payload_cog_m: Three | None = None
+    """Centre of gravity of the load, from the flange."""
+    tcp_offset: Six | None = None
+    """Tool centre point from the flange: position in m, rotation vector in rad."""
+
+    def __post_init__(self) -> None:
+        """Refuse a negative load."""
+        if self.payload_kg is not None and self.payload_kg < 0:
+            raise ValueError(f"payload_kg must be at least 0, not {self.payload_kg:g}")
+
+
+@dataclass(frozen=True, slots=True)
 class UrSettings(_Checked):
     """The robot's address, its limits, and the deadlines of the driver."""
 
@@ -120,6 +137,8 @@ class UrSettings(_Checked):
     """The robot's name or address."""
     limits: UrLimits
     """Limits on commands and on measured states."""
+    tool: InstalledTool = InstalledTool()
+    """What the pendant must have for motion."""
     rate_hz: float = 125.0
     """Robot states per second."""
     watchdog_hz: float = 10.0

@@ -102,12 +102,14 @@ class Connections:
             self._full = False
             self._listener.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
 
-    def disconnect(self, descriptor: int) -> None:
-        """Disconnect the client with this descriptor; one that has disconnected already is left alone."""
+    def disconnect(self, descriptor: int) -> bool:
+        """Disconnect the client with this descriptor; return False if it has disconnected already."""
         with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as client:
             # The number may belong to another file by now.
             if _port(client) == _port(self._listener):
                 client.shutdown(socket.SHUT_RDWR)
+                return True
+        return False
 
     def close(self) -> None:
         """End the counting; the bound socket's owner closes it afterwards."""

@@ -38,6 +38,12 @@ def tiny_calibration(tiny_bank) -> Path:
     return path
 
 
+@pytest.fixture(scope="session")
+def ur_rtde() -> None:
+    """Skip a test whose configuration needs the robot's library."""
+    pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
+
+
 @pytest.fixture
 def config(tmp_path, tiny_bank, tiny_calibration) -> Callable[..., Path]:
     """Write a configuration of one fingertip, with changes to it, and return its path."""

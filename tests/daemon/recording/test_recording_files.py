@@ -6,7 +6,7 @@ import pytest
 from mcap.writer import Writer
 from scipy.io import savemat
 
-from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.config import RecordingConfig, load_daemon_config
 from shearloop.daemon.errors import UserError
@@ -68,12 +68,13 @@ def test_foreign_and_outdated_files_are_refused(tmp_path, monkeypatch, read):
         other = Writer(file)
         other.start()
         other.finish()
+    # The digest is cached in the table once it is read.
     for name, owner, key, value in (
-        ("stale", ChannelTable, "digest", "0" * 64),
+        ("stale", PAPER_TABLE, "digest", "0" * 64),
         ("old", schema, "FORMAT_VERSION", "1"),
     ):
         with monkeypatch.context() as outdated:
-            outdated.setattr(owner, key, value)
+            outdated.setitem(vars(owner), key, value)
             written(tmp_path / f"{name}.mcap")
     for name, why in (
         ("text", r"text\.mcap: this is not an MCAP file"),

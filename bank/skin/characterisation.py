@@ -30,7 +30,7 @@ from shearloop.bank.skin.plane_strain import (
     apply_load,
     condense,
     gauge_responses,
-    midline_strain,
+    line_strain,
     states_along,
     unloaded,
 )
@@ -199,12 +199,12 @@ class ResponseCurve:
 class Characterisation:
     """The table, and the data of figures 5 to 7.
 
-    `strain_profiles` is (11, m): ε_θθ at `midline_deg` under 1 N of normal force and 0, 0.1, … 1 N of shear.
+    `strain_profiles` is (11, m): ε_θθ at `line_deg` under 1 N of normal force and 0, 0.1, … 1 N of shear.
     `near_zero` and `wide` are loadings from zero under 1 N; `wide_by_normal` by normal force, up to 1.6 N.
     """
 
     rows: tuple[FigureOfMerit, ...]
-    midline_deg: FloatArray
+    line_deg: FloatArray
     strain_profiles: FloatArray
     near_zero: ResponseCurve
     wide: ResponseCurve
@@ -218,8 +218,8 @@ def characterise(rng: np.random.Generator) -> Characterisation:
     profiles = [pressed, *states_along(models.skin, 1.0, loading(1.0))]
     return Characterisation(
         rows=(*_model_rows(models, profiles[-1]), *_estimator_rows(models, rng)),
-        midline_deg=models.skin.midline_deg,
-        strain_profiles=np.array([midline_strain(models.skin, state) for state in profiles]),
+        line_deg=models.skin.line_deg,
+        strain_profiles=np.array([line_strain(models.skin, state) for state in profiles]),
         near_zero=models.curve(loading(0.15, 0.005), 1.0),
         wide=models.curve(loading(1.0, 0.02), 1.0),
         wide_by_normal={normal_n: models.curve(loading(1.6), normal_n) for normal_n in PAPER_MEASURED_SENSITIVITY},
@@ -263,8 +263,8 @@ def _model_rows(models: _Models, fully_loaded: ContactState) -> list[FigureOfMer
         slopes, name = (origin_slope(*line) for line in lines(normal_n)), "sensitivity, fit through origin"
         rows.append(FigureOfMerit(f"{name}, Fn = {normal_n} N", "1/N", "0.078", measured, *slopes))
     fitted = [fit_line(*line) for line in lines(1.0)]
-    strain = midline_strain(skin, fully_loaded)
-    flank = strain[(skin.midline_deg > 15) & (skin.midline_deg < 75)]
+    strain = line_strain(skin, fully_loaded)
+    flank = strain[(skin.line_deg > 15) & (skin.line_deg < 75)]
     falls = 100 * (1 - float(np.exp(-PAPER_SECTION.friction * np.radians(60))))
     strain_1, strain_2 = skin.gauge_weights @ strain
     without = sensitivity_per_n(replace(PAPER_SECTION, friction=0.0))

@@ -33,7 +33,8 @@ class Section:
     The paper's load coordinates, (0, −6.35) on the outer surface and (0, −6) on the mid-line, give the radii. They
     contradict its fabrication text (mid-line at 6.3 mm, 0.6 mm thick), but its computed results belong to them. The
     width is the sheet's, 20 mm, loaded evenly. The gauge strips are 3 mm long, 28.65° on the mid-line. The paper
-    places them "adjacent to the nail bed"; here they begin at 15°, two thicknesses clear of the bracket.
+    places them "adjacent to the nail bed"; here they begin at 15°, two thicknesses clear of the bracket. Their depth
+    counts from mid-thickness, outwards.
     """
 
     mid_radius_mm: float = 6.0
@@ -44,6 +45,7 @@ class Section:
     friction: float = 0.04
     gauge_from_deg: float = 15.0
     gauge_to_deg: float = 43.65
+    gauge_depth_mm: float = 0.0
     load_arc_deg: float = 5.0
 
     def __post_init__(self) -> None:
@@ -59,6 +61,10 @@ class Section:
             raise GeometryError(f"The skin's poisson_ratio is {self.poisson_ratio!r}; it must lie in [0, 0.5).")
         if not 0 <= self.friction <= 1:
             raise GeometryError(f"The skin's friction is {self.friction!r}; it must lie in [0, 1].")
+        if not abs(self.gauge_depth_mm) <= self.thickness_mm / 2:
+            raise GeometryError(
+                f"The skin's gauge_depth_mm {self.gauge_depth_mm} lies outside its thickness_mm {self.thickness_mm}."
+            )
         if not 0 < self.gauge_from_deg < self.gauge_to_deg < 90 - self.load_arc_deg / 2:
             raise GeometryError(
                 f"The gauge from {self.gauge_from_deg}° to {self.gauge_to_deg}° must lie between bracket (0°) and load."

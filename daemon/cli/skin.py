@@ -80,7 +80,12 @@ def _calibrate(args: argparse.Namespace) -> int:
         raise UserError(f"{args.table}: {error}") from error
     save_calibration(calibration, args.out)
     source = "fitted" if args.friction is None else "given"
-    named = ("friction", "slope_per_n", "prediction_half_width_n", "linear_to_n", "rows", "rows_beyond")
+    named = (
+        "friction", "slope_per_n", "prediction_half_width_n", "linear_to_n", "slack_ratio", "gauge_depth_mm",
+        "rows", "rows_beyond",
+    )  # fmt: skip
+    depth_mm = calibration.gauge_depth_mm
+    depth = "not that of a depth in the paper's skin" if depth_mm is None else f"{1e3 * depth_mm:+.0f} µm"
     result = {
         "path": str(args.out),
         "friction_given": args.friction is not None,
@@ -93,6 +98,8 @@ def _calibrate(args: argparse.Namespace) -> int:
         f"95 % prediction interval             ± {calibration.prediction_half_width_n:.4f} N",
         f"straight to {calibration.linear_to_n} N; tension calibrated  "
         f"{calibration.tension_n[0]:.2f} … {calibration.tension_n[-1]:.2f} N",
+        f"slack gauge's share of the stretched {calibration.slack_ratio:+.3f}",
+        f"gauge depth outwards from mid-skin    {depth}",
         f"rows fitted                          {calibration.rows}",
         f"rows left out beyond the curve       {calibration.rows_beyond}",
         f"written: {args.out}",

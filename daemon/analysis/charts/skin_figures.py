@@ -53,7 +53,7 @@ def _figure_5(found: Characterisation) -> Figure:
     last = len(found.strain_profiles) - 1
     for i, profile in enumerate(found.strain_profiles):
         shade = 0.25 + 0.75 * i / last
-        axes.plot(found.midline_deg, 100 * profile, color=TWO_D, alpha=shade, lw=1.2)
+        axes.plot(found.line_deg, 100 * profile, color=TWO_D, alpha=shade, lw=1.2)
     tip = 60, 100 * found.strain_profiles[last].max() * 0.75
     axes.annotate("", xy=tip, xytext=(60, 0.15), arrowprops={"arrowstyle": "->", "color": GREY})
     axes.text(47, 4.9, "Ft = 0, 0.1, … 1 N", color=GREY)

@@ -31,17 +31,8 @@ system-packages:
 	[ -z "$$missing" ] || { apt-get update -qq -o Acquire::Retries=2 -o Acquire::http::Timeout=30 && apt-get install -y -qq --no-install-recommends $$missing; }
 
 # The whole emulated rig; with RECORDING=FILE one fingertip that plays a recorded stream (.mat).
-DEMO := $(if $(RECORDING),config/fingertip_demo.yaml --recording '$(RECORDING)',config/demo.yaml)
-demo: install run/demo.bank $(if $(RECORDING),,run/rig.cal)
-	$(BIN)/shearloop run $(DEMO) --show
-
-# Recordings of the emulated rig, and the calibrations made from them.
-run/rig.cal: run/demo.bank src/shearloop/daemon/cli/calibrate_demo.py | install
-	$(BIN)/python -m shearloop.daemon.cli.calibrate_demo --bank $< --out run
-
-run/demo.bank: config/banks/demo.yaml config/fingertips/paper.yaml | install
-	mkdir -p run
-	$(BIN)/shearloop bank build --config $< --out $@
+demo: install
+	$(BIN)/shearloop demo --folder . $(if $(RECORDING),--recording '$(RECORDING)')
 
 # Test files run in parallel, the longest first (tests/conftest.py). Tests that drive a robot run afterwards with less
 # load, because a robot stops when its computer is busy; they may be repeated twice, and the summary names them. Status 5:

@@ -6,7 +6,7 @@ The real daemon in its own process and the real drivers, with the rig emulated o
 the middle of a slow twist. Measured is the time until `loop.state` reports the response, in periods of the failed
 sensor's or device's topic, and whether the next experiment completes once the fault is gone. Finally the daemon is
 killed with SIGKILL in the middle of a fast twist, and the emulated robot reports when it stood still. `--rig` is the
-folder of `shearloop.daemon.cli.calibrate_demo`, with demo.bank and rig-right.cal.
+folder `run` of `shearloop demo --prepare`, with demo.bank and rig-right.cal.
 """
 
 import json
@@ -122,9 +122,7 @@ class RunningRig:
 
 def _experiment(folder: Path, name: str, *steps: dict[str, Any]) -> Path:
     path = folder / f"{name}.yaml"
-    # The estimator needs seven seconds of the grip.
-    grip = [{"do": "grip", "width_mm": 5, "force_n": 60}, {"do": "wait", "wait_s": 8}]
-    begin = [{"do": "release"}, {"do": "tare"}, *grip]
+    begin = [{"do": "release"}, {"do": "tare"}, {"do": "grip", "width_mm": 5, "force_n": 60}]
     content = {"name": name, "torque_source": "load_cell", "limits": {"torque_nm": 0.3}, "steps": [*begin, *steps]}
     path.write_text(yaml.safe_dump(content))
     return path

@@ -22,7 +22,7 @@ from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFrame
 from shearloop.daemon.analysis.charts import simulated_loop as sim
 from shearloop.daemon.analysis.creep import Stretch, fit_creep
-from shearloop.daemon.cli.calibrate_demo import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
+from shearloop.daemon.cli.emulated_calibration import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
 from shearloop.daemon.control.loop_inputs import Creep, LoopConfig
 from shearloop.daemon.control.margins import margin_refusal
 from shearloop.daemon.synthetic_frames import RigFrames

@@ -26,9 +26,9 @@ Measure = Annotated[float, Field(gt=0, le=100)]
 class GridConfig(ConfigModel):
     """`count` values from `low` to `high`, both included; a single one where the two are the same."""
 
-    low: Annotated[float, Field(ge=-1000, le=1000)]
-    high: Annotated[float, Field(ge=-1000, le=1000)]
-    count: Annotated[int, Field(ge=1, le=2000)]
+    low: float = Field(ge=-1000, le=1000, description="the first value")
+    high: float = Field(ge=-1000, le=1000, description="the last value")
+    count: int = Field(ge=1, le=2000, description="number of values")
 
     @model_validator(mode="after")
     def _ascends(self) -> Self:
@@ -46,7 +46,7 @@ class GridConfig(ConfigModel):
 class MeshFileConfig(ConfigModel):
     """A mesh file: .npz or EIDORS .mat."""
 
-    file: Path
+    file: Path = Field(description="the mesh: .npz or EIDORS .mat")
 
 
 class OverConfig(ConfigModel):
@@ -56,13 +56,13 @@ class OverConfig(ConfigModel):
     replace the fingertip's.
     """
 
-    amplitude: GridConfig | None = None
-    offset: GridConfig | None = None
-    tilt_deg: GridConfig | None = None
-    width_cm: GridConfig | None = None
-    height_cm: GridConfig | None = None
-    electrode_width_cm: GridConfig | None = None
-    contact_impedance: GridConfig | None = None
+    amplitude: GridConfig | None = Field(None, description="factor of the basis model f")
+    offset: GridConfig | None = Field(None, description="change of the whole conductivity")
+    tilt_deg: GridConfig | None = Field(None, description="angle of the axis of f")
+    width_cm: GridConfig | None = Field(None, description="width of the fingertip")
+    height_cm: GridConfig | None = Field(None, description="height of the fingertip")
+    electrode_width_cm: GridConfig | None = Field(None, description="width of each electrode")
+    contact_impedance: GridConfig | None = Field(None, description="of each contact, in cm over the conductivity")
 
     @field_validator("tilt_deg")
     @classmethod
@@ -90,13 +90,13 @@ class BankConfig(ConfigModel):
     With `over`, a folder of banks.
     """
 
-    mesh: MeshFileConfig | None = None
-    fingertip: Path | None = None
-    mesh_size_cm: MeshSize | None = None
-    model: ModelName
-    k: GridConfig
-    sigma: GridConfig
-    over: OverConfig | None = None
+    mesh: MeshFileConfig | None = Field(None, description="a mesh from a file; else `fingertip`")
+    fingertip: Path | None = Field(None, description="the fingertip's dimensions, a file; else `mesh`")
+    mesh_size_cm: MeshSize | None = Field(None, description="largest distance of mesh lines (default: the fingertip's)")
+    model: ModelName = Field(description="basis model of the conductivity's change")
+    k: GridConfig = Field(description="the model's first parameter, in cm")
+    sigma: GridConfig = Field(description="the model's second parameter, in cm")
+    over: OverConfig | None = Field(None, description="further parameters: one bank for each combination")
 
     @model_validator(mode="after")
     def _is_of_one_geometry(self) -> Self:
@@ -122,19 +122,19 @@ class BankConfig(ConfigModel):
 class ElectrodeRunConfig(ConfigModel):
     """Successive electrodes on one side, by their centres along it."""
 
-    side: Side
-    centres_cm: Annotated[list[Annotated[float, Field(ge=0, le=100)]], Field(min_length=1)]
+    side: Side = Field(description="side of the fingertip")
+    centres_cm: list[Annotated[float, Field(ge=0, le=100)]] = Field(min_length=1, description="electrodes' centres")
 
 
 class FingertipGeometryConfig(ConfigModel):
     """A rectangular fingertip with electrodes along its edge."""
 
-    width_cm: Measure
-    height_cm: Measure
-    electrode_width_cm: Measure
-    contact_impedance: Annotated[float, Field(gt=0, le=1000)]
-    mesh_size_cm: MeshSize
-    electrodes: list[ElectrodeRunConfig]
+    width_cm: Measure = Field(description="width of the fingertip")
+    height_cm: Measure = Field(description="height of the fingertip")
+    electrode_width_cm: Measure = Field(description="width of each electrode")
+    contact_impedance: float = Field(gt=0, le=1000, description="of each contact, in cm over the conductivity")
+    mesh_size_cm: MeshSize = Field(description="largest distance of mesh lines")
+    electrodes: list[ElectrodeRunConfig] = Field(description="the 32 electrodes in order, from the lower left corner")
 
     def fingertip(self) -> Fingertip:
         """Return the fingertip; raises GeometryError for electrodes that are not 32, leave their side or overlap."""

@@ -150,7 +150,7 @@ class Rig:
         stops_before, file = self._stops, read_experiment(path)
         reason = await self.runner.start(file)
         if reason is None and self._stops != stops_before:
-            self.control_loop.stop("the operator stopped it")
+            self.runner.stop("the operator stopped it")
             return "it was stopped during its start"
         if reason is None and self._recorder is not None:
             self._recorder.record_experiment(file.name, attached, experiment_notes(file))
@@ -162,14 +162,14 @@ class Rig:
         experiment = self.control_loop.experiment
         if experiment is None or not experiment.running:
             return ""
-        self.control_loop.stop("the operator stopped it")
+        self.runner.stop("the operator stopped it")
         return experiment.file.name
 
     def close(self) -> None:
         """Stop the running experiment at the daemon's end."""
         experiment = self.control_loop.experiment
         if experiment is not None and experiment.running:
-            self.control_loop.stop("the daemon ended: the wrist is stopped, a gripped tool stays gripped")
+            self.runner.stop("the daemon ended: the wrist is stopped, a gripped tool stays gripped")
             # The loop is cancelled before the next state.
             self.runner.decide_now()
 

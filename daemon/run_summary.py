@@ -1,4 +1,4 @@
-"""The summary of an experiment, printed at its end and made from the daemon's own messages.
+"""The summary of an experiment, made from the daemon's own messages at its end.
 
 An emulated rig adds the true torque and the disturbances.
 """
@@ -55,7 +55,7 @@ class _StepSummary:
     wrist_to_rad: float | None = None
 
 
-class Emulated(Protocol):
+class EmulatedRig(Protocol):
     """An emulated rig; `sent` holds the disturbances, with their times in ns."""
 
     sent: list[tuple[int, str]]
@@ -80,9 +80,11 @@ class _Run:
 
 
 class RunSummary:
-    """Collects every message of a daemon and writes the summary when an experiment ends."""
+    """Collects every message of a daemon; `text` is the summary of the last experiment that ended, or empty."""
 
-    def __init__(self, out: "TextIO | NonBlockingWriter", emulated: Emulated | None = None) -> None:
+    def __init__(self, out: "TextIO | NonBlockingWriter | None" = None, emulated: EmulatedRig | None = None) -> None:
+        """Take the output for each summary, if any, and an emulated rig, which adds its true torque."""
+        self.text = ""
         self._out = out
         self._emulated = emulated
         self._run: _Run | None = None
@@ -91,6 +93,8 @@ class RunSummary:
         """Handle one message."""
         if topic == "loop.state":
             self._on_loop_state(content)
+        elif topic == "loop.stop":
+            self._out.write(f"{stop_sentence(content)}\n")
         elif self._run is not None:
             _on_sample(self._run, topic, content)
 
@@ -105,7 +109,18 @@ class RunSummary:
             self._run = None
             rig = self._emulated
             lines = _lines(run, None, ()) if rig is None else _lines(run, rig.torques(), rig.sent)
-            self._out.write("\n".join(("", *lines, "", "")))
+            self.text = "\n".join(lines)
+            if self._out is not None:
+                self._out.write(f"\n{self.text}\n\n")
+
+
+def stop_sentence(content: Mapping[str, Any]) -> str:
+    """Return the times of a `loop.stop` message in words."""
+    sent, stands = (
+        f"{after} {content[key]:.3f} s" if content[key] is not None else f"{after} an unknown time"
+        for key, after in (("sent_after_s", "sent after"), ("stands_after_s", "standstill after"))
+    )
+    return f"The stop, from its cause: decided after {content['decided_after_s']:.3f} s, {sent}, {stands}."
 
 
 def _on_sample(run: _Run, topic: str, content: Mapping[str, Any]) -> None:

@@ -29,12 +29,15 @@ _LARGEST_APART = 0.75
 _MOMENTARY = 0.05
 
 
-def read_series(path: Path, sides: tuple[str, ...] | None = None, tool_mm: float | None = None) -> list[FrameSeries]:
+def read_series(
+    path: str | Path, sides: tuple[str, ...] | None = None, tool_mm: float | None = None
+) -> list[FrameSeries]:
     """Return the series of a recording, of a folder of slices, or of a folder with torque_slices and diameter_slices.
 
     `sides` selects the sides of a recording, by default all; `tool_mm` is the diameter of its tool, if the recording
     does not name it. Raises UserError for anything else.
     """
+    path = Path(path)
     if not path.is_dir():
         return [series_of(read_recording(path), sides, tool_mm)]
     inside = [path / name for name in (TORQUE_FOLDER, DIAMETER_FOLDER) if (path / name).is_dir()]

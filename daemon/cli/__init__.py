@@ -29,6 +29,8 @@ class Command(NamedTuple):
 COMMANDS = {
     name: Command(f"shearloop.daemon.{module}", summary)
     for name, module, summary in (
+        ("demo", "cli.demo", "run the whole rig, emulated, in closed loop"),
+        ("init", "cli.init", "write a commented configuration and experiments to start from"),
         ("run", "cli.run", "run the daemon that a configuration describes"),
         ("import", "cli.recording", "convert the paper's MATLAB streams into a recording"),
         ("recording", "cli.recording", "inspect recordings, repair them, and export them as tables"),
@@ -36,6 +38,7 @@ COMMANDS = {
         ("evaluate", "cli.evaluate", "judge a calibrated estimator on recordings or slices"),
         ("chart", "cli.chart", "chart speed against accuracy, stability, and how much model is needed"),
         ("check", "cli.check", "check a configuration and the files it names"),
+        ("schema", "cli.schema", "print the JSON Schema of a configuration, an experiment or another file"),
         ("listen", "cli.listen", "print what a running daemon publishes"),
         ("command", "cli.command", "send a command to a running daemon: tare, start, pause, stop, unlock …"),
         ("view", "cli.view", "show a running daemon as a page in the browser, with a stop button"),
@@ -57,9 +60,9 @@ EXIT_OK, EXIT_USAGE = 0, 2
 # Of `run`: the experiment of `stop_when_done` did not finish.
 EXIT_UNFINISHED = 3
 
-_FIRST_STEPS = """First steps with your own devices:
-`shearloop ports` shows their names, `shearloop check CONFIG` checks the configuration,
-`shearloop doctor CONFIG` finds faults of cables and devices."""
+_FIRST_STEPS = """First steps without devices: `shearloop demo`.
+With your own: `shearloop init DIR` writes a configuration, `shearloop ports` shows the devices' names,
+`shearloop check CONFIG` checks the configuration, `shearloop doctor CONFIG` finds faults of cables and devices."""
 
 
 class Parser(argparse.ArgumentParser):

@@ -98,7 +98,7 @@ def _build_all(args: argparse.Namespace) -> int:
                 yield rows[number], cells
 
         for path, plan in zip(paths, plans.values(), strict=True):
-            if len(paths) > 1 and _is_built(path, plan):
+            if len(paths) > 1 and is_built(path, plan):
                 built.append(path)
                 continue
             try:
@@ -137,8 +137,8 @@ def _paths(out: Path, names: list[str]) -> list[Path]:
     return [out / f"{name}.bank" for name in names]
 
 
-def _is_built(path: Path, plan: "BankPlan") -> bool:
-    """Return whether an earlier build of a folder has finished this bank."""
+def is_built(path: Path, plan: "BankPlan") -> bool:
+    """Return whether an earlier build has finished this bank."""
     from shearloop.bank.eit.bank_file import Bank
     from shearloop.bank.errors import BankFileError
 

@@ -3,9 +3,12 @@
 import argparse
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from shearloop.daemon.cli.options import add_connection, add_option, client_keys
+from shearloop.daemon.cli.terminal import table, task_row
 from shearloop.daemon.messaging import addresses
 
 COMMANDS = {
@@ -75,7 +78,16 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({"ok": accepted, **reply}, ensure_ascii=False))
     elif accepted:
-        print(f"{args.name}: done" if not reply else f"{args.name}: {json.dumps(reply, ensure_ascii=False, indent=2)}")
+        print(*_lines(args.name, reply), sep="\n")
     else:
         print(f"shearloop command: {args.name} was refused: {reply.get('reason')}", file=sys.stderr)
     return 0 if accepted else 1
+
+
+def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
+    """Return an accepted reply as text: the tasks of `status` as a table."""
+    if name == "status":
+        rows = [task_row(task, facts) for task, facts in reply["tasks"].items()]
+        return table(("task", "state", "rate", "notes"), rows)
+    values = {key: ", ".join(value) if isinstance(value, list) else value for key, value in reply.items()}
+    return [f"{name}: {', '.join(f'{key} {value}' for key, value in values.items() if value) or 'done'}"]

@@ -25,7 +25,7 @@ from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.messages import ActivationStatus
-from shearloop.drivers.ur.controller import query_controller
+from shearloop.drivers.ur.controller import query_controller, untested_sentence
 from shearloop.drivers.ur.settings import read_settings
 
 # A larger relative difference between measured and configured rate is reported.
@@ -202,7 +202,12 @@ def _check_robot(settings: Path) -> Iterator[Finding]:
     except DriverError as error:
         yield from_error("robot", error, "the robot cannot be driven")
         return
-    yield good("robot", f"{host} answers, PolyScope {seen.version}")
+    answers = f"{host} answers, PolyScope {seen.version}"
+    if untested := untested_sentence(seen.version):
+        what, _, cure = untested.rpartition(": ")
+        yield note("robot", answers, what, cure.rstrip("."))
+    else:
+        yield good("robot", answers)
     if seen.remote is False:
         means = "it accepts no motion from the network"
         cure = "switch it to remote control, top right on the teach pendant"

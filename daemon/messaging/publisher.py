@@ -19,6 +19,8 @@ from shearloop.daemon.messaging.messages import TOPICS, Message, encode, wire_ma
 HIGH_WATER_MARK = 1000
 # A subscription is a topic's beginning, after about 300 bytes of CURVE handshake. Longer ones end the connection.
 LARGEST_SUBSCRIPTION_BYTES = 1024
+# The last messages may wait this long for their subscribers.
+LINGER_MS = 200
 # Subscriptions read at a time, so that a subscriber that keeps changing them cannot block the publisher.
 SUBSCRIPTIONS_AT_ONCE = 100
 Listener: TypeAlias = Callable[[str, dict[str, Any]], None]
@@ -75,8 +77,8 @@ class Publisher:
         return bool(self._prefixes)
 
     def close(self) -> None:
-        """Close the socket; unsent messages are dropped."""
-        self._socket.close()
+        """Close the socket; subscribers have a moment to take the last messages."""
+        self._socket.close(linger=LINGER_MS)
 
     def _read_subscriptions(self) -> None:
         for _ in range(SUBSCRIPTIONS_AT_ONCE):

@@ -114,7 +114,15 @@ def open_recording(path: Path) -> Iterator[OpenRecording]:
     """Open a closed recording; raises UserError, also for errors while it is read in the block."""
     with reading(path), path.open("rb") as file:
         check_magic(path, file)
-        yield OpenRecording(file)
+        recording = OpenRecording(file)
+        try:
+            yield recording
+        except schema.UnknownTopicError as error:
+            written = recording.metadata().get(schema.METADATA, {}).get("software", "unknown")
+            raise UserError(
+                f"{path}: shearloop {schema.software_version()} has no topic {str(error)!r}; version {written} wrote "
+                "this recording: read it with that version, or export other topics"
+            ) from error
 
 
 def check_magic(path: Path, file: IO[bytes]) -> None:

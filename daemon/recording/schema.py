@@ -50,6 +50,10 @@ _SCALARS = {float: "number", int: "integer", str: "string", bool: "boolean"}
 _TIME = {"type": "integer", "description": "CLOCK_MONOTONIC in ns"}
 
 
+class UnknownTopicError(Exception):
+    """A recording has a topic that this version does not have."""
+
+
 class NoJsonError(ValueError):
     """A value cannot be written as JSON."""
 
@@ -96,7 +100,7 @@ def input_topic(source: str) -> str:
 
 
 def schema_name(topic: str) -> str:
-    """Return the name of a recorded topic's schema; raises KeyError for an unknown topic."""
+    """Return the name of a recorded topic's schema; raises UnknownTopicError for another."""
     if topic == CLOCK_TOPIC or topic in TOPICS:
         return topic
     if topic.startswith(f"{INPUT}."):
@@ -104,7 +108,7 @@ def schema_name(topic: str) -> str:
     for live in _FINGERTIP_TOPICS:
         if topic.startswith(f"{live}."):
             return live
-    raise KeyError(topic)
+    raise UnknownTopicError(topic)
 
 
 @cache

@@ -33,6 +33,8 @@ _MATCHERS: Mapping[str, type[PrunedMatcher | PrunedZeroLagMatcher]] = {
 }
 # Matchers in use have no state, so fingertips with the same bank share one.
 _in_use: WeakValueDictionary[tuple[str, str], PrunedMatcher | PrunedZeroLagMatcher] = WeakValueDictionary()
+# After a grip some frames are disturbed or missing.
+_WARM_UP_SHARE = 2.0
 
 
 class FrameEstimator:
@@ -65,6 +67,11 @@ class FrameEstimator:
     def measures_torque(self) -> bool:
         """Whether it gives torques, and not only diameters or the bank match."""
         return self.calibration.torque is not None
+
+    @property
+    def warm_up_frames(self) -> int:
+        """The gripped frames that the first torque after a grip needs."""
+        return self.calibration.estimator.motion.n_lags + 1
 
     @property
     def assumptions(self) -> str:
@@ -180,13 +187,18 @@ def torque_sources(
             period_s=own.frame_period_s,
             window_s=own.frame_period_s * own.average_frames,
             measures_torque=estimators[name].measures_torque,
+            warm_up_s=_WARM_UP_SHARE * estimators[name].warm_up_frames * own.frame_period_s,
         )
         for name, own in config.fingertips.items()
     }
     if combined is not None:
         period_s = max(own.frame_period_s for own in config.fingertips.values())
         sources[COMBINED] = TorqueSource(
-            name=COMBINED, period_s=period_s, window_s=period_s, measures_torque=combined.measures_torque
+            name=COMBINED,
+            period_s=period_s,
+            window_s=period_s,
+            measures_torque=combined.measures_torque,
+            warm_up_s=_WARM_UP_SHARE * combined.warm_up_frames * period_s,
         )
     if config.skin is not None and (skin := skin_source(config.skin)) is not None:
         sources[skin.name] = skin

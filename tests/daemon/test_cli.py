@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from io import StringIO
 from pathlib import Path
 from typing import Any, NoReturn
 from unittest.mock import Mock
@@ -24,7 +25,7 @@ from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import COMMANDS, main
 from shearloop.daemon.cli.bank import MODEL_NAMES
 from shearloop.daemon.cli.completion import full_parser
-from shearloop.daemon.cli.terminal import message_json, message_line
+from shearloop.daemon.cli.terminal import StatusLine, message_json, message_line, table, task_row
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.runner import WRENCH
 from shearloop.daemon.messaging.messages import EitEstimate, decode, encode, wire_map
@@ -267,6 +268,34 @@ def test_messages_are_readable():
     assert message_json("eit.estimate", content).startswith('{"topic": "eit.estimate", "timestamp": 0.0')
     invalid = {**content, "valid": False, "reason": "no signal"}
     assert message_line("eit.estimate", invalid).endswith("no estimate: no signal")
+
+
+def test_tasks_are_told_in_words_without_what_is_not_known():
+    facts = {"alive": True, "done": False, "restarts": 0, "last_error": "", "rate_hz": None, "errors": {}}
+    for changes, told in (
+        ({}, ("alive", "", "")),
+        ({"rate_hz": 1.85, "expected_hz": 1.849}, ("alive", "1.85 Hz of 1.85", "")),
+        ({"connected": True, "errors": {"unreachable": 1}}, ("alive", "", "reconnected once")),
+        ({"connected": True, "connections": 3}, ("alive", "", "reconnected twice")),
+        ({"connected": False, "error": "No board."}, ("not connected", "", "No board.")),
+        ({"errors": {"nan": 3}, "restarts": 1}, ("alive", "", "restarted once, nan 3 times")),
+        ({"alive": False, "last_error": "ValueError"}, ("DEAD", "", "ValueError")),
+        ({"alive": False, "done": True}, ("done", "", "")),
+    ):
+        assert task_row("right", {**facts, **changes})[1:] == told
+    assert table(("a", "b"), [("longer", "x")]) == ["a       b", "longer  x"]
+
+
+def test_the_status_line_is_redrawn_in_place():
+    out = StringIO()
+    state = {"experiment": "one", "step": 2, "steps": 3, "step_name": "grip", "progress": 0.5, "reasons": ""}
+    with StatusLine(out) as line:
+        line("loop.state", {**state, "phase": "running", "activity": "closing", "torque_source": "right"})
+        for source, valid in (("right", True), ("left", True), ("right", False)):
+            line("eit.estimate", {"source": source, "valid": valid, "torque_nm": 0.1})
+    _, starting, *shown, end = out.getvalue().split("\r\x1b[K")
+    running = "running 50 %  step 2 of 3 grip  closing"
+    assert (starting, shown, end) == ("starting", [running, f"{running}   right +0.100 N·m", running], "")
 
 
 def test_invalid_emulators_and_recordings_are_refused_before_the_start(config, tmp_path, capsys):

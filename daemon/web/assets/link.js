@@ -5,6 +5,8 @@ const RETRY_MS = 500;
 const LOST_AFTER_S = 1.0;
 // Messages that are further from now come from a replay; a step back by more than this starts it again.
 const REPLAYED_S = 5.0;
+// The arrival of one message, found twice, differs by less.
+const SAME_S = 0.2;
 
 const seconds = () => performance.now() / 1000;
 
@@ -65,20 +67,29 @@ export class Link {
 
   sinceDaemon() { return this.daemonAt === null ? Infinity : seconds() - this.daemonAt; }
 
-  // live; dead: no message from the daemon; lost: no message from the viewer.
+  // live; ended: the daemon said that it ends; dead: no message from the daemon; lost: no message from the viewer.
   state() {
     if (this.sinceBatch() > LOST_AFTER_S) {
       // Close a socket that is open but silent, as after the computer slept.
       if (this.batchAt !== null && this.sinceBatch() > 3 && this.socket.readyState === WebSocket.OPEN) this.socket.close();
       return this.batchAt === null ? "connecting" : "lost";
     }
+    if (this.end()) return "ended";
     return this.sinceDaemon() > this.settings.dead_after_s ? "dead" : "live";
+  }
+
+  // The daemon's last message, until another one arrives.
+  end() {
+    const end = this.get("daemon.end");
+    return end && this.daemonAt - end.at < SAME_S ? end : undefined;
   }
 
   ageOf(message) { return seconds() - message.at; }
 
   // Whether a message is stale.
   isOld(message) {
+    const end = this.end();
+    if (end && this.state() === "ended") return end.at - message.at > this.staleAfter(message);
     return this.state() !== "live" || this.ageOf(message) > this.staleAfter(message);
   }
 

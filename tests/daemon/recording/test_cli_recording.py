@@ -111,3 +111,16 @@ def test_mistakes_end_in_one_sentence(arguments, message, recording, tmp_path, c
     assert main(["recording", *given]) == 2
     assert message in capsys.readouterr().err
     assert not list(tmp_path.glob("*.tmp"))
+
+
+def test_a_topic_of_another_version_is_named(tmp_path, capsys, monkeypatch):
+    path = tmp_path / "new.mcap"
+    with monkeypatch.context() as newer:
+        newer.setattr("shearloop.daemon.recording.schema.schema_name", lambda _: "load.torque")
+        newer.setattr("shearloop.daemon.recording.schema.software_version", lambda: "99.1")
+        with RecordingWriter(path, "a bench") as writer:
+            writer._add("arm.temperature", 10**18, {"torque_nm": 0.5})
+    assert main(["recording", "export", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert "has no topic 'arm.temperature'; version 99.1 wrote this recording" in said
+    assert "KeyError" not in said

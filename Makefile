@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS := 1
 # Without bytecode files every test process would compile all modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install install-dev system-packages demo docs test lint format clean
+.PHONY: install install-dev system-packages demo docs docs-site test test-fast lint format clean
 
 # `install` is for running and drawing; `install-dev` adds the tools of tests and checks.
 install: $(VENV)/.installed
@@ -42,6 +42,17 @@ test: install-dev
 	$(PYTEST) -n 3 --dist loadfile --no-loadscope-reorder -m 'not real_time' $(PYTEST_ARGS) || [ $$? -eq 5 ]
 	$(PYTEST) -n 2 --dist loadfile --no-loadscope-reorder -m real_time --reruns 2 --reruns-delay 2 -rR $(PYTEST_ARGS) || [ $$? -eq 5 ]
 
+# What depends most on the versions of Python and of the libraries; nothing in real time.
+FAST := tests/test_package.py $(addprefix tests/bank/test_,bank_file.py forward.py matching.py models.py) \
+	$(addprefix tests/bank/estimation/test_,archive.py heads.py intervals.py values.py) \
+	$(wildcard tests/drivers/test_*.py) tests/drivers/shear_skin \
+	$(addprefix tests/drivers/ur/test_,limits.py messages.py settings.py) tests/daemon/messaging \
+	$(addprefix tests/daemon/recording/test_,replay.py schemas.py tools.py) \
+	$(addprefix tests/daemon/cli/test_,json.py start.py) \
+	$(addprefix tests/daemon/test_,completion.py config_file.py docgen.py garbage_collection.py settings.py)
+test-fast: install-dev
+	$(PYTEST) -n 3 --dist loadfile -m 'not real_time' $(PYTEST_ARGS) $(FAST)
+
 lint: install-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -55,6 +66,10 @@ format: install-dev
 # The generated pages.
 docs: install
 	$(BIN)/python -m shearloop.daemon.docgen
+
+# The pages as a site in build/site; every warning is an error. The variable silences an advertisement.
+docs-site: install-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

@@ -15,10 +15,10 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
-from shearloop.daemon.messaging.addresses import local_stop_address
 from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import CurveAuthenticator, Refusals, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
+from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.recording.recorder import Recorder, daemon_identity
 from shearloop.daemon.rig import Rig, check_experiment, make_gripper, make_loop
@@ -81,11 +81,8 @@ class Daemon:
             self.commands = Commands(self._rig, self.sensors, self._experiment, self.health, self._stop)
             server = CommandServer(context, config.commands, self.commands.handlers(), refusals, keys)
             opened.callback(server.close)
-            open_stop: CommandServer | None = None
-            if "commands" in config.network_addresses:
-                address = local_stop_address(config.commands)
-                open_stop = CommandServer(context, address, self.commands.open_handlers(), refusals)
-                opened.callback(open_stop.close)
+            stop_socket = StopSocket(server.address, self.commands.open_handlers(), refusals)
+            opened.callback(stop_socket.close)
             self._close = opened.pop_all().close
         tasks: dict[str, Task | None] = {
             **self.sensors.tasks(),
@@ -94,7 +91,8 @@ class Daemon:
             "recording": RecordingTask(self.recorder, self._rig) if self.recorder is not None else None,
             "keys": authenticator,
             "commands": server,
-            "open_stop": open_stop,
+            "stop": stop_socket,
+            "publish": self.publisher,
             "health": self.health,
         }
         self._tasks = {name: task for name, task in tasks.items() if task is not None}

@@ -94,7 +94,7 @@ class RunSummary:
         if topic == "loop.state":
             self._on_loop_state(content)
         elif topic == "loop.stop":
-            self._out.write(f"{stop_sentence(content)}\n")
+            self._write(f"{stop_sentence(content)}\n")
         elif self._run is not None:
             _on_sample(self._run, topic, content)
 
@@ -110,8 +110,11 @@ class RunSummary:
             rig = self._emulated
             lines = _lines(run, None, ()) if rig is None else _lines(run, rig.torques(), rig.sent)
             self.text = "\n".join(lines)
-            if self._out is not None:
-                self._out.write(f"\n{self.text}\n\n")
+            self._write(f"\n{self.text}\n\n")
+
+    def _write(self, text: str) -> None:
+        if self._out is not None:
+            self._out.write(text)
 
 
 def stop_sentence(content: Mapping[str, Any]) -> str:

@@ -230,7 +230,7 @@ def _peak(shifts_s: FloatArray, explained: FloatArray) -> float:
 
 
 def _moves(t_s: FloatArray, channels: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return the motion of (n, 896) frames from each to the next, (n − 1, p), its times, and its duration."""
+    """Return the motion of (n, c) frames from each to the next, (n − 1, p), its times, and its duration."""
     frames = channels / np.where(np.isfinite(noise := channel_noise(channels)), noise, 1e9)
     moved = np.diff(frames, axis=0)
     size = np.linalg.norm(moved, axis=1)

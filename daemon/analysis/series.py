@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
-from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.estimation import FrameSeries, Measured
 from shearloop.bank.estimation.calibration import LARGEST_TOOL_SHARE
 from shearloop.daemon.errors import UserError
@@ -83,11 +82,12 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_m
         "raw",
         wanted,
         t_s,
-        np.stack([channels_of_line(one) for one in lines], axis=1),
+        np.stack([recording.table.channels_of_line(one) for one in lines], axis=1),
         (recording.torque_t_ns - start) / 1e9,
         recording.torque_nm,
         np.full(len(t_s), diameter_mm),
         gripper_mm,
+        recording.table,
     )
 
 

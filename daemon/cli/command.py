@@ -55,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
     """Send one command and print its reply; status 1 if the daemon refused it."""
 
     from shearloop.daemon.messaging.client import check_timeout_s, send_command
+    from shearloop.daemon.messaging.stop_socket import send_to_stop_socket
 
     arguments = {} if args.source is None else {"source": args.source}
     if args.heatmap is not None:
@@ -62,18 +63,19 @@ def run(args: argparse.Namespace) -> int:
     if args.experiment is not None:
         # The daemon may run in another folder.
         arguments["experiment"] = str(args.experiment.resolve())
-    address, keys = args.connect, None
+    address, keys, request, reply = args.connect, None, {"command": args.name, **arguments}, None
+    timeout_s = addresses.COMMAND_TIMEOUT_S if args.timeout is None else check_timeout_s(args.timeout)
     if args.name in ("stop", "status") and args.key is None and not addresses.needs_keys(address):
         # These two need no key on the daemon's own machine.
-        address = addresses.stop_address(address)
+        reply = send_to_stop_socket(address, request, timeout_s)
     else:
         keys = client_keys(args)
-    timeout_s = addresses.COMMAND_TIMEOUT_S if args.timeout is None else check_timeout_s(args.timeout)
     if args.name == "unlock" and args.timeout is None:
         # A missing daemon is reported without the long timeout.
         send_command(address, {"command": "status"}, addresses.COMMAND_TIMEOUT_S, keys)
         timeout_s = addresses.UNLOCK_TIMEOUT_S
-    reply = send_command(address, {"command": args.name, **arguments}, timeout_s, keys)
+    if reply is None:
+        reply = send_command(address, request, timeout_s, keys)
     accepted = bool(reply.pop("ok", False))
     if args.json:
         print(json.dumps({"ok": accepted, **reply}, ensure_ascii=False))

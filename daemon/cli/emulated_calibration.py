@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.bank.eit.channels import channels_of_line
+from shearloop.bank.eit.channels import ChannelTable
 from shearloop.bank.estimation import Calibration, FrameSeries, fit, measure_timing
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.series import series_of
@@ -47,7 +47,7 @@ Sides = tuple[str, ...]
 
 
 def lines_of(scene: Scene, frames: RigFrames) -> list[NDArray[np.float64]]:
-    """Return the lines of both boards, (1024,) in volts, for frames that end now."""
+    """Return the lines of both boards, (v,) in volts, for frames that end now."""
     gel = scene.frame(FRAME_PERIOD_S)
     return [frames.line(gel.grip, sign * gel.shear_torque_nm, gel.diameter_mm) for sign in SIDES.values()]
 
@@ -56,6 +56,7 @@ def lines_of(scene: Scene, frames: RigFrames) -> list[NDArray[np.float64]]:
 class RecordedTwists:
     """Frames and torques with their simulated times."""
 
+    table: ChannelTable
     frame_s: list[float] = field(default_factory=list)
     lines: list[list[NDArray[np.float64]]] = field(default_factory=list)
     torque_s: list[float] = field(default_factory=list)
@@ -64,14 +65,16 @@ class RecordedTwists:
     def series(self, diameter_mm: float) -> FrameSeries:
         """Return the series that a reader makes of the recording."""
         t_s = np.array(self.frame_s)
-        channels = np.array([[channels_of_line(line) for line in pair] for pair in self.lines])
+        channels = np.array([[self.table.channels_of_line(line) for line in pair] for pair in self.lines])
         torque = np.array(self.torque_s), np.array(self.torque_nm)
-        return FrameSeries("raw", tuple(SIDES), t_s, channels, *torque, np.full(len(t_s), diameter_mm))
+        return FrameSeries(
+            "raw", tuple(SIDES), t_s, channels, *torque, np.full(len(t_s), diameter_mm), table=self.table
+        )
 
     def write(self, path: Path, diameter_mm: float) -> None:
         """Write a recording that begins at the Unix time 0."""
         notes = {DIAMETER_NOTE: f"{diameter_mm:g}"}
-        with RecordingWriter(path, SOURCE, notes) as writer:
+        with RecordingWriter(path, SOURCE, notes, self.table) as writer:
             for t_s, pair in zip(self.frame_s, self.lines, strict=True):
                 for side, line in zip(SIDES, pair, strict=True):
                     writer.add_frame(side, round(t_s * 1e9), round((t_s + FRAME_PERIOD_S / 2) * 1e9), line)
@@ -83,7 +86,7 @@ class TwistPlayer:
     """One scene with a tool, and its recording."""
 
     def __init__(self, frames: RigFrames, diameter_mm: float, seed: int) -> None:
-        self.recorded = RecordedTwists()
+        self.recorded = RecordedTwists(frames.table)
         self._random = np.random.default_rng(seed)
         self._frames = frames
         self._gripper = Gripper(object_mm=diameter_mm)

@@ -73,11 +73,12 @@ def _run(
     from shearloop.daemon.cli import EXIT_OK, EXIT_UNFINISHED
     from shearloop.daemon.cli.emulated_devices import EmulatedDevices
     from shearloop.daemon.cli.terminal import EstimatePrinter, StatusLine
-    from shearloop.daemon.process import high_priority, lock_memory
+    from shearloop.daemon.process import high_priority, lock_memory, raise_descriptor_limit
     from shearloop.daemon.run_summary import RunSummary
     from shearloop.daemon.supervisor import Reporter
 
     config = _config(args)
+    raise_descriptor_limit()
     if config.lock_memory:
         lock_memory()
     listeners: list[Listener] = []
@@ -87,8 +88,9 @@ def _run(
         if args.slices is not None:
             # Imports scipy.io, which takes long.
             from shearloop.daemon.recording.matlab_slices import SliceRecorder
+            from shearloop.daemon.sensing.estimators import channel_table
 
-            slices = SliceRecorder(args.slices)
+            slices = SliceRecorder(args.slices, channel_table(config))
             stack.callback(slices.close)
             listeners.append(slices)
             reporters["slices"] = slices

@@ -13,12 +13,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from shearloop.bank.eit.channels import ZERO_SLOTS
 from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.messages import TOPICS
+from shearloop.daemon.messaging.stop_socket import send_to_stop_socket
 from shearloop.daemon.rig import make_gripper_client
+from shearloop.daemon.sensing.estimators import fingertip_table
 from shearloop.daemon.serial_ports import access_error
 from shearloop.drivers.connection import find_port
 from shearloop.drivers.eit_kit import EitKit
@@ -116,7 +117,7 @@ def check_rate(subject: str, measured_hz: float | None, configured_hz: float) ->
 def check_channels(name: str, saturated: int, dead: int, frames: int) -> Finding:
     """Judge the numbers of saturated and dead channels."""
     subject = f"channels of {name}"
-    found = f"{saturated} saturated and {dead} dead of 896 in {frames} frames"
+    found = f"{saturated} saturated and {dead} dead of the channels in {frames} frames"
     if saturated:
         means = "more signal than the converter can measure: a short, or too much current; every estimate lacks them"
         cure = "look for bridges at the electrodes' connector; wet the gel; lower the injected current"
@@ -141,7 +142,11 @@ async def _check_fingertip(name: str, config: FingertipConfig, seconds: float) -
     port = check_port(name, config.device)
     if port.state == "trouble":
         return [port]
-    board = EitKit(zero_slots=ZERO_SLOTS, frame_period_s=config.frame_period_s, **config.device.model_dump())
+    board = EitKit(
+        zero_slots=fingertip_table(config).zero_slots,
+        frame_period_s=config.frame_period_s,
+        **config.device.model_dump(),
+    )
     frames = await _received(board.readings(), seconds)
     facts = board.diagnostics()
     if not frames and facts["last_loss"]:
@@ -237,7 +242,9 @@ def _rate_hz(times_ns: list[int]) -> float | None:
 def daemon_tasks(address: str) -> Mapping[str, Mapping[str, Any]] | None:
     """Return the status of a running daemon's tasks; None when no daemon answers."""
     try:
-        tasks = send_command(address, {"command": "status"}, DAEMON_TIMEOUT_S).get("tasks")
+        request = {"command": "status"}
+        reply = send_to_stop_socket(address, request, DAEMON_TIMEOUT_S)
+        tasks = (reply or send_command(address, request, DAEMON_TIMEOUT_S)).get("tasks")
     except UserError:
         return None
     return tasks if isinstance(tasks, dict) else {}

@@ -63,8 +63,8 @@ def message(topic: str, *, rate_hz: float | None) -> Callable[[type[M]], type[M]
 class EitFrame(Message):
     """One frame of a fingertip; its time is the middle of the acquisition."""
 
-    channels: NDArray[np.floating] = column("V", "the 896 channels in the order of the channel table")
-    line: NDArray[np.floating] = column("V", "the 1024 values of the raw line")
+    channels: NDArray[np.floating] = column("V", "the channels in the order of the channel table")
+    line: NDArray[np.floating] = column("V", "the values of the raw line")
     frame: int = column("", "number of the frame since the board was connected")
     age_s: float = column("s", "from the middle of the acquisition to the arrival of the last byte")
     saturated: int = column("", "channels at the converter's full scale")

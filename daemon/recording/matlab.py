@@ -17,7 +17,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter1d
 
 from shearloop.bank.arrays import FloatArray, IntArray
-from shearloop.bank.eit.channels import N_CHANNELS, N_LINE_VALUES
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation.values import LARGEST_TORQUE_NM
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, SIDES
@@ -103,7 +103,7 @@ def read_stream(path: Path, name: str | None = None) -> Stream:
     Raises UserError for a file that cannot be read or holds no such stream.
     """
     names = _STREAMS[name] if name is not None else (*_STREAMS["right"], *_STREAMS["left"])
-    table, width = _one_of(path, _load(path), names), 1 if name == "load" else N_LINE_VALUES
+    table, width = _one_of(path, _load(path), names), 1 if name == "load" else PAPER_TABLE.n_line_values
     if table.shape[1] != width + 1 or len(table) == 0:
         value = "value" if width == 1 else "values"
         raise UserError(f"{path}: expected rows of one time and {width} {value}, found {_size(table)}")
@@ -112,7 +112,7 @@ def read_stream(path: Path, name: str | None = None) -> Stream:
 
 def read_line(path: Path) -> FloatArray:
     """Return the (1024,) values in volts of a file with a single line; raises UserError as `read_stream` does."""
-    return _row(path, _one_of(path, _load(path), _LINES), N_LINE_VALUES)
+    return _row(path, _one_of(path, _load(path), _LINES), PAPER_TABLE.n_line_values)
 
 
 def read_torque_slices(folder: Path) -> Slices:
@@ -139,7 +139,7 @@ def _read_slices(folder: Path, kind: str, pattern: re.Pattern[str], torque_name:
     differences, torques = [], []
     for _, path in files:
         variables = _load(path)
-        differences.append(_row(path, _one_of(path, variables, ["data_diff"]), N_CHANNELS))
+        differences.append(_row(path, _one_of(path, variables, ["data_diff"]), PAPER_TABLE.n_channels))
         if not differences[-1].any():
             raise UserError(f"{path}: data_diff is zero in all channels; leave this slice out")
         torques.append(_row(path, _one_of(path, variables, [torque_name]), 1)[0])

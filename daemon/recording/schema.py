@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from pydantic_core import to_json
 
-from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH
+from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
 from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitFrame, EitHeatmap, LoadTorque
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
@@ -58,11 +58,13 @@ class NoJsonError(ValueError):
     """A value cannot be written as JSON."""
 
 
-def basic_identity(source: str) -> dict[str, str]:
+def basic_identity(source: str, table: ChannelTable = PAPER_TABLE) -> dict[str, str]:
     """Return the metadata of every recording; `source` describes the origin of the data."""
     return {
         "format_version": FORMAT_VERSION,
-        "channel_table_hash": CHANNEL_TABLE_HASH,
+        "channel_table_hash": table.digest,
+        "electrodes": str(table.n_electrodes),
+        "injection": table.injection,
         "source": source,
         "software": software_version(),
         "code_sha256": code_digest(),

@@ -11,6 +11,7 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.defaults import MAX_GAP_S
 from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, Measured, TactileFrame
@@ -62,6 +63,11 @@ class FrameEstimator:
             average_frames=config.average_frames,
             max_gap_s=max(MAX_GAP_S, STALE_AFTER_PERIODS * config.frame_period_s),
         )
+
+    @property
+    def table(self) -> ChannelTable:
+        """The fingertip's channels."""
+        return self.calibration.estimator.table
 
     @property
     def measures_torque(self) -> bool:
@@ -132,6 +138,27 @@ class FrameEstimator:
         return difference[0] if difference is not None and difference[0].any() else None
 
 
+def channel_table(config: DaemonConfig) -> ChannelTable:
+    """Return the channels of the fingertips, by their banks and calibrations.
+
+    Raises UserError where these differ, and BankError as `open_estimator` does.
+    """
+    tables = {name: fingertip_table(fingertip) for name, fingertip in config.fingertips.items()}
+    if len({*tables.values()}) > 1:
+        kinds = ", ".join(f"{name} has {each.n_channels} channels" for name, each in tables.items())
+        raise UserError(f"the fingertips are of different kinds ({kinds}); run a daemon for each kind")
+    return next(iter(tables.values()), PAPER_TABLE)
+
+
+def fingertip_table(config: FingertipConfig) -> ChannelTable:
+    """Return a fingertip's channels, by its bank or its calibration, else the paper's."""
+    if config.bank is not None:
+        return Bank.open(config.bank).table
+    if config.calibration is not None and config.calibration.exists():
+        return Calibration.load(config.calibration).estimator.table
+    return PAPER_TABLE
+
+
 def open_estimator(config: FingertipConfig, name: str) -> FrameEstimator:
     """Return the estimator of one fingertip.
 
@@ -158,7 +185,8 @@ def open_estimator(config: FingertipConfig, name: str) -> FrameEstimator:
         raise _without_bank(PaperEstimator.name, name)
     if config.calibration is not None:
         return FrameEstimator(Calibration.load(config.calibration), config)
-    return FrameEstimator(Calibration.uncalibrated(Bank.open(config.bank).identity), config)
+    bank = Bank.open(config.bank)
+    return FrameEstimator(Calibration.uncalibrated(bank.identity, bank.table), config)
 
 
 def _without_bank(estimator: str, name: str) -> UserError:

@@ -26,7 +26,7 @@ _SAFETY_MODES = {1: "NORMAL", 3: "PROTECTIVE_STOP", 7: "ROBOT_EMERGENCY_STOP"}
 
 FAULTS = (
     *("protective-stop", "emergency-stop", "release", "drop-rtde", "silence", "stop-hangs"),
-    *("registers-in-use", "local-control", "refuse-protocol", "version", "payload", "normal"),
+    *("registers-in-use", "local-control", "refuse-protocol", "mute-dashboard", "version", "payload", "normal"),
 )
 
 log = logging.getLogger(__name__)
@@ -98,7 +98,7 @@ class Controller:
             case ["stop-hangs", count]:
                 hangs = int(number_between(count, 0, 1000, "not a number of requests from 0 to 1000"))
                 self.faults = replace(self.faults, stop_hangs=hangs)
-            case ["registers-in-use" | "local-control" | "refuse-protocol" as fault]:
+            case ["registers-in-use" | "local-control" | "refuse-protocol" | "mute-dashboard" as fault]:
                 self.faults = replace(self.faults, **{fault.replace("-", "_"): True})
             case ["version", numbers]:
                 if re.fullmatch(r"\d{1,4}(\.\d{1,4}){3}", numbers) is None:
@@ -159,8 +159,11 @@ class Controller:
 
     async def _serve_dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with self._connection(writer):
-            self._send(writer, BANNER.encode() + b"\n")
+            if not self.faults.mute_dashboard:
+                self._send(writer, BANNER.encode() + b"\n")
             while line := await reader.readline():
+                if self.faults.mute_dashboard:
+                    continue
                 request, hangs = line.decode("utf-8", "replace").strip(), self.faults.stop_hangs
                 if request == "stop" and hangs:
                     self.faults = replace(self.faults, stop_hangs=hangs - 1)

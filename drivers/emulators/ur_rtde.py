@@ -94,6 +94,7 @@ class ConnectionFaults:
     refuse_protocol: bool = False
     registers_in_use: bool = False
     local_control: bool = False
+    mute_dashboard: bool = False
     # How many of the next requests to stop the dashboard ignores.
     stop_hangs: int = 0
 

@@ -161,7 +161,7 @@ def ask_dashboard(host: str, timeout_s: float, requests: tuple[str, ...]) -> lis
     """Return the dashboard server's answers; DriverError where it is absent or silent."""
     answers = []
     with (
-        explain_failure(host, timeout_s, "asking its dashboard"),
+        explain_failure(host, timeout_s, f"asking its dashboard server (port {DASHBOARD_PORT})"),
         socket.create_connection((host, DASHBOARD_PORT), timeout=timeout_s) as connection,
         connection.makefile("rb") as lines,
     ):
@@ -204,7 +204,8 @@ def silent_sentence(host: str, seconds: float, activity: str) -> str:
     """Return the message about a controller that did not answer."""
     return (
         f"The UR controller at {host} said nothing for {seconds:.1f} s while {activity}: it is starting, hangs, or "
-        "something else listens on its ports. Look at the teach pendant."
+        "something else listens on its ports. Look at the teach pendant, and restart the controller "
+        "if it hangs."
     )
 
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.controller import ProbeError, probe_controller, registers_in_use
+from shearloop.drivers.ur.controller import ProbeError, ask_dashboard, probe_controller, registers_in_use
 from shearloop.drivers.ur.motion import why_unfit
 from shearloop.drivers.ur.settings import UrSettings
 
@@ -116,8 +116,10 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
     host = settings.host
     try:
         pipe.send(messages.WorkerPhase("greeting the controller"))
-        version = probe_controller(host, settings.connect_timeout_s / 3)
+        version = probe_controller(host, settings.connect_timeout_s / 4)
         pipe.send(messages.ControllerVersion(version))
+        # To a silent dashboard, ur-rtde says "Operation canceled".
+        ask_dashboard(host, settings.connect_timeout_s / 4, ("PolyscopeVersion",))
         pipe.send(messages.WorkerPhase("connecting"))
         return UrArm(settings, version)
     except ProbeError as error:

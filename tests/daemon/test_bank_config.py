@@ -59,7 +59,7 @@ def test_the_papers_fingertip_gives_the_papers_voltages_within_the_error_of_its_
 
 
 def test_the_papers_electrodes_are_where_the_papers_mesh_has_them(shared):
-    ours = load_geometry(CONFIG / "fingertips" / "paper.yaml")
+    ours = load_geometry(CONFIG / "fingertips" / "paper.yaml").mesh
     theirs = load_mesh(shared / "reference" / "fingertip_mesh.npz")
     for electrode in range(32):
         ends = [
@@ -96,7 +96,11 @@ def test_a_plan_has_the_grids_and_the_mesh(config):
         ("mesh_size_cm: 0.4", "mesh_size_cm: 0", r"tip\.yaml: `mesh_size_cm` should be .* allowed: from 0\.005 to 10"),
         ("side: top", "side: front", r"tip\.yaml: `electrodes\[1\]\.side` should be 'left'"),
         ("[0.1, 0.5,", "[0.1, 0.2,", r"tip\.yaml: electrodes 0 and 1 on the left side touch or overlap"),
-        ("[0.1, 0.5,", "[0.5,", r"tip\.yaml: the fingertip has 30 electrodes, expected 32"),
+        (
+            "side: left, centres_cm: [0.1,",
+            "side: left, centres_cm: [",
+            r"tip\.yaml: .*an even number of 8 to 32 electrodes, not 31",
+        ),
     ],
 )
 def test_mistakes_in_a_bank_and_its_fingertip_are_named(config, before, after, sentence):

@@ -48,6 +48,7 @@ def test_check_accepts_a_valid_configuration(config, capsys):
     assert "is in order" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("ur_rtde")
 @pytest.mark.parametrize("command", ["run", "check"])
 def test_a_calibration_without_torques_cannot_drive_the_loop(command, config, tiny_bank, tmp_path, capsys):
     grid, path = np.linspace(0.9, 2.1, 30), tmp_path / "diameters.yaml"
@@ -84,6 +85,7 @@ def test_a_configuration_mistake_names_file_key_and_cure(command, changes, parts
         assert part in said
 
 
+@pytest.mark.usefixtures("ur_rtde")
 async def test_fingertip_names_do_not_collide_with_task_names(config, tmp_path):
     shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
     (tmp_path / "wait.yaml").write_text("{name: one, torque_source: right, steps: [{do: wait, wait_s: 1}]}")

@@ -264,7 +264,7 @@ def test_mistakes_of_the_others_are_one_sentence(folder, capsys, arguments, part
 
 
 def test_a_bank_is_of_the_mesh_file_that_the_configuration_names(folder, tmp_path):
-    mesh, file = load_geometry(folder / "tip.yaml").refined(), tmp_path / "mesh.npz"
+    mesh, file = load_geometry(folder / "tip.yaml").mesh.refined(), tmp_path / "mesh.npz"
     names = ("nodes", "triangles", "electrode_edges", "electrode_of_edge", "contact_impedance")
     np.savez(file, **{name: getattr(mesh, name) for name in names})
     (tmp_path / "bank.yaml").write_text(BANK.replace("fingertip: tip.yaml", f"mesh: {{file: {file.name}}}"))

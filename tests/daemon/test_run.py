@@ -127,7 +127,7 @@ async def test_a_heatmap_is_computed_only_with_a_subscriber(config, tmp_path, su
 
 
 @pytest.fixture
-def robotless(config, tmp_path) -> Path:
+def robotless(ur_rtde, config, tmp_path) -> Path:  # noqa: ARG001 - it skips
     """Write a configuration with an experiment, and with a robot that is not there."""
     robot_at(own_address(7), tmp_path)
     rig = {

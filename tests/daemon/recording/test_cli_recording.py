@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from shearloop.bank.eit.channels import line_of_channels
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.daemon.cli import main
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.writer import RecordingWriter
 
-LINES = line_of_channels(np.round(np.random.default_rng(0).uniform(0, 1, (4, 896)), 4))
+LINES = PAPER_TABLE.line_of_channels(np.round(np.random.default_rng(0).uniform(0, 1, (4, 896)), 4))
 
 
 @pytest.fixture

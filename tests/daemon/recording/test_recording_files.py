@@ -6,7 +6,7 @@ import pytest
 from mcap.writer import Writer
 from scipy.io import savemat
 
-from shearloop.bank.eit.channels import N_LINE_VALUES, line_of_channels
+from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.config import RecordingConfig, load_daemon_config
 from shearloop.daemon.errors import UserError
@@ -21,7 +21,7 @@ from shearloop.daemon.recording.writer import RecordingWriter
 
 def written(path, n=4):
     rng = np.random.default_rng(0)
-    frames = line_of_channels(np.round(rng.uniform(0, 1, (n, 896)), 4))
+    frames = PAPER_TABLE.line_of_channels(np.round(rng.uniform(0, 1, (n, 896)), 4))
     with RecordingWriter(path, "a bench", {"tool": "driver"}) as writer:
         for i, line in enumerate(frames):
             writer.add_frame("right", 1_700_000_000_000_000_000 + i * 540_000_000, 1_700_000_000_300_000_000 + i, line)
@@ -67,9 +67,12 @@ def test_foreign_and_outdated_files_are_refused(tmp_path, monkeypatch, read):
         other = Writer(file)
         other.start()
         other.finish()
-    for name, key, value in (("stale", "CHANNEL_TABLE_HASH", "0" * 64), ("old", "FORMAT_VERSION", "1")):
+    for name, owner, key, value in (
+        ("stale", ChannelTable, "digest", "0" * 64),
+        ("old", schema, "FORMAT_VERSION", "1"),
+    ):
         with monkeypatch.context() as outdated:
-            outdated.setattr(schema, key, value)
+            outdated.setattr(owner, key, value)
             written(tmp_path / f"{name}.mcap")
     for name, why in (
         ("text", r"text\.mcap: this is not an MCAP file"),
@@ -180,7 +183,7 @@ def test_unusable_files_are_refused_by_name(mat_folder, tmp_path):
 
 @pytest.mark.parametrize("decimals", [4, 6, 7, 17])
 def test_lines_are_rounded_number_by_number(tmp_path, decimals):
-    line = np.round(np.random.default_rng(decimals).uniform(-1, 1, N_LINE_VALUES), decimals)
+    line = np.round(np.random.default_rng(decimals).uniform(-1, 1, PAPER_TABLE.n_line_values), decimals)
     with RecordingWriter(tmp_path / "a.mcap", "a test") as writer:
         writer.add_frame("right", 1, 2, line)
     found = read_recording(tmp_path / "a.mcap").sides["right"].lines[0]

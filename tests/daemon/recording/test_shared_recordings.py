@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration, FrameSeries, fit, load_delay, measure_timing
 from shearloop.bank.estimation.bank_match import ElectrodeNumbering
@@ -235,7 +236,7 @@ def test_a_tenth_of_a_foreign_frame_in_later_slices_lies_within_the_intervals(na
 
 def test_where_slices_tell_little_intervals_reach_to_what_may_be_hidden_in_them(slices, earlier):
     calibration, later = earlier("motion_regression", 39), slices.between(39, 49)
-    mirrored = ElectrodeNumbering(5, True, score=1.0, runner_up=0.0).model_channels()
+    mirrored = ElectrodeNumbering(5, True).model_channels(PAPER_TABLE)
     foreign = later.channels.mean(axis=0)[:, mirrored]
     spoilt = replace(later, channels=0.9 * later.channels + 0.1 * foreign)
     assert figures_of([estimate_series(calibration, spoilt)])["coverage_95"] >= 0.9
@@ -370,7 +371,7 @@ def test_no_good_recording_is_doubted(shared, twists, cylinders, tmp_path):
 @pytest.mark.parametrize("n", [19, 24, 29, 34, 39, 44])
 def test_no_later_slice_is_strange_and_a_third_of_a_foreign_one_is(slices, n):
     frames, usable = slices.channels[:, 0], np.ones(896, dtype=np.bool_)
-    guard = NoveltyDetector.fit(frames[:n])
+    guard = NoveltyDetector.fit(frames[:n], PAPER_TABLE)
     later = frames[n:]
     foreign = later.mean(axis=0)[np.random.default_rng(7).permutation(896)]
     assert not any(guard.assess(one, usable).reasons for one in later)

@@ -261,7 +261,9 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
         ({"skin": section(ADC, calibration=ROBOT)}, "is not a calibration as `shearloop skin calibrate` writes it: it"),
     ],
 )
-def test_a_mistake_in_the_skin_s_section_is_one_sentence_and_status_2(tmp_path, content, told, capsys):
+def test_a_mistake_in_the_skin_s_section_is_one_sentence_and_status_2(tmp_path, content, told, capsys, request):
+    if "experiment" in content:
+        request.getfixturevalue("ur_rtde")
     path = written(tmp_path, content)
     for command in ("check", "run"):
         assert main([command, str(path)]) == 2

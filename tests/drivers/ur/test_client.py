@@ -230,6 +230,7 @@ async def test_silent_controller_is_reported_and_the_robot_stops(controller):
         ("version 5.0.0.0", "version", "has PolyScope 5.0.0.0, which cannot be driven"),
         ("version 3.9.1.0", "version", "has PolyScope 3.9.1.0, which cannot be driven"),
         ("version 10.7.0.0", "version", "has PolyScope 10.7.0.0, which cannot be driven"),
+        ("mute-dashboard", "silent", "while asking its dashboard server (port 29999): it is starting, hangs"),
     ],
 )
 async def test_connection_that_is_refused_is_explained(controller, fault, kind, said):

@@ -212,13 +212,10 @@ class GaugeLine:
     weights: FloatArray
     shares: FloatArray
 
-    def directions(self) -> FloatArray:
-        """Return the (2, m, 3) unit vectors along the skin at the points."""
-        return along(angle(np.asarray(self.basis.global_coordinates())))
-
     def mean_strain(self) -> csc_matrix:
         """Return the (m, dofs) matrix of each element's mean ε_θθ."""
-        basis, directions = self.basis, self.directions()
+        basis = self.basis
+        directions = along(angle(np.asarray(basis.global_coordinates())))
         values = [
             np.einsum("i...,ij...,j...->...", directions, grad(basis.basis[i][0]), directions) @ self.shares
             for i in range(basis.Nbfun)

@@ -20,7 +20,8 @@ SEED = 2017
 COLUMNS = ("quantity", "unit", "paper: computed", "measured", "closed form", "1-D", "2-D", "synthetic")
 EXPLANATION = """\
 Sensitivity: least squares through the origin over one loading in 0.1 N steps, from the first step up to Fn.
-1-D: membrane with the paper's own F/(EA). 2-D: plane strain, 112 elements, nothing tuned; w = 20 mm is assumed.
+Closed form: a sheet at finite strain. 1-D: membrane with the paper's own F/(EA).
+2-D: plane strain, small strain, 112 elements, nothing tuned; w = 20 mm is assumed.
 Synthetic: the estimator's result on a synthetic recording with the paper's measured value."""
 
 
@@ -29,7 +30,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     summary = "compare the paper's table with the models'"
     characterise = add_action(actions, "characterise", summary, _characterise)
-    add_option(characterise, "--out", Path, "DIR", "draw figures 5, 6 and 7 here, PNG and SVG")
+    add_option(characterise, "--out", Path, "DIR", "draw figures 4 to 8 and the deadband here, PNG and SVG")
     add_json(characterise)
     calibrate = add_action(actions, "calibrate", "fit a calibration to a recorded table", _calibrate)
     add_option(calibrate, "table", Path, "TABLE", "CSV with r1_ohm, r2_ohm, shear_n, normal_n")

@@ -3,7 +3,7 @@
 from dataclasses import fields
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -92,6 +92,8 @@ class BankConfig(ConfigModel):
     With `over`, a folder of banks.
     """
 
+    what: ClassVar[str] = "bank's description"
+
     mesh: MeshFileConfig | None = Field(None, description="a mesh from a file; else `fingertip`")
     fingertip: Path | None = Field(None, description="the fingertip's dimensions, a file; else `mesh`")
     mesh_size_cm: MeshSize | None = Field(None, description="largest distance of mesh lines (default: the fingertip's)")
@@ -135,6 +137,8 @@ class ElectrodeRunConfig(ConfigModel):
 
 class FingertipGeometryConfig(ConfigModel):
     """A fingertip with electrodes along its edge: a rectangle (width_cm, height_cm) or a disc (diameter_cm)."""
+
+    what: ClassVar[str] = "fingertip's description"
 
     width_cm: Measure | None = Field(None, description="width of a rectangle")
     height_cm: Measure | None = Field(None, description="height of a rectangle")

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from shearloop.bank.defaults import BASELINE_FRAMES
 from shearloop.bank.estimators import EstimatorName
-from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model
+from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model, not_of_kind
 from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.messaging import addresses
 from shearloop.drivers.defaults import (
@@ -230,6 +230,12 @@ class EmulatorConfig(ConfigModel):
 
 class DaemonConfig(ConfigModel):
     """A whole configuration."""
+
+    _kind = not_of_kind(
+        "an experiment",
+        "name it in a configuration as `experiment`, or `shearloop command start --experiment FILE`",
+        "steps",
+    )
 
     publish: Address = Field(addresses.PUBLISH_ADDRESS, description="ZeroMQ address of the messages")
     commands: Address = Field(addresses.COMMAND_ADDRESS, description="ZeroMQ address of the commands")

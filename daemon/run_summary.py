@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
+from shearloop.drivers.errors import times
 
 if TYPE_CHECKING:
     from shearloop.daemon.logs import NonBlockingWriter
@@ -253,7 +254,7 @@ def _counted(run: _Run) -> Iterator[str]:
     for source, values in run.diameters.items():
         yield f"  diameter by {source}: {np.mean(values):.1f} mm ± {np.std(values):.1f} of one reading"
     if run.hold_reasons:
-        reasons = "; ".join(f"{count} times {reason}" for reason, count in run.hold_reasons.most_common())
+        reasons = "; ".join(f"{times(count)} {reason}" for reason, count in run.hold_reasons.most_common())
         yield f"  the wrist was held for {run.held_s:.1f} s in all: {reasons}"
     else:
         yield "  the wrist was never held"
@@ -261,5 +262,5 @@ def _counted(run: _Run) -> Iterator[str]:
         # A source without any torque has another purpose.
         if source in run.torques:
             yield f"  {count} of {count + len(run.torques[source])} torques of {source} were not valid and not used"
-    refused = [f"  {count} times {reason}" for reason, count in run.refused.most_common()]
+    refused = [f"  {times(count)} {reason}" for reason, count in run.refused.most_common()]
     yield from refused or ["  no command was refused"]

@@ -8,8 +8,10 @@ large libraries inside functions, so that help and errors come at once.
 import argparse
 import importlib
 import os
+import re
 import sys
 from collections.abc import Sequence
+from difflib import get_close_matches
 from typing import NamedTuple, NoReturn
 
 from shearloop.daemon.errors import UserError
@@ -70,7 +72,19 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the sentence and exit with status 2."""
-        self.exit(EXIT_USAGE, f"{self.prog}: {message}; see `{self.prog} --help`\n")
+        self.exit(EXIT_USAGE, f"{self.prog}: {self._plain(message)}; see `{self.prog} --help`\n")
+
+    def _plain(self, message: str) -> str:
+        """Return argparse's message with the nearest known word."""
+        choice = re.fullmatch(r"argument (\S+): invalid choice: '(.*)' \(choose from (.*)\)", message)
+        if choice is not None:
+            name, given, known = choice[1], choice[2], [one.strip("'") for one in choice[3].split(", ")]
+            of = f" of {name}" if name.startswith("--") else ""
+            meant = "".join(f"; did you mean {one}?" for one in get_close_matches(given, known, 1))
+            return f"there is no {given!r}{of}{meant or '; there are ' + ', '.join(known)}"
+        unknown = re.match(r"unrecognized arguments: (\S+)", message)
+        near = get_close_matches(unknown[1], self._option_string_actions, 1) if unknown else []
+        return f"{message}; did you mean {near[0]}?" if near else message
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -12,6 +12,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Any, Self, TextIO
 
 from shearloop.daemon.errors import UserError
+from shearloop.drivers.errors import times
 
 if TYPE_CHECKING:
     from shearloop.daemon.logs import NonBlockingWriter
@@ -206,9 +207,8 @@ def task_row(name: str, facts: Mapping[str, Any]) -> tuple[str, str, str, str]:
     down = facts.get("connected") is False
     state = "DEAD" if facts.get("alive") is False else "not connected" if down else "alive"
     state = "done" if facts.get("done") else state
-    rate = "" if facts.get("rate_hz") is None else f"{facts['rate_hz']:.2f} Hz"
-    if rate and facts.get("expected_hz") is not None:
-        rate += f" of {facts['expected_hz']:.2f}"
+    rate = " of ".join(f"{facts[key]:.2f}" for key in ("rate_hz", "expected_hz") if facts.get(key) is not None)
+    rate = "" if facts.get("rate_hz") is None else f"{rate} Hz"
     notes = [f"restarted {times(facts['restarts'])}"] if facts.get("restarts") else []
     errors = dict(facts.get("errors") or {})
     lost = sum(errors.pop(kind, 0) for kind in LINK_ERRORS) or (facts.get("connections") or 1) - 1
@@ -227,18 +227,14 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in every]
 
 
-def times(count: int) -> str:
-    """Return how often: once, twice, 3 times."""
-    return {1: "once", 2: "twice"}.get(count, f"{count} times")
-
-
 def _columns(topic: str, content: Mapping[str, Any]) -> str:
     from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS
 
     fields = dataclasses.fields(TOPICS[topic]) if topic in TOPICS else ()
     units = {item.name: f" {item.metadata['unit']}" for item in fields if item.metadata.get("unit")}
     hidden = (*ENVELOPE, "topic")
-    own = {key: value for key, value in content.items() if key not in hidden and value is not None and value != ""}
+    known = {key: value for key, value in content.items() if key not in hidden and value is not None}
+    own = {key: value for key, value in known.items() if not (isinstance(value, str) and not value)}
     return "  ".join(f"{key} {_value(value)}{units.get(key, '')}" for key, value in own.items())
 
 

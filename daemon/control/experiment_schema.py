@@ -1,11 +1,11 @@
 """The experiment file: its limits and its steps, as pydantic models with bounds that the rig can keep."""
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, Field, WithJsonSchema
 
-from shearloop.daemon.config_file import ConfigModel, either
+from shearloop.daemon.config_file import ConfigModel, either, not_of_kind
 
 MOST_ANGLES = 1000
 
@@ -26,16 +26,19 @@ def _angles(given: object) -> object:
     return tuple(np.linspace(start, stop, steps).tolist())
 
 
+LARGEST_ANGLE_RAD = 6.28
+Angle = Annotated[float, Field(ge=-LARGEST_ANGLE_RAD, le=LARGEST_ANGLE_RAD)]
+_ANGLE = {"type": "number", "minimum": -LARGEST_ANGLE_RAD, "maximum": LARGEST_ANGLE_RAD}
 Angles = Annotated[
-    tuple[float, ...],
+    tuple[Angle, ...],
     Field(min_length=1),
     BeforeValidator(_angles),
     WithJsonSchema(
         {
             "description": "one angle, a list, or START:STOP:STEPS",
             "anyOf": [
-                {"type": "number"},
-                {"type": "array", "items": {"type": "number"}, "minItems": 1},
+                _ANGLE,
+                {"type": "array", "items": _ANGLE, "minItems": 1},
                 {"type": "string", "pattern": "^[^:]+:[^:]+:[^:]+$"},
             ],
         }
@@ -176,6 +179,10 @@ Step = Annotated[
 class ExperimentFile(ConfigModel):
     """One experiment: its torque source, its limits and its steps in order."""
 
+    what: ClassVar[str] = "experiment"
+
+    _kind = not_of_kind("a configuration", "name this experiment in it as `experiment`", "fingertips", "skin")
+
     name: str = Field(min_length=1, max_length=80, description="shown in messages and recordings")
     torque_source: Annotated[str, Field(min_length=1)] = Field(
         "right", description="torque that drives the loop: a fingertip's name, `skin`, `load_cell` or `wrench`"
@@ -208,18 +215,17 @@ def first_turn_before_grip(file: ExperimentFile) -> int | None:
     return None
 
 
-def check_limits(file: ExperimentFile) -> str:
-    """Return a sentence on the first step that exceeds its limits, or an empty string."""
+def check_limits(file: ExperimentFile) -> list[str]:
+    """Return a sentence on each step that exceeds its limits."""
+    found = []
     for number, step in enumerate(file.steps):
         limits, (torque_nm, angle_rad) = file.limits_of(step), _reach(step)
         torque = torque_nm, limits.torque_nm, "N·m", "torque_nm"
         for value, limit, unit, key in (torque, (angle_rad, limits.angle_rad, "rad", "angle_rad")):
             if value >= limit:
-                return (
-                    f"`steps[{number}]` ({step.do}) asks for {value:g} {unit}, and its limit is {limit:g} {unit}; "
-                    f"raise `limits.{key}`, or ask for less"
-                )
-    return ""
+                asks = f"steps[{number}]: {step.do} asks for {value:g} {unit}, and its limit is {limit:g} {unit}"
+                found.append(f"{asks}; raise limits.{key}, or ask for less")
+    return found
 
 
 def _reach(step: Step) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import errno
 import os
 import time
 from collections import defaultdict
@@ -23,7 +24,7 @@ from shearloop.daemon.sensing.estimators import fingertip_table
 from shearloop.daemon.serial_ports import access_error
 from shearloop.drivers.connection import find_port
 from shearloop.drivers.eit_kit import EitKit
-from shearloop.drivers.errors import DriverError
+from shearloop.drivers.errors import DriverError, times
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.messages import ActivationStatus
 from shearloop.drivers.ur.controller import query_controller, untested_sentence
@@ -33,6 +34,7 @@ from shearloop.drivers.ur.settings import read_settings
 RATE_TOLERANCE = 0.1
 ROBOT_TIMEOUT_S = 2.0
 DAEMON_TIMEOUT_S = 1.0
+MISSING = os.strerror(errno.ENOENT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +64,8 @@ def from_error(subject: str, error: Exception | str, means: str) -> Finding:
 
 def from_file(subject: str, sentence: str, means: str) -> Finding:
     """Return the finding for a file; the sentence names all of its mistakes."""
-    return trouble(subject, sentence, means, "correct the file, then run `shearloop doctor CONFIG` again")
+    cure = "make the file, or correct its name" if MISSING in sentence else "correct the file"
+    return trouble(subject, sentence, means, f"{cure}, then run `shearloop doctor CONFIG` again")
 
 
 async def check_devices(config: DaemonConfig, seconds: float) -> list[Finding]:
@@ -91,7 +94,8 @@ def check_port(name: str, device: SerialDevice) -> Finding:
     try:
         path = find_port(serial_number=device.serial_number, path=str(device.path) if device.path else None)
     except DriverError as error:
-        return from_error(subject, error, "the board is not plugged in, or has another serial number")
+        cure = "plug the board in, or correct its name in the configuration: `shearloop ports` lists the boards"
+        return trouble(subject, str(error), "the board is not plugged in, or has another serial number", cure)
     denied = access_error(path)
     if denied:
         what, _, cure = denied.partition("; ")
@@ -289,16 +293,16 @@ def check_daemon(
 def check_task(name: str, status: Mapping[str, Any]) -> Finding:
     """Judge one task by the counters that it reports."""
     subject = f"task {name}"
-    counted = ", ".join(f"{count} × {kind}" for kind, count in (status.get("errors") or {}).items() if count)
+    counted = ", ".join(f"{kind} {times(count)}" for kind, count in (status.get("errors") or {}).items() if count)
     reason = str(status.get("error") or status.get("last_loss") or "")
     restarts, last_error = status.get("restarts", 0), str(status.get("last_error", ""))
     read_log = "read the daemon's log; report it if it comes back"
     if status.get("alive") is False:
-        return trouble(subject, f"dead, {restarts} restarts", last_error, read_log)
+        return trouble(subject, f"dead, restarted {times(restarts)}" if restarts else "dead", last_error, read_log)
     if status.get("connected") is False:
         return trouble(subject, "its device is not connected", reason, "check its port, cable and power")
     if restarts:
-        return note(subject, f"alive after {restarts} restarts", last_error, read_log)
+        return note(subject, f"alive, restarted {times(restarts)}", last_error, read_log)
     if counted:
         means = reason or "refused data is not used"
         return note(subject, f"alive; refused: {counted}", means, "see docs/troubleshooting.md")

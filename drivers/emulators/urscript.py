@@ -29,22 +29,6 @@ COMMAND = "input_int_register_0"
 MOST_LOOPS = 10_000
 # Functions that use up cycles.
 _LASTING = ("sync", "speedj", "movel", "stopj", "stopl")
-_IMMEDIATE = (
-    *("read_input_float_register", "read_input_integer_register", "write_output_float_register"),
-    *("write_output_integer_register", "get_actual_joint_positions", "get_tcp_force", "get_steptime", "norm"),
-    *(
-        "zero_ftsensor",
-        "rtde_set_watchdog",
-        "run",
-        "kill",
-        "enter_critical",
-        "exit_critical",
-        "halt",
-        "put",
-        "count_loop",
-    ),
-    *("textmsg", "force_mode_set_gain_scaling", "force_mode_set_damping"),
-)
 _SAME_KEYWORDS = {"and", "or", "not", "if", "elif", "else", "while", "def", "return", "break", "continue", "global"}
 _SAME_KEYWORDS |= {"True", "False", "pass"}
 _RENAMED = re.compile(rf"\b({'|'.join(set(keyword.kwlist) - _SAME_KEYWORDS)})\b")
@@ -145,9 +129,11 @@ class Program:
         self._events: list[Event] = []
         self._watchdogs: dict[str, float] = {}
         code, main = translate(text)
-        names: dict[str, Any] = {name: getattr(self, name) for name in (*_LASTING, *_IMMEDIATE)}
+        # The public methods below are the program's functions; it has these names only.
+        names: dict[str, Any] = {name: getattr(self, name) for name in vars(Program) if not name.startswith("_")}
+        del names["cycle"]
         names |= {"sqrt": math.sqrt, "__builtins__": {}}
-        exec(code, names)  # noqa: S102 - it has these names only
+        exec(code, names)  # noqa: S102
         # By number; the main one is number 1, and the program ends with it.
         self._threads: dict[int, Thread] = {1: names[main]()}
         # The numbers of the running thread, the one in a critical section, and the one that moves the arm; or 0.

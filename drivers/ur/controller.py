@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from shearloop.drivers.errors import DriverError, ProtocolError
+from shearloop.drivers.errors import DriverError, ProtocolError, system_reason
 from shearloop.drivers.ur.messages import RUNTIME_PLAYING, FailureKind
 from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER
 from shearloop.drivers.ur.settings import Six, Three
@@ -183,7 +183,7 @@ def explain_failure(host: str, timeout_s: float, activity: str) -> Iterator[None
     except TimeoutError as error:
         raise ProbeError("silent", silent_sentence(host, timeout_s, activity)) from error
     except (OSError, struct.error) as error:
-        reason = str(error) or type(error).__name__
+        reason = system_reason(error) if isinstance(error, OSError) else "it does not answer as one"
         raise ProbeError(
             "unreachable",
             f"No UR controller at {host}: {reason}. Check that it is switched on and that this computer is in its "

@@ -51,7 +51,7 @@ _GUARD = """\
             room = q[5] - ({lower})
         end
         if left < 0 or left > {longest} or room <= 0:
-            return 0
+            return 0.0
         end
         largest = sqrt(2 * {braking} * room)
         if largest > {speed}:
@@ -70,12 +70,12 @@ _GUARD = """\
             overloaded = asked != 0 and (overloaded or guard_is_overloaded())
             largest = guard_largest_speed(asked)
             if overloaded:
-                largest = 0
+                largest = 0.0
             end
             if norm(asked) > largest:
                 acceleration = {hardest}
                 if asked < 0:
-                    asked = 0 - largest
+                    asked = 0.0 - largest
                 else:
                     asked = largest
                 end

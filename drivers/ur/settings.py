@@ -200,4 +200,4 @@ def read_settings(path: Path) -> UrSettings:
     """
     from shearloop.yaml_files import load_model
 
-    return load_model(path, UrSettings, DriverError)
+    return load_model(path, UrSettings, DriverError, "robot's settings")

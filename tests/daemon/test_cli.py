@@ -28,7 +28,7 @@ from shearloop.daemon.cli.completion import full_parser
 from shearloop.daemon.cli.terminal import StatusLine, message_json, message_line, table, task_row
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.runner import WRENCH
-from shearloop.daemon.messaging.messages import EitEstimate, decode, encode, wire_map
+from shearloop.daemon.messaging.messages import EitEstimate, RobotStateMessage, decode, encode, wire_map
 from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from tests.daemon.sample_messages import sample
@@ -38,7 +38,8 @@ def mistake(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     assert main(arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
-    assert err.count("\n") == 1, err
+    # One line for each mistake, and no traceback.
+    assert all(": " in line and not line.startswith(" ") for line in err.splitlines()), err
     assert err.startswith(f"shearloop {arguments[0]}: ")
     return err
 
@@ -68,12 +69,12 @@ def test_a_calibration_without_torques_cannot_drive_the_loop(command, config, ti
     ("changes", "parts"),
     [
         ({"fingertips": {}}, ["fingertips"]),
-        ({"fingertip": {}}, ["`fingertip` is not a known key", "did you mean `fingertips`?"]),
+        ({"fingertip": {}}, ["fingertip: is not a known key; did you mean fingertips?"]),
         ({"publish": "tcp://0.0.0.0:7761"}, ["publish", "loopback"]),
         ({"publish": "tcp://lab-pc:7761"}, ["publish", "loopback"]),
-        ({"publish": "tcp://127.0.0.1:70000"}, ["`publish` must end in a port, a whole number up to 65535, as in tcp"]),
-        ({"commands": "tcp://127.0.0.1:7762a"}, ["`commands` must end in a port, a whole number"]),
-        ({"commands": "tcp://127.0.0.1"}, ["`commands` must end in a port, a whole number"]),
+        ({"publish": "tcp://127.0.0.1:70000"}, ["publish: must end in a port, a whole number up to 65535, as in tcp"]),
+        ({"commands": "tcp://127.0.0.1:7762a"}, ["commands: must end in a port, a whole number"]),
+        ({"commands": "tcp://127.0.0.1"}, ["commands: must end in a port, a whole number"]),
         ({"fingertips": {"Right Hand": {}}}, ["fingertips"]),
         ({"fingertips": {"load_cell": {"device": {"path": "eit"}}}}, ["cannot be named 'load_cell', as another part"]),
     ],
@@ -228,7 +229,11 @@ def test_every_command_explains_itself(name, capsys):
 def test_an_unknown_command_lists_the_known_ones(capsys):
     with pytest.raises(SystemExit, match="2"):
         main(["fly"])
-    assert "'run'" in capsys.readouterr().err
+    assert " run, " in capsys.readouterr().err
+    for arguments, meant in ((["rnu"], "run"), (["command", "stauts"], "status"), (["listen", "--cuont"], "--count")):
+        with pytest.raises(SystemExit):
+            main(arguments)
+        assert f"did you mean {meant}?" in capsys.readouterr().err
 
 
 def test_every_argument_has_a_help_text():
@@ -268,6 +273,10 @@ def test_messages_are_readable():
     line = message_line("eit.estimate", content)
     assert "torque +0.0500 N·m [+0.0200, +0.0800]   diameter  31.0 mm   k 3.500  sigma 1.500 cm   score 0.750" in line
     assert message_json("eit.estimate", content).startswith('{"topic": "eit.estimate", "timestamp": 0.0')
+    robot = decode(encode(wire_map(sample(RobotStateMessage, blocked=""), timestamp=0.0, seq=1)))
+    shown = message_line("robot.state", {**robot, "safety_mode": None})
+    assert "joints_rad (" in shown
+    assert not any(word in shown for word in ("blocked", "safety_mode", "None"))
     invalid = {**content, "valid": False, "reason": "no signal"}
     assert message_line("eit.estimate", invalid).endswith("no estimate: no signal")
 
@@ -276,7 +285,7 @@ def test_tasks_are_told_in_words_without_what_is_not_known():
     facts = {"alive": True, "done": False, "restarts": 0, "last_error": "", "rate_hz": None, "errors": {}}
     for changes, told in (
         ({}, ("alive", "", "")),
-        ({"rate_hz": 1.85, "expected_hz": 1.849}, ("alive", "1.85 Hz of 1.85", "")),
+        ({"rate_hz": 1.85, "expected_hz": 1.849}, ("alive", "1.85 of 1.85 Hz", "")),
         ({"connected": True, "errors": {"unreachable": 1}}, ("alive", "", "reconnected once")),
         ({"connected": True, "connections": 3}, ("alive", "", "reconnected twice")),
         ({"connected": False, "error": "No board."}, ("not connected", "", "No board.")),
@@ -320,10 +329,10 @@ def test_invalid_emulators_and_recordings_are_refused_before_the_start(config, t
 
 
 def test_missing_paths_and_shared_addresses_are_named(config, capsys):
-    assert "`experiment` must be the path of a file, not '.'" in mistake(
+    assert "experiment: must be the path of a file, not '.'" in mistake(
         capsys, "check", str(config(experiment="", robot="ur.yaml"))
     )
-    assert "`robot` must be the path of a file" in mistake(capsys, "check", str(config(robot="a\0b")))
+    assert "robot: must be the path of a file" in mistake(capsys, "check", str(config(robot="a\0b")))
     both = "ipc:///tmp/one-for-both"
     assert f"are both {both}" in mistake(capsys, "check", str(config(publish=both, commands=both)))
 

@@ -121,8 +121,8 @@ def test_holds_and_refusals_are_counted_by_their_kind():
         loop_state(23, phase="held", response="hold", reasons=reason.replace("1.5", "1.7")),
         loop_state(24, reasons="a command was refused: the robot is not connected."),
     )
-    assert "held for 2.5 s in all: 2 times no new torque has arrived" in text
-    assert "1 times a command was refused: the robot is not connected." in text
+    assert "held for 2.5 s in all: twice no new torque has arrived" in text
+    assert "once a command was refused: the robot is not connected." in text
 
 
 def test_an_experiment_that_was_stopped_says_why():

@@ -4,9 +4,8 @@ import pytest
 
 from shearloop.drivers.emulators.ur_arm import Arm
 from shearloop.drivers.emulators.urscript import Program, ProgramEndedError, Registers, translate
-from tests.drivers.ur.robots import control_script
+from tests.drivers.ur.robots import VERSIONS, control_script
 
-VERSIONS = [(3, 10), (5, 4), (5, 17), (5, 25), (10, 10)]
 COUNTING = "global n = 0\nthread t():\nwhile n < 7:\nn = n + 1\nsync()\nend\nend\n"
 
 

@@ -19,6 +19,8 @@ ROOT = Path(__file__).parents[3]
 
 
 DELIVERED = read_settings(ROOT / "config" / "ur.yaml")
+# Controllers whose scripts differ.
+VERSIONS = [(3, 10), (5, 4), (5, 17), (5, 25), (10, 10)]
 
 
 def control_script(settings: UrSettings | None = None, version: tuple[int, int] = (5, 17)) -> str:

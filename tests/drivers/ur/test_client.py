@@ -297,7 +297,7 @@ from shearloop.drivers.ur.messages import Enable, WristSpeed
 from tests.drivers.ur.robots import pid_of, settings_for, until
 
 async def main():
-    robot = UrRobot(settings_for(sys.argv[1]))
+    robot = UrRobot(settings_for(sys.argv[1], command_timeout_s=0.1, silence_timeout_s=0.1))
     task = asyncio.create_task(robot.run())
     await until(robot, lambda state: state.program_running and not state.recovering)
     await robot.send(Enable())
@@ -309,6 +309,25 @@ async def main():
 
 asyncio.run(main())
 """
+
+
+@pytest.mark.parametrize("worker_hangs", [False, True])
+async def test_wrist_stops_when_the_daemon_hangs(controller, worker_hangs):
+    daemon = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", DAEMON, controller.host, stdout=asyncio.subprocess.PIPE, cwd=ROOT
+    )
+    worker = int(await daemon.stdout.readline())
+    hung_ns = time.monotonic_ns()
+    daemon.send_signal(signal.SIGSTOP)
+    if worker_hangs:
+        os.kill(worker, signal.SIGSTOP)
+    try:
+        stopped = await controller.event("motion-stopped", hung_ns)
+        assert stopped_after_s(stopped, hung_ns) <= STOPPED_WITHIN_S
+    finally:
+        for pid in (daemon.pid, worker):
+            os.kill(pid, signal.SIGKILL)
+        await daemon.communicate()
 
 
 async def test_killed_daemon_leaves_a_resting_robot_and_no_process(controller):

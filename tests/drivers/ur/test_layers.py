@@ -8,9 +8,8 @@ import pytest
 from shearloop.drivers.emulators.ur_robot import Robot
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
 from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER
-from tests.drivers.emulators.test_urscript import VERSIONS
 from tests.drivers.ur.flight import AT_REST, CYCLE_NS, FakeArm, Flight, flying
-from tests.drivers.ur.robots import DELIVERED, control_script
+from tests.drivers.ur.robots import DELIVERED, VERSIONS, control_script
 
 LIMITS, TIMEOUT_S = DELIVERED.limits, DELIVERED.command_timeout_s
 FASTEST = LIMITS.wrist_speed_rad_per_s.inner
@@ -281,3 +280,13 @@ def test_each_version_of_the_script_can_be_guarded(version):
     assert robot.program_running
     # A thread starts in the cycle after the one that starts it.
     assert robot.registers[CLOCK_REGISTER] == pytest.approx(0.072)
+
+
+def test_deadline_counts_during_a_gentle_ramp():
+    """ur-rtde's own thread looks at nothing until its speed is reached."""
+    arm, command = guarded_arm(), WristSpeed(FASTEST, 0.5)
+    assert 0.1 < turn(arm, command, 0.3)[-1].qd_rad_per_s[5] < 0.2
+    for _ in range(round(PROMISED_S * 1e9 / CYCLE_NS)):
+        arm.repeat(command)
+        arm.cycle()
+    assert arm.reading.rests

@@ -1,4 +1,4 @@
-"""The shear skin's models: time against error, the two readings of the paper, and the contact solver's steps.
+"""The shear skin's models: time against error, both readings of the paper, calibrations, and contact solves.
 
     python -m benchmarks.skin
 
@@ -13,11 +13,13 @@ import timeit
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 
 from benchmarks.common import table_head, table_row
 from shearloop.bank.arrays import FloatArray
+from shearloop.bank.skin.calibration import CalibrationTable, fit_calibration
 from shearloop.bank.skin.characterisation import (
     PAPER_MEASURED_SENSITIVITY,
     fit_line,
@@ -88,9 +90,9 @@ def models() -> dict[str, Model]:
 def compare_models() -> None:
     """Print each model's time and errors."""
     up, there_and_back = loading(AMPLITUDE_N), loop(AMPLITUDE_N)
-    begin = time.perf_counter()
+    begin = time.process_time()
     true_loop = at_finite_strain(PAPER_SECTION, NORMAL_N, there_and_back)
-    finite_us = 1e6 * (time.perf_counter() - begin) / len(there_and_back)
+    finite_us = 1e6 * (time.process_time() - begin) / len(there_and_back)
     true_up, scale = true_loop[: len(up)], abs(true_loop).max()
     print(table_head("model", "µs per step", "loading", "whole loop"))
     for name, model in models().items():
@@ -118,6 +120,21 @@ def compare_readings() -> None:
             slopes = [f"{origin_slope(READ, each):.4f}" for each in found.values()]
             name, kink = f"{section.thickness_mm:.2f} mm, {theory}", f"{fit_line(READ, found[1.0]).kink_n:.3f}"
             print(table_row(name, f"{GAUGE_FACTOR / stiffness_n:.4f}", *slopes, kink, f"{strain:.1%}"), flush=True)
+
+
+def compare_calibrations() -> None:
+    """Print what the run-time membrane finds on skins that follow the closed form at finite strain, without noise."""
+    print("\n" + table_head("recorded under", "friction", "slope, 1/N", "95 % interval, ± N"))
+    for normal_forces in ((1.0,), (0.5, 1.0, 1.5, 2.0)):
+        rows = []
+        for normal_n, sign in product(normal_forces, (1.0, -1.0)):
+            rows += [(1.0, 1.0, 0.0, 0.0)] * 2
+            for shear_n in READ.tolist():
+                response = loading_response(THICK_SECTION, normal_n, sign * shear_n)
+                rows.append((1 + max(response, 0.0), 1 + max(-response, 0.0), sign * shear_n, normal_n))
+        found = fit_calibration(CalibrationTable(*np.array(rows).T))
+        name = f"{normal_forces[0]} to {normal_forces[-1]} N" if len(normal_forces) > 1 else f"{normal_forces[0]} N"
+        print(table_row(name, found.friction, found.slope_per_n, found.prediction_half_width_n), flush=True)
 
 
 def random_states(seed: int) -> Iterator[tuple[CondensedSkin, ContactState]]:
@@ -161,6 +178,7 @@ def main() -> None:
     """Measure and print the tables."""
     compare_models()
     compare_readings()
+    compare_calibrations()
     count_steps()
 
 

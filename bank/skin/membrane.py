@@ -108,9 +108,10 @@ def warming_change(kelvin: float) -> float:
     return (1 + RESISTIVITY_PER_K * kelvin) / (1 + EXPANSION_PER_K * kelvin) - 1
 
 
-# The closed form balances moments about the core's centre. The tension at mid-thickness, N = F_t R_out/R, is shared by
-# the two sides, and ε₁ − ε₂ does not depend on how. Plane strain and the core's pressure, −σ_r ≈ N/(2 R w) at
-# mid-thickness, turn N into strain. Friction takes e^(−μφ) on the way to the gauge and μ F_n R_in/R_out at the load.
+# At small strain the closed form balances moments about the core's centre. The tension at mid-thickness, F_t R_out/R,
+# is shared by the two sides, and ε₁ − ε₂ does not depend on how. Plane strain and the core's pressure, −σ_r ≈ N/(2 R w)
+# at mid-thickness, turn tension N into strain. Friction takes e^(−μφ) on the way to the gauge and μ F_n R_in/R_out at
+# the load.
 
 
 def sensitivity_per_n(section: Section) -> float:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
-from shearloop.bank.defaults import BASELINE_FRAMES
+from shearloop.bank.defaults import BASELINE_FRAMES, MAX_GAP_S
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatch, BankMatcher
@@ -28,8 +28,6 @@ REPEATED_FRAME = ("the board sent the same frame again",)
 _UNITS: dict[Quantity, str] = {"torque": "N·m", "diameter": "mm"}
 _UNKNOWN = (None, None, None)
 _AMBIGUOUS = ("two positions of the bank far apart fit the frame equally well",)
-# A longer gap restarts the average of frames.
-_MAX_GAP_S = 3.0
 
 # A value, and its 95 % interval: how far it extends below and above, or its ends.
 _Interval = tuple[float, float, float]
@@ -47,7 +45,7 @@ class EstimatorSession:
         period_s: float = np.inf,
         baseline_frames: int = BASELINE_FRAMES,
         average_frames: int = 1,
-        max_gap_s: float = _MAX_GAP_S,
+        max_gap_s: float = MAX_GAP_S,
     ) -> None:
         """Begin a session; raises CalibrationError for a bank that is missing or another one.
 

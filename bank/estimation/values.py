@@ -37,7 +37,8 @@ class FrameSeries:
 
     t_s (n,) is the middle of each acquisition in seconds; channels (n, m, 896) in volts for m sides. torque_nm (p,)
     was measured at torque_t_s (p,) on the same clock. diameter_mm (n,) is NaN where unknown; gripper_mm is then the
-    gripper's width, if there was a gripper. Diameters are not fitted to gripper_mm.
+    gripper's width, if there was a gripper. Diameters are not fitted to gripper_mm. first_frame is the first frame's
+    number in the whole recording.
     Raises CalibrationError for shapes that do not match and for times that decrease.
     """
 
@@ -49,6 +50,7 @@ class FrameSeries:
     torque_nm: FloatArray
     diameter_mm: FloatArray
     gripper_mm: Measured | None = None
+    first_frame: int = 0
 
     def __post_init__(self) -> None:
         """Check shapes and times."""
@@ -88,7 +90,13 @@ class FrameSeries:
     def between(self, start: int, stop: int) -> "FrameSeries":
         """Return frames `start` to `stop` with all torques."""
         part = slice(start, stop)
-        return replace(self, t_s=self.t_s[part], channels=self.channels[part], diameter_mm=self.diameter_mm[part])
+        return replace(
+            self,
+            t_s=self.t_s[part],
+            channels=self.channels[part],
+            diameter_mm=self.diameter_mm[part],
+            first_frame=self.first_frame + start,
+        )
 
     @property
     def tool_mm(self) -> Measured | None:
@@ -156,6 +164,15 @@ def check_finite(recordings: Sequence[FrameSeries]) -> None:
         wrong = sum(int(np.count_nonzero(~np.isfinite(values))) for values in (one.t_s, one.channels, torque))
         if wrong:
             raise CalibrationError(f"{which} holds {wrong} values that are not finite numbers; leave those frames out")
+
+
+def winkler_scores(truth: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return the scores of (n,) 95 % intervals: their widths and 40 times the distance of a truth outside.
+
+    Less is better (Winkler 1972; Gneiting and Raftery 2007, equation 43).
+    """
+    outside = np.maximum(low - truth, 0.0) + np.maximum(truth - high, 0.0)
+    return high - low + 2 / (1 - 0.95) * outside
 
 
 def distinct(measured: Sequence[Measured]) -> list[Measured]:

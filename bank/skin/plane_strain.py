@@ -10,11 +10,13 @@ the contact conditions are
 
 Both are one piecewise linear equation Φ(λ) = 0 (Alart & Curnier 1991; Hüeber, Stadler & Wohlmuth, SIAM J. Sci. Comput.
 30 (2008)), solved by a semismooth Newton method: each step guesses which nodes are apart, stick or slip, solves the
-linear system of that guess, and goes along it as far as Φ falls.
+linear system of that guess, and goes along it as far as Φ falls. Where that does not converge, Lemke's method solves
+the same conditions as a linear complementarity problem.
 """
 
 from collections.abc import Iterable
 from dataclasses import astuple, dataclass
+from itertools import cycle
 from typing import NamedTuple
 
 import numpy as np
@@ -29,13 +31,15 @@ from shearloop.bank.errors import BankError, GeometryError
 from shearloop.bank.skin.membrane import GAUGE_FACTOR, Section
 
 # Random starts at a friction of 1 take up to about 45 steps, a step of loading 3 to 25.
-MAX_STEPS = 200
+MAX_STEPS = 100
 # Relative to the largest contact force: about a thousand roundings.
 TOLERANCE = 1e-11
 # Below this fraction of a step Φ does not fall: the step alternates between two pieces of Φ.
 SHORTEST_STEP = 1e-2
 # The whole step is then taken, and Φ weighs displacement against force differently, which moves its pieces' borders.
 WEIGHTS = (1.0, 3.0, 0.3)
+# Lemke's method takes about one pivot to two rows.
+MAX_PIVOTS_PER_ROW, PIVOT_TOLERANCE = 20, 1e-12
 
 
 class ContactError(BankError):
@@ -206,12 +210,17 @@ def _along(theta: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContactState:
-    """The skin at rest under a load: contact forces (2n,) in N, circumferential displacements (n,) in mm."""
+    """The skin at rest under a load: contact forces (2n,) in N, circumferential displacements (n,) in mm.
+
+    `steps` of Newton's method found it, `pivoted` after Lemke's method.
+    """
 
     normal_n: float
     shear_n: float
     contact_force_n: FloatArray
     along_mm: FloatArray
+    steps: int = 0
+    pivoted: bool = False
 
 
 def unloaded(skin: CondensedSkin) -> ContactState:
@@ -229,9 +238,10 @@ def apply_load(
     """
     friction = skin.section.friction if friction is None else friction
     free = skin.load_displacement @ (normal_n, shear_n)
-    force = solve_contact(skin.compliance, free, before.along_mm, friction, before.contact_force_n)
+    found = solve_contact(skin.compliance, free, before.along_mm, friction, before.contact_force_n)
     n = len(before.along_mm)
-    return ContactState(normal_n, shear_n, force, skin.compliance[n:] @ force + free[n:])
+    along_mm = skin.compliance[n:] @ found.force_n + free[n:]
+    return ContactState(normal_n, shear_n, found.force_n, along_mm, found.steps, found.pivoted)
 
 
 def states_along(
@@ -266,39 +276,33 @@ def gauge_responses(skin: CondensedSkin, states: Iterable[ContactState]) -> Floa
     return gauge_strains(skin, states) @ [GAUGE_FACTOR, -GAUGE_FACTOR]
 
 
+class ContactSolution(NamedTuple):
+    """Contact forces (2n,) in N, the steps of Newton's method, and whether Lemke's method came before the last ones."""
+
+    force_n: FloatArray
+    steps: int
+    pivoted: bool = False
+
+
 def solve_contact(
     compliance: FloatArray, displacement: FloatArray, along_before: FloatArray, friction: float, start: FloatArray
-) -> FloatArray:
-    """Return the contact forces (2n,) in N of one increment.
+) -> ContactSolution:
+    """Return the contact forces of one increment.
 
-    `compliance` (2n, 2n) mm/N, `displacement` (2n,) mm without contact, `along_before` (n,) mm at the previous
-    increment, `start` (2n,) N. Raises ContactError where no solution is found.
+    `compliance` (2n, 2n) mm/N, symmetric and positive definite; `displacement` (2n,) mm without contact;
+    `along_before` (n,) mm at the previous increment; `start` (2n,) N. Raises ContactError for a load that is not a
+    number.
     """
     if not (np.isfinite(displacement).all() and np.isfinite(start).all()):
         raise ContactError("The skin's load is not a number; give its normal and shear force in N.")
     problem = _Problem(compliance, displacement, along_before, friction)
-    force, weight = start, 0
-    residual, guess = problem.residual(force, WEIGHTS[weight])
-    smallest = np.finfo(np.float64).tiny
-    for _ in range(MAX_STEPS):
-        size = np.linalg.norm(residual)
-        if size <= max(TOLERANCE * abs(force).max(), smallest):
-            return force
-        towards = problem.solve(guess) - force
-        length = 1.0
-        while length >= SHORTEST_STEP:
-            new_residual, new_guess = problem.residual(force + length * towards, WEIGHTS[weight])
-            if np.linalg.norm(new_residual) <= (1 - 1e-4 * length) * size:
-                break
-            length /= 2
-        else:
-            length, weight = 1.0, (weight + 1) % len(WEIGHTS)
-            new_residual, new_guess = problem.residual(force + towards, WEIGHTS[weight])
-        force, residual, guess = force + length * towards, new_residual, new_guess
-    raise ContactError(
-        f"The contact of the skin did not converge in {MAX_STEPS} steps at a friction of {friction}; "
-        "apply the load in smaller steps."
-    )
+    found, converged = problem.newton(start)
+    if converged:
+        return found
+    pivoted = problem.pivot()
+    # Newton's method removes the rounding of the pivots.
+    polished, converged = problem.newton(pivoted)
+    return ContactSolution(polished.force_n if converged else pivoted, found.steps + polished.steps, True)
 
 
 class _Guess(NamedTuple):
@@ -314,6 +318,31 @@ class _Problem:
     along_before: FloatArray
     friction: float
 
+    def newton(self, force: FloatArray) -> tuple[ContactSolution, bool]:
+        """Return where a semismooth Newton method comes from these forces, and whether it converged."""
+        weights = cycle(WEIGHTS)
+        weight = next(weights)
+        residual, guess = self.residual(force, weight)
+        smallest = np.finfo(np.float64).tiny
+        for step in range(MAX_STEPS):
+            size = np.linalg.norm(residual)
+            if size <= max(TOLERANCE * abs(force).max(), smallest):
+                return ContactSolution(force, step), True
+            solved = self.solve(guess)
+            if solved is None:
+                return ContactSolution(force, step), False
+            towards, length = solved - force, 1.0
+            while length >= SHORTEST_STEP:
+                residual, guess = self.residual(force + length * towards, weight)
+                if np.linalg.norm(residual) <= (1 - 1e-4 * length) * size:
+                    break
+                length /= 2
+            else:
+                length, weight = 1.0, next(weights)
+                residual, guess = self.residual(solved, weight)
+            force = force + length * towards
+        return ContactSolution(force, MAX_STEPS), False
+
     def residual(self, force: FloatArray, weight: float) -> tuple[FloatArray, _Guess]:
         """Return Φ (2n,) in N, and the piece of Φ that contains the forces."""
         n = len(self.along_before)
@@ -327,8 +356,11 @@ class _Problem:
         slipping = np.sign(trial[n:]) * (abs(trial[n:]) >= bound)
         return force - wanted, _Guess(trial[:n] > 0, slipping)
 
-    def solve(self, guess: _Guess) -> FloatArray:
-        """Return the forces of a guess: u_n = 0 where touching; there u_t as before or λ_t = ±μ λ_n."""
+    def solve(self, guess: _Guess) -> FloatArray | None:
+        """Return the forces of a guess: u_n = 0 where touching; there u_t as before or λ_t = ±μ λ_n.
+
+        None where the guess is singular: the sliding skin wedges.
+        """
         n, nodes = len(self.along_before), np.flatnonzero(guess.touching)
         sticking = n + nodes[guess.slipping[nodes] == 0]
         slip = self.friction * guess.slipping[nodes]
@@ -339,12 +371,70 @@ class _Problem:
         wanted[len(nodes) :] += self.along_before[sticking - n]
         try:
             solution = np.linalg.solve(matrix, wanted)
-        except np.linalg.LinAlgError as error:
-            raise ContactError(
-                f"At a friction of {self.friction} the sliding skin wedges: its equations are singular."
-            ) from error
+        except np.linalg.LinAlgError:
+            return None
         force = np.zeros(2 * n)
         force[nodes] = solution[: len(nodes)]
         force[n + nodes] = slip * force[nodes]
         force[sticking] = solution[len(nodes) :]
         return force
+
+    def pivot(self) -> FloatArray:
+        """Return the solution by Lemke's method: exact but for rounding, from any load and any history.
+
+        With λ_t = β⁺ − β⁻ and γ the slip, the conditions are a linear complementarity problem in (λ_n, β⁺, β⁻, γ) ≥ 0
+        with the slacks (u_n, γ + u_t − u_t,before, γ − u_t + u_t,before, μ λ_n − β⁺ − β⁻). Its matrix is copositive.
+        Without displacements only γ alone solves it, which no displacement multiplies, so the method cannot end in a
+        ray (Cottle, Pang & Stone, The Linear Complementarity Problem, section 4.4).
+        """
+        n = len(self.along_before)
+        scale = 1 / np.sqrt(np.diag(self.compliance))
+        scaled, moved = self.compliance * np.outer(scale, scale), self.displacement.copy()
+        moved[n:] -= self.along_before
+        moved *= scale
+        size = max(abs(moved).max(), np.finfo(np.float64).tiny)
+        one, none = np.eye(n), np.zeros((n, n))
+        (rr, rt), (tr, tt) = (np.hsplit(half, 2) for half in np.vsplit(scaled, 2))
+        bound = np.diag(self.friction * scale[:n] / scale[n:])
+        matrix = np.block([[rr, rt, -rt, none], [tr, tt, -tt, one], [-tr, -tt, tt, one], [bound, -one, -one, none]])
+        gaps, slips = np.split(moved / size, 2)
+        found = lemke(matrix, np.concatenate([gaps, slips, -slips, np.zeros(n)]))
+        force: FloatArray = np.concatenate([found[:n], found[n : 2 * n] - found[2 * n : 3 * n]]) * scale * size
+        return force
+
+
+def lemke(matrix: FloatArray, constant: FloatArray) -> FloatArray:
+    """Return z ≥ 0 with w = matrix z + constant ≥ 0 and wᵀz = 0, by complementary pivoting.
+
+    Raises ContactError where it ends in a ray.
+    """
+    n = len(constant)
+    # Uneven weights of the artificial variable break ties.
+    weights = np.random.default_rng(0).uniform(1.0, 2.0, n)
+    # Rows are the basic variables, columns the others and the constant. Variables: z, w, then the artificial one.
+    table = np.column_stack([matrix, weights, constant])
+    artificial = 2 * n
+    basic, others = np.arange(n, 2 * n), np.append(np.arange(n), artificial)
+    row, column = int(np.argmin(constant / weights)), n
+    if constant[row] >= 0:
+        return np.zeros(n)
+    for _ in range(MAX_PIVOTS_PER_ROW * n):
+        pivot = table[row, column]
+        swapped, factors = -table[row] / pivot, table[:, column].copy()
+        swapped[column], factors[row] = 1 / pivot, 0.0
+        table[row] = table[:, column] = 0.0
+        table += np.outer(factors, swapped)
+        table[row] = swapped
+        left = basic[row]
+        basic[row], others[column] = others[column], left
+        values = np.zeros(artificial + 1)
+        values[basic] = np.maximum(table[:, -1], 0.0)
+        if values[artificial] <= PIVOT_TOLERANCE:
+            return values[:n]
+        column = int(np.flatnonzero(others == (left + n) % artificial)[0])
+        rate = table[:, column]
+        falling = np.flatnonzero(rate < -PIVOT_TOLERANCE)
+        if not falling.size:
+            break
+        row = int(falling[np.argmin(np.maximum(table[falling, -1], 0.0) / -rate[falling])])
+    raise ContactError("The contact of the skin could not be solved by pivoting.")

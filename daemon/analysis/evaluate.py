@@ -1,19 +1,26 @@
 """Evaluates a calibration on recordings: every frame in order through a session, against the truth."""
 
+import csv
+import math
 import re
 import time
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
+from shearloop.bank.defaults import LOADED_NM
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, TactileFrame
+from shearloop.bank.estimation.values import winkler_scores
 
+Figures: TypeAlias = dict[str, float | int | None]
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
+_ENDS = ("", "_low", "_high")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,33 +51,44 @@ def estimate_in_worker(shared: tuple[Calibration, str | None], series: FrameSeri
     return estimate_series(calibration, series, None if path is None else Bank.open(path))
 
 
-def figures_of(tracks: Sequence[EstimateTrack]) -> dict[str, float | int | None]:
-    """Return the figures of `shearloop evaluate`, by the names that it prints.
+def figures_of(tracks: Sequence[EstimateTrack]) -> Figures:
+    """Return the figures of all frames, by the names that `shearloop evaluate` prints.
 
     They are of valid frames with a known truth, None where there are too few. interval_nm is the median width of their
-    intervals from end to end. With known diameters, diameter_rmse_mm, diameter_coverage_95 and diameter_interval_mm
-    are added, and coverage_95 is the diameter's if there is no torque.
+    intervals from end to end, winkler_nm the mean score of these, and zero_rmse_nm the error of always saying 0. With
+    known diameters, diameter_rmse_mm, diameter_coverage_95 and diameter_interval_mm are added, and coverage_95 is the
+    diameter's if there is no torque.
     """
-    torque = _compare(tracks, "torque")
-    diameter = _compare(tracks, "diameter")
+    torque, diameter = (_compare(_frames(tracks, *one)) for one in (("torque", "nm"), ("diameter", "mm")))
     valid = [estimate.valid for track in tracks for estimate in track.estimates]
     latency = np.concatenate([track.latency_ms for track in tracks])
-    figures: dict[str, float | int | None] = {
+    figures: Figures = {
         "r": torque.r,
-        "rmse_nm": torque.rmse,
-        "bias_nm": torque.bias,
-        "coverage_95": torque.coverage if torque.n else diameter.coverage,
-        "interval_nm": torque.width,
+        **torque.errors_nm(),
         "valid_fraction": float(np.mean(valid)) if valid else None,
         "latency_ms_p50": float(np.quantile(latency, 0.5)) if len(latency) else None,
         "latency_ms_p99": float(np.quantile(latency, 0.99)) if len(latency) else None,
         "frames": len(valid),
     }
+    if not torque.estimated:
+        figures["coverage_95"] = diameter.coverage
     if any(np.isfinite(track.series.diameter_mm).any() for track in tracks):
         figures["diameter_rmse_mm"] = diameter.rmse
         figures["diameter_coverage_95"] = diameter.coverage
         figures["diameter_interval_mm"] = diameter.width
     return figures
+
+
+def figures_by_load(tracks: Sequence[EstimateTrack], loaded_nm: float = LOADED_NM) -> dict[str, Figures]:
+    """Return the torque's figures of `loaded` frames, whose truth is loaded_nm or more in size, and of `unloaded` ones.
+
+    Of n frames with a known truth valid_fraction have a torque; the others are not judged. gain is the mean estimate
+    over the mean truth, both along the truth.
+    """
+    frames = _frames(tracks, "torque", "nm")
+    is_loaded = np.abs(frames[0]) >= loaded_nm
+    loaded, unloaded = _compare(frames[:, is_loaded]), _compare(frames[:, ~is_loaded])
+    return {"loaded": {**loaded.stratum_nm(), "gain": loaded.gain}, "unloaded": unloaded.stratum_nm()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,37 +111,80 @@ def invalid_reasons(tracks: Sequence[EstimateTrack]) -> list[InvalidReason]:
 
 @dataclass(frozen=True, slots=True)
 class _Comparison:
+    """The errors of the `estimated` ones of n frames with a known truth."""
+
     n: int
+    estimated: int
     r: float | None = None
     rmse: float | None = None
+    zero_rmse: float | None = None
     bias: float | None = None
+    gain: float | None = None
     coverage: float | None = None
     width: float | None = None
+    winkler: float | None = None
+
+    def errors_nm(self) -> Figures:
+        """Return the errors of a torque by their names."""
+        return {
+            "rmse_nm": self.rmse,
+            "zero_rmse_nm": self.zero_rmse,
+            "bias_nm": self.bias,
+            "coverage_95": self.coverage,
+            "interval_nm": self.width,
+            "winkler_nm": self.winkler,
+        }
+
+    def stratum_nm(self) -> Figures:
+        """Return the errors with the number of frames and the share with a torque."""
+        return {"n": self.n, **self.errors_nm(), "valid_fraction": self.estimated / self.n if self.n else None}
 
 
-def _compare(tracks: Sequence[EstimateTrack], quantity: str) -> _Comparison:
-    unit = {"torque": "nm", "diameter": "mm"}[quantity]
+def _frames(tracks: Sequence[EstimateTrack], quantity: str, unit: str) -> FloatArray:
+    """Return truth, estimate and interval's ends (4, n) of frames with a known truth; NaN for what is not estimated."""
+    names = [f"{quantity}_{unit}", f"{quantity}_low_{unit}", f"{quantity}_high_{unit}"]
     rows = []
     for track in tracks:
         truths = track.series.torque_at_frames() if quantity == "torque" else track.series.diameter_mm
-        for estimate, truth in zip(track.estimates, truths, strict=True):
-            value = getattr(estimate, f"{quantity}_{unit}")
-            if value is not None and np.isfinite(truth):
-                low, high = getattr(estimate, f"{quantity}_low_{unit}"), getattr(estimate, f"{quantity}_high_{unit}")
-                rows.append((value, float(truth), low <= truth <= high, high - low))
-    if len(rows) < 2:
-        return _Comparison(len(rows))
-    value, truth, inside, width = np.array(rows, dtype=np.float64).T
-    error = value - truth
+        for truth, estimate in zip(truths.tolist(), track.estimates, strict=True):
+            rows.append([truth, *(getattr(estimate, name) for name in names)])
+    table = np.array(rows, dtype=np.float64).reshape(-1, 4).T
+    return table[:, np.isfinite(table[0])]
+
+
+def _compare(frames: FloatArray) -> _Comparison:
+    truth, value, low, high = frames[:, np.isfinite(frames[1])]
+    if len(truth) < 2:
+        return _Comparison(frames.shape[1], len(truth))
+    error, size = value - truth, float(np.abs(truth).sum())
     changing = value.std() > 0 and truth.std() > 0
     return _Comparison(
-        len(rows),
-        float(np.corrcoef(value, truth)[0, 1]) if changing else None,
-        float(np.sqrt((error**2).mean())),
-        float(error.mean()),
-        float(inside.mean()),
-        float(np.median(width)),
+        frames.shape[1],
+        len(truth),
+        r=float(np.corrcoef(value, truth)[0, 1]) if changing else None,
+        rmse=float(np.sqrt((error**2).mean())),
+        zero_rmse=float(np.sqrt((truth**2).mean())),
+        bias=float(error.mean()),
+        gain=float((value * np.sign(truth)).sum()) / size if size else None,
+        coverage=float(((low <= truth) & (truth <= high)).mean()),
+        width=float(np.median(high - low)),
+        winkler=float(winkler_scores(truth, low, high).mean()),
     )
+
+
+def write_estimates(tracks: Sequence[EstimateTrack], names: Sequence[str], path: Path) -> None:
+    """Write a CSV row for every frame of each named series; a cell is empty where there is no truth or no estimate."""
+    values = [f"{quantity}{end}_{unit}" for quantity, unit in (("torque", "nm"), ("diameter", "mm")) for end in _ENDS]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow(["recording", "frame", "t_s", "truth_nm", *values, "valid", "reason"])
+        for track, name in zip(tracks, names, strict=True):
+            series = track.series
+            truths = [None if math.isnan(one) else one for one in series.torque_at_frames().tolist()]
+            frames = enumerate(zip(series.t_s.tolist(), truths, track.estimates, strict=True), series.first_frame)
+            for number, (t_s, truth, estimate) in frames:
+                cells = [getattr(estimate, one) for one in values]
+                table.writerow([name, number, t_s, truth, *cells, estimate.valid, "; ".join(estimate.reasons)])
 
 
 def draw_tracks(tracks: Sequence[EstimateTrack], names: Sequence[str], title: str, path: Path) -> None:

@@ -52,8 +52,13 @@ def read_series(path: Path, sides: tuple[str, ...] | None = None, tool_mm: float
 
 
 def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_mm: float | None = None) -> FrameSeries:
-    """Return a recording's frames, several sides paired by time; times are in seconds since its first frame."""
-    wanted = sides or tuple(side for side in SIDES if side in recording.sides) or tuple(recording.sides)
+    """Return a recording's frames, several sides paired by time at their mean time.
+
+    Times are in seconds since the middle of the recording's first frame of the right side, or of the left without a
+    right one, whatever `sides` are wanted.
+    """
+    known = tuple(side for side in SIDES if side in recording.sides) or tuple(recording.sides)
+    wanted = sides or known
     missing = [side for side in wanted if side not in recording.sides]
     if missing or not wanted:
         # Only frames of SIDES can be imported.
@@ -68,7 +73,7 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_m
     times = np.array([recording.sides[side].t_mid_ns[row] for side, row in zip(wanted, rows, strict=True)])
     paired = np.ptp(times, axis=0) <= _LARGEST_APART * period_ns
     lines = [recording.sides[side].lines[row][paired] for side, row in zip(wanted, rows, strict=True)]
-    start = int(first.t_mid_ns[0])
+    start = int(recording.sides[known[0]].t_mid_ns[0])
     t_s = (times[:, paired] - start).mean(axis=0) / 1e9
     diameter_mm, gripper_mm = tool_of(recording, first.t_mid_ns, tool_mm)
     return FrameSeries(

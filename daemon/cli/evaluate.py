@@ -3,10 +3,17 @@
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from shearloop.bank.defaults import LOADED_NM
 from shearloop.daemon.cli.options import add_cluster, add_json, add_option, writing
 from shearloop.daemon.errors import UserError
+
+if TYPE_CHECKING:
+    from shearloop.bank.estimation import Calibration
+    from shearloop.daemon.analysis.evaluate import EstimateTrack
 
 _FIGURES = (".png", ".svg", ".pdf")
 
@@ -18,15 +25,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--bank", Path, "FILE", "the bank of the calibration, if any")
     text = "share of each recording to use, e.g. 0.6:1 after calibrating on 0:0.6 (default: all)"
     add_option(parser, "--time-range", str, "FROM:TO", text, default="0:1")
+    text = "least true torque of a frame that counts as loaded (default: %(default)s N·m)"
+    add_option(parser, "--loaded-nm", float, "NM", text, default=LOADED_NM)
+    add_option(parser, "--estimates", Path, "FILE.csv", "table to write with truth and estimate of every frame")
     add_cluster(parser)
     add_json(parser)
     parser.add_argument("--plot", action="store_true", help="draw truth and estimate over time into --out")
     add_option(parser, "--out", Path, "FILE", "figure to draw (default with --plot: CAL.png)")
     parser.epilog = (
-        "Prints for valid estimates with a known truth: correlation (r), root mean square error and bias in N·m, the "
-        "share of truths within the 95 % intervals (coverage_95), and the median width of the intervals from end to "
-        "end (interval_nm, for diameters diameter_interval_mm). Prints for all frames: the share that is valid, why "
-        "others are not, and the milliseconds of an estimate."
+        "Prints for valid estimates with a known truth, first of loaded frames, then of the others, then of all: root "
+        "mean square error, the same for an estimate that is always 0 (zero_rmse_nm), bias, the share of truths within "
+        "the 95 % intervals (coverage_95), the median width of the intervals (interval_nm, for diameters "
+        "diameter_interval_mm), and their mean score (winkler_nm: the width, and 40 times the distance of a truth "
+        "outside; less is better). gain is the mean estimate over the mean truth, r the correlation. Prints for all "
+        "frames: the share that is valid, why others are not, and the milliseconds of an estimate."
     )
 
 
@@ -35,49 +47,69 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.eit.bank_file import Bank
     from shearloop.bank.estimation import Calibration
     from shearloop.bank.estimation.load_delay import load_delay_warning
-    from shearloop.daemon.analysis.evaluate import draw_tracks, estimate_in_worker, figures_of, invalid_reasons
+    from shearloop.daemon.analysis.evaluate import (
+        estimate_in_worker,
+        figures_by_load,
+        figures_of,
+        invalid_reasons,
+        write_estimates,
+    )
     from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, part_of, read_series
-    from shearloop.daemon.cli.options import check_kind, parse_time_range
+    from shearloop.daemon.cli.options import check_kind, check_overwrite, parse_time_range
     from shearloop.daemon.executors import in_order, open_executor
 
     if args.out is not None and args.out.suffix not in _FIGURES:
         raise UserError(f"--out {args.out} is not the name of a figure; give one that ends in {', '.join(_FIGURES)}")
+    if not args.loaded_nm >= 0:
+        raise UserError(f"--loaded-nm must be 0 N·m or more, not {args.loaded_nm:g}")
+    if args.estimates is not None:
+        check_overwrite(args.estimates, "a table")
     check_paths_differ(args.recordings)
     calibration = Calibration.load(args.calibration)
     bank = Bank.open(args.bank) if args.bank else None
     start, stop = parse_time_range(args.time_range)
-    named = [(path, one) for path in args.recordings for one in read_series(path)]
+    sides = calibration.sides if calibration.kind == "raw" else None
+    named = [(path, one) for path in args.recordings for one in read_series(path, sides)]
     check_kind(args.calibration, calibration, [one for _, one in named])
     parts = [part_of(one, start, stop) for _, one in named]
     check_no_copies([(str(path), part) for (path, _), part in zip(named, parts, strict=True)])
     shared = (calibration, None if bank is None else str(args.bank.resolve()))
     with open_executor(args.cluster) as pool:
         tracks = in_order(pool.map(estimate_in_worker, shared, parts))
-    figures = figures_of(tracks)
+    if args.estimates is not None:
+        with writing(args.estimates, "the estimates"):
+            write_estimates(tracks, [str(path) for path, _ in named], args.estimates)
     if calibration.assumptions:
         print(f"{args.calibration} assumes that {calibration.assumption_text}.", file=sys.stderr)
     for (path, _), part in zip(named, parts, strict=True):
         if warning := load_delay_warning(part):
             print(f"Warning: {path.name}: {warning}.", file=sys.stderr)
     if args.plot or args.out:
-        out = args.out or args.calibration.with_suffix(".png")
-        titles = [f"{path.name}, {' and '.join(part.sides)}" for (path, _), part in zip(named, parts, strict=True)]
-        title = f"{calibration.estimator.name}, fitted to {calibration.source}"
-        try:
-            with writing(out, "the figure"):
-                draw_tracks(tracks, titles, title, out)
-        except ModuleNotFoundError as error:
-            raise UserError(f"the figure needs {error.name}: `pip install 'shearloop[plot]'`") from error
-        print(f"The figure is in {out}.", file=sys.stderr)
+        _draw(tracks, [path for path, _ in named], calibration, args.out or args.calibration.with_suffix(".png"))
+    by_load, figures = figures_by_load(tracks, args.loaded_nm), figures_of(tracks)
     if args.json:
-        print(json.dumps(figures))
+        print(json.dumps({**by_load, **figures}))
         return 0
-    width = max(map(len, figures))
-    for name, value in figures.items():
-        print(f"{name:<{width}}  {_shown(value)}")
+    groups = {**{f"{load} ": group for load, group in by_load.items()}, "": figures}
+    rows = [(load + name, _shown(value)) for load, group in groups.items() for name, value in group.items()]
+    width = max(len(name) for name, _ in rows)
+    for name, shown in rows:
+        print(f"{name:<{width}}  {shown}")
     for reason in invalid_reasons(tracks):
         print(f"{reason.frames:>6} frames not valid{', e.g.' if reason.differ else ''}: {reason.sentence}")
     return 0
+
+
+def _draw(tracks: "Sequence[EstimateTrack]", paths: "Sequence[Path]", calibration: "Calibration", out: Path) -> None:
+    from shearloop.daemon.analysis.evaluate import draw_tracks
+
+    names = [f"{path.name}, {' and '.join(one.series.sides)}" for path, one in zip(paths, tracks, strict=True)]
+    try:
+        with writing(out, "the figure"):
+            draw_tracks(tracks, names, f"{calibration.estimator.name}, fitted to {calibration.source}", out)
+    except ModuleNotFoundError as error:
+        raise UserError(f"the figure needs {error.name}: `pip install 'shearloop[plot]'`") from error
+    print(f"The figure is in {out}.", file=sys.stderr)
 
 
 def _shown(value: float | None) -> str:

@@ -106,7 +106,7 @@ def writing(out: Path, what: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise UserError(f"{out}: {what} cannot be written: {error.strerror}; choose another --out") from error
+        raise UserError(f"{out}: {what} cannot be written: {error.strerror}; choose another path") from error
 
 
 def parse_time_range(text: str) -> tuple[float, float]:

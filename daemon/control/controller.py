@@ -33,7 +33,7 @@ from shearloop.daemon.control.loop_inputs import NotNegative, Positive, TorqueSa
 from shearloop.daemon.errors import UserError
 
 # The ramp does not catch up when the loop was late for longer than this.
-_LONGEST_STEP_NS = 50_000_000
+LONGEST_STEP_NS = 50_000_000
 # A rest ends at the deadband, a motion at this share of it: the hysteresis keeps noise from toggling the two.
 _SETTLED_SHARE = 0.1
 # CUSUM test for jumps (Page 1954), in standard deviations: the slack per innovation and the threshold of the sum. It
@@ -307,7 +307,7 @@ class TwistController:
         anything forbids motion, and never exceeds the limit. It counts as sent until `sent` corrects it.
         """
         own, tool = self.settings, self.estimator
-        elapsed_s = min(max(t_ns - self._t_ns, 0), _LONGEST_STEP_NS) / 1e9
+        elapsed_s = min(max(t_ns - self._t_ns, 0), LONGEST_STEP_NS) / 1e9
         self._t_ns = max(t_ns, self._t_ns)
         reasons = []
         if math.isfinite(wrist_angle_rad):

@@ -3,7 +3,7 @@
 import math
 from collections import deque
 
-from shearloop.daemon.control.controller import ControllerSettings, TwistController, WristCommand
+from shearloop.daemon.control.controller import LONGEST_STEP_NS, ControllerSettings, TwistController, WristCommand
 from shearloop.daemon.control.experiment import (
     ConstantVelocity,
     Hold,
@@ -18,8 +18,6 @@ from shearloop.daemon.control.margins import gain_for_noise, integral_gain, marg
 
 # Torques that wait for the next wrist angle.
 MOST_PENDING = 64
-# After a longer pause of the loop, the speed sent last is unknown.
-LONGEST_STEP_NS = 50_000_000
 # The largest drift of the torque at a fixed angle that counts as creep.
 CREEP_LIMIT_NM_PER_S = 0.005
 # Either way from the wrist angle of the closed loop's start.
@@ -139,6 +137,7 @@ class WristController:
         """Return the turn that was sent and does not show in the angle yet."""
         passed_ns = t_ns - self._turned_ns
         self._turned_ns = t_ns
+        # After a longer pause of the loop, the speed sent last is unknown.
         if 0 < passed_ns <= LONGEST_STEP_NS:
             self._under_way.append((t_ns, self._sent_rad_per_s, passed_ns / 1e9))
         since_ns = t_ns - self._config.actuation_s * 1e9

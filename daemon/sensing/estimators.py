@@ -9,11 +9,13 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
+from shearloop.bank.defaults import MAX_GAP_S
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, Measured, TactileFrame
 from shearloop.bank.estimation.bank_match import PaperMatcher
+from shearloop.bank.estimation.estimator import PaperEstimator
 from shearloop.bank.estimation.session import REPEATED_FRAME
 from shearloop.daemon.config import CombinedConfig, DaemonConfig, FingertipConfig
 from shearloop.daemon.control.loop_inputs import TorqueSource
@@ -31,8 +33,6 @@ _MATCHERS: Mapping[str, type[PrunedMatcher | PrunedZeroLagMatcher]] = {
 }
 # Matchers in use have no state, so fingertips with the same bank share one.
 _in_use: WeakValueDictionary[tuple[str, str], PrunedMatcher | PrunedZeroLagMatcher] = WeakValueDictionary()
-# A longer gap restarts the average of frames.
-_MAX_GAP_S = 3.0
 
 
 class FrameEstimator:
@@ -58,7 +58,7 @@ class FrameEstimator:
             period_s=config.frame_period_s,
             baseline_frames=config.baseline_frames,
             average_frames=config.average_frames,
-            max_gap_s=max(_MAX_GAP_S, STALE_AFTER_PERIODS * config.frame_period_s),
+            max_gap_s=max(MAX_GAP_S, STALE_AFTER_PERIODS * config.frame_period_s),
         )
 
     @property
@@ -141,21 +141,21 @@ def open_estimator(config: FingertipConfig, name: str) -> FrameEstimator:
         if calibration.estimator.searches_bank and config.bank is None:
             raise _without_bank(calibration.estimator.name, name)
         return _live(config.calibration, calibration, config)
-    if config.estimator not in (None, "paper"):
+    if config.estimator not in (None, PaperEstimator.name):
         found = "none is configured" if config.calibration is None else f"{config.calibration} does not exist"
         raise UserError(
             f"the estimator {config.estimator} of {name} needs a calibration on recordings, and {found}; make one with "
             f"`shearloop calibrate REC… --estimator {config.estimator} --out CAL`"
         )
     if config.bank is None:
-        raise _without_bank("paper", name)
+        raise _without_bank(PaperEstimator.name, name)
     if config.calibration is not None:
         return FrameEstimator(Calibration.load(config.calibration), config)
     return FrameEstimator(Calibration.uncalibrated(Bank.open(config.bank).identity), config)
 
 
 def _without_bank(estimator: str, name: str) -> UserError:
-    return UserError(f"the estimator {estimator} of {name} needs its bank; add `bank:` to the fingertip")
+    return UserError(f"the estimator `{estimator}` needs a bank; add `bank:` to the fingertip {name}")
 
 
 def open_combined(config: CombinedConfig, fingertips: Mapping[str, FingertipConfig]) -> FrameEstimator:

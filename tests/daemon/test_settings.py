@@ -21,45 +21,88 @@ PACKAGE = Path(__file__).parents[2]
 SIMULATED = ("emulators", "charts", "synthetic")
 
 
-def literal(default: ast.expr | None) -> object:
-    """Return a default that is written out, a number other than 0 and 1 or a text; None for a name."""
-    if isinstance(default, ast.Call) and isinstance(default.func, ast.Name) and default.func.id == "Field":
-        named = [keyword.value for keyword in default.keywords if keyword.arg == "default"]
-        default = next(iter([*named, *default.args]), None)
-    if not isinstance(default, ast.Constant) or isinstance(default.value, bool) or default.value in (0, 1, ""):
-        return None
-    return default.value
+Place = tuple[str, str]
 
 
-def defaults(path: Path) -> Iterator[tuple[str, object, bool]]:
-    """Yield the name and the value of each default of a class, and whether it is an argument of its constructor."""
-    bodies = [node.body for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ClassDef)]
-    for line in [line for body in bodies for line in body]:
+def module_of(path: Path) -> str:
+    return ".".join(("shearloop", *path.relative_to(PACKAGE).with_suffix("").parts))
+
+
+TREES = {
+    module_of(path): ast.parse(path.read_text())
+    for folder in ("bank", "drivers", "daemon")
+    for path in (PACKAGE / folder).rglob("*.py")
+    if not any(word in str(path) for word in SIMULATED)
+}
+
+
+def constants() -> dict[Place, ast.expr]:
+    """Return the values of the modules' constants."""
+    found: dict[Place, ast.expr] = {}
+    for module, line in [(module, line) for module, tree in TREES.items() for line in tree.body]:
+        if not isinstance(line, ast.Assign | ast.AnnAssign):
+            continue
+        targets = line.targets if isinstance(line, ast.Assign) else [line.target]
+        for target in targets:
+            several = isinstance(target, ast.Tuple) and isinstance(line.value, ast.Tuple)
+            pairs = zip(target.elts, line.value.elts, strict=True) if several else [(target, line.value)]
+            found.update({(module, name.id): value for name, value in pairs if isinstance(name, ast.Name)})
+    return found
+
+
+CONSTANTS = constants()
+IMPORTS = {
+    (module, each.asname or each.name): (line.module, each.name)
+    for module, tree in TREES.items()
+    for line in ast.walk(tree)
+    if isinstance(line, ast.ImportFrom)
+    for each in line.names
+}
+
+
+def origin(module: str, default: ast.expr | None) -> tuple[Place, object] | None:
+    """Return where a default is written out, and its value; None for a switch, an empty value and what is computed."""
+    match default:
+        case ast.Call(func=ast.Name(id="Field")):
+            named = [keyword.value for keyword in default.keywords if keyword.arg == "default"]
+            return origin(module, next(iter([*named, *default.args]), None))
+        case ast.Constant(value=value) if not isinstance(value, bool) and value not in (None, 0, 1, "", ...):
+            return (module, f"line {default.lineno}"), value
+        case ast.Name(id=name):
+            module, name = IMPORTS.get((module, name), (module, name))
+        case ast.Attribute(value=ast.Name(id=owner), attr=name) if (module, owner) in IMPORTS:
+            module = ".".join(IMPORTS[module, owner])
+        case _:
+            return None
+    found = origin(module, CONSTANTS.get((module, name)))
+    return found if found is None or found[0][0] != module else ((module, name), found[1])
+
+
+def defaults() -> Iterator[tuple[str, Place, object]]:
+    """Yield the name of each default of a class or of its constructor, where it is written out, and its value."""
+    classes = [(module, node) for module, tree in TREES.items() for node in ast.walk(tree)]
+    bodies = [(module, node.body) for module, node in classes if isinstance(node, ast.ClassDef)]
+    for module, line in [(module, line) for module, body in bodies for line in body]:
+        pairs: list[tuple[str, ast.expr | None]] = []
         if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name):
-            if "ClassVar" not in ast.unparse(line.annotation) and (value := literal(line.value)) is not None:
-                yield line.target.id, value, False
+            pairs = [(line.target.id, line.value)]
         elif isinstance(line, ast.FunctionDef) and line.name == "__init__":
             arguments = [*line.args.posonlyargs, *line.args.args][::-1]
-            pairs = [*zip(arguments, line.args.defaults[::-1], strict=False)]
-            for argument, default in [*pairs, *zip(line.args.kwonlyargs, line.args.kw_defaults, strict=True)]:
-                if (value := literal(default)) is not None:
-                    yield argument.arg, value, True
+            by_position = zip(arguments, line.args.defaults[::-1], strict=False)
+            by_name = zip(line.args.kwonlyargs, line.args.kw_defaults, strict=True)
+            pairs = [(argument.arg, value) for argument, value in [*by_position, *by_name]]
+        for name, value in pairs:
+            if (found := origin(module, value)) is not None:
+                yield name, *found
 
 
 def test_no_default_stands_twice():
-    """Two models may use one name with different values, as the steps do; a constructor repeats no default."""
-    places: dict[str, dict[Path, tuple[object, bool]]] = defaultdict(dict)
-    for path in [path for folder in ("bank", "drivers", "daemon") for path in (PACKAGE / folder).rglob("*.py")]:
-        if not any(word in str(path) for word in SIMULATED):
-            for name, value, of_constructor in defaults(path):
-                places[name][path] = value, of_constructor
-    twice = {
-        name: sorted(str(path.relative_to(PACKAGE)) for path in found)
-        for name, found in places.items()
-        if len({value for value, _ in found.values()}) < len(found)
-        or (len(found) > 1 and any(of_constructor for _, of_constructor in found.values()))
-    }
-    assert twice == {}
+    """One name may have several values, as in the steps of an experiment; equal values come from one constant."""
+    places: dict[tuple[str, object], set[Place]] = defaultdict(set)
+    for name, place, value in defaults():
+        places[name, value].add(place)
+    assert len(places) > 100
+    assert {name: found for name, found in places.items() if len(found) > 1} == {}
 
 
 @pytest.mark.parametrize("where", ["loop", "robot"])

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 # The paper's screwdriver, and the largest torque of its peak samples.
 K_CM, LARGEST_TORQUE_NM = 3.25, 0.14
-LEVER_ARM_M, STANDARD_GRAVITY = 0.035, 9.80665
 UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standard input:
   protective-stop         stop for safety, pause the program
   emergency-stop          press the button: stop, end the program, power off
@@ -122,6 +121,8 @@ def _configure_hx711(parser: argparse.ArgumentParser) -> None:
 
 def _run_hx711(args: argparse.Namespace) -> int:
     from shearloop.drivers.emulators.boards import LOAD_PERIOD_S, PAPER_SKETCH, Hx711Board, Sketch
+    from shearloop.drivers.load_calibration import STANDARD_GRAVITY
+    from shearloop.drivers.load_cell import LEVER_ARM_M
 
     console.check_positive(args, "speed")
     if not math.isfinite(args.torque_nm):

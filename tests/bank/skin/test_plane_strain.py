@@ -8,6 +8,7 @@ import pytest
 import skfem
 from numpy.typing import NDArray
 
+from benchmarks.skin import random_states
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import GeometryError
 from shearloop.bank.skin import membrane as membrane_model
@@ -19,6 +20,7 @@ from shearloop.bank.skin.plane_strain import (
     ContactError,
     ContactState,
     MeshSize,
+    _Problem,
     annulus_mesh,
     apply_load,
     condense,
@@ -225,11 +227,17 @@ def gaps_and_forces(skin: CondensedSkin, state: ContactState) -> tuple[FloatArra
 
 def test_the_contact_conditions_hold_at_every_node(loadings, skin_112):
     for state in itertools.chain(*loadings.values()):
-        gap, pressing, along = gaps_and_forces(skin_112, state)
-        assert gap.min() > -1e-12
-        assert pressing.min() >= 0
-        assert (pressing * gap).max() < 1e-14
-        assert (abs(along) <= SECTION.friction * pressing + 1e-14).all()
+        assert_contact(skin_112, state)
+
+
+def assert_contact(skin: CondensedSkin, state: ContactState) -> None:
+    gap, pressing, along = gaps_and_forces(skin, state)
+    free = skin.load_displacement @ (state.normal_n, state.shear_n)
+    force_n, way_mm = abs(state.contact_force_n).max(), abs(free).max()
+    assert gap.min() > -1e-9 * way_mm
+    assert pressing.min() >= 0
+    assert (pressing * gap).max() <= 1e-9 * force_n * way_mm
+    assert (abs(along) <= skin.section.friction * pressing + 1e-9 * force_n).all()
 
 
 def projected_gauss_seidel(
@@ -274,7 +282,7 @@ def test_it_converges_from_random_starts_and_in_one_jump(skin_112, friction):
     for normal_n, shear_n in [(1.0, 0.0), (1.0, 1.0), (2.0, -1.5), (0.5, 3.0)]:
         free = skin_112.load_displacement @ (normal_n, shear_n)
         jumps = [
-            solve_contact(skin_112.compliance, free, np.zeros(n), friction, start)
+            solve_contact(skin_112.compliance, free, np.zeros(n), friction, start).force_n
             for start in [np.zeros(2 * n), *rng.normal(0, (0.01, 1, 10), (2 * n, 3)).T]
         ]
         for jump in jumps[1:]:
@@ -296,22 +304,50 @@ def test_random_histories_of_slip_do_not_stop_it():
         free = skin.load_displacement @ (rng.uniform(0, 2), rng.uniform(-3, 3))
         friction = (0.04, 0.5, 1.0)[seed % 3]
         before = rng.normal(0, 0.3, n)
-        force = solve_contact(skin.compliance, free, before, friction, rng.normal(0, 1, 2 * n))
+        force = solve_contact(skin.compliance, free, before, friction, rng.normal(0, 1, 2 * n)).force_n
         gap = (skin.compliance @ force + free)[:n]
         assert gap.min() > -1e-9
         assert force[:n].min() >= 0
 
 
-@pytest.mark.parametrize(("thickness_mm", "friction"), [(0.05, 0.04), (0.7, 1.0)])
-def test_a_loop_is_followed_far_from_the_paper_s_section(thickness_mm, friction):
-    skin = condense(replace(SECTION, thickness_mm=thickness_mm, friction=friction))
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"thickness_mm": 0.05},
+        {"friction": 1.0},
+        {"thickness_mm": 6.0},
+        {"thickness_mm": 6.0, "friction": 1.0},
+        {"poisson_ratio": 0.4999, "friction": 1.0},
+    ],
+)
+def test_a_loop_is_followed_far_from_the_paper_s_section(changed):
+    skin = condense(replace(SECTION, **changed))
     for state in states_along(skin, 1.0, loop(1.0)[:13]):
-        gap, pressing, along = gaps_and_forces(skin, state)
-        free = skin.load_displacement @ (state.normal_n, state.shear_n)
-        scale = abs(state.contact_force_n).max()
-        assert gap.min() > -1e-9 * abs(free).max()
-        assert pressing.min() >= 0
-        assert (abs(along) <= friction * pressing + 1e-9 * scale).all()
+        assert_contact(skin, state)
+
+
+def test_a_load_that_rises_at_a_tilt_is_solved_on_a_fine_mesh():
+    skin = condense(SECTION, MeshSize(5, 9, 26, 16, 4))
+    state = unloaded(skin)
+    for load_n in np.arange(1, 21) * 0.1:
+        state = apply_load(skin, state, load_n * np.cos(np.radians(1)), load_n * np.sin(np.radians(1)))
+        assert_contact(skin, state)
+
+
+@pytest.mark.parametrize("seed", [1, 8, 45])
+def test_random_loads_on_random_skins_are_solved(seed):
+    for skin, state in random_states(seed):
+        assert_contact(skin, state)
+
+
+def test_pivoting_finds_newton_s_forces():
+    skin = condense(SECTION, MeshSize(3, 4, 6, 2, 2))
+    before = np.random.default_rng(3).normal(0, 0.1, len(skin.contact_deg))
+    for load_n in [(1.0, 0.0), (1.0, 1.0), (0.5, -2.0)]:
+        problem = _Problem(skin.compliance, skin.load_displacement @ load_n, before, SECTION.friction)
+        newton, converged = problem.newton(np.zeros(2 * len(before)))
+        assert converged
+        np.testing.assert_allclose(problem.pivot(), newton.force_n, atol=1e-9 * abs(newton.force_n).max())
 
 
 def test_numbers_that_are_none_are_refused_not_returned(skin_112):

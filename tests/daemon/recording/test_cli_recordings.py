@@ -19,7 +19,7 @@ from shearloop.daemon.cli import main
 from shearloop.daemon.cli.calibrate.recording import sentences_of
 
 KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "interval_nm", "valid_fraction", "frames"}
-KEYS |= {"latency_ms_p50", "latency_ms_p99"}
+KEYS |= {"latency_ms_p50", "latency_ms_p99", "winkler_nm", "zero_rmse_nm", "loaded", "unloaded"}
 
 
 @pytest.mark.usefixtures("fonts", "few_mixtures")
@@ -41,6 +41,8 @@ def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_p
     assert figures["rmse_nm"] < 0.01
     assert figures["diameter_rmse_mm"] < 3
     assert figures["frames"] == 20 + 6
+    assert figures["loaded"]["n"] + figures["unloaded"]["n"] == 20 + 6
+    assert figures["winkler_nm"] >= figures["interval_nm"] / 2
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
     assert main(["evaluate", str(first), str(slices_folder), "--out", str(tmp_path / "named.svg")]) == 0
     capsys.readouterr()
@@ -50,6 +52,24 @@ def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_p
     assert "rmse_nm" in text
     assert re.search(r"^interval_nm +0\.\d+$", text, re.MULTILINE)
     assert "diameter" not in text
+
+
+@pytest.mark.usefixtures("few_mixtures")
+def test_a_part_of_the_slices_has_the_rows_of_the_whole(slices_folder, tmp_path, capsys):
+    slices, whole, judged = str(slices_folder / "torque_slices"), tmp_path / "all.cal", []
+    for out, part in ((whole, []), (tmp_path / "part.cal", ["--time-range", "0:1"])):
+        assert main(["calibrate", slices, "--estimator", "regression", "--out", str(out), *part]) == 0
+    assert whole.read_bytes() == (tmp_path / "part.cal").read_bytes()
+    capsys.readouterr()
+    for n, part in enumerate(([], ["--time-range", "0:1"], ["--time-range", "0.6:1"], ["--loaded-nm", "9"])):
+        table = tmp_path / f"{n}.csv"
+        assert main(["evaluate", str(whole), slices, *part, "--estimates", str(table), "--json"]) == 0
+        judged.append((table.read_text(), json.loads(capsys.readouterr().out)))
+    (rows, figures), (same_rows, same), (later, _), (_, unloaded) = judged
+    assert same_rows == rows
+    assert same["loaded"] == figures["loaded"]
+    assert later.splitlines()[1:] == rows.splitlines()[-20:]
+    assert (unloaded["loaded"]["n"], unloaded["unloaded"]["n"]) == (0, 49)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,6 +210,7 @@ def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, 
         (["calibrate", "nowhere.mcap", "--out", "x"], "nowhere.mcap: the recording cannot be read"),
         (["evaluate", "nowhere.cal", "{slices}"], "nowhere.cal: the calibration cannot be read"),
         (["evaluate", "nowhere.cal", "{slices}", "--out", "x.mcap"], "x.mcap is not the name of a figure"),
+        (["evaluate", "nowhere.cal", "{slices}", "--loaded-nm", "-1"], "--loaded-nm must be 0 N·m or more, not -1"),
     ],
 )
 def test_mistakes_end_in_one_sentence(arguments, message, slices_folder, capsys, tmp_path, monkeypatch):

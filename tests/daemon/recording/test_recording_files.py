@@ -150,6 +150,11 @@ def test_two_sides_are_paired_by_time(mat_folder, tmp_path):
     assert both.channels.shape == (60, 2, 896)
     left = series_of(read_recording(tmp_path / "a.mcap"), ("left",))
     np.testing.assert_array_equal(left.channels[:, 0], both.channels[:, 1])
+    # Times count from the first right frame; the left ones arrived 0.05 s later.
+    np.testing.assert_allclose(left.t_s, PERIOD_S * np.arange(60) + 0.05, atol=1e-6)
+    np.testing.assert_allclose(both.t_s, PERIOD_S * np.arange(60) + 0.025, atol=1e-6)
+    import_mat([mat_folder("alone", sides=("Left_Data",))], tmp_path / "b.mcap")
+    np.testing.assert_allclose(series_of(read_recording(tmp_path / "b.mcap")).t_s[0], 0.0, atol=1e-9)
     assert np.isfinite(both.torque_at_frames()[2:55]).all()
     early, later = part_of(both, 0, 0.25), part_of(both, 0.25, 1)
     assert (len(early.t_s), len(later.t_s)) == (15, 45)

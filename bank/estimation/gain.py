@@ -18,7 +18,7 @@ from shearloop.bank.polynomial import TWO_SIDED_95
 
 # Standard deviation of the logarithm of one fingertip's gain between recordings, and the recordings that it counts as.
 # Cylinders and days recorded twice differ by factors of 0.44 to 1.4.
-PRIOR_SPREAD, _PRIOR_RECORDINGS = 0.35, 3
+PRIOR_SPREAD, _PRIOR_RECORDINGS = 0.28, 3
 # Twists of a recording differ at least by this; a few alike are chance.
 _LEAST_WITHIN = 0.05
 # A frame is loaded above this share of the largest torque.
@@ -31,12 +31,14 @@ _LEAST_GAIN, _LARGEST_GAIN = 0.2, 5.0
 class GainSpread:
     """Standard deviations of the gain's logarithm, and of a loaded frame in N·m beside the gain.
 
-    `between` is of one recording to the next, `within` of one twist to the next.
+    `between` is of one recording to the next, and as certain as from this number of `recordings`; `within` is of one
+    twist to the next.
     """
 
     between: float = 0.0
     within: float = _LEAST_WITHIN
     noise_nm: float = 0.0
+    recordings: int = _PRIOR_RECORDINGS
 
     @classmethod
     def fit(
@@ -50,37 +52,56 @@ class GainSpread:
         residuals = [truth[rows] - gain * predicted[rows] for gain, rows in zip(gains, twists, strict=True)]
         noise_nm = float(np.sqrt(np.mean(np.concatenate(residuals) ** 2))) if twists else 0.0
         within = float(np.std(np.log(gains))) if twists else 0.0
-        prior = PRIOR_SPREAD**2 / m
-        squares = sum(math.log(one) ** 2 for one in recordings)
-        between = math.sqrt((_PRIOR_RECORDINGS * prior + squares) / (_PRIOR_RECORDINGS + len(recordings)))
-        return cls(between, max(within, _LEAST_WITHIN), noise_nm)
+        prior = cls(PRIOR_SPREAD / math.sqrt(m), max(within, _LEAST_WITHIN), noise_nm)
+        return prior._with_recordings([math.log(one) ** 2 for one in recordings])
+
+    def _with_recordings(self, squares: Sequence[float]) -> Self:
+        """Return the spread after recordings with these squares of the gain's logarithm."""
+        n = self.recordings + len(squares)
+        return replace(self, between=math.sqrt((self.recordings * self.between**2 + sum(squares)) / n), recordings=n)
 
     def reach(self, value: float) -> tuple[float, float]:
         """Return how far the truth may lie towards zero and away from it, at 95 %, because of the gain."""
         factor = math.exp(TWO_SIDED_95 * self.between)
         return abs(value) * (1.0 - 1.0 / factor), abs(value) * (factor - 1.0)
 
-    def correct(
-        self, parts: FloatArray, truth: FloatArray, twists: Sequence[IntArray]
-    ) -> tuple[FloatArray, "GainSpread"]:
-        """Return the (m,) factors on the parts (n, m) of predictions that m fingertips add, and the spread then.
+    def correct(self, parts: FloatArray, truth: FloatArray, twists: Sequence[IntArray]) -> "GainCorrection":
+        """Return the factors on the parts (n, m) of predictions that m fingertips add.
 
         Frames of a twist share its gain, so a long twist determines the gain no better than twists agree.
         """
-        m = parts.shape[1]
-        information = np.eye(m) / (self.between**2 * m)
+        m, loaded = parts.shape[1], np.concatenate(twists)
+        total = parts.sum(axis=1)
+        # This recording shows how far gains go as well, less what its noise and its twists would show alone.
+        excess = math.log(_gain(total[loaded], truth[loaded])) ** 2 - self.within**2 / len(twists)
+        excess -= self.noise_nm**2 / float(total[loaded] @ total[loaded])
+        spread = self._with_recordings([max(excess, 0.0)])
+        information = np.eye(m) / (spread.between**2 * m)
         towards = np.zeros(m)
         for rows in twists:
-            own, total = parts[rows], parts[rows].sum(axis=1)
             error = self.noise_nm**2 * np.eye(len(rows)) + self.within**2 * np.outer(truth[rows], truth[rows])
-            weighted = np.linalg.solve(error, own).T
-            information += weighted @ own
-            towards += weighted @ (truth[rows] - total)
+            weighted = np.linalg.solve(error, parts[rows]).T
+            information += weighted @ parts[rows]
+            towards += weighted @ (truth[rows] - total[rows])
         covariance = np.linalg.inv(information)
         factors = np.clip(1.0 + covariance @ towards, _LEAST_GAIN, _LARGEST_GAIN)
-        loaded = parts[np.concatenate(twists)]
-        relative = np.einsum("ni,ij,nj->n", loaded, covariance, loaded).mean() / ((loaded @ factors) ** 2).mean()
-        return factors, replace(self, between=float(min(np.sqrt(relative), self.between)))
+        variance = np.einsum("ni,ij,nj->n", parts[loaded], covariance, parts[loaded]).mean()
+        relative = float(np.sqrt(variance / ((parts[loaded] @ factors) ** 2).mean()))
+        spread = replace(spread, between=min(relative, spread.between))
+        return GainCorrection(factors, np.sqrt(np.diag(covariance)), spread, len(twists))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GainCorrection:
+    """Factors (m,) on the torques of m fingertips with their standard errors, the spread that remains, and the twists.
+
+    Where an estimator combines its fingertips otherwise, m is 1.
+    """
+
+    factors: FloatArray
+    errors: FloatArray
+    spread: GainSpread
+    twists: int
 
 
 def find_twists(torque_nm: FloatArray) -> list[IntArray]:

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from shearloop.bank.estimation import TRUSTED, Calibration, FrameSeries, LoadTiming, Physics, fit, measure_timing
+from shearloop.bank.estimation import TRUSTED, Calibration, FrameSeries, LoadTiming, Physics, adapt, fit, measure_timing
+from shearloop.bank.estimation.gain import GainCorrection
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor
 from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, part_of, read_series, series_of
@@ -113,6 +114,29 @@ def calibrate(
     warned = [each for each in zip(timing.references, timing.warnings, strict=True) if each[1]]
     doubts = [f"{name}: {why}" for name, one in named for reference, why in warned if one is reference]
     return CalibrationResult(calibration, sum(len(one.t_s) for one in parts), timing, doubts)
+
+
+def adapt_to_recordings(
+    calibration: Calibration,
+    paths: Sequence[Path],
+    physics: Physics,
+    *,
+    time_range: tuple[float, float],
+    load_cell_delay_s: float = 0.0,
+    tool_mm: float | None = None,
+) -> tuple[Calibration, GainCorrection]:
+    """Return a calibration adapted to the twists within these shares of recordings, and the correction of its gain.
+
+    Raises UserError for recordings that are given twice, and CalibrationError for those that show no gain.
+    """
+    check_paths_differ(paths)
+    start, stop = time_range
+    series = [one for path in paths for one in read_series(path, calibration.sides, tool_mm)]
+    # Earlier frames show the session the idle fingertip.
+    until = [part_of(replace(one, torque_t_s=one.torque_t_s - load_cell_delay_s), 0.0, stop) for one in series]
+    first = [part_of(one, start, stop).first_frame for one in series]
+    options = CalibrationOptions(time_range=time_range, load_cell_delay_s=load_cell_delay_s)
+    return adapt(calibration, until, _source(paths, options), physics, first_frames=first)
 
 
 def _read(path: Path, options: CalibrationOptions) -> tuple[list[FrameSeries], list[FrameSeries]]:

@@ -34,6 +34,7 @@ COMMANDS = {
         ("recording", "cli.recording", "inspect recordings, repair them, and export them as tables"),
         ("replay", "cli.replay", "send a recording through the same estimators again, as if live"),
         ("evaluate", "cli.evaluate", "judge a calibrated estimator on recordings or slices"),
+        ("adapt", "cli.adapt", "correct a calibration's gain by one or a few twists of known torque"),
         ("chart", "cli.chart", "chart speed against accuracy, stability, and how much model is needed"),
         ("check", "cli.check", "check a configuration and the files it names"),
         ("listen", "cli.listen", "print what a running daemon publishes"),

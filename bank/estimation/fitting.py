@@ -25,7 +25,6 @@ from shearloop.bank.estimation.estimator import (
     Reading,
 )
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator, segment_grip
-from shearloop.bank.estimation.gain import GainCorrection
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor, Mixtures, fit_interval_regressor
 from shearloop.bank.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
 from shearloop.bank.estimation.novelty import NoveltyDetector
@@ -33,6 +32,7 @@ from shearloop.bank.estimation.regressors import later_origins
 from shearloop.bank.estimation.session_state import ProcessedFrame, SessionState
 from shearloop.bank.estimation.values import FrameSeries, Measured, TactileFrame, check_finite, distinct
 from shearloop.bank.estimators import EstimatorName, estimator_class
+from shearloop.bank.gain import GainCorrection
 
 # With more variance left on a tool of another diameter, the tools have no torque in common.
 _TOOLS_MAY_LEAVE = 0.75

@@ -12,20 +12,20 @@ ones. On torques of another recording the error of the gain is added, which grow
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol, Self, TypeAlias
+from typing import ClassVar, Protocol, Self, TypeAlias
 
 import numpy as np
 from scipy.special import stdtrit
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.gain import LOADED_SHARE, GainCorrection, GainSpread, find_twists, loaded_gain
 from shearloop.bank.estimation.regressors import (
     InverseCalibration,
     later_splits,
     left_out_blocks,
 )
 from shearloop.bank.estimation.values import INLINE
+from shearloop.bank.gain import LOADED_SHARE, GainCorrection, GainSpread, find_twists, loaded_gain
 from shearloop.bank.polynomial import TWO_SIDED_95, Polynomial
 
 LEVEL = 0.95
@@ -266,8 +266,7 @@ class IntervalRegressor:
         widening /= math.sqrt(max(usable_share, 0.1))
         half = widening * float(self.intervals.half_widths[self.intervals.edges.searchsorted(raw)])
         moved = others[0] - value if others else 0.0
-        inward, outward = self.gain.reach(value)
-        down, up = (inward, outward) if value > 0 else (outward, inward)
+        down, up = self.gain.reach(value)
         below = max(math.hypot(half, down) + max(-moved, 0.0), limit_share * self.contamination_below)
         above = max(math.hypot(half, up) + max(moved, 0.0), limit_share * self.contamination_above)
         if self.misses_loads:
@@ -297,15 +296,16 @@ class IntervalRegressor:
                 f"no twist reaches {least_nm:.3g} N·m while an estimate is possible; twist further, some seconds "
                 "after the grip"
             )
+        lever = isinstance(point, CensoredRidge)
         sign = point.sign if isinstance(point, CensoredRidge) else 1.0
         m, weighted = int(sides.max()) + 1, features * point.weights
         constant = point.offset - float(point.mean @ point.weights)
         parts = np.array([weighted[:, sides == side].sum(axis=1) + constant / m for side in range(m)]).T
-        correction = self.gain.correct(parts, sign * torque_nm, twists)
+        correction = self.gain.correct(parts, sign * torque_nm, twists, bounded=lever)
         factors, loaded = correction.factors, np.concatenate(twists)
         total = float((parts[loaded] @ factors).sum() / parts[loaded].sum())
         weights, larger = point.weights * factors[sides], max(total, 1.0)
-        offset = constant * float(factors.mean()) + float(point.mean @ weights)
+        offset = constant * float(factors.mean()) + float(point.mean @ weights) + correction.offset_nm
         adapted = replace(
             self,
             point=replace(point, weights=weights, offset=offset),
@@ -332,6 +332,8 @@ class IntervalRegressor:
 @dataclass(frozen=True, slots=True)
 class PolynomialRegressor:
     """The paper's curve over the first feature, sigma or k in cm, with its prediction interval."""
+
+    gain: ClassVar[GainSpread] = GainSpread()
 
     symbol: str
     polynomial: Polynomial
@@ -381,14 +383,14 @@ def fit_interval_regressor(
     extend to the further one. With the number of each row's recording, `recordings` (n,), intervals allow for the gain
     of another recording of as many `fingertips`. Raises CalibrationError where the data does not determine the fit.
     """
-    if len(values) < _LEAST_FRAMES or np.ptp(values) == 0:
-        raise CalibrationError(
-            f"{len(values)} frames with values between {np.min(values, initial=np.inf):.3g} and "
-            f"{np.max(values, initial=-np.inf):.3g} determine no calibration; record more, at different loads"
-        )
+    _check_values(values)
     strength = strengths[0] if len(strengths) == 1 else best_strength(features, values, fit, strengths)[0]
     blocks = list(left_out or left_out_blocks(len(values)))
-    parts = [fit(features[past], values[past], strength) for past, _ in blocks]
+
+    def refit(rows: IntArray) -> Regressor:
+        return fit(features[rows], values[rows], strength)
+
+    parts = [refit(past) for past, _ in blocks]
     raw = [part.predict(features[future]) for part, (_, future) in zip(parts, blocks, strict=True)]
     reported = np.concatenate([_reported(part, one) for part, one in zip(parts, raw, strict=True)])
     predicted, rows = np.concatenate(raw), np.concatenate([future for _, future in blocks])
@@ -421,21 +423,32 @@ def fit_interval_regressor(
         tested = ((part, test.accepted(*block)) for part, block in zip(parts, blocks, strict=True))
         contamination = _contamination(features, values, tested, inflation)
         if not full_range:
-            ends = (
-                _range_end(point, features, values, lambda rows: fit(features[rows], values[rows], strength), sign)
-                for sign in (1, -1)
-            )
+            ends = (_range_end(point, features, values, refit, sign) for sign in (1, -1))
             span = ValueRange(low, high, span.lowest, span.highest, *ends)
-    gain = GainSpread()
-    if recordings is not None:
-        gains = []
-        for one in np.unique(recordings):
-            kept, out = np.flatnonzero(recordings != one), np.flatnonzero(recordings == one)
-            if len(kept) and np.ptp(values[kept]) > 0 and np.ptp(values[out]) > 0:
-                part = fit(features[kept], values[kept], strength)
-                gains.append(loaded_gain(_reported(part, part.predict(features[out])), values[out]))
-        gain = GainSpread.fit(reported, truth, find_twists(truth), gains, fingertips)
+    gains = [] if recordings is None else _gains_of_recordings(features, values, recordings, refit)
+    gain = GainSpread() if recordings is None else GainSpread.fit(reported, truth, gains, fingertips)
     return IntervalRegressor(point, intervals, span, centre, deviation, misses_loads, *contamination, widening, gain)
+
+
+def _check_values(values: FloatArray) -> None:
+    if len(values) < _LEAST_FRAMES or np.ptp(values) == 0:
+        raise CalibrationError(
+            f"{len(values)} frames with values between {np.min(values, initial=np.inf):.3g} and "
+            f"{np.max(values, initial=-np.inf):.3g} determine no calibration; record more, at different loads"
+        )
+
+
+def _gains_of_recordings(
+    features: FloatArray, values: FloatArray, recordings: IntArray, refit: Callable[[IntArray], Regressor]
+) -> list[float]:
+    """Return the gain of each recording that the others can predict."""
+    gains: list[float] = []
+    for one in np.unique(recordings):
+        kept, out = np.flatnonzero(recordings != one), np.flatnonzero(recordings == one)
+        if len(kept) and np.ptp(values[kept]) > 0 and np.ptp(values[out]) > 0:
+            part = refit(kept)
+            gains.append(loaded_gain(_reported(part, part.predict(features[out])), values[out]))
+    return gains
 
 
 def _contamination(

@@ -58,6 +58,8 @@ class Recording:
     torque_nm: NDArray[np.float64]
     # The tools that a calibrated gripper held: since when (Unix ns), and the diameter or None for no tool.
     tools: tuple[tuple[int, Measured | None], ...] = ()
+    # Whether a daemon recorded it: frames and torques are then stamped on arrival by one clock.
+    live: bool = False
 
 
 class OpenRecording:
@@ -147,6 +149,7 @@ def read_recording(path: str | Path) -> Recording:
         prefix = f"{schema.FRAME_TOPIC}."
         sides = {topic: topic.removeprefix(prefix) for topic in recording.counts if topic.startswith(prefix)}
         inputs = [schema.input_topic(side) for side in sides.values()]
+        topics = set(recording.counts)
         for channel, message in recording.messages([schema.LOAD_TOPIC, *sides, *inputs]):
             topic, t_ns = channel.topic, message.log_time
             try:
@@ -178,6 +181,7 @@ def read_recording(path: str | Path) -> Recording:
         np.array([t for t, _ in torques], dtype=np.int64),
         np.array([torque for _, torque in torques], dtype=np.float64),
         tuple(tools),
+        live=bool(sides) and all(schema.input_topic(side) in topics for side in sides.values()),
     )
 
 

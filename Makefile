@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS := 1
 # Without bytecode files every test process would compile all modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install install-dev system-packages demo docs test lint format clean
+.PHONY: install install-dev system-packages demo docs docs-site test test-fast lint format clean
 
 # `install` is for running and drawing; `install-dev` adds the tools of tests and checks.
 install: $(VENV)/.installed
@@ -31,17 +31,8 @@ system-packages:
 	[ -z "$$missing" ] || { apt-get update -qq -o Acquire::Retries=2 -o Acquire::http::Timeout=30 && apt-get install -y -qq --no-install-recommends $$missing; }
 
 # The whole emulated rig; with RECORDING=FILE one fingertip that plays a recorded stream (.mat).
-DEMO := $(if $(RECORDING),config/fingertip_demo.yaml --recording '$(RECORDING)',config/demo.yaml)
-demo: install run/demo.bank $(if $(RECORDING),,run/rig.cal)
-	$(BIN)/shearloop run $(DEMO) --show
-
-# Recordings of the emulated rig, and the calibrations made from them.
-run/rig.cal: run/demo.bank src/shearloop/daemon/cli/calibrate_demo.py | install
-	$(BIN)/python -m shearloop.daemon.cli.calibrate_demo --bank $< --out run
-
-run/demo.bank: config/banks/demo.yaml config/fingertips/paper.yaml | install
-	mkdir -p run
-	$(BIN)/shearloop bank build --config $< --out $@
+demo: install
+	$(BIN)/shearloop demo --folder . $(if $(RECORDING),--recording '$(RECORDING)')
 
 # Test files run in parallel, the longest first (tests/conftest.py). Tests that drive a robot run afterwards with less
 # load, because a robot stops when its computer is busy; they may be repeated twice, and the summary names them. Status 5:
@@ -50,6 +41,17 @@ PYTEST := $(BIN)/pytest
 test: install-dev
 	$(PYTEST) -n 3 --dist loadfile --no-loadscope-reorder -m 'not real_time' $(PYTEST_ARGS) || [ $$? -eq 5 ]
 	$(PYTEST) -n 2 --dist loadfile --no-loadscope-reorder -m real_time --reruns 2 --reruns-delay 2 -rR $(PYTEST_ARGS) || [ $$? -eq 5 ]
+
+# What depends most on the versions of Python and of the libraries; nothing in real time.
+FAST := tests/test_package.py $(addprefix tests/bank/test_,bank_file.py forward.py matching.py models.py) \
+	$(addprefix tests/bank/estimation/test_,archive.py heads.py intervals.py values.py) \
+	$(wildcard tests/drivers/test_*.py) tests/drivers/shear_skin \
+	$(addprefix tests/drivers/ur/test_,limits.py messages.py settings.py) tests/daemon/messaging \
+	$(addprefix tests/daemon/recording/test_,replay.py schemas.py tools.py) \
+	$(addprefix tests/daemon/cli/test_,json.py start.py) \
+	$(addprefix tests/daemon/test_,completion.py config_file.py docgen.py garbage_collection.py settings.py)
+test-fast: install-dev
+	$(PYTEST) -n 3 --dist loadfile -m 'not real_time' $(PYTEST_ARGS) $(FAST)
 
 lint: install-dev
 	$(BIN)/ruff check .
@@ -64,6 +66,10 @@ format: install-dev
 # The generated pages.
 docs: install
 	$(BIN)/python -m shearloop.daemon.docgen
+
+# The pages as a site in build/site; every warning is an error. The variable silences an advertisement.
+docs-site: install-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

@@ -3,8 +3,8 @@
     python -m benchmarks.daemon_speed --bank run/paper.bank --rig run --out run/daemon_speed.json
 
 Each figure is measured on a daemon in its own process, through a pseudo-terminal and a subscriber's socket. Latency
-counts from before the last byte is written until the subscriber has the estimate. `--rig` is the folder of
-`shearloop.daemon.cli.calibrate_demo`, with the default estimator's recording and calibrations, and the rig's bank.
+counts from before the last byte is written until the subscriber has the estimate. `--rig` is the folder
+`run` of `shearloop demo --prepare`, with the default estimator's recording and calibrations, and the rig's bank.
 Needs the extra `bench`.
 """
 

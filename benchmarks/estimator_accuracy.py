@@ -22,7 +22,7 @@ from shearloop.bank.estimation import FrameSeries, Physics, fit, measure_timing
 from shearloop.bank.estimators import DEFAULT, EstimatorName
 from shearloop.daemon.analysis.evaluate import EstimateTrack, draw_tracks, estimate_series, figures_of
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
-from shearloop.daemon.cli.calibrate_demo import calibrate, record
+from shearloop.daemon.cli.emulated_calibration import calibrate, record
 from shearloop.daemon.recording.matlab import import_mat
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.drivers.emulators.rig import SIDES

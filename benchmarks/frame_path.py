@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 import shearloop
 from benchmarks import common
 from shearloop.daemon.app import Daemon
-from shearloop.daemon.cli.calibrate_demo import calibrate, record
+from shearloop.daemon.cli.emulated_calibration import calibrate, record
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.runner import ControlLoopRunner

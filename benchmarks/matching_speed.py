@@ -24,7 +24,7 @@ from scipy.io import loadmat
 from benchmarks.common import parser_of, write_figures
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import MIN_SIGNAL_NORM, Bank
-from shearloop.bank.eit.channels import N_CHANNELS, N_LINE_VALUES, channels_of_line
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.forward import BatchForwardModel
 from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatcher, best_match, unit_magnitudes
 from shearloop.bank.eit.mesh import Mesh
@@ -91,10 +91,10 @@ def cell_methods(mesh: Mesh) -> tuple[dict[str, tuple[Run, int]], float]:
 
 def match_methods(bank: Bank, frames: FloatArray) -> dict[str, tuple[Run, int]]:
     """Return the functions that match frames, with the number of frames of each call."""
-    single = unit_magnitudes(frames).astype(np.float32)
+    single = unit_magnitudes(frames, PAPER_TABLE.n_channels).astype(np.float32)
     signals = np.abs(bank.signals[bank.valid]).astype(np.float32)
     signals /= np.linalg.norm(signals, axis=1, keepdims=True)
-    length = fft.next_fast_len(2 * N_CHANNELS - 1, real=True)
+    length = fft.next_fast_len(2 * PAPER_TABLE.n_channels - 1, real=True)
     spectra = np.conj(fft.rfft(signals, length)).astype(np.complex64)
     every, zero = PrunedMatcher.from_bank(bank), PrunedZeroLagMatcher.from_bank(bank)
     n = len(frames)
@@ -117,7 +117,7 @@ def match_methods(bank: Bank, frames: FloatArray) -> dict[str, tuple[Run, int]]:
     except ImportError:
         return methods
     faiss.omp_set_num_threads(1)
-    index = faiss.IndexFlatIP(N_CHANNELS)
+    index = faiss.IndexFlatIP(PAPER_TABLE.n_channels)
     index.add(signals)
     methods["zero lag, FAISS flat"] = (lambda: [index.search(frame[None], 1) for frame in single], n)
     return methods
@@ -131,10 +131,10 @@ def recorded_slices(folder: Path) -> FloatArray:
 def recorded_frames(folder: Path, every: int) -> Iterator[FloatArray]:
     """Yield (n, 896) differences of all slices, and of every n-th stream frame to the mean of its first ten."""
     streams = [
-        channels_of_line(values[:, 1:])
+        PAPER_TABLE.channels_of_line(values[:, 1:])
         for path in sorted(folder.glob("streams/*/*.mat"))
         for values in loadmat(path).values()
-        if getattr(values, "shape", (0, 0))[-1] == N_LINE_VALUES + 1
+        if getattr(values, "shape", (0, 0))[-1] == PAPER_TABLE.n_line_values + 1
     ]
     for frames in (recorded_slices(folder), *(each[10::every] - each[:10].mean(axis=0) for each in streams)):
         for start in range(0, len(frames), 32):
@@ -212,7 +212,7 @@ def main() -> None:
     args = parser.parse_args()
     bank, slices = Bank.open(args.bank), recorded_slices(args.recordings)
     frames = slices[np.linspace(0, len(slices) - 1, N_FRAMES).astype(int)]
-    cells, error = cell_methods(load_geometry(args.mesh))
+    cells, error = cell_methods(load_geometry(args.mesh).mesh)
     seconds = take_turns({**cells, **match_methods(bank, frames)}, args.turns)
     seconds |= cold_seconds(bank, frames, args.turns)
     found: dict[str, Any] = {

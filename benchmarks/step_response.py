@@ -18,11 +18,11 @@ import numpy as np
 
 from benchmarks.common import parser_of, write_figures
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.eit.channels import channels_of_line
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFrame
 from shearloop.daemon.analysis.charts import simulated_loop as sim
 from shearloop.daemon.analysis.creep import Stretch, fit_creep
-from shearloop.daemon.cli.calibrate_demo import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
+from shearloop.daemon.cli.emulated_calibration import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
 from shearloop.daemon.control.loop_inputs import Creep, LoopConfig
 from shearloop.daemon.control.margins import margin_refusal
 from shearloop.daemon.synthetic_frames import RigFrames
@@ -120,7 +120,9 @@ class RigPlant(sim.Plant):
         self._reading.ends_s += FRAME_PERIOD_S
         lines, t_mid_s = lines_of(self.scene, self.frames), self.t_s - FRAME_PERIOD_S / 2
         true_nm = self.scene.conversion_nm(FRAME_PERIOD_S)
-        estimate = self.tracker.estimate(TactileFrame.of(t_mid_s, np.array([channels_of_line(one) for one in lines])))
+        estimate = self.tracker.estimate(
+            TactileFrame.of(t_mid_s, np.array([PAPER_TABLE.channels_of_line(one) for one in lines]))
+        )
         if estimate.torque_nm is None or estimate.torque_low_nm is None or estimate.torque_high_nm is None:
             self.not_valid += 1
             return

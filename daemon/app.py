@@ -15,13 +15,14 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
-from shearloop.daemon.messaging.addresses import local_stop_address
 from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import CurveAuthenticator, Refusals, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
+from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.recording.recorder import Recorder, daemon_identity
 from shearloop.daemon.rig import Rig, check_experiment, make_gripper, make_loop
+from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.estimators import COMBINED, open_combined, open_estimator, torque_sources
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.sensors import SensorBuilder, Sensors
@@ -50,12 +51,12 @@ class RecordingTask:
 class Daemon:
     """All parts of one running daemon."""
 
-    def __init__(self, config: DaemonConfig, context: zmq.asyncio.Context) -> None:
+    def __init__(self, config: DaemonConfig, context: zmq.asyncio.Context, summary: RunSummary | None = None) -> None:
         """Open every file of the configuration and bind the sockets; devices may connect later."""
         clock = Clock()
         self.supervisor = Supervisor()
+        self._summary = summary or RunSummary()
         self._stop = asyncio.Event()
-        self._stop_when_done = config.stop_when_done
         with contextlib.ExitStack() as opened:
             keys = load_server_keys(config.curve.server_key) if config.curve is not None else None
             refusals = Refusals()
@@ -65,6 +66,7 @@ class Daemon:
                 authenticator = CurveAuthenticator(context, config.curve.clients, refusals)
                 opened.callback(authenticator.close)
             self.publisher = opened.enter_context(contextlib.closing(Publisher(context, config.publish, clock, keys)))
+            self.publisher.add_listener(self._summary)
             self.recorder: Recorder | None = None
             if config.recording is not None:
                 self.recorder = Recorder(config.recording.folder, daemon_identity(config), clock)
@@ -79,11 +81,8 @@ class Daemon:
             self.commands = Commands(self._rig, self.sensors, self._experiment, self.health, self._stop)
             server = CommandServer(context, config.commands, self.commands.handlers(), refusals, keys)
             opened.callback(server.close)
-            open_stop: CommandServer | None = None
-            if "commands" in config.network_addresses:
-                address = local_stop_address(config.commands)
-                open_stop = CommandServer(context, address, self.commands.open_handlers(), refusals)
-                opened.callback(open_stop.close)
+            stop_socket = StopSocket(server.address, self.commands.open_handlers(), refusals)
+            opened.callback(stop_socket.close)
             self._close = opened.pop_all().close
         tasks: dict[str, Task | None] = {
             **self.sensors.tasks(),
@@ -92,7 +91,8 @@ class Daemon:
             "recording": RecordingTask(self.recorder, self._rig) if self.recorder is not None else None,
             "keys": authenticator,
             "commands": server,
-            "open_stop": open_stop,
+            "stop": stop_socket,
+            "publish": self.publisher,
             "health": self.health,
         }
         self._tasks = {name: task for name, task in tasks.items() if task is not None}
@@ -106,6 +106,7 @@ class Daemon:
             await self._run_tasks(on_ready)
             if self._experiment is not None:
                 self._experiment.close()
+            self.health.publish_end(finished=self.finished, summary=self._summary.text)
         finally:
             try:
                 if self.recorder is not None:
@@ -151,7 +152,7 @@ class Daemon:
     @property
     def finished(self) -> bool:
         """Whether the experiment that ends the daemon is done; True without one."""
-        return self._experiment is None or self._experiment.done or not self._stop_when_done
+        return self._experiment is None or self._experiment.finished
 
 
 def _build_rig(
@@ -177,12 +178,13 @@ async def run_daemon(
     listeners: tuple[Listener, ...] = (),
     reporters: Mapping[str, Reporter] = MappingProxyType({}),
     on_ready: Callable[[], None] = lambda: None,
+    summary: RunSummary | None = None,
 ) -> bool:
     """Run a daemon until SIGINT, SIGTERM, SIGHUP or the command `stop`; return whether it ended as planned.
 
     It ended as planned if its experiment is done, or by SIGTERM or SIGHUP. `listeners` receive every message;
-    `reporters` add their parts to `health`, by name; `on_ready` is called once all tasks run. SIGTERM and SIGHUP are
-    ignored afterwards.
+    `reporters` add their parts to `health`, by name; `on_ready` is called once all tasks run; `summary` collects
+    the daemon's messages. SIGTERM and SIGHUP are ignored afterwards.
     """
     loop, terminated = asyncio.get_running_loop(), False
 
@@ -192,7 +194,7 @@ async def run_daemon(
         daemon.stop()
 
     with zmq.asyncio.Context() as context:
-        daemon = Daemon(config, context)
+        daemon = Daemon(config, context, summary)
         for listener in listeners:
             daemon.publisher.add_listener(listener)
         for name, reporter in reporters.items():

@@ -3,14 +3,15 @@
 from dataclasses import fields
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import BankDefinition
-from shearloop.bank.eit.fingertip import ElectrodePlace, Fingertip, Side
+from shearloop.bank.eit.channels import INJECTION, ChannelTable, Injection
+from shearloop.bank.eit.fingertip import ElectrodePlace, Fingertip, RectangularFingertip, RoundFingertip, Side
 from shearloop.bank.eit.mesh import Mesh, load_mesh
 from shearloop.bank.eit.models import QUARTER_DEG, Variation
 from shearloop.bank.errors import GeometryError
@@ -26,9 +27,9 @@ Measure = Annotated[float, Field(gt=0, le=100)]
 class GridConfig(ConfigModel):
     """`count` values from `low` to `high`, both included; a single one where the two are the same."""
 
-    low: Annotated[float, Field(ge=-1000, le=1000)]
-    high: Annotated[float, Field(ge=-1000, le=1000)]
-    count: Annotated[int, Field(ge=1, le=2000)]
+    low: float = Field(ge=-1000, le=1000, description="the first value")
+    high: float = Field(ge=-1000, le=1000, description="the last value")
+    count: int = Field(ge=1, le=2000, description="number of values")
 
     @model_validator(mode="after")
     def _ascends(self) -> Self:
@@ -44,9 +45,10 @@ class GridConfig(ConfigModel):
 
 
 class MeshFileConfig(ConfigModel):
-    """A mesh file: .npz or EIDORS .mat."""
+    """A mesh file (.npz or EIDORS .mat), and how its electrodes are driven."""
 
-    file: Path
+    file: Path = Field(description="the mesh: .npz or EIDORS .mat")
+    injection: Injection = Field(INJECTION, description="the electrode that an injection's current comes from")
 
 
 class OverConfig(ConfigModel):
@@ -56,13 +58,13 @@ class OverConfig(ConfigModel):
     replace the fingertip's.
     """
 
-    amplitude: GridConfig | None = None
-    offset: GridConfig | None = None
-    tilt_deg: GridConfig | None = None
-    width_cm: GridConfig | None = None
-    height_cm: GridConfig | None = None
-    electrode_width_cm: GridConfig | None = None
-    contact_impedance: GridConfig | None = None
+    amplitude: GridConfig | None = Field(None, description="factor of the basis model f")
+    offset: GridConfig | None = Field(None, description="change of the whole conductivity")
+    tilt_deg: GridConfig | None = Field(None, description="angle of the axis of f")
+    width_cm: GridConfig | None = Field(None, description="width of the fingertip")
+    height_cm: GridConfig | None = Field(None, description="height of the fingertip")
+    electrode_width_cm: GridConfig | None = Field(None, description="width of each electrode")
+    contact_impedance: GridConfig | None = Field(None, description="of each contact, in cm over the conductivity")
 
     @field_validator("tilt_deg")
     @classmethod
@@ -90,13 +92,15 @@ class BankConfig(ConfigModel):
     With `over`, a folder of banks.
     """
 
-    mesh: MeshFileConfig | None = None
-    fingertip: Path | None = None
-    mesh_size_cm: MeshSize | None = None
-    model: ModelName
-    k: GridConfig
-    sigma: GridConfig
-    over: OverConfig | None = None
+    what: ClassVar[str] = "bank's description"
+
+    mesh: MeshFileConfig | None = Field(None, description="a mesh from a file; else `fingertip`")
+    fingertip: Path | None = Field(None, description="the fingertip's dimensions, a file; else `mesh`")
+    mesh_size_cm: MeshSize | None = Field(None, description="largest distance of mesh lines (default: the fingertip's)")
+    model: ModelName = Field(description="basis model of the conductivity's change")
+    k: GridConfig = Field(description="the model's first parameter, in cm")
+    sigma: GridConfig = Field(description="the model's second parameter, in cm")
+    over: OverConfig | None = Field(None, description="further parameters: one bank for each combination")
 
     @model_validator(mode="after")
     def _is_of_one_geometry(self) -> Self:
@@ -120,26 +124,63 @@ class BankConfig(ConfigModel):
 
 
 class ElectrodeRunConfig(ConfigModel):
-    """Successive electrodes on one side, by their centres along it."""
+    """Successive electrodes: on one side of a rectangle by their centres along it, or around a disc by their angles."""
 
-    side: Side
-    centres_cm: Annotated[list[Annotated[float, Field(ge=0, le=100)]], Field(min_length=1)]
+    side: Side | None = Field(None, description="side of a rectangle")
+    centres_cm: list[Annotated[float, Field(ge=0, le=100)]] | None = Field(
+        None, min_length=1, description="electrodes' centres along the side"
+    )
+    angles_deg: list[Annotated[float, Field(ge=-360, le=360)]] | None = Field(
+        None, min_length=1, description="electrodes' centres around a disc, anticlockwise from the right"
+    )
 
 
 class FingertipGeometryConfig(ConfigModel):
-    """A rectangular fingertip with electrodes along its edge."""
+    """A fingertip with electrodes along its edge: a rectangle (width_cm, height_cm) or a disc (diameter_cm)."""
 
-    width_cm: Measure
-    height_cm: Measure
-    electrode_width_cm: Measure
-    contact_impedance: Annotated[float, Field(gt=0, le=1000)]
-    mesh_size_cm: MeshSize
-    electrodes: list[ElectrodeRunConfig]
+    what: ClassVar[str] = "fingertip's description"
+
+    width_cm: Measure | None = Field(None, description="width of a rectangle")
+    height_cm: Measure | None = Field(None, description="height of a rectangle")
+    diameter_cm: Measure | None = Field(None, description="diameter of a disc")
+    electrode_width_cm: Measure = Field(description="width of each electrode")
+    contact_impedance: float = Field(gt=0, le=1000, description="of each contact, in cm over the conductivity")
+    mesh_size_cm: MeshSize = Field(description="largest distance of mesh lines")
+    injection: Injection = Field(INJECTION, description="the electrode that an injection's current comes from")
+    electrodes: list[ElectrodeRunConfig] = Field(description="the electrodes in order")
+
+    @model_validator(mode="after")
+    def _has_one_outline(self) -> Self:
+        is_round = self.diameter_cm is not None
+        if is_round in (self.width_cm is not None, self.height_cm is not None):
+            raise ValueError("give either `diameter_cm`, or `width_cm` and `height_cm`")
+        for run in self.electrodes:
+            given = run.side is not None, run.centres_cm is not None, run.angles_deg is not None
+            if given != (not is_round, not is_round, is_round):
+                wanted = "`angles_deg`" if is_round else "`side` and `centres_cm`"
+                raise ValueError(f"each entry of `electrodes` needs {wanted}, and nothing else")
+        return self
 
     def fingertip(self) -> Fingertip:
-        """Return the fingertip; raises GeometryError for electrodes that are not 32, leave their side or overlap."""
-        places = tuple(ElectrodePlace(run.side, centre) for run in self.electrodes for centre in run.centres_cm)
-        return Fingertip(**self.model_dump(exclude={"electrodes"}), electrodes=places)
+        """Return the fingertip; raises GeometryError for electrodes that leave their side or overlap."""
+        if self.diameter_cm is not None:
+            angles = tuple(angle for run in self.electrodes for angle in run.angles_deg or ())
+            measures = self.model_dump(exclude={"electrodes", "width_cm", "height_cm"})
+            return RoundFingertip(**measures, angles_deg=angles)
+        places = tuple(
+            ElectrodePlace(run.side, centre)
+            for run in self.electrodes
+            for centre in run.centres_cm or ()
+            if run.side is not None
+        )
+        return RectangularFingertip(**self.model_dump(exclude={"electrodes", "diameter_cm"}), electrodes=places)
+
+
+class Geometry(NamedTuple):
+    """A fingertip's mesh and its channels."""
+
+    mesh: Mesh
+    table: ChannelTable
 
 
 class BankPlan(NamedTuple):
@@ -166,7 +207,7 @@ def load_bank_plans(path: Path) -> dict[str, BankPlan]:
     With `over`, a name lists the parameters, `amplitude=0.5,tilt_deg=2`; a single bank has an empty name.
     """
     config = load_yaml_model(path, BankConfig)
-    meshes: dict[tuple[tuple[str, float], ...], Mesh] = {}
+    meshes: dict[tuple[tuple[str, float], ...], Geometry] = {}
     plans = {}
     for chosen in config.over.values() if config.over is not None else [{}]:
         varied = {name: value for name, value in chosen.items() if name in _VARIED}
@@ -176,31 +217,39 @@ def load_bank_plans(path: Path) -> dict[str, BankPlan]:
             meshes[key] = _mesh_of(path, config, geometry)
         if (name := _shown(chosen)) in plans:
             raise UserError(f"{path}: two banks of `over` would be named {name}; take fewer values, or further apart")
-        mesh = meshes[key]
+        mesh, table = meshes[key]
         grids = config.k.values(), config.sigma.values()
-        plans[name] = BankPlan(mesh, BankDefinition(mesh.digest, config.model, *grids, Variation(**varied)))
+        plans[name] = BankPlan(mesh, BankDefinition(mesh.digest, config.model, *grids, Variation(**varied), table))
     return plans
 
 
-def _mesh_of(path: Path, config: BankConfig, geometry: dict[str, float]) -> Mesh:
+def _mesh_of(path: Path, config: BankConfig, geometry: dict[str, float]) -> Geometry:
     if config.mesh is not None:
-        return load_geometry(path.parent / config.mesh.file)
+        mesh = load_mesh(path.parent / config.mesh.file)
+        return Geometry(mesh, ChannelTable(mesh.n_electrodes, config.mesh.injection))
     if config.fingertip is None:
         raise UserError(f"{path}: give either `mesh` or `fingertip`")
     size = {} if config.mesh_size_cm is None else {"mesh_size_cm": config.mesh_size_cm}
     return _fingertip_mesh(path.parent / config.fingertip, **geometry, **size)
 
 
-def load_geometry(path: Path) -> Mesh:
-    """Return the mesh of a file: a fingertip's description (.yaml, .yml), an .npz or an EIDORS .mat file."""
-    return _fingertip_mesh(path) if path.suffix in (".yaml", ".yml") else load_mesh(path)
+def load_geometry(path: Path) -> Geometry:
+    """Return the geometry of a file: a fingertip's description (.yaml, .yml), an .npz or an EIDORS .mat file.
+
+    A file of a mesh alone is taken for a fingertip with opposite injections.
+    """
+    if path.suffix in (".yaml", ".yml"):
+        return _fingertip_mesh(path)
+    mesh = load_mesh(path)
+    return Geometry(mesh, ChannelTable(mesh.n_electrodes))
 
 
-def _fingertip_mesh(path: Path, **changed: float) -> Mesh:
+def _fingertip_mesh(path: Path, **changed: float) -> Geometry:
     content = load_yaml_model(path, FingertipGeometryConfig).model_dump() | changed
     config = validated(content, FingertipGeometryConfig, f"{path}, with {_shown(changed)}", UserError)
     try:
-        return config.fingertip().mesh()
+        fingertip = config.fingertip()
+        return Geometry(fingertip.mesh(), fingertip.table)
     except GeometryError as error:
         raise GeometryError(f"{path}{f', with {_shown(changed)}' if changed else ''}: {error}") from error
 

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from shearloop.bank.defaults import BASELINE_FRAMES
 from shearloop.bank.estimators import EstimatorName
-from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model
+from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model, not_of_kind
 from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.messaging import addresses
 from shearloop.drivers.defaults import (
@@ -28,7 +28,7 @@ from shearloop.drivers.defaults import (
 # Names of other tasks, sources and recordings; a fingertip needs a different one.
 TAKEN_NAMES = {
     *("load_cell", "wrench", "skin", "combined", "robot", "gripper", "loop", "experiment", "recording", "slices"),
-    *("commands", "open_stop", "keys", "health", "log", "shown", "daemon", "clock"),
+    *("commands", "stop", "publish", "keys", "health", "log", "shown", "daemon", "clock"),
 }
 
 
@@ -73,19 +73,15 @@ class CreepConfig(ConfigModel):
 class FingertipConfig(ConfigModel):
     """One EIT fingertip: its board, its bank and its calibration."""
 
-    device: SerialDevice
+    device: SerialDevice = Field(description="the board's serial port")
     bank: Path | None = Field(None, description="of `shearloop bank build`; for k, sigma, heatmaps, estimator `paper`")
     calibration: Path | None = Field(None, description="without one, k and sigma are published, but no torque")
     estimator: EstimatorName | None = Field(None, description="default: the calibration's")
-    matching: Literal["all_lags", "zero_lag"] = "all_lags"
-    baseline_frames: int = Field(
-        BASELINE_FRAMES, ge=2, le=1000, description="frames averaged into the homogeneous frame"
-    )
+    matching: Literal["all_lags", "zero_lag"] = Field("all_lags", description="shifts of a frame to search")
+    baseline_frames: int = Field(BASELINE_FRAMES, ge=2, le=1000, description="frames of the homogeneous frame")
     average_frames: int = Field(1, ge=1, le=100, description="latest frames averaged before matching")
     creep: CreepConfig | None = Field(None, description="of the gel; subtracted from the loop's torque")
-    frame_period_s: float = Field(
-        FRAME_PERIOD_S, gt=0, le=60, description="the board's frame period before it is measured"
-    )
+    frame_period_s: float = Field(FRAME_PERIOD_S, gt=0, le=60, description="frame period before it is measured")
     heatmap: Literal["on_request", "always"] = Field("on_request", description="when to compute eit.heatmap")
 
 
@@ -100,7 +96,7 @@ class CombinedConfig(ConfigModel):
 class LoadCellConfig(ConfigModel):
     """The load cell on the lever."""
 
-    device: SerialDevice
+    device: SerialDevice = Field(description="the board's serial port")
     calibration: Path | None = Field(None, description="default: the board sends torques in N·m")
     rate_hz: float = Field(LOAD_CELL_RATE_HZ, gt=0, le=1000, description="lines per second")
 
@@ -108,18 +104,18 @@ class LoadCellConfig(ConfigModel):
 class InstrumentSocket(ConfigModel):
     """An instrument on the network, or a serial one behind a terminal server."""
 
-    host: str = Field(min_length=1)
-    port: int = Field(ge=1, le=65535)
+    host: str = Field(min_length=1, description="name or address")
+    port: int = Field(ge=1, le=65535, description="TCP port, as set on the instrument or server")
 
 
 class SkinSourceConfig(ConfigModel):
     """The Keithley 6430 that feeds the skin's gauges, on RS-232 or a socket."""
 
-    socket: InstrumentSocket | None = None
-    serial: SerialDevice | None = None
+    socket: InstrumentSocket | None = Field(None, description="its network address; else `serial`")
+    serial: SerialDevice | None = Field(None, description="its RS-232 port; else `socket`")
     baud: int = Field(SOURCE_BAUD, ge=300, le=57600, description="of the RS-232 interface, as set on the instrument")
-    current_ma: float = Field(SOURCE_CURRENT_MA, gt=0, le=20)
-    compliance_v: float = Field(SOURCE_COMPLIANCE_V, gt=0, le=5)
+    current_ma: float = Field(SOURCE_CURRENT_MA, gt=0, le=20, description="through both gauges in series")
+    compliance_v: float = Field(SOURCE_COMPLIANCE_V, gt=0, le=5, description="largest voltage of the source")
 
     _one_way_in = either("socket", "serial")
 
@@ -127,9 +123,9 @@ class SkinSourceConfig(ConfigModel):
 class ScannerConfig(ConfigModel):
     """A scanning multimeter on a socket."""
 
-    socket: InstrumentSocket
+    socket: InstrumentSocket = Field(description="its network address")
     channels: tuple[Channel, Channel] = Field(SCANNER_CHANNELS, description="of gauge 1 and 2")
-    range_v: float = Field(SCANNER_RANGE_V, gt=0, le=300)
+    range_v: float = Field(SCANNER_RANGE_V, gt=0, le=300, description="measuring range, above each gauge's voltage")
 
     @model_validator(mode="after")
     def _two_channels(self) -> "ScannerConfig":
@@ -141,16 +137,16 @@ class ScannerConfig(ConfigModel):
 class AdcConfig(ConfigModel):
     """A converter board that sends lines `v1,v2` in volts."""
 
-    device: SerialDevice
-    full_scale_v: float = Field(ADC_FULL_SCALE_V, gt=0, le=10)
+    device: SerialDevice = Field(description="the board's serial port")
+    full_scale_v: float = Field(ADC_FULL_SCALE_V, gt=0, le=10, description="largest voltage of the converter")
 
 
 class SkinDaqConfig(ConfigModel):
     """The instrument that reads the gauges' voltages: a scanner or an ADC board."""
 
-    scanner: ScannerConfig | None = None
-    adc: AdcConfig | None = None
-    rate_hz: float = Field(DAQ_RATE_HZ, ge=1, le=1000)
+    scanner: ScannerConfig | None = Field(None, description="a scanning multimeter; else `adc`")
+    adc: AdcConfig | None = Field(None, description="a converter board; else `scanner`")
+    rate_hz: float = Field(DAQ_RATE_HZ, ge=1, le=1000, description="readings of both gauges per second")
 
     _one_way_in = either("scanner", "adc")
 
@@ -158,31 +154,27 @@ class SkinDaqConfig(ConfigModel):
 class SkinConfig(ConfigModel):
     """The shear skin: its instruments, its calibration and its contact."""
 
-    source: SkinSourceConfig
-    daq: SkinDaqConfig
+    source: SkinSourceConfig = Field(description="the current source")
+    daq: SkinDaqConfig = Field(description="the instrument that reads the voltages")
     calibration: Path = Field(description="made by `shearloop skin calibrate`")
     normal_n: float = Field(1.0, ge=0, le=100, description="normal force on the skin, for its friction")
-    tool_radius_mm: float | None = Field(
-        None, gt=0, le=200, description="from the wrist's axis to the skin, for torque"
-    )
+    tool_radius_mm: float | None = Field(None, gt=0, le=200, description="from wrist axis to skin, for torque")
     zero_samples: int = Field(20, ge=10, le=1000, description="readings averaged into the zero")
-    drift_per_hour: float = Field(
-        DRIFT_PER_HOUR, ge=0, le=1, description="95 % bound on the response's drift; the paper's"
-    )
+    drift_per_hour: float = Field(DRIFT_PER_HOUR, ge=0, le=1, description="95 % bound of the response's drift")
 
 
 class GripperSocket(ConfigModel):
     """The gripper behind the URCap's socket."""
 
-    host: str = Field(min_length=1)
-    port: int = Field(URCAP_PORT, ge=1, le=65535)
+    host: str = Field(min_length=1, description="the robot's name or address")
+    port: int = Field(URCAP_PORT, ge=1, le=65535, description="TCP port of the URCap")
 
 
 class GripperConfig(ConfigModel):
     """The gripper, on a socket or on Modbus."""
 
-    socket: GripperSocket | None = None
-    modbus: SerialDevice | None = None
+    socket: GripperSocket | None = Field(None, description="through the robot's URCap; else `modbus`")
+    modbus: SerialDevice | None = Field(None, description="Modbus RTU by USB; else `socket`")
     calibration: Path | None = Field(None, description="default: the maker's data")
 
     _one_way_in = either("socket", "modbus")
@@ -205,30 +197,36 @@ class EventConfig(ConfigModel):
 class EmulatorConfig(ConfigModel):
     """A device that is emulated by its own process, for demonstrations."""
 
-    device: str
-    arguments: tuple[str, ...] = ()
+    device: str = Field(description="a device of `shearloop emulate`")
+    arguments: tuple[str, ...] = Field((), description="of `shearloop emulate`; see its --help")
     synthetic: tuple[str, ...] = Field((), description="further arguments, unless a recording is played")
-    events: tuple[EventConfig, ...] = ()
+    events: tuple[EventConfig, ...] = Field((), description="commands to the device during an experiment")
 
 
 class DaemonConfig(ConfigModel):
     """A whole configuration."""
 
-    publish: Address = addresses.PUBLISH_ADDRESS
-    commands: Address = addresses.COMMAND_ADDRESS
+    _kind = not_of_kind(
+        "an experiment",
+        "name it in a configuration as `experiment`, or `shearloop command start --experiment FILE`",
+        "steps",
+    )
+
+    publish: Address = Field(addresses.PUBLISH_ADDRESS, description="ZeroMQ address of the messages")
+    commands: Address = Field(addresses.COMMAND_ADDRESS, description="ZeroMQ address of the commands")
     curve: CurveConfig | None = Field(None, description="keys for addresses that are open to the network")
-    fingertips: dict[FingertipName, FingertipConfig] = Field(default_factory=dict)
+    fingertips: dict[FingertipName, FingertipConfig] = Field(default_factory=dict, description="by name: right, left")
     combined: CombinedConfig | None = Field(None, description="one estimate of both fingertips")
-    skin: SkinConfig | None = None
-    load_cell: LoadCellConfig | None = None
+    skin: SkinConfig | None = Field(None, description="the shear skin")
+    load_cell: LoadCellConfig | None = Field(None, description="the load cell")
     robot: Path | None = Field(None, description="the robot's settings, a file such as config/ur.yaml")
-    gripper: GripperConfig | None = None
-    loop: LoopConfig = LoopConfig()
+    gripper: GripperConfig | None = Field(None, description="the gripper; needs `robot`")
+    loop: LoopConfig = Field(LoopConfig(), description="settings of the closed loop")
     experiment: Path | None = Field(None, description="started once all devices are connected")
     stop_when_done: bool = Field(False, description="the daemon ends with that experiment: status 0 if done, else 3")
     recording: RecordingConfig | None = Field(None, description="default: no recording")
     lock_memory: bool = Field(False, description="keep all memory out of swap, see docs/service.md")
-    emulators: tuple[EmulatorConfig, ...] = ()
+    emulators: tuple[EmulatorConfig, ...] = Field((), description="devices to emulate, for demonstrations")
 
     @model_validator(mode="after")
     def _loop_is_whole(self) -> "DaemonConfig":

@@ -3,25 +3,32 @@
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator, model_validator
 
 from shearloop.daemon.errors import UserError
 from shearloop.yaml_files import load_model
 
+# No length of a tool, a grip or a lever is smaller.
+LEAST_MM = 0.1
+
 
 class ConfigModel(BaseModel):
     """Base of the configuration models: unknown keys are mistakes, values do not change.
 
-    Relative paths are taken from the folder of the file.
+    Relative paths are taken from the folder of the file. `what` names the file in errors.
     """
+
+    what: ClassVar[str] = "configuration"
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     @field_validator("*")
     @classmethod
-    def _resolve_path(cls, value: object, info: ValidationInfo) -> object:
+    def _check(cls, value: object, info: ValidationInfo) -> object:
+        if str(info.field_name).endswith("_mm") and isinstance(value, float) and 0 < abs(value) < LEAST_MM:
+            raise ValueError(f"{value:g} is too small for mm; did you mean {1000 * value:g}, the thousandfold?")
         if not isinstance(value, Path):
             return value
         if value == Path() or "\0" in str(value):
@@ -40,7 +47,18 @@ class ConfigModel(BaseModel):
                     yield from item.walk(path)
 
 
-Model = TypeVar("Model", bound=BaseModel)
+Model = TypeVar("Model", bound=ConfigModel)
+
+
+def not_of_kind(kind: str, cure: str, *keys: str) -> Any:
+    """Return a model's validator: content with one of these keys is of another kind."""
+
+    def check(content: object) -> object:
+        if isinstance(content, dict) and not content.keys().isdisjoint(keys):
+            raise ValueError(f"this is {kind}; {cure}")
+        return content
+
+    return model_validator(mode="before")(check)
 
 
 def either(one: str, other: str) -> Any:
@@ -56,4 +74,4 @@ def either(one: str, other: str) -> Any:
 
 def load_yaml_model(path: str | Path, model: type[Model]) -> Model:
     """Return a YAML file's content as a pydantic model; raises UserError with every mistake."""
-    return load_model(Path(path), model, UserError)
+    return load_model(Path(path), model, UserError, model.what)

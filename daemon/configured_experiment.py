@@ -33,6 +33,11 @@ class ConfiguredExperiment:
         self._end_reported.set()
         self._crash_marker = CrashMarker()
 
+    @property
+    def finished(self) -> bool:
+        """Whether it is done, if the daemon ends with it."""
+        return self.done or self._stop is None
+
     async def run(self) -> None:
         """Start the experiment once, and return at its end.
 

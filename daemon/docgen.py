@@ -1,17 +1,20 @@
-"""Writes the generated parts of `docs/messages.md` and `docs/safety.md` (`make docs`)."""
+"""Writes the generated parts of the pages, and the schemas of `config/schemas/` (`make docs`)."""
 
 import dataclasses
+import json
 import types
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from shearloop.daemon.cli.command import COMMANDS
+from shearloop.daemon.config_schema import MODELS, Section, references, schema_of, schema_text, sections, unit_of
 from shearloop.daemon.control.safety import TABLE, Response
 from shearloop.daemon.messaging.messages import TOPICS, Message
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 EXAMPLES = DOCS / "examples"
+SCHEMAS = DOCS.parent / "config" / "schemas"
 RESPONSES = {
     Response.NOTE: "reported only",
     Response.REFUSE_START: "no experiment starts; a running one continues",
@@ -76,11 +79,64 @@ def safety_table() -> str:
     return table(("fault", "response", "message", "what to do"), rows)
 
 
+def configuration() -> str:
+    """Return the keys of all files that people write, section by section."""
+    parts = []
+    for kind in MODELS:
+        first, *inner = sections(schema_of(kind))
+        parts.append(f"## {kind.capitalize()}\n\n{_section_text(first)}")
+        parts += [f"### `{section.paths[0]}`\n\n{_section_text(section)}" for section in inner]
+    return "\n\n".join(parts)
+
+
+def _section_text(section: Section) -> str:
+    _, *others = section.paths
+    also = f" Also {', '.join(f'`{path}`' for path in others)}." if others else ""
+    required = section.schema.get("required", ())
+    rows = [_setting(key, found, key in required) for key, found in section.schema["properties"].items()]
+    return f"{section.schema['description']}{also}\n\n{table(('key', 'value', 'unit', 'default', 'meaning'), rows)}"
+
+
+def _setting(key: str, found: Mapping[str, Any], required: bool) -> tuple[str, ...]:
+    unit = unit_of(key)
+    default = found.get("default")
+    if required or default is None:
+        shown = "required" if required else "–"
+    else:
+        # The defaults of a section stand with its keys.
+        shown = "" if isinstance(default, dict) else f"`{json.dumps(default, ensure_ascii=False)}`"
+    return f"`{key}`", _value(found), unit, shown, found["description"].removesuffix(f" [{unit}]")
+
+
+def _value(found: Mapping[str, Any]) -> str:
+    """Return a value's kind and range in words."""
+    if "anyOf" in found:
+        return " or ".join(_value(one) for one in found["anyOf"] if one.get("type") != "null")
+    if "const" in found or "enum" in found:
+        return ", ".join(f"`{one}`" for one in found.get("enum", [found.get("const")]))
+    if any(references(found)) or found["type"] == "object":
+        return "list of sections" if "items" in found else "section"
+    if found["type"] == "array":
+        items = found.get("items") or found["prefixItems"][0]
+        count = f" of {found['minItems']}" if found.get("minItems") == found.get("maxItems", 0) else ""
+        return f"list{count}: {_value(items)}"
+    names = {"string": "path" if found.get("format") == "path" else "text", "boolean": "true or false"}
+    signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+    bounds = [f"{sign} {found[name]:g}" for name, sign in signs.items() if name in found]
+    return " ".join([names.get(found["type"], found["type"]), ", ".join(bounds)]).strip()
+
+
 def pages() -> dict[Path, str]:
-    """Return the expected text of each page by its path: generated parts stand between two comments."""
-    parts = {"topics": topics, "commands": commands, "subscribers": subscribers, "safety table": safety_table}
-    found = {}
-    for name in ("messages.md", "safety.md"):
+    """Return the expected text of each generated file by its path: in pages, between two comments."""
+    parts = {
+        "topics": topics,
+        "commands": commands,
+        "subscribers": subscribers,
+        "safety table": safety_table,
+        "configuration": configuration,
+    }
+    found = {SCHEMAS / f"{kind}.json": schema_text(kind) for kind in MODELS}
+    for name in ("configuration.md", "messages.md", "safety.md"):
         text = (DOCS / name).read_text(encoding="utf-8")
         for part, write in parts.items():
             begin, end = f"<!-- generated: {part} -->\n", "<!-- end -->"

@@ -19,6 +19,8 @@ from shearloop.drivers.connection import LinkEvent
 
 # Texts beyond this number are dropped and counted.
 MOST_WAITING = 10_000
+# Returns to the beginning of a terminal's line and empties it.
+CLEAR_LINE = "\r\x1b[K"
 # The end waits this long for the reader.
 CLOSE_S = 1.0
 
@@ -99,8 +101,13 @@ def silence(stream: TextIO) -> None:
 
 
 @contextmanager
-def logging_to_stderr(*, json_lines: bool | None = None, level: int = logging.INFO) -> Iterator[NonBlockingWriter]:
-    """Configure structlog for the context: readable lines at a console, JSON under systemd or with `json_lines`."""
+def logging_to_stderr(
+    *, json_lines: bool | None = None, level: int = logging.INFO, before: str = ""
+) -> Iterator[NonBlockingWriter]:
+    """Configure structlog for the context: readable lines at a console, JSON under systemd or with `json_lines`.
+
+    `before` precedes each line: CLEAR_LINE where a status line stands.
+    """
     if json_lines is None:
         json_lines = "JOURNAL_STREAM" in os.environ
     processors: list[structlog.typing.Processor] = [
@@ -113,6 +120,8 @@ def logging_to_stderr(*, json_lines: bool | None = None, level: int = logging.IN
     else:
         plain = structlog.dev.plain_traceback
         processors.append(structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), exception_formatter=plain))
+    if before:
+        processors.append(lambda _logger, _name, text: f"{before}{text}")
     with closing(NonBlockingWriter(sys.stderr)) as writer:
         structlog.configure(
             processors=processors,

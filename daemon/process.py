@@ -1,4 +1,4 @@
-"""The process: signals that end it, its priority over other programs, resident memory, no long garbage collections."""
+"""The process: signals that end it, its priority, its limits, resident memory, no long garbage collections."""
 
 import contextlib
 import ctypes
@@ -21,6 +21,8 @@ RETRY_S = 0.05
 NICENESS = -10
 # With autogrouping the kernel compares niceness only within a session; the session has a niceness of its own.
 AUTOGROUP = Path("/proc/self/autogroup")
+# Many times what the daemon and all its clients use; see `messaging/connections.py`.
+MAX_DESCRIPTORS = 4096
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 
 
@@ -127,6 +129,12 @@ def _set_session_niceness(niceness: int) -> None:
     # Some kernels have no autogroups, and some containers forbid changing them.
     with contextlib.suppress(OSError):
         AUTOGROUP.write_text(str(niceness))
+
+
+def raise_descriptor_limit() -> None:
+    """Raise the limit of open files to MAX_DESCRIPTORS, or as far as the system allows."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(hard, MAX_DESCRIPTORS)), hard))
 
 
 def lock_memory() -> None:

@@ -1,4 +1,4 @@
-"""The summary of an experiment, printed at its end and made from the daemon's own messages.
+"""The summary of an experiment, made from the daemon's own messages at its end.
 
 An emulated rig adds the true torque and the disturbances.
 """
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
+from shearloop.drivers.errors import times
 
 if TYPE_CHECKING:
     from shearloop.daemon.logs import NonBlockingWriter
@@ -55,7 +56,7 @@ class _StepSummary:
     wrist_to_rad: float | None = None
 
 
-class Emulated(Protocol):
+class EmulatedRig(Protocol):
     """An emulated rig; `sent` holds the disturbances, with their times in ns."""
 
     sent: list[tuple[int, str]]
@@ -80,9 +81,11 @@ class _Run:
 
 
 class RunSummary:
-    """Collects every message of a daemon and writes the summary when an experiment ends."""
+    """Collects every message of a daemon; `text` is the summary of the last experiment that ended, or empty."""
 
-    def __init__(self, out: "TextIO | NonBlockingWriter", emulated: Emulated | None = None) -> None:
+    def __init__(self, out: "TextIO | NonBlockingWriter | None" = None, emulated: EmulatedRig | None = None) -> None:
+        """Take the output for each summary, if any, and an emulated rig, which adds its true torque."""
+        self.text = ""
         self._out = out
         self._emulated = emulated
         self._run: _Run | None = None
@@ -91,6 +94,8 @@ class RunSummary:
         """Handle one message."""
         if topic == "loop.state":
             self._on_loop_state(content)
+        elif topic == "loop.stop":
+            self._add(stop_sentence(content))
         elif self._run is not None:
             _on_sample(self._run, topic, content)
 
@@ -105,7 +110,22 @@ class RunSummary:
             self._run = None
             rig = self._emulated
             lines = _lines(run, None, ()) if rig is None else _lines(run, rig.torques(), rig.sent)
-            self._out.write("\n".join(("", *lines, "", "")))
+            self.text = ""
+            self._add("\n".join(lines))
+
+    def _add(self, text: str) -> None:
+        self.text = f"{self.text}\n{text}".lstrip("\n")
+        if self._out is not None:
+            self._out.write(f"\n{text}\n\n")
+
+
+def stop_sentence(content: Mapping[str, Any]) -> str:
+    """Return the times of a `loop.stop` message in words."""
+    sent, stands = (
+        f"{after} {content[key]:.3f} s" if content[key] is not None else f"{after} an unknown time"
+        for key, after in (("sent_after_s", "sent after"), ("stands_after_s", "standstill after"))
+    )
+    return f"The stop, from its cause: decided after {content['decided_after_s']:.3f} s, {sent}, {stands}."
 
 
 def _on_sample(run: _Run, topic: str, content: Mapping[str, Any]) -> None:
@@ -235,7 +255,7 @@ def _counted(run: _Run) -> Iterator[str]:
     for source, values in run.diameters.items():
         yield f"  diameter by {source}: {np.mean(values):.1f} mm ± {np.std(values):.1f} of one reading"
     if run.hold_reasons:
-        reasons = "; ".join(f"{count} times {reason}" for reason, count in run.hold_reasons.most_common())
+        reasons = "; ".join(f"{times(count)} {reason}" for reason, count in run.hold_reasons.most_common())
         yield f"  the wrist was held for {run.held_s:.1f} s in all: {reasons}"
     else:
         yield "  the wrist was never held"
@@ -243,5 +263,5 @@ def _counted(run: _Run) -> Iterator[str]:
         # A source without any torque has another purpose.
         if source in run.torques:
             yield f"  {count} of {count + len(run.torques[source])} torques of {source} were not valid and not used"
-    refused = [f"  {count} times {reason}" for reason, count in run.refused.most_common()]
+    refused = [f"  {times(count)} {reason}" for reason, count in run.refused.most_common()]
     yield from refused or ["  no command was refused"]

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from shearloop.bank.eit.channels import ZERO_SLOTS
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, SerialDevice
 from shearloop.daemon.control.control_loop import ControlLoop
@@ -91,7 +90,7 @@ class SensorBuilder:
             pairs = CombinedFingertips(estimates(COMBINED, combined), period_s)
         fingertips = {
             name: FingertipTask(
-                self._eit_kit(name),
+                self._eit_kit(name, estimator),
                 estimates(name, estimator),
                 self.publisher,
                 pairs,
@@ -101,9 +100,9 @@ class SensorBuilder:
         }
         return Sensors(fingertips, pairs, self._skin(), self._load_cell())
 
-    def _eit_kit(self, name: str) -> EitKit:
-        own = self.config.fingertips[name]
-        return EitKit(zero_slots=ZERO_SLOTS, frame_period_s=own.frame_period_s, **self._link(name, own.device))
+    def _eit_kit(self, name: str, estimator: FrameEstimator) -> EitKit:
+        own, slots = self.config.fingertips[name], estimator.table.zero_slots
+        return EitKit(zero_slots=slots, frame_period_s=own.frame_period_s, **self._link(name, own.device))
 
     def _load_cell(self) -> LoadCellTask | None:
         own = self.config.load_cell

@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 import structlog
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.messaging.messages import Health, Scalar
+from shearloop.daemon.messaging.messages import DaemonEnd, Health, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.service import notify
 
@@ -113,6 +113,11 @@ class HealthReporter:
         for name, reporter in self._reporters.items():
             gathered[name] = {**gathered.get(name, {}), **reporter.diagnostics()}
         return gathered
+
+    def publish_end(self, *, finished: bool, summary: str) -> None:
+        """Publish that the daemon ends, as its last message."""
+        end = DaemonEnd(source="daemon", t_mono_ns=self._clock.now_ns(), finished=finished, summary=summary)
+        self._publisher.publish(end)
 
     async def run(self) -> None:
         """Publish once a second until cancelled."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import LINE_SLOTS, N_ELECTRODES, line_of_channels
+from shearloop.bank.eit.channels import ChannelTable
 from shearloop.daemon.errors import UserError
 from shearloop.drivers.eit_kit import ADC_STEP_V
 
@@ -20,8 +20,6 @@ NOISE_V = 0.002
 # With this share of the modelled conductivity change, difference frames have an RMS of 5 mV, as the 49 torque peak
 # samples (Gaussian derivative, k = 3.25 cm, σ from 1.25 to 1.85 cm).
 AMPLITUDE = 0.17
-# (896,) the injection, 0…31 in order of time, of each channel.
-INJECTIONS: NDArray[np.int64] = LINE_SLOTS // N_ELECTRODES
 # σ at rest and at the largest torque of the peak samples, in N·m; k of the thinnest and thickest recorded cylinder.
 SIGMA_CM, LARGEST_TORQUE_NM = (1.85, 1.25), 0.14
 K_CM, DIAMETER_MM = (3.78, 3.47), (10.0, 40.0)
@@ -61,24 +59,26 @@ class Synthesiser:
 
     def __init__(self, bank: Bank, *, seed: int = 0, amplitude: float = AMPLITUDE, noise_v: float = NOISE_V) -> None:
         self._bank = bank
+        # (n,) the injection, in order of time, of each channel.
+        self.injections: NDArray[np.int64] = bank.table.electrodes[:, 0]
         self._gain = MEAN_V / float(np.abs(bank.homogeneous).mean())
         self._amplitude = amplitude
         self._noise_v = noise_v
         self._random = np.random.default_rng(seed)
 
     def line(self, k: float, sigma: float | FloatArray, grip: float | FloatArray = 1.0) -> FloatArray:
-        """Return the (1024,) values of one frame; `grip` from 0 (untouched) to 1 scales the change.
+        """Return the (v,) values of one frame; `grip` from 0 (untouched) to 1 scales the change.
 
-        σ and grip may be (896,), with a value per channel. Raises UserError outside the bank's valid cells.
+        σ and grip may be (n,), with a value per channel. Raises UserError outside the bank's valid cells.
         """
         volts = self._bank.homogeneous + grip * self._amplitude * self.signal(k, sigma)
         volts = self._gain * np.abs(volts) + self._random.normal(0.0, self._noise_v, volts.shape)
         # The board rounds its RMS down to a whole step; no live channel reads 0.
         steps = np.maximum(np.floor(np.abs(volts) / ADC_STEP_V), 1.0)
-        return line_of_channels(steps * ADC_STEP_V)
+        return self._bank.table.line_of_channels(steps * ADC_STEP_V)
 
     def signal(self, k: float, sigma: float | FloatArray) -> FloatArray:
-        """Return the (896,) difference signal, interpolated between the bank's cells; σ is a number or (896,)."""
+        """Return the (n,) difference signal, interpolated between the bank's cells; σ is a number or (n,)."""
         bank, mixed = self._bank, np.zeros(self._bank.homogeneous.shape)
         sigmas = np.broadcast_to(sigma, mixed.shape)
         channels = np.arange(mixed.size)
@@ -101,7 +101,7 @@ def twist_frames(
     sigma_of_torque: Callable[[float], float],
     period_s: float,
 ) -> Iterator[FloatArray]:
-    """Yield the lines (1024,) of a programme without end, one every `period_s`.
+    """Yield the lines (v,) of a programme without end, one every `period_s`.
 
     `sigma_of_torque` is the inverse of a calibration: the σ of a torque in N·m. Raises UserError as `Synthesiser.line`.
     """
@@ -140,10 +140,17 @@ class RigFrames:
         self._sigmas_cm = np.array([high, low])
         self._torques_nm = (self._sigmas_cm - rest) * LARGEST_TORQUE_NM / (largest - rest)
 
+    @property
+    def table(self) -> ChannelTable:
+        """The fingertips' channels."""
+        return self._bank.table
+
     def line(self, grip: FloatArray, shear_torque_nm: FloatArray, diameter_mm: float) -> FloatArray:
-        """Return the board's line, (1024,) in volts, for grip (0…1) and shear at each injection, (32,) each."""
+        """Return the board's line, (v,) in volts, for grip (0…1) and shear at each injection, (L,) each."""
         sigma_cm = np.interp(shear_torque_nm, self._torques_nm, self._sigmas_cm)
-        return self._synthesiser.line(self._k_cm(diameter_mm), sigma_cm[INJECTIONS], grip[INJECTIONS])
+        # The scene has the values of 32 injections.
+        injections = self._synthesiser.injections * len(grip) // self._bank.table.n_electrodes
+        return self._synthesiser.line(self._k_cm(diameter_mm), sigma_cm[injections], grip[injections])
 
     def _k_cm(self, diameter_mm: float) -> float:
         slope = (K_CM[1] - K_CM[0]) / (DIAMETER_MM[1] - DIAMETER_MM[0])

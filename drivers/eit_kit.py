@@ -1,9 +1,9 @@
 """The EIT-kit, a Teensy on USB: checks its lines, turns them into frames, starts it and reconnects to it.
 
-The board sends a line per frame: 1024 values with four decimals, each followed by `, `, then a newline. It computes
-each value from 10-bit samples as floor(√(mean of (sample − 512)²)) × 2.2 V / 1024 (`read_signal` of the EIT-kit's
-open-source firmware), hence the steps of 2.2/1024 V. It writes 0 where the measuring pair touches a driven electrode.
-All values are below 10 V, so a valid line is 1024 cells of eight bytes.
+The board sends a line per frame: values with four decimals, each followed by `, `, then a newline. L electrodes have
+L² values (v), some of them channels (c). The board computes each from 10-bit samples as floor(√(mean of (sample −
+512)²)) × 2.2 V / 1024 (`read_signal` of the EIT-kit's open-source firmware), hence the steps of 2.2/1024 V. It writes 0
+where the measuring pair touches a driven electrode. Values are below 10 V, so a line has cells of eight bytes.
 """
 
 import math
@@ -25,11 +25,9 @@ from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.errors import DeviceLostError
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, LineSplitter, RawEvent, SerialSensor
 
-N_VALUES = 1024
 CELL_BYTES = len(b"0.1234, ")
-LINE_BYTES = N_VALUES * CELL_BYTES
-# Twice a valid line: a line with a wrong count is shorter, a stream without newlines is longer.
-MAX_LINE_BYTES = 2 * LINE_BYTES
+# Twice a line of 32 electrodes: a line with a wrong count is shorter, a stream without newlines is longer.
+MAX_LINE_BYTES = 2 * 32 * 32 * CELL_BYTES
 EXCERPT_BYTES = 60
 
 # The board's period until the clock has learned the real one.
@@ -68,14 +66,14 @@ PLAUSIBLE = 0.05
 
 _SEPARATOR = b", "
 _DECIMAL = re.compile(rb"-?\d+\.\d{4}")
-_LINE = re.compile(rb"(?:\d\.\d{4}, ){%d}" % N_VALUES)
+_LINE = re.compile(rb"(?:\d\.\d{4}, )+")
 
 
 class FrameErrorKind(Enum):
     """Why a line is rejected; the value is the operator's sentence."""
 
     TOO_LONG = f"a line of more than {MAX_LINE_BYTES} bytes: newlines are lost, or this is not an EIT-kit"
-    WRONG_COUNT = f"a line without {N_VALUES} values, each followed by a comma and a space: bytes were lost"
+    WRONG_COUNT = "a line without all of its values, each followed by a comma and a space: bytes were lost"
     NOT_A_NUMBER = "a value that is not a decimal with four places: bytes were lost or changed"
     NAN = "a value that is NaN: the board divided by zero, restart it so that it calibrates again"
     NEGATIVE = "a negative value, impossible for an amplitude: bytes were changed"
@@ -86,7 +84,7 @@ class FrameErrorKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class FrameError:
-    """A rejected line: the reason, the first bad value (0…1023) if known, and its text."""
+    """A rejected line: the reason, the first bad value (counted from 0) if known, and its text."""
 
     kind: FrameErrorKind
     excerpt: bytes
@@ -103,12 +101,12 @@ _PARTIAL_ERRORS = (FrameErrorKind.WRONG_COUNT, FrameErrorKind.NOT_A_NUMBER)
 
 
 def read_line(line: bytes, zero_slots: NDArray[np.bool_]) -> NDArray[np.float64] | FrameError:
-    """Return the (1024,) values in volts of a line without its end, or the reason to reject it.
+    """Return the (v,) values in volts of a line without its end, or the reason to reject it.
 
-    `zero_slots` (1024,) is true where the board writes 0. Values must have the board's own form, `d.dddd`.
+    `zero_slots` (v,) is true where the board writes 0. Values must have the board's own form, `d.dddd`.
     """
-    if not _LINE.fullmatch(line):
-        return _find_error(line)
+    if len(line) != zero_slots.size * CELL_BYTES or not _LINE.fullmatch(line):
+        return _find_error(line, zero_slots.size)
     values = np.array(list(map(float, line.split(_SEPARATOR)[:-1])))
     zeros = values == 0.0
     for kind, bad in (
@@ -122,9 +120,9 @@ def read_line(line: bytes, zero_slots: NDArray[np.bool_]) -> NDArray[np.float64]
     return values
 
 
-def _find_error(line: bytes) -> FrameError:
+def _find_error(line: bytes, n_values: int) -> FrameError:
     *values, rest = line.split(_SEPARATOR)
-    if rest or len(values) != N_VALUES:
+    if rest or len(values) != n_values:
         return FrameError(FrameErrorKind.WRONG_COUNT, line[:EXCERPT_BYTES])
     for position, value in enumerate(values):
         if value.lower().lstrip(b"-") == b"nan":
@@ -145,10 +143,10 @@ def _find_error(line: bytes) -> FrameError:
 class Frame:
     """One frame of the board; its arrays are read-only.
 
-    `channels` (896,) and `raw` (1024,) are in volts and line order; `line` is the received line without its end.
+    `channels` (c,) and `raw` (v,) are in volts and line order; `line` is the received line without its end.
     `t_mid_ns` is the middle of the acquisition, `t_arrival_ns` the arrival of the last byte (monotonic clock).
-    `seq` counts frames from 0 across reconnections. `saturated` (896,): the signal exceeds the ADC's range; `dead`
-    (896,): unchanged for DEAD_AFTER_FRAMES, so nothing is connected; `unusable` counts channels with either flag;
+    `seq` counts frames from 0 across reconnections. `saturated` (c,): the signal exceeds the ADC's range; `dead`
+    (c,): unchanged for DEAD_AFTER_FRAMES, so nothing is connected; `unusable` counts channels with either flag;
     `repeated`: the same line as the frame before, so no new measurement.
     """
 
@@ -268,13 +266,11 @@ class _Opening:
 class FrameParser:
     """Turns bytes, however they are sliced, into frames; counts rejected lines by kind. No I/O.
 
-    `zero_slots` (1024,) is true where the injection pattern makes the value 0. Two counters are not errors:
+    `zero_slots` (v,) is true where the injection pattern makes the value 0. Two counters are not errors:
     `partial_lines` were under way when the port was opened, `unfinished` were cut off by a reopening or restart.
     """
 
     def __init__(self, zero_slots: NDArray[np.bool_], *, nominal_period_ns: int = NOMINAL_PERIOD_NS) -> None:
-        if zero_slots.shape != (N_VALUES,):
-            raise ValueError(f"the mask of zero slots has the shape {zero_slots.shape} instead of ({N_VALUES},)")
         self.clock = FrameClock(nominal_period_ns)
         self.frames = 0
         self.errors: Counter[FrameErrorKind] = Counter()
@@ -338,7 +334,7 @@ class FrameParser:
             if not isinstance(rest_values, FrameError):
                 self._restarted_lines += 1
                 return rest, rest_values
-        if self._opening.first and values.kind in _PARTIAL_ERRORS and len(line) < LINE_BYTES:
+        if self._opening.first and values.kind in _PARTIAL_ERRORS and len(line) < self._zero_slots.size * CELL_BYTES:
             self.partial_lines += 1
         else:
             self._reject(values)
@@ -380,7 +376,7 @@ class FrameParser:
 class EitKit(SerialSensor[Frame]):
     """One board, named by USB serial number or path.
 
-    `zero_slots` (1024,) is true where its injection pattern makes a value 0. `frame_period_s` is used until the period
+    `zero_slots` (v,) is true where its injection pattern makes a value 0. `frame_period_s` is used until the period
     is measured. `inputs` keeps every input of the parser.
     """
 

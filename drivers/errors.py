@@ -1,5 +1,19 @@
 """Errors of devices; each message is a sentence for the person at the bench."""
 
+import os
+
+
+def times(count: int) -> str:
+    """Return how often something happened: once, twice, 3 times."""
+    return {1: "once", 2: "twice"}.get(count, f"{count} times")
+
+
+def system_reason(error: OSError) -> str:
+    """Return the system's words for an error, such as `Connection refused`; a timeout has none."""
+    if error.errno is not None and error.errno > 0:
+        return os.strerror(error.errno)
+    return error.strerror or "no answer"
+
 
 class DriverError(Exception):
     """Base class of all errors that drivers raise on purpose."""

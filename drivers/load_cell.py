@@ -16,6 +16,7 @@ from shearloop.drivers import serial_sensor
 from shearloop.drivers.calibration_files import CalibrationModel, Finite, Positive
 from shearloop.drivers.connection import Diagnostics, LinkMonitor, SerialLink
 from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ
+from shearloop.drivers.errors import times
 
 BAUD_RATE = 115200
 PERIOD_NS = round(1e9 / LOAD_CELL_RATE_HZ)
@@ -192,7 +193,7 @@ class LoadParser:
 
 def describe_errors(errors: Counter[str], sentences: dict[str, str] = LINE_ERRORS) -> str:
     """Return one sentence, with its count, for every kind of rejected line."""
-    return " ".join(f"{sentences[kind]} ({count} times)" for kind, count in sorted(errors.items()))
+    return " ".join(f"{sentences[kind]} ({times(count)})" for kind, count in sorted(errors.items()))
 
 
 class LoadCell(serial_sensor.SerialSensor[LoadSample]):

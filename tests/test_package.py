@@ -2,14 +2,20 @@
 
 import ast
 import importlib
+import re
+import subprocess
+import sys
+import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 import shearloop
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("bank", "daemon", "drivers")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
 @pytest.mark.parametrize("name", shearloop.__all__)
@@ -36,3 +42,34 @@ def test_no_module_imports_the_folders_at_the_top_by_themselves():
             names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             bare += [f"{path.relative_to(ROOT)}: {name}" for name in names if name.split(".")[0] in FOLDERS]
     assert not bare
+
+
+def test_the_version_and_its_date_are_the_same_everywhere():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    newest = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)[0]
+    assert newest == f"{citation['version']} ({citation['date-released']})"
+    assert citation["version"] == PROJECT["version"]
+    links = PROJECT["urls"].values()
+    assert all(f"https://doi.org/{paper['doi']}" in links for paper in citation["references"])
+
+
+def test_the_checks_run_on_every_supported_python_and_on_both_machines():
+    supported = [name.rpartition(" ")[2] for name in PROJECT["classifiers"] if "Python :: 3." in name]
+    assert f"for version in {' '.join(supported)}; do" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "checks.yml").read_text(encoding="utf-8"))
+    job = workflow["jobs"]["checks"]
+    assert job["strategy"]["matrix"] == {"machine": ["ubuntu-24.04", "ubuntu-24.04-arm"]}
+    checkout, python, run = job["steps"]
+    assert checkout["uses"].startswith("actions/checkout@")
+    assert python["with"]["python-version"].split() == supported
+    assert run == {"run": ".ci/run"}
+
+
+def test_the_pages_become_a_site_without_a_warning(tmp_path):
+    pytest.importorskip("material", reason="the site needs the extra `docs`")
+    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(
+        command, cwd=ROOT, env={"NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert (tmp_path / "site" / "configuration" / "index.html").exists()

@@ -8,7 +8,7 @@ Layout, all numbers little-endian:
     48    header    JSON, padded with blanks to the end of the first page: the definition, and a table of the arrays
                     (type, shape, offset in the file, sha256)
     4096  arrays    the small ones at multiples of 64, and last the signals at a multiple of the page size:
-                    float32 (k × σ × 896), C order
+                    float32 (k × σ × channels), C order
 
 Opening a bank checks the header and the small arrays; the signals are checked on request.
 """
@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray
-from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS, STIMULATION_CURRENT
+from shearloop.bank.eit.channels import PAPER_TABLE, STIMULATION_CURRENT, ChannelTable
 from shearloop.bank.eit.models import MODELS, PLAIN, Variation, model_named
-from shearloop.bank.errors import BankFileError, ModelError
+from shearloop.bank.errors import BankFileError, GeometryError, ModelError
 from shearloop.files import replace_file
 
 FORMAT_VERSION = 1
@@ -63,6 +63,7 @@ class BankDefinition:
     k_grid: FloatArray
     sigma_grid: FloatArray
     variation: Variation = PLAIN
+    table: ChannelTable = PAPER_TABLE
 
     def __post_init__(self) -> None:
         """Take read-only copies of the grids and check all."""
@@ -81,7 +82,7 @@ class BankDefinition:
         """The hash of everything that defines a bank, the same on all machines."""
         defining = {
             "format": FORMAT_VERSION,
-            "channel_table": CHANNEL_TABLE_HASH,
+            "channel_table": self.table.digest,
             "stimulation_current": STIMULATION_CURRENT,
             "geometry": self.geometry_hash,
             "model": self.model,
@@ -96,7 +97,7 @@ class BankDefinition:
 class Bank:
     """A bank of difference signals v(k, σ) − v_homogeneous; its arrays are read-only.
 
-    signals (K, S, 896) float32, zeros in cells that are not valid; homogeneous (896,); k_grid (K,) and sigma_grid (S,)
+    signals (K, S, n) float32, zeros in cells that are not valid; homogeneous (n,); k_grid (K,) and sigma_grid (S,)
     in the model's units; min_conductivity (K, S), the smallest of each cell's conductivities; valid (K, S), where
     that is positive and the signal's norm at least MIN_SIGNAL_NORM.
     """
@@ -118,6 +119,11 @@ class Bank:
     def model(self) -> str:
         """The basis model's name."""
         return self.definition.model
+
+    @property
+    def table(self) -> ChannelTable:
+        """The channel table."""
+        return self.definition.table
 
     @property
     def geometry_hash(self) -> str:
@@ -156,17 +162,24 @@ class Bank:
                         arrays["k_grid"],
                         arrays["sigma_grid"],
                         Variation(**header.get("variation", {})),
+                        ChannelTable(**header.get("channels", {})),
                     )
-                except (KeyError, TypeError, ValueError, ModelError) as error:
+                except (KeyError, TypeError, ValueError, ModelError, GeometryError) as error:
                     raise _unusable(path, f"its header does not describe a bank ({error!r})") from error
         except OSError as error:
             raise BankFileError(f"{path}: the bank cannot be read: {error.strerror}; {_cure(path)}") from error
         for name, array in arrays.items():
             if (verify or name != "signals") and _sha256(array) != checksums[name]:
                 raise _unusable(path, f"the file is damaged: the checksum of {name} is not {checksums[name][:12]}…")
+        if header.get("channel_table") != definition.table.digest:
+            raise _unusable(
+                path,
+                f"the bank was made under the channel table {str(header.get('channel_table'))[:12]}…, expected "
+                f"{definition.table.digest[:12]}…",
+            )
         if definition.identity != identity:
             raise _unusable(path, f"its grids, model and geometry do not give its identity {identity[:12]}…")
-        _check_shapes(path, arrays)
+        _check_shapes(path, arrays, definition.table.n_channels)
         del arrays["k_grid"], arrays["sigma_grid"]
         return cls(path=path, definition=definition, signals_sha256=checksums["signals"], **arrays)
 
@@ -219,7 +232,8 @@ def _layout(definition: BankDefinition, stored: dict[str, NDArray[Any]]) -> tupl
         end = offsets[name] + array.nbytes
     header = {
         "identity": definition.identity,
-        "channel_table": CHANNEL_TABLE_HASH,
+        "channels": asdict(definition.table),
+        "channel_table": definition.table.digest,
         "geometry": definition.geometry_hash,
         "model": definition.model,
         "k_unit": MODELS[definition.model].k_unit,
@@ -252,12 +266,6 @@ def _read_header(path: Path, file: BinaryIO) -> dict[str, Any]:
     header = json.loads(text)
     if not isinstance(header, dict):
         raise _unusable(path, "its header does not describe a bank")
-    if header.get("channel_table") != CHANNEL_TABLE_HASH:
-        raise _unusable(
-            path,
-            f"the bank was made under the channel table {str(header.get('channel_table'))[:12]}…, "
-            f"expected {CHANNEL_TABLE_HASH[:12]}…",
-        )
     return header
 
 
@@ -274,13 +282,13 @@ def _read_array(path: Path, file: BinaryIO, name: str, entry: dict[str, Any]) ->
     return array
 
 
-def _check_shapes(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+def _check_shapes(path: Path, arrays: dict[str, NDArray[Any]], channels: int) -> None:
     cells = (len(arrays["k_grid"]), len(arrays["sigma_grid"]))
     expected = {
-        "homogeneous": (N_CHANNELS,),
+        "homogeneous": (channels,),
         "min_conductivity": cells,
         "valid": cells,
-        "signals": (*cells, N_CHANNELS),
+        "signals": (*cells, channels),
     }
     for name, shape in expected.items():
         if arrays[name].shape != shape:

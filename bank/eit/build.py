@@ -18,7 +18,6 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray
 from shearloop.bank.eit.bank_file import MIN_SIGNAL_NORM, BankDefinition, unwritable, write_bank
-from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.forward import BatchForwardModel
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import ConductivityModel
@@ -30,7 +29,7 @@ _CHECKSUM_BYTES = 32
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BankRow:
-    """The cells of one k: min_conductivity (S,), valid (S,), and signals (S, 896), zeros where not valid."""
+    """The cells of one k: min_conductivity (S,), valid (S,), and signals (S, n), zeros where not valid."""
 
     min_conductivity: FloatArray
     valid: BoolArray
@@ -44,12 +43,12 @@ RowsSolver = Callable[[Mesh, BankDefinition, Sequence[int]], Iterator[tuple[int,
 class RowSolver:
     """Solves a bank's rows on its mesh; safe to use from several threads.
 
-    `homogeneous` are the (896,) voltages that signals are differences from.
+    `homogeneous` are the (n,) voltages that signals are differences from.
     """
 
     def __init__(self, mesh: Mesh, definition: BankDefinition) -> None:
         """Prepare the forward model and solve it for the homogeneous voltages."""
-        self._forward = BatchForwardModel(mesh)
+        self._forward = BatchForwardModel(mesh, definition.table)
         self._conductivities = ConductivityModel(mesh, definition.variation)
         self._definition = definition
         self._n_triangles = len(mesh.triangles)
@@ -65,7 +64,7 @@ class RowSolver:
             smallest[cell] = cells[n_solved].min()
             n_solved += smallest[cell] > 0
         valid = smallest > 0
-        signals = np.zeros((len(sigmas), N_CHANNELS), dtype=np.float32)
+        signals = np.zeros((len(sigmas), self._definition.table.n_channels), dtype=np.float32)
         differences = self._forward.voltages(cells[:n_solved]) - self.homogeneous
         loud = np.linalg.norm(differences, axis=1) >= MIN_SIGNAL_NORM
         valid[valid] = loud
@@ -215,6 +214,7 @@ class RowJournal:
         if any(path.suffix not in (".row", ".tmp") for path in found):
             raise self._in_the_way()
         n, total = len(self._definition.sigma_grid), len(self._definition.k_grid)
+        channels = self._definition.table.n_channels
         for row in range(total):
             path = self.path / f"{row}.row"
             content = path.read_bytes() if path.exists() else b""
@@ -223,7 +223,7 @@ class RowJournal:
                 self.rows[row] = BankRow(
                     np.frombuffer(body, "<f8", n),
                     np.frombuffer(body, "|b1", n, offset=8 * n),
-                    np.frombuffer(body, "<f4", n * N_CHANNELS, offset=9 * n).reshape(n, N_CHANNELS),
+                    np.frombuffer(body, "<f4", n * channels, offset=9 * n).reshape(n, channels),
                 )
         if self.rows:
             self.notice = f"{self.path}: resuming, {len(self.rows)} of {total} rows are already solved"

@@ -1,65 +1,131 @@
-"""The channel table: which electrodes each of the 896 channels drives and measures, and where it stands in a line.
+"""The channel table: which electrodes each channel drives and measures, and where it stands in a line.
 
-The one place that knows the order and the sign of the channels. Its hash goes into every bank, calibration and
+The one place that knows the order and the sign of the channels. A table's digest goes into every bank, calibration and
 recording; files made under another table are refused by name.
-
-Opposite injection, adjacent measurement (Trehan et al. 2025, figure 2d): injection i drives −I at electrode i and
-+I at electrode i+16; channel (i, m) is V(m) − V(m+1), m ascending with wrap, without the four pairs that touch a
-driven electrode. The board sends all 32 × 32 pairs and writes those four as exactly 0.
 """
 
 import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.errors import GeometryError
 
-N_ELECTRODES = 32
-N_CHANNELS = 896
-N_LINE_VALUES = N_ELECTRODES * N_ELECTRODES
+Injection = Literal["opposite", "adjacent"]
+# The paper's.
+INJECTION: Injection = "opposite"
 # In the model's unit of current, as the reference solutions have it.
 STIMULATION_CURRENT = 5.0
+# Fewer electrodes leave too few pairs that touch no driven electrode; the EIT-kit has no more.
+_ELECTRODES = range(8, 33)
+_Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
-def _table() -> IntArray:
-    injection, pair = np.divmod(np.arange(N_LINE_VALUES), N_ELECTRODES)
-    sink, source = injection, (injection + N_ELECTRODES // 2) % N_ELECTRODES
-    positive, negative = pair, (pair + 1) % N_ELECTRODES
-    return np.column_stack([sink, source, positive, negative])
+@dataclass(frozen=True)
+class ChannelTable:
+    """The channels of a kind of fingertip: n channels of L electrodes. The default is the paper's, with 896 of 32.
+
+    Injection i drives −I at electrode i and +I at the opposite electrode (Trehan et al. 2025, figure 2d) or at the
+    next one. Channel (i, m) is V(m) − V(m+1), m ascending with wrap, without the pairs that touch a driven electrode.
+    The board sends all L × L pairs and writes those as exactly 0. Raises GeometryError for a number of electrodes that
+    is odd, below 8 or above 32.
+    """
+
+    n_electrodes: int = 32
+    injection: Injection = INJECTION
+
+    def __post_init__(self) -> None:
+        """Check the number of electrodes."""
+        if self.n_electrodes not in _ELECTRODES or self.n_electrodes % 2:
+            raise GeometryError(
+                f"a fingertip has an even number of {_ELECTRODES.start} to {_ELECTRODES.stop - 1} electrodes, not "
+                f"{self.n_electrodes}"
+            )
+
+    @property
+    def n_line_values(self) -> int:
+        """Values of a line."""
+        return self.n_electrodes**2
+
+    @property
+    def n_channels(self) -> int:
+        """Channels of a frame."""
+        return len(self.line_slots)
+
+    @cached_property
+    def zero_slots(self) -> BoolArray:
+        """(L²,) True at the values of a line whose pair touches a driven electrode."""
+        pairs = self._pairs()
+        return _read_only((pairs[:, :2, None] == pairs[:, None, 2:]).any(axis=(1, 2)))
+
+    @cached_property
+    def line_slots(self) -> IntArray:
+        """(n,) position of each channel among the values of a line."""
+        return _read_only(np.flatnonzero(~self.zero_slots))
+
+    @cached_property
+    def electrodes(self) -> IntArray:
+        """(n, 4) electrodes of each channel: sink (−I), source (+I), positive and negative measuring electrode."""
+        return _read_only(self._pairs()[self.line_slots])
+
+    @cached_property
+    def twins(self) -> IntArray:
+        """(2, n/2) the two channels of each voltage: a frame has every voltage twice.
+
+        An opposite injection comes a second time with its current reversed. Adjacent ones may change places with the
+        measuring pair (reciprocity).
+        """
+        found: dict[frozenset[frozenset[int]], list[int]] = {}
+        for channel, (sink, source, positive, negative) in enumerate(self.electrodes.tolist()):
+            found.setdefault(frozenset({frozenset({sink, source}), frozenset({positive, negative})}), []).append(
+                channel
+            )
+        return _read_only(np.array(sorted(found.values())).T)
+
+    @cached_property
+    def digest(self) -> str:
+        """The hash of the table, the same on all machines."""
+        rows = np.column_stack([self.line_slots, self.electrodes]).astype("<i4")
+        return hashlib.sha256(b"shearloop channel table 1" + rows.tobytes()).hexdigest()
+
+    def channels_of_line(self, values: FloatArray) -> FloatArray:
+        """Return the (…, n) channels of (…, L²) line values, in volts and line order."""
+        return values[..., self.line_slots]
+
+    def line_of_channels(self, channels: FloatArray) -> FloatArray:
+        """Return the (…, L²) line values of (…, n) channels, with exact zeros where the board writes them."""
+        values = np.zeros((*channels.shape[:-1], self.n_line_values))
+        values[..., self.line_slots] = channels
+        return values
+
+    def twin_means(self, differences: FloatArray) -> FloatArray:
+        """Return the (…, n/2) means of the magnitudes that (…, n) differences contain twice."""
+        first, second = self.twins
+        return np.asarray((differences[..., first] + differences[..., second]) / 2)
+
+    def _pairs(self) -> IntArray:
+        injection, pair = np.divmod(np.arange(self.n_line_values), self.n_electrodes)
+        step = self.n_electrodes // 2 if self.injection == "opposite" else 1
+        source, negative = (injection + step) % self.n_electrodes, (pair + 1) % self.n_electrodes
+        return np.column_stack([injection, source, pair, negative])
 
 
-_ALL_PAIRS = _table()
-# True at the 128 values of a line whose pair touches a driven electrode.
-ZERO_SLOTS: BoolArray = (_ALL_PAIRS[:, :2, None] == _ALL_PAIRS[:, None, 2:]).any(axis=(1, 2))
-# (896,) position of each channel among the 1024 values of a line.
-LINE_SLOTS: IntArray = np.flatnonzero(~ZERO_SLOTS)
-# (896, 4) electrodes of each channel: sink (−I), source (+I), positive and negative measuring electrode.
-CHANNELS: IntArray = _ALL_PAIRS[LINE_SLOTS]
-for _array in (ZERO_SLOTS, LINE_SLOTS, CHANNELS):
-    _array.setflags(write=False)
-
-CHANNEL_TABLE_HASH = hashlib.sha256(
-    b"shearloop channel table 1" + np.column_stack([LINE_SLOTS, CHANNELS]).astype("<i4").tobytes()
-).hexdigest()
-
-
-def channels_of_line(values: FloatArray) -> FloatArray:
-    """Return the (…, 896) channels of (…, 1024) line values, in volts and line order."""
-    return values[..., LINE_SLOTS]
-
-
-def line_of_channels(channels: FloatArray) -> FloatArray:
-    """Return the (…, 1024) line values of (…, 896) channels, with exact zeros where the board writes them."""
-    values = np.zeros((*channels.shape[:-1], N_LINE_VALUES))
-    values[..., LINE_SLOTS] = channels
-    return values
-
+PAPER_TABLE = ChannelTable()
 
 # The paper's window along the channels: a Gaussian over nine, standard deviation 9/5; less of it at both ends.
 _WINDOW = np.exp(-0.5 * (np.arange(-4, 5) / (9 / 5)) ** 2)
-_WINDOW_WITHIN = np.convolve(np.ones(N_CHANNELS), _WINDOW, "same")
 
 
 def smoothed_along_channels(differences: FloatArray) -> FloatArray:
-    """Return (n, 896) differences averaged over nine channels, as the paper did with its cylinders (its section 2)."""
-    return np.asarray(np.array([np.convolve(row, _WINDOW, "same") for row in differences]) / _WINDOW_WITHIN)
+    """Return (m, n) differences averaged over nine channels, as the paper did with its cylinders (its section 2)."""
+    within = np.convolve(np.ones(differences.shape[1]), _WINDOW, "same")
+    return np.asarray(np.array([np.convolve(row, _WINDOW, "same") for row in differences]) / within)
+
+
+def _read_only(array: NDArray[_Scalar]) -> NDArray[_Scalar]:
+    array.setflags(write=False)
+    return array

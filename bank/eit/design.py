@@ -22,7 +22,7 @@ from scipy.signal import find_peaks
 from scipy.stats import rankdata
 
 from shearloop.bank.arrays import FloatArray, IntArray
-from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
+from shearloop.bank.eit.channels import ChannelTable
 from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.matching import ReferenceMatcher
@@ -42,6 +42,8 @@ _FOLDS = 8
 # Errors of linear elements are proportional to the mesh size: two fine meshes extrapolate to the limit.
 _FINE_CM = (0.05, 0.035)
 _N_DRIFT = 2
+# Settings of the models are for this height, and scale with another one.
+_PAPER_HEIGHT_CM = 3.6
 _MIN_FRAMES = 8
 # A smaller share of a frame is rounding: the board's converter alone makes thousands of times as much noise.
 _MIN_NOISE = 1e-6
@@ -55,7 +57,7 @@ class Setting(NamedTuple):
 
 
 def centred_settings(model: str, centre: float) -> list[Setting]:
-    """Return settings of a model that is centred on the fingertip, in cm (modulated Gaussian: k in rad/cm)."""
+    """Return settings of a model that is centred on the paper's fingertip, in cm (modulated Gaussian: k in rad/cm)."""
     widths = {
         "step": [1.0],
         "linear": [2.0, 2.5, 3.0, 4.0, 6.0],
@@ -69,7 +71,7 @@ def centred_settings(model: str, centre: float) -> list[Setting]:
 
 def searched_settings(model: str, height: float) -> list[Setting]:
     """Return settings all over a fingertip of this height, in cm, to search for the best one."""
-    up = (height * np.linspace(0.1, 0.9, 9)).tolist()
+    up, size = (_PAPER_HEIGHT_CM * np.linspace(0.1, 0.9, 9)).tolist(), height / _PAPER_HEIGHT_CM
     places, widths = {
         "step": (up, [1.0]),
         "linear": (up, [2.5, 4.0, 6.0, 10.0]),
@@ -77,19 +79,20 @@ def searched_settings(model: str, height: float) -> list[Setting]:
         "gaussian_derivative": (up, [0.65, 0.8, 1.0, 1.2, 1.5, 1.9, 2.5]),
         "modulated_gaussian": ([1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0.3, 0.4, 0.6, 0.9, 1.2]),
     }[model]
-    return [Setting(k, sigma) for k in places for sigma in widths]
+    k_unit = 1 / size if model == "modulated_gaussian" else size
+    return [Setting(k * k_unit, sigma * size) for k in places for sigma in widths]
 
 
 def simulated_signals(forward: ForwardModel, model: str, settings: Sequence[Setting]) -> FloatArray:
-    """Return the (m, 896) difference signals of the settings whose conductivity is positive everywhere."""
+    """Return the (m, n) difference signals of the settings whose conductivity is positive everywhere."""
     homogeneous = forward.homogeneous()
     cells = [conductivity(forward.mesh, model, k, sigma) for k, sigma in settings]
     signals = [forward.voltages(cell) - homogeneous for cell in cells if cell.min() > 0]
-    return np.array(signals).reshape(-1, N_CHANNELS)
+    return np.array(signals).reshape(-1, forward.table.n_channels)
 
 
 def envelope(magnitudes: FloatArray) -> FloatArray:
-    """Return the (896,) smoothed curve over the peaks of (896,) magnitudes, the last channel followed by the first.
+    """Return the (n,) smoothed curve over the peaks of (n,) magnitudes, the last channel followed by the first.
 
     Raises MatchingError where there are no two peaks to carry it.
     """
@@ -97,27 +100,27 @@ def envelope(magnitudes: FloatArray) -> FloatArray:
     peaks, _ = find_peaks(thrice, distance=_PEAK_DISTANCE)
     if len(peaks) < 2:
         raise MatchingError("a signal without peaks has no envelope")
-    curve = CubicSpline(peaks, thrice[peaks])(np.arange(N_CHANNELS, 2 * N_CHANNELS))
+    curve = CubicSpline(peaks, thrice[peaks])(np.arange(len(magnitudes), 2 * len(magnitudes)))
     return _moving_average(curve)
 
 
 def envelope_score(difference: FloatArray, signal: FloatArray) -> float:
-    """Return Spearman's correlation of the envelopes of two (896,) signals, the largest over all circular shifts.
+    """Return Spearman's correlation of the envelopes of two (n,) signals, the largest over all circular shifts.
 
     The difference is smoothed beforehand. Raises MatchingError as `envelope` does.
     """
     a, b = _ranks(envelope(_moving_average(np.abs(difference)))), _ranks(envelope(np.abs(signal)))
-    correlations = np.fft.irfft(np.fft.rfft(a) * np.conj(np.fft.rfft(b)), N_CHANNELS)
+    correlations = np.fft.irfft(np.fft.rfft(a) * np.conj(np.fft.rfft(b)), len(a))
     return float(correlations.max())
 
 
 def mean_envelope_score(difference: FloatArray, signals: FloatArray) -> float:
-    """Return the mean of the envelope scores of (m, 896) signals, for one (896,) difference."""
+    """Return the mean of the envelope scores of (m, n) signals, for one (n,) difference."""
     return float(np.mean([envelope_score(difference, signal) for signal in signals]))
 
 
 def matching_scores(differences: FloatArray, signals: FloatArray) -> FloatArray:
-    """Return the (n,) best scores, over (m, 896) signals and all lags, of (n, 896) differences."""
+    """Return the (f,) best scores, over (m, n) signals and all lags, of (f, n) differences."""
     m = len(signals)
     matcher = ReferenceMatcher(
         signals[:, None].astype(np.float32), np.ones((m, 1), dtype=np.bool_), np.arange(float(m)), np.zeros(1)
@@ -138,7 +141,7 @@ def _ranks(values: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredFrames:
-    """(n, 896) measured differences in volts, the noise of one frame in volts, torque (n,) or None."""
+    """(f, n) measured differences in volts, the noise of one frame in volts, torque (f,) or None."""
 
     differences: FloatArray
     noise_v: float
@@ -240,10 +243,11 @@ class Design:
 
 def design_bank(measured: MeasuredFrames, fingertip: Fingertip) -> Design:
     """Return the choices for frames of this fingertip. Raises BankError for a geometry that cannot be solved on."""
-    forward = ForwardModel(replace(fingertip, mesh_size_cm=0.2).mesh())
+    table = fingertip.table
+    forward = ForwardModel(replace(fingertip, mesh_size_cm=0.2).mesh(), table)
     searched = {name: _positive(forward, name, searched_settings(name, forward.mesh.height_cm)) for name in MODELS}
     signals = {name: np.abs(simulated_signals(forward, name, settings)) for name, settings in searched.items()}
-    models = tuple(_model_fit(measured, name, signals[name]) for name in MODELS)
+    models = tuple(_model_fit(measured, name, signals[name], table) for name in MODELS)
     model = min(models, key=lambda one: one.penalised).model
     k_range, sigma_range = _ranges(measured, searched[model], signals[model])
     # Not every conductivity is positive in the middle of the ranges: take the nearest that is.
@@ -263,7 +267,7 @@ def design_bank(measured: MeasuredFrames, fingertip: Fingertip) -> Design:
         mesh=_mesh_choice(fingertip, model, middle, noise),
         k_count=_count_choice(forward, model, middle, "k", k_range, noise),
         sigma_count=sigma_count,
-        injections=_injection_choice(measured),
+        injections=_injection_choice(measured, table),
     )
 
 
@@ -279,8 +283,8 @@ def _fit(frames: FloatArray, signals: FloatArray) -> tuple[FloatArray, FloatArra
     return amplitude, (frames**2).sum(axis=1)[:, None] - amplitude**2 * energy
 
 
-def _model_fit(measured: MeasuredFrames, model: str, signals: FloatArray) -> ModelFit:
-    frames, injection = np.abs(measured.differences), CHANNELS[:, 0]
+def _model_fit(measured: MeasuredFrames, model: str, signals: FloatArray, table: ChannelTable) -> ModelFit:
+    frames, injection = np.abs(measured.differences), table.electrodes[:, 0]
     left = np.zeros(len(frames))
     for fold in range(_FOLDS):
         out = injection % _FOLDS == fold
@@ -291,7 +295,7 @@ def _model_fit(measured: MeasuredFrames, model: str, signals: FloatArray) -> Mod
     share = left / (frames**2).sum(axis=1)
     p = 3 if MODELS[model].uses_sigma else 2
     error = float(np.sqrt(share.mean()))
-    penalised = float(np.sqrt(share.mean() * (1 + p * np.log(N_CHANNELS) / N_CHANNELS)))
+    penalised = float(np.sqrt(share.mean() * (1 + p * np.log(table.n_channels) / table.n_channels)))
     return ModelFit(model, p, error, float(share.std() / np.sqrt(len(share)) / (2 * error)), penalised)
 
 
@@ -317,7 +321,7 @@ def _shape_error(one: FloatArray, other: FloatArray) -> float:
 
 def _mesh_choice(fingertip: Fingertip, model: str, place: Setting, noise: float) -> DesignChoice:
     def solved(size: float) -> tuple[FloatArray, int]:
-        forward = ForwardModel(replace(fingertip, mesh_size_cm=size).mesh())
+        forward = ForwardModel(replace(fingertip, mesh_size_cm=size).mesh(), fingertip.table)
         return np.abs(simulated_signals(forward, model, [place])[0]), len(forward.mesh.triangles)
 
     coarse, fine = (solved(size)[0] for size in _FINE_CM)
@@ -353,7 +357,7 @@ def _count_choice(
     return DesignChoice(f"cells along {name}", "cells", tuple(steps))
 
 
-def _injection_choice(measured: MeasuredFrames) -> DesignChoice:
+def _injection_choice(measured: MeasuredFrames, table: ChannelTable) -> DesignChoice:
     """Choose injections by the torque's standard deviation, each the best to add to those before.
 
     The recording gives the frames' slope over torque, their drift about it and their noise. Without a known torque the
@@ -378,15 +382,15 @@ def _injection_choice(measured: MeasuredFrames) -> DesignChoice:
         return 1.0 / max(float(b @ b - (b @ v) @ inner @ (v.T @ b)), 1e-300)
 
     def channels_of(injections: Sequence[int]) -> IntArray:
-        return np.flatnonzero(np.isin(CHANNELS[:, 0], injections))
+        return np.flatnonzero(np.isin(table.electrodes[:, 0], injections))
 
-    least = variance(np.arange(N_CHANNELS))
+    least = variance(np.arange(table.n_channels))
     taken: list[int] = []
     steps = []
-    while rest := [one for one in range(N_ELECTRODES) if one not in taken]:
+    while rest := [one for one in range(table.n_electrodes) if one not in taken]:
         taken.append(min(rest, key=lambda one: variance(channels_of([*taken, one]))))
         channels = channels_of(taken)
         rate = f"{1.0 / (len(channels) * CHANNEL_S):.2f} frames/s at {1e3 * CHANNEL_S:g} ms a channel"
         added = float(np.sqrt(max(variance(channels) / least - 1.0, 0.0)))
         steps.append(DesignStep(len(taken), added, f"{rate}; injections {', '.join(map(str, sorted(taken)))}"))
-    return DesignChoice("injections", "of 32", tuple(steps))
+    return DesignChoice("injections", f"of {table.n_electrodes}", tuple(steps))

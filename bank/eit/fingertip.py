@@ -1,19 +1,21 @@
-"""A fingertip described by its measures, and its mesh.
+"""A fingertip described by its measures, and its mesh: a rectangle or a disc.
 
-The mesh is a grid of lines parallel to the sides, each cell cut into two triangles. Lines run through both ends of
-every electrode, with a spacing of at most `mesh_size_cm` between them. The current is crowded at the boundary, so the
-outermost rows are halved twice. The diagonals alternate like a chessboard, so that no direction is preferred.
+A rectangle's mesh is a grid of lines parallel to the sides, each cell cut into two triangles; the diagonals alternate
+like a chessboard, so that no direction is preferred. A disc's mesh is of concentric rings. Nodes lie at both ends of
+every electrode, with at most `mesh_size_cm` between neighbours. The current is crowded at the boundary, so the
+outermost rows are halved twice.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
+from scipy.spatial import Delaunay
 
 from shearloop.bank.arrays import FloatArray, IntArray
-from shearloop.bank.eit.channels import N_ELECTRODES
+from shearloop.bank.eit.channels import INJECTION, ChannelTable, Injection
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.errors import GeometryError
 
@@ -37,8 +39,16 @@ class ElectrodePlace:
 
 
 @dataclass(frozen=True, slots=True)
-class Fingertip:
-    """A rectangle from (0, 0) to (width, height) with 32 electrodes, in electrode order, along its edge.
+class Outline:
+    """What a drawing needs, in cm: the closed contour, and both ends of each electrode, as points (x, y)."""
+
+    contour: list[tuple[float, float]]
+    electrodes: list[tuple[tuple[float, float], tuple[float, float]]]
+
+
+@dataclass(frozen=True, slots=True)
+class RectangularFingertip:
+    """A rectangle from (0, 0) to (width, height) with electrodes, in electrode order, along its edge.
 
     contact_impedance is in cm over the unit of conductivity. Raises GeometryError for electrodes that leave their side
     or overlap.
@@ -50,22 +60,18 @@ class Fingertip:
     contact_impedance: float
     mesh_size_cm: float
     electrodes: tuple[ElectrodePlace, ...]
+    injection: Injection = INJECTION
 
     def __post_init__(self) -> None:
         """Check the measures."""
-        for name in ("width_cm", "height_cm", "electrode_width_cm", "contact_impedance", "mesh_size_cm"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise GeometryError(f"the fingertip's {name} must be above 0, not {value:g}")
-        if self.electrode_width_cm < _LEAST_ELECTRODE_CM:
-            raise GeometryError(
-                f"the fingertip's electrode_width_cm must be {_LEAST_ELECTRODE_CM:g} or more, not "
-                f"{self.electrode_width_cm:g}"
-            )
-        if len(self.electrodes) != N_ELECTRODES:
-            raise GeometryError(f"the fingertip has {len(self.electrodes)} electrodes, expected {N_ELECTRODES}")
+        _check_measures(self, ("width_cm", "height_cm"))
         for side in SIDES:
             self._check_side(side)
+
+    @property
+    def table(self) -> ChannelTable:
+        """The fingertip's channels."""
+        return ChannelTable(len(self.electrodes), self.injection)
 
     def ends_cm(self, place: ElectrodePlace) -> tuple[float, float]:
         """Return where an electrode begins and ends along its side, in cm."""
@@ -83,8 +89,19 @@ class Fingertip:
             triangles=_chessboard(len(x), len(y)),
             electrode_edges=edges,
             electrode_of_edge=of_edge,
-            contact_impedance=np.full(N_ELECTRODES, self.contact_impedance),
+            contact_impedance=np.full(len(self.electrodes), self.contact_impedance),
         )
+
+    def outline(self) -> Outline:
+        """Return the rectangle and its electrodes."""
+        w, h = self.width_cm, self.height_cm
+        electrodes = []
+        for place in self.electrodes:
+            start, end = self.ends_cm(place)
+            across = {"left": 0.0, "right": w, "bottom": 0.0, "top": h}[place.side]
+            upright = place.side in ("left", "right")
+            electrodes.append(((across, start), (across, end)) if upright else ((start, across), (end, across)))
+        return Outline([(0.0, 0.0), (w, 0.0), (w, h), (0.0, h)], electrodes)
 
     def _check_side(self, side: Side) -> None:
         length = self.height_cm if side in ("left", "right") else self.width_cm
@@ -128,6 +145,105 @@ class Fingertip:
             covered = nodes[(lines > start - _SAME_CM) & (lines < end + _SAME_CM)]
             edges.append(np.column_stack([covered[:-1], covered[1:]]))
         return np.vstack(edges), np.repeat(np.arange(len(edges)), [len(each) for each in edges])
+
+
+@dataclass(frozen=True, slots=True)
+class RoundFingertip:
+    """A disc with its lowest point at height 0, and electrodes in electrode order around it.
+
+    angles_deg are the electrodes' centres, anticlockwise from the right; electrode_width_cm is measured along the
+    edge. Raises GeometryError for electrodes that overlap.
+    """
+
+    diameter_cm: float
+    electrode_width_cm: float
+    contact_impedance: float
+    mesh_size_cm: float
+    angles_deg: tuple[float, ...]
+    injection: Injection = INJECTION
+
+    def __post_init__(self) -> None:
+        """Check the measures."""
+        _check_measures(self, ("diameter_cm",))
+        order = np.argsort(np.mod(self.angles_deg, 360.0))
+        places = np.mod(self.angles_deg, 360.0)[order]
+        apart_cm = np.deg2rad(np.diff(places, append=places[0] + 360.0)) * self.diameter_cm / 2
+        if (near := int(apart_cm.argmin())) >= 0 and apart_cm[near] < self.electrode_width_cm + _SAME_CM:
+            pair = order[near], order[(near + 1) % len(order)]
+            raise GeometryError(f"electrodes {pair[0]} and {pair[1]} touch or overlap")
+
+    @property
+    def table(self) -> ChannelTable:
+        """The fingertip's channels."""
+        return ChannelTable(len(self.angles_deg), self.injection)
+
+    @property
+    def height_cm(self) -> float:
+        """The height of the outline."""
+        return self.diameter_cm
+
+    def outline(self) -> Outline:
+        """Return the disc and its electrodes, as chords."""
+        radius, half = self.diameter_cm / 2, self.electrode_width_cm / self.diameter_cm
+
+        def at(angle: float) -> tuple[float, float]:
+            return radius + radius * float(np.cos(angle)), radius + radius * float(np.sin(angle))
+
+        centres = np.deg2rad(self.angles_deg).tolist()
+        around = np.linspace(0.0, 2 * np.pi, 120, endpoint=False).tolist()
+        return Outline([at(angle) for angle in around], [(at(one - half), at(one + half)) for one in centres])
+
+    def mesh(self) -> Mesh:
+        """Return the fingertip's mesh."""
+        radius, size = self.diameter_cm / 2, self.mesh_size_cm
+        starts = np.deg2rad(self.angles_deg) - self.electrode_width_cm / self.diameter_cm
+        ends = np.deg2rad(self.angles_deg) + self.electrode_width_cm / self.diameter_cm
+        stops = np.sort(np.mod(np.concatenate([starts, ends]), 2 * np.pi))
+        pieces = [
+            np.linspace(start, end, max(1, int(np.ceil((end - start) * radius / size - _SAME_CM))), endpoint=False)
+            for start, end in pairwise([*stops.tolist(), stops[0] + 2 * np.pi])
+        ]
+        around = np.concatenate(pieces)
+        n_rings = int(np.ceil(radius / size))
+        depths = radius / n_rings * np.array([0.0, 0.25, 0.5, *range(1, n_rings)])
+        points = []
+        for row, ring in enumerate(radius - depths):
+            # The outermost rows follow the electrodes' ends; every other ring inside is turned by half a spacing.
+            n = max(6, int(np.ceil(2 * np.pi * ring / size)))
+            angles = around if row <= _BOUNDARY_HALVINGS else 2 * np.pi * (np.arange(n) + 0.5 * (row % 2)) / n
+            points.append(radius + ring * np.column_stack([np.cos(angles), np.sin(angles)]))
+        nodes = np.vstack([*points, [[radius, radius]]])
+        following = np.append(np.arange(1, len(around)), 0)
+        middles = around + np.diff(around, append=around[0] + 2 * np.pi) / 2
+        edges, of_edge = [], []
+        for electrode, (start, end) in enumerate(zip(starts, ends, strict=True)):
+            covered = np.flatnonzero(np.mod(middles - start, 2 * np.pi) < end - start)
+            edges.append(np.column_stack([covered, following[covered]]))
+            of_edge += [electrode] * len(covered)
+        return Mesh(
+            nodes=nodes,
+            triangles=Delaunay(nodes).simplices.astype(np.int64),
+            electrode_edges=np.vstack(edges),
+            electrode_of_edge=np.array(of_edge),
+            contact_impedance=np.full(len(self.angles_deg), self.contact_impedance),
+        )
+
+
+Fingertip: TypeAlias = RectangularFingertip | RoundFingertip
+
+
+def _check_measures(fingertip: Fingertip, lengths: tuple[str, ...]) -> None:
+    # The table checks the number of electrodes.
+    _ = fingertip.table
+    for name in (*lengths, "electrode_width_cm", "contact_impedance", "mesh_size_cm"):
+        value = getattr(fingertip, name)
+        if not (np.isfinite(value) and value > 0):
+            raise GeometryError(f"the fingertip's {name} must be above 0, not {value:g}")
+    if fingertip.electrode_width_cm < _LEAST_ELECTRODE_CM:
+        raise GeometryError(
+            f"the fingertip's electrode_width_cm must be {_LEAST_ELECTRODE_CM:g} or more, not "
+            f"{fingertip.electrode_width_cm:g}"
+        )
 
 
 def _chessboard(columns: int, rows: int) -> IntArray:

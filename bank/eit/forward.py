@@ -15,13 +15,13 @@ from skfem import Basis, BilinearForm, ElementTriP1, FacetBasis, LinearForm, Mes
 from skfem.helpers import dot, grad
 
 from shearloop.bank.arrays import FloatArray, IntArray
-from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES, STIMULATION_CURRENT
-from shearloop.bank.eit.mesh import Mesh, Terms, require_fingertip, rows_of_edges
-from shearloop.bank.errors import ConductivityError
+from shearloop.bank.eit.channels import PAPER_TABLE, STIMULATION_CURRENT, ChannelTable
+from shearloop.bank.eit.mesh import Mesh, Terms, rows_of_edges
+from shearloop.bank.errors import ConductivityError, GeometryError
 
 # The node of zero potential; only differences of potentials leave this module.
 _GROUND = 0
-# The largest sum of a row as a share of its diagonal: rounding in 896 differences of voltages is of that size, and the
+# The largest sum of a row as a share of its diagonal: rounding in differences of voltages is of that size, and the
 # smallest signal in a bank is 5e-5 of the voltages.
 MAX_LEAK = 1e-11
 
@@ -72,67 +72,73 @@ class CompleteElectrodeModel:
 
 
 class ForwardModel:
-    """The 896 voltages of a fingertip. Raises GeometryError for a mesh without 32 electrodes.
+    """The n voltages of a fingertip. Raises GeometryError for a mesh with another number of electrodes than its table.
 
-    currents (32, 16) go into the electrodes in the first half of the patterns.
+    currents (L, p) go into the electrodes in the p injections that differ by more than their sign.
     """
 
-    def __init__(self, mesh: Mesh) -> None:
+    def __init__(self, mesh: Mesh, table: ChannelTable = PAPER_TABLE) -> None:
         """Check the mesh and assemble."""
-        require_fingertip(mesh)
-        self.mesh = mesh
+        if mesh.n_electrodes != table.n_electrodes:
+            raise GeometryError(
+                f"the mesh has {mesh.n_electrodes} electrodes, but the channel table needs {table.n_electrodes}"
+            )
+        self.mesh, self.table = mesh, table
         self._solver = CompleteElectrodeModel(mesh)
-        # Opposite injection: the second half of the patterns is the first with the sign changed.
-        half = N_ELECTRODES // 2
-        self.currents = STIMULATION_CURRENT * np.vstack([-np.eye(half), np.eye(half)])
-        sink, _, self._positive, self._negative = CHANNELS.T
-        self._pattern = sink % half
-        self._sign = np.where(sink < half, 1.0, -1.0)
+        sink, source, self._positive, self._negative = table.electrodes.T
+        # The second half of opposite injections is the first with the current reversed.
+        patterns = table.n_electrodes // (2 if table.injection == "opposite" else 1)
+        self._pattern = sink % patterns
+        self._sign = np.where(sink < patterns, 1.0, -1.0)
+        first = np.array([np.flatnonzero(sink == one)[0] for one in range(patterns)])
+        self.currents = np.zeros((table.n_electrodes, patterns))
+        self.currents[sink[first], np.arange(patterns)] = -STIMULATION_CURRENT
+        self.currents[source[first], np.arange(patterns)] = STIMULATION_CURRENT
 
     def voltages(self, conductivity: FloatArray) -> FloatArray:
-        """Return the (896,) voltages of (T,) conductivities of the mesh's triangles.
+        """Return the (n,) voltages of (T,) conductivities of the mesh's triangles.
 
         Raises ConductivityError, before anything is solved, where conductivity is not positive.
         """
         return self.channels_of(self._solver.electrode_potentials(conductivity, self.currents))
 
     def channels_of(self, potentials: FloatArray) -> FloatArray:
-        """Return the (…, 896) voltages of the (…, 32, 16) potentials that `currents` raise."""
+        """Return the (…, n) voltages of the (…, L, p) potentials that `currents` raise."""
         differences: FloatArray = (
             potentials[..., self._positive, self._pattern] - potentials[..., self._negative, self._pattern]
         )
         return self._sign * differences
 
     def homogeneous(self) -> FloatArray:
-        """Return the (896,) voltages of conductivity 1 everywhere."""
+        """Return the (n,) voltages of conductivity 1 everywhere."""
         return self.voltages(np.ones(len(self.mesh.triangles)))
 
 
 class BatchForwardModel:
-    """The 896 voltages of a fingertip for many conductivities at once; safe to use from several threads.
+    """The n voltages of a fingertip for many conductivities at once; safe to use from several threads.
 
-    The nodes are eliminated and never solved for (static condensation, Guyan 1965): a 32 × 32 matrix from potentials of
+    The nodes are eliminated and never solved for (static condensation, Guyan 1965): an L × L matrix from potentials of
     electrodes to currents into them remains. No node is grounded, so equal potentials drive no current and the rows of
     that matrix add up to zero, up to rounding. A cell with too much rounding is solved directly. Raises GeometryError
-    for a mesh without 32 electrodes.
+    as `ForwardModel` does.
     """
 
-    def __init__(self, mesh: Mesh) -> None:
+    def __init__(self, mesh: Mesh, table: ChannelTable = PAPER_TABLE) -> None:
         """Assemble, and plan the elimination (about a tenth of a second for 5000 triangles)."""
         # The daemon imports this module, and numba takes 60 MB.
         from shearloop.bank.eit.elimination import Elimination
 
         self.mesh = mesh
-        self.direct = ForwardModel(mesh)
+        self.direct = ForwardModel(mesh, table)
         terms, place = _terms(mesh)
         # The node that the direct solve grounds is the last one here.
         n_nodes = len(mesh.nodes)
         place[n_nodes:] += 1
         place[place < 0] = n_nodes - 1
-        self._elimination = Elimination(terms.moved(place), n_nodes + N_ELECTRODES, N_ELECTRODES)
+        self._elimination = Elimination(terms.moved(place), n_nodes + mesh.n_electrodes, mesh.n_electrodes)
 
     def voltages(self, conductivities: FloatArray) -> FloatArray:
-        """Return the (n, 896) voltages of (n, T) conductivities of the mesh's triangles.
+        """Return the (m, n) voltages of (m, T) conductivities of the mesh's triangles.
 
         The bits of one do not depend on the others. Raises ConductivityError, before anything is solved, where a
         conductivity is not positive.
@@ -140,10 +146,10 @@ class BatchForwardModel:
         for each in conductivities:
             require_positive(each, len(self.mesh.triangles))
         schur = self._elimination.schur_complements(conductivities)
-        found = np.empty((len(conductivities), N_CHANNELS))
+        found = np.empty((len(conductivities), self.direct.table.n_channels))
         sound = rounding_leaks(schur) <= MAX_LEAK
         # The last electrode is grounded: only differences of potentials are wanted.
-        potentials = np.zeros((int(sound.sum()), N_ELECTRODES, self.direct.currents.shape[1]))
+        potentials = np.zeros((int(sound.sum()), *self.direct.currents.shape))
         potentials[:, :-1] = np.linalg.solve(schur[sound, :-1, :-1], self.direct.currents[:-1])
         found[sound] = self.direct.channels_of(potentials)
         for cell in np.flatnonzero(~sound):

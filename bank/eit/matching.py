@@ -17,7 +17,6 @@ from scipy.special import chdtri
 
 from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.errors import MatchingError
 
 # Scores closer than this are equal up to rounding: the first cell in (k, σ) order wins.
@@ -26,10 +25,8 @@ TIE = 1e-12
 RUNNER_UP_RADIUS = 5
 # Share of pure noise frames that pass as a signal: at 1.85 frames/s, one in about six days.
 FALSE_ALARM = 1e-6
-_MIN_ENERGY = float(chdtri(N_CHANNELS, FALSE_ALARM))
-# Cells scored at a time: 1024 × 897 complex numbers and their correlations take 30 MB.
+# Cells scored at a time: with 896 channels, 1024 × 897 complex numbers and their correlations take 30 MB.
 CHUNK_CELLS = 1024
-_N_LAGS = 2 * N_CHANNELS - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,15 +48,15 @@ class Matcher(ABC):
     """Scores differences against all valid cells of a bank; keeps no state between calls."""
 
     def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
-        """Take (K, S, 896) difference signals, (K, S) validity, and the (K,) and (S,) grids.
+        """Take (K, S, n) difference signals, (K, S) validity, and the (K,) and (S,) grids.
 
         Signals are not copied; those of invalid cells are never read. Raises MatchingError when shapes differ, no cell
         is valid, or a valid cell has no signal.
         """
         shape = (len(k_grid), len(sigma_grid))
-        if signals.shape != (*shape, N_CHANNELS) or valid.shape != shape:
+        if signals.ndim != 3 or signals.shape[:2] != shape or valid.shape != shape:
             raise MatchingError(
-                f"a bank of {shape[0]} k × {shape[1]} σ needs signals of shape {(*shape, N_CHANNELS)} and a validity "
+                f"a bank of {shape[0]} k × {shape[1]} σ needs signals of shape {shape} × channels and a validity "
                 f"of shape {shape}, not {signals.shape} and {valid.shape}"
             )
         if not valid.any():
@@ -68,7 +65,8 @@ class Matcher(ABC):
         self.sigma_grid = sigma_grid
         self.valid = valid
         # A plain array: indexing a memory map is slow.
-        self._signals = np.asarray(signals).reshape(-1, N_CHANNELS)
+        self.n_channels = signals.shape[2]
+        self._signals = np.asarray(signals).reshape(-1, self.n_channels)
         self._cells = np.flatnonzero(valid)
 
     @classmethod
@@ -77,17 +75,17 @@ class Matcher(ABC):
         return cls(bank.signals, bank.valid, bank.k_grid, bank.sigma_grid)
 
     def heatmap(self, difference: ArrayLike) -> FloatArray:
-        """Return the (K, S) scores, 0 to 1, of one (896,) difference; NaN in invalid cells. Errors as `heatmaps`."""
+        """Return the (K, S) scores, 0 to 1, of one (n,) difference; NaN in invalid cells. Errors as `heatmaps`."""
         found: FloatArray = self.heatmaps(np.asarray(difference)[None])[0]
         return found
 
     def heatmaps(self, differences: ArrayLike) -> FloatArray:
-        """Return the (n, K, S) scores of (n, 896) differences; their sign and scale do not matter.
+        """Return the (m, K, S) scores of (m, n) differences; their sign and scale do not matter.
 
         Raises MatchingError for a wrong shape, a value that is not finite, and a difference of zeros (ask
         `signal_above_noise` first).
         """
-        frames = unit_magnitudes(differences)
+        frames = unit_magnitudes(differences, self.n_channels)
         maps = np.full((len(frames), self.valid.size), np.nan)
         for cells in self._chunks():
             maps[:, cells] = self._scores(frames, self._unit_signals(cells))
@@ -95,7 +93,7 @@ class Matcher(ABC):
         return np.clip(maps, 0.0, 1.0, out=maps).reshape(-1, *self.valid.shape)
 
     def match(self, difference: ArrayLike) -> Match:
-        """Return the maximum of one (896,) difference's heatmap and its runner-up. Errors as `heatmaps`."""
+        """Return the maximum of one (n,) difference's heatmap and its runner-up. Errors as `heatmaps`."""
         return best_match(self.heatmap(difference), self.k_grid, self.sigma_grid)
 
     def _chunks(self) -> Iterator[IntArray]:
@@ -115,15 +113,15 @@ class Matcher(ABC):
 
     @abstractmethod
     def _scores(self, frames: FloatArray, signals: FloatArray) -> FloatArray:
-        """Return the (n, m) scores of (n, 896) frames and (m, 896) signals, both magnitudes of norm 1."""
+        """Return the (m, c) scores of (m, n) frames and (c, n) signals, both magnitudes of norm 1."""
 
 
 class ReferenceMatcher(Matcher):
-    """The paper's score: the largest cross-correlation, over all 1791 lags, of two magnitudes of norm 1."""
+    """The paper's score: the largest cross-correlation, over all 2n − 1 lags, of two magnitudes of norm 1."""
 
     def _scores(self, frames: FloatArray, signals: FloatArray) -> FloatArray:
         # Padded to all lags, nothing wraps around. Padding may add a lag without overlap, where the product is 0.
-        n = fft.next_fast_len(_N_LAGS, real=True)
+        n = fft.next_fast_len(2 * self.n_channels - 1, real=True)
         spectra = fft.rfft(signals, n)
         scores = np.empty((len(frames), len(signals)))
         for row, spectrum in enumerate(fft.rfft(frames, n)):
@@ -141,14 +139,14 @@ class ZeroLagMatcher(Matcher):
         return np.asarray(frames @ signals.T)
 
 
-def unit_magnitudes(differences: ArrayLike) -> FloatArray:
-    """Return the magnitudes of (n, 896) differences, each row of norm 1.
+def unit_magnitudes(differences: ArrayLike, n_channels: int) -> FloatArray:
+    """Return the magnitudes of (m, n) differences, each row of norm 1.
 
     Raises MatchingError for a wrong shape, a value that is not finite, and a row of zeros.
     """
     values = np.asarray(differences, dtype=np.float64)
-    if values.ndim != 2 or values.shape[1] != N_CHANNELS:
-        raise MatchingError(f"a difference has {N_CHANNELS} channels; the array has shape {values.shape}")
+    if values.ndim != 2 or values.shape[1] != n_channels:
+        raise MatchingError(f"a difference has {n_channels} channels; the array has shape {values.shape}")
     magnitudes = np.abs(values)
     # Scaled by the largest first, so that squares neither overflow nor vanish.
     largest = magnitudes.max(axis=1, keepdims=True, initial=0.0)
@@ -161,26 +159,27 @@ def unit_magnitudes(differences: ArrayLike) -> FloatArray:
 
 
 def signal_above_noise(difference: ArrayLike, noise_std: ArrayLike) -> str | None:
-    """Return why an (896,) difference is no signal and must not be matched, or None where it exceeds the noise.
+    """Return why an (n,) difference is no signal and must not be matched, or None where it exceeds the noise.
 
-    noise_std is the difference's standard deviation from noise alone, (896,) or one number. For independent Gaussian
-    noise Σ (difference/noise_std)² is χ² distributed with 896 degrees of freedom; a signal exceeds its quantile at
+    noise_std is the difference's standard deviation from noise alone, (n,) or one number. For independent Gaussian
+    noise Σ (difference/noise_std)² is χ² distributed with n degrees of freedom; a signal exceeds its quantile at
     1 − FALSE_ALARM. Raises MatchingError for values that are not finite and for a noise that is not above zero.
     """
     values, noise = np.asarray(difference, dtype=np.float64), np.asarray(noise_std, dtype=np.float64)
-    if values.shape != (N_CHANNELS,) or noise.shape not in ((), (N_CHANNELS,)):
+    if values.ndim != 1 or noise.shape not in ((), values.shape):
         raise MatchingError(
-            f"a difference has {N_CHANNELS} channels; the arrays have shapes {values.shape}, {noise.shape}"
+            f"a difference has a value for each channel; the arrays have shapes {values.shape}, {noise.shape}"
         )
     if not (np.isfinite(values).all() and np.isfinite(noise).all() and (noise > 0).all()):
         raise MatchingError("the difference must be finite, and its noise finite and above zero, in all channels")
     with np.errstate(over="ignore"):  # infinite energy is still a signal
         energy = float(np.sum((values / noise) ** 2))
-    if energy > _MIN_ENERGY:
+    least = float(chdtri(values.size, FALSE_ALARM))
+    if energy > least:
         return None
     return (
-        f"no signal above the noise: the difference is {np.sqrt(energy / N_CHANNELS):.2f} times the noise, "
-        f"and a signal needs {np.sqrt(_MIN_ENERGY / N_CHANNELS):.2f} times"
+        f"no signal above the noise: the difference is {np.sqrt(energy / values.size):.2f} times the noise, "
+        f"and a signal needs {np.sqrt(least / values.size):.2f} times"
     )
 
 

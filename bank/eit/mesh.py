@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.csgraph import connected_components
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
-from shearloop.bank.eit.channels import N_ELECTRODES
 from shearloop.bank.errors import GeometryError
 
 # A triangle with a smaller area over its longest edge squared is an error of the mesh.
@@ -111,8 +110,7 @@ def doubled_areas(nodes: FloatArray, triangles: IntArray) -> FloatArray:
 def load_mesh(path: str | Path) -> Mesh:
     """Read a fingertip's mesh from an npz file (the fields of `Mesh`) or an EIDORS model (.mat, variable `mdl`).
 
-    Raises GeometryError, with the file's name, for a file that is missing, truncated, foreign or not of a fingertip
-    with 32 electrodes.
+    Raises GeometryError, with the file's name, for a file that is missing, truncated, foreign or not of a fingertip.
     """
     path = Path(path)
     try:
@@ -130,17 +128,9 @@ def load_mesh(path: str | Path) -> Mesh:
             "or an EIDORS model saved from MATLAB or Octave with `save -v6`"
         )
     try:
-        mesh = Mesh(**fields)
-        require_fingertip(mesh)
+        return Mesh(**fields)
     except GeometryError as error:
         raise GeometryError(f"{path}: {error}") from error
-    return mesh
-
-
-def require_fingertip(mesh: Mesh) -> None:
-    """Raise GeometryError unless the mesh has the channel table's 32 electrodes."""
-    if mesh.n_electrodes != N_ELECTRODES:
-        raise GeometryError(f"the mesh has {mesh.n_electrodes} electrodes, but the channel table needs {N_ELECTRODES}")
 
 
 _FIELDS = tuple(Mesh.__dataclass_fields__)

@@ -3,7 +3,7 @@
 A compressed bank bounds the scores of groups of cells, then of cells. Cells bounded below a score that another cell
 reaches are dropped; the rest is scored in float64. The compression decides the time, never the result.
 
-Every unit signal b of the bank is split as b = Φ c + d, with Φ (896 × r) an orthonormal basis fitted to the bank, d
+Every unit signal b of the bank is split as b = Φ c + d, with Φ (n × r) an orthonormal basis fitted to the bank, d
 orthogonal to it and ‖d‖ = ρ. For a frame y with g = Φᵀ y and t = ‖y − Φ g‖, Cauchy and Schwarz give
 
     b·y = c·g + d·(y − Φ g) ≤ c·g + ρ t,
@@ -29,7 +29,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, linalg
 
 from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.matching import (
     CHUNK_CELLS,
     RUNNER_UP_RADIUS,
@@ -61,7 +60,7 @@ ROUNDING = 2e-5
 _SQUARE_ROUNDING = 4e-6
 # Rounding of float64 in the square of ρ.
 _SQUARE_ROUNDING_64 = 1e-12
-# Rounding of a sum of 896 products in float64; where a tie hangs on less, the reference decides. And in float32.
+# Rounding of a sum of a thousand products in float64; where a tie hangs on less, the reference decides. In float32.
 _ROUNDING_64 = 1e-14
 _ROUNDING_32 = 6e-5
 # With more lags than this, a transform costs less per cell than the products.
@@ -70,9 +69,6 @@ _FEW_LAGS = 128
 _FEW_CELLS = 48
 # With fewer cells, the whole heatmap at all lags is faster than pruning.
 MIN_PRUNED_CELLS = 300
-# Transform lengths: the shorter where only small lags can matter.
-_LENGTHS = (1280, 2 * N_CHANNELS)
-_CHANNELS = np.arange(N_CHANNELS)
 # The runner-up may be this much worse than the best cell at lag 0 before groups are bounded a second time.
 _SLACK = 0.01
 # More bounds than this (16 MB) are not computed: all cells and lags remain.
@@ -84,7 +80,7 @@ class _UndecidedError(Exception):
 
 
 class Candidates(NamedTuple):
-    """Cells (n,) that may win, bounds of their scores (n,), and the (m, 896) frame at the lags that matter."""
+    """Cells (n,) that may win, bounds of their scores (n,), and the (m, n) frame at the lags that matter."""
 
     cells: IntArray
     bounds: Float32Array
@@ -95,9 +91,9 @@ class Candidates(NamedTuple):
 class CompressedBank:
     """Rows of bounds; a bound is a row times a column of `columns`.
 
-    basis (R, 896), most important directions first; fine (n, R + 2) and coarse (n, r + 2) rows of the n cells; groups
-    (m, r + 2), the rows of groups of cells. overlaps (1792,) bound the norm of a signal's overlap with a frame at the
-    lags from −896 up. Cell i belongs to group group_of[i]; members[j] are the cells of group j, and centres[j] is the
+    basis (R, n), most important directions first; fine (n, R + 2) and coarse (n, r + 2) rows of the n cells; groups
+    (m, r + 2), the rows of groups of cells. overlaps (2n,) bound the norm of a signal's overlap with a frame at the
+    lags from −n up. Cell i belongs to group group_of[i]; members[j] are the cells of group j, and centres[j] is the
     cell nearest to its centre.
     """
 
@@ -112,23 +108,24 @@ class CompressedBank:
 
 
 def compress(unit_signals: Callable[[IntArray], FloatArray], cells: IntArray) -> CompressedBank:
-    """Compress the unit signals of n cells; `unit_signals` returns the (m, 896) signals of some of them."""
-    gram, total = np.zeros((N_CHANNELS, N_CHANNELS)), np.zeros(N_CHANNELS)
+    """Compress the unit signals of n cells; `unit_signals` returns the (m, n) signals of some of them."""
+    n = unit_signals(cells[:1]).shape[1]
+    gram, total = np.zeros((n, n)), np.zeros(n)
     fitted = cells[:: max(len(cells) // _FITTED_CELLS, 1)]
     for some in _chunks(fitted):
         part = unit_signals(some)
         gram += part.T @ part
         total += part.sum(axis=0)
-    rank = min(FINE_RANK, len(fitted), N_CHANNELS)
+    rank = min(FINE_RANK, len(fitted), n)
     mean = total / np.linalg.norm(total)
     at_mean = gram @ mean
     # Remove the mean from the Gram matrix and put it back with the largest weight, so that it comes first.
     above = mean @ at_mean + 2 * len(fitted)
     gram -= np.outer(mean, at_mean) + np.outer(at_mean, mean) - above * np.outer(mean, mean)
-    _, ascending = linalg.eigh(gram, subset_by_index=[N_CHANNELS - rank, N_CHANNELS - 1])
+    _, ascending = linalg.eigh(gram, subset_by_index=[n - rank, n - 1])
     basis = np.column_stack([mean, ascending[:, -2::-1]])
     found = []
-    least, most = np.ones(N_CHANNELS), np.zeros(N_CHANNELS)
+    least, most = np.ones(n), np.zeros(n)
     for some in _chunks(cells):
         part = unit_signals(some)
         found.append(part @ basis)
@@ -221,7 +218,7 @@ def _squared_distances(points: Float32Array, place: Float32Array) -> Float32Arra
 
 
 class ZeroLagBounds:
-    """A unit frame (896,), bounded at lag 0 for all cells; frames (1, 896) is that frame."""
+    """A unit frame (n,), bounded at lag 0 for all cells; frames (1, n) is that frame."""
 
     def __init__(self, bank: CompressedBank, frame: FloatArray) -> None:
         self._bank, self.frames = bank, frame[None]
@@ -244,20 +241,21 @@ class ZeroLagBounds:
 
 
 class AllLagsBounds:
-    """A unit frame (896,), bounded at all lags for a matcher: lags are dropped first, then groups, then cells.
+    """A unit frame (n,), bounded at all lags for a matcher: lags are dropped first, then groups, then cells.
 
-    A lag is the place in the padded frame where the shifted frame begins: 896 for no shift. `reached` is a promising
+    A lag is the place in the padded frame where the shifted frame begins: n for no shift. `reached` is a promising
     cell and a score that it reaches.
     """
 
     def __init__(self, matcher: "PrunedMatcher", frame: FloatArray) -> None:
         self._matcher, bank = matcher, matcher.compressed
-        self._padded = np.zeros(3 * N_CHANNELS)
-        self._padded[N_CHANNELS : 2 * N_CHANNELS] = frame
+        n = frame.size
+        self._padded, self._channels = np.zeros(3 * n), np.arange(n)
+        self._padded[n : 2 * n] = frame
         # The squared norm of the frame's overlap with the channels at each lag.
-        self._energies = np.zeros(2 * N_CHANNELS)
-        np.cumsum((frame * frame)[:-1], out=self._energies[1:N_CHANNELS])
-        self._energies[N_CHANNELS:] = np.maximum(1.0 - self._energies[:N_CHANNELS], 0.0)
+        self._energies = np.zeros(2 * n)
+        np.cumsum((frame * frame)[:-1], out=self._energies[1:n])
+        self._energies[n:] = np.maximum(1.0 - self._energies[:n], 0.0)
         at_0 = bank.basis[:COARSE_RANK] @ frame.astype(np.float32)
         cell = self._likeliest(bank.members[int((bank.groups[:, :-2] @ at_0).argmax())], at_0)
         reached = cell, matcher.score(cell, frame[None])
@@ -303,21 +301,21 @@ class AllLagsBounds:
 
     def _bound_groups(self, score: float) -> None:
         """Bound the groups at all lags that let any cell reach the score."""
-        bank, spectra = self._matcher.compressed, self._matcher.spectra
+        bank, spectra, n = self._matcher.compressed, self._matcher.spectra, self._matcher.n_channels
         self._bounded_down_to = score
         overlap = bank.overlaps * np.sqrt(self._energies) >= score - ROUNDING
-        first, end = int(overlap.argmax()), 2 * N_CHANNELS - int(overlap[::-1].argmax())
-        length = next(n for n in spectra if n >= max(2 * N_CHANNELS - first, end))
-        single = self._padded[N_CHANNELS : 2 * N_CHANNELS].astype(np.float32)
+        first, end = int(overlap.argmax()), 2 * n - int(overlap[::-1].argmax())
+        length = next(one for one in spectra if one >= max(2 * n - first, end))
+        single = self._padded[n : 2 * n].astype(np.float32)
         parts = fft.irfft(fft.rfft(single, length) * spectra[length], length)
         self._lags = np.arange(first, end)
-        numbers = np.concatenate([parts[:, length + first - N_CHANNELS :], parts[:, : end - N_CHANNELS]], axis=1)
+        numbers = np.concatenate([parts[:, length + first - n :], parts[:, : end - n]], axis=1)
         self._columns = columns(numbers, self._energies[first:end])
         self._group_bounds = bank.groups @ self._columns
         self._highest = self._group_bounds.max(axis=0)
 
     def _frames(self, lags: IntArray) -> FloatArray:
-        return self._padded.take(lags[:, None] + _CHANNELS)
+        return self._padded.take(lags[:, None] + self._channels)
 
 
 class _PruningMatcher(Matcher):
@@ -337,12 +335,12 @@ class _PruningMatcher(Matcher):
         self._row, self._column = np.divmod(self._cells, valid.shape[1])
 
     def match(self, difference: ArrayLike, *, runner_up: bool = True) -> Match:
-        """Return what `best_match` finds in the heatmap of one (896,) difference, at a fraction of its cost.
+        """Return what `best_match` finds in the heatmap of one (n,) difference, at a fraction of its cost.
 
         Without `runner_up`, that is None. Raises MatchingError as `heatmap` does.
         """
         if len(self._cells) >= self._min_cells:
-            (frame,) = unit_magnitudes(np.asarray(difference)[None])
+            (frame,) = unit_magnitudes(np.asarray(difference)[None], self.n_channels)
             with suppress(_UndecidedError):
                 return self._search(frame, runner_up)
         match = super().match(difference)
@@ -376,7 +374,7 @@ class _PruningMatcher(Matcher):
     def _contenders(
         self, frame: FloatArray, cells: IntArray, frames: FloatArray, reached: float
     ) -> tuple[IntArray, FloatArray]:
-        """Return the cells that may score `reached`, and their scores at the lags of (m, 896) frames."""
+        """Return the cells that may score `reached`, and their scores at the lags of (m, n) frames."""
         if len(frames) > _FEW_LAGS:
             return cells, self._scores(frame[None], self._unit_signals(self._cells[cells]))[0]
         magnitudes = np.abs(self._signals.take(self._cells[cells], axis=0))
@@ -387,7 +385,7 @@ class _PruningMatcher(Matcher):
         return cells, (frames @ magnitudes.astype(np.float64).T).max(axis=0) / self._norms[cells]
 
     def score(self, cell: int, frames: FloatArray) -> float:
-        """Return a cell's highest score at the lags of (m, 896) frames."""
+        """Return a cell's highest score at the lags of (m, n) frames."""
         magnitudes = np.abs(self._signals[self._cells[cell]], dtype=np.float64)
         return float((frames @ magnitudes).max() / self._norms[cell])
 
@@ -439,8 +437,10 @@ class PrunedMatcher(_PruningMatcher, ReferenceMatcher):
     def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Compress the bank; arguments and errors as `Matcher`."""
         super().__init__(signals, valid, k_grid, sigma_grid)
-        # The conjugate transforms of the basis's first directions, (r, n // 2 + 1), by length n.
-        self.spectra = {n: np.conj(fft.rfft(self.compressed.basis[:COARSE_RANK], n)) for n in _LENGTHS}
+        # The conjugate transforms of the basis's first directions, (r, l // 2 + 1), by length l. The shorter one serves
+        # where only small lags can matter.
+        lengths, directions = (10 * self.n_channels // 7, 2 * self.n_channels), self.compressed.basis[:COARSE_RANK]
+        self.spectra = {length: np.conj(fft.rfft(directions, length)) for length in lengths}
 
     def _search(self, frame: FloatArray, runner_up: bool) -> Match:
         bounds = AllLagsBounds(self, frame)

@@ -7,13 +7,14 @@ step from the homogeneous conductivity with the NOSER prior (Cheney et al. 1990)
 """
 
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES, smoothed_along_channels
+from shearloop.bank.eit.channels import ChannelTable, smoothed_along_channels
 from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ _SCORE_SCALE, _LEAST_WEIGHT = 0.0005, 1e-9
 # A weighted mean finds a sampled Gaussian peak if its standard deviation is at least 0.6 cells, so weights reach this
 # share of the drop to the next cell. On grids with a larger drop than _COARSE a parabola through the maximum is used.
 _RESOLVED, _COARSE = 0.7, 0.005
+# Numberings correlate alike, by the symmetry of the fingertip, within this difference.
+_SYMMETRIC = 0.01
 _PIXELS_ALONG = 12
 _STEP, _SMOOTHING = 1e-3, 0.05
 
@@ -57,7 +60,7 @@ class PaperMatcher:
         self._matcher = PrunedMatcher.from_bank(bank) if isinstance(bank, Bank) else bank
 
     def match(self, difference: FloatArray) -> BankMatch:
-        """Return the position of the heatmap's maximum for a (896,) difference of any sign."""
+        """Return the position of the heatmap's maximum for a (c,) difference of any sign."""
         found = self._matcher.match(difference)
         size = float(np.log(np.linalg.norm(difference)))
         return BankMatch(found.k, found.sigma, size, found.score, found.runner_up, ambiguous=False)
@@ -67,55 +70,57 @@ class PaperMatcher:
 class ElectrodeNumbering:
     """The model's electrode for each of the board's: e becomes rotation + e, or rotation − e when reflected.
 
-    score and runner_up are the correlations of the idle frame with the homogeneous voltages, for this numbering and
-    for the best one that is not equal by symmetry.
+    score is the correlation of the idle frame with the homogeneous voltages.
     """
 
     rotation: int
     reflected: bool
     score: float = 1.0
-    runner_up: float = 0.0
 
-    def model_channels(self) -> IntArray:
-        """Return (896,) the number of the model's channel for each of the board's channels."""
-        sink, _, positive, negative = CHANNELS.T
+    def model_channels(self, table: ChannelTable) -> IntArray:
+        """Return (c,) the number of the model's channel for each of the board's channels."""
+        sink, source, positive, negative = table.electrodes.T
         turn = -1 if self.reflected else 1
 
-        def electrode(number: IntArray) -> FloatArray:
-            return np.asarray((self.rotation + turn * number) % N_ELECTRODES)
+        def electrode(number: IntArray) -> IntArray:
+            return np.asarray((self.rotation + turn * number) % table.n_electrodes)
 
-        # A reflected pair is measured the other way round.
+        # A reflected pair is driven and measured the other way round; opposite electrodes stay opposite.
         first = electrode(negative if self.reflected else positive)
-        position = np.full((N_ELECTRODES, N_ELECTRODES), -1)
-        position[sink, positive] = np.arange(N_CHANNELS)
-        return np.asarray(position[electrode(sink).astype(int), first.astype(int)])
+        driven = electrode(source if self.reflected and table.injection == "adjacent" else sink)
+        position = np.full((table.n_electrodes, table.n_electrodes), -1)
+        position[sink, positive] = np.arange(table.n_channels)
+        return np.asarray(position[driven, first])
 
 
 NOT_TURNED = ElectrodeNumbering(0, reflected=False)
 
 
-def find_numbering(idle: FloatArray, homogeneous: FloatArray) -> ElectrodeNumbering:
-    """Return the numbering under which a (896,) idle frame correlates best with the homogeneous voltages."""
-    model, measured = np.abs(homogeneous), np.abs(idle)
-    scores = {}
-    for reflected in (False, True):
-        for rotation in range(N_ELECTRODES):
-            turned = ElectrodeNumbering(rotation, reflected).model_channels()
-            scores[rotation, reflected] = float(np.corrcoef(model[turned], measured)[0, 1])
-    best = max(scores, key=lambda key: (round(scores[key], 9), -key[0]))
-    # Half a turn swaps the two ends of every injection and changes no magnitude of a symmetric tip.
-    other = [score for key, score in scores.items() if key[1] != best[1] or (key[0] - best[0]) % 16]
-    return ElectrodeNumbering(best[0], best[1], scores[best], max(other))
+def find_numberings(idle: FloatArray, homogeneous: FloatArray, table: ChannelTable) -> list[ElectrodeNumbering]:
+    """Return the numberings under which a (c,) idle frame correlates best with the homogeneous voltages, best first.
 
-
-def resolve_half_turn(found: ElectrodeNumbering, touch: FloatArray, bank: Bank) -> ElectrodeNumbering:
-    """Return the numbering or its half turn, choosing the better match of a touch; idle frames cannot decide.
-
-    touch (896,) is the change of the idle frame by a grip, in volts.
+    A symmetric fingertip has several: half a turn changes no magnitude of a rectangle's, any turn none of a disc's.
     """
-    turned = replace(found, rotation=(found.rotation + N_ELECTRODES // 2) % N_ELECTRODES)
-    scores = [RefinedMatcher(bank, one).match(touch).score for one in (found, turned)]
-    return turned if scores[1] > scores[0] + _ALIKE else found
+    model, measured = np.abs(homogeneous), np.abs(idle)
+    found = []
+    for reflected, rotation in product((False, True), range(table.n_electrodes)):
+        turned = ElectrodeNumbering(rotation, reflected)
+        score = float(np.corrcoef(model[turned.model_channels(table)], measured)[0, 1])
+        found.append(replace(turned, score=score))
+    best = max(found, key=lambda one: (round(one.score, 9), -one.rotation))
+    half_turn = best.reflected, (best.rotation + table.n_electrodes // 2) % table.n_electrodes
+    alike = [one for one in found if one.score > best.score - _SYMMETRIC or (one.reflected, one.rotation) == half_turn]
+    return sorted(alike, key=lambda one: one is not best)
+
+
+def resolve_symmetry(numberings: list[ElectrodeNumbering], touch: FloatArray, bank: Bank) -> ElectrodeNumbering:
+    """Return the numbering under which a touch matches best, the first unless another is clearly better.
+
+    touch (c,) is the change of the idle frame by a grip, in volts.
+    """
+    scores = [RefinedMatcher(bank, one).match(touch).score for one in numberings]
+    best = int(np.argmax(scores))
+    return numberings[best] if scores[best] > scores[0] + _ALIKE else numberings[0]
 
 
 class RefinedMatcher:
@@ -126,14 +131,15 @@ class RefinedMatcher:
         self._coarse = _COARSE if mean_of_alike else -np.inf
         self._k_grid, self._sigma_grid = bank.k_grid, bank.sigma_grid
         self._valid = np.asarray(bank.valid).ravel()
-        signals = np.abs(bank.signals.reshape(-1, N_CHANNELS)[self._valid][:, numbering.model_channels()])
+        signals = bank.signals.reshape(-1, bank.table.n_channels)[self._valid]
+        signals = np.abs(signals[:, numbering.model_channels(bank.table)])
         smooth = smoothed_along_channels(signals.astype(np.float64))
         self._norms = np.linalg.norm(smooth, axis=1)
         self._shapes = (smooth / self._norms[:, None]).astype(np.float32)
         self._cells = np.flatnonzero(self._valid)
 
     def match(self, difference: FloatArray) -> BankMatch:
-        """Return the refined position of the best cell for a (896,) difference of any sign."""
+        """Return the refined position of the best cell for a (c,) difference of any sign."""
         (x,) = smoothed_along_channels(np.abs(difference)[None])
         norm = float(np.linalg.norm(x))
         scores = np.full(len(self._valid), -np.inf)
@@ -172,8 +178,8 @@ class RefinedMatcher:
 BankMatcher: TypeAlias = PaperMatcher | RefinedMatcher
 
 
-def image_matrix(mesh: "Mesh") -> FloatArray:
-    """Return the (p, 896) matrix from a difference of voltages to the change of p pixels' log conductivity.
+def image_matrix(mesh: "Mesh", table: ChannelTable) -> FloatArray:
+    """Return the (p, c) matrix from a difference of voltages to the change of p pixels' log conductivity.
 
     One Gauss–Newton step, (JᵀJ + 0.05 · diag(JᵀJ))⁻¹ Jᵀ, with J by central differences of whole pixels. Pixels are
     squares of the mesh's bounding box with at least one triangle.
@@ -181,7 +187,7 @@ def image_matrix(mesh: "Mesh") -> FloatArray:
     # Imported here because only fitting needs it: it would slow the daemon's start.
     from shearloop.bank.eit.forward import ForwardModel
 
-    model = ForwardModel(mesh)
+    model = ForwardModel(mesh, table)
     centres = mesh.nodes[mesh.triangles].mean(axis=1)
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     size = float((high - low).max()) / _PIXELS_ALONG

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS
+from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatcher
 from shearloop.bank.estimation.estimator import Estimator, OutputModel, PaperEstimator, Quantity
@@ -68,15 +68,16 @@ class Calibration:
     assumptions: tuple[Assumption, ...] = ()
 
     @classmethod
-    def uncalibrated(cls, bank_identity: str) -> Self:
+    def uncalibrated(cls, bank_identity: str, table: ChannelTable = PAPER_TABLE) -> Self:
         """Return the paper's estimator on a bank without any fit: it gives k and sigma alone."""
-        return cls(PaperEstimator(np.ones((1, N_CHANNELS))), "raw", (), "", bank_identity)
+        return cls(_paper_estimator(table), "raw", (), "", bank_identity)
 
     @classmethod
     def from_matches(
         cls,
         bank_identity: str,
         source: str,
+        table: ChannelTable = PAPER_TABLE,
         *,
         torque: tuple[FloatArray, FloatArray] | None = None,
         diameter: tuple[FloatArray, FloatArray] | None = None,
@@ -95,7 +96,7 @@ class Calibration:
             return OutputModel(PolynomialRegressor(symbol, Polynomial.fit(*points, degree)), None, np.zeros(0))
 
         return cls(
-            PaperEstimator(np.ones((1, N_CHANNELS))), "raw", (), source, bank_identity,
+            _paper_estimator(table), "raw", (), source, bank_identity,
             torque=model("sigma", TORQUE_DEGREE, torque), diameter=model("k", DIAMETER_DEGREE, diameter),
         )  # fmt: skip
 
@@ -119,7 +120,7 @@ class Calibration:
         header = {
             "kind": _FILE_KIND,
             "format_version": FORMAT_VERSION,
-            "channel_table": CHANNEL_TABLE_HASH,
+            "channel_table": self.estimator.table.digest,
             "content": content,
             "sha256": {name: hashlib.sha256(data).hexdigest() for name, data in members.items()},
         }
@@ -144,15 +145,10 @@ class Calibration:
         header, arrays = _read_members(path)
         if header.get("kind") != _FILE_KIND:
             raise CalibrationError(f"{path} is not an estimator's calibration: make one with `shearloop calibrate`")
-        version, table = header.get("format_version"), str(header.get("channel_table"))
+        version = header.get("format_version")
         if version != FORMAT_VERSION:
             raise CalibrationError(
                 f"{path}: the calibration has format version {version}, expected {FORMAT_VERSION}; calibrate again"
-            )
-        if table != CHANNEL_TABLE_HASH:
-            raise CalibrationError(
-                f"{path}: the calibration was made with the channel table {table[:12]}…, expected "
-                f"{CHANNEL_TABLE_HASH[:12]}…; calibrate again"
             )
         try:
             restored: Self = _from_plain(cls, header["content"], "", arrays)
@@ -161,6 +157,12 @@ class Calibration:
                 f"{path}: the file does not describe a calibration of this version ({error}); use the version that "
                 "wrote it, or calibrate again"
             ) from error
+        table, expected = str(header.get("channel_table")), restored.estimator.table.digest
+        if table != expected:
+            raise CalibrationError(
+                f"{path}: the calibration was made with the channel table {table[:12]}…, expected {expected[:12]}…; "
+                "calibrate again"
+            )
         return restored
 
     def check_bank(self, bank: Bank | None) -> Bank:
@@ -179,10 +181,17 @@ class Calibration:
         return self.estimator.matcher(self.check_bank(bank)) if self.estimator.searches_bank else None
 
 
+def _paper_estimator(table: ChannelTable) -> PaperEstimator:
+    return PaperEstimator(np.ones((1, table.n_channels)), table)
+
+
 def _read_members(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Return header and arrays after checking each array's checksum."""
     try:
         with zipfile.ZipFile(path) as archive:
+            # Stored members are no larger than the file; compressed or overlapping ones may fill the memory.
+            if sum(member.file_size for member in archive.infolist()) > path.stat().st_size:
+                raise ValueError("its members are larger than the file")
             found = {name: archive.read(name) for name in archive.namelist()}
     except OSError as error:
         raise CalibrationError(f"{path}: the calibration cannot be read: {error.strerror or error}") from error
@@ -202,9 +211,15 @@ def _read_members(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     for name, data in found.items():
         if hashlib.sha256(data).hexdigest() != checksums[name]:
             raise CalibrationError(f"{path}: the calibration is damaged: {name} has changed; calibrate again")
-    return header, {
-        name.removesuffix(".npy"): np.load(io.BytesIO(data), allow_pickle=False) for name, data in found.items()
-    }
+    try:
+        return header, {name.removesuffix(".npy"): _array(data) for name, data in found.items()}
+    except (ValueError, EOFError, MemoryError) as error:
+        raise CalibrationError(f"{path}: the calibration holds a member that is no array; calibrate again") from error
+
+
+def _array(data: bytes) -> NDArray[Any]:
+    array: NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
+    return array
 
 
 def _npy_bytes(array: NDArray[Any]) -> bytes:

@@ -12,7 +12,7 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.estimation.bank_match import (
     NOT_TURNED,
     BankMatch,
@@ -20,9 +20,9 @@ from shearloop.bank.estimation.bank_match import (
     ElectrodeNumbering,
     PaperMatcher,
     RefinedMatcher,
-    find_numbering,
+    find_numberings,
     image_matrix,
-    resolve_half_turn,
+    resolve_symmetry,
 )
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.interval_regressor import (
@@ -49,7 +49,7 @@ _LEAST_MARGIN_K_CM = 0.05
 _MOST_FOR_DIAMETER = 240
 # Fewer diameters do not determine a line and its error.
 LEAST_DIAMETERS, LEAST_LEFT = 3, 2
-NO_ERRORS: FloatArray = np.zeros((0, 1, N_CHANNELS))
+NO_ERRORS: FloatArray = np.zeros((0, 1, 1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,13 +105,15 @@ class Reading:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Material:
-    """What an estimator is prepared from: the scale (m, 896) of its differences, and knowledge before calibration.
+    """What an estimator is prepared from: the scale (m, c) of its differences, knowledge before calibration, and
+    the channels.
 
-    Raw recordings have validators, and the (n, m, 896) frames of each grip.
+    Raw recordings have validators, and the (n, m, c) frames of each grip.
     """
 
     scale: FloatArray
     physics: Physics
+    table: ChannelTable
     validators: tuple[FingertipValidator, ...] = ()
     grips: Sequence[FloatArray] = ()
 
@@ -137,7 +139,7 @@ class CalibrationRow:
 class Estimator:
     """An estimator of one calibration. The file keeps its fields, which are arrays, values, or dataclasses of these.
 
-    scale (m, 896) divides differences per channel and is infinite for dead ones. imputer serves raw frames.
+    scale (m, c) divides differences per channel and is infinite for dead ones. imputer serves raw frames.
     """
 
     name: ClassVar[str]
@@ -156,12 +158,13 @@ class Estimator:
     most_frames: ClassVar[float] = math.inf
 
     scale: FloatArray
+    table: ChannelTable = PAPER_TABLE
     imputer: ChannelImputer | None = None
 
     @classmethod
     def prepare(cls, material: Material) -> Self:
         """Return the estimator before its fit."""
-        return cls(material.scale)
+        return cls(material.scale, material.table)
 
     @property
     def searches_bank(self) -> bool:
@@ -174,7 +177,7 @@ class Estimator:
         return Motion()
 
     def with_imputer(self, positions: FloatArray, validators: tuple[FingertipValidator, ...]) -> Self:
-        """Return the estimator with the imputer of (n, m·896) gripped differences in units of noise."""
+        """Return the estimator with the imputer of (n, m·c) gripped differences in units of noise."""
         return replace(self, imputer=ChannelImputer.fit(positions, validators))
 
     def matcher(self, _bank: Bank) -> BankMatcher | None:
@@ -192,7 +195,7 @@ class Estimator:
     def impute(
         self, difference: FloatArray, usable: BoolArray, novelty: NoveltyDetector | None
     ) -> tuple[FloatArray, FloatArray]:
-        """Return a (m, 896) difference with unusable channels imputed, and their errors (k, m, 896)."""
+        """Return a (m, c) difference with unusable channels imputed, and their errors (k, m, c)."""
         if self.imputer is not None:
             return self.imputer.impute(difference, usable)
         if novelty is None:
@@ -273,7 +276,7 @@ class Regression(Estimator):
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction(Estimator):
-    """A ridge on an image of the conductivity; image (p, 896) maps a difference to pixels."""
+    """A ridge on an image of the conductivity; image (p, c) maps a difference to pixels."""
 
     name: ClassVar[str] = "reconstruction"
     needs: ClassVar[Literal["bank", "mesh", ""]] = "mesh"
@@ -285,7 +288,7 @@ class Reconstruction(Estimator):
         """Return the estimator with the mesh's image."""
         if material.physics.mesh is None:
             raise ValueError("a reconstruction needs a mesh")
-        return cls(material.scale, image=image_matrix(material.physics.mesh))
+        return cls(material.scale, material.table, image=image_matrix(material.physics.mesh, material.table))
 
     def features(self, reading: Reading) -> tuple[FloatArray, BankMatch | None]:
         """Return the pixels of each side."""
@@ -316,10 +319,10 @@ class BankEstimator(_OnBank):
         """Return the estimator with the numbering of the first side's electrodes."""
         bank = material.physics.bank
         if not material.validators or bank is None:
-            return cls(material.scale)
+            return cls(material.scale, material.table)
         first = material.validators[0]
-        found = find_numbering(first.idle, bank.homogeneous)
-        return cls(material.scale, numbering=resolve_half_turn(found, first.gripped - first.idle, bank))
+        found = find_numberings(first.idle, bank.homogeneous, material.table)
+        return cls(material.scale, material.table, numbering=resolve_symmetry(found, first.gripped - first.idle, bank))
 
     def matcher(self, bank: Bank) -> BankMatcher:
         """Return the refined match on the bank."""

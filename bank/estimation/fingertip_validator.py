@@ -13,7 +13,6 @@ from typing import Self
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
-from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.values import FrameSeries
 
@@ -25,8 +24,8 @@ LEAST_NOISE_V = float(_CONVERTER_STEP_V / np.sqrt(12.0))
 LARGEST_DEVIATION = 0.12
 # Added to voltages in denominators: a relative change of less is noise.
 SMALL_V = 0.01
-# Channels that are compared, and the least number of them.
-_WELL_ABOVE_NOISE_V, _FEWEST_COMPARED = 0.03, N_CHANNELS // 4
+# Channels that are compared, and the least share of them.
+_WELL_ABOVE_NOISE_V, _LEAST_COMPARED_SHARE = 0.03, 0.25
 LARGEST_JUMPING_SHARE = 0.12
 LARGEST_UNUSABLE_SHARE = 0.25
 # A channel that moves between frames by more than both of these is disturbed.
@@ -66,7 +65,7 @@ _LARGEST_RISE = 1 / 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FingertipValidator:
-    """One fingertip at calibration: mean frames idle and gripped, noise (896,), all in volts, and grip discriminant.
+    """One fingertip at calibration: mean frames idle and gripped, noise (c,), all in volts, and grip discriminant.
 
     Channels that were dead at calibration have infinite noise. If the calibration has no frames after a release, the
     gel's slow recovery could pass for a grip. A release is then detected as a step: further than step_limit (in
@@ -84,7 +83,7 @@ class FingertipValidator:
 
     @classmethod
     def fit(cls, side: str, *recordings: tuple[FloatArray, FloatArray, FloatArray]) -> Self:
-        """Fit to each recording's (n, 896) frames before, in, and after the grip (none after it is allowed).
+        """Fit to each recording's (n, c) frames before, in, and after the grip (none after it is allowed).
 
         Each recording is compared with its own idle frames, because the gel drifts between recordings.
         """
@@ -108,7 +107,7 @@ class FingertipValidator:
             parts = [np.concatenate([one[i][rows] for one in relative]) / scale for i in range(3)]
             return _discriminant([part for part in parts if len(part)]) / scale
 
-        # Some combination of 896 channels separates any frames, so test it on frames that it was not fitted to.
+        # Some combination of c channels separates any frames, so test it on frames that it was not fitted to.
         half = discriminant(slice(0, None, 2))
         for one in relative:
             scores = [part[1::2] @ half for part in one]
@@ -162,9 +161,9 @@ class FingertipValidator:
 def compare_frames(
     frame: FloatArray, known: FloatArray, usable: BoolArray | np.bool_ = np.True_
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Compare a (…, 896) frame with k known (…, k, 896) ones; return gains (n,), deviations and their medians (n,).
+    """Compare a (…, c) frame with k known (…, k, c) ones; return gains (n,), deviations and their medians (n,).
 
-    The common gain over each known frame is divided out of the relative deviations (…, k, 896); n counts the known
+    The common gain over each known frame is divided out of the relative deviations (…, k, c); n counts the known
     frames. Channels that are not usable or hardly above the noise are NaN. Gains and deviations are NaN, and medians
     infinite, without a gain. Medians are also infinite where too few channels can be compared.
     """
@@ -175,12 +174,12 @@ def compare_frames(
     gains[~(gains > 0)] = np.nan
     deviations = np.abs(frame / gains.reshape(*known.shape[:-1], 1) - known) / known
     medians = _medians(deviations, counts)
-    medians[(counts < _FEWEST_COMPARED) | np.isnan(medians)] = np.inf
+    medians[(counts < _LEAST_COMPARED_SHARE * known.shape[-1]) | np.isnan(medians)] = np.inf
     return gains, deviations, medians
 
 
 class FingertipSet:
-    """The validators of m sides together; frames are (m, 896) in volts."""
+    """The validators of m sides together; frames are (m, c) in volts."""
 
     def __init__(self, sides: tuple[FingertipValidator, ...]) -> None:
         """Take the validators in the order of a frame's sides."""
@@ -195,7 +194,7 @@ class FingertipSet:
 
     def too_few_channels(self, usable: BoolArray) -> list[str]:
         """Return for each side the reason why too few channels are usable, empty where there are enough."""
-        unusable = 1.0 - np.count_nonzero(usable, axis=1) / N_CHANNELS
+        unusable = 1.0 - np.count_nonzero(usable, axis=1) / usable.shape[1]
         return [
             f"{one.side} fingertip: {100 * share:.0f} % of the channels are dead or saturated; check the ribbon cable "
             "and the gel's contact with the electrodes"
@@ -205,7 +204,7 @@ class FingertipSet:
         ]
 
     def check(self, frame: FloatArray, usable: BoolArray) -> tuple[list[str], BoolArray]:
-        """Return for each side a reason against it or an empty text, and which (m, 896) channels are lost.
+        """Return for each side a reason against it or an empty text, and which (m, c) channels are lost.
 
         A side is refused with too few usable channels or as another fingertip. A lost channel reads a value that
         neither grip nor twist explains: a lost electrode or a crossed wire.
@@ -259,7 +258,7 @@ class GripDetector:
         self._passed.clear()
 
     def update(self, frame: FloatArray, idle: FloatArray, gain: FloatArray, least_score: float) -> bool:
-        """Take the next (896,) frame and return whether it is gripped; a grip begins above the least score."""
+        """Take the next (c,) frame and return whether it is gripped; a grip begins above the least score."""
         side = self._side
         self._passed.append(frame)
         if len(self._passed) > STEP_FRAMES and max(side.step_limit, side.fall_limit) < math.inf:
@@ -280,12 +279,12 @@ class GripDetector:
 
 
 def relative_change(frame: FloatArray, idle: FloatArray) -> FloatArray:
-    """Return the change of (…, 896) channels from idle, relative to idle."""
+    """Return the change of (…, c) channels from idle, relative to idle."""
     return np.asarray((frame - idle) / (idle + SMALL_V))
 
 
 def mask_saturated(channels: FloatArray, usable: BoolArray) -> BoolArray:
-    """Return the (m, 896) usable channels without those at an amplifier's rail."""
+    """Return the (m, c) usable channels without those at an amplifier's rail."""
     heights = np.where(usable, channels, -np.inf)
     largest = heights == heights.max(axis=-1, keepdims=True)
     at_rail = largest & (np.count_nonzero(largest, axis=-1) >= _FEWEST_AT_RAIL)[:, None]
@@ -293,7 +292,7 @@ def mask_saturated(channels: FloatArray, usable: BoolArray) -> BoolArray:
 
 
 def channel_noise(frames: FloatArray) -> FloatArray:
-    """Return the (896,) standard deviation of fast noise in (n, 896) frames, from their second differences.
+    """Return the (c,) standard deviation of fast noise in (n, c) frames, from their second differences.
 
     Slow signals cancel. It is at least the converter's rounding, and infinite for a channel that never changes.
     """
@@ -303,12 +302,12 @@ def channel_noise(frames: FloatArray) -> FloatArray:
 
 
 def frame_steps(frames: FloatArray, noise: FloatArray) -> FloatArray:
-    """Return the (n − STEP_FRAMES,) mean distances in noises that (n, 896) frames move within STEP_FRAMES frames."""
+    """Return the (n − STEP_FRAMES,) mean distances in noises that (n, c) frames move within STEP_FRAMES frames."""
     return np.asarray((np.abs(frames[STEP_FRAMES:] - frames[:-STEP_FRAMES]) / noise).mean(axis=1))
 
 
 def _medians(rows: FloatArray, counts: IntArray) -> FloatArray:
-    """Return the (n,) medians of (…, 896) rows with `counts` (n,) values that are not NaN; 0 for a row without any."""
+    """Return the (n,) medians of (…, c) rows with `counts` (n,) values that are not NaN; 0 for a row without any."""
     # Sorting puts NaN last and takes half the time of np.partition and a tenth of np.nanmedian.
     ordered, rows_of = np.sort(rows, axis=-1).reshape(-1, rows.shape[-1]), np.arange(len(counts))
     halves = ordered[rows_of, (counts - 1) // 2] + ordered[rows_of, counts // 2]
@@ -382,7 +381,7 @@ def segment_grip(series: FrameSeries) -> tuple[slice, slice, slice]:
 
 
 def _idle_end_without_step(frames: FloatArray, loaded: slice) -> int:
-    """Return how many of (n, m, 896) frames are like the first ones, where no step shows the grip.
+    """Return how many of (n, m, c) frames are like the first ones, where no step shows the grip.
 
     0 where frames between the twists are like the first ones too: then the recording began gripped.
     """
@@ -394,7 +393,7 @@ def _idle_end_without_step(frames: FloatArray, loaded: slice) -> int:
 
 
 def _is_like_idle(frames: FloatArray, idle: slice, loaded: slice) -> BoolArray:
-    """Return which (n, 896) frames are nearer to the idle ones than to the loaded ones, along their difference."""
+    """Return which (n, c) frames are nearer to the idle ones than to the loaded ones, along their difference."""
     if idle.stop == 0:
         return np.zeros(len(frames), dtype=np.bool_)
     # Imported here because the daemon does not calibrate: it would slow its start.

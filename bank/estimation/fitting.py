@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
-from shearloop.bank.eit.channels import N_CHANNELS, N_ELECTRODES
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatcher, ElectrodeNumbering
 from shearloop.bank.estimation.calibration import Assumption, Calibration
@@ -38,12 +37,11 @@ from shearloop.bank.gain import GainCorrection
 _TOOLS_MAY_LEAVE = 0.75
 # Foreign frames: every eighth of a turn, plain and mirrored, except the own numbering. Of a few numberings alone the
 # result depends on the choice: single ones give half to twice the median.
-_NUMBERINGS = [(turn, mirrored) for turn in range(0, N_ELECTRODES, N_ELECTRODES // 8) for mirrored in (False, True)][1:]
+_NUMBERINGS = [(eighth, mirrored) for eighth in range(8) for mirrored in (False, True)][1:]
 # Hardly any mixture with a larger share is accepted.
 _SHARES = (0.1, 0.2, 0.3)
 # Later slices of each origin that are mixed; twice as many give the same result.
 _MOST_LATER = 10
-_ALL = np.ones(N_CHANNELS, dtype=np.bool_)
 
 
 def fit(
@@ -69,7 +67,9 @@ def fit(
     is_raw = recordings[0].kind == "raw"
     if is_raw:
         timing = timing or measure_timing(recordings)
-    material = _material(chosen, physics) if is_raw else Material(np.ones((len(sides), N_CHANNELS)), physics)
+    table = recordings[0].table
+    slices = Material(np.ones((len(sides), table.n_channels)), physics, table)
+    material = _material(chosen, physics) if is_raw else slices
     tools = _tools_of(recordings)
     blank = Calibration(
         estimator=kind.prepare(material),
@@ -91,6 +91,8 @@ def _check_recordings(recordings: Sequence[FrameSeries]) -> tuple[str, ...]:
     if not recordings:
         raise CalibrationError("there is no recording to calibrate on")
     check_finite(recordings)
+    if len({one.table for one in recordings}) > 1:
+        raise CalibrationError("the recordings are of different kinds of fingertips; make a calibration of each")
     if len({one.kind for one in recordings}) > 1:
         raise CalibrationError("raw frames and slices of differences do not fit into one calibration; make two")
     sides = tuple(side for side in recordings[0].sides if all(side in one.sides for one in recordings))
@@ -118,7 +120,7 @@ def _material(recordings: Sequence[FrameSeries], physics: Physics) -> Material:
         for layer, side in enumerate(recordings[0].sides)
     )
     grips = [one.channels[during] for one, (_, during, _) in zip(recordings, parts, strict=True)]
-    return Material(np.array([one.noise for one in validators]), physics, validators, grips)
+    return Material(np.array([one.noise for one in validators]), physics, recordings[0].table, validators, grips)
 
 
 def _fit_raw(
@@ -251,7 +253,7 @@ def _fit_slices(
             )
         differences = np.abs(frames[known, 0])
         # First, because it checks that a board sent the slices.
-        novelty = NoveltyDetector.fit(differences)
+        novelty = NoveltyDetector.fit(differences, estimator.table)
         test = ContaminationTest(differences, times[known], estimator, matcher)
         features = np.array([test.features(one, row) for row, one in enumerate(differences)])
         regressor = fit_interval_regressor(
@@ -281,23 +283,29 @@ class ContaminationTest:
     def __init__(
         self, differences: FloatArray, t_s: FloatArray, estimator: Estimator, matcher: BankMatcher | None
     ) -> None:
-        """Take (n, 896) differences at the times t_s (n,) in order, and their estimator."""
+        """Take (n, c) differences at the times t_s (n,) in order, and their estimator."""
         self._differences, self._t_s = differences, t_s
         self._estimator, self._matcher = estimator, matcher
         mean = differences.mean(axis=0)
-        self._foreign = [mean[ElectrodeNumbering(turn, mirrored).model_channels()] for turn, mirrored in _NUMBERINGS]
+        table = estimator.table
+        numberings = [
+            ElectrodeNumbering(eighth * table.n_electrodes // 8, mirrored).model_channels(table)
+            for eighth, mirrored in _NUMBERINGS
+        ]
+        self._foreign = [mean[channels] for channels in numberings]
+        self._every = np.ones(table.n_channels, dtype=np.bool_)
         self._detectors: dict[bytes, NoveltyDetector] = {}
         self._features: dict[tuple[int, int, float], FloatArray] = {}
 
     def features(self, difference: FloatArray, row: int) -> FloatArray:
-        """Return the (d,) features of a (896,) difference at the time of a row."""
-        frame = ProcessedFrame(difference[None], (), _ALL[None])
+        """Return the (d,) features of a (c,) difference at the time of a row."""
+        frame = ProcessedFrame(difference[None], (), self._every[None])
         return self._estimator.features(Reading(frame, float(self._t_s[row]), self._matcher))[0]
 
     def growth(self, past: IntArray, future: IntArray) -> FloatArray:
         """Return the growth of the intervals of (q,) later slices, by a detector fitted to the earlier ones."""
         detector = self._detector(past)
-        return np.array([detector.widening(one, _ALL) for one in self._differences[future]])
+        return np.array([detector.widening(one, self._every) for one in self._differences[future]])
 
     def accepted(self, past: IntArray, future: IntArray) -> Mixtures:
         """Return the mixtures of later slices that a detector fitted to the earlier ones accepts."""
@@ -308,7 +316,7 @@ class ContaminationTest:
             for number, foreign in enumerate(self._foreign):
                 for share in _SHARES:
                     mixed = (1 - share) * self._differences[row] + share * foreign
-                    novelty = detector.assess(mixed, _ALL)
+                    novelty = detector.assess(mixed, self._every)
                     if novelty.reasons:
                         break
                     rows.append(row)
@@ -322,7 +330,7 @@ class ContaminationTest:
     def _detector(self, past: IntArray) -> NoveltyDetector:
         key = past.tobytes()
         if key not in self._detectors:
-            self._detectors[key] = NoveltyDetector.fit(self._differences[past])
+            self._detectors[key] = NoveltyDetector.fit(self._differences[past], self._estimator.table)
         return self._detectors[key]
 
 

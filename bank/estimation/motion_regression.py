@@ -14,7 +14,7 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.defaults import BASELINE_FRAMES
-from shearloop.bank.eit.channels import N_CHANNELS, smoothed_along_channels
+from shearloop.bank.eit.channels import ChannelTable, smoothed_along_channels
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatch
 from shearloop.bank.estimation.estimator import (
@@ -41,7 +41,7 @@ from shearloop.bank.estimation.interval_regressor import (
     fit_interval_regressor,
     is_one_sided,
 )
-from shearloop.bank.estimation.novelty import fitted_parts, reciprocal_means
+from shearloop.bank.estimation.novelty import fitted_parts
 from shearloop.bank.estimation.regressors import InverseCalibration, left_out_blocks
 from shearloop.bank.estimation.session_state import Motion
 from shearloop.bank.polynomial import TWO_SIDED_95
@@ -67,7 +67,7 @@ _CURVES: dict[Quantity, tuple[int, int, bool]] = {"torque": (3, 3, True), "diame
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TemporalFeatures(Motion):
-    """Directions (m, p, 896) along which each side's motion is measured, in units of noise, and how far back.
+    """Directions (m, p, c) along which each side's motion is measured, in units of noise, and how far back.
 
     With uses_position the position relative to the idle frame is a feature too.
     """
@@ -78,7 +78,7 @@ class TemporalFeatures(Motion):
 
     @classmethod
     def fit(cls, parts: Sequence[FloatArray], validators: tuple[FingertipValidator, ...]) -> Self:
-        """Fit the main directions of motion to each recording's (n, m, 896) gripped frames."""
+        """Fit the main directions of motion to each recording's (n, m, c) gripped frames."""
         directions = []
         for layer, one in enumerate(validators):
             moved = np.vstack([(part[_N_LAGS:, layer] - part[:-_N_LAGS, layer]) / one.noise for part in parts])
@@ -87,17 +87,17 @@ class TemporalFeatures(Motion):
         return cls(np.array(directions), _N_LAGS, uses_position=True)
 
     def project(self, channels: FloatArray) -> FloatArray:
-        """Return the (…, m·p) positions of (…, m, 896) frames along the directions."""
+        """Return the (…, m·p) positions of (…, m, c) frames along the directions."""
         found = np.einsum("...mc,mpc->...mp", channels, self.directions)
         return np.asarray(found.reshape(*found.shape[:-2], -1))
 
     def fill(self, moved: FloatArray, usable: BoolArray, sides: Sequence[FingertipValidator]) -> FloatArray:
-        """Return the motion (m, 896) since the last frame, unusable channels along the directions."""
+        """Return the motion (m, c) since the last frame, unusable channels along the directions."""
         imputed = [self._impute(layer, moved[layer], usable[layer], one.noise) for layer, one in enumerate(sides)]
         return np.where(usable, moved, imputed)
 
     def complete(self, difference: FloatArray, usable: BoolArray, sides: Sequence[FingertipValidator]) -> FloatArray:
-        """Return a (m, 896) difference to the idle frame, unusable channels along the directions and the grip."""
+        """Return a (m, c) difference to the idle frame, unusable channels along the directions and the grip."""
         imputed = [
             self._impute(layer, difference[layer], usable[layer], one.noise, one.gripped - one.idle)
             for layer, one in enumerate(sides)
@@ -142,8 +142,8 @@ class MotionRegression(Estimator):
     def prepare(cls, material: Material) -> Self:
         """Return the estimator with the directions of the grips' motion."""
         if not material.validators:
-            return cls(material.scale)
-        return cls(material.scale, temporal=TemporalFeatures.fit(material.grips, material.validators))
+            return cls(material.scale, material.table)
+        return cls(material.scale, material.table, temporal=TemporalFeatures.fit(material.grips, material.validators))
 
     @property
     def motion(self) -> Motion:
@@ -207,7 +207,7 @@ class MotionRegression(Estimator):
 
     def fit_diameter(self, rows: list[CalibrationRow]) -> OutputModel:
         """Return the diameter's model from rows of known diameters, by age."""
-        return OutputModel(fit_cylinders(_cylinder_grips(rows)), None, np.zeros(0))
+        return OutputModel(fit_cylinders(_cylinder_grips(rows), self.table), None, np.zeros(0))
 
     def slices_fit(self, quantity: Quantity, values: FloatArray) -> RegressorFit:
         """Return the fit of a curve; raises CalibrationError where a part of (n,) values has too few distinct ones."""
@@ -234,19 +234,19 @@ class CylinderGrip:
     means: FloatArray
 
 
-def fit_cylinders(grips: Sequence[CylinderGrip]) -> IntervalRegressor:
+def fit_cylinders(grips: Sequence[CylinderGrip], table: ChannelTable) -> IntervalRegressor:
     """Return the diameter's regressor on the mean of a grip, from grips of three diameters or more.
 
     Its interval is the error on cylinders left out.
     """
     diameters = np.array([one.diameter_mm for one in grips])
-    line = fit_line(grips)
+    line = fit_line(grips, table)
     squares = []
     for one in grips:
         # Leave out all grips of this cylinder: another one would only confirm this diameter.
         rest = [other for other in grips if other.diameter_mm != one.diameter_mm]
         if len({other.diameter_mm for other in rest}) >= LEAST_LEFT:
-            squares.append(float(((fit_line(rest).predict(one.means) - one.diameter_mm) ** 2).mean()))
+            squares.append(float(((fit_line(rest, table).predict(one.means) - one.diameter_mm) ** 2).mean()))
     # Each recording counts once, which is too few for a quantile.
     half_width = max(TWO_SIDED_95 * math.sqrt(np.mean(squares)), LEAST_HALF_WIDTH * float(np.ptp(diameters)))
     low, high = float(diameters.min()), float(diameters.max())
@@ -256,17 +256,17 @@ def fit_cylinders(grips: Sequence[CylinderGrip]) -> IntervalRegressor:
     return IntervalRegressor(line, intervals, span, line.mean, np.zeros(0))
 
 
-def fit_line(grips: Sequence[CylinderGrip]) -> Ridge:
+def fit_line(grips: Sequence[CylinderGrip], table: ChannelTable) -> Ridge:
     """Return the line from a position to a diameter through grips of two diameters or more.
 
     The noise of the idle frame is constant within a recording, like the diameter, so a regression on single frames
     confuses the two. Here a recording counts as one position of known noise. Motion within recordings is shrunk, and
     the line uses only directions where positions differ by more than their noise, by the amount that they would
-    differ without it (errors in variables, Fuller 1987). Averaging reciprocal channels and smoothing along neighbours,
-    as the paper did with its cylinders, lowers the noise.
+    differ without it (errors in variables, Fuller 1987). Averaging channels of one voltage and smoothing along
+    neighbours, as the paper did with its cylinders, lowers the noise.
     """
     diameters = np.array([one.diameter_mm for one in grips])
-    reduction = _noise_reduction(grips[0].frames.shape[1] // N_CHANNELS)
+    reduction = _noise_reduction(grips[0].frames.shape[1] // table.n_channels, table)
     frames = [one.frames @ reduction for one in grips]
     positions = np.array([one.mean(axis=0) for one in frames])
     moved = np.concatenate([one - position for one, position in zip(frames, positions, strict=True)])
@@ -293,9 +293,10 @@ def fit_line(grips: Sequence[CylinderGrip]) -> Ridge:
     return Ridge(mean, reduction @ whitened(along), float(diameters.mean()), 0.0)
 
 
-def _noise_reduction(n_sides: int) -> FloatArray:
-    """Return the (m·896, m·448) matrix that smooths m sides' channels and averages reciprocal ones."""
-    return np.asarray(np.kron(np.eye(n_sides), reciprocal_means(smoothed_along_channels(np.eye(N_CHANNELS)))))
+def _noise_reduction(n_sides: int, table: ChannelTable) -> FloatArray:
+    """Return the (m·c, m·c/2) matrix that smooths m sides' channels and averages those of one voltage."""
+    smoothed = smoothed_along_channels(np.eye(table.n_channels))
+    return np.asarray(np.kron(np.eye(n_sides), table.twin_means(smoothed)))
 
 
 def _cylinder_grips(rows: list[CalibrationRow]) -> list[CylinderGrip]:

@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
-from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
+from shearloop.bank.eit.channels import ChannelTable
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.fingertip_validator import LARGEST_UNUSABLE_SHARE
 from shearloop.bank.estimation.interval_regressor import LEVEL
@@ -37,56 +37,47 @@ _POWER = 2
 _RECIPROCITY_DIRECTIONS, _RECIPROCITY_MARGIN = 12, 1.5
 # Less than this share of a slice is rounding: a board's converter alone makes thousands of times as much.
 _LEAST_NOISE = 1e-6
-_ALL = np.ones(N_CHANNELS, dtype=np.bool_)
-
-# Injection i + 16 drives the current of injection i backwards, so a frame has every voltage twice.
-_FIRST = np.flatnonzero(CHANNELS[:, 0] < N_ELECTRODES // 2)
-_NUMBERS = {(sink, positive): i for i, (sink, _, positive, _) in enumerate(CHANNELS.tolist())}
-_SECOND = np.array([_NUMBERS[sink + N_ELECTRODES // 2, positive] for sink, _, positive, _ in CHANNELS[_FIRST].tolist()])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReciprocityCheck:
-    """Checks the voltages that opposite injections measure twice.
+    """Checks the voltages that a frame has twice (`ChannelTable.twins`).
 
     Their means have half of the noise, so other errors stand out. A gel's drift is large in some channels, a foreign
     frame differs in all: the median of the channels separates the two better than their mean (docs/charts.md).
-    mean (448,) and spread (448,) of the means are in volts; directions (r, 448) in units of the spread.
+    mean (c/2,) and spread (c/2,) of the means are in volts; directions (r, c/2) in units of the spread.
     """
 
+    table: ChannelTable
     mean: FloatArray
     spread: FloatArray
     directions: FloatArray
     largest_residual: float
 
     @classmethod
-    def fit(cls, differences: FloatArray) -> Self:
-        """Fit to (n, 896) differences in time order; the limit comes from blocks of time left out in turn."""
-        residuals = []
+    def fit(cls, differences: FloatArray, table: ChannelTable) -> Self:
+        """Fit to (n, c) differences in time order; the limit comes from blocks of time left out in turn."""
+        residuals, every = [], np.ones(table.n_channels, dtype=np.bool_)
         for rest, block in left_out_blocks(len(differences)):
-            part = cls._model(differences[rest], np.inf)
-            residuals += [part.residual(one, _ALL) for one in differences[block]]
-        return cls._model(differences, _RECIPROCITY_MARGIN * max(residuals))
+            part = cls._model(differences[rest], table, np.inf)
+            residuals += [part.residual(one, every) for one in differences[block]]
+        return cls._model(differences, table, _RECIPROCITY_MARGIN * max(residuals))
 
     @classmethod
-    def _model(cls, differences: FloatArray, largest_residual: float) -> Self:
-        pairs = reciprocal_means(differences)
+    def _model(cls, differences: FloatArray, table: ChannelTable, largest_residual: float) -> Self:
+        pairs = table.twin_means(differences)
         mean, variance = pairs.mean(axis=0), pairs.var(axis=0)
         # Shrink towards the median: few slices determine a channel's own variance badly.
         spread = np.sqrt(0.5 * variance + 0.5 * np.median(variance) + np.finfo(np.float64).tiny)
         directions = np.linalg.svd((pairs - mean) / spread, full_matrices=False)[2]
-        return cls(mean, spread, directions[: min(_RECIPROCITY_DIRECTIONS, len(pairs) // 2)], largest_residual)
+        return cls(table, mean, spread, directions[: min(_RECIPROCITY_DIRECTIONS, len(pairs) // 2)], largest_residual)
 
     def residual(self, difference: FloatArray, usable: BoolArray) -> float:
-        """Return the median squared residual of a (896,) difference off the directions."""
-        both = usable[_FIRST] & usable[_SECOND]
-        x = (reciprocal_means(difference) - self.mean) / self.spread
+        """Return the median squared residual of a (c,) difference off the directions."""
+        first, second = self.table.twins
+        both = np.asarray(usable[first] & usable[second])
+        x = np.asarray((self.table.twin_means(difference) - self.mean) / self.spread)
         return float(np.median((x - _coordinates(self.directions, x, both) @ self.directions)[both] ** 2))
-
-
-def reciprocal_means(differences: FloatArray) -> FloatArray:
-    """Return the (…, 448) means of the voltages that (…, 896) differences contain twice."""
-    return np.asarray((differences[..., _FIRST] + differences[..., _SECOND]) / 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +100,7 @@ FAMILIAR = Novelty(())
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoveltyDetector:
-    """Mean (896,) and spread (896,) in volts, directions (r, 896) in units of spread with their variances (r,).
+    """Mean (c,) and spread (c,) in volts, directions (r, c) in units of spread with their variances (r,).
 
     typical_q is the median Q residual of differences left out. typical_response is the response share at LEVEL of
     them.
@@ -128,27 +119,27 @@ class NoveltyDetector:
     typical_response: float
 
     @classmethod
-    def fit(cls, differences: FloatArray) -> Self:
-        """Fit to (n, 896) differences in time order; the limits come from blocks of time left out in turn."""
-        n = len(differences)
+    def fit(cls, differences: FloatArray, table: ChannelTable) -> Self:
+        """Fit to (n, c) differences in time order; the limits come from blocks of time left out in turn."""
+        n, every = len(differences), np.ones(table.n_channels, dtype=np.bool_)
         if n < _LEAST_DIFFERENCES:
             raise CalibrationError(f"{n} slices are too few to calibrate on; record {_LEAST_DIFFERENCES}")
         _check_slices(differences)
         q_and_outlying, t2, responses = [], [], []
         for rest, block in left_out_blocks(n):
             part = cls._model(differences[rest])
-            q_and_outlying += [part.q_residual(one, _ALL) for one in differences[block]]
-            t2 += [part.t2(one, _ALL) for one in differences[block]]
-            responses += [part.response_share(one, _ALL) for one in differences[block]]
+            q_and_outlying += [part.q_residual(one, every) for one in differences[block]]
+            t2 += [part.t2(one, every) for one in differences[block]]
+            responses += [part.response_share(one, every) for one in differences[block]]
         largest_q, outlying = np.array(q_and_outlying).max(axis=0)
         whole = cls._model(differences)
-        largest_t2 = max(*t2, *(whole.t2(one, _ALL) for one in differences))
-        least = 0.5 * float(np.linalg.norm(differences, axis=1).min() / np.sqrt(N_CHANNELS))
+        largest_t2 = max(*t2, *(whole.t2(one, every) for one in differences))
+        least = 0.5 * float(np.linalg.norm(differences, axis=1).min() / np.sqrt(table.n_channels))
         return cls(
             whole.mean, whole.spread, whole.directions, whole.variances, least,
             float(np.median(q_and_outlying, axis=0)[0]), _Q_MARGIN * float(largest_q),
             max(_Q_MARGIN * float(outlying), _LEAST_OUTLYING), _T2_MARGIN * largest_t2,
-            ReciprocityCheck.fit(differences), float(np.quantile(responses, LEVEL)),
+            ReciprocityCheck.fit(differences, table), float(np.quantile(responses, LEVEL)),
         )  # fmt: skip
 
     @classmethod
@@ -166,18 +157,18 @@ class NoveltyDetector:
         return cls(mean, spread, vt[:rank], variances, 0.0, 1.0, np.inf, np.inf, np.inf, None, 0.0)
 
     def q_residual(self, difference: FloatArray, usable: BoolArray) -> tuple[float, float]:
-        """Return the mean squared residual of a (896,) difference, and the share of outlying channels."""
+        """Return the mean squared residual of a (c,) difference, and the share of outlying channels."""
         x = self._scale(difference)
         residual = (x - _coordinates(self.directions, x, usable) @ self.directions)[usable]
         return float((residual**2).mean()), float((np.abs(residual) > _OUTLYING_SPREADS).mean())
 
     def t2(self, difference: FloatArray, usable: BoolArray) -> float:
-        """Return Hotelling's T² of a (896,) difference along the main directions."""
+        """Return Hotelling's T² of a (c,) difference along the main directions."""
         scores = _coordinates(self.directions[:_T2_DIRECTIONS], self._scale(difference), usable)
         return float((scores**2 / self.variances[:_T2_DIRECTIONS]).sum())
 
     def response_share(self, difference: FloatArray, usable: BoolArray) -> float:
-        """Return the share of the mean in a (896,) difference, by its part off the main directions.
+        """Return the share of the mean in a (c,) difference, by its part off the main directions.
 
         A smaller response, as where a foreign signal replaces it, moves a difference along the main directions like
         another torque. A torque leaves the other part alone (partial regression, Frisch–Waugh).
@@ -187,7 +178,7 @@ class NoveltyDetector:
         return float((difference / self.spread)[usable] @ rest / (mean[usable] @ rest))
 
     def impute(self, difference: FloatArray, usable: BoolArray) -> FloatArray:
-        """Return a (896,) difference with unusable channels estimated along the main directions."""
+        """Return a (c,) difference with unusable channels estimated along the main directions."""
         scores = _coordinates(self.directions, self._scale(difference), usable)
         return np.where(usable, difference, np.maximum(self.mean + self.spread * (scores @ self.directions), 0.0))
 
@@ -202,7 +193,7 @@ class NoveltyDetector:
         return max(q / self.typical_q, 1.0) ** _POWER
 
     def assess(self, difference: FloatArray, usable: BoolArray) -> Novelty:
-        """Return the novelty of a (896,) difference, by its usable channels."""
+        """Return the novelty of a (c,) difference, by its usable channels."""
         if 1.0 - usable.mean() > LARGEST_UNUSABLE_SHARE:
             return _refused(
                 f"{100 * (1 - usable.mean()):.0f} % of the channels are dead or saturated; check the ribbon cable"
@@ -225,7 +216,7 @@ class NoveltyDetector:
             limit_share = residual / self.reciprocity.largest_residual
             if limit_share > 1:
                 return _refused(
-                    f"outside the calibration: opposite injections differ by {residual:.2f} (limit "
+                    f"outside the calibration: two measurements of the same voltages differ by {residual:.2f} (limit "
                     f"{self.reciprocity.largest_residual:.2f}); part of the frame may be another fingertip's"
                 )
         t2 = self.t2(difference, usable)
@@ -255,7 +246,7 @@ def _coordinates(directions: FloatArray, values: FloatArray, usable: BoolArray) 
 
 
 def _check_slices(differences: FloatArray) -> None:
-    """Raise CalibrationError for (n, 896) differences that are alike, or with too many constant channels."""
+    """Raise CalibrationError for (n, c) differences that are alike, or with too many constant channels."""
     n = len(differences)
     with np.errstate(over="ignore"):
         rounding_v = _LEAST_NOISE * np.sqrt((differences**2).mean())

@@ -145,7 +145,7 @@ def _spread_about_parabola(frames: FloatArray, z: FloatArray) -> FloatArray:
 class ChannelImputer:
     """Gaussian model of gripped differences, to impute channels that died after the calibration.
 
-    mean (m, 896) in volts; modes (k, m, 896) in volts, each one standard deviation; precision (m, 896) in V⁻² is one
+    mean (m, c) in volts; modes (k, m, c) in volts, each one standard deviation; precision (m, c) in V⁻² is one
     over each channel's remaining variance, 0 for channels that were dead at calibration.
     """
 
@@ -155,7 +155,7 @@ class ChannelImputer:
 
     @classmethod
     def fit(cls, positions: FloatArray, validators: tuple[FingertipValidator, ...]) -> Self:
-        """Fit to the (n, m·896) differences of gripped frames in units of the validators' noises."""
+        """Fit to the (n, m·c) differences of gripped frames in units of the validators' noises."""
         noise = np.array([one.noise for one in validators])
         alive = np.isfinite(noise)
         mean = positions.mean(axis=0)
@@ -171,9 +171,9 @@ class ChannelImputer:
         return cls(mean.reshape(noise.shape) * scale, modes, precision)
 
     def impute(self, difference: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Return a (m, 896) difference in volts with unusable channels at their conditional mean.
+        """Return a (m, c) difference in volts with unusable channels at their conditional mean.
 
-        Also return the (k, m, 896) independent errors of the imputed channels, one standard deviation each.
+        Also return the (k, m, c) independent errors of the imputed channels, one standard deviation each.
         """
         k = len(self.modes)
         modes = self.modes.reshape(k, -1)

@@ -98,7 +98,7 @@ class EstimatorSession:
         else:
             motion = calibration.estimator.motion
             self._state = SessionState(calibration.validators, motion, self._period_s, idle_frames)
-        # The (m, 896) difference to the idle frame behind the last estimate, None where there was none.
+        # The (m, c) difference to the idle frame behind the last estimate, None where there was none.
         self.difference: FloatArray | None = None
         self._latest: FloatArray = np.full(calibration.estimator.scale.shape, np.nan)
 
@@ -189,7 +189,7 @@ class EstimatorSession:
     ) -> tuple[_Interval, tuple[str, ...]]:  # fmt: skip
         """Return one quantity with its interval, and the reasons against it.
 
-        Imputed channels have the (k, m, 896) errors, one standard deviation each.
+        Imputed channels have the (k, m, c) errors, one standard deviation each.
         """
         frame, estimator = reading.frame, self.calibration.estimator
         features, complete = estimator.inputs(quantity, features, reading), None

@@ -14,7 +14,6 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.defaults import BASELINE_FRAMES
-from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.matching import signal_above_noise
 from shearloop.bank.estimation.fingertip_validator import (
     LARGEST_JUMPING_SHARE,
@@ -47,8 +46,8 @@ _POOLED_FREEDOM = 30
 class ProcessedFrame:
     """A frame after the session's checks, with the reasons against it.
 
-    difference (m, 896) is to the idle frame, mean_difference its mean over the grip's last held_frames. motion holds
-    features of the last frames' motion. usable (m, 896) excludes channels that the board or the frame itself shows to
+    difference (m, c) is to the idle frame, mean_difference its mean over the grip's last held_frames. motion holds
+    features of the last frames' motion. usable (m, c) excludes channels that the board or the frame itself shows to
     be lost or saturated. has_baseline is whether every fingertip was seen idle, lag_s the lag of an average.
     """
 
@@ -73,7 +72,7 @@ class Motion:
     n_lags: int = 0
 
     def project(self, channels: FloatArray) -> FloatArray:
-        """Return the (…, p) positions of (…, m, 896) frames."""
+        """Return the (…, p) positions of (…, m, c) frames."""
         return np.zeros((*channels.shape[:-2], 0))
 
     def features(self, _positions: Sequence[FloatArray], _from_idle: FloatArray) -> FloatArray:
@@ -81,11 +80,11 @@ class Motion:
         return np.zeros(0)
 
     def fill(self, moved: FloatArray, usable: BoolArray, _sides: Sequence[FingertipValidator]) -> FloatArray:
-        """Return the motion (m, 896) since the last frame with unusable channels imputed."""
+        """Return the motion (m, c) since the last frame with unusable channels imputed."""
         return np.where(usable, moved, 0.0)
 
     def complete(self, difference: FloatArray, _usable: BoolArray, _sides: Sequence[FingertipValidator]) -> FloatArray:
-        """Return a (m, 896) difference to the idle frame, unusable channels imputed unless the estimator does that."""
+        """Return a (m, c) difference to the idle frame, unusable channels imputed unless the estimator does that."""
         return difference
 
 
@@ -111,7 +110,7 @@ class FrameTimer:
 
 
 class IdleFrames:
-    """The idle (m, 896) frame: the calibration's until the session has its own, and (m, 1) gains over it."""
+    """The idle (m, c) frame: the calibration's until the session has its own, and (m, 1) gains over it."""
 
     def __init__(self, fingertips: FingertipSet, wanted: int) -> None:
         """Begin; the operator guarantees that the first `wanted` usable frames are untouched."""
@@ -187,10 +186,10 @@ class IdleFrames:
 
 
 class GripMemory:
-    """The last positions of this grip, some of them interpolated, and its mean (m, 896) difference to idle."""
+    """The last positions of this grip, some of them interpolated, and its mean (m, c) difference to idle."""
 
-    def __init__(self, motion: Motion, n_sides: int) -> None:
-        """Begin without a grip."""
+    def __init__(self, motion: Motion, shape: tuple[int, ...]) -> None:
+        """Begin without a grip; frames have the shape (m, n)."""
         self._motion = motion
         self.positions: deque[FloatArray] = deque(maxlen=motion.n_lags + 1)
         self._bridged: deque[bool] = deque(maxlen=motion.n_lags + 1)
@@ -198,7 +197,7 @@ class GripMemory:
         # Features of the last frames' motion.
         self.features: FloatArray = np.zeros(0)
         # Over the last valid frames, and their number.
-        self.mean_difference: FloatArray = np.zeros((n_sides, N_CHANNELS))
+        self.mean_difference: FloatArray = np.zeros(shape)
         self.held_frames = 0
 
     def forget(self) -> None:
@@ -265,10 +264,10 @@ class SessionState:
         self._timer = FrameTimer(period_s)
         self._idle = IdleFrames(self._fingertips, idle_frames)
         self._grips = [GripDetector(one) for one in validators]
-        self._memory = GripMemory(motion, len(validators))
+        self._memory = GripMemory(motion, self._fingertips.idle.shape)
         self._before: FloatArray | None = None
         self._disturbed: FloatArray | None = None
-        self._lost: BoolArray = np.zeros((len(validators), N_CHANNELS), dtype=np.bool_)
+        self._lost: BoolArray = np.zeros(self._fingertips.idle.shape, dtype=np.bool_)
         # Channels that were unusable when the session began: their idle voltages are unknown.
         self._unknown: BoolArray = self._lost
 
@@ -353,7 +352,7 @@ class SessionState:
     def _update_baseline(self, channels: FloatArray, frame: TactileFrame) -> None:
         """Follow the idle frame while nothing is gripped; a session that begins gripped keeps the calibration's.
 
-        Channels that were unknown and work again in an idle frame are restored in `channels` (m, 896).
+        Channels that were unknown and work again in an idle frame are restored in `channels` (m, c).
         """
         for layer in self._idle.idle_sides(channels):
             back = self._unknown[layer]
@@ -438,7 +437,7 @@ class PaperState:
 
     @cached_property
     def _noise(self) -> FloatArray:
-        """Standard deviation of one frame, (896,) in volts, at least the converter's rounding.
+        """Standard deviation of one frame, (c,) in volts, at least the converter's rounding.
 
         A few frames know the variance of one channel badly: each is drawn towards the mean of all (Smyth 2004).
         """

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
-from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.polynomial import TWO_SIDED_95
 
@@ -35,10 +35,10 @@ class Measured:
 class FrameSeries:
     """Frames in time order with the torque and the tool's diameter, where these are known.
 
-    t_s (n,) is the middle of each acquisition in seconds; channels (n, m, 896) in volts for m sides. torque_nm (p,)
+    t_s (n,) is the middle of each acquisition in seconds; channels (n, m, c) in volts for m sides. torque_nm (p,)
     was measured at torque_t_s (p,) on the same clock. diameter_mm (n,) is NaN where unknown; gripper_mm is then the
     gripper's width, if there was a gripper. Diameters are not fitted to gripper_mm. first_frame is the first frame's
-    number in the whole recording.
+    number in the whole recording, load_doubt why the torque's times may be wrong.
     Raises CalibrationError for shapes that do not match and for times that decrease.
     """
 
@@ -50,14 +50,17 @@ class FrameSeries:
     torque_nm: FloatArray
     diameter_mm: FloatArray
     gripper_mm: Measured | None = None
+    table: ChannelTable = PAPER_TABLE
     first_frame: int = 0
+    load_doubt: str = ""
 
     def __post_init__(self) -> None:
         """Check shapes and times."""
         n, m = len(self.t_s), len(self.sides)
-        if self.channels.shape != (n, m, N_CHANNELS) or self.diameter_mm.shape != (n,):
+        expected = n, m, self.table.n_channels
+        if self.channels.shape != expected or self.diameter_mm.shape != (n,):
             raise CalibrationError(
-                f"{n} frames of {m} sides need channels of shape {(n, m, N_CHANNELS)} and {n} diameters, not "
+                f"{n} frames of {m} sides need channels of shape {expected} and {n} diameters, not "
                 f"{self.channels.shape} and {self.diameter_mm.shape}"
             )
         if self.torque_t_s.shape != self.torque_nm.shape:
@@ -109,9 +112,9 @@ class FrameSeries:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TactileFrame:
-    """Frames of m sides at one time: t_s in seconds (middle of the acquisition), channels (m, 896) in volts.
+    """Frames of m sides at one time: t_s in seconds (middle of the acquisition), channels (m, c) in volts.
 
-    usable (m, 896) is False at dead and saturated channels. Do not change the arrays afterwards.
+    usable (m, c) is False at dead and saturated channels. Do not change the arrays afterwards.
     """
 
     t_s: float

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
-from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.estimation import FrameSeries, Measured
 from shearloop.bank.estimation.calibration import LARGEST_TOOL_SHARE
 from shearloop.daemon.errors import UserError
@@ -19,7 +18,7 @@ from shearloop.daemon.recording.matlab import (
     read_torque_slices,
 )
 from shearloop.daemon.recording.reader import Recording, read_recording
-from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, SIDES
+from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, LOAD_DOUBT_NOTE, SIDES
 
 # Slices do not name their side.
 SLICE_SIDE = "right"
@@ -29,12 +28,15 @@ _LARGEST_APART = 0.75
 _MOMENTARY = 0.05
 
 
-def read_series(path: Path, sides: tuple[str, ...] | None = None, tool_mm: float | None = None) -> list[FrameSeries]:
+def read_series(
+    path: str | Path, sides: tuple[str, ...] | None = None, tool_mm: float | None = None
+) -> list[FrameSeries]:
     """Return the series of a recording, of a folder of slices, or of a folder with torque_slices and diameter_slices.
 
     `sides` selects the sides of a recording, by default all; `tool_mm` is the diameter of its tool, if the recording
     does not name it. Raises UserError for anything else.
     """
+    path = Path(path)
     if not path.is_dir():
         return [series_of(read_recording(path), sides, tool_mm)]
     inside = [path / name for name in (TORQUE_FOLDER, DIAMETER_FOLDER) if (path / name).is_dir()]
@@ -80,11 +82,13 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_m
         "raw",
         wanted,
         t_s,
-        np.stack([channels_of_line(one) for one in lines], axis=1),
+        np.stack([recording.table.channels_of_line(one) for one in lines], axis=1),
         (recording.torque_t_ns - start) / 1e9,
         recording.torque_nm,
         np.full(len(t_s), diameter_mm),
         gripper_mm,
+        recording.table,
+        load_doubt=recording.notes.get(LOAD_DOUBT_NOTE, ""),
     )
 
 

@@ -8,8 +8,10 @@ large libraries inside functions, so that help and errors come at once.
 import argparse
 import importlib
 import os
+import re
 import sys
 from collections.abc import Sequence
+from difflib import get_close_matches
 from typing import NamedTuple, NoReturn
 
 from shearloop.daemon.errors import UserError
@@ -29,6 +31,8 @@ class Command(NamedTuple):
 COMMANDS = {
     name: Command(f"shearloop.daemon.{module}", summary)
     for name, module, summary in (
+        ("demo", "cli.demo", "run the whole rig, emulated, in closed loop"),
+        ("init", "cli.init", "write a commented configuration and experiments to start from"),
         ("run", "cli.run", "run the daemon that a configuration describes"),
         ("import", "cli.recording", "convert the paper's MATLAB streams into a recording"),
         ("recording", "cli.recording", "inspect recordings, repair them, and export them as tables"),
@@ -37,6 +41,7 @@ COMMANDS = {
         ("adapt", "cli.adapt", "correct a calibration's gain by one or a few twists of known torque"),
         ("chart", "cli.chart", "chart speed against accuracy, stability, and how much model is needed"),
         ("check", "cli.check", "check a configuration and the files it names"),
+        ("schema", "cli.schema", "print the JSON Schema of a configuration, an experiment or another file"),
         ("listen", "cli.listen", "print what a running daemon publishes"),
         ("command", "cli.command", "send a command to a running daemon: tare, start, pause, stop, unlock …"),
         ("view", "cli.view", "show a running daemon as a page in the browser, with a stop button"),
@@ -58,9 +63,9 @@ EXIT_OK, EXIT_USAGE = 0, 2
 # Of `run`: the experiment of `stop_when_done` did not finish.
 EXIT_UNFINISHED = 3
 
-_FIRST_STEPS = """First steps with your own devices:
-`shearloop ports` shows their names, `shearloop check CONFIG` checks the configuration,
-`shearloop doctor CONFIG` finds faults of cables and devices."""
+_FIRST_STEPS = """First steps without devices: `shearloop demo`.
+With your own: `shearloop init DIR` writes a configuration, `shearloop ports` shows the devices' names,
+`shearloop check CONFIG` checks the configuration, `shearloop doctor CONFIG` finds faults of cables and devices."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -68,7 +73,19 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the sentence and exit with status 2."""
-        self.exit(EXIT_USAGE, f"{self.prog}: {message}; see `{self.prog} --help`\n")
+        self.exit(EXIT_USAGE, f"{self.prog}: {self._plain(message)}; see `{self.prog} --help`\n")
+
+    def _plain(self, message: str) -> str:
+        """Return argparse's message with the nearest known word."""
+        choice = re.fullmatch(r"argument (\S+): invalid choice: '(.*)' \(choose from (.*)\)", message)
+        if choice is not None:
+            name, given, known = choice[1], choice[2], [one.strip("'") for one in choice[3].split(", ")]
+            of = f" of {name}" if name.startswith("--") else ""
+            meant = "".join(f"; did you mean {one}?" for one in get_close_matches(given, known, 1))
+            return f"there is no {given!r}{of}{meant or '; there are ' + ', '.join(known)}"
+        unknown = re.match(r"unrecognized arguments: (\S+)", message)
+        near = get_close_matches(unknown[1], self._option_string_actions, 1) if unknown else []
+        return f"{message}; did you mean {near[0]}?" if near else message
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -57,12 +57,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(plot, "path", Path, "PATH", "draw this bank's signals", nargs="?")
     add_option(plot, "--config", Path, "FILE", "draw the models on this configuration's mesh")
     add_option(plot, "--out", Path, "DIR", "directory for the PNG and SVG files", required=True)
-    solve = add_action(actions, "solve", "solve for the 896 voltages of one conductivity", _solve)
+    solve = add_action(actions, "solve", "solve for the voltages of one conductivity", _solve)
     add_option(solve, "--mesh", Path, "FILE", "a mesh (.npz, EIDORS .mat) or a fingertip (.yaml)", required=True)
     solve.add_argument("--model", required=True, metavar="M", help=f"basis model: {MODEL_NAMES}")
     add_option(solve, "--k", float, "K", "the model's first parameter", required=True)
     add_option(solve, "--sigma", float, "S", "the model's second parameter", required=True)
-    add_option(solve, "--out", Path, "V.npy", "file for the 896 float64 voltages", required=True)
+    add_option(
+        solve, "--out", Path, "V.npy", "file for the float64 voltages, in the order of the channels", required=True
+    )
     add_json(solve)
 
 
@@ -98,7 +100,7 @@ def _build_all(args: argparse.Namespace) -> int:
                 yield rows[number], cells
 
         for path, plan in zip(paths, plans.values(), strict=True):
-            if len(paths) > 1 and _is_built(path, plan):
+            if len(paths) > 1 and is_built(path, plan):
                 built.append(path)
                 continue
             try:
@@ -137,8 +139,8 @@ def _paths(out: Path, names: list[str]) -> list[Path]:
     return [out / f"{name}.bank" for name in names]
 
 
-def _is_built(path: Path, plan: "BankPlan") -> bool:
-    """Return whether an earlier build of a folder has finished this bank."""
+def is_built(path: Path, plan: "BankPlan") -> bool:
+    """Return whether an earlier build has finished this bank."""
     from shearloop.bank.eit.bank_file import Bank
     from shearloop.bank.errors import BankFileError
 
@@ -185,7 +187,6 @@ def _info(args: argparse.Namespace) -> int:
     import numpy as np
 
     from shearloop.bank.eit.bank_file import FORMAT_VERSION, Bank
-    from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH
     from shearloop.bank.eit.models import MODELS
 
     bank = Bank.open(args.path, verify=True)
@@ -196,7 +197,8 @@ def _info(args: argparse.Namespace) -> int:
         "format_version": FORMAT_VERSION,
         "variation": asdict(bank.definition.variation),
         "geometry_hash": bank.geometry_hash,
-        "channel_table_hash": CHANNEL_TABLE_HASH,
+        "channels": bank.table.n_channels,
+        "channel_table_hash": bank.table.digest,
         "signals_sha256": bank.signals_sha256,
         **{name: {"low": grid[0], "high": grid[-1], "count": len(grid), "unit": unit} for name, grid, unit in grids},
         "not_positive_cells": int((bank.min_conductivity <= 0).sum()),
@@ -250,13 +252,13 @@ def _solve(args: argparse.Namespace) -> int:
     from shearloop.files import replace_file
 
     check_overwrite(args.out, "an array of NumPy", np.lib.format.MAGIC_PREFIX)
-    mesh = load_geometry(args.mesh)
+    mesh, table = load_geometry(args.mesh)
     try:
-        voltages = ForwardModel(mesh).voltages(conductivity(mesh, args.model, args.k, args.sigma))
+        voltages = ForwardModel(mesh, table).voltages(conductivity(mesh, args.model, args.k, args.sigma))
     except ConductivityError as error:
         raise UserError(f"--model {args.model} --k {args.k:g} --sigma {args.sigma:g}: {error}") from error
     with writing(args.out, "the voltages"), replace_file(args.out) as file:
         np.save(file, voltages)
     norm = float(np.linalg.norm(voltages))
     result = {"path": str(args.out), "voltages": len(voltages), "norm": norm}
-    return print_result(result, [f"{args.out}: 896 voltages, norm {norm:.9g}"], as_json=args.json)
+    return print_result(result, [f"{args.out}: {len(voltages)} voltages, norm {norm:.9g}"], as_json=args.json)

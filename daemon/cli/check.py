@@ -45,10 +45,13 @@ def run(args: argparse.Namespace) -> int:
     if config.skin is not None:
         parts["skin"] = _skin(config.skin)
     parts |= _rig(config)
-    experiment = check_experiment(config, torque_sources(config, estimators, combined))
+    sources = torque_sources(config, estimators, combined)
+    experiment = check_experiment(config, sources)
     if experiment is not None:
         steps = f"{len(experiment.steps)} steps, driven by {experiment.torque_source}"
         parts["experiment"] = f"{experiment.name!r}, {steps}"
+        if warm_up_s := max((one.warm_up_s for one in sources.values() if one.measures_torque), default=0.0):
+            parts["experiment"] += f"; after a grip it waits up to {warm_up_s:.0f} s for the first torques"
     if args.json:
         print(json.dumps({"config": str(args.config), "parts": parts}, ensure_ascii=False))
         return 0

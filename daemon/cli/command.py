@@ -3,9 +3,12 @@
 import argparse
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from shearloop.daemon.cli.options import add_connection, add_option, client_keys
+from shearloop.daemon.cli.terminal import table, task_row
 from shearloop.daemon.messaging import addresses
 
 COMMANDS = {
@@ -52,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
     """Send one command and print its reply; status 1 if the daemon refused it."""
 
     from shearloop.daemon.messaging.client import check_timeout_s, send_command
+    from shearloop.daemon.messaging.stop_socket import send_to_stop_socket
 
     arguments = {} if args.source is None else {"source": args.source}
     if args.heatmap is not None:
@@ -59,23 +63,33 @@ def run(args: argparse.Namespace) -> int:
     if args.experiment is not None:
         # The daemon may run in another folder.
         arguments["experiment"] = str(args.experiment.resolve())
-    address, keys = args.connect, None
+    address, keys, request, reply = args.connect, None, {"command": args.name, **arguments}, None
+    timeout_s = addresses.COMMAND_TIMEOUT_S if args.timeout is None else check_timeout_s(args.timeout)
     if args.name in ("stop", "status") and args.key is None and not addresses.needs_keys(address):
         # These two need no key on the daemon's own machine.
-        address = addresses.stop_address(address)
+        reply = send_to_stop_socket(address, request, timeout_s)
     else:
         keys = client_keys(args)
-    timeout_s = addresses.COMMAND_TIMEOUT_S if args.timeout is None else check_timeout_s(args.timeout)
     if args.name == "unlock" and args.timeout is None:
         # A missing daemon is reported without the long timeout.
         send_command(address, {"command": "status"}, addresses.COMMAND_TIMEOUT_S, keys)
         timeout_s = addresses.UNLOCK_TIMEOUT_S
-    reply = send_command(address, {"command": args.name, **arguments}, timeout_s, keys)
+    if reply is None:
+        reply = send_command(address, request, timeout_s, keys)
     accepted = bool(reply.pop("ok", False))
     if args.json:
         print(json.dumps({"ok": accepted, **reply}, ensure_ascii=False))
     elif accepted:
-        print(f"{args.name}: done" if not reply else f"{args.name}: {json.dumps(reply, ensure_ascii=False, indent=2)}")
+        print(*_lines(args.name, reply), sep="\n")
     else:
         print(f"shearloop command: {args.name} was refused: {reply.get('reason')}", file=sys.stderr)
     return 0 if accepted else 1
+
+
+def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
+    """Return an accepted reply as text: the tasks of `status` as a table."""
+    if name == "status":
+        rows = [task_row(task, facts) for task, facts in reply["tasks"].items()]
+        return table(("task", "state", "rate", "notes"), rows)
+    values = {key: ", ".join(value) if isinstance(value, list) else value for key, value in reply.items()}
+    return [f"{name}: {', '.join(f'{key} {value}' for key, value in values.items() if value) or 'done'}"]

@@ -6,10 +6,11 @@ import json
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import IO, TYPE_CHECKING, Any, Self
 
 import numpy as np
 import structlog
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from shearloop.daemon.config import EmulatorConfig, EventConfig
     from shearloop.daemon.run_summary import TorqueSeries
 
+# An emulator prints a line once its ports are open, which takes about two seconds.
+READY_S = 20.0
 # An emulator needs some of it to remove its port's link; a clean stop takes less than a second in all.
 STOP_S = 0.5
 
@@ -41,7 +44,7 @@ def check_emulators(emulators: "tuple[EmulatorConfig, ...]", config: Path) -> li
 
 
 class EmulatedDevices:
-    """Runs each device in a process, as a context, and listens to the daemon's messages.
+    """Runs each device in a process, as a context that begins once all are ready, and takes the daemon's messages.
 
     At each `loop.state` it sends the events that are due, and at each `health` it reports devices that have ended.
     """
@@ -65,15 +68,21 @@ class EmulatedDevices:
                 folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="shearloop-"))
                 self._truth = Path(folder) / "truth.jsonl"
             processes: list[subprocess.Popen[bytes]] = []
+            ready: list[threading.Event] = []
             stack.callback(_stop, processes)
             for emulator in self._emulators:
                 # An emulator ends when its standard input is closed.
                 process = subprocess.Popen(
-                    self._command(emulator), cwd=self._folder, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL
+                    self._command(emulator), cwd=self._folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE
                 )
                 processes.append(process)
+                ready.append(threading.Event())
+                threading.Thread(target=_read_lines, args=(process.stdout, ready[-1]), daemon=True).start()
                 self._alive.append((emulator.device, process))
                 self._waiting += [(event, process) for event in emulator.events]
+            until_s = time.monotonic() + READY_S
+            for one in ready:
+                one.wait(max(0.0, until_s - time.monotonic()))
             self._stack = stack.pop_all()
         return self
 
@@ -125,6 +134,14 @@ class EmulatedDevices:
             self._alive.remove(entry)
             sentence = "an emulated device has ended: restart the daemon to emulate it again"
             structlog.get_logger().error(sentence, device=entry[0], status=entry[1].returncode)
+
+
+def _read_lines(output: IO[bytes], ready: threading.Event) -> None:
+    """Read what a device prints, so that it never waits; set `ready` at its first line or its end."""
+    with output:
+        for _ in output:
+            ready.set()
+    ready.set()
 
 
 def _stop(processes: "list[subprocess.Popen[bytes]]") -> None:

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from shearloop.bank.estimation import Calibration, FrameSeries
     from shearloop.daemon.messaging.keys import ClientKeys
 
+PAPERS_RECORDINGS = (
+    "The paper's recordings: https://github.com/DhruvTrehan03/Soft-Tactile-Sensing-For-Robotic-Manipulation "
+    "(see docs/recording.md)"
+)
 # Longer than the 124 characters of text at the start of a MATLAB file.
 _HEAD_BYTES = 512
 

@@ -7,7 +7,14 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.options import add_action, add_json, add_option, check_overwrite, run_action
+from shearloop.daemon.cli.options import (
+    PAPERS_RECORDINGS,
+    add_action,
+    add_json,
+    add_option,
+    check_overwrite,
+    run_action,
+)
 from shearloop.daemon.cli.terminal import print_result, progress_bar
 from shearloop.daemon.errors import UserError
 
@@ -26,6 +33,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         add_option(mat, "sources", Path, "SRC", ".mat files of one recording, or its folder", nargs="+")
         add_option(mat, "--out", Path, "REC", "recording to write, e.g. twist.mcap", required=True)
         add_json(mat)
+        parser.epilog = PAPERS_RECORDINGS
         return
     parts = parser.add_subparsers(dest="part", metavar="WHAT", required=True)
     info = add_action(parts, "info", "show the content of recordings, closed or not", _info)

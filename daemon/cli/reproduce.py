@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.options import add_json, add_option, checked_jobs, writing
+from shearloop.daemon.cli.options import PAPERS_RECORDINGS, add_json, add_option, checked_jobs, writing
 from shearloop.daemon.cli.terminal import progress_bar
 from shearloop.daemon.errors import UserError
 
@@ -25,6 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(geometry, "--mesh", Path, "FILE", f"mesh (.npz, EIDORS .mat) or fingertip (.yaml); by default {default}")
     add_option(geometry, "--bank-config", Path, "FILE", "a bank's configuration, for its geometry")
     add_option(parser, "--jobs", int, "N", "processors to use (default: all)")
+    parser.epilog = PAPERS_RECORDINGS
 
 
 def run(args: argparse.Namespace) -> int:

@@ -21,7 +21,11 @@ if TYPE_CHECKING:
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `run`."""
     add_option(parser, "config", Path, "CONFIG", "a YAML file such as config/demo.yaml")
-    parser.add_argument("--show", action="store_true", help="print the estimates, and a summary at the end")
+    parser.add_argument(
+        "--show",
+        action="store_true",
+        help="show the state (to a file: each estimate), and a summary",
+    )
     text = "write a slice of each held angle of a sweep, in torque_slices and diameter_slices for `reproduce`"
     add_option(parser, "--slices", Path, "DIR", text)
     text = "log JSON lines (the default under systemd)"
@@ -37,35 +41,44 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run until a signal, `shearloop command stop`, or the end of the experiment (`stop_when_done`)."""
-    from shearloop.daemon.logs import NonBlockingWriter, logging_to_stderr
+    import logging
+
+    from shearloop.daemon.logs import CLEAR_LINE, NonBlockingWriter, logging_to_stderr
     from shearloop.daemon.process import ending_signals, without_long_collections
 
     # Until the event loop handles the signals: stopping a service that is still starting is no failure.
     for number in ending_signals():
         if number != signal.SIGINT:
             signal.signal(number, lambda *_: sys.exit(0))
+    # A terminal shows one line that changes, and only warnings between.
+    terminal = args.show and not args.json_log and sys.stdout.isatty() and sys.stderr.isatty()
+    level, before = (logging.WARNING, CLEAR_LINE) if terminal else (logging.INFO, "")
     with (
         without_long_collections() as on_ready,
-        logging_to_stderr(json_lines=args.json_log) as log,
+        logging_to_stderr(json_lines=args.json_log, level=level, before=before) as log,
         closing(NonBlockingWriter(sys.stdout)) as out,
     ):
-        return _run(args, log, out, on_ready)
+        return _run(args, log, out, on_ready, terminal=terminal)
 
 
 def _run(
-    args: argparse.Namespace, log: "NonBlockingWriter", out: "NonBlockingWriter", on_ready: Callable[[], None]
+    args: argparse.Namespace,
+    log: "NonBlockingWriter",
+    out: "NonBlockingWriter",
+    on_ready: Callable[[], None],
+    *,
+    terminal: bool,
 ) -> int:
-    import structlog
-
     from shearloop.daemon.app import run_daemon
     from shearloop.daemon.cli import EXIT_OK, EXIT_UNFINISHED
     from shearloop.daemon.cli.emulated_devices import EmulatedDevices
-    from shearloop.daemon.cli.terminal import EstimatePrinter
-    from shearloop.daemon.process import high_priority, lock_memory
+    from shearloop.daemon.cli.terminal import EstimatePrinter, StatusLine
+    from shearloop.daemon.process import high_priority, lock_memory, raise_descriptor_limit
     from shearloop.daemon.run_summary import RunSummary
     from shearloop.daemon.supervisor import Reporter
 
     config = _config(args)
+    raise_descriptor_limit()
     if config.lock_memory:
         lock_memory()
     listeners: list[Listener] = []
@@ -75,8 +88,9 @@ def _run(
         if args.slices is not None:
             # Imports scipy.io, which takes long.
             from shearloop.daemon.recording.matlab_slices import SliceRecorder
+            from shearloop.daemon.sensing.estimators import channel_table
 
-            slices = SliceRecorder(args.slices)
+            slices = SliceRecorder(args.slices, channel_table(config))
             stack.callback(slices.close)
             listeners.append(slices)
             reporters["slices"] = slices
@@ -84,14 +98,11 @@ def _run(
         stack.enter_context(high_priority() if config.robot is not None else nullcontext())
         emulated = stack.enter_context(EmulatedDevices(config.emulators, args.config.parent, args.recording))
         listeners.append(emulated)
-        if config.emulators:
-            # The daemon does not know about emulation and will report missing devices.
-            names = [emulator.device for emulator in config.emulators]
-            sentence = "emulated devices are starting; the daemon misses them for a second"
-            structlog.get_logger().info(sentence, devices=names)
         if args.show:
-            listeners += [EstimatePrinter(out), RunSummary(out, emulated)]
-        finished = asyncio.run(run_daemon(config, tuple(listeners), reporters, on_ready))
+            listeners.append(stack.enter_context(StatusLine(out)) if terminal else EstimatePrinter(out))
+        shown = out if args.show or config.recording is not None else None
+        summary = RunSummary(shown, emulated)
+        finished = asyncio.run(run_daemon(config, tuple(listeners), reporters, on_ready, summary))
     if slices is not None:
         out.write(f"{args.slices}: {slices.summary}\n")
     return EXIT_OK if finished else EXIT_UNFINISHED

@@ -4,18 +4,22 @@ import asyncio
 import dataclasses
 import json
 import os
+import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, Self, TextIO
 
 from shearloop.daemon.errors import UserError
+from shearloop.drivers.errors import times
 
 if TYPE_CHECKING:
     from shearloop.daemon.logs import NonBlockingWriter
 
 STDIN = 0
+# Errors of a device's connection, which connects again by itself.
+LINK_ERRORS = ("unreachable", "silent", "lost")
 READ_BYTES = 4096
 
 
@@ -54,6 +58,43 @@ class EstimatePrinter:
         if topic in ("eit.estimate", "skin.shear"):
             self._out.write(message_line(topic, content) + "\n")
             self._out.flush()
+
+
+class StatusLine:
+    """Shows a daemon's state on one line of a terminal, as a context that leaves an empty line."""
+
+    def __init__(self, out: "TextIO | NonBlockingWriter") -> None:
+        self._out = out
+        self._state = self._driving = self._torque = ""
+
+    def __enter__(self) -> Self:
+        """Show that the daemon starts."""
+        self._draw("starting")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Empty the line."""
+        self._draw("")
+
+    def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
+        """Take one message; redraw after those that it shows."""
+        if topic == "loop.state":
+            self._state = _loop(topic, content)
+            self._driving = content["torque_source"]
+        elif topic in ("eit.estimate", "load.torque", "skin.shear") and content["source"] == self._driving:
+            torque_nm = content["torque_nm"] if content["valid"] else None
+            self._torque = "" if torque_nm is None else f"   {self._driving} {torque_nm:+.3f} N·m"
+        else:
+            return
+        self._draw(self._state + self._torque)
+
+    def _draw(self, text: str) -> None:
+        from shearloop.daemon.logs import CLEAR_LINE
+
+        # A longer line would wrap, and could not be cleared.
+        width = shutil.get_terminal_size().columns - 1
+        self._out.write(f"{CLEAR_LINE}{text if len(text) <= width else text[: width - 1] + '…'}")
+        self._out.flush()
 
 
 class Operator:
@@ -144,15 +185,46 @@ def _shear(_: str, content: Mapping[str, Any]) -> str:
     return f"shear {content['shear_n']:+.3f} N {interval}{torque}   response {content['response']:+.5f}   {direction}"
 
 
+def _loop(_: str, content: Mapping[str, Any]) -> str:
+    """Return phase, step, activity, progress, and the reasons for holding."""
+    if not content["experiment"]:
+        return f"{content['phase']}: {content['reasons']}" if content["reasons"] else str(content["phase"])
+    step = f"step {content['step']} of {content['steps']} {content['step_name']}"
+    percent = f"{100 * content['progress']:.0f} %"
+    activity = content["activity"] or content["experiment"]
+    reasons = f": {content['reasons']}" if content["reasons"] and content["reasons"] != activity else ""
+    return f"{content['phase']} {percent}  {step}  {activity}{reasons}"
+
+
 def _health(_: str, content: Mapping[str, Any]) -> str:
-    tasks = []
-    for name, status in content["tasks"].items():
-        state = "done" if status.get("done") else "alive" if status.get("alive", True) else "DEAD"
-        restarts = f", {status['restarts']} restarts" if status.get("restarts") else ""
-        errors = "".join(f", {count} {kind}" for kind, count in (status.get("errors") or {}).items())
-        reason = f" ({status['error']})" if status.get("error") else ""
-        tasks.append(f"{name} {state}{restarts}{errors}{reason}")
+    rows = [task_row(name, facts) for name, facts in content["tasks"].items()]
+    tasks = (f"{name} {', '.join(filter(None, cells))}" for name, *cells in rows)
     return f"{content['memory_mb']:.0f} MB  {content['cpu_percent']:.1f} % CPU  " + "; ".join(tasks)
+
+
+def task_row(name: str, facts: Mapping[str, Any]) -> tuple[str, str, str, str]:
+    """Return the name of a task of `health`, its state, its rate, and its notes: restarts, errors, the latest error."""
+    down = facts.get("connected") is False
+    state = "DEAD" if facts.get("alive") is False else "not connected" if down else "alive"
+    state = "done" if facts.get("done") else state
+    rate = " of ".join(f"{facts[key]:.2f}" for key in ("rate_hz", "expected_hz") if facts.get(key) is not None)
+    rate = "" if facts.get("rate_hz") is None else f"{rate} Hz"
+    notes = [f"restarted {times(facts['restarts'])}"] if facts.get("restarts") else []
+    errors = dict(facts.get("errors") or {})
+    lost = sum(errors.pop(kind, 0) for kind in LINK_ERRORS) or (facts.get("connections") or 1) - 1
+    if lost and not down:
+        notes.append(f"reconnected {times(lost)}")
+    notes += [f"{kind} {times(count)}" for kind, count in errors.items()]
+    if error := facts.get("error") or facts.get("last_error"):
+        notes.append(error)
+    return name, state, rate, ", ".join(notes)
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return the lines of a table whose columns are aligned."""
+    every = [tuple(head), *map(tuple, rows)]
+    widths = [max(map(len, column)) for column in zip(*every, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in every]
 
 
 def _columns(topic: str, content: Mapping[str, Any]) -> str:
@@ -160,7 +232,9 @@ def _columns(topic: str, content: Mapping[str, Any]) -> str:
 
     fields = dataclasses.fields(TOPICS[topic]) if topic in TOPICS else ()
     units = {item.name: f" {item.metadata['unit']}" for item in fields if item.metadata.get("unit")}
-    own = {key: value for key, value in content.items() if key not in (*ENVELOPE, "topic")}
+    hidden = (*ENVELOPE, "topic")
+    known = {key: value for key, value in content.items() if key not in hidden and value is not None}
+    own = {key: value for key, value in known.items() if not (isinstance(value, str) and not value)}
     return "  ".join(f"{key} {_value(value)}{units.get(key, '')}" for key, value in own.items())
 
 
@@ -174,4 +248,4 @@ def _value(value: object) -> str:
     return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
-_BODIES = {"eit.estimate": _estimate, "skin.shear": _shear, "health": _health}
+_BODIES = {"eit.estimate": _estimate, "skin.shear": _shear, "loop.state": _loop, "health": _health}

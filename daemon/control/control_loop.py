@@ -8,7 +8,16 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from shearloop.daemon.control.controller import WristCommand
-from shearloop.daemon.control.experiment import ACTIVE, Action, Experiment, ExperimentPhase, GripTo, Hold, TrackTorque
+from shearloop.daemon.control.experiment import (
+    ACTIVE,
+    Action,
+    Experiment,
+    ExperimentPhase,
+    GripTo,
+    Hold,
+    StepCommand,
+    TrackTorque,
+)
 from shearloop.daemon.control.experiment_schema import (
     ExperimentFile,
     ExperimentLimits,
@@ -17,6 +26,7 @@ from shearloop.daemon.control.experiment_schema import (
     first_turn_before_grip,
 )
 from shearloop.daemon.control.fault_detection import (
+    Grip,
     LatestInputs,
     Watched,
     compared_for_s,
@@ -65,6 +75,8 @@ class _Grip:
 
     # The wrist's angle at the grip.
     origin_rad: float | None = None
+    # When the latest grip, release or tare ended, until each torque has been measured since, or should have been.
+    unmeasured_since_ns: int | None = None
     # Whether a tool should be between the fingers.
     expected: bool = False
     # A stop has opened the gripper, or why it did not open, until the operator acknowledges it.
@@ -158,21 +170,20 @@ class ControlLoop:
 
     def on_action_ended(self, error: str = "") -> None:
         """Take the end of the present action, with its error if it failed."""
-        experiment = self.experiment
+        experiment, arm = self.experiment, self.inputs.arm
         if experiment is None or not experiment.end_action(error) or error:
             return
-        match experiment.command.action:
-            case TareStep():
-                # The tool was identified with another zero.
-                self._forget_tool()
-            case GripTo(expect_object=expected):
-                arm, gripper = self.inputs.arm, self.inputs.gripper
-                self._grip.origin_rad = arm.wrist_rad if arm is not None else None
-                # An unexpected object is watched as well.
-                self._grip.expected = expected or (gripper is not None and gripper.holding)
-                self._forget_tool()
-            case _:
-                pass
+        action, grip = experiment.command.action, self._grip
+        if not isinstance(action, TareStep | GripTo):
+            return
+        # The tool was identified with another zero, or in another grip.
+        self._forget_tool()
+        grip.unmeasured_since_ns = arm.t_ns if arm is not None else None
+        if isinstance(action, GripTo):
+            gripper = self.inputs.gripper
+            grip.origin_rad = arm.wrist_rad if arm is not None else None
+            # An unexpected object is watched as well.
+            grip.expected = action.expect_object or (gripper is not None and gripper.holding)
 
     def on_release_ended(self, error: str = "") -> None:
         """Take the end of the release after a stop, with its error if the gripper did not open."""
@@ -201,7 +212,7 @@ class ControlLoop:
         # Without a gripper of ours the tool is held by other means; with one, it may hold a tool already.
         gripper = self.inputs.gripper
         expected = "gripper" not in watched.required or (gripper is not None and gripper.holding)
-        self._grip = _Grip(expected=expected, release_error=self._grip.release_error)
+        self._grip = _Grip(unmeasured_since_ns=t_ns, expected=expected, release_error=self._grip.release_error)
         return None
 
     def pause(self) -> str | None:
@@ -231,12 +242,13 @@ class ControlLoop:
             watched = replace(watched, limits=experiment.limits)
         if experiment is not None and active:
             command, controller = experiment.command, self.wrist.controller
-            gripped = grip.expected and not isinstance(command.action, GripTo)
-            turns = not isinstance(command.wrist, Hold) or isinstance(command.action, IdentifyStep)
+            state = Grip.HELD if grip.expected else Grip.NONE
+            state = Grip.CHANGING if isinstance(command.action, GripTo) else state
+            needed = state is Grip.HELD and _turns(command) and not self._awaited_torques(experiment, t_ns)
             watched = replace(
                 watched,
-                gripped=gripped,
-                torque_needed=gripped and turns and experiment.phase is ExperimentPhase.RUNNING,
+                grip=state,
+                torque_needed=needed and experiment.phase is ExperimentPhase.RUNNING,
                 twisted_rad=0.0 if arm is None or grip.origin_rad is None else arm.wrist_rad - grip.origin_rad,
                 expected_nm=controller.torque_nm if controller is not None else None,
                 overdue=experiment.overdue,
@@ -247,6 +259,8 @@ class ControlLoop:
             found.append(Fault(FaultCode.NOT_RELEASED, grip.release_error))
         if experiment is None or not active:
             # Nothing moves: faults are reported, and only a stop of an experiment waits for the operator.
+            if arm is not None and arm.enabled_by_start:
+                found = [fault for fault in found if fault.code is not FaultCode.ROBOT_BLOCKED]
             return self._ended(self.safety.report(found))
         decision = self.safety.judge(found, t_ns)
         if decision.response >= Response.STOP_AND_KEEP_GRIP:
@@ -273,13 +287,14 @@ class ControlLoop:
             grip.origin_rad = wrist_rad
         latest = self.inputs.torques.get(experiment.file.torque_source)
         torque_nm = latest.torque_nm if latest is not None and not held else None
-        experiment.update(t_ns, wrist_rad - grip.origin_rad, torque_nm, gripped_at_rad=grip.origin_rad, held=held)
+        stands = held or bool(self._awaited_torques(experiment, t_ns))
+        experiment.update(t_ns, wrist_rad - grip.origin_rad, torque_nm, gripped_at_rad=grip.origin_rad, held=stands)
         command = experiment.command
-        turns = not isinstance(command.wrist, Hold) or isinstance(command.action, IdentifyStep)
         # A tool that the gripper holds is watched. After a stop, the gripper's doubt may arrive only now.
-        if turns and not grip.expected and (uncertain := self._why_uncertain()):
+        if _turns(command) and not grip.expected and (uncertain := self._why_uncertain()):
             experiment.fail(f"{uncertain}; put a `grip` or a `release` before it")
-        still = held or experiment.phase is ExperimentPhase.PAUSED
+        awaited = self._awaited_torques(experiment, t_ns)
+        still = held or bool(awaited) or experiment.phase is ExperimentPhase.PAUSED
         if isinstance(command.wrist, TrackTorque) and wrist.tracked != command.wrist and not still:
             reason = wrist.close_loop(command.wrist, t_ns, wrist_rad, experiment.limits.torque_nm)
             if reason:
@@ -300,8 +315,30 @@ class ControlLoop:
                     return self._ended(decision)
         else:
             velocity = wrist.turn(command.wrist, t_ns, wrist_rad, grip.origin_rad)
-        self.status = LoopStatus("held" if held else experiment.phase.value, command.activity, velocity, decision)
+        phase = "held" if held else experiment.phase.value
+        self.status = LoopStatus(phase, awaited or command.activity, velocity, decision)
         return ControlOutput(velocity.speed_rad_per_s, hold=still, action=action)
+
+    def _awaited_torques(self, experiment: Experiment, t_ns: int) -> str:
+        """Return which torques a step that turns the tool waits for after a grip or a tare, or an empty string.
+
+        An estimator needs some frames of the new grip; a source without a torque after its `warm_up_s` is a fault.
+        """
+        since_ns = self._grip.unmeasured_since_ns
+        if since_ns is None or not (self._grip.expected and _turns(experiment.command)):
+            return ""
+        awaited, reason = [], ""
+        for name, source in self._sources.items():
+            latest = self.inputs.torques.get(name)
+            measured = latest is not None and latest.torque_nm is not None and latest.t_mid_ns >= since_ns
+            due = t_ns - since_ns < source.warm_up_s * 1e9 and name not in self.inputs.lost
+            if due and source.measures_torque and not measured:
+                awaited.append(name)
+                reason = latest.reason if latest is not None else ""
+        if not awaited:
+            self._grip.unmeasured_since_ns = None
+            return ""
+        return f"waiting for the first torque of {', '.join(awaited)}{f': {reason}' if reason else ''}"
 
     def _forget_tool(self) -> None:
         self.wrist.reset()
@@ -316,3 +353,7 @@ class ControlLoop:
         release = decision.response is Response.STOP_AND_RELEASE and not self._grip.released
         self._grip.released |= release
         return ControlOutput(stop=True, release=release)
+
+
+def _turns(command: StepCommand) -> bool:
+    return not isinstance(command.wrist, Hold) or isinstance(command.action, IdentifyStep)

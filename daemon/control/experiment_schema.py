@@ -1,11 +1,11 @@
 """The experiment file: its limits and its steps, as pydantic models with bounds that the rig can keep."""
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, WithJsonSchema
 
-from shearloop.daemon.config_file import ConfigModel, either
+from shearloop.daemon.config_file import ConfigModel, either, not_of_kind
 
 MOST_ANGLES = 1000
 
@@ -26,33 +26,50 @@ def _angles(given: object) -> object:
     return tuple(np.linspace(start, stop, steps).tolist())
 
 
-Angles = Annotated[tuple[float, ...], BeforeValidator(_angles), Field(min_length=1)]
+LARGEST_ANGLE_RAD = 6.28
+Angle = Annotated[float, Field(ge=-LARGEST_ANGLE_RAD, le=LARGEST_ANGLE_RAD)]
+_ANGLE = {"type": "number", "minimum": -LARGEST_ANGLE_RAD, "maximum": LARGEST_ANGLE_RAD}
+Angles = Annotated[
+    tuple[Angle, ...],
+    Field(min_length=1),
+    BeforeValidator(_angles),
+    WithJsonSchema(
+        {
+            "description": "one angle, a list, or START:STOP:STEPS",
+            "anyOf": [
+                _ANGLE,
+                {"type": "array", "items": _ANGLE, "minItems": 1},
+                {"type": "string", "pattern": "^[^:]+:[^:]+:[^:]+$"},
+            ],
+        }
+    ),
+]
 Seconds = Annotated[float, Field(ge=0, le=24 * 3600)]
 TorqueNm = Annotated[float, Field(ge=-5, le=5)]
 PositiveTorqueNm = Annotated[float, Field(gt=0, le=5)]
-WristSpeed = Annotated[float, Field(gt=0, le=3.14, description="rad/s")]
-Pose = Annotated[tuple[float, float, float, float, float, float], Field(description="x, y, z in m; rotation vector")]
+WristSpeed = Annotated[float, Field(gt=0, le=3.14, description="speed of the wrist")]
+Pose = tuple[float, float, float, float, float, float]
 
 
 class ExperimentLimits(ConfigModel):
     """Limits of all steps; a step's limits can only be tighter."""
 
-    torque_nm: PositiveTorqueNm = 0.5
+    torque_nm: PositiveTorqueNm = Field(default=0.5, description="a larger torque stops the motion")
     angle_rad: Annotated[float, Field(gt=0, le=6.28, description="from the angle at which the tool was gripped")] = 3.2
 
 
 class _Step(ConfigModel):
-    timeout_s: Annotated[float, Field(gt=0, le=24 * 3600)] | None = None
-    limits: ExperimentLimits | None = None
+    timeout_s: float | None = Field(None, gt=0, le=24 * 3600, description="a longer step stops the experiment")
+    limits: ExperimentLimits | None = Field(None, description="tighter limits for this step")
 
 
 class ApproachStep(_Step):
     """Move the tool centre in a straight line, to a pose or by a distance along the tool's axis."""
 
     do: Literal["approach"]
-    pose_m_rad: Pose | None = None
-    along_tool_m: Annotated[float, Field(ge=-0.5, le=0.5)] | None = None
-    speed_m_per_s: Annotated[float, Field(gt=0, le=0.5)] = 0.1
+    pose_m_rad: Pose | None = Field(None, description="x, y, z and rotation vector; else `along_tool_m`")
+    along_tool_m: float | None = Field(None, ge=-0.5, le=0.5, description="along the tool's axis; else `pose_m_rad`")
+    speed_m_per_s: float = Field(0.1, gt=0, le=0.5, description="speed of the tool centre")
 
     _one_end = either("pose_m_rad", "along_tool_m")
 
@@ -67,10 +84,10 @@ class GripStep(_Step):
     """Close to a width, or onto an object in between."""
 
     do: Literal["grip"]
-    width_mm: Annotated[float, Field(ge=0, le=140)] = 0.0
-    speed_mm_per_s: Annotated[float, Field(ge=30, le=250)] = 60.0
-    force_n: Annotated[float, Field(ge=10, le=125)] = 20.0
-    expect_object: bool = True
+    width_mm: float = Field(0.0, ge=0, le=140, description="width to close to")
+    speed_mm_per_s: float = Field(60.0, ge=30, le=250, description="speed of the fingers")
+    force_n: float = Field(20.0, ge=10, le=125, description="largest force of the fingers")
+    expect_object: bool = Field(True, description="closing on nothing is an error")
 
 
 class TareStep(_Step):
@@ -83,7 +100,7 @@ class IdentifyStep(_Step):
     """Measure stiffness, delay and noise of the gripped tool, with small twists."""
 
     do: Literal["identify"]
-    amplitude_rad: Annotated[float, Field(gt=0, le=0.6)] = 0.2
+    amplitude_rad: float = Field(0.2, gt=0, le=0.6, description="largest angle of the twists")
 
 
 class TwistStep(_Step):
@@ -93,16 +110,16 @@ class TwistStep(_Step):
     angles_rad: Angles
     absolute: bool = Field(False, description="angles of the wrist joint, not from the angle at the grip")
     speed_rad_per_s: WristSpeed = 0.2
-    hold_s: Seconds = 2.0
-    return_to_start: bool = True
-    repeats: Annotated[int, Field(ge=1, le=1000)] = 1
+    hold_s: Seconds = Field(2.0, description="time at each angle")
+    return_to_start: bool = Field(True, description="turn back after each round")
+    repeats: int = Field(1, ge=1, le=1000, description="rounds over all angles")
 
 
 class TurnToStep(_Step):
     """Turn the wrist joint to an angle, before a tool is gripped."""
 
     do: Literal["turn_to"]
-    angle_rad: Annotated[float, Field(ge=-6.28, le=6.28)]
+    angle_rad: float = Field(ge=-6.28, le=6.28, description="angle of the wrist joint")
     speed_rad_per_s: WristSpeed = 0.4
 
 
@@ -110,33 +127,33 @@ class HoldTorqueStep(_Step):
     """Ramp the torque to a set point, and hold it in closed loop."""
 
     do: Literal["hold_torque"]
-    torque_nm: TorqueNm
-    ramp_nm_per_s: Annotated[float, Field(gt=0, le=1)] = 0.05
-    hold_s: Seconds = 10.0
+    torque_nm: TorqueNm = Field(description="the set point; counterclockwise is positive")
+    ramp_nm_per_s: float = Field(0.05, gt=0, le=1, description="rise of the set point")
+    hold_s: Seconds = Field(10.0, description="time at the set point")
 
 
 class TightenStep(_Step):
     """Turn until a torque or an angle is reached."""
 
     do: Literal["tighten"]
-    until_torque_nm: PositiveTorqueNm
-    until_angle_rad: Annotated[float, Field(gt=0, le=6.28)]
+    until_torque_nm: PositiveTorqueNm = Field(description="the turn ends at this torque")
+    until_angle_rad: float = Field(gt=0, le=6.28, description="the turn ends at this angle")
     speed_rad_per_s: WristSpeed = 0.05
-    direction: Literal["clockwise", "counterclockwise"] = "clockwise"
+    direction: Literal["clockwise", "counterclockwise"] = Field("clockwise", description="direction of the turn")
 
 
 class ReleaseStep(_Step):
     """Open the gripper."""
 
     do: Literal["release"]
-    width_mm: Annotated[float, Field(ge=0, le=140)] = 140.0
+    width_mm: float = Field(140.0, ge=0, le=140, description="width to open to")
 
 
 class WaitStep(_Step):
     """Stand still for a time."""
 
     do: Literal["wait"]
-    wait_s: Seconds
+    wait_s: Seconds = Field(description="time to stand still")
 
 
 Step = Annotated[
@@ -158,19 +175,21 @@ Step = Annotated[
 class ExperimentFile(ConfigModel):
     """One experiment: its torque source, its limits and its steps in order."""
 
-    name: Annotated[str, Field(min_length=1, max_length=80)]
+    what: ClassVar[str] = "experiment"
+
+    _kind = not_of_kind("a configuration", "name this experiment in it as `experiment`", "fingertips", "skin")
+
+    name: str = Field(min_length=1, max_length=80, description="shown in messages and recordings")
     torque_source: Annotated[str, Field(min_length=1)] = Field(
         "right", description="torque that drives the loop: a fingertip's name, `skin`, `load_cell` or `wrench`"
     )
-    limits: ExperimentLimits = ExperimentLimits()
-    tool_mm: Annotated[float, Field(gt=0, lt=140)] | None = Field(
-        None, description="diameter of the tool; recordings store it, and calibrations use it"
-    )
+    limits: ExperimentLimits = Field(ExperimentLimits(), description="limits of all steps")
+    tool_mm: float | None = Field(None, gt=0, lt=140, description="diameter of the tool, for recordings")
     slices: Literal["torque", "diameter"] | None = Field(
         None,
         description="kind of samples that `shearloop run --slices DIR` stores for each held angle; none by default",
     )
-    steps: Annotated[tuple[Step, ...], Field(min_length=1)]
+    steps: tuple[Step, ...] = Field(min_length=1, description="the steps in order")
 
     def limits_of(self, step: Step) -> ExperimentLimits:
         """Return the tighter of the experiment's limits and the step's."""
@@ -190,18 +209,17 @@ def first_turn_before_grip(file: ExperimentFile) -> int | None:
     return None
 
 
-def check_limits(file: ExperimentFile) -> str:
-    """Return a sentence on the first step that exceeds its limits, or an empty string."""
+def check_limits(file: ExperimentFile) -> list[str]:
+    """Return a sentence on each step that exceeds its limits."""
+    found = []
     for number, step in enumerate(file.steps):
         limits, (torque_nm, angle_rad) = file.limits_of(step), _reach(step)
         torque = torque_nm, limits.torque_nm, "N·m", "torque_nm"
         for value, limit, unit, key in (torque, (angle_rad, limits.angle_rad, "rad", "angle_rad")):
             if value >= limit:
-                return (
-                    f"`steps[{number}]` ({step.do}) asks for {value:g} {unit}, and its limit is {limit:g} {unit}; "
-                    f"raise `limits.{key}`, or ask for less"
-                )
-    return ""
+                asks = f"steps[{number}]: {step.do} asks for {value:g} {unit}, and its limit is {limit:g} {unit}"
+                found.append(f"{asks}; raise limits.{key}, or ask for less")
+    return found
 
 
 def _reach(step: Step) -> tuple[float, float]:

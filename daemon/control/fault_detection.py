@@ -3,6 +3,7 @@
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from enum import Enum
 
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopConfig, TorqueSample, TorqueSource
@@ -19,6 +20,14 @@ LATEST_LOOP_S = ARM_STALE_S - LONGEST_TICK_S
 # A longer absence is a paused process rather than a slow loop. CLOCK_MONOTONIC stands while the computer is suspended;
 # the devices that were lost report that case.
 AWAY_S = 1.0
+
+
+class Grip(Enum):
+    """What the fingers do with the tool."""
+
+    NONE = "none"
+    CHANGING = "changing"  # they open or close: a fingertip measures their motion, and no torque
+    HELD = "held"
 
 
 @dataclass(slots=True)
@@ -67,7 +76,7 @@ class Watched:
     required: tuple[str, ...] = ()
     # The wrist is driven by the torque, or twists under its limit.
     torque_needed: bool = False
-    gripped: bool = False
+    grip: Grip = Grip.NONE
     twisted_rad: float = 0.0
     expected_nm: float | None = None
     overdue: str = ""
@@ -96,12 +105,14 @@ def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_
         torque = inputs.torques.get(source.name)
         if torque is None or torque.torque_nm is None or abs(torque.torque_nm) <= limit_nm:
             continue
+        if watched.grip is Grip.CHANGING and source.warm_up_s:
+            continue
         if t_ns - torque.t_ns <= watched.fresh_s[source.name] * 1e9:
             beyond = f"{source.name} measured {torque.torque_nm:+.3f} N·m, the limit is {limit_nm:g} N·m"
-            found.append(Fault(FaultCode.TORQUE_LIMIT, beyond))
-    if watched.gripped and abs(watched.twisted_rad) > limit_rad:
+            found.append(Fault(FaultCode.TORQUE_LIMIT, beyond, t_ns=torque.t_mid_ns))
+    if watched.grip is Grip.HELD and abs(watched.twisted_rad) > limit_rad:
         turned = f"turned by {watched.twisted_rad:+.3f} rad since the grip, the limit is {limit_rad:g} rad"
-        found.append(Fault(FaultCode.ANGLE_LIMIT, turned))
+        found.append(Fault(FaultCode.ANGLE_LIMIT, turned, t_ns=inputs.arm.t_ns if inputs.arm is not None else None))
     found += _device_faults(inputs, watched, t_ns)
     for name, reason in watched.died.items():
         found.append(Fault(FaultCode.TASK_DIED, f"{name}: {reason}"))
@@ -131,7 +142,7 @@ def _torque_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t
         return found
     if watched.expected_nm is not None and abs(latest.torque_nm - watched.expected_nm) > config.max_innovation_nm:
         jumped = f"{source.name} measured {latest.torque_nm:+.3f} N·m where {watched.expected_nm:+.3f} N·m was expected"
-        found.append(Fault(FaultCode.ESTIMATE_JUMPED, jumped))
+        found.append(Fault(FaultCode.ESTIMATE_JUMPED, jumped, t_ns=latest.t_mid_ns))
     for other in watched.supervising:
         found += _disagreement(inputs, other, watched, config, t_ns)
     return found
@@ -148,7 +159,7 @@ def _unusable(inputs: LatestInputs, source: TorqueSource, allowed_s: float, t_ns
     came_s, measured_s = (t_ns - latest.t_ns) / 1e9, (t_ns - latest.t_mid_ns) / 1e9
     if came_s > allowed_s:
         silent = f"the last torque of {source.name} came {came_s:.1f} s ago, {allowed_s:.1f} s are allowed"
-        return Fault(FaultCode.ESTIMATE_STALE, silent)
+        return Fault(FaultCode.ESTIMATE_STALE, silent, t_ns=latest.t_ns)
     # A torque is half its acquisition old at its end. The rest of its age is transport: a board or an estimator that
     # falls behind sends on time, but old torques.
     oldest_s = allowed_s + 0.5 * max(source.window_s, source.period_s)
@@ -157,9 +168,11 @@ def _unusable(inputs: LatestInputs, source: TorqueSource, allowed_s: float, t_ns
             f"the last torque of {source.name} was measured {measured_s:.1f} s ago, {oldest_s:.1f} s are allowed; "
             f"it took {measured_s - came_s:.1f} s to come"
         )
-        return Fault(FaultCode.ESTIMATE_STALE, late)
+        return Fault(FaultCode.ESTIMATE_STALE, late, t_ns=latest.t_mid_ns)
     if latest.torque_nm is None and source.measures_torque:
-        return Fault(FaultCode.ESTIMATE_INVALID, f"{source.name} says: {latest.reason or 'nothing'}")
+        return Fault(
+            FaultCode.ESTIMATE_INVALID, f"{source.name} says: {latest.reason or 'nothing'}", t_ns=latest.t_mid_ns
+        )
     return None
 
 
@@ -186,7 +199,7 @@ def _disagreement(
         f"{slow.name} measured {latest.torque_nm:+.3f} N·m and {fast.name} {other_nm:+.3f} N·m, "
         f"{apart_nm:.3f} N·m apart where {config.disagreement_nm:g} are allowed"
     )
-    return [Fault(FaultCode.TORQUES_DISAGREE, apart)]
+    return [Fault(FaultCode.TORQUES_DISAGREE, apart, t_ns=latest.t_mid_ns)]
 
 
 def _device_faults(inputs: LatestInputs, watched: Watched, t_ns: int) -> list[Fault]:
@@ -203,22 +216,26 @@ def _device_faults(inputs: LatestInputs, watched: Watched, t_ns: int) -> list[Fa
     if arm is not None:
         if t_ns - arm.t_ns > ARM_STALE_S * 1e9:
             stale = f"the robot last reported its state {(t_ns - arm.t_ns) / 1e9:.2f} s ago"
-            found.append(Fault(FaultCode.STATE_STALE, stale))
+            found.append(Fault(FaultCode.STATE_STALE, stale, t_ns=arm.t_ns))
         elif arm.emergency_stop:
-            found.append(Fault(FaultCode.EMERGENCY_STOP, arm.blocked or "the controller reports it"))
+            found.append(Fault(FaultCode.EMERGENCY_STOP, arm.blocked or "the controller reports it", t_ns=arm.t_ns))
         elif arm.protective_stop:
-            found.append(Fault(FaultCode.PROTECTIVE_STOP, arm.blocked or "the controller reports it"))
+            found.append(Fault(FaultCode.PROTECTIVE_STOP, arm.blocked or "the controller reports it", t_ns=arm.t_ns))
+        elif arm.blocked and arm.starting:
+            starting = "safety, power and control program are made ready"
+            found.append(Fault(FaultCode.ROBOT_STARTING, starting, t_ns=arm.t_ns))
         elif arm.blocked:
-            found.append(Fault(FaultCode.ROBOT_BLOCKED, arm.blocked))
+            found.append(Fault(FaultCode.ROBOT_BLOCKED, arm.blocked, t_ns=arm.t_ns))
     if gripper is not None and has_gripper:
         age_s = (t_ns - gripper.t_ns) / 1e9
         if age_s > HAND_STALE_S:
-            found.append(Fault(FaultCode.STATE_STALE, f"the gripper last reported its state {age_s:.1f} s ago"))
+            silent = f"the gripper last reported its state {age_s:.1f} s ago"
+            found.append(Fault(FaultCode.STATE_STALE, silent, t_ns=gripper.t_ns))
         elif gripper.fault:
-            found.append(Fault(FaultCode.GRIPPER_FAULT, gripper.fault))
-        elif watched.gripped and not gripper.holding:
+            found.append(Fault(FaultCode.GRIPPER_FAULT, gripper.fault, t_ns=gripper.t_ns))
+        elif watched.grip is Grip.HELD and not gripper.holding:
             empty = f"its fingers are {gripper.width_mm:.1f} mm apart with nothing between them"
-            found.append(Fault(FaultCode.GRIP_LOST, empty))
+            found.append(Fault(FaultCode.GRIP_LOST, empty, t_ns=gripper.t_ns))
     for name, reason in lost.items():
         if name in watched.required and name not in awaited:
             gone = (FaultCode.ROBOT_LOST, reason) if name == "robot" else (FaultCode.DEVICE_LOST, f"{name}: {reason}")

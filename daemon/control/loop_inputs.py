@@ -19,19 +19,17 @@ class LoopConfig(ConfigModel):
     allowed_noise_nm: float = Field(default=0.0025, gt=0, le=1, description="true torque's std that noise may cause")
     kp: float | None = Field(default=None, gt=0, le=1, description="fixes the gain, which else follows from the noise")
     deadband_nm: float = Field(default=0.001, ge=0, le=1, description="error below which the wrist rests")
-    disagreement_nm: float = Field(default=0.05, gt=0, le=5)
-    max_innovation_nm: float = Field(default=0.08, gt=0, le=5)
-    max_offset_drift_nm: float = Field(
-        default=0.06, gt=0, le=5, description="drift of the torque at a fixed angle: slip"
-    )
-    wrist_speed_rad_per_s: float = Field(default=0.5, gt=0, le=3.14)
+    disagreement_nm: float = Field(default=0.05, gt=0, le=5, description="largest difference of two torque sources")
+    max_innovation_nm: float = Field(default=0.08, gt=0, le=5, description="largest error of the expected torque")
+    max_offset_drift_nm: float = Field(default=0.06, gt=0, le=5, description="drift at a fixed angle: slip")
+    wrist_speed_rad_per_s: float = Field(default=0.5, gt=0, le=3.14, description="largest wrist speed of the loop")
     stale_after_s: float = Field(default=0.1, ge=0, le=10, description="no torque that is younger counts as stale")
     wrist_acceleration_rad_per_s2: float = Field(default=4.0, gt=0, le=1000, description="given to the robot")
     angle_bandwidth_per_s: float = Field(default=5.0, gt=0, le=80, description="how fast the wrist approaches an angle")
     torque_bandwidth_per_s: float = Field(default=4.0, gt=0, le=30, description="how fast it approaches a torque")
     actuation_s: float = Field(default=0.02, ge=0, le=0.2, description="from sending a speed until the angle shows it")
-    gain_margin: float = Field(default=2.0, ge=1, le=100)
-    phase_margin_deg: float = Field(default=45.0, ge=0, le=90)
+    gain_margin: float = Field(default=2.0, ge=1, le=100, description="least gain margin, as a factor")
+    phase_margin_deg: float = Field(default=45.0, ge=0, le=90, description="least phase margin")
 
     @property
     def planned_acceleration_rad_per_s2(self) -> float:
@@ -103,6 +101,10 @@ class ArmStatus:
     protective_stop: bool = False
     emergency_stop: bool = False
     blocked: str = ""
+    # The robot is being unlocked, powered or started.
+    starting: bool = False
+    # Nothing but the start of an experiment is missing: it enables the arm.
+    enabled_by_start: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +129,8 @@ class TorqueSource:
 
     `has_friction_band`: friction hides the torque within a band; the wrist turns through it without a change.
     `from_robot`: the torque comes with the robot's state, so its age is checked there. `measures_torque` is False for a
-    fingertip without a calibration; a silent one is a fault all the same.
+    fingertip without a calibration; a silent one is a fault all the same. `warm_up_s`: the longest time from a grip to
+    the first torque; 0 for a source that measures without a grip.
     """
 
     name: str
@@ -136,3 +139,4 @@ class TorqueSource:
     has_friction_band: bool = False
     from_robot: bool = False
     measures_torque: bool = True
+    warm_up_s: float = 0.0

@@ -9,16 +9,18 @@ import structlog
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
-from shearloop.daemon.control.experiment import Action, Experiment, GripTo
+from shearloop.daemon.control.experiment import Action, Experiment, ExperimentPhase, GripTo
 from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, TareStep
 from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
-from shearloop.daemon.messaging.messages import LoopState, RobotStateMessage
+from shearloop.daemon.control.stop_timeline import StopTimeline
+from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateMessage
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH
-from shearloop.daemon.taring import Tareable, tare_all
+from shearloop.daemon.taring import LONGEST_TARE_S, Tareable, tare_all
 from shearloop.drivers.ur.client import UrRobot
+from shearloop.drivers.ur.command_handler import NOT_ENABLED
 from shearloop.drivers.ur.messages import (
     ARRIVED,
     STOPPED_ON_COMMAND,
@@ -50,6 +52,8 @@ RELEASED_WITHIN_S = 7.0
 LINEAR_ACCELERATION_M_PER_S2 = 0.3
 # The arm rests within this time after a stop, unless something else moves it.
 COMES_TO_REST_S = 2.0
+# A tare gives up this much before its step is overdue, so that the sensors' reasons are reported.
+GIVES_UP_BEFORE_S = 0.1
 
 
 def wrench_source(rate_hz: float) -> TorqueSource:
@@ -76,7 +80,8 @@ class ControlLoopRunner:
         self._clock = clock
         self._dead_tasks = dead_tasks
         self._acceleration_rad_per_s2 = control_loop.config.wrist_acceleration_rad_per_s2
-        self._velocity = CommandSender(robot, control_loop)
+        self._stops = StopTimeline()
+        self._velocity = CommandSender(robot, control_loop, self._stops, clock)
         self._actions = ActionExecutor(robot, gripper, sensors, self._velocity, control_loop)
         self._states = StatePublisher(publisher, control_loop)
         self._running = False
@@ -110,7 +115,13 @@ class ControlLoopRunner:
             raise
         finally:
             self._running = False
+            self._states.publish_stop(self._stops.end())
             await self._actions.close()
+
+    def stop(self, reason: str) -> None:
+        """End the experiment on request, at the next decision."""
+        self._stops.request(self._clock.now_ns())
+        self._control_loop.stop(reason)
 
     def decide_now(self) -> None:
         """Decide without a new state, at the daemon's end."""
@@ -141,15 +152,19 @@ class ControlLoopRunner:
         """Return the present or the next experiment once it has ended."""
         while (experiment := self._control_loop.experiment) is None:
             await self._states.changed.wait()
-        while experiment.running:
+        while experiment.running or self._stops.pending:
             await self._states.changed.wait()
         return experiment
 
     async def halt_and_wait(self) -> None:
-        """Halt moving fingers, and wait for the end of the last release or halt."""
+        """Halt moving fingers, and wait for the end of the last release or halt, and for the arm's standstill."""
         if self._actions.fingers_move:
             self._actions.cancel()
         await self._actions.halt_and_wait()
+        with suppress(TimeoutError):
+            async with asyncio.timeout(BRAKE_S):
+                while self._running and self._stops.pending:
+                    await self._states.changed.wait()
 
     async def unlock(self) -> str | None:
         """Enable robot and gripper after a stop, on the operator's command; return None, or why not."""
@@ -171,6 +186,8 @@ class ControlLoopRunner:
                 protective_stop=state.protective_stop,
                 emergency_stop=state.emergency_stop,
                 blocked=state.blocked,
+                starting=state.recovering,
+                enabled_by_start=state.blocked == NOT_ENABLED,
             )
         )
         if self._states.publish_robot(state):
@@ -185,7 +202,7 @@ class ControlLoopRunner:
         self._decided_ns = now_ns
         output = self._control_loop.tick(now_ns, max(0.0, late_s), self._dead_tasks)
         if output.stop:
-            self._stop(output)
+            self._stop(output, now_ns)
         else:
             self._stopped = False
             if not output.hold:
@@ -196,10 +213,14 @@ class ControlLoopRunner:
                 self._actions.begin(output.action)
             self._velocity.send(WristSpeed(output.wrist_rad_per_s, self._acceleration_rad_per_s2, now_ns))
         self._states.publish_loop(self._velocity.sent_rad_per_s, now_ns)
+        self._states.publish_stop(self._stops.update(self._robot.state, now_ns))
 
-    def _stop(self, output: ControlOutput) -> None:
+    def _stop(self, output: ControlOutput, now_ns: int) -> None:
         if not self._stopped:
             self._stopped = True
+            experiment, status = self._control_loop.experiment, self._control_loop.status
+            if experiment is not None and experiment.phase is ExperimentPhase.STOPPED:
+                self._stops.begin(experiment.file.name, status.activity, status.decision, now_ns)
             self._actions.cancel()
             self._velocity.send(Stop(self._acceleration_rad_per_s2))
         if output.release:
@@ -218,13 +239,15 @@ class ControlLoopRunner:
 class CommandSender:
     """Sends wrist velocities and stops to the robot's process, and reports the results to the control loop."""
 
-    def __init__(self, robot: UrRobot, control_loop: ControlLoop) -> None:
+    def __init__(self, robot: UrRobot, control_loop: ControlLoop, stops: StopTimeline, clock: Clock) -> None:
         # The speed that the robot's process accepted last.
         self.sent_rad_per_s = 0.0
         # Commands that wait for their replies.
         self.unanswered = 0
         self._robot = robot
         self._control_loop = control_loop
+        self._stops = stops
+        self._clock = clock
 
     def send(self, command: WristSpeed | Stop) -> None:
         """Send a stop of the arm, or a wrist speed.
@@ -248,6 +271,8 @@ class CommandSender:
                 self._control_loop.on_command_unanswered(reply.refusal)
             elif not reply.accepted:
                 self._control_loop.on_command_refused(reply.refusal)
+            if isinstance(reply.sent, Stop):
+                self._stops.on_sent(self._clock.now_ns())
             self.sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
             self._control_loop.on_speed_sent(self.sent_rad_per_s)
         except Exception as error:  # noqa: BLE001 - the next decision ends the experiment
@@ -368,10 +393,12 @@ class ActionExecutor:
                 self.fingers_move = bool(error)
                 return error
             case TareStep():
+                loop, longest_s = asyncio.get_running_loop(), action.timeout_s or LONGEST_TARE_S
+                until_s = loop.time() + longest_s - GIVES_UP_BEFORE_S
                 if error := await self._rest():
                     return error
                 reply = await self._robot.send(ZeroForceTorque())
-                return reply.refusal if not reply.accepted else await tare_all(self._sensors)
+                return reply.refusal if not reply.accepted else await tare_all(self._sensors, until_s - loop.time())
             case _:
                 raise TypeError(f"{action} is not an action of the devices")
 
@@ -458,6 +485,7 @@ class StatePublisher:
             t_mono_ns=state.t_mono_ns,
             joints_rad=state.q_rad,
             tcp_pose=state.tcp_pose,
+            tcp_speed_m_per_s=state.tcp_speed_m_per_s,
             wrench=state.wrench,
             wrist_rad=state.wrist_rad,
             wrist_speed_rad_per_s=state.qd_rad_per_s[5],
@@ -465,6 +493,9 @@ class StatePublisher:
             robot_mode=state.robot_mode,
             safety_mode=state.safety_mode,
             speed_scaling=state.speed_scaling,
+            payload_kg=state.payload_kg,
+            payload_cog_m=state.payload_cog_m,
+            tcp_offset=state.tcp_offset,
             protective_stop=state.protective_stop,
             emergency_stop=state.emergency_stop,
             blocked=state.blocked,
@@ -492,6 +523,15 @@ class StatePublisher:
             )
         self._key, self._hold, self._published_ns = key, hold, now_ns
         self._publisher.publish(loop_state(self._control_loop, sent_rad_per_s, now_ns))
+        self._notify()
+
+    def publish_stop(self, stop: LoopStop | None) -> None:
+        """Publish the times of a stop, if there is one."""
+        if stop is not None:
+            self._publisher.publish(stop)
+            self._notify()
+
+    def _notify(self) -> None:
         # Wake the present waiters only.
         self.changed.set()
         self.changed.clear()

@@ -5,7 +5,7 @@ the task that meets it, and `TASK_DIED` is a row.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum
 
 
@@ -113,6 +113,9 @@ class FaultCode(Enum):
         "a device that the experiment needs is not connected yet: {detail}.",
         "Switch it on and connect it; it is found automatically. `shearloop doctor CONFIG` examines it.",
     )
+    ROBOT_STARTING = Rule(
+        _KEEP, "the robot is not ready yet: {detail}.", "Wait a few seconds, then start the experiment again."
+    )
     DEVICE_LOST = Rule(
         _KEEP,
         "a device that the experiment needs is gone: {detail}.",
@@ -193,6 +196,8 @@ class Fault:
     code: FaultCode
     detail: str
     is_consequence: bool = False
+    # When its cause was measured (CLOCK_MONOTONIC), if a measurement shows it.
+    t_ns: int | None = field(default=None, compare=False)
 
     @property
     def rule(self) -> Rule:

@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS
 from shearloop.bank.errors import BankError
 from shearloop.bank.skin.calibration import load_calibration
 from shearloop.daemon.config import CombinedConfig, CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
@@ -30,7 +29,6 @@ from shearloop.daemon.doctor.devices import (
     trouble,
 )
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.addresses import stop_address
 from shearloop.daemon.sensing.estimators import open_combined, open_estimator
 from shearloop.daemon.serial_ports import list_serial_ports
 from shearloop.drivers.errors import DriverError
@@ -64,8 +62,7 @@ def examine(config_path: Path | None, seconds: float, geometry: Path | None = No
     yield good("configuration", f"{config_path} is in order")
     yield check_disk(Path() if config.recording is None else config.recording.folder)
     yield from check_files(config, geometry)
-    on_network = "commands" in config.network_addresses
-    tasks = daemon_tasks(stop_address(config.commands) if on_network else config.commands)
+    tasks = daemon_tasks(config.commands)
     if tasks is not None:
         yield good("daemon", f"answers at {config.commands}; it holds the devices and reports on them")
         received = {} if "publish" in config.network_addresses else listen(config.publish, seconds)
@@ -190,14 +187,14 @@ def check_bank(name: str, fingertip: FingertipConfig, geometry: Path | None = No
         return from_error(subject, error, "no frame can be matched")
     found = (
         f"{fingertip.bank} is intact, {int(bank.valid.sum())} of {bank.valid.size} cells valid, channel table "
-        f"{CHANNEL_TABLE_HASH[:12]} with {N_CHANNELS} channels, geometry {bank.geometry_hash[:12]}"
+        f"{bank.table.digest[:12]} with {bank.table.n_channels} channels, geometry {bank.geometry_hash[:12]}"
     )
     if geometry is None:
         return good(subject, found)
     from shearloop.daemon.bank_config import load_geometry
 
     try:
-        digest = load_geometry(geometry).digest
+        digest = load_geometry(geometry).mesh.digest
     except (UserError, BankError) as error:
         return from_error(subject, error, "the bank cannot be compared with it")
     if digest != bank.geometry_hash:

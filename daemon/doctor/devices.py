@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import errno
 import os
 import time
 from collections import defaultdict
@@ -13,25 +14,27 @@ from typing import Any, Literal
 
 import numpy as np
 
-from shearloop.bank.eit.channels import ZERO_SLOTS
 from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.messages import TOPICS
+from shearloop.daemon.messaging.stop_socket import send_to_stop_socket
 from shearloop.daemon.rig import make_gripper_client
+from shearloop.daemon.sensing.estimators import fingertip_table
 from shearloop.daemon.serial_ports import access_error
 from shearloop.drivers.connection import find_port
 from shearloop.drivers.eit_kit import EitKit
-from shearloop.drivers.errors import DriverError
+from shearloop.drivers.errors import DriverError, times
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.messages import ActivationStatus
-from shearloop.drivers.ur.controller import query_controller
+from shearloop.drivers.ur.controller import query_controller, untested_sentence
 from shearloop.drivers.ur.settings import read_settings
 
 # A larger relative difference between measured and configured rate is reported.
 RATE_TOLERANCE = 0.1
 ROBOT_TIMEOUT_S = 2.0
 DAEMON_TIMEOUT_S = 1.0
+MISSING = os.strerror(errno.ENOENT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +64,8 @@ def from_error(subject: str, error: Exception | str, means: str) -> Finding:
 
 def from_file(subject: str, sentence: str, means: str) -> Finding:
     """Return the finding for a file; the sentence names all of its mistakes."""
-    return trouble(subject, sentence, means, "correct the file, then run `shearloop doctor CONFIG` again")
+    cure = "make the file, or correct its name" if MISSING in sentence else "correct the file"
+    return trouble(subject, sentence, means, f"{cure}, then run `shearloop doctor CONFIG` again")
 
 
 async def check_devices(config: DaemonConfig, seconds: float) -> list[Finding]:
@@ -90,7 +94,8 @@ def check_port(name: str, device: SerialDevice) -> Finding:
     try:
         path = find_port(serial_number=device.serial_number, path=str(device.path) if device.path else None)
     except DriverError as error:
-        return from_error(subject, error, "the board is not plugged in, or has another serial number")
+        cure = "plug the board in, or correct its name in the configuration: `shearloop ports` lists the boards"
+        return trouble(subject, str(error), "the board is not plugged in, or has another serial number", cure)
     denied = access_error(path)
     if denied:
         what, _, cure = denied.partition("; ")
@@ -116,7 +121,7 @@ def check_rate(subject: str, measured_hz: float | None, configured_hz: float) ->
 def check_channels(name: str, saturated: int, dead: int, frames: int) -> Finding:
     """Judge the numbers of saturated and dead channels."""
     subject = f"channels of {name}"
-    found = f"{saturated} saturated and {dead} dead of 896 in {frames} frames"
+    found = f"{saturated} saturated and {dead} dead of the channels in {frames} frames"
     if saturated:
         means = "more signal than the converter can measure: a short, or too much current; every estimate lacks them"
         cure = "look for bridges at the electrodes' connector; wet the gel; lower the injected current"
@@ -141,7 +146,11 @@ async def _check_fingertip(name: str, config: FingertipConfig, seconds: float) -
     port = check_port(name, config.device)
     if port.state == "trouble":
         return [port]
-    board = EitKit(zero_slots=ZERO_SLOTS, frame_period_s=config.frame_period_s, **config.device.model_dump())
+    board = EitKit(
+        zero_slots=fingertip_table(config).zero_slots,
+        frame_period_s=config.frame_period_s,
+        **config.device.model_dump(),
+    )
     frames = await _received(board.readings(), seconds)
     facts = board.diagnostics()
     if not frames and facts["last_loss"]:
@@ -202,7 +211,12 @@ def _check_robot(settings: Path) -> Iterator[Finding]:
     except DriverError as error:
         yield from_error("robot", error, "the robot cannot be driven")
         return
-    yield good("robot", f"{host} answers, PolyScope {seen.version}")
+    answers = f"{host} answers, PolyScope {seen.version}"
+    if untested := untested_sentence(seen.version):
+        what, _, cure = untested.rpartition(": ")
+        yield note("robot", answers, what, cure.rstrip("."))
+    else:
+        yield good("robot", answers)
     if seen.remote is False:
         means = "it accepts no motion from the network"
         cure = "switch it to remote control, top right on the teach pendant"
@@ -232,7 +246,9 @@ def _rate_hz(times_ns: list[int]) -> float | None:
 def daemon_tasks(address: str) -> Mapping[str, Mapping[str, Any]] | None:
     """Return the status of a running daemon's tasks; None when no daemon answers."""
     try:
-        tasks = send_command(address, {"command": "status"}, DAEMON_TIMEOUT_S).get("tasks")
+        request = {"command": "status"}
+        reply = send_to_stop_socket(address, request, DAEMON_TIMEOUT_S)
+        tasks = (reply or send_command(address, request, DAEMON_TIMEOUT_S)).get("tasks")
     except UserError:
         return None
     return tasks if isinstance(tasks, dict) else {}
@@ -277,16 +293,16 @@ def check_daemon(
 def check_task(name: str, status: Mapping[str, Any]) -> Finding:
     """Judge one task by the counters that it reports."""
     subject = f"task {name}"
-    counted = ", ".join(f"{count} × {kind}" for kind, count in (status.get("errors") or {}).items() if count)
+    counted = ", ".join(f"{kind} {times(count)}" for kind, count in (status.get("errors") or {}).items() if count)
     reason = str(status.get("error") or status.get("last_loss") or "")
     restarts, last_error = status.get("restarts", 0), str(status.get("last_error", ""))
     read_log = "read the daemon's log; report it if it comes back"
     if status.get("alive") is False:
-        return trouble(subject, f"dead, {restarts} restarts", last_error, read_log)
+        return trouble(subject, f"dead, restarted {times(restarts)}" if restarts else "dead", last_error, read_log)
     if status.get("connected") is False:
         return trouble(subject, "its device is not connected", reason, "check its port, cable and power")
     if restarts:
-        return note(subject, f"alive after {restarts} restarts", last_error, read_log)
+        return note(subject, f"alive, restarted {times(restarts)}", last_error, read_log)
     if counted:
         means = reason or "refused data is not used"
         return note(subject, f"alive; refused: {counted}", means, "see docs/troubleshooting.md")

@@ -47,20 +47,6 @@ def needs_keys(address: str) -> bool:
     return address.startswith("tcp://") and urlsplit(address).hostname != "localhost" and not is_local(address)
 
 
-def local_stop_address(address: str) -> str:
-    """Return the socket that accepts `stop` without a key, for a daemon that takes its commands over the network.
-
-    It is an abstract Unix socket, open to all users of this machine, named after the port of `commands`.
-    """
-    return f"ipc://@shearloop-stop-{address.rpartition(':')[2]}"
-
-
-def stop_address(address: str) -> str:
-    """Return where to send `stop` without a key: the local stop socket if it exists, else the address itself."""
-    local = local_stop_address(address)
-    return local if probe("\0" + local.removeprefix("ipc://@")) == 0 else address
-
-
 def probe(path: str) -> int:
     """Return the error number of a connection to a Unix socket, 0 where a program listens."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:

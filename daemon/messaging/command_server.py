@@ -15,9 +15,9 @@ import structlog
 import zmq
 import zmq.asyncio
 
+from shearloop.daemon.messaging.connections import bind
 from shearloop.daemon.messaging.keys import KeyPair, Refusals
 from shearloop.daemon.messaging.messages import decode, encode
-from shearloop.daemon.messaging.publisher import bind
 
 LARGEST_REQUEST_BYTES = 64 * 1024
 MAX_CONCURRENT = 16
@@ -47,11 +47,15 @@ class TokenBucket:
     used: float = 0.0
     updated_ns: int = 0
 
-    def allow(self, t_ns: int) -> bool:
-        """Use one token at monotonic time t_ns; return False if no token is left."""
+    def has_token(self, t_ns: int) -> bool:
+        """Return whether a token is left at monotonic time t_ns."""
         self.used = max(0.0, self.used - self.per_s * (t_ns - self.updated_ns) / 1e9)
         self.updated_ns = t_ns
-        allowed = self.used <= self.burst - 1.0
+        return self.used <= self.burst - 1.0
+
+    def allow(self, t_ns: int) -> bool:
+        """Use one token at monotonic time t_ns; return False if no token is left."""
+        allowed = self.has_token(t_ns)
         self.used += allowed
         return allowed
 
@@ -75,43 +79,14 @@ class RateLimit:
         return bucket.allow(t_ns) and self._total.allow(t_ns)
 
 
-class CommandServer:
-    """Receives requests, passes them to handlers and sends the replies."""
+class RequestExecutor:
+    """Checks requests and executes commands; the sockets around it receive and reply."""
 
-    def __init__(
-        self,
-        context: zmq.asyncio.Context,
-        address: str,
-        handlers: Mapping[str, Handler],
-        refusals: Refusals,
-        keys: KeyPair | None = None,
-    ) -> None:
-        """Bind the socket; raises UserError if the address is in use, malformed, or needs keys."""
+    def __init__(self, handlers: Mapping[str, Handler], refusals: Refusals) -> None:
         self._handlers = handlers
+        self._refusals = refusals
         self._limit = RateLimit()
-        self.refused = refusals.counts
-        self._running: set[asyncio.Task[None]] = set()
-        self._socket = context.socket(zmq.ROUTER)
-        self._socket.setsockopt(zmq.LINGER, 100)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_REQUEST_BYTES)
-        bind(self._socket, address, "commands", keys)
-
-    async def run(self) -> None:
-        """Serve requests until cancelled; a slow command such as `unlock` does not delay a `stop`."""
-        async with asyncio.TaskGroup() as group:
-            while True:
-                parts = await self._socket.recv_multipart()
-                # Receiving a message that has already arrived does not yield to other tasks.
-                await asyncio.sleep(0)
-                # A DEALER sends two frames, a REQ three. Other counts are answered like a DEALER's.
-                route = parts[:2] if len(parts) == 3 and not parts[1] else parts[:1]
-                checked = self.check(parts[0], parts[len(route) :], time.monotonic_ns())
-                if isinstance(checked, dict):
-                    await self._reply(route, checked)
-                else:
-                    task = group.create_task(self._serve(route, *checked))
-                    self._running.add(task)
-                    task.add_done_callback(self._running.discard)
+        self._running = 0
 
     def check(self, client: bytes, frames: list[bytes], t_ns: int) -> tuple[str, Request] | Reply:
         """Return the name and content of a valid request, or the refusal; t_ns is the monotonic time."""
@@ -132,13 +107,14 @@ class CommandServer:
         if not isinstance(name, str) or name not in self._handlers:
             known, shown = ", ".join(sorted(self._handlers)), repr(name)[:40]
             return self._refuse("unknown command", f"there is no command {shown}; the commands are {known}")
-        if len(self._running) >= MAX_CONCURRENT:
+        if self._running >= MAX_CONCURRENT:
             return self._refuse("too many at once", "too many commands at once; wait")
         return name, request
 
     async def execute(self, name: str, request: Request) -> Reply:
         """Call the handler and return the reply; a handler's exception becomes a refusal."""
         log = structlog.get_logger()
+        self._running += 1
         try:
             reply = await self._handlers[name](request)
         except CommandRefusedError as error:
@@ -148,27 +124,67 @@ class CommandServer:
             log.exception("command failed", command=name)
             reason = f"{name} failed ({type(error).__name__}: {error}); see the daemon's log"
             return self._refuse(f"{name} failed", reason)
+        finally:
+            self._running -= 1
         # Pages and scripts ask for the status every second.
         (log.debug if name == STATUS else log.info)("command executed", command=name)
         return {"ok": True, **reply}
 
+    def _refuse(self, kind: str, reason: str, *, frequent: bool = False) -> Reply:
+        self._refusals.add(kind, reason, frequent=frequent)
+        return {"ok": False, "reason": reason}
+
+
+class CommandServer:
+    """Receives requests, passes them to handlers and sends the replies."""
+
+    def __init__(
+        self,
+        context: zmq.asyncio.Context,
+        address: str,
+        handlers: Mapping[str, Handler],
+        refusals: Refusals,
+        keys: KeyPair | None = None,
+    ) -> None:
+        """Bind the socket; raises UserError if the address is in use, malformed, or needs keys."""
+        self._requests = RequestExecutor(handlers, refusals)
+        self._refusals = refusals
+        self._socket = context.socket(zmq.ROUTER)
+        self._socket.setsockopt(zmq.LINGER, 100)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_REQUEST_BYTES)
+        self._connections = bind(context, self._socket, address, "commands", refusals, keys)
+
+    async def run(self) -> None:
+        """Serve requests until cancelled; a slow command such as `unlock` does not delay a `stop`."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._connections.run())
+            while True:
+                parts = await self._socket.recv_multipart()
+                # Receiving a message that has already arrived does not yield to other tasks.
+                await asyncio.sleep(0)
+                # A DEALER sends two frames, a REQ three. Other counts are answered like a DEALER's.
+                route = parts[:2] if len(parts) == 3 and not parts[1] else parts[:1]
+                checked = self._requests.check(parts[0], parts[len(route) :], time.monotonic_ns())
+                if isinstance(checked, dict):
+                    await self._reply(route, checked)
+                else:
+                    group.create_task(self._serve(route, *checked))
+
     async def _serve(self, route: list[bytes], name: str, request: Request) -> None:
-        await self._reply(route, await self.execute(name, request))
+        await self._reply(route, await self._requests.execute(name, request))
 
     async def _reply(self, route: list[bytes], reply: Reply) -> None:
         try:
             await self._socket.send_multipart([*route, encode(reply)], zmq.NOBLOCK)
         except zmq.Again:
-            self.refused["client does not read its replies"] += 1
+            self._refusals.counts["client does not read its replies"] += 1
 
-    def _refuse(self, kind: str, reason: str, *, frequent: bool = False) -> Reply:
-        """Count and log a refusal; a frequent kind is logged at counts 1, 10, 100 and so on."""
-        self.refused[kind] += 1
-        count = self.refused[kind]
-        if not frequent or str(count).strip("0") == "1":
-            structlog.get_logger().warning("command refused", reason=reason, count=count)
-        return {"ok": False, "reason": reason}
+    @property
+    def address(self) -> str:
+        """The bound address, with the port that a `*` stands for."""
+        return str(self._socket.getsockopt_string(zmq.LAST_ENDPOINT))
 
     def close(self) -> None:
         """Close the socket after the last replies are sent."""
+        self._connections.close()
         self._socket.close()

@@ -136,9 +136,16 @@ def check_allowed_clients(folder: Path) -> dict[bytes, str]:
 
 @dataclass(frozen=True, slots=True)
 class Refusals:
-    """Numbers of refused commands and clients, by kind."""
+    """Numbers of refused requests and clients, by kind."""
 
     counts: Counter[str] = field(default_factory=Counter)
+
+    def add(self, kind: str, reason: str, *, frequent: bool = False) -> None:
+        """Count and log a refusal; a frequent kind is logged at counts 1, 10, 100 and so on."""
+        self.counts[kind] += 1
+        count = self.counts[kind]
+        if not frequent or str(count).strip("0") == "1":
+            structlog.get_logger().warning("refused", reason=reason, count=count)
 
     def diagnostics(self) -> Mapping[str, Mapping[str, int]]:
         """Return the counts for `health`."""

@@ -63,8 +63,8 @@ def message(topic: str, *, rate_hz: float | None) -> Callable[[type[M]], type[M]
 class EitFrame(Message):
     """One frame of a fingertip; its time is the middle of the acquisition."""
 
-    channels: NDArray[np.floating] = column("V", "the 896 channels in the order of the channel table")
-    line: NDArray[np.floating] = column("V", "the 1024 values of the raw line")
+    channels: NDArray[np.floating] = column("V", "the channels in the order of the channel table")
+    line: NDArray[np.floating] = column("V", "the values of the raw line")
     frame: int = column("", "number of the frame since the board was connected")
     age_s: float = column("s", "from the middle of the acquisition to the arrival of the last byte")
     saturated: int = column("", "channels at the converter's full scale")
@@ -145,6 +145,7 @@ class RobotStateMessage(Message):
 
     joints_rad: tuple[float, ...] = column("rad", "the six joint angles, base to wrist 3")
     tcp_pose: tuple[float, ...] = column("m, rad", "position and rotation vector of the tool centre in the base frame")
+    tcp_speed_m_per_s: float = column("m/s", "speed of the tool centre")
     wrench: tuple[float, ...] = column("N, N·m", "force and torque at the tool centre")
     wrist_rad: float = column("rad", "angle of wrist 3, about which the tool twists")
     wrist_speed_rad_per_s: float = column("rad/s", "its speed")
@@ -152,6 +153,9 @@ class RobotStateMessage(Message):
     robot_mode: int = column("", "the controller's robot mode, 7 when running")
     safety_mode: int = column("", "the controller's safety mode, 1 when normal")
     speed_scaling: float = column("", "share of the commanded speed that the controller allows")
+    payload_kg: float = column("kg", "payload that is set at the pendant; NaN before PolyScope 3.12 and 5.5.1")
+    payload_cog_m: tuple[float, ...] = column("m", "its centre of gravity from the flange")
+    tcp_offset: tuple[float, ...] = column("m, rad", "tool centre point that is set, from the flange")
     protective_stop: bool = column("", "whether it is in a protective stop")
     emergency_stop: bool = column("", "whether an emergency stop is pressed")
     blocked: str = column("", "why motion is refused at present; empty when it is allowed")
@@ -202,6 +206,18 @@ class LoopState(Message):
     reasons: str = column("", "every reason for holding or stopping, in sentences")
 
 
+@message("loop.stop", rate_hz=None)
+class LoopStop(Message):
+    """One stop of an experiment, with the times since its cause; its own time is the cause's."""
+
+    experiment: str = column("", "name of the experiment")
+    cause: str = column("", "why it stopped, in sentences")
+    response: str = column("", "the safety response")
+    decided_after_s: float = column("s", "from the measurement or request that caused it to the decision")
+    sent_after_s: float | None = column("s", "until the robot's process had sent the stop; nil if it did not answer")
+    stands_after_s: float | None = column("s", "until the robot measured a standstill; nil if it did not within 5 s")
+
+
 @message("health", rate_hz=1.0)
 class Health(Message):
     """The state of the process and of each of its tasks."""
@@ -212,6 +228,14 @@ class Health(Message):
     loop_lag_s: float = column("s", "how late the event loop woke this message's task")
     memory_mb: float = column("MB", "resident memory")
     cpu_percent: float = column("%", "of one core since the message before")
+
+
+@message("daemon.end", rate_hz=None)
+class DaemonEnd(Message):
+    """The last message of a daemon that ends on request or with its experiment; a crashed one sends none."""
+
+    finished: bool = column("", "whether the experiment of `stop_when_done` is done; true without one")
+    summary: str = column("", "summary of the last experiment, in lines; empty without one")
 
 
 def stale_after_s(topic: str) -> float:

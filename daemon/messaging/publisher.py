@@ -1,24 +1,25 @@
 """The publisher: sends messages over ZeroMQ and passes them to listeners in this process."""
 
-import errno
-import os
-import stat
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
 import zmq
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.addresses import LARGEST_PORT, has_valid_port, is_local, network_refusal, probe
-from shearloop.daemon.messaging.keys import KeyPair
+from shearloop.daemon.messaging.connections import bind
+from shearloop.daemon.messaging.keys import KeyPair, Refusals
 from shearloop.daemon.messaging.messages import TOPICS, Message, encode, wire_map
 
 # Messages kept for a slow subscriber. It loses later ones; others are not delayed.
 HIGH_WATER_MARK = 1000
 # A subscription is a topic's beginning, after about 300 bytes of CURVE handshake. Longer ones end the connection.
-LARGEST_SUBSCRIPTION_BYTES = 1024
+LARGEST_SUBSCRIPTION_BYTES = 512
+# A client that subscribes to more topics that do not exist is disconnected. libzmq keeps some 40 bytes of memory for
+# each byte of a subscription.
+MAX_UNKNOWN_TOPICS = 16
+# The last messages may wait this long for their subscribers.
+LINGER_MS = 200
 # Subscriptions read at a time, so that a subscriber that keeps changing them cannot block the publisher.
 SUBSCRIPTIONS_AT_ONCE = 100
 Listener: TypeAlias = Callable[[str, dict[str, Any]], None]
@@ -37,12 +38,26 @@ class Publisher:
         self._listeners: list[Listener] = []
         # Topic beginnings that have subscribers.
         self._prefixes: tuple[bytes, ...] = ()
+        # Unknown topics of each client, by its descriptor.
+        self._unknown: Counter[int] = Counter()
+        self._refusals = Refusals()
         # An XPUB socket is a PUB socket that also receives the subscriptions.
         self._socket: zmq.Socket[bytes] = zmq.Socket(context, zmq.XPUB)
         self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_SUBSCRIPTION_BYTES)
         self._socket.setsockopt(zmq.SNDHWM, HIGH_WATER_MARK)
+        self._socket.setsockopt(zmq.RCVHWM, SUBSCRIPTIONS_AT_ONCE)
+        # Every subscription is passed on, even if another client has the same.
+        self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)
         self._socket.setsockopt(zmq.LINGER, 0)
-        bind(self._socket, address, "publish", keys)
+        self._connections = bind(context, self._socket, address, "publish", self._refusals, keys)
+
+    async def run(self) -> None:
+        """Bound the number of subscribers until cancelled."""
+        await self._connections.run()
+
+    def diagnostics(self) -> Mapping[str, Mapping[str, int]]:
+        """Return the refused subscribers for `health`."""
+        return self._refusals.diagnostics()
 
     def add_listener(self, listener: Listener) -> None:
         """Call `listener` with topic and content of each message from now on."""
@@ -75,67 +90,29 @@ class Publisher:
         return bool(self._prefixes)
 
     def close(self) -> None:
-        """Close the socket; unsent messages are dropped."""
-        self._socket.close()
+        """Close the socket; subscribers have a moment to take the last messages."""
+        self._connections.close()
+        self._socket.close(linger=LINGER_MS)
 
     def _read_subscriptions(self) -> None:
         for _ in range(SUBSCRIPTIONS_AT_ONCE):
             if not int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
                 return
-            message = self._socket.recv(zmq.NOBLOCK)
-            kind, prefix = message[:1], message[1:]
-            # Only beginnings of known topics are kept, which bounds the memory.
-            if kind == b"\x01" and any(topic.encode().startswith(prefix) for topic in TOPICS):
-                self._prefixes = (*self._prefixes, prefix)
-            elif kind == b"\x00":
+            message = self._socket.recv(zmq.NOBLOCK, copy=False)
+            kind, prefix = message.bytes[:1], message.bytes[1:]
+            if kind == b"\x00":
                 self._prefixes = tuple(one for one in self._prefixes if one != prefix)
+            elif not any(topic.encode().startswith(prefix) for topic in TOPICS):
+                self._refuse(message.get(zmq.SRCFD))
+            elif kind == b"\x01" and prefix not in self._prefixes:
+                self._prefixes = (*self._prefixes, prefix)
 
-
-def bind(socket: "zmq.Socket[Any]", address: str, key: str, keys: KeyPair | None = None) -> None:
-    """Bind a socket; a network address needs `keys`. Raises UserError that names `key` of the configuration."""
-    try:
-        if "://" in address and not is_local(address):
-            if keys is None:
-                raise UserError(network_refusal(address, key))
-            keys.apply(socket)
-        if not has_valid_port(address):
-            raise UserError(
-                f"`{key}: {address}` has no valid port (a whole number up to {LARGEST_PORT}); "
-                "use e.g. tcp://127.0.0.1:7761"
-            )
-        _check_ipc_path(address, key)
-        socket.bind(address)
-    except UserError:
-        socket.close()
-        raise
-    except zmq.ZMQError as error:
-        socket.close()
-        if error.errno == zmq.EADDRINUSE:
-            raise _in_use(address, key) from error
-        raise UserError(
-            f"`{key}: {address}` cannot be bound ({error.strerror}); use e.g. tcp://127.0.0.1:7761"
-        ) from error
-
-
-def _check_ipc_path(address: str, key: str) -> None:
-    """Raise UserError if an ipc path is in use or is another kind of file: libzmq would delete it and bind."""
-    path = address.removeprefix("ipc://")
-    if path == address or path.startswith(("@", "*")):
-        return
-    try:
-        mode = os.lstat(path).st_mode
-    except OSError:
-        return
-    if not stat.S_ISSOCK(mode):
-        raise UserError(f"`{key}: {address}` cannot be bound: {path} exists and is no socket; choose another address")
-    if (error := probe(path)) == 0:
-        raise _in_use(address, key)
-    # A killed daemon leaves the socket behind.
-    if error != errno.ECONNREFUSED:
-        raise UserError(f"`{key}: {address}` cannot be bound ({os.strerror(error)}); choose another address")
-
-
-def _in_use(address: str, key: str) -> UserError:
-    return UserError(
-        f"`{key}: {address}` is already in use; is another daemon running? Stop it, or choose another address"
-    )
+    def _refuse(self, client: int) -> None:
+        """Count an unknown topic of a client, and disconnect the client after too many."""
+        self._unknown[client] += 1
+        if self._unknown[client] >= MAX_UNKNOWN_TOPICS:
+            del self._unknown[client]
+            # Some of its subscriptions may still come after its end.
+            if self._connections.disconnect(client):
+                reason = f"a subscriber was disconnected: it asked for {MAX_UNKNOWN_TOPICS} topics that do not exist"
+                self._refusals.add("too many unknown topics", reason, frequent=True)

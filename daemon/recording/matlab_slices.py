@@ -19,7 +19,7 @@ import structlog
 from scipy.io import savemat
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.eit.channels import channels_of_line
+from shearloop.bank.eit.channels import ChannelTable
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import Scalar
 from shearloop.daemon.recording.matlab import DIAMETER_FOLDER, RAW_FRAME, RAW_HOMOGENEOUS, TORQUE_FOLDER
@@ -125,13 +125,13 @@ class SliceRecorder:
     `close` waits for the last file.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, table: ChannelTable) -> None:
         """Create the folder for `torque_slices` and `diameter_slices`; raises UserError on failure."""
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UserError(f"{folder} cannot be made ({error.strerror}); choose another folder for slices") from None
-        self._folder = _SliceFolder(folder)
+        self._folder, self._table = _SliceFolder(folder), table
         self._frames: dict[str, deque[_SliceFrame]] = {}
         self._torques: deque[tuple[int, float]] = deque(maxlen=MAX_TORQUES)
         # The start of the running `tare` step.
@@ -244,7 +244,7 @@ class SliceRecorder:
         near = np.exp(-0.5 * ((torques[:, 0] - float(weights @ times)) / (STD_FRAMES * period_ns)) ** 2)
         rest = self._homogeneous[hold.source]
         return _Slice(
-            np.abs(smoothed - channels_of_line(rest)),
+            np.abs(smoothed - self._table.channels_of_line(rest)),
             float(near @ torques[:, 1] / near.sum()),
             self._diameter_mm if hold.kind == "diameter" else None,
             frames[len(frames) // 2].line,

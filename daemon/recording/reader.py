@@ -8,11 +8,11 @@ index that is written when a file is closed.
 import json
 import zlib
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 from mcap.exceptions import McapError
@@ -22,7 +22,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
-from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_LINE_VALUES
+from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.estimation import Measured
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import schema
@@ -34,12 +34,12 @@ from shearloop.files import replace_file
 Progress = Callable[[int], None]
 _LARGEST_RECORD_BYTES = 1 << 30
 # Metadata of every recording; the other keys are notes of this one.
-_IDENTITY_KEYS = ("format_version", "channel_table_hash", "software", "code_sha256")
+_IDENTITY_KEYS = ("format_version", "channel_table_hash", "electrodes", "injection", "software", "code_sha256")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SideFrames:
-    """One side's frames by rising time: t_mid_ns and arrival_ns (n,) in Unix nanoseconds, lines (n, 1024) in volts."""
+    """One side's frames by rising time: t_mid_ns and arrival_ns (n,) in Unix nanoseconds, lines (n, v) in volts."""
 
     t_mid_ns: NDArray[np.int64]
     arrival_ns: NDArray[np.int64]
@@ -58,6 +58,7 @@ class Recording:
     torque_nm: NDArray[np.float64]
     # The tools that a calibrated gripper held: since when (Unix ns), and the diameter or None for no tool.
     tools: tuple[tuple[int, Measured | None], ...] = ()
+    table: ChannelTable = PAPER_TABLE
     # Whether a daemon recorded it: frames and torques are then stamped on arrival by one clock.
     live: bool = False
 
@@ -116,7 +117,15 @@ def open_recording(path: Path) -> Iterator[OpenRecording]:
     """Open a closed recording; raises UserError, also for errors while it is read in the block."""
     with reading(path), path.open("rb") as file:
         check_magic(path, file)
-        yield OpenRecording(file)
+        recording = OpenRecording(file)
+        try:
+            yield recording
+        except schema.UnknownTopicError as error:
+            written = recording.metadata().get(schema.METADATA, {}).get("software", "unknown")
+            raise UserError(
+                f"{path}: shearloop {schema.software_version()} has no topic {str(error)!r}; version {written} wrote "
+                "this recording: read it with that version, or export other topics"
+            ) from error
 
 
 def check_magic(path: Path, file: IO[bytes]) -> None:
@@ -131,10 +140,17 @@ def check_identity(path: Path, identity: dict[str, str] | None) -> dict[str, str
         raise _unusable(path, "it is an MCAP file, but not a recording of shearloop")
     if (version := identity.get("format_version")) != schema.FORMAT_VERSION:
         raise _unusable(path, f"it has format version {version}, expected {schema.FORMAT_VERSION}")
-    found = str(identity.get("channel_table_hash"))
-    if found != CHANNEL_TABLE_HASH:
-        raise _unusable(path, f"it has the channel table {found[:12]}…, expected {CHANNEL_TABLE_HASH[:12]}…")
+    found, expected = str(identity.get("channel_table_hash")), recorded_table(identity).digest
+    if found != expected:
+        raise _unusable(path, f"it has the channel table {found[:12]}…, expected {expected[:12]}…")
     return identity
+
+
+def recorded_table(identity: Mapping[str, str]) -> ChannelTable:
+    """Return the channels of a recording's fingertips; those of the paper's where it names none."""
+    paper = asdict(PAPER_TABLE)
+    injection: Any = identity.get("injection", paper["injection"])
+    return ChannelTable(int(identity.get("electrodes", paper["n_electrodes"])), injection)
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -146,6 +162,7 @@ def read_recording(path: str | Path) -> Recording:
     with open_recording(path) as recording:
         metadata = recording.metadata()
         identity = check_identity(path, metadata.get(schema.METADATA))
+        table = recorded_table(identity)
         prefix = f"{schema.FRAME_TOPIC}."
         sides = {topic: topic.removeprefix(prefix) for topic in recording.counts if topic.startswith(prefix)}
         inputs = [schema.input_topic(side) for side in sides.values()]
@@ -159,7 +176,7 @@ def read_recording(path: str | Path) -> Recording:
                         torques.append((t_ns, float(content["torque_nm"])))
                 elif topic in sides:
                     line = content["line"]
-                    if len(line) != N_LINE_VALUES:
+                    if len(line) != table.n_line_values:
                         raise ValueError(f"a line of {len(line)} values")
                     rows = frames.setdefault(sides[topic], [])
                     # The board repeated an old frame.
@@ -181,6 +198,7 @@ def read_recording(path: str | Path) -> Recording:
         np.array([t for t, _ in torques], dtype=np.int64),
         np.array([torque for _, torque in torques], dtype=np.float64),
         tuple(tools),
+        table,
         live=bool(sides) and all(schema.input_topic(side) in topics for side in sides.values()),
     )
 

@@ -32,6 +32,7 @@ from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import LoopState, Scalar
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.writer import PARTIAL, McapFile
+from shearloop.daemon.sensing.estimators import channel_table
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 
 # A kill loses the data since the last flush, less than a second even on a busy computer.
@@ -82,7 +83,7 @@ def daemon_identity(config: DaemonConfig) -> Identity:
 
     Raises BankError for a bank that cannot be opened, and UserError for a path that is not UTF-8.
     """
-    metadata = schema.basic_identity(f"a daemon on {platform.node()}")
+    metadata = schema.basic_identity(f"a daemon on {platform.node()}", channel_table(config))
     metadata["python"] = f"{platform.python_version()}, numpy {np.__version__}, {platform.machine()}"
     for name, fingertip in config.fingertips.items():
         if fingertip.bank is not None:

@@ -6,6 +6,7 @@ estimates bit for bit.
 
 import asyncio
 import json
+import math
 import tempfile
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -16,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from shearloop.bank.eit.channels import N_LINE_VALUES, ZERO_SLOTS
 from shearloop.bank.estimation import Measured
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig
@@ -151,7 +151,9 @@ class ReplayPipeline:
             sides = combined.calibration.sides
             self._pairing = FramePairing(sides, round(config.fingertips[sides[0]].frame_period_s * 1e9))
         self._frame_parsers = {
-            name: FrameParser(ZERO_SLOTS, nominal_period_ns=round(fingertip.frame_period_s * 1e9))
+            name: FrameParser(
+                self._estimators[name].table.zero_slots, nominal_period_ns=round(fingertip.frame_period_s * 1e9)
+            )
             for name, fingertip in config.fingertips.items()
         }
         self._load_parser: LoadParser | None = None
@@ -340,7 +342,7 @@ def _imported_event(topic: str, content: dict[str, Any], log_ns: int, number: in
     if topic.startswith(f"{schema.FRAME_TOPIC}."):
         # The line as the board sent it: four decimals, each followed by a comma and a space.
         values = np.asarray(content["line"], dtype=np.float64)
-        if values.shape != (N_LINE_VALUES,):
+        if math.isqrt(values.size) ** 2 != values.size:
             raise ValueError(f"a line of {values.size} values")
         text = "".join(f"{value:.4f}, " for value in values.tolist()) + "\r\n"
         side, t_ns = topic.removeprefix(f"{schema.FRAME_TOPIC}."), int(content["arrival_unix_ns"])

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from pydantic_core import to_json
 
-from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH
+from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
 from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitFrame, EitHeatmap, LoadTorque
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
@@ -45,20 +45,30 @@ SIDES = ("right", "left")
 DIAMETER_NOTE = "diameter_mm"
 LARGEST_DIAMETER_MM = 140.0
 
+# Metadata key of a doubt about the load cell's times, and the doubt of an import.
+LOAD_DOUBT_NOTE = "load_doubt"
+LOAD_DOUBT = "the load's values waited in a buffer, and nothing shows for how long: its times may be seconds off"
+
 _FINGERTIP_TOPICS = (EitFrame.topic, EitEstimate.topic, EitHeatmap.topic)
 _SCALARS = {float: "number", int: "integer", str: "string", bool: "boolean"}
 _TIME = {"type": "integer", "description": "CLOCK_MONOTONIC in ns"}
+
+
+class UnknownTopicError(Exception):
+    """A recording has a topic that this version does not have."""
 
 
 class NoJsonError(ValueError):
     """A value cannot be written as JSON."""
 
 
-def basic_identity(source: str) -> dict[str, str]:
+def basic_identity(source: str, table: ChannelTable = PAPER_TABLE) -> dict[str, str]:
     """Return the metadata of every recording; `source` describes the origin of the data."""
     return {
         "format_version": FORMAT_VERSION,
-        "channel_table_hash": CHANNEL_TABLE_HASH,
+        "channel_table_hash": table.digest,
+        "electrodes": str(table.n_electrodes),
+        "injection": table.injection,
         "source": source,
         "software": software_version(),
         "code_sha256": code_digest(),
@@ -96,7 +106,7 @@ def input_topic(source: str) -> str:
 
 
 def schema_name(topic: str) -> str:
-    """Return the name of a recorded topic's schema; raises KeyError for an unknown topic."""
+    """Return the name of a recorded topic's schema; raises UnknownTopicError for another."""
     if topic == CLOCK_TOPIC or topic in TOPICS:
         return topic
     if topic.startswith(f"{INPUT}."):
@@ -104,7 +114,7 @@ def schema_name(topic: str) -> str:
     for live in _FINGERTIP_TOPICS:
         if topic.startswith(f"{live}."):
             return live
-    raise KeyError(topic)
+    raise UnknownTopicError(topic)
 
 
 @cache

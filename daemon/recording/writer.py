@@ -13,6 +13,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
+from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import schema
 from shearloop.files import sync_directory
@@ -147,15 +148,21 @@ class RecordingWriter:
     Raises UserError where the file cannot be written.
     """
 
-    def __init__(self, path: str | Path, source: str, notes: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        source: str,
+        notes: Mapping[str, str] | None = None,
+        table: ChannelTable = PAPER_TABLE,
+    ) -> None:
         """Create `path`.partial; `source` describes the origin of the data."""
         self.path = Path(path)
         with self._errors():
             self._file = McapFile(io.FileIO(f"{self.path}{PARTIAL}", "wb"))
-        self._file.add_metadata(schema.METADATA, {**schema.basic_identity(source), **(notes or {})})
+        self._file.add_metadata(schema.METADATA, {**schema.basic_identity(source, table), **(notes or {})})
 
     def add_frame(self, side: str, t_mid_unix_ns: int, arrival_unix_ns: int, line: NDArray[np.float64]) -> None:
-        """Append one frame: the (1024,) values of its line in volts."""
+        """Append one frame: the (v,) values of its line in volts."""
         # The board sends four decimals of a volt.
         values = [round(value, 6) for value in line.tolist()]
         content = {"arrival_unix_ns": arrival_unix_ns, "line": values}

@@ -11,6 +11,7 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.defaults import MAX_GAP_S
 from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, Measured, TactileFrame
@@ -33,6 +34,8 @@ _MATCHERS: Mapping[str, type[PrunedMatcher | PrunedZeroLagMatcher]] = {
 }
 # Matchers in use have no state, so fingertips with the same bank share one.
 _in_use: WeakValueDictionary[tuple[str, str], PrunedMatcher | PrunedZeroLagMatcher] = WeakValueDictionary()
+# After a grip some frames are disturbed or missing.
+_WARM_UP_SHARE = 2.0
 
 
 class FrameEstimator:
@@ -62,9 +65,19 @@ class FrameEstimator:
         )
 
     @property
+    def table(self) -> ChannelTable:
+        """The fingertip's channels."""
+        return self.calibration.estimator.table
+
+    @property
     def measures_torque(self) -> bool:
         """Whether it gives torques, and not only diameters or the bank match."""
         return self.calibration.torque is not None
+
+    @property
+    def warm_up_frames(self) -> int:
+        """The gripped frames that the first torque after a grip needs."""
+        return self.calibration.estimator.motion.n_lags + 1
 
     @property
     def assumptions(self) -> str:
@@ -125,6 +138,27 @@ class FrameEstimator:
         return difference[0] if difference is not None and difference[0].any() else None
 
 
+def channel_table(config: DaemonConfig) -> ChannelTable:
+    """Return the channels of the fingertips, by their banks and calibrations.
+
+    Raises UserError where these differ, and BankError as `open_estimator` does.
+    """
+    tables = {name: fingertip_table(fingertip) for name, fingertip in config.fingertips.items()}
+    if len({*tables.values()}) > 1:
+        kinds = ", ".join(f"{name} has {each.n_channels} channels" for name, each in tables.items())
+        raise UserError(f"the fingertips are of different kinds ({kinds}); run a daemon for each kind")
+    return next(iter(tables.values()), PAPER_TABLE)
+
+
+def fingertip_table(config: FingertipConfig) -> ChannelTable:
+    """Return a fingertip's channels, by its bank or its calibration, else the paper's."""
+    if config.bank is not None:
+        return Bank.open(config.bank).table
+    if config.calibration is not None and config.calibration.exists():
+        return Calibration.load(config.calibration).estimator.table
+    return PAPER_TABLE
+
+
 def open_estimator(config: FingertipConfig, name: str) -> FrameEstimator:
     """Return the estimator of one fingertip.
 
@@ -151,7 +185,8 @@ def open_estimator(config: FingertipConfig, name: str) -> FrameEstimator:
         raise _without_bank(PaperEstimator.name, name)
     if config.calibration is not None:
         return FrameEstimator(Calibration.load(config.calibration), config)
-    return FrameEstimator(Calibration.uncalibrated(Bank.open(config.bank).identity), config)
+    bank = Bank.open(config.bank)
+    return FrameEstimator(Calibration.uncalibrated(bank.identity, bank.table), config)
 
 
 def _without_bank(estimator: str, name: str) -> UserError:
@@ -180,13 +215,18 @@ def torque_sources(
             period_s=own.frame_period_s,
             window_s=own.frame_period_s * own.average_frames,
             measures_torque=estimators[name].measures_torque,
+            warm_up_s=_WARM_UP_SHARE * estimators[name].warm_up_frames * own.frame_period_s,
         )
         for name, own in config.fingertips.items()
     }
     if combined is not None:
         period_s = max(own.frame_period_s for own in config.fingertips.values())
         sources[COMBINED] = TorqueSource(
-            name=COMBINED, period_s=period_s, window_s=period_s, measures_torque=combined.measures_torque
+            name=COMBINED,
+            period_s=period_s,
+            window_s=period_s,
+            measures_torque=combined.measures_torque,
+            warm_up_s=_WARM_UP_SHARE * combined.warm_up_frames * period_s,
         )
     if config.skin is not None and (skin := skin_source(config.skin)) is not None:
         sources[skin.name] = skin

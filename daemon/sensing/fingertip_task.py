@@ -59,6 +59,45 @@ class FramePairing(Generic[Item]):
         return found
 
 
+class _Tare:
+    """A tare of one estimator: when it begins, whether it is done, and what its frames were refused for."""
+
+    def __init__(self) -> None:
+        # The tare begins with the first frame acquired after this.
+        self._from_ns: int | None = None
+        self.done = asyncio.Event()
+        self.done.set()
+        # By the reason without its numbers: the count, and the latest reason.
+        self._refused: dict[str, tuple[int, str]] = {}
+
+    def begin(self, now_ns: int) -> None:
+        """Begin, also during another tare."""
+        self._from_ns = now_ns
+        self.done.clear()
+        self._refused.clear()
+
+    def is_due(self, t_begin_ns: int) -> bool:
+        """Return, once, whether a frame that began then is the tare's first."""
+        due = self._from_ns is not None and t_begin_ns >= self._from_ns
+        self._from_ns = None if due else self._from_ns
+        return due
+
+    def add(self, reason: str, *, taring: bool) -> None:
+        """Take the reason of an estimate, and whether more frames are needed."""
+        if self.done.is_set() or self._from_ns is not None:
+            return
+        if not taring:
+            self.done.set()
+        kind = "".join(letter for letter in reason if not letter.isdigit())
+        self._refused[kind] = self._refused.get(kind, (0, ""))[0] + 1, reason
+
+    @property
+    def reasons(self) -> str:
+        """The reasons with their counts, the most frequent first."""
+        often = sorted(self._refused.values(), reverse=True)
+        return ", ".join(f"{count} {'frame' if count == 1 else 'frames'}: {reason}" for count, reason in often)
+
+
 class FingertipPipeline:
     """Estimates from the frames of one fingertip, or of several together, for the control loop and for subscribers."""
 
@@ -87,17 +126,14 @@ class FingertipPipeline:
         self._gripper = gripper
         self._diameters = diameters
         self._inputs = inputs
-        self._tare_from_ns: int | None = None
-        self._tared = asyncio.Event()
-        self._tared.set()
+        self._tare = _Tare()
         self._held: Measured | None = None
 
     async def process(self, *frames: Frame) -> None:
         """Estimate from the frames of one time, hand the estimate to the control loop, and publish it."""
         number, now_ns = frames[0].seq, self._clock.now_ns()
         # A replay tares, and takes the held tool, before the same frame.
-        if self._tare_from_ns is not None and min(frame.t_begin_ns for frame in frames) >= self._tare_from_ns:
-            self._tare_from_ns = None
+        if self._tare.is_due(min(frame.t_begin_ns for frame in frames)):
             self.estimator.tare()
             self._record(InputKind.TARE, now_ns, str(number).encode())
         tool = self._gripper.held_tool(now_ns) if self._gripper is not None else None
@@ -115,18 +151,21 @@ class FingertipPipeline:
             self._diameters.update(self.name, estimate, now_ns)
         self._publisher.publish(message)
         self.count += 1
-        if not (self._tared.is_set() or self._tare_from_ns is not None or self.estimator.taring):
-            self._tared.set()
+        self._tare.add(message.reason, taring=self.estimator.taring)
 
     def tare(self) -> None:
         """Take a new homogeneous frame from frames acquired entirely after now."""
-        self._tare_from_ns = self._clock.now_ns()
-        self._tared.clear()
+        self._tare.begin(self._clock.now_ns())
 
-    async def tare_and_wait(self) -> str:
-        """Take a new homogeneous frame and wait until it is complete; return an empty error."""
+    async def tare_and_wait(self, within_s: float) -> str:
+        """Take a new homogeneous frame and wait until it is complete; return why it is not, or an empty text."""
         self.tare()
-        await self._tared.wait()
+        try:
+            async with asyncio.timeout(within_s):
+                await self._tare.done.wait()
+        except TimeoutError:
+            what = f"the homogeneous frame of {self.name} could not be taken within {within_s:.3g} s"
+            return f"{what}: {self._tare.reasons or 'no frame came'}"
         return ""
 
     def _record(self, kind: InputKind, t_ns: int, data: bytes) -> None:

@@ -66,15 +66,16 @@ class LoadCellTask:
         self._zero_from_ns = now_ns + round((SETTLING_PERIODS - 0.5) * self._period_s * 1e9)
         self._zero_until_ns = now_ns + round(self._timeout_s * 1e9)
 
-    async def tare_and_wait(self) -> str:
+    async def tare_and_wait(self, within_s: float) -> str:
         """Take a new zero and wait until it is done; return the reason of a failure, else an empty text."""
         self.tare()
+        within_s = min(self._timeout_s, within_s)
         try:
             # Earlier waiters get this zero too.
-            return await self._zero_waiters.wait(self._timeout_s)
+            return await self._zero_waiters.wait(within_s)
         except TimeoutError:
             reason = self._reason or "nothing came"
-            return f"the load cell's zero could not be taken within {self._timeout_s:g} s: {reason}"
+            return f"the load cell's zero could not be taken within {within_s:.3g} s: {reason}"
         finally:
             if not self._zero_waiters:
                 # A zero taken later could be of any load.

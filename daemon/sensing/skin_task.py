@@ -107,15 +107,16 @@ class SkinTask:
             self._inputs.record(RawEvent(InputKind.TARE, now_ns))
         self._estimator.tare(now_ns)
 
-    async def tare_and_wait(self) -> str:
+    async def tare_and_wait(self, within_s: float) -> str:
         """Take a new zero and wait until it is done; return the reason of a failure, else an empty text."""
         self.tare()
+        within_s = min(ZERO_TIMEOUT_S, within_s)
         try:
             # Earlier waiters get this zero too.
-            return await self._zero_waiters.wait(ZERO_TIMEOUT_S)
+            return await self._zero_waiters.wait(within_s)
         except TimeoutError:
             reason = self._reason or "nothing came"
-            return f"the skin's zero could not be taken within {ZERO_TIMEOUT_S:g} s: {reason}"
+            return f"the skin's zero could not be taken within {within_s:.3g} s: {reason}"
 
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the values of voltages, zero and force for `health`."""

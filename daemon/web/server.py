@@ -27,9 +27,11 @@ from aiohttp import WSCloseCode, web
 from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging import messages
-from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S, needs_keys, stop_address
+from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S, needs_keys
 from shearloop.daemon.messaging.client import connect, decode_reply, no_reply
-from shearloop.daemon.messaging.keys import ClientKeys
+from shearloop.daemon.messaging.command_server import TokenBucket
+from shearloop.daemon.messaging.keys import ClientKeys, Refusals
+from shearloop.daemon.messaging.stop_socket import send_to_stop_socket
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.web.message_store import MessageStore
 
@@ -41,6 +43,8 @@ TOKEN_LENGTHS = range(32, 201)
 SHUTDOWN_S = 1.0
 # Commands that move something, or change what moves it.
 NEEDS_TOKEN = ("tare", "start", "pause", "resume", "unlock")
+# Wrong tokens that are compared at once, and then per second.
+WRONG_BURST, WRONG_PER_S = 20.0, 1.0
 # Maximum redraw rate of a page.
 BATCHES_PER_S = 30.0
 # A page gets a batch at least this often.
@@ -80,10 +84,6 @@ class DaemonAddress:
     commands: str
     keys: ClientKeys | None = None
 
-    def stop_address(self) -> str:
-        """Return where to send a stop: a local daemon accepts it even without valid keys."""
-        return self.commands if needs_keys(self.commands) else stop_address(self.commands)
-
 
 class BusyError(Exception):
     """Too many commands are pending."""
@@ -106,7 +106,7 @@ class Bridge:
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
         try:
             connect(self._socket, address.publish, address.keys)
-            with self._command_socket(address.commands):
+            with self._command_socket():
                 pass
         except UserError:
             self._socket.close()
@@ -144,7 +144,7 @@ class Bridge:
             raise BusyError
         async with self._free:
             timeout_s = UNLOCK_TIMEOUT_S if name == "unlock" else COMMAND_TIMEOUT_S
-            return await self._request(self._address.commands, {"command": name}, timeout_s)
+            return await self._request({"command": name}, timeout_s)
 
     async def stop(self) -> dict[str, Any]:
         """Return the daemon's reply to a stop of all motion; simultaneous calls share one request.
@@ -152,14 +152,21 @@ class Bridge:
         Raises UserError without a reply.
         """
         if self._stopping is None or self._stopping.done():
-            content = {"command": "stop", "spare_daemon": True}
-            request = self._request(self._address.stop_address(), content, COMMAND_TIMEOUT_S)
-            self._stopping = asyncio.ensure_future(request)
+            self._stopping = asyncio.ensure_future(self._request_stop())
         # Shielded: a page that disappears has still requested the stop.
         return await asyncio.shield(self._stopping)
 
-    async def _request(self, address: str, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
-        with self._command_socket(address) as socket:
+    async def _request_stop(self) -> dict[str, Any]:
+        content, address = {"command": "stop", "spare_daemon": True}, self._address.commands
+        reply = None
+        if not needs_keys(address):
+            # A local daemon accepts it even without valid keys.
+            reply = await asyncio.to_thread(send_to_stop_socket, address, content, COMMAND_TIMEOUT_S)
+        return reply or await self._request(content, COMMAND_TIMEOUT_S)
+
+    async def _request(self, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
+        address = self._address.commands
+        with self._command_socket() as socket:
             try:
                 async with asyncio.timeout(timeout_s):
                     await socket.send(messages.encode(content))
@@ -169,12 +176,10 @@ class Bridge:
         return decode_reply(data, address)
 
     @contextlib.contextmanager
-    def _command_socket(self, address: str) -> "Iterator[zmq.asyncio.Socket]":
-        # The local stop socket is not encrypted.
-        keys = self._address.keys if address == self._address.commands else None
+    def _command_socket(self) -> "Iterator[zmq.asyncio.Socket]":
         with self._context.socket(zmq.DEALER) as socket:
             socket.setsockopt(zmq.LINGER, 0)
-            connect(socket, address, keys)
+            connect(socket, self._address.commands, self._address.keys)
             yield socket
 
     async def close(self) -> None:
@@ -195,7 +200,7 @@ async def serve(
     signals = ending_signals()
     with zmq.asyncio.Context() as context:
         bridge = Bridge(context, address, MessageStore(fingertip.height_cm))
-        app = make_app(bridge, token, asdict(fingertip), address.publish)
+        app = make_app(bridge, token, asdict(fingertip.outline()), address.publish)
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=SHUTDOWN_S)
         receiving = asyncio.create_task(bridge.run(), name="messages")
         try:
@@ -224,7 +229,7 @@ async def serve(
 def make_app(bridge: Bridge, token: str, fingertip: dict[str, Any], publish: str) -> web.Application:
     """Return the web application; the page draws the fingertip's outline and shows the address `publish`."""
     page = _Page(bridge, token, fingertip, publish)
-    app = web.Application(middlewares=[_check_access], client_max_size=MAX_BODY_BYTES)
+    app = web.Application(middlewares=[page.check_access], client_max_size=MAX_BODY_BYTES)
     app.router.add_get("/", page.file)
     app.router.add_get("/assets/{name}", page.file)
     app.router.add_get("/settings.json", page.settings)
@@ -235,34 +240,28 @@ def make_app(bridge: Bridge, token: str, fingertip: dict[str, Any], publish: str
     return app
 
 
-@web.middleware
-async def _check_access(
-    request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
-) -> web.StreamResponse:
-    """Refuse requests of other sites, and add the security headers to every response."""
-    host = request.headers.get("Host")
-    if not host_allowed(host):
-        return _refuse(421, f"{host!r} is not this computer's loopback; open http://127.0.0.1:PORT/")
-    if not origin_allowed(request.headers.get("Origin"), host):
-        return _refuse(403, "requests from other sites are not answered")
-    try:
-        response = await handler(request)
-    except web.HTTPException as error:
-        response = _refuse(error.status, error.reason)
-    if not response.prepared:
-        response.headers.update(HEADERS)
-    return response
+class TokenCheck:
+    """Checks tokens; after WRONG_BURST wrong ones it refuses all, right or wrong, but for WRONG_PER_S."""
 
+    def __init__(self, token: str) -> None:
+        self._token = token
+        self._wrong = TokenBucket(WRONG_BURST, WRONG_PER_S)
 
-def _refuse(status: int, reason: str) -> web.Response:
-    structlog.get_logger().warning("request refused", status=status, reason=reason)
-    return web.json_response({"ok": False, "reason": reason}, status=status, headers=HEADERS)
+    def refusal(self, name: str, authorization: str | None, t_ns: int) -> tuple[int, str] | None:
+        """Return status and reason if a command with this Authorization header is refused at monotonic time t_ns."""
+        if not self._wrong.has_token(t_ns):
+            return 429, "too many wrong tokens came; wait a second and try again, or use `shearloop command`"
+        if token_valid(authorization, self._token):
+            return None
+        self._wrong.allow(t_ns)
+        return 403, f"{name} needs the token: open the address that `shearloop view` printed"
 
 
 class _Page:
     def __init__(self, bridge: Bridge, token: str, fingertip: dict[str, Any], publish: str) -> None:
         self._bridge = bridge
-        self._token = token
+        self._tokens = TokenCheck(token)
+        self._refusals = Refusals()
         regular = [topic for topic, kind in messages.TOPICS.items() if kind.rate_hz is not None]
         self._settings = {
             "fingertip": fingertip,
@@ -279,10 +278,33 @@ class _Page:
             if item.name.rsplit(".", 1)[-1] in _TYPES
         }
 
+    @web.middleware
+    async def check_access(
+        self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
+    ) -> web.StreamResponse:
+        """Refuse requests of other sites, and add the security headers to every response."""
+        host = request.headers.get("Host")
+        if not host_allowed(host):
+            return self._refuse(421, f"{host!r} is not this computer's loopback; open http://127.0.0.1:PORT/")
+        if not origin_allowed(request.headers.get("Origin"), host):
+            return self._refuse(403, "requests from other sites are not answered")
+        try:
+            response = await handler(request)
+        except web.HTTPException as error:
+            response = self._refuse(error.status, error.reason)
+        if not response.prepared:
+            response.headers.update(HEADERS)
+        return response
+
+    def _refuse(self, status: int, reason: str) -> web.Response:
+        # Any program may send any number of wrong requests.
+        self._refusals.add(f"status {status}", reason, frequent=status < 500)
+        return web.json_response({"ok": False, "reason": reason}, status=status, headers=HEADERS)
+
     async def file(self, request: web.Request) -> web.Response:
         name = request.match_info.get("name", "index.html")
         if name not in self._files:
-            return _refuse(404, "there is no such file")
+            return self._refuse(404, "there is no such file")
         body, kind = self._files[name]
         return web.Response(body=body, content_type=kind, charset="utf-8")
 
@@ -297,25 +319,26 @@ class _Page:
     async def command(self, request: web.Request) -> web.Response:
         name = request.match_info["name"]
         if name not in NEEDS_TOKEN:
-            return _refuse(404, f"there is no command {name!r} here; there are {', '.join(NEEDS_TOKEN)}")
-        if not token_valid(request.headers.get("Authorization"), self._token):
-            return _refuse(403, f"{name} needs the token: open the address that `shearloop view` printed")
+            return self._refuse(404, f"there is no command {name!r} here; there are {', '.join(NEEDS_TOKEN)}")
+        refusal = self._tokens.refusal(name, request.headers.get("Authorization"), time.monotonic_ns())
+        if refusal is not None:
+            return self._refuse(*refusal)
         return await self._reply(name, self._bridge.command(name))
 
     async def _reply(self, name: str, requested: Awaitable[dict[str, Any]]) -> web.Response:
         try:
             reply = await requested
         except BusyError:
-            return _refuse(429, "too many commands at once; wait for their answers")
+            return self._refuse(429, "too many commands at once; wait for their answers")
         except UserError as error:
-            return _refuse(503, str(error))
+            return self._refuse(503, str(error))
         structlog.get_logger().info("command answered", command=name, ok=reply.get("ok"), reason=reply.get("reason"))
         content = {key: reply[key] for key in ("ok", "reason", "stopped", "tared", "experiment") if key in reply}
         return web.json_response(content, status=200 if reply.get("ok") else 409)
 
     async def stream(self, request: web.Request) -> web.StreamResponse:
         if len(self._open) >= MAX_PAGES:
-            return _refuse(503, f"{MAX_PAGES} pages are open already; close one")
+            return self._refuse(503, f"{MAX_PAGES} pages are open already; close one")
         socket = web.WebSocketResponse(heartbeat=SEND_TIMEOUT_S, max_msg_size=MAX_BODY_BYTES, compress=False)
         await socket.prepare(request)
         self._open.add(socket)

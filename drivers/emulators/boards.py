@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.drivers.defaults import FRAME_PERIOD_S
-from shearloop.drivers.eit_kit import N_VALUES
 from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.ports import PtyPort
 from shearloop.drivers.load_cell import COUNTS_MAX, COUNTS_MIN
@@ -87,12 +86,12 @@ class EmulatedBoard(ABC):
 
 
 def format_line(values: NDArray[np.float64]) -> bytes:
-    """Return the line of the EIT-kit for (1024,) values in volts."""
-    return ("%.4f, " * N_VALUES % tuple(values.tolist()) + "\n").encode()
+    """Return the line of the EIT-kit for (v,) values in volts."""
+    return ("".join(f"{value:.4f}, " for value in values.tolist()) + "\n").encode()
 
 
 class EitKitBoard(EmulatedBoard):
-    """An EIT-kit: waits for a `y`, then sends `frames` (1024 values in volts each), and then is silent.
+    """An EIT-kit: waits for a `y`, then sends `frames` ((v,) values in volts each), and then is silent.
 
     A frame is requested from the iterator at the end of its acquisition. `fault_at` maps frame numbers, from 0, to
     faults. Only an unplugged board loses a frame; a silence without a duration lasts until the next `y`.

@@ -35,7 +35,7 @@ class FrameSynthesiser(Protocol):
     """Makes the frames of one fingertip."""
 
     def line(self, grip: FloatArray, shear_torque_nm: FloatArray, diameter_mm: float) -> FloatArray:
-        """Return the board's line, (1024,) in volts, for grip (0…1) and shear at each injection, (32,) each."""
+        """Return the board's line, (v,) in volts, for grip (0…1) and shear at each injection, (L,) each."""
 
 
 class RigSkin(Gauges, Protocol):

@@ -89,8 +89,13 @@ class LinearMove:
         """Compute the length; a move that only turns is measured in radians."""
         way_m = float(np.linalg.norm(self.target[:3, 3] - self.start[:3, 3]))
         self._turn = Rotation.from_matrix(self.start[:3, :3].T @ self.target[:3, :3]).as_rotvec()
-        self._length = way_m if way_m > 1e-6 else float(np.linalg.norm(self._turn))
+        self._length = self._end = way_m if way_m > 1e-6 else float(np.linalg.norm(self._turn))
         self._done = self._rate = 0.0
+
+    def stop(self, deceleration: float) -> None:
+        """End on the way, as early as this deceleration allows."""
+        self.acceleration = deceleration
+        self._end = min(self._end, self._done + self._rate**2 / (2 * deceleration))
 
     def advance(self, q_rad: Vector, qd_rad_per_s: Vector, dt_s: float) -> Advanced:  # noqa: ARG002 - on its own rails
         """Return the arm one cycle later; `PathError` where the joints cannot follow within their limits."""
@@ -106,16 +111,16 @@ class LinearMove:
             raise PathError("the line leads through a singularity") from singular
         if np.abs(step).max() > JOINT_SPEED_LIMIT_RAD_PER_S * dt_s:
             raise PathError("the line asks a joint for more than its largest speed")
-        finished = self._done >= self._length
+        finished = self._done >= self._end
         return Advanced(q_rad + step, np.zeros(6) if finished else step / dt_s, finished)
 
     def _advance_trapezoid(self, dt_s: float) -> float:
         """Return the covered share of the length one cycle later."""
-        left = self._length - self._done
+        left = self._end - self._done
         self._rate = min(self.speed, self._rate + self.acceleration * dt_s, math.sqrt(2 * self.acceleration * left))
         # The last cycle of a discrete trapezoid would creep for ever.
         if left <= max(self._rate * dt_s, 1e-9):
-            self._done, self._rate = self._length, 0.0
+            self._done, self._rate = self._end, 0.0
         else:
             self._done += self._rate * dt_s
         return 1.0 if self._length <= 0 else self._done / self._length
@@ -129,9 +134,16 @@ class Arm:
         self.q_rad: Vector = np.array([0.0, -1.0, 1.0, -1.0, -1.0, 0.0]) * (math.pi / 2)
         self.qd_rad_per_s: Vector = np.zeros(6)
         self.motion: Motion | None = None
-        self._frame = link_frames(self.q_rad)[-1]
+        self._framed_q_rad, self._last_frame = self.q_rad, link_frames(self.q_rad)[-1]
         self._wrench = np.zeros(6)
         self._wrench_zero = np.zeros(6)
+
+    @property
+    def _frame(self) -> Matrix:
+        # Only where it is needed: it takes longer than all else in a cycle. A motion makes new angles.
+        if self._framed_q_rad is not self.q_rad:
+            self._framed_q_rad, self._last_frame = self.q_rad, link_frames(self.q_rad)[-1]
+        return self._last_frame
 
     @property
     def moving(self) -> bool:
@@ -142,6 +154,11 @@ class Arm:
     def pose(self) -> Vector:
         """The tool's pose (6,)."""
         return np.concatenate([self._frame[:3, 3], Rotation.from_matrix(self._frame[:3, :3]).as_rotvec()])
+
+    @property
+    def speed(self) -> Vector:
+        """The tool's linear and angular velocity (6,) in base coordinates."""
+        return np.asarray(jacobian(link_frames(self.q_rad)) @ self.qd_rad_per_s)
 
     @property
     def wrench(self) -> Vector:
@@ -162,12 +179,18 @@ class Arm:
         """Slow every joint down to rest."""
         self.motion = Speed(np.zeros(6), deceleration, halts=True) if self.moving else None
 
+    def halt_on_line(self, deceleration: float) -> None:
+        """Slow a linear move down to rest on its line; anything else as `halt` does."""
+        if isinstance(self.motion, LinearMove):
+            self.motion.stop(deceleration)
+        else:
+            self.halt(deceleration)
+
     def advance(self, dt_s: float) -> None:
         """Move for one cycle; `PathError` where the motion leads nowhere."""
         if self.motion is not None:
             self.q_rad, self.qd_rad_per_s, finished = self.motion.advance(self.q_rad, self.qd_rad_per_s, dt_s)
             self.motion = None if finished else self.motion
-            self._frame = link_frames(self.q_rad)[-1]
 
     def load(self, torque_nm: float) -> None:
         """Take a torque about the tool's axis."""

@@ -2,14 +2,16 @@
 
 import asyncio
 import logging
+import re
 import time
 from collections.abc import AsyncIterator, Iterator
-from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
 from dataclasses import replace
 
 from shearloop.drivers.emulators import number_between
-from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, Robot, RobotEvent, armed_hz
-from shearloop.drivers.emulators.ur_rtde import VERSION_NUMBERS, ConnectionFaults, NotRtdeError, RtdeSession
+from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, Robot, RobotEvent
+from shearloop.drivers.emulators.ur_rtde import ConnectionFaults, NotRtdeError, RtdeSession
+from shearloop.drivers.emulators.urscript import translate
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 # A control script closes its outermost block in the first column.
@@ -24,7 +26,7 @@ _SAFETY_MODES = {1: "NORMAL", 3: "PROTECTIVE_STOP", 7: "ROBOT_EMERGENCY_STOP"}
 
 FAULTS = (
     *("protective-stop", "emergency-stop", "release", "drop-rtde", "silence", "stop-hangs"),
-    *("registers-in-use", "local-control", "refuse-protocol", "normal"),
+    *("registers-in-use", "local-control", "refuse-protocol", "mute-dashboard", "version", "payload", "normal"),
 )
 
 log = logging.getLogger(__name__)
@@ -96,8 +98,16 @@ class Controller:
             case ["stop-hangs", count]:
                 hangs = int(number_between(count, 0, 1000, "not a number of requests from 0 to 1000"))
                 self.faults = replace(self.faults, stop_hangs=hangs)
-            case ["registers-in-use" | "local-control" | "refuse-protocol" as fault]:
+            case ["registers-in-use" | "local-control" | "refuse-protocol" | "mute-dashboard" as fault]:
                 self.faults = replace(self.faults, **{fault.replace("-", "_"): True})
+            case ["version", numbers]:
+                if re.fullmatch(r"\d{1,4}(\.\d{1,4}){3}", numbers) is None:
+                    raise ValueError(f"{numbers!r} is not a version such as 5.4.0.0")
+                major, minor, bugfix, build = map(int, numbers.split("."))
+                self.robot.change(replace(self.robot.spec, version=(major, minor, bugfix, build)))
+            case ["payload", mass_kg]:
+                payload_kg = number_between(mass_kg, 0.0, 100.0, "not a mass in kg from 0 to 100")
+                self.robot.change(replace(self.robot.spec, payload_kg=payload_kg))
             case ["normal"]:
                 self.robot.clear_faults()
                 self.faults = ConnectionFaults()
@@ -137,7 +147,11 @@ class Controller:
             while data := await reader.read(65536):
                 text += data
                 if text.endswith(SCRIPT_END):
-                    self.robot.upload(armed_hz(text))
+                    script = text.decode("utf-8", "replace")
+                    with suppress(SyntaxError):  # which `upload` reports
+                        # In a thread: it takes 40 ms, and the controller is never late.
+                        await asyncio.to_thread(translate, script)
+                    self.robot.upload(script)
                     text.clear()
                 elif len(text) > LARGEST_SCRIPT:
                     log.warning("a script without an end was dropped after %d bytes", len(text))
@@ -145,8 +159,11 @@ class Controller:
 
     async def _serve_dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with self._connection(writer):
-            self._send(writer, BANNER.encode() + b"\n")
+            if not self.faults.mute_dashboard:
+                self._send(writer, BANNER.encode() + b"\n")
             while line := await reader.readline():
+                if self.faults.mute_dashboard:
+                    continue
                 request, hangs = line.decode("utf-8", "replace").strip(), self.faults.stop_hangs
                 if request == "stop" and hangs:
                     self.faults = replace(self.faults, stop_hangs=hangs - 1)
@@ -158,7 +175,7 @@ class Controller:
         robot = self.robot
         match request:
             case "PolyscopeVersion":
-                return f"URSoftware {'.'.join(map(str, VERSION_NUMBERS))} (Jun 01 2024)"
+                return f"URSoftware {'.'.join(map(str, robot.spec.version))} (Jun 01 2024)"
             case "get serial number":
                 return "20235500001"
             case "is in remote control":

@@ -8,24 +8,22 @@ from dataclasses import dataclass, field
 
 from shearloop.drivers.emulators.ur_arm import Vector
 from shearloop.drivers.emulators.ur_robot import (
-    COMMAND,
     MODE_RUNNING,
     SAFETY_EMERGENCY_STOP,
     SAFETY_NORMAL,
     SAFETY_PROTECTIVE_STOP,
     Robot,
 )
+from shearloop.drivers.emulators.urscript import COMMAND
 
 Value = int | float | Sequence[float] | Vector
 
-# PolyScope's.
-VERSION_NUMBERS = (5, 17, 3, 0)
 VERSION, URCONTROL_VERSION, DATA, OUTPUTS, INPUTS, START, PAUSE = b"VvUOISP"
 _HEADER = struct.Struct(">HB")
 # The largest input recipe has 25 registers; a longer package than this is no RTDE.
 LARGEST_PACKAGE = 4096
 
-FORMATS = {"UINT32": "I", "INT32": "i", "DOUBLE": "d", "VECTOR6D": "6d"}
+FORMATS = {"UINT32": "I", "INT32": "i", "DOUBLE": "d", "VECTOR3D": "3d", "VECTOR6D": "6d"}
 _REGISTERS = 48
 _REGISTER = re.compile(r"(input|output)_(int|double)_register_(\d+)")
 _SAFETY_BITS = {
@@ -39,6 +37,7 @@ _VARIABLES: dict[str, tuple[str, Callable[[Robot], Value]]] = {
     "actual_q": ("VECTOR6D", lambda robot: robot.arm.q_rad),
     "actual_qd": ("VECTOR6D", lambda robot: robot.arm.qd_rad_per_s),
     "actual_TCP_pose": ("VECTOR6D", lambda robot: robot.arm.pose),
+    "actual_TCP_speed": ("VECTOR6D", lambda robot: robot.arm.speed),
     "actual_TCP_force": ("VECTOR6D", lambda robot: robot.arm.wrench),
     "robot_mode": ("INT32", lambda robot: robot.safety.robot_mode),
     "safety_mode": ("INT32", lambda robot: robot.safety.safety_mode),
@@ -50,6 +49,9 @@ _VARIABLES: dict[str, tuple[str, Callable[[Robot], Value]]] = {
     ),
     "speed_scaling": ("DOUBLE", lambda _: 1.0),
     "external_force_torque": ("VECTOR6D", lambda _: (0.0,) * 6),
+    "payload": ("DOUBLE", lambda robot: robot.spec.payload_kg),
+    "payload_cog": ("VECTOR3D", lambda robot: robot.spec.payload_cog_m),
+    "tcp_offset": ("VECTOR6D", lambda _: (0.0,) * 6),
 }
 
 
@@ -92,6 +94,7 @@ class ConnectionFaults:
     refuse_protocol: bool = False
     registers_in_use: bool = False
     local_control: bool = False
+    mute_dashboard: bool = False
     # How many of the next requests to stop the dashboard ignores.
     stop_hangs: int = 0
 
@@ -148,7 +151,7 @@ class RtdeSession:
         if kind == VERSION:
             return package(VERSION, bytes([payload == b"\x00\x02" and not self.faults.refuse_protocol]))
         if kind == URCONTROL_VERSION:
-            return package(URCONTROL_VERSION, struct.pack(">4I", *VERSION_NUMBERS))
+            return package(URCONTROL_VERSION, struct.pack(">4I", *self.robot.spec.version))
         if kind == OUTPUTS:
             return self._set_outputs(payload)
         if kind == INPUTS:

@@ -8,7 +8,7 @@ import asyncio
 from contextlib import suppress
 
 from shearloop.drivers.defaults import URCAP_PORT
-from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, ProtocolError
+from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, ProtocolError, system_reason
 from shearloop.drivers.robotiq import messages
 
 CONNECT_DEADLINE_S = 2.0
@@ -113,7 +113,7 @@ class SocketClient:
                 self._streams = await asyncio.open_connection(self._host, self._port)
         except OSError as error:  # a timeout is one
             raise DeviceNotFoundError(
-                f"There is no gripper socket at {self.name} ({error or 'no answer'}); check the robot's address and "
+                f"There is no gripper socket at {self.name} ({system_reason(error)}); check the robot's address and "
                 "that the Robotiq URCap is installed and runs."
             ) from error
 

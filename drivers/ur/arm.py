@@ -17,16 +17,22 @@ import rtde_control
 import script_client
 
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.ur.controller import RTDE_PORT, RtdeReceiver, SampleAge, ScriptReadiness, ask_dashboard
+from shearloop.drivers.ur.controller import (
+    RTDE_PORT,
+    ProbeError,
+    RtdeReceiver,
+    SampleAge,
+    ScriptReadiness,
+    ask_dashboard,
+)
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, WristSpeed
+from shearloop.drivers.ur.script import guard_script
 from shearloop.drivers.ur.settings import UrSettings
 
 # A thread of ur-rtde polls its socket every 0.1 ms, which takes 5 % of a core. With this timer slack it wakes once per
 # two samples. One-time commands wait for that thread, so that the slack is at most a sixth of the watchdog's time.
 _LONGEST_POLL_SLACK_NS, _SLACKS_PER_WATCHDOG = 16_000_000, 6
 _PR_SET_TIMERSLACK = 29
-# The line before the loop in ur-rtde 1.6.5's control script.
-_BEFORE_LOOP = "        keep_running = True\n"
 
 
 class UrArm:
@@ -37,13 +43,17 @@ class UrArm:
 
         Raises:
             RuntimeError: ur-rtde failed.
-            ProbeError: the controller does not send its state.
+            ProbeError: the controller does not send its state, or ur-rtde's script is unknown.
         """
         self._settings = settings
         major, minor = map(int, version.split(".")[:2])
-        self._script = arm_watchdog_in(script_client.ScriptClient("", major, minor).getScript(), settings.watchdog_hz)
+        self._script = guard_script(script_client.ScriptClient("", major, minor).getScript(), settings)
         if not self._script:
-            sys.stderr.write("This ur-rtde has an unknown control script: only a command arms the script's watchdog.\n")
+            raise ProbeError(
+                "version",
+                "The control script of the installed ur-rtde is unknown, so that its limits cannot be added: install "
+                "ur-rtde 1.6.5.",
+            )
         self._receiver = RtdeReceiver(settings.host, settings.rate_hz, settings.connect_timeout_s / 3)
         kind, ours = rtde_control.RTDEControlInterface, connections_to(RTDE_PORT)
         watchdog_ns = 1e9 / settings.watchdog_hz
@@ -63,7 +73,7 @@ class UrArm:
         sample = self._receiver.latest()
         now_ns = time.monotonic_ns()
         return RtdeSample(
-            *sample[:-1],
+            *sample[:-2],
             t_mono_ns=now_ns,
             age_ns=self._age.age_ns(sample.timestamp_s, now_ns),
             connected=self._receiver.connected
@@ -74,9 +84,10 @@ class UrArm:
             and self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
         )
 
-    def wrist(self, command: WristSpeed) -> bool:
-        """Turn wrist 3 and hold the other joints; not during a linear move."""
+    def wrist(self, command: WristSpeed, left_s: float) -> bool:
+        """Turn wrist 3 for `left_s` at most, and hold the other joints; not during a linear move."""
         self._may_move_linearly = False
+        self._write_deadline(left_s)
         speeds = [0.0, 0.0, 0.0, 0.0, 0.0, command.rad_per_s]
         return self._script_readiness.wait() and bool(
             self._control.speedJ(speeds, command.acceleration_rad_per_s2, 0.0)
@@ -89,17 +100,20 @@ class UrArm:
     def move(self, command: MoveLinear) -> bool:
         """Begin a linear move; `RtdeSample.moving_linearly` shows its end."""
         self._may_move_linearly = True
+        self._write_deadline(self._settings.silence_timeout_s)
         speed, acceleration = command.speed_m_per_s, command.acceleration_m_per_s2
         return self._send_once(self._control.moveL, [*command.pose], speed, acceleration, asynchronous=True)
 
     def stop_move(self, deceleration_rad_per_s2: float) -> bool:
-        """Begin to end a linear move."""
+        """Begin to end a linear move; ur-rtde's script takes the deceleration of an asynchronous stop in m/s²."""
         # ur-rtde does not report whether the stop was accepted; the heartbeat after it does.
         self._send_once(self._control.stopJ, deceleration_rad_per_s2, asynchronous=True)
         return self.send_heartbeat()
 
-    def send_heartbeat(self) -> bool:
-        """Feed the robot's watchdog."""
+    def send_heartbeat(self, left_s: float | None = None) -> bool:
+        """Feed the robot's watchdog; a linear move goes on for `left_s` at most."""
+        if left_s is not None:
+            self._write_deadline(left_s)
         return self._script_readiness.wait() and bool(self._control.kickWatchdog())
 
     def clear_command(self) -> bool:
@@ -120,13 +134,10 @@ class UrArm:
     def upload(self) -> bool:
         """Send the control script; the program starts by itself, and ends when it receives nothing."""
         try:
-            if self._script:
-                with open(os.memfd_create("control.script"), "w") as file:
-                    file.write(self._script)
-                    file.flush()
-                    self._control.setCustomScriptFile(f"/proc/self/fd/{file.fileno()}")
-            else:
-                self._control.reuploadScript()
+            with open(os.memfd_create("control.script"), "w") as file:
+                file.write(self._script)
+                file.flush()
+                self._control.setCustomScriptFile(f"/proc/self/fd/{file.fileno()}")
         except RuntimeError as error:
             # The controller closed the script connection, and ur-rtde does not reopen it.
             sys.stderr.write(f"The control script could not be sent: {error}.\n")
@@ -143,6 +154,10 @@ class UrArm:
         if self._script_readiness.wait():
             self._control.stopScript()
 
+    def _write_deadline(self, left_s: float) -> None:
+        # The latest sample is older than now, so that the deadline is never late.
+        self._receiver.write_deadline(self._receiver.latest().script_s + left_s)
+
     def _send_once(self, call: Callable[..., object], *arguments: object, **options: object) -> bool:
         """Send a command that the script carries out once."""
         if not self._script_readiness.wait():
@@ -156,18 +171,6 @@ class UrArm:
         answers = ask_dashboard(self._settings.host, 2.5, requests)
         if requests == ("unlock protective stop",) and answers != ["Protective stop releasing"]:
             raise DriverError(f"The controller refused: {answers[0]}")
-
-
-def arm_watchdog_in(script: str, watchdog_hz: float) -> str:
-    """Return ur-rtde's script with its watchdog armed before the loop, or "" when the place is not found.
-
-    ur-rtde arms the watchdog by a command once the script runs. Until then a script would outlive its client. URScript
-    manual, `rtde_set_watchdog`: a program's watchdogs end with it.
-    """
-    if script.count(_BEFORE_LOOP) != 1:
-        return ""
-    armed = f'        rtde_set_watchdog("input_int_register_0", {watchdog_hz:g}, "stop")\n'
-    return f"def rtde_control():\n{script.replace(_BEFORE_LOOP, armed + _BEFORE_LOOP)}end\n"
 
 
 def connections_to(port: int) -> set[tuple[int, int]]:

@@ -18,7 +18,7 @@ from typing import Any, Literal, Protocol, cast
 from shearloop.drivers.connection import Diagnostics, LinkMonitor
 from shearloop.drivers.errors import DeviceLostError, ProtocolError
 from shearloop.drivers.ur import messages
-from shearloop.drivers.ur.controller import silent_sentence
+from shearloop.drivers.ur.controller import silent_sentence, untested_sentence
 from shearloop.drivers.ur.settings import UrSettings
 
 LossKind = messages.FailureKind | Literal["crashed", "hung", "garbled"]
@@ -70,6 +70,7 @@ class UrRobot:
         self._connection: WorkerConnection | None = None
         self._replies: dict[int, asyncio.Future[messages.CommandReply]] = {}
         self._number = 0
+        self._version = ""
         self._lost_s = -math.inf
         self._next: asyncio.Future[messages.RobotState] | None = None
 
@@ -114,7 +115,9 @@ class UrRobot:
                 await self._run_worker()
             except LostError as loss:
                 self.losses[loss.kind] += 1
-                await asyncio.sleep(self.link.failed(loss, time.monotonic_ns()))
+                pause_s = self.link.failed(loss, time.monotonic_ns())
+                # Only an update of the controller changes its version.
+                await asyncio.sleep(math.inf if loss.kind == "version" else pause_s)
 
     async def _run_worker(self) -> None:
         connection = WorkerConnection(self.settings, self)
@@ -149,8 +152,9 @@ class UrRobot:
                 counted = before.failed_program_stops if before is not None else 0
                 self.failed_program_stops += message.failed_program_stops - counted
                 if before is None:
-                    sentence = f"The robot at {self.settings.host} is connected. {message.blocked}".strip()
-                    self.link.connected(sentence, time.monotonic_ns())
+                    untested = untested_sentence(self._version) if self._version else ""
+                    said = (f"The robot at {self.settings.host} is connected.", untested, message.blocked)
+                    self.link.connected(" ".join(filter(None, said)), time.monotonic_ns())
                 if message.motion == "linear" and self._connection is not None:
                     # A straight move stops when the daemon falls silent; other commands are renewed by the loop.
                     self._connection.send(messages.Heartbeat())
@@ -161,6 +165,8 @@ class UrRobot:
                 replied = self._replies.pop(number, None)
                 if replied is not None and not replied.done():
                     replied.set_result(message)
+            case messages.ControllerVersion():
+                self._version = message.version
             case messages.Failed():
                 raise LostError(message.kind, message.sentence)
 

@@ -27,7 +27,7 @@ from shearloop.drivers.ur.messages import (
     WristSpeed,
     ZeroForceTorque,
 )
-from shearloop.drivers.ur.motion import MotionExecutor, is_recent, violation, why_unfit
+from shearloop.drivers.ur.motion import MotionExecutor, is_recent, why_unfit
 from shearloop.drivers.ur.settings import UrSettings
 
 if TYPE_CHECKING:
@@ -280,7 +280,7 @@ class CommandHandler:
             case _ if self._recovery is not None:
                 refusal = BEING_MADE_READY
             case Enable() | Unlock():
-                refusal = unfit or violation(sample, self._settings.limits)
+                refusal = unfit or self._executor.violation(sample)
                 if not refusal:
                     self._held_reason = ""
                 return CommandReply(refusal=refusal)
@@ -303,7 +303,7 @@ class CommandHandler:
     def _zero_wrench(self, sample: RtdeSample) -> str:
         """Zero the wrench; return why not, or an empty string."""
         # A new zero would only hide a value beyond its limit.
-        if beyond := violation(sample, self._settings.limits):
+        if beyond := self._executor.violation(sample):
             return beyond
         if not (self.at_rest and sample.rests):
             return "The wrench is zeroed only at rest: stop the arm first."
@@ -335,14 +335,14 @@ class CommandHandler:
                 if recent and self._program.ours and sample.program_paused and not self.leaving:
                     self._program.stop_paused(now_ns)
             return None
-        beyond = violation(sample, self._settings.limits)
+        beyond = self._executor.violation(sample)
         if beyond:
             self._held_reason = beyond
             self._executor.stop(sample, now_ns, beyond)
         elif now_ns - self._daemon_alive_ns > self._settings.silence_timeout_s * 1e9:
             silent = f"the daemon was silent for {self._settings.silence_timeout_s:g} s"
             self._executor.stop(sample, now_ns, silent)
-        self._executor.keep(sample, now_ns)
+        self._executor.keep(sample, now_ns, self._daemon_alive_ns)
         return None
 
     def state(self, sample: RtdeSample, cycle: int) -> RobotState:
@@ -370,7 +370,7 @@ class CommandHandler:
         """Return why motion is refused, or the empty string."""
         if self._recovery is not None:
             return BEING_MADE_READY
-        reason = self._why_unfit(sample) or violation(sample, self._settings.limits) or self._held_reason
+        reason = self._why_unfit(sample) or self._executor.violation(sample) or self._held_reason
         return f"{reason} {self._program.failure}" if self._program.failure else reason
 
     def _end_recovery(self, recovery: Recovery) -> tuple[int, CommandReply] | None:

@@ -14,34 +14,47 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from shearloop.drivers.errors import DriverError, ProtocolError
+from shearloop.drivers.errors import DriverError, ProtocolError, system_reason
 from shearloop.drivers.ur.messages import RUNTIME_PLAYING, FailureKind
-from shearloop.drivers.ur.settings import Six
+from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER
+from shearloop.drivers.ur.settings import Six, Three
 
 RTDE_PORT, DASHBOARD_PORT = 30004, 29999
 SCRIPT_READY: Final = 1
 HEADER: Final = struct.Struct(">HB")
 _PROTOCOL, _CONTROLLER_VERSION, _OUTPUTS, _INPUTS, _START, _DATA = b"VvOISU"
+# By major version: the oldest controllers with all that ur-rtde uses, and the newest that ur-rtde 1.6 is tested on.
+OLDEST: Final = {3: (3, 10), 5: (5, 4)}
+NEWEST_TESTED: Final = {3: (3, 15, 8), 5: (5, 17, 3)}
 _OTHER_PACKAGES = 20
 _LONGEST_LINE = 1024
-# The command registers of ur-rtde's control script.
-_REGISTERS = ("input_int_register_0", "input_double_register_0")
+# The command registers of ur-rtde's control script, and ours.
+_REGISTERS = ("input_int_register_0", "input_double_register_0", DEADLINE_REGISTER)
 # The outputs and their types, in the order of a sample's fields.
 _TYPES: Final = {
     "timestamp": "DOUBLE",
     "actual_q": "VECTOR6D",
     "actual_qd": "VECTOR6D",
     "actual_TCP_pose": "VECTOR6D",
+    "actual_TCP_speed": "VECTOR6D",
     "actual_TCP_force": "VECTOR6D",
     "robot_mode": "INT32",
     "safety_mode": "INT32",
     "runtime_state": "UINT32",
     "speed_scaling": "DOUBLE",
     "output_int_register_0": "INT32",
+    CLOCK_REGISTER: "DOUBLE",
 }
+# Outputs that controllers have from PolyScope 3.12 and 5.5.1 on.
+_TOOL_TYPES: Final = {"payload": "DOUBLE", "payload_cog": "VECTOR3D", "tcp_offset": "VECTOR6D"}
 # The same outputs, after the header and the recipe's number.
-_VALUES: Final = struct.Struct(">d24d2iIdi")
+_VALUES: Final = struct.Struct(">d30d2iIdid")
+_TOOL_VALUES: Final = struct.Struct(">d3d6d")
 _PACKAGE_BYTES: Final = HEADER.size + 1 + _VALUES.size
+_PACKAGE_SIZES: Final = (_PACKAGE_BYTES, _PACKAGE_BYTES + _TOOL_VALUES.size)
+_NO_TOOL: Final = (math.nan,) * 10
+# An input package: the header, the recipe's number and one value.
+_DEADLINE: Final = struct.Struct(">HBBd")
 # One second of samples.
 _READ_BYTES = 1 << 15
 # The smallest clock offset may rise by this share of the time. Clocks drift by up to 500 ppm, and a simulator's may be
@@ -69,41 +82,58 @@ class ControllerInfo:
 
 
 class ReceivedSample(NamedTuple):
-    """The outputs in one package, the first nine as in `RtdeSample`."""
+    """The outputs in one package, all but the last two as in `RtdeSample`."""
 
     timestamp_s: float
     q_rad: Six
     qd_rad_per_s: Six
     tcp_pose: Six
+    tcp_speed: Six
     wrench: Six
     robot_mode: int
     safety_mode: int
     runtime_state: int
     speed_scaling: float
-    # Of ur-rtde's control script: 1 when ready, 2 when done with a command.
+    # NaN where the controller does not report them.
+    payload_kg: float
+    payload_cog_m: Three
+    tcp_offset: Six
+    # Of the control script: 1 when ready, 2 when done with a command; and its own clock.
     script_state: int
+    script_s: float = 0.0
 
 
 def probe_controller(host: str, timeout_s: float) -> str:
     """Return the controller's version, as 5.17.3.0, after agreeing on protocol 2.
 
     Raises:
-        ProbeError: it is not there, stays silent, or refuses the protocol.
+        ProbeError: it is not there, stays silent, refuses the protocol, or its version is not supported.
     """
     with (
         explain_failure(host, timeout_s, "greeting it"),
         socket.create_connection((host, RTDE_PORT), timeout=timeout_s) as connection,
     ):
         answer = _request(connection, _CONTROLLER_VERSION)
-        version = ".".join(str(number) for number in struct.unpack(">4I", answer[:16]))
+        numbers = struct.unpack(">4I", answer[:16])
         accepted = _agree_on_protocol(connection)
-    if not accepted:
+    version = ".".join(map(str, numbers))
+    if not accepted or numbers[0] not in OLDEST or numbers < OLDEST[numbers[0]]:
         raise ProbeError(
             "version",
-            f"The UR controller at {host} ({version}) refuses protocol 2 of RTDE: it needs PolyScope 3.10 or 5.4, or "
-            "newer.",
+            f"The UR controller at {host} has PolyScope {version}, which cannot be driven; install PolyScope 3.10 "
+            "(CB3) or 5.4 (e-Series), or a newer 3.x or 5.x, and restart the daemon.",
         )
     return version
+
+
+def untested_sentence(version: str) -> str:
+    """Return a warning about a version (5.17.3.0) that is newer than those tested, or an empty string."""
+    numbers = tuple(map(int, version.split(".")))[:3]
+    newest = NEWEST_TESTED[numbers[0]]
+    if numbers <= newest:
+        return ""
+    tested = ".".join(map(str, newest))
+    return f"PolyScope {version} is newer than {tested}, the newest that ur-rtde 1.6 is tested on: move slowly first."
 
 
 def query_controller(host: str, timeout_s: float) -> ControllerInfo:
@@ -131,7 +161,7 @@ def ask_dashboard(host: str, timeout_s: float, requests: tuple[str, ...]) -> lis
     """Return the dashboard server's answers; DriverError where it is absent or silent."""
     answers = []
     with (
-        explain_failure(host, timeout_s, "asking its dashboard"),
+        explain_failure(host, timeout_s, f"asking its dashboard server (port {DASHBOARD_PORT})"),
         socket.create_connection((host, DASHBOARD_PORT), timeout=timeout_s) as connection,
         connection.makefile("rb") as lines,
     ):
@@ -153,7 +183,7 @@ def explain_failure(host: str, timeout_s: float, activity: str) -> Iterator[None
     except TimeoutError as error:
         raise ProbeError("silent", silent_sentence(host, timeout_s, activity)) from error
     except (OSError, struct.error) as error:
-        reason = str(error) or type(error).__name__
+        reason = system_reason(error) if isinstance(error, OSError) else "it does not answer as one"
         raise ProbeError(
             "unreachable",
             f"No UR controller at {host}: {reason}. Check that it is switched on and that this computer is in its "
@@ -161,11 +191,21 @@ def explain_failure(host: str, timeout_s: float, activity: str) -> Iterator[None
         ) from error
 
 
+def registers_in_use(host: str) -> ProbeError:
+    """Return the error about input registers that another client writes."""
+    return ProbeError(
+        "registers-in-use",
+        f"The input registers of the robot at {host} are already in use by another RTDE client, EtherNet/IP or "
+        "PROFINET: end the other program, or disable the adapter under Installation → Fieldbus.",
+    )
+
+
 def silent_sentence(host: str, seconds: float, activity: str) -> str:
     """Return the message about a controller that did not answer."""
     return (
         f"The UR controller at {host} said nothing for {seconds:.1f} s while {activity}: it is starting, hangs, or "
-        "something else listens on its ports. Look at the teach pendant."
+        "something else listens on its ports. Look at the teach pendant, and restart the controller "
+        "if it hangs."
     )
 
 
@@ -211,7 +251,7 @@ class SampleParser:
         start, newest, received = 0, -1, len(data)
         while received - start >= HEADER.size:
             size, kind = HEADER.unpack_from(data, start)
-            if size < HEADER.size or (kind == _DATA and size != _PACKAGE_BYTES):
+            if size < HEADER.size or (kind == _DATA and size not in _PACKAGE_SIZES):
                 raise ProtocolError(f"The controller sent a package of kind {kind} with {size} bytes.")
             if received - start < size:
                 break
@@ -221,12 +261,15 @@ class SampleParser:
         self._buffer = data[start:]
         if newest < 0:
             return None
-        values = _VALUES.unpack_from(data, newest + HEADER.size + 1)
-        return ReceivedSample(values[0], values[1:7], values[7:13], values[13:19], values[19:25], *values[25:])
+        (size, _), start = HEADER.unpack_from(data, newest), newest + HEADER.size + 1
+        v = _VALUES.unpack_from(data, start)
+        tool = _NO_TOOL if size == _PACKAGE_BYTES else _TOOL_VALUES.unpack_from(data, start + _VALUES.size)
+        motion = v[0], v[1:7], v[7:13], v[13:19], v[19:25], v[25:31]
+        return ReceivedSample(*motion, v[31], v[32], v[33], v[34], tool[0], tool[1:4], tool[4:], v[35], v[36])
 
 
 class RtdeReceiver:
-    """A connection that receives the controller's samples; `connected` is False once it has ended.
+    """A connection for the controller's samples and our register; `connected` is False once it has ended.
 
     Samples wait in the kernel until `latest` takes the newest one. ur-rtde's interface polls its socket instead, which
     takes a third of the worker's processor time at rest.
@@ -236,8 +279,9 @@ class RtdeReceiver:
         """Connect and wait for the first sample.
 
         Raises:
-            ProbeError: the controller is absent or silent, or does not send the outputs.
+            ProbeError: the controller is absent or silent, does not send the outputs, or our register is in use.
         """
+        self._host = host
         self._parser = SampleParser()
         self.connected = True
         with explain_failure(host, timeout_s, "asking for its state"):
@@ -256,10 +300,17 @@ class RtdeReceiver:
 
     def _first_sample(self, rate_hz: float) -> ReceivedSample:
         _agree_on_protocol(self._connection)
-        answer = _request(self._connection, _OUTPUTS, struct.pack(">d", rate_hz) + ",".join(_TYPES).encode())
-        types = answer[1:].decode(errors="replace")
-        if types != ",".join(_TYPES.values()):
+        for outputs in (_TYPES | _TOOL_TYPES, _TYPES):
+            answer = _request(self._connection, _OUTPUTS, struct.pack(">d", rate_hz) + ",".join(outputs).encode())
+            types = answer[1:].decode(errors="replace")
+            if types == ",".join(outputs.values()):
+                break
+        else:
             raise OSError(f"its outputs are of the types {types}")
+        answer = _request(self._connection, _INPUTS, DEADLINE_REGISTER.encode())
+        if b"IN_USE" in answer:
+            raise registers_in_use(self._host)
+        self._recipe = answer[0]
         if _request(self._connection, _START) != b"\x01":
             raise OSError("it does not send its state")
         while self.connected:
@@ -273,6 +324,14 @@ class RtdeReceiver:
         if self.connected:
             self._sample = self._receive() or self._sample
         return self._sample
+
+    def write_deadline(self, script_s: float) -> None:
+        """Write when the motion has to end, by the script's clock."""
+        try:
+            self._connection.send(_DEADLINE.pack(_DEADLINE.size, _DATA, self._recipe, script_s))
+        except OSError:
+            # Also where the socket is full: the controller has read nothing for long.
+            self.connected = False
 
     def wait(self, seconds: float) -> bool:
         """Wait for data, at most this long, and return whether there is any."""

@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 import msgpack
 
 from shearloop.drivers.errors import ProtocolError
-from shearloop.drivers.ur.settings import Bound, JointRange, Six, Three, UrLimits, UrSettings, Workspace
+from shearloop.drivers.ur.settings import Bound, InstalledTool, JointRange, Six, Three, UrLimits, UrSettings, Workspace
 
 MotionKind = Literal["idle", "wrist", "linear", "stopping"]
 FailureKind = Literal["unreachable", "silent", "version", "registers-in-use", "local-control", "lost"]
@@ -112,11 +112,16 @@ class RtdeSample:
     q_rad: Six
     qd_rad_per_s: Six
     tcp_pose: Six
+    tcp_speed: Six
     wrench: Six
     robot_mode: int
     safety_mode: int
     runtime_state: int
     speed_scaling: float
+    # What is set at the pendant, at the flange; NaN where the controller does not report it.
+    payload_kg: float
+    payload_cog_m: Three
+    tcp_offset: Six
     t_mono_ns: int
     # Time since the controller made the sample, by its own clock.
     age_ns: int
@@ -152,6 +157,11 @@ class RtdeSample:
     def fastest_rad_per_s(self) -> float:
         """The speed of the fastest joint."""
         return max(map(abs, self.qd_rad_per_s))
+
+    @property
+    def tcp_speed_m_per_s(self) -> float:
+        """The speed of the tool centre point."""
+        return math.hypot(*self.tcp_speed[:3])
 
     @property
     def wrist_rad(self) -> float:
@@ -222,6 +232,13 @@ class WorkerPhase:
 
 
 @dataclass(frozen=True, slots=True)
+class ControllerVersion:
+    """The controller's version, as 5.17.3.0."""
+
+    version: str
+
+
+@dataclass(frozen=True, slots=True)
 class Failed:
     """Why the worker exits."""
 
@@ -229,7 +246,7 @@ class Failed:
     sentence: str
 
 
-Message = Command | CommandReply | RobotState | Configure | Heartbeat | WorkerPhase | Failed
+Message = Command | CommandReply | RobotState | Configure | Heartbeat | WorkerPhase | ControllerVersion | Failed
 
 # The largest message, a state with every reason for clipping, has about 2 kB.
 LARGEST_MESSAGE: Final = 1 << 16
@@ -237,7 +254,7 @@ LARGEST_MESSAGE: Final = 1 << 16
 _MOTIONS: Final = (WristSpeed, MoveLinear, Stop)
 _TYPES: Final[tuple[Any, ...]] = (
     *_MOTIONS, ZeroForceTorque, Enable, Unlock, Disconnect, CommandReply, RobotState, Configure, Heartbeat, WorkerPhase,
-    Failed, UrSettings, UrLimits, Bound, JointRange, Workspace,
+    ControllerVersion, Failed, UrSettings, UrLimits, Bound, InstalledTool, JointRange, Workspace,
 )  # fmt: skip
 _CODES: Final = {kind: code for code, kind in enumerate(_TYPES)}
 

@@ -5,6 +5,7 @@ robot's watchdog: nothing more is sent to the program, and only a new program ma
 """
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -20,7 +21,7 @@ from shearloop.drivers.ur.messages import (
     Stop,
     WristSpeed,
 )
-from shearloop.drivers.ur.settings import Bound, Six, UrLimits, UrSettings
+from shearloop.drivers.ur.settings import Bound, InstalledTool, Six, UrLimits, UrSettings
 
 if TYPE_CHECKING:
     from shearloop.drivers.ur.arm import UrArm
@@ -35,6 +36,10 @@ _NO_OVERSHOOT = math.e
 CLOSE, ARRIVED_AFTER_S = 2e-3, 0.2
 # An idle arm may tremble, but not move this fast for this long.
 ASTRAY_RAD_PER_S, ASTRAY_S = 0.02, 0.2
+# Accelerations are means over this time by the controller's clock: the difference of two samples is mostly noise.
+ACCELERATION_S = 0.04
+# The pendant shows grams, tenths of a millimetre and thousandths of a radian.
+PAYLOAD_KG, TOOL_M_RAD = 0.01, 1e-3
 # The time allowed for a motion to end: nominal time × factor + constant.
 MOVE_SLACK_S, STOP_SLACK_S, SLACK = 2.0, 1.0, 1.5
 # The pendant's speed slider slows everything; below this a motion would have no end.
@@ -97,6 +102,7 @@ class MotionExecutor:
         # The script's thread for speeds runs; it has to be ended before a linear move.
         self._speed_thread = False
         self._rested_ns = now_ns
+        self._accelerations = Accelerations()
 
     @property
     def motion(self) -> MotionKind:
@@ -118,7 +124,7 @@ class MotionExecutor:
     def begin(self, motion_id: int, asked: WristSpeed | MoveLinear, sample: RtdeSample, now_ns: int) -> str:
         """Turn the wrist at a speed from now on, or begin a linear move; return why not, or the empty string."""
         match asked, self._motion:
-            case WristSpeed(decided_ns=decided_ns), _ if decided_ns and self._is_too_old(decided_ns, now_ns):
+            case WristSpeed(decided_ns=decided_ns), _ if decided_ns and self._left_s(decided_ns, now_ns) < 0:
                 return f"The wrist speed was decided {(now_ns - decided_ns) / 1e9:.2f} s ago: the computer is too busy."
             case WristSpeed(_, acceleration), _ if acceleration <= 0:
                 return f"An acceleration of {acceleration:g} rad/s² is not above 0."
@@ -133,7 +139,7 @@ class MotionExecutor:
         self.motion_id, self.end_reason = motion_id, ""
         if isinstance(asked, WristSpeed):
             self._motion = _Turn(asked, asked.decided_ns or now_ns)
-            self._send_clipped_speed(asked, sample)
+            self._keep_turning(self._motion, sample, now_ns)
         else:
             self._end_speed_thread()
             sent, self.clipped = clip_linear(asked, self._settings.limits)
@@ -190,19 +196,27 @@ class MotionExecutor:
         self.disabled_reason = disabled_reason
 
     def watch(self, sample: RtdeSample, now_ns: int) -> None:
-        """Note whether an idle arm rests; call this in every cycle."""
+        """Note the arm's accelerations, and whether an idle arm rests; call this in every cycle."""
         if self._motion is not None or sample.fastest_rad_per_s < ASTRAY_RAD_PER_S:
             self._rested_ns = now_ns
+        self._accelerations.add(sample)
 
-    def keep(self, sample: RtdeSample, now_ns: int) -> None:
-        """Send what this cycle needs."""
+    def violation(self, sample: RtdeSample) -> str:
+        """Return a sentence that names the limit that the sample or the present motion exceeds, or the empty string."""
+        beyond = violation(sample, self._settings)
+        if not beyond and isinstance(self._motion, _Turn | _Move):
+            beyond = self._accelerations.violation(self._settings.limits)
+        return beyond
+
+    def keep(self, sample: RtdeSample, now_ns: int, daemon_alive_ns: int) -> None:
+        """Send what this cycle needs; the daemon's last message came at `daemon_alive_ns`."""
         if self.disabled_reason:
             return
         match self._motion:
             case _Turn() as turn:
                 self._keep_turning(turn, sample, now_ns)
             case _Move() as move:
-                self._keep_moving(move, sample, now_ns)
+                self._keep_moving(move, sample, now_ns, daemon_alive_ns)
             case _Braking() as braking:
                 self._keep_stopping(braking, sample, now_ns)
             case None if now_ns - self._rested_ns > ASTRAY_S * 1e9:
@@ -211,17 +225,21 @@ class MotionExecutor:
             case None:
                 self._arm.send_heartbeat()
 
-    def _is_too_old(self, decided_ns: int, now_ns: int) -> bool:
-        return now_ns - decided_ns > self._settings.command_timeout_s * 1e9
+    def _left_s(self, decided_ns: int, now_ns: int) -> float:
+        """Return how long a wrist speed still holds."""
+        return self._settings.command_timeout_s - (now_ns - decided_ns) / 1e9
 
     def _keep_turning(self, turn: _Turn, sample: RtdeSample, now_ns: int) -> None:
-        if self._is_too_old(turn.decided_ns, now_ns):
+        left_s = self._left_s(turn.decided_ns, now_ns)
+        if left_s < 0:
             late = f"the wrist speed was not renewed within {self._settings.command_timeout_s:g} s"
             self.stop_now(sample, now_ns, late)
         else:
-            self._send_clipped_speed(turn.asked, sample)
+            # The one check of all speeds that turn the wrist.
+            self.sent, self.clipped = clip_wrist(turn.asked, sample, self._settings)
+            self._send_speed(self.sent, left_s)
 
-    def _keep_moving(self, move: _Move, sample: RtdeSample, now_ns: int) -> None:
+    def _keep_moving(self, move: _Move, sample: RtdeSample, now_ns: int, daemon_alive_ns: int) -> None:
         move.seen = move.seen or sample.moving_linearly
         reason = line_violation(sample, self._settings.limits)
         if now_ns > move.deadline_ns:
@@ -234,14 +252,14 @@ class MotionExecutor:
         elif reason:
             self.stop(sample, now_ns, reason)
             return
-        self._arm.send_heartbeat()
+        self._arm.send_heartbeat(self._settings.silence_timeout_s - (now_ns - daemon_alive_ns) / 1e9)
 
     def _keep_stopping(self, braking: _Braking, sample: RtdeSample, now_ns: int) -> None:
         if now_ns > braking.deadline_ns:
             self.leave_to_watchdog(NOT_STOPPING)
         elif self._speed_thread:
             deceleration = clip_stop(braking.deceleration_rad_per_s2, sample, self._settings)
-            if self._send_speed(WristSpeed(0.0, deceleration)) and sample.rests:
+            if self._send_speed(WristSpeed(0.0, deceleration), 0.0) and sample.rests:
                 self._end_speed_thread()
                 self._motion = None
         else:
@@ -249,14 +267,9 @@ class MotionExecutor:
                 self._motion = None
             self._arm.send_heartbeat()
 
-    def _send_clipped_speed(self, asked: WristSpeed, sample: RtdeSample) -> None:
-        """Send the speed within the limits of this moment: the one check of all speeds that turn the wrist."""
-        self.sent, self.clipped = clip_wrist(asked, sample, self._settings)
-        self._send_speed(self.sent)
-
-    def _send_speed(self, command: WristSpeed) -> bool:
+    def _send_speed(self, command: WristSpeed, left_s: float) -> bool:
         self._speed_thread = True
-        accepted = self._arm.wrist(command)
+        accepted = self._arm.wrist(command, left_s)
         if not accepted:
             # An earlier speed may still hold.
             self._reject("wrist speed")
@@ -400,10 +413,47 @@ _SAFETY = {
 }
 
 
-def violation(sample: RtdeSample, limits: UrLimits) -> str:
-    """Return a sentence that names the hard limit that the sample exceeds, or the empty string."""
-    if not all(map(math.isfinite, (*sample.q_rad, *sample.qd_rad_per_s, *sample.tcp_pose, *sample.wrench))):
+class Accelerations:
+    """The measured accelerations of wrist and tool: the changes of their speeds over `ACCELERATION_S`. No clock.
+
+    What gets slower does not count: a stop brakes up to the hard limit, and the robot's own stops brake harder.
+    """
+
+    def __init__(self) -> None:
+        self._samples: deque[RtdeSample] = deque()
+
+    def add(self, sample: RtdeSample) -> None:
+        """Take a sample; one without a later timestamp begins anew, unless it is the latest again."""
+        samples = self._samples
+        if samples and sample.timestamp_s <= samples[-1].timestamp_s:
+            if sample.timestamp_s == samples[-1].timestamp_s:
+                return
+            samples.clear()
+        samples.append(sample)
+        while len(samples) > 2 and sample.timestamp_s - samples[1].timestamp_s > ACCELERATION_S - 1e-6:
+            samples.popleft()
+
+    def violation(self, limits: UrLimits) -> str:
+        """Return a sentence that names the hard limit that an acceleration exceeds, or the empty string."""
+        first, last = self._samples[0], self._samples[-1]
+        span_s = last.timestamp_s - first.timestamp_s
+        if span_s < ACCELERATION_S - 1e-6:
+            return ""
+        before, after = first.qd_rad_per_s[WRIST], last.qd_rad_per_s[WRIST]
+        wrist = abs(after - before) / span_s if abs(after) >= abs(before) else 0.0
+        faster = last.tcp_speed_m_per_s >= first.tcp_speed_m_per_s
+        tool = math.dist(last.tcp_speed[:3], first.tcp_speed[:3]) / span_s if faster else 0.0
+        return _beyond("wrist acceleration", wrist, limits.wrist_acceleration_rad_per_s2, "rad/s²") or _beyond(
+            "tool acceleration", tool, limits.linear_acceleration_m_per_s2, "m/s²"
+        )
+
+
+def violation(sample: RtdeSample, settings: UrSettings) -> str:
+    """Return a sentence that names the hard limit or the setting that the sample contradicts, or the empty string."""
+    measured = (*sample.q_rad, *sample.qd_rad_per_s, *sample.tcp_pose, *sample.tcp_speed, *sample.wrench)
+    if not all(map(math.isfinite, measured)):
         return "The controller reports values that are no numbers."
+    limits = settings.limits
     joints, box = limits.joints, limits.workspace
     for number, (q, low, high) in enumerate(zip(sample.q_rad, joints.lower_rad, joints.upper_rad, strict=True), 1):
         if not low <= q <= high:
@@ -411,11 +461,47 @@ def violation(sample: RtdeSample, limits: UrLimits) -> str:
     for axis, value, low, high in zip("xyz", sample.tcp_pose[:3], box.lower_m, box.upper_m, strict=True):
         if not low <= value <= high:
             return f"The tool is at {axis} = {value:.3f} m, beyond the workspace's {low:g} to {high:g} m."
-    speed = ("wrist speed", abs(sample.qd_rad_per_s[WRIST]), limits.wrist_speed_rad_per_s, "rad/s")
-    for name, value, bound, unit in (speed, *_loads(sample, limits)):
-        if value > bound.hard:
-            return f"{name.capitalize()} is {value:.2f} {unit}, beyond the hard limit of {bound.hard:g} {unit}."
+    speeds = [
+        (f"joint {number} speed" if number <= WRIST else "wrist speed", abs(qd), limits.wrist_speed_rad_per_s, "rad/s")
+        for number, qd in enumerate(sample.qd_rad_per_s, 1)
+    ]
+    tool = ("tool speed", sample.tcp_speed_m_per_s, limits.linear_speed_m_per_s, "m/s")
+    for one in (*speeds, tool, *_loads(sample, limits)):
+        if beyond := _beyond(*one):
+            return beyond
+    return tool_difference(sample, settings.tool)
+
+
+def tool_difference(sample: RtdeSample, tool: InstalledTool) -> str:
+    """Return how payload, centre of gravity or tool centre point differ from the settings, or the empty string.
+
+    A value that the controller does not report is NaN and differs.
+    """
+    load, cog, tcp = tool.payload_kg, tool.payload_cog_m, tool.tcp_offset
+    checks = (
+        ("payload_kg", load, sample.payload_kg, load is None or abs(sample.payload_kg - load) < PAYLOAD_KG),
+        ("payload_cog_m", cog, sample.payload_cog_m, cog is None or math.dist(sample.payload_cog_m, cog) < TOOL_M_RAD),
+        ("tcp_offset", tcp, sample.tcp_offset, tcp is None or is_close(sample.tcp_offset, tcp, TOOL_M_RAD)),
+    )  # fmt: skip
+    for name, configured, found, same in checks:
+        if not same:
+            return (
+                f"The controller has {name} {_rounded(found)}, the robot's settings have {_rounded(configured)}: "
+                "correct the payload and the tool centre point at the teach pendant, or the settings."
+            )
     return ""
+
+
+def _rounded(value: float | tuple[float, ...] | None) -> str:
+    values = value if isinstance(value, tuple) else (value,)
+    return ", ".join("unknown" if one is None or math.isnan(one) else f"{one:.4g}" for one in values)
+
+
+def _beyond(name: str, value: float, bound: Bound, unit: str) -> str:
+    # Rounding errors do not count.
+    if round(value, 9) <= bound.hard:
+        return ""
+    return f"{name.capitalize()} is {value:.2f} {unit}, beyond the hard limit of {bound.hard:g} {unit}."
 
 
 def line_violation(sample: RtdeSample, limits: UrLimits) -> str:

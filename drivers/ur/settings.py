@@ -28,10 +28,10 @@ _LEAST_WATCHDOG_HZ = 1.0
 
 
 class _Checked:
-    """Makes pydantic refuse unknown keys and numbers that are not finite."""
+    """Makes pydantic refuse unknown keys and numbers that are not finite, and describe keys by their docstrings."""
 
     __slots__ = ()
-    __pydantic_config__: ClassVar = {"extra": "forbid", "allow_inf_nan": False}
+    __pydantic_config__: ClassVar = {"extra": "forbid", "allow_inf_nan": False, "use_attribute_docstrings": True}
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,9 @@ class Bound(_Checked):
     """A limit: commands stay at or below `inner`, measured values below `hard`."""
 
     inner: float
+    """Commands are clipped to it."""
     hard: float
+    """A measured value beyond it stops the motion."""
 
     def __post_init__(self) -> None:
         """Refuse limits in the wrong order."""
@@ -52,8 +54,11 @@ class JointRange(_Checked):
     """The hard ends of each joint's range in rad, and the margin that commands keep from them."""
 
     lower_rad: Six
+    """Lowest angle of each joint."""
     upper_rad: Six
+    """Highest angle of each joint."""
     margin_rad: float
+    """Distance that commands keep from both."""
 
     def __post_init__(self) -> None:
         """Refuse a range without room between the margins."""
@@ -65,8 +70,11 @@ class Workspace(_Checked):
     """The box for the tool centre point in m, in the base frame, and the margin that commands keep from its faces."""
 
     lower_m: Three
+    """Lowest x, y and z of the tool centre point in the base frame."""
     upper_m: Three
+    """Highest x, y and z."""
     margin_m: float
+    """Distance that commands keep from both."""
 
     def __post_init__(self) -> None:
         """Refuse a box without room between the margins."""
@@ -78,13 +86,21 @@ class UrLimits(_Checked):
     """The limits on commands and on measured states."""
 
     joints: JointRange
+    """Range of each joint."""
     workspace: Workspace
+    """Box for the tool centre point."""
     wrist_speed_rad_per_s: Bound
+    """Speed of the last joint."""
     wrist_acceleration_rad_per_s2: Bound
+    """Acceleration of the last joint."""
     linear_speed_m_per_s: Bound
+    """Speed of the tool centre point."""
     linear_acceleration_m_per_s2: Bound
+    """Acceleration of the tool centre point."""
     force_n: Bound
+    """Force on the tool centre point."""
     torque_nm: Bound
+    """Torque on the tool centre point."""
 
     def __post_init__(self) -> None:
         """Refuse what ur-rtde would: it raises on a command beyond its own bounds, which would end the worker."""
@@ -97,26 +113,50 @@ class UrLimits(_Checked):
 
 
 @dataclass(frozen=True, slots=True)
+class InstalledTool(_Checked):
+    """Payload and tool centre point that the pendant must have for motion; a key that is absent is not compared."""
+
+    payload_kg: float | None = None
+    """Mass of the load."""
+    payload_cog_m: Three | None = None
+    """Centre of gravity of the load, from the flange."""
+    tcp_offset: Six | None = None
+    """Tool centre point from the flange: position in m, rotation vector in rad."""
+
+    def __post_init__(self) -> None:
+        """Refuse a negative load."""
+        if self.payload_kg is not None and self.payload_kg < 0:
+            raise ValueError(f"payload_kg must be at least 0, not {self.payload_kg:g}")
+
+
+@dataclass(frozen=True, slots=True)
 class UrSettings(_Checked):
     """The robot's address, its limits, and the deadlines of the driver."""
 
     host: str
+    """The robot's name or address."""
     limits: UrLimits
+    """Limits on commands and on measured states."""
+    tool: InstalledTool = InstalledTool()
+    """What the pendant must have for motion."""
     rate_hz: float = 125.0
-    # The robot ends its program when it receives nothing for 1/watchdog_hz.
+    """Robot states per second."""
     watchdog_hz: float = 10.0
-    # A wrist speed holds for this long after it was decided; then the wrist stops.
+    """The robot ends its program when it receives nothing for 1/watchdog_hz."""
     command_timeout_s: float = 0.1
-    # Other motion stops when the daemon sends nothing for this long.
+    """A wrist speed holds for this long after it was decided; then the wrist stops. At most 1 s."""
     silence_timeout_s: float = 0.1
-    # A sample older than this blocks motion; at three times this age the connection counts as lost.
+    """Other motion stops when the daemon sends nothing for this long. At most 1 s."""
     state_timeout_s: float = 0.25
+    """An older state blocks motion; at three times this age the connection counts as lost. At most 1 s."""
     connect_timeout_s: float = 10.0
-    # A cycle that takes longer is a hang, and the worker is ended: calls of ur-rtde block for up to 301 s.
+    """Time for connecting."""
     hang_timeout_s: float = 1.5
+    """A longer cycle is a hang, and the worker is ended: calls of ur-rtde block for up to 301 s."""
     recover_timeout_s: float = 30.0
-    # Delay until a commanded speed takes effect; distances to the joint limits include it.
+    """Time for one attempt to make the robot ready."""
     reaction_s: float = 0.04
+    """Delay until a commanded speed takes effect; distances to the joint limits include it. At most 0.5 s."""
 
     def __post_init__(self) -> None:
         """Refuse an empty host, and deadlines that contradict each other."""
@@ -160,4 +200,4 @@ def read_settings(path: Path) -> UrSettings:
     """
     from shearloop.yaml_files import load_model
 
-    return load_model(path, UrSettings, DriverError)
+    return load_model(path, UrSettings, DriverError, "robot's settings")

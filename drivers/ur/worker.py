@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.controller import ProbeError, probe_controller
+from shearloop.drivers.ur.controller import ProbeError, ask_dashboard, probe_controller, registers_in_use
 from shearloop.drivers.ur.motion import why_unfit
 from shearloop.drivers.ur.settings import UrSettings
 
@@ -116,7 +116,10 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
     host = settings.host
     try:
         pipe.send(messages.WorkerPhase("greeting the controller"))
-        version = probe_controller(host, settings.connect_timeout_s / 3)
+        version = probe_controller(host, settings.connect_timeout_s / 4)
+        pipe.send(messages.ControllerVersion(version))
+        # To a silent dashboard, ur-rtde says "Operation canceled".
+        ask_dashboard(host, settings.connect_timeout_s / 4, ("PolyscopeVersion",))
         pipe.send(messages.WorkerPhase("connecting"))
         return UrArm(settings, version)
     except ProbeError as error:
@@ -124,12 +127,7 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
     except RuntimeError as error:
         text = str(error)
         if "already in use" in text:
-            _fail(
-                pipe,
-                "registers-in-use",
-                f"The input registers of the robot at {host} are already in use by another RTDE client, EtherNet/IP or "
-                "PROFINET: end the other program, or disable the adapter under Installation → Fieldbus.",
-            )
+            _fail(pipe, "registers-in-use", str(registers_in_use(host)))
         if "remote control" in text:
             _fail(
                 pipe,

@@ -1,8 +1,10 @@
 """YAML files: read with unique keys, checked by pydantic, and replaced at once when written.
 
-Each caller names the exception to raise. Its message names the file and every mistake, with the key and allowed range.
+Each caller names the exception to raise. Its message has a line for each mistake: `file:line: key: what is wrong;
+allowed: …; did you mean …?`.
 """
 
+import math
 import re
 from collections.abc import Hashable, Mapping, Sequence
 from difflib import get_close_matches
@@ -95,8 +97,8 @@ def read_yaml(path: Path, raises: type[Exception], what: str = "configuration", 
         raise raises(f"{path}: the {what} is not UTF-8 text (byte {error.start})") from error
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
-        raise raises(f"{path}: {where}{error.problem or error.context}") from error
+        where = f"{path}:{mark.line + 1}:{mark.column + 1}" if mark else str(path)
+        raise raises(f"{where}: {_syntax(error)}") from error
     except yaml.YAMLError as error:
         raise raises(f"{path}: not a YAML file: {' '.join(str(error).split())}") from error
     except RecursionError as error:
@@ -114,26 +116,23 @@ def load_model(
     if not isinstance(content, dict):
         example = next(iter(TypeAdapter(model).json_schema()["properties"]), "key")
         raise raises(f"{path}: expected keys and values such as `{example}: …`, found {_shown(content)}")
-    return validated(content, model, str(path), raises, folder=path.resolve().parent)
-
-
-def validated(
-    content: object,
-    model: type[Model],
-    where: str,
-    raises: type[Exception],
-    *,
-    cure: str = "",
-    folder: Path | None = None,
-) -> Model:
-    """Return the content as a model; the message begins with `where`, lists every mistake, and ends with `cure`."""
-    adapter = TypeAdapter(model)
     try:
-        return adapter.validate_python(content, context=folder and {"folder": folder})
+        return _validated(content, model, path.resolve().parent)
     except ValidationError as error:
-        schema = adapter.json_schema()
-        mistakes = dict.fromkeys(_sentence(details, schema) for details in error.errors(include_url=False))
-        raise raises(f"{where}: {'; '.join(mistakes)}{cure}") from error
+        root = _Loader(path.read_text(encoding="utf-8")).get_single_node()
+        raise raises("\n".join(_mistakes(error, model, content, str(path), root))) from error
+
+
+def validated(content: object, model: type[Model], where: str, raises: type[Exception], *, cure: str = "") -> Model:
+    """Return the content as a model; each line of the message begins with `where`, and the last ends with `cure`."""
+    try:
+        return _validated(content, model)
+    except ValidationError as error:
+        raise raises("\n".join(_mistakes(error, model, content, where)) + cure) from error
+
+
+def _validated(content: object, model: type[Model], folder: Path | None = None) -> Model:
+    return TypeAdapter(model).validate_python(content, context=folder and {"folder": folder})
 
 
 def save_yaml(path: Path, content: Mapping[str, Any], raises: type[Exception]) -> None:
@@ -145,44 +144,138 @@ def save_yaml(path: Path, content: Mapping[str, Any], raises: type[Exception]) -
         raise raises(f"{path}: the calibration cannot be written: {error.strerror}") from error
 
 
-def _sentence(details: ErrorDetails, schema: Mapping[str, Any]) -> str:
-    location = details["loc"]
+# The libraries' words for frequent mistakes, and ours.
+_SYNTAX = (
+    ("found character '\\t'", "a tab indents this line; use spaces"),
+    ("mapping values are not allowed", "a second `:` stands in this line, or the line before is indented otherwise"),
+    ("could not find expected ':'", "a key without its `:`"),
+    ("expected <block end>", "this line is indented otherwise than those above"),
+    ("expected ',' or ']'", "a list is not closed: `,` or `]` is missing"),
+    ("expected ',' or '}'", "a section is not closed: `,` or `}` is missing"),
+    ("found unhashable key", "a key is a list or a section; a name is expected"),
+    ("found undefined alias", "an alias `*name` without its anchor `&name`"),
+)
+_WRONG = (
+    ("finite_number", "is not a finite number"),
+    ("float_", "is not a number"),
+    ("int_", "is not a whole number"),
+    ("bool_", "is neither true nor false"),
+    ("string_pattern", "is not such a name"),
+    ("string_too_short", "is empty"),
+    ("too_short", "has too few entries"),
+    ("string_too_long", "is too long"),
+    ("too_long", "has too many entries"),
+    ("string_", "is not text"),
+    ("tuple_", "is not a list"),
+    ("list_", "is not a list"),
+    ("dict_", "is not a section with keys"),
+    ("model_", "is not a section with keys"),
+    ("dataclass_", "is not a section with keys"),
+    ("path_", "is not the path of a file"),
+    ("literal_error", "does not exist"),
+    ("enum", "does not exist"),
+    ("greater_than", "is too small"),
+    ("less_than", "is too large"),
+)
+
+
+def _syntax(error: yaml.MarkedYAMLError) -> str:
+    problem = str(error.problem or error.context)
+    return next((words for begin, words in _SYNTAX if problem.startswith(begin)), problem)
+
+
+def _mistakes(
+    error: ValidationError, model: type, content: object, where: str, root: yaml.Node | None = None
+) -> list[str]:
+    """Return a line for each mistake, in the order of the file; `root` is its content with line numbers."""
+    schema = TypeAdapter(model).json_schema()
+    found: dict[str, int] = {}
+    every = error.errors(include_url=False)
+    for details in every:
+        location = details["loc"]
+        # A list counts only its valid entries, so that mistakes within it make it too short as well.
+        if details["type"] == "too_short" and any(one["loc"][:-1][: len(location)] == location for one in every):
+            continue
+        key, line = _place(details, content, root)
+        subject = f"{key}: " if key else ""
+        found[f"{where}{f':{line}' if root is not None else ''}: {subject}{_sentence(details, schema)}"] = line
+    return sorted(found, key=lambda text: found[text])
+
+
+def _place(details: ErrorDetails, content: object, node: yaml.Node | None) -> tuple[str, int]:
+    """Return the key of a mistake as it stands in the file, without the names of alternatives, and its line."""
+    key, line, last = "", 1, len(details["loc"]) - 1
     if details["type"] == "invalid_key":
-        return f"the key {_shown(details['input'])} is a number; a name is expected"
-    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location).lstrip(".")
-    subject = f"`{key}` " if key else ""
-    if details["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        return f"{subject}is not a known key{_known_keys(str(location[-1]), _schema_at(schema, location[:-1], schema))}"
-    allowed = _allowed(_schema_at(schema, location, schema))
-    if details["type"] == "missing":
-        return f"{subject}is missing{f' (allowed: {allowed})' if allowed else ''}"
-    if details["type"] in ("value_error", "assertion_error"):
-        return f"{subject}{details['msg'].split(', ', 1)[1]}"
+        return key, line
+    for number, part in enumerate(details["loc"]):
+        child: yaml.Node | None = None
+        if isinstance(content, Mapping) and part in content:
+            content = content[part]
+            for name, value in node.value if isinstance(node, yaml.MappingNode) else ():
+                if name.value == str(part):
+                    line, child = name.start_mark.line + 1, value
+        elif isinstance(content, list | tuple) and isinstance(part, int) and part < len(content):
+            content = content[part]
+            if isinstance(node, yaml.SequenceNode):
+                child = node.value[part]
+                line = child.start_mark.line + 1
+        elif not (number == last and details["type"] == "missing"):
+            continue
+        node = child
+        key += f"[{part}]" if isinstance(part, int) else f".{part}"
     if details["type"].startswith("union_tag"):
-        return f"{subject}{_tag(details)}"
-    reason = details["msg"].replace("Input should", "should", 1).replace("Value should", "should", 1)
-    allowed_text = f", allowed: {allowed}" if allowed else ""
-    return f"{subject}{reason} (found {_shown(details['input'])}{allowed_text})"
+        discriminator = details["ctx"]["discriminator"].strip("'")
+        key += f".{discriminator}"
+    return key.lstrip("."), line
 
 
-def _tag(details: ErrorDetails) -> str:
-    """Return the mistake in a key that selects the kind of a section."""
-    context = details["ctx"]
-    key = context["discriminator"].strip("'")
-    if "tag" not in context:
-        return f"lacks `{key}`, its kind"
-    known = [tag.strip("'") for tag in context["expected_tags"].split(", ")]
-    near = get_close_matches(context["tag"], known, 1)
-    meant = f", did you mean {near[0]!r}?" if near else ""
-    return f"has the {key} {context['tag']!r}, which does not exist{meant} (allowed: {', '.join(known)})"
+def _sentence(details: ErrorDetails, schema: Mapping[str, Any]) -> str:
+    location, kind, found = details["loc"], details["type"], details["input"]
+    if kind == "invalid_key":
+        return f"the key {_shown(found)} is a number; a name is expected"
+    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
+        return f"is not a known key{_known_keys(str(location[-1]), _schema_at(schema, location[:-1], schema))}"
+    if kind in ("value_error", "assertion_error"):
+        return details["msg"].split(", ", 1)[1]
+    here = _schema_at(schema, location, schema)
+    choices, allowed = list(map(str, here.get("enum", ()))), _allowed(here)
+    if kind.startswith("union_tag"):
+        choices = [tag.strip("'") for tag in details["ctx"].get("expected_tags", "").split(", ") if tag]
+        found, allowed = details["ctx"].get("tag"), ", ".join(choices)
+    if kind in ("missing", "union_tag_not_found"):
+        sentence = "is missing"
+    elif kind == "union_tag_invalid":
+        sentence = f"{_shown(found)} does not exist"
+    else:
+        wrong = (words for begin, words in _WRONG if kind.startswith(begin))
+        sentence = f"{_shown(found)} {next(wrong, details['msg'])}"
+    near = get_close_matches(str(found), choices, 1)
+    hint = f"did you mean {near[0]}?" if near else _unit_hint(location, found, here)
+    return "; ".join(filter(None, (sentence, f"allowed: {allowed}" if allowed else "", hint)))
+
+
+def _unit_hint(location: Sequence[int | str], found: object, schema: Mapping[str, Any]) -> str:
+    """Return a question where a number would fit in another unit."""
+    if not isinstance(found, int | float) or isinstance(found, bool) or not found or not _allowed(schema):
+        return ""
+    low = schema.get("minimum", schema.get("exclusiveMinimum", -math.inf))
+    high = schema.get("maximum", schema.get("exclusiveMaximum", math.inf))
+    key = next((part for part in reversed(location) if isinstance(part, str)), "")
+    if key.endswith("_rad") and low <= math.radians(found) <= high:
+        return f"did you mean {math.radians(found):.4g}, {found:g} degrees in rad?"
+    for factor, name, far in ((1e-3, "thousandth", abs(found) > 10 * high), (1e3, "thousandfold", found < low / 10)):
+        if far and low <= found * factor <= high:
+            return f"did you mean {found * factor:g}, the {name}?"
+    return ""
 
 
 def _known_keys(wrong: str, schema: Mapping[str, Any]) -> str:
     known = list(schema.get("properties", {}))
-    near = get_close_matches(wrong, known, n=1)
+    # Often the unit is missing: `speed` for `speed_rad_per_s`.
+    near = get_close_matches(wrong, known, n=1) or [name for name in known if name.startswith(f"{wrong}_")]
     if near:
-        return f", did you mean `{near[0]}`?"
-    return f", known are {', '.join(known)}" if known else ""
+        return f"; did you mean {near[0]}?"
+    return f"; allowed: {', '.join(known)}" if known else ""
 
 
 def _schema_at(schema: Mapping[str, Any], location: Sequence[int | str], root: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -191,9 +284,14 @@ def _schema_at(schema: Mapping[str, Any], location: Sequence[int | str], root: M
         return _schema_at(root["$defs"][schema["$ref"].rsplit("/", 1)[-1]], location, root)
     if "anyOf" in schema:
         candidates = [part for part in schema["anyOf"] if part.get("type") != "null"]
+        if location and isinstance(location[0], int):
+            candidates = [part for part in candidates if part.get("type") == "array"]
         return _schema_at(candidates[0], location, root) if len(candidates) == 1 else {}
     if not location:
         return schema
+    if "oneOf" in schema:
+        kind = schema.get("discriminator", {}).get("mapping", {}).get(location[0])
+        return _schema_at({"$ref": kind}, location[1:], root) if kind else {}
     step, rest = location[0], location[1:]
     if isinstance(step, int):
         inside = schema.get("items")

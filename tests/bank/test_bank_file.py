@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.eit.bank_file import FORMAT_VERSION, Bank, BankDefinition, write_bank
-from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.errors import BankFileError, ModelError
 
 GEOMETRY = "ab" * 32
@@ -126,7 +126,7 @@ def test_foreign_files_other_formats_and_other_channel_tables_are_refused(path, 
         Bank.open(tmp_path / "foreign.bank")
 
     rewrite_header(path, lambda header: header | {"channel_table": "0123456789abcdef"})
-    with pytest.raises(BankFileError, match=f"channel table 0123456789ab…, expected {CHANNEL_TABLE_HASH[:12]}…"):
+    with pytest.raises(BankFileError, match=f"channel table 0123456789ab…, expected {PAPER_TABLE.digest[:12]}…"):
         Bank.open(path)
     write(path)
     content = bytearray(path.read_bytes())

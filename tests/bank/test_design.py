@@ -9,7 +9,7 @@ import yaml
 from scipy.io import loadmat
 from scipy.stats import spearmanr
 
-from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, channels_of_line
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.design import (
     ALLOWED,
     DesignChoice,
@@ -129,14 +129,14 @@ def test_the_mesh_is_within_a_third_of_the_noise_of_a_much_finer_one_and_the_one
 def test_injections_cost_what_generalised_least_squares_loses_without_them():
     """By the true slope, drift and noise, and the whole covariance: nothing of it is known to the choice."""
     rng = np.random.default_rng(6)
-    slope, other = 1e-3 * rng.normal(size=(2, 896)) * (1 + CHANNELS[:, 0] % 5)
-    drift = np.where(CHANNELS[:, 0] % 2 == 0, 2 * slope, 0.2 * slope) + other
+    slope, other = 1e-3 * rng.normal(size=(2, 896)) * (1 + PAPER_TABLE.electrodes[:, 0] % 5)
+    drift = np.where(PAPER_TABLE.electrodes[:, 0] % 2 == 0, 2 * slope, 0.2 * slope) + other
     torque, shift = rng.normal(size=(2, 1500))
     frames = 0.1 + np.outer(torque, slope) + np.outer(shift, drift) + rng.normal(0, 3e-3, (1500, 896))
-    injections = _injection_choice(MeasuredFrames(frames, 3e-3, torque))
+    injections = _injection_choice(MeasuredFrames(frames, 3e-3, torque), PAPER_TABLE)
 
     def spread(taken: list[int]) -> float:
-        rows = np.isin(CHANNELS[:, 0], taken)
+        rows = np.isin(PAPER_TABLE.electrodes[:, 0], taken)
         covariance = 9e-6 * np.eye(int(rows.sum())) + np.outer(drift[rows], drift[rows])
         return float((slope[rows] @ np.linalg.solve(covariance, slope[rows])) ** -0.5)
 
@@ -160,7 +160,7 @@ def test_all_injections_lose_nothing_and_half_of_them_are_twice_as_fast(quiet):
     assert quiet.injections.steps[-1].added == 0.0
     assert "1.86 frames/s" in quiet.injections.steps[-1].cost
     assert "3.72 frames/s" in quiet.injections.steps[15].cost
-    assert len(quiet.injections.steps) == len(np.unique(CHANNELS[:, 0]))
+    assert len(quiet.injections.steps) == len(np.unique(PAPER_TABLE.electrodes[:, 0]))
 
 
 def test_a_choice_that_nothing_is_good_enough_for_says_so():
@@ -194,9 +194,9 @@ def test_frames_without_noise_or_size_are_refused_in_a_sentence(clean, scale, no
         MeasuredFrames(scale * clean, noise_v, None)
 
 
-CHANNEL = np.arange(N_CHANNELS)
+CHANNEL = np.arange(PAPER_TABLE.n_channels)
 # Fourteen equal periods of 64 channels, under a slow change of size.
-SLOW = 2 + np.sin(2 * np.pi * CHANNEL / N_CHANNELS)
+SLOW = 2 + np.sin(2 * np.pi * CHANNEL / PAPER_TABLE.n_channels)
 SIGNAL = SLOW * (1 + np.cos(2 * np.pi * CHANNEL / 64))
 
 
@@ -209,14 +209,14 @@ def test_the_envelope_runs_over_the_peaks_and_closes_upon_itself():
 
 def test_a_signal_without_peaks_has_no_envelope():
     with pytest.raises(MatchingError, match="without peaks"):
-        envelope(np.ones(N_CHANNELS))
+        envelope(np.ones(PAPER_TABLE.n_channels))
 
 
 def test_the_score_is_spearmans_at_the_best_shift():
-    other = np.random.default_rng(2).uniform(0.5, 1.5, N_CHANNELS) * SIGNAL
+    other = np.random.default_rng(2).uniform(0.5, 1.5, PAPER_TABLE.n_channels) * SIGNAL
     smooth = np.mean([np.roll(other, shift) for shift in range(5)], axis=0)
     a, b = envelope(smooth), envelope(SIGNAL)
-    by_hand = max(spearmanr(np.roll(a, shift), b).statistic for shift in range(N_CHANNELS))
+    by_hand = max(spearmanr(np.roll(a, shift), b).statistic for shift in range(PAPER_TABLE.n_channels))
     assert envelope_score(other, SIGNAL) == pytest.approx(by_hand, abs=1e-12)
 
 
@@ -229,10 +229,10 @@ def test_neither_shift_nor_scale_nor_offset_matters_to_the_score(changed):
 def test_only_physical_settings_are_simulated(forward):
     settings = [Setting(1.6, 0.1), Setting(1.6, 1.0), Setting(1.6, 2.0)]
     signals = simulated_signals(forward, "gaussian_derivative", settings)
-    assert signals.shape == (2, N_CHANNELS), "a narrow Gaussian's conductivity falls below 0"
+    assert signals.shape == (2, PAPER_TABLE.n_channels), "a narrow Gaussian's conductivity falls below 0"
     expected = forward.voltages(conductivity(forward.mesh, "gaussian_derivative", 1.6, 2.0)) - forward.homogeneous()
     np.testing.assert_array_equal(signals[1], expected)
-    assert simulated_signals(forward, "gaussian_derivative", settings[:1]).shape == (0, N_CHANNELS)
+    assert simulated_signals(forward, "gaussian_derivative", settings[:1]).shape == (0, PAPER_TABLE.n_channels)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -244,9 +244,9 @@ def test_every_model_has_settings_that_are_physical(forward, model):
 
 
 def test_the_matching_score_is_the_best_over_settings_and_lags():
-    signals = np.random.default_rng(3).normal(size=(4, N_CHANNELS))
+    signals = np.random.default_rng(3).normal(size=(4, PAPER_TABLE.n_channels))
     shifted = np.concatenate([signals[2, 1:], [0.0]])
-    best = matching_scores(np.array([signals[1], shifted, np.ones(N_CHANNELS)]), signals)
+    best = matching_scores(np.array([signals[1], shifted, np.ones(PAPER_TABLE.n_channels)]), signals)
     assert best[0] == pytest.approx(1.0, abs=1e-6)
     assert best[1] > 0.99
     assert 0.7 < best[2] < 0.9
@@ -256,7 +256,7 @@ def test_the_papers_scores_and_its_best_model_are_found(shared):
     folder = shared / "recordings" / "torque_slices"
     frame = loadmat(folder / "TorqueSlice.mat")["clipped_data"].ravel()
     homogeneous = loadmat(folder / "TorqueSliceHom.mat")["clipped_data_hom"].ravel()
-    difference = channels_of_line(frame) - channels_of_line(homogeneous)
+    difference = PAPER_TABLE.channels_of_line(frame) - PAPER_TABLE.channels_of_line(homogeneous)
     forward = ForwardModel(load_mesh(shared / "reference" / "fingertip_mesh.npz"))
     paper = yaml.safe_load((shared / "reference" / "anchors.yaml").read_text())["paper_twist"]["model_scores"]
     scores = {

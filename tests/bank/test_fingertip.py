@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shearloop.bank.eit.fingertip import ElectrodePlace, Fingertip
+from shearloop.bank.eit.channels import ChannelTable
+from shearloop.bank.eit.fingertip import ElectrodePlace, RectangularFingertip, RoundFingertip
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import boundary_edges, doubled_areas
 from shearloop.bank.eit.models import conductivity
@@ -15,7 +16,7 @@ from shearloop.bank.errors import GeometryError
 
 CENTRES = 0.1 + 0.4 * np.arange(8)
 # A square with eight electrodes on each side, in order around it from the lower left corner.
-SQUARE = Fingertip(
+SQUARE = RectangularFingertip(
     width_cm=3.2,
     height_cm=3.2,
     electrode_width_cm=0.2,
@@ -86,7 +87,7 @@ def test_voltages_and_signals_converge_at_the_rate_that_the_electrodes_ends_allo
     [
         ({"width_cm": 0.0}, "width_cm must be above 0, not 0"),
         ({"contact_impedance": float("nan")}, "contact_impedance must be above 0"),
-        ({"electrodes": SQUARE.electrodes[1:]}, "31 electrodes, expected 32"),
+        ({"electrodes": SQUARE.electrodes[1:]}, "8 to 32 electrodes, not 31"),
         ({"electrode_width_cm": 0.3}, "electrode 0 reaches from -0.05 to 0.25 cm on the left side"),
         (
             {"electrodes": (replace(SQUARE.electrodes[0], centre_cm=0.4), *SQUARE.electrodes[1:])},
@@ -97,3 +98,80 @@ def test_voltages_and_signals_converge_at_the_rate_that_the_electrodes_ends_allo
 def test_measures_that_make_no_fingertip_are_refused(changed, sentence):
     with pytest.raises(GeometryError, match=sentence):
         replace(SQUARE, **changed)
+
+
+def disc(size_cm, injection="adjacent"):
+    return RoundFingertip(4.0, 0.05, 0.01, size_cm, tuple(22.5 * np.arange(16)), injection)
+
+
+def point_electrodes(tip):
+    """Return the voltages of a disc with point electrodes, from u = I/π · ln(|x − sink| / |x − source|)."""
+    sink, source, positive, negative = np.deg2rad(tip.angles_deg)[tip.table.electrodes].T
+
+    def potential(at):
+        return 5 / np.pi * np.log(np.abs(np.sin((at - sink) / 2) / np.sin((at - source) / 2)))
+
+    return potential(positive) - potential(negative)
+
+
+@pytest.mark.parametrize("injection", ["adjacent", "opposite"])
+def test_a_disc_has_the_voltages_of_the_closed_form(injection):
+    """Narrow electrodes are nearly points; the error of linear elements falls with the mesh size."""
+    expected = point_electrodes(disc(0.2, injection))
+    errors = [
+        np.linalg.norm(ForwardModel(tip.mesh(), tip.table).homogeneous() - expected) / np.linalg.norm(expected)
+        for tip in (disc(0.2, injection), disc(0.05, injection))
+    ]
+    assert errors[1] < 0.001
+    assert errors[1] < 0.3 * errors[0]
+
+
+@settings(deadline=None, max_examples=20)  # a mesh takes longer on a busy machine
+@given(size=st.floats(0.1, 1.5), width=st.floats(0.02, 0.6), turn=st.floats(-360, 360))
+def test_the_mesh_covers_the_disc_and_electrodes_have_their_place_and_width(size, width, turn):
+    tip = replace(disc(size), electrode_width_cm=width, angles_deg=tuple(turn + 22.5 * np.arange(16)))
+    mesh = tip.mesh()
+    x, y = (mesh.nodes[np.unique(boundary_edges(mesh.triangles))] - 2.0).T
+    np.testing.assert_allclose(np.hypot(x, y), 2.0)
+    around = np.sort(np.arctan2(y, x))
+    polygon = 2.0 * np.sin(np.diff(around, append=around[0] + 2 * np.pi)).sum()
+    assert np.abs(doubled_areas(mesh.nodes, mesh.triangles)).sum() / 2 == pytest.approx(polygon, rel=1e-12)
+    for electrode, centre in enumerate(np.deg2rad(tip.angles_deg)):
+        nodes = mesh.nodes[mesh.electrode_edges[mesh.electrode_of_edge == electrode]].reshape(-1, 2) - 2.0
+        from_centre = np.angle(np.exp(1j * (np.arctan2(nodes[:, 1], nodes[:, 0]) - centre)))
+        np.testing.assert_allclose([from_centre.min(), from_centre.max()], [-width / 4, width / 4], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({"electrode_width_cm": 0.8}, "electrodes 0 and 1 touch or overlap"),
+        ({"diameter_cm": 0.0}, "the fingertip's diameter_cm must be above 0"),
+        ({"electrode_width_cm": 1e-4}, "electrode_width_cm must be 0.001 or more"),
+    ],
+)
+def test_a_disc_that_cannot_be_is_refused(changed, sentence):
+    with pytest.raises(GeometryError, match=sentence):
+        replace(disc(0.2), **changed)
+
+
+@pytest.mark.parametrize("table", [ChannelTable(), ChannelTable(16, "adjacent"), ChannelTable(10, "opposite")])
+def test_a_channel_table_numbers_each_voltage_twice(table):
+    """Twins have the same magnitude on any conductivity."""
+    sink, source, positive, negative = table.electrodes.T
+    assert not (table.electrodes[:, :2, None] == table.electrodes[:, None, 2:]).any()
+    step = table.n_electrodes // 2 if table.injection == "opposite" else 1
+    np.testing.assert_array_equal((sink + step) % table.n_electrodes, source)
+    np.testing.assert_array_equal((positive + 1) % table.n_electrodes, negative)
+    assert sorted(table.twins.ravel()) == list(range(table.n_channels))
+    tip = RoundFingertip(4.0, 0.1, 0.01, 0.4, tuple(360 / table.n_electrodes * np.arange(table.n_electrodes)))
+    mesh = tip.mesh()
+    random = np.random.default_rng(1).uniform(0.5, 2.0, len(mesh.triangles))
+    first, second = np.abs(ForwardModel(mesh, table).voltages(random))[table.twins]
+    np.testing.assert_allclose(first, second, rtol=1e-9)
+
+
+@pytest.mark.parametrize("n", [6, 15, 34])
+def test_numbers_of_electrodes_that_the_board_has_not_are_refused(n):
+    with pytest.raises(GeometryError, match=f"an even number of 8 to 32 electrodes, not {n}"):
+        ChannelTable(n)

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from shearloop.bank.eit import channels
-from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS
+from shearloop.bank.eit.channels import PAPER_TABLE, smoothed_along_channels
 from shearloop.bank.eit.forward import CompleteElectrodeModel, ForwardModel
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS, conductivity
@@ -84,8 +83,8 @@ def test_channels_are_differences_between_neighbours_under_opposite_injection(fi
     values = conductivity(fingertip, "step", 1.1, 1.0)
     voltages = forward.voltages(values)
     solver = CompleteElectrodeModel(fingertip)
-    for channel in (0, 27, 28, 500, N_CHANNELS - 1):
-        sink, source, positive, negative = CHANNELS[channel]
+    for channel in (0, 27, 28, 500, PAPER_TABLE.n_channels - 1):
+        sink, source, positive, negative = PAPER_TABLE.electrodes[channel]
         currents = np.zeros((32, 1))
         currents[[sink, source], 0] = -5, 5
         potentials = solver.electrode_potentials(values, currents)[:, 0]
@@ -106,22 +105,22 @@ def test_a_conductivity_that_is_not_positive_is_refused_before_solving(fingertip
 
 
 def test_the_table_has_896_channels_and_128_zero_slots():
-    assert channels.CHANNELS.shape == (channels.N_CHANNELS, 4)
-    assert channels.ZERO_SLOTS.sum() == 128
+    assert PAPER_TABLE.electrodes.shape == (PAPER_TABLE.n_channels, 4)
+    assert PAPER_TABLE.zero_slots.sum() == 128
 
 
 def test_no_channel_measures_on_a_driven_electrode():
-    for sink, source, positive, negative in channels.CHANNELS:
+    for sink, source, positive, negative in PAPER_TABLE.electrodes:
         assert {sink, source}.isdisjoint({positive, negative})
         assert source == (sink + 16) % 32
         assert negative == (positive + 1) % 32
 
 
 def test_a_line_and_its_channels_are_one_another():
-    frame = np.arange(1.0, channels.N_CHANNELS + 1)
-    line = channels.line_of_channels(frame)
-    assert (line[channels.ZERO_SLOTS] == 0).all()
-    np.testing.assert_array_equal(channels.channels_of_line(line), frame)
+    frame = np.arange(1.0, PAPER_TABLE.n_channels + 1)
+    line = PAPER_TABLE.line_of_channels(frame)
+    assert (line[PAPER_TABLE.zero_slots] == 0).all()
+    np.testing.assert_array_equal(PAPER_TABLE.channels_of_line(line), frame)
     assert line[:3].tolist() == [0.0, 1.0, 2.0], "injection 0: the pair 0-1 touches the driven electrode 0"
 
 
@@ -129,7 +128,7 @@ def test_smoothing_keeps_what_is_constant_and_spreads_a_peak_over_nine_channels(
     peak = np.zeros((2, 896))
     peak[0] = 3.0
     peak[1, 100] = 1.0
-    smooth = channels.smoothed_along_channels(peak)
+    smooth = smoothed_along_channels(peak)
     np.testing.assert_allclose(smooth[0], 3.0)
     assert np.flatnonzero(smooth[1]).tolist() == list(range(96, 105))
     assert smooth[1].sum() == pytest.approx(1.0)

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.matching import (
     Matcher,
     ReferenceMatcher,
@@ -20,7 +20,7 @@ VALID[2, 3] = VALID[0, 0] = VALID[6, 7] = False
 
 
 def bank_signals() -> np.ndarray:
-    signals = np.random.default_rng(1).normal(size=(7, 8, N_CHANNELS)).astype(np.float32)
+    signals = np.random.default_rng(1).normal(size=(7, 8, PAPER_TABLE.n_channels)).astype(np.float32)
     signals[~VALID] = np.nan  # must never be read
     return signals
 
@@ -29,7 +29,7 @@ SIGNALS = bank_signals()
 REFERENCE = ReferenceMatcher(SIGNALS, VALID, K_GRID, SIGMA_GRID)
 MATCHERS: tuple[Matcher, ...] = (REFERENCE, ZeroLagMatcher(SIGNALS, VALID, K_GRID, SIGMA_GRID))
 both = pytest.mark.parametrize("matcher", MATCHERS, ids=lambda matcher: type(matcher).__name__)
-frames = hnp.arrays(np.float64, N_CHANNELS, elements=st.floats(-10, 10, width=32)).filter(np.any)
+frames = hnp.arrays(np.float64, PAPER_TABLE.n_channels, elements=st.floats(-10, 10, width=32)).filter(np.any)
 
 
 def correlations(frame: np.ndarray, cell: tuple[int, int]) -> np.ndarray:
@@ -44,9 +44,9 @@ def test_scores_are_those_of_the_definition(frame):
     reference, zero_lag = (matcher.heatmap(frame) for matcher in MATCHERS)
     for cell in [(0, 1), (3, 3), (6, 6)]:
         every_lag = correlations(frame, cell)
-        assert every_lag.shape == (2 * N_CHANNELS - 1,)
+        assert every_lag.shape == (2 * PAPER_TABLE.n_channels - 1,)
         assert reference[cell] == pytest.approx(every_lag.max(), abs=1e-12)
-        assert zero_lag[cell] == pytest.approx(every_lag[N_CHANNELS - 1], abs=1e-12)
+        assert zero_lag[cell] == pytest.approx(every_lag[PAPER_TABLE.n_channels - 1], abs=1e-12)
 
 
 @both
@@ -78,14 +78,14 @@ def test_only_the_reference_finds_a_shifted_signal():
 
 @both
 def test_many_frames_are_scored_like_each_of_them(matcher):
-    batch = np.random.default_rng(2).normal(size=(3, N_CHANNELS))
+    batch = np.random.default_rng(2).normal(size=(3, PAPER_TABLE.n_channels))
     maps = matcher.heatmaps(batch)
     for frame, heatmap in zip(batch, maps, strict=True):
         np.testing.assert_allclose(matcher.heatmap(frame), heatmap, atol=1e-14)
 
 
 def test_a_bank_of_more_cells_than_fit_a_chunk_is_scored_cell_by_cell_all_the_same():
-    signals = np.random.default_rng(3).normal(size=(1030, 2, N_CHANNELS)).astype(np.float32)
+    signals = np.random.default_rng(3).normal(size=(1030, 2, PAPER_TABLE.n_channels)).astype(np.float32)
     every = np.ones((1030, 2), dtype=np.bool_)
     large = ReferenceMatcher(signals, every, np.arange(1030.0), np.arange(2.0))
     small = ReferenceMatcher(signals[1020:], every[1020:], np.arange(10.0), np.arange(2.0))
@@ -97,9 +97,9 @@ def test_a_bank_of_more_cells_than_fit_a_chunk_is_scored_cell_by_cell_all_the_sa
 @pytest.mark.parametrize(
     ("frame", "says"),
     [
-        (np.zeros(N_CHANNELS), "zero in all channels"),
-        (np.full(N_CHANNELS, np.nan), "896 channels of the difference are not finite"),
-        (np.append(np.ones(N_CHANNELS - 1), np.inf), "1 channels of the difference are not finite"),
+        (np.zeros(PAPER_TABLE.n_channels), "zero in all channels"),
+        (np.full(PAPER_TABLE.n_channels, np.nan), "896 channels of the difference are not finite"),
+        (np.append(np.ones(PAPER_TABLE.n_channels - 1), np.inf), "1 channels of the difference are not finite"),
         (np.ones(1024), "896 channels; the array has shape"),
     ],
 )
@@ -115,7 +115,7 @@ def test_banks_that_cannot_be_matched_are_refused():
         ReferenceMatcher(SIGNALS[:3], VALID, K_GRID, SIGMA_GRID)
     empty = ZeroLagMatcher(np.zeros_like(SIGNALS), VALID, K_GRID, SIGMA_GRID)
     with pytest.raises(MatchingError, match="build the bank again"):
-        empty.heatmap(np.ones(N_CHANNELS))
+        empty.heatmap(np.ones(PAPER_TABLE.n_channels))
 
 
 heatmaps = hnp.arrays(np.float64, (7, 8), elements=st.floats(0, 1) | st.just(np.nan)).filter(
@@ -157,24 +157,24 @@ def test_a_heatmap_without_a_valid_cell_is_refused():
 
 def test_noise_is_no_signal_and_a_signal_is_not_noise():
     generator = np.random.default_rng(4)
-    std = generator.uniform(1e-4, 1e-2, N_CHANNELS)
-    frames_of_noise = std * generator.normal(size=(2000, N_CHANNELS))
+    std = generator.uniform(1e-4, 1e-2, PAPER_TABLE.n_channels)
+    frames_of_noise = std * generator.normal(size=(2000, PAPER_TABLE.n_channels))
     assert all(signal_above_noise(frame, std) is not None for frame in frames_of_noise)
     assert signal_above_noise(frames_of_noise[0] + 0.7 * std, std) is None
-    assert signal_above_noise(np.full(N_CHANNELS, 1e300), std) is None
-    silent = signal_above_noise(np.zeros(N_CHANNELS), 1.0)
+    assert signal_above_noise(np.full(PAPER_TABLE.n_channels, 1e300), std) is None
+    silent = signal_above_noise(np.zeros(PAPER_TABLE.n_channels), 1.0)
     assert silent == "no signal above the noise: the difference is 0.00 times the noise, and a signal needs 1.11 times"
 
 
 def test_the_noise_test_keeps_its_false_alarm_rate():
     # χ² of 896 degrees is close to Gaussian: mean 896, variance 2 · 896; the quantile of 1e-6 is 4.75 sd and a little.
     limit = 896 + 4.7534 * np.sqrt(2 * 896)
-    lower, upper = (np.full(N_CHANNELS, np.sqrt(energy / 896)) for energy in (limit, limit + 20))
+    lower, upper = (np.full(PAPER_TABLE.n_channels, np.sqrt(energy / 896)) for energy in (limit, limit + 20))
     assert signal_above_noise(lower, 1.0) is not None
     assert signal_above_noise(upper, 1.0) is None
 
 
-@pytest.mark.parametrize("noise", [0.0, -1.0, np.nan, np.inf, np.zeros(N_CHANNELS), np.ones(3)])
+@pytest.mark.parametrize("noise", [0.0, -1.0, np.nan, np.inf, np.zeros(PAPER_TABLE.n_channels), np.ones(3)])
 def test_a_noise_that_cannot_be_is_refused(noise):
     with pytest.raises(MatchingError):
-        signal_above_noise(np.ones(N_CHANNELS), noise)
+        signal_above_noise(np.ones(PAPER_TABLE.n_channels), noise)

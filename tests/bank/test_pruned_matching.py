@@ -16,7 +16,7 @@ from hypothesis.extra import numpy as hnp
 from scipy.io import loadmat
 
 from shearloop.bank.eit import pruned_matching
-from shearloop.bank.eit.channels import N_CHANNELS, channels_of_line
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.matching import Match, Matcher, ReferenceMatcher, ZeroLagMatcher, unit_magnitudes
 from shearloop.bank.eit.pruned_matching import (
     COARSE_RANK,
@@ -35,10 +35,10 @@ SHAPE = (22, 20)
 def smooth_bank() -> tuple[np.ndarray, np.ndarray]:
     """Return signals that change little from cell to cell, as a bank's do, with plateaus of cells that are alike."""
     k, sigma = np.meshgrid(np.linspace(0, 1, SHAPE[0]), np.linspace(0.1, 1, SHAPE[1]), indexing="ij")
-    channel = np.arange(N_CHANNELS)
+    channel = np.arange(PAPER_TABLE.n_channels)
     phase = 2 * np.pi * (channel % 28) / 28
     signals = np.sin(phase + 6 * k[..., None]) * np.exp(
-        -(((channel / N_CHANNELS - k[..., None]) / sigma[..., None]) ** 2)
+        -(((channel / PAPER_TABLE.n_channels - k[..., None]) / sigma[..., None]) ** 2)
     )
     signals += 0.3 * np.cos(3 * phase * sigma[..., None]) * k[..., None]
     signals[10:14, 3:9] = signals[10, 3]
@@ -49,8 +49,8 @@ def smooth_bank() -> tuple[np.ndarray, np.ndarray]:
     return signals.astype(np.float32), valid
 
 
-def bank_of_noise(*, n_live: int = N_CHANNELS, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    signals = np.zeros((*SHAPE, N_CHANNELS), dtype=np.float32)
+def bank_of_noise(*, n_live: int = PAPER_TABLE.n_channels, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    signals = np.zeros((*SHAPE, PAPER_TABLE.n_channels), dtype=np.float32)
     signals[..., :n_live] = np.random.default_rng(seed).random((*SHAPE, n_live))
     return signals, np.ones(SHAPE, dtype=np.bool_)
 
@@ -61,7 +61,7 @@ def bank_of_five_alone() -> tuple[tuple[np.ndarray, np.ndarray], dict[str, tuple
     "above" has the first channels alone, so that it may lie whole in a frame's last ones.
     """
     random = np.random.default_rng(0)
-    signals = np.zeros((20, 20, N_CHANNELS), dtype=np.float32)
+    signals = np.zeros((20, 20, PAPER_TABLE.n_channels), dtype=np.float32)
     signals[..., 860:] = random.random((20, 20, 2)) @ random.random((2, 36))
     alone = {"left": (10, 5), "right": (10, 11), "between": (10, 8), "below": (2, 2), "above": (18, 18)}
     for name, cell in alone.items():
@@ -94,7 +94,9 @@ def two_contacts(seed: int) -> np.ndarray:
     one, other = (np.abs(BANK[0][BANK[1]][cell]) for cell in random.integers(0, BANK[1].sum(), 2))
     lag = int(random.integers(0, 60))
     frame = other * random.random()
-    frame[lag:] += (one * random.random() + 0.01 * random.random(N_CHANNELS))[: N_CHANNELS - lag]
+    frame[lag:] += (one * random.random() + 0.01 * random.random(PAPER_TABLE.n_channels))[
+        : PAPER_TABLE.n_channels - lag
+    ]
     return frame
 
 
@@ -112,21 +114,21 @@ def without_runner_up(match: Match) -> Match:
     return replace(match, runner_up=None, runner_up_cell=None)
 
 
-amplitudes = hnp.arrays(np.float64, N_CHANNELS, elements=st.floats(-10, 10, width=32)).filter(np.any)
+amplitudes = hnp.arrays(np.float64, PAPER_TABLE.n_channels, elements=st.floats(-10, 10, width=32)).filter(np.any)
 
 
 def test_a_bank_of_few_cells_is_not_searched_and_matches_the_same():
     signals, valid = BANK[0][:6], BANK[1][:6]
     assert 0 < valid.sum() < pruned_matching.MIN_PRUNED_CELLS <= BANK[1].sum()
     slow, fast = pair(ReferenceMatcher, PrunedMatcher, (signals, valid))
-    frame = np.random.default_rng(3).normal(size=N_CHANNELS)
+    frame = np.random.default_rng(3).normal(size=PAPER_TABLE.n_channels)
     assert fast.match(frame) == slow.match(frame)
     assert fast.match(frame, runner_up=False) == without_runner_up(slow.match(frame))
 
 
 @both
 def test_a_matcher_that_was_copied_matches_the_same(slow, fast):
-    frame = np.random.default_rng(5).normal(size=N_CHANNELS)
+    frame = np.random.default_rng(5).normal(size=PAPER_TABLE.n_channels)
     for one in (slow, fast):
         # As pickling does, which sends it to another process.
         again = copy.deepcopy(one)
@@ -154,17 +156,19 @@ def test_random_frames(slow, fast, frame):
 def test_frames_like_those_of_the_bank(slow, fast, cell, other, share, noise, lag, seed):
     signals = BANK[0].astype(np.float64)
     frame = np.abs((1 - share) * signals[cell] + share * signals[other])
-    frame += noise * np.abs(np.random.default_rng(seed).normal(size=N_CHANNELS))
-    moved = np.zeros(N_CHANNELS)
-    moved[max(lag, 0) : N_CHANNELS + min(lag, 0)] = frame[max(-lag, 0) : N_CHANNELS - max(lag, 0)]
+    frame += noise * np.abs(np.random.default_rng(seed).normal(size=PAPER_TABLE.n_channels))
+    moved = np.zeros(PAPER_TABLE.n_channels)
+    moved[max(lag, 0) : PAPER_TABLE.n_channels + min(lag, 0)] = frame[
+        max(-lag, 0) : PAPER_TABLE.n_channels - max(lag, 0)
+    ]
     if moved.any():
         assert_same(fast.match(moved), slow.match(moved))
 
 
 @both
 def test_constant_frames_and_cells_that_tie(slow, fast):
-    one = np.eye(N_CHANNELS)
-    alike = np.ones(N_CHANNELS), BANK[0][12, 6], BANK[0][20, 3], np.arange(N_CHANNELS)
+    one = np.eye(PAPER_TABLE.n_channels)
+    alike = np.ones(PAPER_TABLE.n_channels), BANK[0][12, 6], BANK[0][20, 3], np.arange(PAPER_TABLE.n_channels)
     for frame in (*alike, one[895], 1e-300 * one[5], 1e300 * one[[0, 400]].sum(axis=0)):
         assert_same(fast.match(frame), slow.match(frame))
     # Rounding may carry the score of a cell's own signal past 1.
@@ -177,9 +181,9 @@ def test_constant_frames_and_cells_that_tie(slow, fast):
 @settings(max_examples=8, deadline=None)
 def test_banks_of_a_few_numbers_where_many_cells_tie(kind, n_k, n_sigma, few, seed):
     random = np.random.default_rng(seed)
-    signals = np.zeros((n_k, n_sigma, N_CHANNELS), dtype=np.float32)
-    signals[..., random.choice(N_CHANNELS, few)] = random.choice([0, 1, 2, 1e-3], (n_k, n_sigma, few))
-    valid, frame = signals.any(axis=2), random.choice([0, 1, 0.5], N_CHANNELS, p=[0.9, 0.05, 0.05])
+    signals = np.zeros((n_k, n_sigma, PAPER_TABLE.n_channels), dtype=np.float32)
+    signals[..., random.choice(PAPER_TABLE.n_channels, few)] = random.choice([0, 1, 2, 1e-3], (n_k, n_sigma, few))
+    valid, frame = signals.any(axis=2), random.choice([0, 1, 0.5], PAPER_TABLE.n_channels, p=[0.9, 0.05, 0.05])
     if valid.any() and frame.any():
         slow, fast = pair(*kind, (signals, valid))
         assert_same(fast.match(frame), slow.match(frame))
@@ -192,13 +196,13 @@ def test_a_basis_that_is_fitted_to_few_cells_bounds_all(kind, bank, monkeypatch)
     slow, fast = pair(*kind, bank)
     random = np.random.default_rng(7)
     for signal in bank[0][bank[1]][::40]:
-        frame = signal + 0.3 * signal.std() * random.normal(size=N_CHANNELS)
+        frame = signal + 0.3 * signal.std() * random.normal(size=PAPER_TABLE.n_channels)
         assert_same(fast.match(frame), slow.match(frame))
 
 
 @both
 def test_the_maximum_alone_is_the_same_without_the_runner_up(slow, fast):
-    frame = np.random.default_rng(7).normal(size=N_CHANNELS)
+    frame = np.random.default_rng(7).normal(size=PAPER_TABLE.n_channels)
     assert fast.match(frame, runner_up=False) == without_runner_up(fast.match(frame))
     np.testing.assert_array_equal(fast.heatmap(frame), slow.heatmap(frame))
 
@@ -207,7 +211,7 @@ def test_the_maximum_alone_is_the_same_without_the_runner_up(slow, fast):
 def test_cells_that_all_score_nothing_tie(kind):
     """Wherever the search begins: the first one is the lowest of all."""
     slow, fast = pair(*kind, bank_of_noise(n_live=40))
-    frame = np.eye(N_CHANNELS)[-1]
+    frame = np.eye(PAPER_TABLE.n_channels)[-1]
     assert_same(fast.match(frame, runner_up=False), without_runner_up(slow.match(frame)))
     if isinstance(slow, ZeroLagMatcher):
         assert fast.match(frame).cell == (0, 0)
@@ -216,10 +220,10 @@ def test_cells_that_all_score_nothing_tie(kind):
 @both
 def test_what_cannot_be_matched_is_refused_alike(slow, fast):
     for frame, says in (
-        (np.zeros(N_CHANNELS), "zero in all channels"),
-        (np.full(N_CHANNELS, np.nan), "not finite"),
-        (np.ones((1, N_CHANNELS)), "has shape"),
-        (np.ones((N_CHANNELS, 1)), "has shape"),
+        (np.zeros(PAPER_TABLE.n_channels), "zero in all channels"),
+        (np.full(PAPER_TABLE.n_channels, np.nan), "not finite"),
+        (np.ones((1, PAPER_TABLE.n_channels)), "has shape"),
+        (np.ones((PAPER_TABLE.n_channels, 1)), "has shape"),
     ):
         for matcher in (slow, fast):
             with pytest.raises(MatchingError, match=says):
@@ -234,7 +238,7 @@ def recorded_differences(shared: Path) -> Iterator[np.ndarray]:
     for path in sorted((shared / "recordings" / "streams").glob("*/*.mat")):
         for values in loadmat(path).values():
             if getattr(values, "shape", (0, 0))[-1] == 1025:
-                channels = channels_of_line(values[:, 1:])
+                channels = PAPER_TABLE.channels_of_line(values[:, 1:])
                 yield from channels[20::701] - channels[:10].mean(axis=0)
 
 
@@ -260,9 +264,9 @@ def test_the_runner_up_may_be_at_a_lag_at_which_nothing_reaches_what_is_known_fr
     """
     bank, alone = bank_of_five_alone()
     slow, fast = pair(*kind, bank)
-    frame = np.zeros(N_CHANNELS)
+    frame = np.zeros(PAPER_TABLE.n_channels)
     for name, size, lag in (("left", 5, 0), ("right", 4.8, 0), ("between", 6, 7), ("below", 2, 7), ("above", 3.5, far)):
-        frame[lag:] += size * bank[0][alone[name]][: N_CHANNELS - lag]
+        frame[lag:] += size * bank[0][alone[name]][: PAPER_TABLE.n_channels - lag]
     expected = slow.match(frame)
     assert (expected.cell, expected.runner_up_cell) == (alone["between"], alone["above"])
     assert_same(fast.match(frame), expected)
@@ -276,7 +280,7 @@ def test_of_cells_that_tie_but_for_rounding_the_first_is_found(kind):
     signals[3, 3, [200, 300]] = signals[9, 9, [600, 750]] = 1.0
     slow, fast = pair(*kind, (signals, valid))
     for smaller, cell in ((0.0, (3, 3)), (4e-13, (3, 3)), (4e-12, (9, 9))):
-        frame = np.zeros(N_CHANNELS)
+        frame = np.zeros(PAPER_TABLE.n_channels)
         frame[[200, 300]], frame[[600, 750]] = 1.0 - smaller, 1.0
         assert slow.match(frame).cell == cell
         assert_same(fast.match(frame), slow.match(frame))
@@ -288,7 +292,7 @@ def test_the_outermost_lags_are_searched(first):
     signals[14, 5] = 0.1
     signals[14, 5, 0 if first else -1] = 30.0
     slow, fast = pair(*KINDS[0], (signals, valid))
-    frame = np.eye(N_CHANNELS)[-1 if first else 0]
+    frame = np.eye(PAPER_TABLE.n_channels)[-1 if first else 0]
     assert slow.match(frame).cell == (14, 5)
     assert_same(fast.match(frame), slow.match(frame))
 
@@ -307,7 +311,7 @@ def test_of_lags_that_tie_the_highest_score_is_returned():
     signals[3, 3, [200, 700]] = 1.0
     slow, fast = pair(*KINDS[0], (signals, valid))
     for at_0, at_100 in ((1.0, 1.0 - 7e-13), (1.0 - 7e-13, 1.0)):
-        frame = np.zeros(N_CHANNELS)
+        frame = np.zeros(PAPER_TABLE.n_channels)
         frame[[200, 700]], frame[[300, 800]] = at_0, at_100
         assert_same(fast.match(frame), slow.match(frame))
 
@@ -316,9 +320,9 @@ def test_of_lags_that_tie_the_highest_score_is_returned():
 def test_cells_that_float32_hardly_tells_apart(kind):
     """Next to nothing is left out of the basis, so the bounds have no room for their own rounding."""
     random = np.random.default_rng(3)
-    signals = 1 + 1e-3 * (random.random((*SHAPE, 3)) @ random.random((3, N_CHANNELS)))
+    signals = 1 + 1e-3 * (random.random((*SHAPE, 3)) @ random.random((3, PAPER_TABLE.n_channels)))
     slow, fast = pair(*kind, (signals.astype(np.float32), np.ones(SHAPE, dtype=np.bool_)))
-    for frame in signals.reshape(-1, N_CHANNELS)[::22]:
+    for frame in signals.reshape(-1, PAPER_TABLE.n_channels)[::22]:
         assert_same(fast.match(frame), slow.match(frame))
 
 
@@ -326,7 +330,7 @@ def test_cells_that_float32_hardly_tells_apart(kind):
 @pytest.mark.parametrize(("limit", "value"), [("_MAX_BOUNDS", 10), ("_FEW_LAGS", 0)])
 def test_where_bounds_do_not_help_all_is_scored(slow, fast, monkeypatch, limit, value):
     monkeypatch.setattr(pruned_matching, limit, value)
-    for frame in np.random.default_rng(5).random((4, N_CHANNELS)):
+    for frame in np.random.default_rng(5).random((4, PAPER_TABLE.n_channels)):
         assert_same(fast.match(frame), slow.match(frame))
 
 
@@ -335,7 +339,7 @@ def test_where_bounds_do_not_help_all_is_scored(slow, fast, monkeypatch, limit, 
 def test_no_bound_is_below_its_score(cell, noise, seed):
     """Also of frames that are a cell's own signal, where next to nothing is left out of the bank's basis."""
     _, fast = PAIRS[1]
-    noisy = BANK[0][cell] + noise * np.random.default_rng(seed).normal(size=N_CHANNELS)
+    noisy = BANK[0][cell] + noise * np.random.default_rng(seed).normal(size=PAPER_TABLE.n_channels)
     (frame,) = unit_magnitudes(noisy[None])
     signals = np.abs(BANK[0][BANK[1]].astype(np.float64))
     scores = (signals @ frame) / np.linalg.norm(signals, axis=1)
@@ -352,7 +356,7 @@ def test_no_group_of_cells_is_bounded_below_one_of_them():
     bank = PAIRS[0][1].compressed
     signals = np.abs(BANK[0][BANK[1]].astype(np.float64))
     signals /= np.linalg.norm(signals, axis=1, keepdims=True)
-    apart = np.maximum(signals[::3, None] - 0.95 * signals[None, ::7], 0.0).reshape(-1, N_CHANNELS)
+    apart = np.maximum(signals[::3, None] - 0.95 * signals[None, ::7], 0.0).reshape(-1, PAPER_TABLE.n_channels)
     frames = np.vstack([signals, signals.mean(axis=0), apart[apart.any(axis=1)]])
     frames /= np.linalg.norm(frames, axis=1, keepdims=True)
     scores = frames @ signals.T
@@ -365,7 +369,7 @@ def test_no_group_of_cells_is_bounded_below_one_of_them():
 @given(cells, st.sampled_from([0.0, 1e-6, 1e-2, 1.0]), st.integers(0, 2**32 - 1))
 def test_no_bound_at_any_lag_is_below_its_score(cell, noise, seed):
     slow, fast = PAIRS[0]
-    frame = BANK[0][cell] + noise * np.random.default_rng(seed).normal(size=N_CHANNELS)
+    frame = BANK[0][cell] + noise * np.random.default_rng(seed).normal(size=PAPER_TABLE.n_channels)
     found = AllLagsBounds(fast, unit_magnitudes(frame[None])[0])
     scores = slow.heatmap(frame)[BANK[1]]
     best, reached = found.reached
@@ -388,7 +392,7 @@ def test_few_cells_are_scored_exactly(slow, fast, monkeypatch):
         return contenders(self, frame, cells, frames, reached)
 
     monkeypatch.setattr(type(fast), "_contenders", counted)
-    frame = BANK[0][7, 12] * (1 + 0.05 * np.random.default_rng(6).normal(size=N_CHANNELS))
+    frame = BANK[0][7, 12] * (1 + 0.05 * np.random.default_rng(6).normal(size=PAPER_TABLE.n_channels))
     assert_same(fast.match(frame), slow.match(frame))
     assert sum(read) < BANK[1].sum() / 4
 

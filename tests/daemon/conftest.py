@@ -15,7 +15,7 @@ import zmq.asyncio
 from scipy.io import savemat
 
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import LINE_SLOTS, line_of_channels
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
@@ -36,6 +36,12 @@ def tiny_calibration(tiny_bank) -> Path:
         path
     )
     return path
+
+
+@pytest.fixture(scope="session")
+def ur_rtde() -> None:
+    """Skip a test whose configuration needs the robot's library."""
+    pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
 
 
 @pytest.fixture
@@ -148,10 +154,10 @@ def robot_at(host: str, folder: Path) -> None:
 def recording(folder: Path, n_frames: int) -> tuple[Path, np.ndarray]:
     """Write a recording with a touch in its second half, and return its path and its lines (n_frames, 1024)."""
     random = np.random.default_rng(2)
-    idle = random.integers(20, 200, len(LINE_SLOTS))
-    steps = idle + random.integers(-1, 2, (n_frames, len(LINE_SLOTS)))
-    steps[n_frames // 2 :] += random.integers(-15, 16, len(LINE_SLOTS))
-    lines = np.round(line_of_channels(steps * ADC_STEP_V), 4)
+    idle = random.integers(20, 200, len(PAPER_TABLE.line_slots))
+    steps = idle + random.integers(-1, 2, (n_frames, len(PAPER_TABLE.line_slots)))
+    steps[n_frames // 2 :] += random.integers(-15, 16, len(PAPER_TABLE.line_slots))
+    lines = np.round(PAPER_TABLE.line_of_channels(steps * ADC_STEP_V), 4)
     days = 739_588 + np.arange(n_frames) * FRAME_PERIOD_S / 86_400
     savemat(folder / "stream.mat", {"Right_Data": np.column_stack([days, lines])})
     return folder / "stream.mat", lines

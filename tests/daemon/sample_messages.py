@@ -14,7 +14,8 @@ def sample(kind: type[Message], **changes: Any) -> Message:
     values: dict[str, Any] = {}
     for item in dataclasses.fields(kind):
         hint = str(get_type_hints(kind)[item.name])
-        if "ndarray" in hint:
+        # Of NumPy's array types: numpy.ndarray[…], or from 2.5 on numpy.typing.NDArray[…].
+        if "ndarray" in hint.lower():
             values[item.name] = np.arange(6.0).reshape(2, 3)
         elif "tuple" in hint:
             values[item.name] = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)

@@ -8,7 +8,7 @@ from scipy.io import savemat
 
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.build import build_bank
-from shearloop.bank.eit.channels import N_CHANNELS, N_LINE_VALUES
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.design import MeasuredFrames, Setting, design_bank, simulated_signals
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.errors import CalibrationError
@@ -46,7 +46,7 @@ def test_a_design_is_a_configuration_that_builds(built):
 
 def step_frames() -> np.ndarray:
     """Return the model's frames (8, 896) of steps of eight sizes."""
-    mesh = load_geometry(OWN_FINGERTIP)
+    mesh = load_geometry(OWN_FINGERTIP).mesh
     steps = [Setting(k, 1.0) for k in np.linspace(1.2, 2.2, 8).tolist()]
     return 0.01 * np.abs(simulated_signals(ForwardModel(mesh), "step", steps))
 
@@ -74,7 +74,7 @@ def test_frames_that_no_model_explains_are_called_so_on_screen_and_in_the_config
 ):
     frames = step_frames()
     rng = np.random.default_rng(0)
-    frames = frames[:, rng.permutation(N_CHANNELS)] if mixed_up else frames
+    frames = frames[:, rng.permutation(PAPER_TABLE.n_channels)] if mixed_up else frames
     frames += rng.normal(0.0, noise_v, frames.shape)
     for number, frame in enumerate(frames, 1):
         savemat(tmp_path / f"Data_Slice_{number}.mat", {"data_diff": frame[None], "torque_value": 0.01 * number})
@@ -87,7 +87,7 @@ def test_frames_that_no_model_explains_are_called_so_on_screen_and_in_the_config
 
 
 def test_sizes_that_overflow_are_refused_without_a_warning():
-    t_s, frames = np.arange(12.0), np.random.default_rng(1).normal(0.0, 1e200, (12, 1, N_CHANNELS))
+    t_s, frames = np.arange(12.0), np.random.default_rng(1).normal(0.0, 1e200, (12, 1, PAPER_TABLE.n_channels))
     with pytest.raises(CalibrationError, match="no noise to design for"):
         scene_of(FrameSeries("difference", ("right",), t_s, frames, t_s, t_s, np.full(12, np.nan)))
 
@@ -99,7 +99,7 @@ def test_a_recording_that_is_none_is_one_sentence(tmp_path, capsys):
 
 def test_a_recording_that_begins_gripped_is_designed_for_without_the_frame_that_stands_in_for_the_idle_one():
     rng = np.random.default_rng(4)
-    t_s, frames = np.arange(12.0), rng.normal(0.3, 0.01, (12, 1, N_CHANNELS))
+    t_s, frames = np.arange(12.0), rng.normal(0.3, 0.01, (12, 1, PAPER_TABLE.n_channels))
     series = FrameSeries("raw", ("right",), t_s, frames, t_s, np.full(12, 0.1), np.full(12, np.nan))
     found = scene_of(series)
     np.testing.assert_array_equal(found.differences, frames[1:, 0] - frames[0, 0])
@@ -110,13 +110,13 @@ def test_a_side_is_designed_for_by_its_own_frames_however_few_the_other_one_has(
     with RecordingWriter(tmp_path / "one.mcap", "a test") as writer:
         for number in range(12):
             t_ns = number * period_ns
-            writer.add_frame("left", t_ns, t_ns, rng.uniform(0.3, 0.4, N_LINE_VALUES))
+            writer.add_frame("left", t_ns, t_ns, rng.uniform(0.3, 0.4, PAPER_TABLE.n_line_values))
             writer.add_torque(t_ns, 0.1)
         # A board that was lost soon, and whose frames lie beside the other's.
         for t_ns in (6 * period_ns, 20 * period_ns):
-            writer.add_frame("right", t_ns, t_ns, rng.uniform(0.3, 0.4, N_LINE_VALUES))
+            writer.add_frame("right", t_ns, t_ns, rng.uniform(0.3, 0.4, PAPER_TABLE.n_line_values))
     scenes: list[MeasuredFrames] = []
     monkeypatch.setattr("shearloop.daemon.analysis.bank_design.design_bank", lambda scene, _: scenes.append(scene))
     designed_for(tmp_path / "one.mcap", None, "left")
     # Of the twelve the first stands in for the idle one.
-    assert scenes[0].differences.shape == (11, N_CHANNELS)
+    assert scenes[0].differences.shape == (11, PAPER_TABLE.n_channels)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from io import StringIO
 from pathlib import Path
 from typing import Any, NoReturn
 from unittest.mock import Mock
@@ -24,10 +25,10 @@ from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import COMMANDS, main
 from shearloop.daemon.cli.bank import MODEL_NAMES
 from shearloop.daemon.cli.completion import full_parser
-from shearloop.daemon.cli.terminal import message_json, message_line
+from shearloop.daemon.cli.terminal import StatusLine, message_json, message_line, table, task_row
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.runner import WRENCH
-from shearloop.daemon.messaging.messages import EitEstimate, decode, encode, wire_map
+from shearloop.daemon.messaging.messages import EitEstimate, RobotStateMessage, decode, encode, wire_map
 from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from tests.daemon.sample_messages import sample
@@ -37,7 +38,8 @@ def mistake(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     assert main(arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
-    assert err.count("\n") == 1, err
+    # One line for each mistake, and no traceback.
+    assert all(": " in line and not line.startswith(" ") for line in err.splitlines()), err
     assert err.startswith(f"shearloop {arguments[0]}: ")
     return err
 
@@ -47,6 +49,7 @@ def test_check_accepts_a_valid_configuration(config, capsys):
     assert "is in order" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("ur_rtde")
 @pytest.mark.parametrize("command", ["run", "check"])
 def test_a_calibration_without_torques_cannot_drive_the_loop(command, config, tiny_bank, tmp_path, capsys):
     grid, path = np.linspace(0.9, 2.1, 30), tmp_path / "diameters.yaml"
@@ -66,12 +69,12 @@ def test_a_calibration_without_torques_cannot_drive_the_loop(command, config, ti
     ("changes", "parts"),
     [
         ({"fingertips": {}}, ["fingertips"]),
-        ({"fingertip": {}}, ["`fingertip` is not a known key", "did you mean `fingertips`?"]),
+        ({"fingertip": {}}, ["fingertip: is not a known key; did you mean fingertips?"]),
         ({"publish": "tcp://0.0.0.0:7761"}, ["publish", "loopback"]),
         ({"publish": "tcp://lab-pc:7761"}, ["publish", "loopback"]),
-        ({"publish": "tcp://127.0.0.1:70000"}, ["`publish` must end in a port, a whole number up to 65535, as in tcp"]),
-        ({"commands": "tcp://127.0.0.1:7762a"}, ["`commands` must end in a port, a whole number"]),
-        ({"commands": "tcp://127.0.0.1"}, ["`commands` must end in a port, a whole number"]),
+        ({"publish": "tcp://127.0.0.1:70000"}, ["publish: must end in a port, a whole number up to 65535, as in tcp"]),
+        ({"commands": "tcp://127.0.0.1:7762a"}, ["commands: must end in a port, a whole number"]),
+        ({"commands": "tcp://127.0.0.1"}, ["commands: must end in a port, a whole number"]),
         ({"fingertips": {"Right Hand": {}}}, ["fingertips"]),
         ({"fingertips": {"load_cell": {"device": {"path": "eit"}}}}, ["cannot be named 'load_cell', as another part"]),
     ],
@@ -83,6 +86,7 @@ def test_a_configuration_mistake_names_file_key_and_cure(command, changes, parts
         assert part in said
 
 
+@pytest.mark.usefixtures("ur_rtde")
 async def test_fingertip_names_do_not_collide_with_task_names(config, tmp_path):
     shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
     (tmp_path / "wait.yaml").write_text("{name: one, torque_source: right, steps: [{do: wait, wait_s: 1}]}")
@@ -225,7 +229,11 @@ def test_every_command_explains_itself(name, capsys):
 def test_an_unknown_command_lists_the_known_ones(capsys):
     with pytest.raises(SystemExit, match="2"):
         main(["fly"])
-    assert "'run'" in capsys.readouterr().err
+    assert " run, " in capsys.readouterr().err
+    for arguments, meant in ((["rnu"], "run"), (["command", "stauts"], "status"), (["listen", "--cuont"], "--count")):
+        with pytest.raises(SystemExit):
+            main(arguments)
+        assert f"did you mean {meant}?" in capsys.readouterr().err
 
 
 def test_every_argument_has_a_help_text():
@@ -265,8 +273,40 @@ def test_messages_are_readable():
     line = message_line("eit.estimate", content)
     assert "torque +0.0500 N·m [+0.0200, +0.0800]   diameter  31.0 mm   k 3.500  sigma 1.500 cm   score 0.750" in line
     assert message_json("eit.estimate", content).startswith('{"topic": "eit.estimate", "timestamp": 0.0')
+    robot = decode(encode(wire_map(sample(RobotStateMessage, blocked=""), timestamp=0.0, seq=1)))
+    shown = message_line("robot.state", {**robot, "safety_mode": None})
+    assert "joints_rad (" in shown
+    assert not any(word in shown for word in ("blocked", "safety_mode", "None"))
     invalid = {**content, "valid": False, "reason": "no signal"}
     assert message_line("eit.estimate", invalid).endswith("no estimate: no signal")
+
+
+def test_tasks_are_told_in_words_without_what_is_not_known():
+    facts = {"alive": True, "done": False, "restarts": 0, "last_error": "", "rate_hz": None, "errors": {}}
+    for changes, told in (
+        ({}, ("alive", "", "")),
+        ({"rate_hz": 1.85, "expected_hz": 1.849}, ("alive", "1.85 of 1.85 Hz", "")),
+        ({"connected": True, "errors": {"unreachable": 1}}, ("alive", "", "reconnected once")),
+        ({"connected": True, "connections": 3}, ("alive", "", "reconnected twice")),
+        ({"connected": False, "error": "No board."}, ("not connected", "", "No board.")),
+        ({"errors": {"nan": 3}, "restarts": 1}, ("alive", "", "restarted once, nan 3 times")),
+        ({"alive": False, "last_error": "ValueError"}, ("DEAD", "", "ValueError")),
+        ({"alive": False, "done": True}, ("done", "", "")),
+    ):
+        assert task_row("right", {**facts, **changes})[1:] == told
+    assert table(("a", "b"), [("longer", "x")]) == ["a       b", "longer  x"]
+
+
+def test_the_status_line_is_redrawn_in_place():
+    out = StringIO()
+    state = {"experiment": "one", "step": 2, "steps": 3, "step_name": "grip", "progress": 0.5, "reasons": ""}
+    with StatusLine(out) as line:
+        line("loop.state", {**state, "phase": "running", "activity": "closing", "torque_source": "right"})
+        for source, valid in (("right", True), ("left", True), ("right", False)):
+            line("eit.estimate", {"source": source, "valid": valid, "torque_nm": 0.1})
+    _, starting, *shown, end = out.getvalue().split("\r\x1b[K")
+    running = "running 50 %  step 2 of 3 grip  closing"
+    assert (starting, shown, end) == ("starting", [running, f"{running}   right +0.100 N·m", running], "")
 
 
 def test_invalid_emulators_and_recordings_are_refused_before_the_start(config, tmp_path, capsys):
@@ -289,10 +329,10 @@ def test_invalid_emulators_and_recordings_are_refused_before_the_start(config, t
 
 
 def test_missing_paths_and_shared_addresses_are_named(config, capsys):
-    assert "`experiment` must be the path of a file, not '.'" in mistake(
+    assert "experiment: must be the path of a file, not '.'" in mistake(
         capsys, "check", str(config(experiment="", robot="ur.yaml"))
     )
-    assert "`robot` must be the path of a file" in mistake(capsys, "check", str(config(robot="a\0b")))
+    assert "robot: must be the path of a file" in mistake(capsys, "check", str(config(robot="a\0b")))
     both = "ipc:///tmp/one-for-both"
     assert f"are both {both}" in mistake(capsys, "check", str(config(publish=both, commands=both)))
 

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field, ValidationError, model_validator
 
+from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.config_file import ConfigModel, load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.errors import UserError
@@ -39,8 +40,7 @@ def refused(tmp_path, text):
     with pytest.raises(UserError) as error:
         load_yaml_model(path, Outer)
     sentence = str(error.value)
-    assert sentence.startswith(f"{path}: ")
-    assert "\n" not in sentence
+    assert all(line.startswith(f"{path}:") for line in sentence.splitlines())
     return sentence
 
 
@@ -59,14 +59,52 @@ def test_all_mistakes_are_reported_together_with_key_and_range(tmp_path):
         "torque_limit_nm: 9\nmode: quick\nsteps: [{hold_s: 1}, {hold_s: -1}, {}]\nspare: {hold_s: x}\ntorqe_limit: 1\n",
     )
     for part in (
-        "`torque_limit_nm` should be less than or equal to 2 (found 9, allowed: from 0.05 to 2)",
-        "`mode` should be 'slow' or 'fast' (found 'quick', allowed: slow, fast)",
-        "`steps[1].hold_s` should be greater than 0 (found -1, allowed: above 0 to 60)",
-        "`steps[2].hold_s` is missing (allowed: above 0 to 60)",
-        "`spare.hold_s` should be a valid number, unable to parse string as a number (found 'x', allowed: above 0",
-        "`torqe_limit` is not a known key, did you mean `torque_limit_nm`?",
+        "1: torque_limit_nm: 9 is too large; allowed: from 0.05 to 2",
+        "2: mode: 'quick' does not exist; allowed: slow, fast",
+        "3: steps[1].hold_s: -1 is too small; allowed: above 0 to 60",
+        "3: steps[2].hold_s: is missing; allowed: above 0 to 60",
+        "4: spare.hold_s: 'x' is not a number; allowed: above 0 to 60",
+        "5: torqe_limit: is not a known key; did you mean torque_limit_nm?",
     ):
-        assert part in sentence
+        assert f"a.yaml:{part}" in sentence.splitlines()[int(part[0]) - 1 + (part[0] > "3" or "[2]" in part)]
+
+
+def test_a_value_in_another_unit_is_recognised_and_a_schema_mistake_hides_no_other(tmp_path):
+    path = tmp_path / "experiment.yaml"
+    path.write_text("""\
+name: one
+drive: rigth
+steps:
+  - {do: grip, width_mm: 0.005}
+  - {do: approach, along_tool_m: 30}
+  - {do: twist, angles_rad: 90}
+  - {do: twist, angles_rad: [0.1, 90], speed: 1}
+""")
+    with pytest.raises(UserError) as caught:
+        load_yaml_model(path, ExperimentFile)
+    found = [line.removeprefix(f"{path}:").partition("; allowed")[::2] for line in str(caught.value).splitlines()]
+    assert [begin for begin, _ in found] == [
+        "2: drive: is not a known key",
+        "4: steps[0].width_mm: 0.005 is too small for mm; did you mean 5, the thousandfold?",
+        "5: steps[1].along_tool_m: 30 is too large",
+        "6: steps[2].angles_rad: 90 is too large",
+        "7: steps[3].angles_rad[1]: 90 is too large",
+        "7: steps[3].speed: is not a known key; did you mean speed_rad_per_s?",
+    ]
+    assert found[2][1].endswith("did you mean 0.03, the thousandth?")
+    assert found[3][1].endswith("did you mean 1.571, 90 degrees in rad?")
+
+
+def test_a_file_of_another_kind_is_recognised(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text("name: one\nsteps: [{do: tare}]\n")
+    with pytest.raises(UserError, match=r"a\.yaml:1: this is an experiment; name it in a configuration"):
+        load_yaml_model(path, DaemonConfig)
+    path.write_text("fingertips: {}\n")
+    with pytest.raises(UserError, match=r"a\.yaml:1: this is a configuration; name this experiment in it"):
+        load_yaml_model(path, ExperimentFile)
+    with pytest.raises(UserError, match=r"b\.yaml: the experiment cannot be read: No such file"):
+        load_yaml_model(tmp_path / "b.yaml", ExperimentFile)
 
 
 # Each list holds nine of the one before it: 3 GB, if all were written out.
@@ -79,29 +117,29 @@ ALIAS_BOMB = "a: &a [x]\n" + "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n"
         ("", "the configuration is empty"),
         ("# nothing\n", "the configuration is empty"),
         ("- 1\n- 2\n", "expected keys and values such as `torque_limit_nm: …`, found [1, 2]"),
-        ("torque_limit_nm: 1\nmode: [slow\n", "line 3, column 1: "),
-        ("torque_limit_nm: 1\n\tmode: slow\n", "line 2, column 1: found character '\\t'"),
+        ("torque_limit_nm: 1\nmode: [slow\n", ":3:1: a list is not closed"),
+        ("torque_limit_nm: 1\n\tmode: slow\n", ":2:1: a tab indents this line; use spaces"),
         (
             "torque_limit_nm: 1\nmode: slow\ntorque_limit_nm: 2\n",
-            "line 3, column 1: the key `torque_limit_nm` is given",
+            ":3:1: the key `torque_limit_nm` is given",
         ),
-        ("spare: {hold_s: 1, hold_s: 2}\n", "line 1, column 20: the key `hold_s` is given twice"),
-        ("mode: !!python/object/apply:os.system [ls]\n", "line 1, column 7: the type tag tag:yaml.org,2002:python/"),
-        ("torque_limit_nm: !!int 1:1\n", "line 1, column 18: the type tag tag:yaml.org,2002:int is not supported"),
-        ("torque_limit_nm: 2024-13-45\n", "should be a valid number, unable to parse string as a number"),
-        (f"torque_limit_nm: {'9' * 100_000}\n", "should be"),
-        (f"torque_limit_nm: {':'.join(['59'] * 40_000)}\n", "should be a valid number"),
-        ("mode: &a [*a]\n", "line 1, column 11: an alias stands within its anchor"),
-        (ALIAS_BOMB, "column 4: more than 20000 values, with every alias written out"),
+        ("spare: {hold_s: 1, hold_s: 2}\n", ":1:20: the key `hold_s` is given twice"),
+        ("mode: !!python/object/apply:os.system [ls]\n", ":1:7: the type tag tag:yaml.org,2002:python/"),
+        ("torque_limit_nm: !!int 1:1\n", ":1:18: the type tag tag:yaml.org,2002:int is not supported"),
+        ("torque_limit_nm: 2024-13-45\n", "torque_limit_nm: '2024-13-45' is not a number"),
+        (f"torque_limit_nm: {'9' * 100_000}\n", "is not a finite number"),
+        (f"torque_limit_nm: {':'.join(['59'] * 40_000)}\n", "is not a number"),
+        ("mode: &a [*a]\n", ":1:11: an alias stands within its anchor"),
+        (ALIAS_BOMB, ":4: more than 20000 values, with every alias written out"),
         ("#" * 131_073, "is larger than 128 kB"),
-        ("? [1, 2]\n: 3\n", "line 1, column 3: found unhashable key"),
-        ("mode: *other\n", "line 1, column 7: found undefined alias 'other'"),
+        ("? [1, 2]\n: 3\n", ":1:3: a key is a list or a section"),
+        ("mode: *other\n", ":1:7: an alias `*name` without its anchor"),
         ("mode: \x00\n", "not a YAML file: unacceptable character"),
         ("[" * 500, "nested too deeply"),
-        ("torque_limit_nm: .nan\n", "should be a finite number (found nan, allowed: from 0.05 to 2)"),
-        ("torque_limit_nm: 1\nwhat: 1\n", "`what` is not a known key, known are torque_limit_nm, mode, steps, spare"),
-        ("torque_limit_nm: 1\nspare: {hold: 1}\n", "`spare.hold` is not a known key, did you mean `hold_s`?"),
-        ("torque_limit_nm: 1\nsteps: 3\n", "`steps` should be a valid tuple (found 3)"),
+        ("torque_limit_nm: .nan\n", "nan is not a finite number; allowed: from 0.05 to 2"),
+        ("torque_limit_nm: 1\nwhat: 1\n", "2: what: is not a known key; allowed: torque_limit_nm, mode, steps, spare"),
+        ("torque_limit_nm: 1\nspare: {hold: 1}\n", "spare.hold: is not a known key; did you mean hold_s?"),
+        ("torque_limit_nm: 1\nsteps: 3\n", "steps: 3 is not a list"),
         ("1: 2\n", "the key 1 is a number; a name is expected"),
         ("torque_limit_nm: 1\nlow: 3\n", ": low must be below high, but low is 3 and high is 1"),
     ],
@@ -131,9 +169,9 @@ def test_no_content_whatever_does_anything_but_load_or_be_refused(tmp_path_facto
 @pytest.mark.parametrize(
     ("step", "said"),
     [
-        ("{do: gripp}", "`steps[0]` has the do 'gripp', which does not exist, did you mean 'grip'? (allowed: approach"),
-        ("{do: 7}", "`steps[0]` has the do '7', which does not exist (allowed: approach, "),
-        ("{width_mm: 5}", "`steps[0]` lacks `do`, its kind"),
+        ("{do: gripp}", "1: steps[0].do: 'gripp' does not exist; allowed: approach"),
+        ("{do: 7}", "1: steps[0].do: '7' does not exist; allowed: approach, "),
+        ("{width_mm: 5}", "1: steps[0].do: is missing"),
     ],
 )
 def test_a_step_of_no_kind_is_told_in_a_sentence(step, said, tmp_path):

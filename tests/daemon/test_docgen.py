@@ -10,6 +10,7 @@ import pytest
 import zmq
 
 from shearloop.daemon.clock import Clock
+from shearloop.daemon.config_schema import MODELS, schema_of
 from shearloop.daemon.control.safety import TABLE
 from shearloop.daemon.docgen import DOCS, pages
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
@@ -18,18 +19,39 @@ from shearloop.daemon.messaging.publisher import Publisher
 from tests.daemon.conftest import DEADLINE_S
 from tests.daemon.sample_messages import sample
 
+PAGES = pages()
+
 
 @pytest.fixture(scope="module")
 def written() -> dict[str, str]:
     """Return the generated pages by name."""
-    return {path.name: text for path, text in pages().items()}
+    return {path.name: text for path, text in PAGES.items()}
 
 
-@pytest.mark.parametrize("name", ["messages.md", "safety.md"])
-def test_a_page_is_up_to_date(written, name):
-    assert len(written) == 2
-    found = (DOCS / name).read_text(encoding="utf-8")
-    assert found == written[name], f"docs/{name} is out of date: run `make docs` and commit it"
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
+def test_a_generated_file_is_up_to_date(path):
+    assert path.read_text(encoding="utf-8") == PAGES[path], f"{path} is out of date: run `make docs` and commit it"
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_every_key_of_a_file_is_described_and_listed(written, kind):
+    schema = schema_of(kind)
+    for section in (schema, *schema.get("$defs", {}).values()):
+        assert section["description"]
+        for key, described in section["properties"].items():
+            assert described["description"], key
+            assert f"| `{key}` |" in written["configuration.md"]
+
+
+def test_the_schema_of_a_configuration_has_units_ranges_and_defaults():
+    loop = schema_of("configuration")["$defs"]["LoopConfig"]["properties"]
+    assert loop["wrist_speed_rad_per_s"] == {
+        "description": "largest wrist speed of the loop [rad/s]",
+        "default": 0.5,
+        "exclusiveMinimum": 0,
+        "maximum": 3.14,
+        "type": "number",
+    }
 
 
 def test_every_topic_and_key_is_listed(written):
@@ -62,8 +84,8 @@ async def test_the_python_subscriber_prints_estimates(tmp_path):
                     await asyncio.wait([seen], timeout=0.05)
                 assert b"text 0.5 " in seen.result()
                 publisher.publish(frame)
-                while b"text 5.0" not in await process.stdout.readline():
-                    pass
+                while b"text 5.0" not in (line := await process.stdout.readline()):
+                    assert line, "the program has ended"
         finally:
             process.kill()
             await process.communicate()

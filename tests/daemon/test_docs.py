@@ -1,14 +1,21 @@
 """The pages name only commands, options, files and pages that there are."""
 
 import ast
+import importlib.util
 import re
 import shlex
+import textwrap
 from pathlib import Path
 
 import pytest
+import yaml
 
+from shearloop.daemon.bank_config import load_bank_plans
 from shearloop.daemon.cli import COMMANDS
 from shearloop.daemon.cli.completion import full_parser
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.control.loop_inputs import TorqueSource
+from shearloop.daemon.rig import check_experiment
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -33,6 +40,69 @@ def test_commands_and_options_exist(page):
         for word in words[1:]:
             if word.startswith("--"):
                 assert word.rstrip(",.").split("=")[0] in known, f"{page.name}: shearloop {text}"
+
+
+def blocks(page: Path) -> list[str]:
+    """Return the indented blocks of a page."""
+    found = re.findall(
+        r"^ {4}.*\n(?:\n* {4}.*\n)*", re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL), re.MULTILINE
+    )
+    return [textwrap.dedent(block) for block in found]
+
+
+BLOCKS = [pytest.param(block, id=f"{page.stem}-{n}") for page in PAGES for n, block in enumerate(blocks(page))]
+SYSTEM_PROGRAMS = {"sudo", "pip", "ssh", "dask", "systemctl", "journalctl"}
+
+
+@pytest.mark.parametrize("block", BLOCKS)
+def test_every_block_is_valid(block, tmp_path):
+    if re.match(r"\w+:(\s|$)", block):
+        check_yaml(block, tmp_path)
+    elif block.startswith("import "):
+        compile(block, "block", "exec")  # test_newcomer runs it
+    elif block.startswith("#"):
+        (schema,) = re.findall(r"\$schema=(\S+)", block)
+        assert (ROOT / "config" / schema).exists()
+    elif "─" not in block and "drivers/connection.py" not in block:
+        for line in block.splitlines():
+            for command in re.split(r" && | & ", re.sub(r" +#.*| &$", "", line)):
+                check_command(command)
+
+
+def check_yaml(block: str, folder: Path) -> None:
+    """Load a block as the file that its keys show it to be."""
+    content = yaml.safe_load(block)
+    (folder / "here").mkdir()
+    path = folder / "here" / "file.yaml"
+    if "steps" in content:
+        path.write_text(block)
+        sources = {name: TorqueSource(name=name, period_s=0.5) for name in ("right", "left", "combined", "load_cell")}
+        demo = load_daemon_config(ROOT / "config/demo.yaml").model_copy(update={"experiment": path})
+        assert check_experiment(demo, sources) is not None
+    elif "model" in content:
+        (folder / "fingertips").symlink_to(ROOT / "config/fingertips")
+        path.write_text(block)
+        assert load_bank_plans(path)
+    else:
+        rest = {"fingertips": {"right": {"device": {"path": "port"}}}}
+        path.write_text(yaml.safe_dump({**rest, **content}))
+        load_daemon_config(path)
+
+
+def check_command(line: str) -> None:
+    """Parse a shearloop command with its own parser; of others check that there is such a program."""
+    program, *arguments = shlex.split(line.removeprefix("sudo "))
+    if program.endswith("shearloop"):
+        module = importlib.import_module(COMMANDS[arguments[0]].module)
+        expand = getattr(module, "expand_default_command", list)
+        full_parser().parse_args([arguments[0], *expand(arguments[1:])])
+    elif program == "make":
+        assert re.search(rf"^{arguments[0]}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    elif program == "python":
+        assert arguments[0] == "-m"
+        assert importlib.util.find_spec(arguments[1])
+    elif not re.fullmatch(r"\[\w+\]|\w+=.*", program):
+        assert program.split("/")[-1] in {*SYSTEM_PROGRAMS, "python3", "usermod"}
 
 
 def test_the_readmes_recordings_are_ignored_by_git():

@@ -11,8 +11,8 @@ import pytest
 
 from shearloop.daemon import doctor
 from shearloop.daemon.cli import main
-from shearloop.daemon.config import CurveConfig, load_daemon_config
-from shearloop.daemon.doctor.devices import check_channels, check_rate, check_task, from_error
+from shearloop.daemon.config import CurveConfig, SerialDevice, load_daemon_config
+from shearloop.daemon.doctor.devices import check_channels, check_port, check_rate, check_task, from_error
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.keys import make_key_pair
 from shearloop.daemon.serial_ports import SerialPortInfo
@@ -60,7 +60,7 @@ async def test_doctor_checks_a_rig_with_and_without_its_daemon(rig_config, tiny_
             assert found[subject].state == "good", found[subject]
         # How near a busy computer comes to it is not the question here.
         assert f"{SPEED / 0.5412:.3g} Hz configured" in found["rate of right"].found
-        assert found["channels of right"].found.startswith("0 saturated and 0 dead of 896 in ")
+        assert found["channels of right"].found.startswith("0 saturated and 0 dead of the channels in ")
         assert found["remote control"].state == "good"
         # The board sends more often than the configuration says.
         assert found["rate of load_cell"].state == "note"
@@ -112,10 +112,10 @@ def test_the_disk(tmp_path, monkeypatch):
     ("facts", "state", "part"),
     [
         ({"alive": True, "errors": {}}, "good", "alive"),
-        ({"alive": False, "restarts": 3, "last_error": "ValueError: x"}, "trouble", "dead, 3 restarts"),
+        ({"alive": False, "restarts": 3, "last_error": "ValueError: x"}, "trouble", "dead, restarted 3 times"),
         ({"alive": True, "connected": False, "last_loss": "unplugged"}, "trouble", "not connected"),
-        ({"alive": True, "restarts": 1, "last_error": "x"}, "note", "1 restarts"),
-        ({"alive": True, "connected": True, "errors": {"nan": 2}}, "note", "2 × nan"),
+        ({"alive": True, "restarts": 1, "last_error": "x"}, "note", "restarted once"),
+        ({"alive": True, "connected": True, "errors": {"nan": 2}}, "note", "nan twice"),
     ],
 )
 def test_tasks_are_judged_by_their_counters(facts, state, part):
@@ -163,6 +163,10 @@ def test_an_error_sentence_becomes_a_finding_with_its_cure():
         finding = from_error("x", sentence, "nothing")
         assert finding.found == sentence
         assert "shearloop doctor CONFIG" in finding.next_step
+    missing = from_error("experiment", "e.yaml: the experiment cannot be read: No such file or directory", "nothing")
+    assert missing.next_step.startswith("make the file, or correct its name")
+    absent = check_port("right", SerialDevice(path=Path("/nowhere/eit")))
+    assert absent.next_step.startswith("plug the board in")
 
 
 def port(**changes: Any) -> Any:

@@ -9,7 +9,7 @@ import pytest
 from scipy.io import loadmat
 
 from shearloop.bank.eit.bank_file import BankDefinition, write_bank
-from shearloop.bank.eit.channels import CHANNELS, ZERO_SLOTS
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.daemon.cli import EXIT_USAGE, main
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.emulators.boards import EitKitBoard
@@ -32,7 +32,7 @@ async def test_a_recording_at_a_hundred_times_its_pace_arrives_whole_and_in_orde
     folder = shared / "recordings" / "streams" / "2024-12-03_16-09"
     expected = loadmat(folder / "device1.mat")["Right_Data"][:, 1:]
     async with emulator("--recording", str(folder / "device1.mat"), "--speed", "100", "--once") as (_, path):
-        kit = EitKit(zero_slots=ZERO_SLOTS, path=path)
+        kit = EitKit(zero_slots=PAPER_TABLE.zero_slots, path=path)
         frames = await take(kit.readings(), 832)
     assert [frame.seq for frame in frames] == list(range(832))
     np.testing.assert_array_equal([frame.raw for frame in frames], expected)
@@ -51,7 +51,7 @@ async def test_a_recording_is_played_again_and_again_under_the_name_given(number
     link = tmp_path / "eit"
     async with emulator("--recording", str(path), "--speed", "500", "--link", str(link)) as (process, port):
         assert port == str(link)
-        frames = await take(EitKit(zero_slots=ZERO_SLOTS, path=port).readings(), 7)
+        frames = await take(EitKit(zero_slots=PAPER_TABLE.zero_slots, path=port).readings(), 7)
         process.send_signal(number)
         assert await process.wait() == 0
     np.testing.assert_array_equal([frame.raw for frame in frames], [lines[n % 3] for n in range(7)])
@@ -62,7 +62,7 @@ async def test_faults_are_switched_on_by_argument_and_by_standard_input(tmp_path
     path, lines = recording(tmp_path, 40)
     arguments = ("--recording", str(path), "--speed", "20", "--link", str(tmp_path / "eit"), "--once")
     async with emulator(*arguments, "--fault", "cut-line@1", "--fault", "unplug:0.1@3") as (process, port):
-        kit = EitKit(zero_slots=ZERO_SLOTS, path=port)
+        kit = EitKit(zero_slots=PAPER_TABLE.zero_slots, path=port)
         frames: list[Frame] = []
         async with aclosing(kit.readings()) as arriving:
             async for frame in arriving:
@@ -87,12 +87,14 @@ async def test_faults_are_switched_on_by_argument_and_by_standard_input(tmp_path
 
 async def test_twists_are_synthesised_from_a_bank(tmp_path):
     definition = BankDefinition("0" * 64, "gaussian_derivative", np.array([3.0, 3.5]), np.array([1.0, 2.0]))
-    homogeneous = 0.5 * np.sin(CHANNELS @ [0.1, 0.2, 0.3, 0.4]) + 0.7
-    signals = np.broadcast_to(np.cos(CHANNELS @ [0.3, 0.1, 0.2, 0.5]), (2, 2, len(CHANNELS))).astype(np.float32)
+    homogeneous = 0.5 * np.sin(PAPER_TABLE.electrodes @ [0.1, 0.2, 0.3, 0.4]) + 0.7
+    signals = np.broadcast_to(
+        np.cos(PAPER_TABLE.electrodes @ [0.3, 0.1, 0.2, 0.5]), (2, 2, len(PAPER_TABLE.electrodes))
+    ).astype(np.float32)
     path = tmp_path / "bank.shb"
     write_bank(path, definition, homogeneous, np.full((2, 2), 0.5), np.ones((2, 2), bool), signals)
     async with emulator("--bank", str(path), "--speed", "200") as (_, port):
-        frames = await take(EitKit(zero_slots=ZERO_SLOTS, path=port).readings(), 50)
+        frames = await take(EitKit(zero_slots=PAPER_TABLE.zero_slots, path=port).readings(), 50)
     channels = np.array([frame.channels for frame in frames])
     # The programme begins with 15 s of nothing, then grips within 3 s: 28 and 34 frames.
     idle, gripped = channels[:25].mean(axis=0), channels[36:].mean(axis=0)

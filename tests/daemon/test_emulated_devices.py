@@ -29,8 +29,10 @@ def held(t_s: float, step: int = 7, hold: int = 1, phase: str = "running") -> di
 def played(tmp_path, monkeypatch) -> Devices:
     """Return devices whose processes run these programs."""
 
-    def devices(emulators: tuple[EmulatorConfig, ...], *programs: str) -> EmulatedDevices:
-        commands = [[sys.executable, "-c", program] for program in programs]
+    def devices(
+        emulators: tuple[EmulatorConfig, ...], *programs: str, ready: str = "print('ready', flush=True); "
+    ) -> EmulatedDevices:
+        commands = [[sys.executable, "-c", ready + program] for program in programs]
         monkeypatch.setattr(EmulatedDevices, "_command", lambda _, one: commands[emulators.index(one)])
         return EmulatedDevices(emulators, tmp_path)
 
@@ -68,6 +70,13 @@ def test_an_ended_device_is_reported_once(played):
             devices(topic, held(1, phase="idle"))
     ((device, status),) = [(entry["device"], entry["status"]) for entry in logged]
     assert (device, status) == ("rig", 3)
+
+
+def test_devices_are_awaited_until_they_are_ready_or_have_ended(played, tmp_path):
+    late = f"import time; time.sleep(0.5); open({str(tmp_path / 'late')!r}, 'w'); print('more', flush=True); input()"
+    devices = played((emulator(device="eit-kit"), emulator()), late, "raise SystemExit(3)", ready="")
+    with devices:
+        assert (tmp_path / "late").exists()
 
 
 def test_the_truth_is_read_up_to_its_last_complete_line(played):

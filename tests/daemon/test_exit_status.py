@@ -20,7 +20,7 @@ LEFT_TO_OPERATOR = "it starts by `shearloop command start` only"
 
 
 @pytest.fixture
-def waiting_config(config, tmp_path) -> Path:
+def waiting_config(ur_rtde, config, tmp_path) -> Path:  # noqa: ARG001 - it skips
     """Write a configuration whose experiment waits for a robot that there is none of."""
     robot_at(own_address(6), tmp_path)
     steps = {"name": "test", "torque_source": "wrench", "steps": [{"do": "wait", "wait_s": 1}]}

@@ -53,7 +53,7 @@ async def reading(rate_hz: float = 10.9) -> AsyncIterator[tuple[LoadCellTask, Bo
 
 
 async def asked(task: LoadCellTask) -> asyncio.Task[str]:
-    zero = asyncio.create_task(task.tare_and_wait())
+    zero = asyncio.create_task(task.tare_and_wait(60.0))
     await asyncio.sleep(0)
     return zero
 

@@ -12,6 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -39,8 +40,14 @@ def readme_commands() -> list[str]:
     found = re.findall(rf"^    {re.escape(PROGRAM)} (.*)$", section, re.MULTILINE)
     names = [command.split()[0] for command in found]
     assert names == ["run", "run", "replay", "calibrate", "evaluate"]
-    assert f"{PROGRAM} view" in readme
     return found
+
+
+def readme_program() -> str:
+    """Return the README's program."""
+    block = re.search(r"^ {4}import shearloop\n(?:(?: {4}.*)?\n)*", Path("README.md").read_text(), re.MULTILINE)
+    assert block
+    return textwrap.dedent(block[0])
 
 
 class Tree:
@@ -117,7 +124,7 @@ def tree(tmp_path) -> Iterator[Tree]:
         content["combined"]["creep"]["time_s"] /= SPEED
         content["load_cell"]["rate_hz"] = 10.9 * SPEED
         # Two and a half periods of such a load cell are what a busy computer may be late.
-        content["loop"] = {"stale_after_s": 0.3}
+        content["loop"]["stale_after_s"] = 0.3
         content["gripper"]["socket"]["host"] = HOST
         (rig,) = content["emulators"]
         rig["arguments"] += ["--host", HOST, "--speed", str(SPEED), "--unlock-wait-s", "0.2", "--power-on-s", "0.1"]
@@ -128,8 +135,6 @@ def tree(tmp_path) -> Iterator[Tree]:
         for step in content["steps"]:
             if step["do"] == "hold_torque":
                 step["hold_s"] = HOLD_S
-            elif step["do"] == "wait":
-                step["wait_s"] /= SPEED
 
     tree.change("demo.yaml", demo)
     tree.change("demo_ur.yaml", lambda content: content.update(host=HOST))
@@ -172,7 +177,7 @@ def test_the_readmes_path_from_the_demo_to_a_calibration_of_ones_own(tree):
     pytest.importorskip("aiohttp", reason="the live view needs the extra `view`")
     pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
     run, run_again, replay, calibrate, evaluate = (f"{PROGRAM} {command}" for command in readme_commands())
-    tree.shell("make run/rig.cal")
+    tree.shell(f"{PROGRAM} demo --folder . --prepare", 2 * DEADLINE_S)
     view = f"{PROGRAM} view --connect ipc://{tree.root}/publish --commands ipc://{tree.root}/commands --port 0 --json"
     with tree.started(run) as demo, tree.started(view) as viewer:
         address = json.loads(viewer.stdout.readline())["url"]
@@ -206,3 +211,9 @@ def test_the_readmes_path_from_the_demo_to_a_calibration_of_ones_own(tree):
     assert float(figures["rmse_nm"]) < 0.02
     assert float(figures["valid_fraction"]) > 0.3
     assert (tree.root / "run" / "my.png").read_bytes().startswith(b"\x89PNG")
+    (recording,) = (tree.root / "recordings/second").glob("*.mcap")
+    example = readme_program().replace("fingertip.cal", "run/my.cal").replace("twists.mcap", str(recording))
+    (tree.root / "example.py").write_text(example)
+    torques = [line.split()[1] for line in tree.shell(".venv/bin/python example.py").stdout.splitlines()]
+    assert len(torques) > 100
+    assert any(torque != "None" for torque in torques)

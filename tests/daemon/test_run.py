@@ -72,9 +72,20 @@ async def test_the_daemon_and_its_emulators_stop_cleanly_on_a_signal(number, con
         frames = subscriber(f"ipc://{tmp_path}/publish", "eit.frame")
         content = await asyncio.to_thread(next_message, frames)
         assert content["channels"].shape == (896,)
-        assert b"emulated devices are starting" in await daemon.stderr.readline(), "before what is missed of them"
         await stop_and_time(daemon, number)
+        log = (await daemon.stderr.read()).decode()
+        assert "warning" not in log, "the emulated devices were awaited"
         assert not link.is_symlink(), "the emulator has taken its port away"
+
+
+async def test_a_daemon_that_ends_says_so_in_its_last_message(config, tmp_path, subscriber):
+    async with shearloop("run", str(config())) as daemon:
+        messages = subscriber(f"ipc://{tmp_path}/publish", "")
+        await asyncio.to_thread(next_message, messages)
+        await stop_and_time(daemon, signal.SIGINT)
+        while (content := await asyncio.to_thread(next_message, messages)).get("finished") is None:
+            pass
+        assert (content["source"], content["finished"], content["summary"]) == ("daemon", True, "")
 
 
 async def test_tare_status_and_stop_commands(config, tmp_path):
@@ -116,7 +127,7 @@ async def test_a_heatmap_is_computed_only_with_a_subscriber(config, tmp_path, su
 
 
 @pytest.fixture
-def robotless(config, tmp_path) -> Path:
+def robotless(ur_rtde, config, tmp_path) -> Path:  # noqa: ARG001 - it skips
     """Write a configuration with an experiment, and with a robot that is not there."""
     robot_at(own_address(7), tmp_path)
     rig = {

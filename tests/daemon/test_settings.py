@@ -105,6 +105,7 @@ def test_no_default_stands_twice():
     assert {name: found for name, found in places.items() if len(found) > 1} == {}
 
 
+@pytest.mark.usefixtures("ur_rtde")
 @pytest.mark.parametrize("where", ["loop", "robot"])
 def test_the_wrists_acceleration_reaches_controller_identification_and_robot(where, tmp_path):
     """The lower one of loop and robot counts; half of it is planned with, the robot may use all."""

@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, ZERO_SLOTS, channels_of_line
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.eit.models import conductivity
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.matlab import read_torque_slices
-from shearloop.daemon.synthetic_frames import INJECTIONS, Synthesiser, TwistProgramme, twist_frames
+from shearloop.daemon.synthetic_frames import Synthesiser, TwistProgramme, twist_frames
 from shearloop.drivers.eit_kit import FrameParser
 from shearloop.drivers.emulators.boards import format_line
 
@@ -22,13 +22,14 @@ ADC_STEP_V = 2.2 / 1024
 def small_bank() -> SimpleNamespace:
     """Signals with the shape of a bank's, growing with k and σ, that can be computed in advance."""
     k, sigma = np.array([3.0, 3.5]), np.array([1.0, 1.5, 2.0])
-    shape = np.cos(CHANNELS @ [0.3, 0.1, 0.2, 0.5])
+    shape = np.cos(PAPER_TABLE.electrodes @ [0.3, 0.1, 0.2, 0.5])
     valid = np.ones((2, 3), bool)
     valid[1, 2] = False
     return SimpleNamespace(
+        table=PAPER_TABLE,
         k_grid=k,
         sigma_grid=sigma,
-        homogeneous=0.5 * np.sin(CHANNELS @ [0.1, 0.2, 0.3, 0.4]) + 0.7,
+        homogeneous=0.5 * np.sin(PAPER_TABLE.electrodes @ [0.1, 0.2, 0.3, 0.4]) + 0.7,
         signals=(k[:, None, None] * sigma[None, :, None] * shape / 10).astype(np.float32),
         valid=valid,
     )
@@ -37,14 +38,14 @@ def small_bank() -> SimpleNamespace:
 def test_frames_have_the_recorded_mean_noise_and_steps_and_pass_the_parser():
     synthesiser = Synthesiser(small_bank())
     lines = np.array([synthesiser.line(3.0, 1.5) for _ in range(400)])
-    channels = channels_of_line(lines)
+    channels = PAPER_TABLE.channels_of_line(lines)
     assert channels.mean() == pytest.approx(0.13, abs=0.003)
     # A step's own rounding adds its twelfth to the variance.
     assert np.median(channels.std(axis=0)) == pytest.approx(np.hypot(0.002, ADC_STEP_V / 12**0.5), rel=0.05)
     steps = channels / ADC_STEP_V
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
-    assert (lines[:, ZERO_SLOTS] == 0).all()
-    parser = FrameParser(ZERO_SLOTS)
+    assert (lines[:, PAPER_TABLE.zero_slots] == 0).all()
+    parser = FrameParser(PAPER_TABLE.zero_slots)
     assert len(parser.feed(b"".join(map(format_line, lines)), 0)) == 400
 
 
@@ -52,7 +53,7 @@ def test_no_live_channel_reads_nothing():
     bank = small_bank()
     bank.homogeneous[:5] = 0.0
     lines = np.array([Synthesiser(bank, seed=seed).line(3.0, 1.5, grip=0.0) for seed in range(20)])
-    assert channels_of_line(lines).min() == pytest.approx(ADC_STEP_V)
+    assert PAPER_TABLE.channels_of_line(lines).min() == pytest.approx(ADC_STEP_V)
 
 
 def test_without_noise_a_frame_is_the_magnitude_of_homogeneous_and_scaled_signal():
@@ -60,7 +61,7 @@ def test_without_noise_a_frame_is_the_magnitude_of_homogeneous_and_scaled_signal
     synthesiser = Synthesiser(bank, amplitude=0.2, noise_v=0.0)
     gain = 0.13 / np.abs(bank.homogeneous).mean()
     expected = gain * np.abs(bank.homogeneous + 0.5 * 0.2 * bank.signals[0, 1].astype(float))
-    found = channels_of_line(synthesiser.line(3.0, 1.5, grip=0.5))
+    found = PAPER_TABLE.channels_of_line(synthesiser.line(3.0, 1.5, grip=0.5))
     assert ((expected - found >= -1e-12) & (expected - found < ADC_STEP_V + 1e-12)).all(), "rounded down to a step"
 
 
@@ -73,12 +74,14 @@ def test_between_cells_the_signal_is_interpolated(k, sigma):
 
 def test_a_twist_during_the_frame_shows_in_the_injections_after_it():
     synthesiser = Synthesiser(small_bank(), noise_v=0.0)
-    before, after = (channels_of_line(synthesiser.line(3.0, sigma)) for sigma in (1.9, 1.1))
+    before, after = (PAPER_TABLE.channels_of_line(synthesiser.line(3.0, sigma)) for sigma in (1.9, 1.1))
     sigma = np.where(np.arange(32) < 20, 1.9, 1.1)
-    found = channels_of_line(synthesiser.line(3.0, sigma[INJECTIONS], np.ones(32)[INJECTIONS]))
+    found = PAPER_TABLE.channels_of_line(
+        synthesiser.line(3.0, sigma[synthesiser.injections], np.ones(32)[synthesiser.injections])
+    )
     # 28 channels belong to each injection.
     np.testing.assert_array_equal(found, np.concatenate([before[: 20 * 28], after[20 * 28 :]]))
-    assert np.count_nonzero(before != after) > N_CHANNELS / 4
+    assert np.count_nonzero(before != after) > PAPER_TABLE.n_channels / 4
 
 
 @pytest.mark.parametrize(
@@ -122,7 +125,7 @@ def test_frames_follow_the_programme():
     for number, line in enumerate(lines):
         grip, torque_nm = programme.at(0.25 + 0.5 * number)
         np.testing.assert_array_equal(line, synthesiser.line(3.25, sigma_of_torque(torque_nm), grip))
-    assert np.count_nonzero(channels_of_line(lines[0] != lines[9])) > N_CHANNELS / 2
+    assert np.count_nonzero(PAPER_TABLE.channels_of_line(lines[0] != lines[9])) > PAPER_TABLE.n_channels / 2
 
 
 def test_the_same_seed_gives_the_same_frames():
@@ -138,10 +141,11 @@ def test_a_grip_changes_the_frame_by_as_much_as_the_recorded_torques_do(shared):
     k, sigma = np.array([3.25]), np.array([1.25, 1.85])
     signals = [[forward.voltages(conductivity(mesh, "gaussian_derivative", k[0], s)) - homogeneous for s in sigma]]
     arrays = {"signals": np.array(signals, np.float32), "valid": np.ones((1, 2), bool)}
-    bank = SimpleNamespace(k_grid=k, sigma_grid=sigma, homogeneous=homogeneous, **arrays)
+    bank = SimpleNamespace(table=PAPER_TABLE, k_grid=k, sigma_grid=sigma, homogeneous=homogeneous, **arrays)
     synthesiser = Synthesiser(bank)
     idle, gripped = (
-        np.mean([channels_of_line(synthesiser.line(3.25, 1.55, grip)) for _ in range(60)], axis=0) for grip in (0, 1)
+        np.mean([PAPER_TABLE.channels_of_line(synthesiser.line(3.25, 1.55, grip)) for _ in range(60)], axis=0)
+        for grip in (0, 1)
     )
     recorded = read_torque_slices(shared / "recordings" / "torque_slices").differences
     assert np.sqrt(np.mean((gripped - idle) ** 2)) == pytest.approx(np.sqrt(np.mean(recorded**2)), rel=0.1)

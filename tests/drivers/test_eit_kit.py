@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shearloop.bank.eit.channels import LINE_SLOTS, ZERO_SLOTS, line_of_channels
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.drivers import eit_kit
 from shearloop.drivers.connection import LinkEvent, LinkMonitor
 from shearloop.drivers.eit_kit import ADC_STEP_V, EitKit, Frame, FrameErrorKind
@@ -19,8 +19,8 @@ PERIOD_S = 0.003
 
 
 def some_lines(n: int) -> list[NDArray[np.float64]]:
-    steps = np.random.default_rng(1).integers(1, 300, (n, len(LINE_SLOTS)))
-    return [np.round(line_of_channels(row * ADC_STEP_V), 4) for row in steps]
+    steps = np.random.default_rng(1).integers(1, 300, (n, len(PAPER_TABLE.line_slots)))
+    return [np.round(PAPER_TABLE.line_of_channels(row * ADC_STEP_V), 4) for row in steps]
 
 
 async def play(
@@ -30,7 +30,7 @@ async def play(
     told = LinkEvents()
     fault_at = {number: parse_fault(text, EitKitBoard.faults) for number, text in (faults or {}).items()}
     async with running(EitKitBoard(lines, period_s=PERIOD_S, link=link, fault_at=fault_at).run()):
-        kit = EitKit(zero_slots=ZERO_SLOTS, path=link, frame_period_s=PERIOD_S, monitor=LinkMonitor(told))
+        kit = EitKit(zero_slots=PAPER_TABLE.zero_slots, path=link, frame_period_s=PERIOD_S, monitor=LinkMonitor(told))
         frames = await take(kit.readings(), n_frames)
     return kit, frames, told.events
 
@@ -52,7 +52,7 @@ async def test_every_frame_arrives_once_and_in_order(tmp_path):
 
 async def test_the_rate_is_told_once_it_is_measured(tmp_path):
     async with running(EitKitBoard(cycle(some_lines(4)), period_s=PERIOD_S, link=tmp_path / "eit").run()):
-        kit = EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit", frame_period_s=PERIOD_S)
+        kit = EitKit(zero_slots=PAPER_TABLE.zero_slots, path=tmp_path / "eit", frame_period_s=PERIOD_S)
         assert kit.diagnostics()["measured_hz"] is None
         async with asyncio.timeout(DEADLINE_S), aclosing(kit.readings()) as arriving:
             async for _ in arriving:
@@ -65,7 +65,7 @@ async def test_a_reader_that_stops_for_a_while_loses_nothing(tmp_path):
     lines = some_lines(40)
     board = EitKitBoard(lines, period_s=PERIOD_S, link=tmp_path / "eit")
     async with running(board.run()):
-        kit = EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit", frame_period_s=PERIOD_S)
+        kit = EitKit(zero_slots=PAPER_TABLE.zero_slots, path=tmp_path / "eit", frame_period_s=PERIOD_S)
         frames = []
         async with asyncio.timeout(DEADLINE_S), aclosing(kit.readings()) as arriving:
             async for frame in arriving:
@@ -139,8 +139,8 @@ async def test_a_board_that_is_unplugged_is_found_again_and_started(tmp_path):
 async def test_a_driver_that_begins_while_the_board_sends_takes_up_with_the_next_line(tmp_path):
     lines = some_lines(30)
     async with running(EitKitBoard(lines, period_s=PERIOD_S, link=tmp_path / "eit").run()):
-        first = await take(EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit").readings(), 10)
-        kit = EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit")
+        first = await take(EitKit(zero_slots=PAPER_TABLE.zero_slots, path=tmp_path / "eit").readings(), 10)
+        kit = EitKit(zero_slots=PAPER_TABLE.zero_slots, path=tmp_path / "eit")
         second = await take(kit.readings(), 10)
     assert_same(first, lines[:10])
     sent = [line.tolist() for line in lines]
@@ -152,7 +152,7 @@ async def test_a_driver_that_begins_while_the_board_sends_takes_up_with_the_next
 
 async def test_a_board_that_is_not_there_is_awaited_and_told_of_once(tmp_path):
     told = LinkEvents()
-    kit = EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit", monitor=LinkMonitor(told))
+    kit = EitKit(zero_slots=PAPER_TABLE.zero_slots, path=tmp_path / "eit", monitor=LinkMonitor(told))
     taking = asyncio.create_task(take(kit.readings(), 1))
     await told.down(2)
     async with running(EitKitBoard(some_lines(1), period_s=PERIOD_S, link=tmp_path / "eit").run()):

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.io import loadmat
 
-from shearloop.bank.eit.channels import LINE_SLOTS, ZERO_SLOTS, channels_of_line, line_of_channels
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.drivers import eit_kit
 from shearloop.drivers.eit_kit import ADC_STEP_V, FULL_SCALE_SINE_RMS_V, Frame, FrameErrorKind, FrameParser
 from shearloop.drivers.emulators.boards import format_line
@@ -18,8 +18,8 @@ PERIOD_NS = eit_kit.NOMINAL_PERIOD_NS
 
 
 def some_line(seed: int) -> bytes:
-    steps = np.random.default_rng(seed).integers(1, 300, len(LINE_SLOTS))
-    return format_line(line_of_channels(steps * ADC_STEP_V))
+    steps = np.random.default_rng(seed).integers(1, 300, len(PAPER_TABLE.line_slots))
+    return format_line(PAPER_TABLE.line_of_channels(steps * ADC_STEP_V))
 
 
 LINES = [some_line(seed) for seed in range(4)]
@@ -33,7 +33,7 @@ def with_value(position: int, value: bytes, line: bytes = GOOD) -> bytes:
 
 
 # Each kind of refusal, and a way to earn it.
-CHANNEL, SLOT = int(LINE_SLOTS[500]), int(np.flatnonzero(ZERO_SLOTS)[60])
+CHANNEL, SLOT = int(PAPER_TABLE.line_slots[500]), int(np.flatnonzero(PAPER_TABLE.zero_slots)[60])
 BROKEN = [
     (FrameErrorKind.TOO_LONG, b"0.1234, " * 5000 + b"\n"),
     (FrameErrorKind.WRONG_COUNT, GOOD[:4321] + b"\n"),
@@ -76,7 +76,7 @@ def test_a_cell_is_sound_with_digits_and_punctuation_in_their_places_alone():
             line = bytearray(GOOD.rstrip())
             line += b" "
             line[8 * CHANNEL + place] = byte
-            found = eit_kit.read_line(bytes(line), ZERO_SLOTS)
+            found = eit_kit.read_line(bytes(line), PAPER_TABLE.zero_slots)
             if byte in sound:
                 # A first digit above 2 V, or digits that are all 0, are refused for what they say.
                 assert not isinstance(found, eit_kit.FrameError) or found.kind in (
@@ -87,10 +87,10 @@ def test_a_cell_is_sound_with_digits_and_punctuation_in_their_places_alone():
 
 
 def test_a_line_is_read_to_the_last_digit():
-    frame, other = FrameParser(ZERO_SLOTS).feed(GOOD + LINES[1], 5_000_000_000)
+    frame, other = FrameParser(PAPER_TABLE.zero_slots).feed(GOOD + LINES[1], 5_000_000_000)
     expected = [float(value) for value in GOOD.decode().split(", ")[:-1]]
     assert frame.raw.tolist() == expected, "the same doubles that float() reads"
-    np.testing.assert_array_equal(frame.channels, channels_of_line(frame.raw))
+    np.testing.assert_array_equal(frame.channels, PAPER_TABLE.channels_of_line(frame.raw))
     assert frame.line + b"\n" == GOOD
     assert (frame.seq, other.seq) == (0, 1)
     assert frame.t_arrival_ns == 5_000_000_000
@@ -102,14 +102,14 @@ def test_a_line_is_read_to_the_last_digit():
 
 
 def test_carriage_returns_are_taken_as_part_of_the_line_end():
-    frames = FrameParser(ZERO_SLOTS).feed(GOOD.replace(b"\n", b"\r\n") * 2, 0)
+    frames = FrameParser(PAPER_TABLE.zero_slots).feed(GOOD.replace(b"\n", b"\r\n") * 2, 0)
     assert [frame.line + b"\n" for frame in frames] == [GOOD, GOOD]
 
 
 def test_each_kind_of_broken_line_is_refused_and_named_and_the_next_is_unaffected():
     assert {kind for kind, _ in BROKEN} == set(FrameErrorKind)
     for kind, broken in BROKEN:
-        parser = FrameParser(ZERO_SLOTS)
+        parser = FrameParser(PAPER_TABLE.zero_slots)
         frames = parser.feed(GOOD + broken + LINES[1], 0)
         assert dict(parser.errors) == {kind: 1}, broken[:20]
         assert [frame.line + b"\n" for frame in frames] == [GOOD, LINES[1]]
@@ -118,7 +118,7 @@ def test_each_kind_of_broken_line_is_refused_and_named_and_the_next_is_unaffecte
 
 
 def test_a_refusal_says_which_value_it_was():
-    refusal = eit_kit.read_line(with_value(CHANNEL, b"-0.1234").rstrip(b"\n"), ZERO_SLOTS)
+    refusal = eit_kit.read_line(with_value(CHANNEL, b"-0.1234").rstrip(b"\n"), PAPER_TABLE.zero_slots)
     assert refusal.position == CHANNEL
     assert f"read '-0.1234' at value {CHANNEL + 1}" in str(refusal)
 
@@ -128,9 +128,9 @@ def test_a_line_with_any_one_byte_changed_is_refused_or_reads_as_another_number(
     position = data.draw(st.integers(0, len(GOOD) - 2))
     byte = data.draw(st.integers(0, 255).filter(lambda byte: byte != GOOD[position] and byte != ord("\n")))
     changed = GOOD[:position] + bytes([byte]) + GOOD[position + 1 :]
-    parser = FrameParser(ZERO_SLOTS)
+    parser = FrameParser(PAPER_TABLE.zero_slots)
     frames = parser.feed(LINES[1] + changed + LINES[2], 0)
-    eit_kit.read_line(changed.rstrip(b"\n"), ZERO_SLOTS)
+    eit_kit.read_line(changed.rstrip(b"\n"), PAPER_TABLE.zero_slots)
     is_digit = chr(byte).isdigit() and byte < 128 and chr(GOOD[position]).isdigit()
     assert len(frames) + parser.errors.total() == 3
     assert [frames[0].line + b"\n", frames[-1].line + b"\n"] == LINES[1:3]
@@ -141,7 +141,7 @@ def test_a_line_with_any_one_byte_changed_is_refused_or_reads_as_another_number(
 def test_every_good_line_among_broken_ones_arrives_and_every_broken_one_is_counted(lines, data):
     stream = GOOD + b"".join(lines)
     cuts = data.draw(st.lists(st.integers(0, len(stream)), max_size=10))
-    parser = FrameParser(ZERO_SLOTS)
+    parser = FrameParser(PAPER_TABLE.zero_slots)
     frames = [frame for n, part in enumerate(slices(stream, cuts)) for frame in parser.feed(part, n)]
     assert [frame.line + b"\n" for frame in frames] == [GOOD, *[line for line in lines if line in LINES]]
     assert parser.errors.total() == len(lines) + 1 - len(frames)
@@ -149,7 +149,7 @@ def test_every_good_line_among_broken_ones_arrives_and_every_broken_one_is_count
 
 @given(st.binary(max_size=3000), st.integers(1, 300))
 def test_garbage_never_yields_a_frame_nor_grows_the_parser(garbage, times):
-    parser = FrameParser(ZERO_SLOTS)
+    parser = FrameParser(PAPER_TABLE.zero_slots)
     for _ in range(times):
         assert parser.feed(garbage, 0) == []
         assert len(parser._lines.partial) <= eit_kit.MAX_LINE_BYTES
@@ -157,23 +157,23 @@ def test_garbage_never_yields_a_frame_nor_grows_the_parser(garbage, times):
     assert [frame.line + b"\n" for frame in parser.feed(GOOD, 0)] == [GOOD]
 
 
-@given(st.integers(1, eit_kit.LINE_BYTES))
+@given(st.integers(1, 1024 * eit_kit.CELL_BYTES))
 def test_the_rest_of_a_line_that_was_under_way_is_no_error(start):
-    parser = FrameParser(ZERO_SLOTS)
+    parser = FrameParser(PAPER_TABLE.zero_slots)
     assert len(parser.feed(GOOD[start:] + LINES[1], 0)) == 1
     assert not parser.errors
     assert parser.partial_lines == 1
 
 
 def test_a_whole_line_that_is_broken_is_refused_even_as_the_first():
-    parser = FrameParser(ZERO_SLOTS)
+    parser = FrameParser(PAPER_TABLE.zero_slots)
     parser.feed(with_value(CHANNEL, b"nan"), 0)
     assert dict(parser.errors) == {FrameErrorKind.NAN: 1}
     assert parser.partial_lines == 0
 
 
 def test_another_port_drops_the_line_that_was_cut_off_and_counts_it_apart():
-    parser = FrameParser(ZERO_SLOTS)
+    parser = FrameParser(PAPER_TABLE.zero_slots)
     parser.feed(GOOD + LINES[1][:3000], 0)
     parser.handle(RawEvent(InputKind.OPENED, 0))
     frames = parser.feed(LINES[2], 0)
@@ -182,9 +182,9 @@ def test_another_port_drops_the_line_that_was_cut_off_and_counts_it_apart():
     assert not parser.errors
 
 
-@given(st.integers(0, eit_kit.LINE_BYTES), st.booleans())
+@given(st.integers(0, 1024 * eit_kit.CELL_BYTES), st.booleans())
 def test_a_board_that_is_started_again_may_go_on_or_begin_anew(begun, anew):
-    parser = FrameParser(ZERO_SLOTS)
+    parser = FrameParser(PAPER_TABLE.zero_slots)
     parser.feed(GOOD + LINES[1][:begun], 0)
     parser.handle(RawEvent(InputKind.STARTED, 0))
     frames = parser.feed((LINES[2] if anew else LINES[1][begun:]) + LINES[3], 0)
@@ -194,7 +194,7 @@ def test_a_board_that_is_started_again_may_go_on_or_begin_anew(begun, anew):
 
 
 def test_frames_that_waited_together_are_stamped_a_period_apart():
-    parser = FrameParser(ZERO_SLOTS)
+    parser = FrameParser(PAPER_TABLE.zero_slots)
     for number in range(30):
         parser.feed(LINES[number % 2], number * PERIOD_NS)
     # The reader was away from frame 30 to shortly after frame 34.
@@ -206,7 +206,7 @@ def test_frames_that_waited_together_are_stamped_a_period_apart():
 
 @given(st.lists(st.tuples(st.integers(1, 3), st.integers(0, 3 * PERIOD_NS)), max_size=25))
 def test_the_middles_of_frames_are_in_order_and_before_their_arrival(bursts):
-    parser, now_ns, middles = FrameParser(ZERO_SLOTS), 0, []
+    parser, now_ns, middles = FrameParser(PAPER_TABLE.zero_slots), 0, []
     for number, pause_ns in bursts:
         now_ns += pause_ns
         frames = parser.feed(GOOD * number, now_ns)
@@ -216,18 +216,18 @@ def test_the_middles_of_frames_are_in_order_and_before_their_arrival(bursts):
 
 
 def flagged(lines: list[NDArray[np.float64]]) -> list[Frame]:
-    parser = FrameParser(ZERO_SLOTS)
+    parser = FrameParser(PAPER_TABLE.zero_slots)
     return [frame for n, line in enumerate(lines) for frame in parser.feed(format_line(line), n * PERIOD_NS)]
 
 
 def noisy(n: int) -> list[NDArray[np.float64]]:
-    steps = np.random.default_rng(0).integers(1, 300, (n, len(LINE_SLOTS)))
-    return [line_of_channels(row * ADC_STEP_V) for row in steps]
+    steps = np.random.default_rng(0).integers(1, 300, (n, len(PAPER_TABLE.line_slots)))
+    return [PAPER_TABLE.line_of_channels(row * ADC_STEP_V) for row in steps]
 
 
 def test_a_channel_above_the_largest_sine_the_adc_follows_is_saturated():
     line = noisy(1)[0]
-    line[LINE_SLOTS[[3, 7]]] = [FULL_SCALE_SINE_RMS_V + ADC_STEP_V, FULL_SCALE_SINE_RMS_V - ADC_STEP_V]
+    line[PAPER_TABLE.line_slots[[3, 7]]] = [FULL_SCALE_SINE_RMS_V + ADC_STEP_V, FULL_SCALE_SINE_RMS_V - ADC_STEP_V]
     (frame,) = flagged([line])
     assert np.flatnonzero(frame.saturated).tolist() == [3]
     assert frame.unusable == 1
@@ -237,7 +237,7 @@ def test_a_channel_that_has_not_changed_for_n_frames_is_dead_until_it_changes(mo
     monkeypatch.setattr(eit_kit, "DEAD_AFTER_FRAMES", 4)
     lines = noisy(8)
     for line in lines[:6]:
-        line[LINE_SLOTS[10]] = 0.5
+        line[PAPER_TABLE.line_slots[10]] = 0.5
     frames = flagged(lines)
     dead = [frame.dead[10] for frame in frames]
     assert [frame.unusable for frame in frames] == dead

@@ -93,7 +93,7 @@ def test_a_line_that_is_no_decimal_is_refused_by_kind_with_a_sentence(line, kind
     parser = LoadParser(TORQUE_LINES)
     assert feed_lines(parser, [line]) == []
     assert dict(parser.errors) == {kind: 1}
-    assert load_cell.describe_errors(parser.errors).count("(1 times)") == 1
+    assert load_cell.describe_errors(parser.errors).count("(once)") == 1
 
 
 def test_the_ends_of_the_converters_range_are_flagged_and_their_neighbours_are_not():
@@ -191,7 +191,7 @@ def test_a_calibration_survives_its_file(tmp_path):
         ("tare_counts: .nan\nscale_n_per_count: 2.0e-5\n", "tare_counts"),
         ("tare_counts: 1.0\nscale_n_per_count: 2.0e-5\nsign: 0\n", "sign"),
         ("tare_counts: 1.0\nscale_n_per_count: 2.0e-5\nlever_arm_m: -0.035\n", "lever_arm_m"),
-        ("[1, 2", "line 1, column 6: "),
+        ("[1, 2", ":1:6: a list is not closed"),
         ("", "the calibration is empty"),
     ],
 )

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from shearloop.bank.arrays import IntArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS, conductivity
@@ -96,7 +96,7 @@ def models_figure(mesh: Mesh) -> Figure:
         plane.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]), ylabel="y (cm)")
         figure.colorbar(drawn, ax=plane, label="conductivity\n(homogeneous = 1)", ticks=[0, 0.5, 1, 1.5, 2])
         signal.plot(forward.voltages(values) - homogeneous, color=_BLUE, linewidth=0.5)
-        signal.set(xlim=(0, N_CHANNELS), ylabel="v − v(homog.)\n(model's voltage)")
+        signal.set(xlim=(0, PAPER_TABLE.n_channels), ylabel="v − v(homog.)\n(model's voltage)")
     axes[-1, 0].set_xlabel("basis function f")
     axes[-1, 1].set_xlabel("x (cm)")
     axes[-1, 2].set_xlabel("channel")

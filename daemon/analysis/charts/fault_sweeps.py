@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import (
     Calibration,
@@ -74,12 +74,12 @@ def _noise(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyF
 
 def lost_channels(electrodes: NDArray[np.int64]) -> Mask:
     """Return the (896,) channels that inject or measure at one of these electrodes."""
-    return np.asarray(np.isin(CHANNELS, electrodes).any(axis=1))
+    return np.asarray(np.isin(PAPER_TABLE.electrodes, electrodes).any(axis=1))
 
 
 def _lost_reported(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
     """Let electrodes read one ADC step, and mark their channels."""
-    lost = lost_channels(rng.choice(N_ELECTRODES, int(level), replace=False))
+    lost = lost_channels(rng.choice(PAPER_TABLE.n_electrodes, int(level), replace=False))
     channels = scene.series.channels.copy()
     dead = ADC_STEP_V - scene.idle[:, lost] if scene.series.kind == "difference" else ADC_STEP_V
     channels[:, :, lost] = dead
@@ -99,7 +99,7 @@ def _saturated(scene: FaultScene, level: float, _: np.random.Generator) -> Fault
     if scene.series.kind == "raw":
         return _faulty(scene, np.minimum(channels, rail))
     # Differences have lost their sign: let half of the channels rise.
-    signs = np.where(np.arange(N_CHANNELS) % 2, -1.0, 1.0)
+    signs = np.where(np.arange(PAPER_TABLE.n_channels) % 2, -1.0, 1.0)
     read = np.minimum(scene.idle + signs * channels, rail)
     return _faulty(scene, read - np.minimum(scene.idle, rail))
 
@@ -121,18 +121,21 @@ def _gain(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFram
 
 
 def _turned(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFrames:
-    order = ElectrodeNumbering(int(level), reflected=False).model_channels()
+    order = ElectrodeNumbering(int(level), reflected=False).model_channels(PAPER_TABLE)
     return _faulty(scene, scene.series.channels[:, :, order])
 
 
 def _swapped(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
     """Exchange the wires of pairs of electrodes; a channel that no longer exists keeps its value."""
-    wires = np.arange(N_ELECTRODES)
-    chosen = rng.choice(N_ELECTRODES, 2 * int(level), replace=False)
+    wires = np.arange(PAPER_TABLE.n_electrodes)
+    chosen = rng.choice(PAPER_TABLE.n_electrodes, 2 * int(level), replace=False)
     wires[chosen[::2]], wires[chosen[1::2]] = chosen[1::2], chosen[::2]
-    place = {(sink, positive): i for i, (sink, _, positive, _) in enumerate(CHANNELS.tolist())}
+    place = {(sink, positive): i for i, (sink, _, positive, _) in enumerate(PAPER_TABLE.electrodes.tolist())}
     order = np.array(
-        [place.get((wires[sink], wires[positive]), i) for i, (sink, _, positive, _) in enumerate(CHANNELS.tolist())]
+        [
+            place.get((wires[sink], wires[positive]), i)
+            for i, (sink, _, positive, _) in enumerate(PAPER_TABLE.electrodes.tolist())
+        ]
     )
     return _faulty(scene, scene.series.channels[:, :, order])
 
@@ -306,7 +309,7 @@ def scene_for(split: Split, bank: Bank) -> FaultScene:
     """
     series = shortened(split.future)
     rng = np.random.default_rng(7)
-    foreign = np.array([layer[rng.permutation(N_CHANNELS)] for layer in series.channels.mean(axis=0)])
+    foreign = np.array([layer[rng.permutation(PAPER_TABLE.n_channels)] for layer in series.channels.mean(axis=0)])
     if series.kind == "difference":
         idle = np.abs(bank.homogeneous) * (_MEAN_V / float(np.abs(bank.homogeneous).mean()))
         noise = residual_noise(split.past.channels[:, 0])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.forward import BatchForwardModel, ForwardModel
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import ConductivityModel, conductivity
@@ -120,12 +120,12 @@ def pyeit_solver(mesh: Mesh) -> Callable[[FloatArray], object] | None:
     except ImportError:
         return None
     nodes = np.column_stack([mesh.nodes, np.zeros(len(mesh.nodes))])
-    middles = [mesh.electrode_edges[mesh.electrode_of_edge == e][0, 0] for e in range(N_ELECTRODES)]
+    middles = [mesh.electrode_edges[mesh.electrode_of_edge == e][0, 0] for e in range(PAPER_TABLE.n_electrodes)]
     free = int(np.setdiff1d(np.arange(len(mesh.nodes)), mesh.electrode_edges)[0])
     body = PyEITMesh(node=nodes, element=np.asarray(mesh.triangles), el_pos=np.array(middles), ref_node=free)
-    injections = CHANNELS.reshape(N_ELECTRODES, -1, 4)
+    injections = PAPER_TABLE.electrodes.reshape(PAPER_TABLE.n_electrodes, -1, 4)
     protocol = PyEITProtocol(
-        injections[:, 0, [1, 0]].copy(), injections[:, :, 2:].copy(), np.ones(N_CHANNELS, dtype=bool)
+        injections[:, 0, [1, 0]].copy(), injections[:, :, 2:].copy(), np.ones(PAPER_TABLE.n_channels, dtype=bool)
     )
     solver = EITForward(body, protocol)
     return lambda conductivity: solver.solve_eit(perm=conductivity)

@@ -8,7 +8,7 @@ import numpy as np
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import N_CHANNELS, channels_of_line
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.estimation import FrameSeries
@@ -50,7 +50,7 @@ def own_fingertip(mesh_size_cm: float) -> Fingertip:
 
 def mesh_of(path: Path | None) -> Mesh:
     """Return the mesh of a file, or the own fingertip's."""
-    return load_geometry(path) if path is not None else own_fingertip(MESH_SIZE_CM).mesh()
+    return load_geometry(path).mesh if path is not None else own_fingertip(MESH_SIZE_CM).mesh()
 
 
 def bank_of(path: Path | None, mesh: Mesh, scratch: Path, grid: Grid = GRID) -> Bank:
@@ -91,7 +91,7 @@ def played_bank(scratch: Path) -> Bank:
 def mean_frame(synthesiser: Synthesiser, k: float, sigma: float, grip: float) -> FloatArray:
     """Return the mean of nine frames (896,) in volts, like the paper's smoothed slices."""
     lines = [synthesiser.line(k, sigma, grip) for _ in range(_AVERAGED_FRAMES)]
-    return np.asarray(np.mean([channels_of_line(line) for line in lines], axis=0))
+    return np.asarray(np.mean([PAPER_TABLE.channels_of_line(line) for line in lines], axis=0))
 
 
 def homogeneous_of(synthesiser: Synthesiser) -> FloatArray:
@@ -124,10 +124,10 @@ def synthetic_stream(scratch: Path, seed: int = 0, cycles: int = 8) -> FrameSeri
     t_s = np.arange(0.5 * FRAME_PERIOD_S, end_s, FRAME_PERIOD_S)
     # A rest after the grip, before the first twist.
     moments = [programme.at(t if t < gripped_s else max(t - _REST_S, gripped_s)) for t in t_s.tolist()]
-    channels = np.empty((len(t_s), 2, N_CHANNELS))
+    channels = np.empty((len(t_s), 2, PAPER_TABLE.n_channels))
     for side, k in enumerate((3.2, 3.35)):
         synthesiser = Synthesiser(played_bank(scratch), seed=seed + 100 * side)
         for i, (grip, torque_nm) in enumerate(moments):
-            channels[i, side] = channels_of_line(synthesiser.line(k, sigma_of(torque_nm), grip))
+            channels[i, side] = PAPER_TABLE.channels_of_line(synthesiser.line(k, sigma_of(torque_nm), grip))
     torque = np.array([torque_nm for _, torque_nm in moments])
     return FrameSeries("raw", ("right", "left"), t_s, channels, t_s, torque, np.full(len(t_s), np.nan))

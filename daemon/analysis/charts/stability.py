@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import conductivity
@@ -301,18 +301,18 @@ def detect_mixtures(series: FrameSeries, origins: Sequence[float] = ORIGINS, see
     The best limit is the lowest that refuses no good later slice; no rule on the misfit can refuse more mixtures.
     """
     frames = np.abs(series.channels[:, 0])
-    usable = np.ones(N_CHANNELS, dtype=np.bool_)
+    usable = np.ones(PAPER_TABLE.n_channels, dtype=np.bool_)
     turned = bank_match.ElectrodeNumbering(_TURNED_ELECTRODES, reflected=False)
     found = []
     for origin in origins:
         n = round(origin * len(frames))
-        guard, later = NoveltyDetector.fit(frames[:n]), frames[n:]
+        guard, later = NoveltyDetector.fit(frames[:n], PAPER_TABLE), frames[n:]
         mean = later.mean(axis=0)
         foreign = {
-            "another fingertip": mean[np.random.default_rng(seed).permutation(N_CHANNELS)],
-            f"turned by {_TURNED_ELECTRODES} electrodes": mean[turned.model_channels()],
+            "another fingertip": mean[np.random.default_rng(seed).permutation(PAPER_TABLE.n_channels)],
+            f"turned by {_TURNED_ELECTRODES} electrodes": mean[turned.model_channels(PAPER_TABLE)],
         }
-        twins = ReciprocityCheck.fit(frames[:n])
+        twins = ReciprocityCheck.fit(frames[:n], PAPER_TABLE)
         good = _misfits(twins, later)
         for kind, one in foreign.items():
             for share in FOREIGN_SHARES:
@@ -330,7 +330,7 @@ def detect_mixtures(series: FrameSeries, origins: Sequence[float] = ORIGINS, see
 
 
 def _misfits(twins: ReciprocityCheck, frames: FloatArray) -> FloatArray:
-    usable = np.ones(N_CHANNELS, dtype=np.bool_)
+    usable = np.ones(PAPER_TABLE.n_channels, dtype=np.bool_)
     return np.array([twins.residual(one, usable) for one in frames]) / twins.largest_residual
 
 

@@ -10,7 +10,7 @@ from scipy.cluster.vq import kmeans2
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import channels_of_line, smoothed_along_channels
+from shearloop.bank.eit.channels import PAPER_TABLE, smoothed_along_channels
 from shearloop.bank.eit.design import (
     centred_settings,
     matching_scores,
@@ -84,7 +84,7 @@ def _raw_difference(folder: Path, notes: list[str]) -> FloatArray | None:
     if absent:
         notes.append(f"{' and '.join(absent)} not found in {folder}: models are scored by the matching alone.")
         return None
-    return np.abs(channels_of_line(read_line(frame)) - channels_of_line(read_line(homogeneous)))
+    return np.abs(PAPER_TABLE.channels_of_line(read_line(frame)) - PAPER_TABLE.channels_of_line(read_line(homogeneous)))
 
 
 # Called with the number of slices matched so far.

@@ -70,13 +70,13 @@ def choose_mesh(recordings: Path, mesh: Path | None, bank_config: Path | None) -
     The second value is its origin, for the report. Raises UserError and GeometryError for unusable files.
     """
     if mesh is not None:
-        return load_geometry(mesh), str(mesh)
+        return load_geometry(mesh).mesh, str(mesh)
     if bank_config is not None:
         return load_bank_plan(bank_config).mesh, f"the geometry of {bank_config}"
     beside = recordings.resolve().parent / PAPER_MESH
     if beside.is_file():
-        return load_geometry(beside), f"{beside} (the paper's)"
-    return load_geometry(OWN_FINGERTIP), f"our own grid for {OWN_FINGERTIP}"
+        return load_geometry(beside).mesh, f"{beside} (the paper's)"
+    return load_geometry(OWN_FINGERTIP).mesh, f"our own grid for {OWN_FINGERTIP}"
 
 
 def cached_bank(

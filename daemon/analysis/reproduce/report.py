@@ -13,7 +13,7 @@ from matplotlib.gridspec import SubplotSpec
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.matching import Match
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import CalibrationError
@@ -146,7 +146,7 @@ def save_calibrations(found: Reproduction, banks: dict[str, Bank], recordings: P
     for name, (bank, points) in fits.items():
         source = f"{name.split('_')[0]} slices of {recordings.name}, on the {bank} bank"
         try:
-            calibration = Calibration.from_matches(banks[bank].identity, source, **points)
+            calibration = Calibration.from_matches(banks[bank].identity, source, banks[bank].table, **points)
         except CalibrationError:  # already in the notes
             continue
         written.append(folder / f"calibration_{name}.cal")
@@ -220,7 +220,7 @@ def heatmap_figure(torque: TorqueResult, bank: Bank) -> Figure:
     halves = made.add_gridspec(1, 2, width_ratios=[1.25, 1])
     measured, simulated = halves[0].subgridspec(2, 1).subplots(sharex=True, squeeze=False)[:, 0]
     measured.plot(torque.slices.differences[index] * 1e3, color=_BLACK, linewidth=0.6)
-    measured.set(ylabel="|difference| (mV)", xlim=(0, N_CHANNELS))
+    measured.set(ylabel="|difference| (mV)", xlim=(0, PAPER_TABLE.n_channels))
     measured.set_title(f"Measured: slice {number} at {torque.slices.torque_nm[index]:.3f} N·m", loc="left", fontsize=10)
     simulated.plot(np.abs(bank.signals[match.cell]), color=_BLUE, linewidth=0.6)
     simulated.set(ylabel="|signal| (model's voltage)", xlabel="channel")

@@ -32,6 +32,9 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
   registers-in-use        refuse input registers as if a fieldbus had them
   local-control           leave remote control
   refuse-protocol         refuse the RTDE protocol version
+  mute-dashboard          accept connections to the dashboard, and send nothing on them
+  version A.B.C.D         report this version of PolyScope to later connections
+  payload KG              have another payload set at the pendant
   normal                  end all of them
 """
 

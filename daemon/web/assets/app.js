@@ -5,7 +5,7 @@ import { Controls } from "./controls.js";
 import { Link } from "./link.js";
 import { estimatesFirst, FingertipPanel, gripperPanel, healthPanel, isFingertip, loopPanel, robotPanel, shearPanel, torquePanel, wantedNow } from "./panels.js";
 import { Series } from "./series.js";
-import { age, byId, number, put } from "./text.js";
+import { age, byId, number, put, show } from "./text.js";
 
 const REDRAWS_PER_S = 30;
 // Estimates differ in shape, and in lightness of blue and brown.
@@ -84,7 +84,11 @@ function linkLine() {
   const state = link.state();
   byId("link").dataset.state = state;
   const heard = Number.isFinite(link.sinceDaemon());
+  const end = link.end()?.content;
+  show(byId("summary"), state === "ended" && Boolean(end?.summary));
+  put(byId("summary-text"), end?.summary ?? "");
   const [name, reason] = {
+    ended: [end?.finished ? "✓ DONE" : "ended", "the daemon has ended; the last values are shown"],
     live: ["● live", ""],
     connecting: ["connecting", "to the viewer on the rig's computer"],
     lost: ["✗ VIEWER LOST", `no word from the viewer for ${age(link.sinceBatch())}; what is shown is old, and it is tried again`],

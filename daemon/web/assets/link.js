@@ -14,6 +14,7 @@ export class Link {
     this.settings = settings;
     this.latest = new Map();
     this.refused = {};
+    this.ended = false;
     this.onMessage = onMessage;
     this.batchAt = null;
     this.daemonAt = null;
@@ -40,6 +41,7 @@ export class Link {
     this.batchAt = now;
     this.offset = batch.now - now;
     this.refused = batch.refused;
+    this.ended = batch.ended;
     for (const message of batch.history) this.onMessage(message);
     if (batch.quiet_s !== null) this.daemonAt = now - batch.quiet_s;
     for (const message of batch.messages) {
@@ -65,20 +67,26 @@ export class Link {
 
   sinceDaemon() { return this.daemonAt === null ? Infinity : seconds() - this.daemonAt; }
 
-  // live; dead: no message from the daemon; lost: no message from the viewer.
+  // live; ended: the daemon said that it ends; dead: no message from the daemon; lost: no message from the viewer.
   state() {
     if (this.sinceBatch() > LOST_AFTER_S) {
       // Close a socket that is open but silent, as after the computer slept.
       if (this.batchAt !== null && this.sinceBatch() > 3 && this.socket.readyState === WebSocket.OPEN) this.socket.close();
       return this.batchAt === null ? "connecting" : "lost";
     }
+    if (this.end()) return "ended";
     return this.sinceDaemon() > this.settings.dead_after_s ? "dead" : "live";
   }
+
+  // The daemon's last message, until another one arrives.
+  end() { return this.ended ? this.get("daemon.end") : undefined; }
 
   ageOf(message) { return seconds() - message.at; }
 
   // Whether a message is stale.
   isOld(message) {
+    const end = this.end();
+    if (end && this.state() === "ended") return end.at - message.at > this.staleAfter(message);
     return this.state() !== "live" || this.ageOf(message) > this.staleAfter(message);
   }
 

@@ -236,7 +236,9 @@ export function loopPanel(link) {
   put(byId("phase-name"), current ? `${current.phase}${current.experiment ? `: ${current.experiment}` : ""}${step}` : "–");
   const reasons = current?.reasons ?? "";
   // The reason for the stop is listed below, with its cure.
-  put(byId("phase-activity"), current?.phase === "stopped" && reasons ? "" : current?.activity ?? "");
+  const stopped = current?.phase === "stopped";
+  const texts = [stopped && reasons ? "" : current?.activity, stopped && stopTimes(link.get("loop.stop")?.content, current)];
+  put(byId("phase-activity"), texts.filter(Boolean).join(" "));
   const underWay = Boolean(current?.steps) && (ACTIVE.has(current.phase) || current.phase === "done");
   const share = underWay ? current.progress : 0;
   if (byId("progress").value !== share) byId("progress").value = share;
@@ -255,6 +257,13 @@ export function loopPanel(link) {
     put(item, sentence);
     return item;
   }));
+}
+
+// The times of the stop of this experiment, from its cause.
+function stopTimes(stop, current) {
+  if (stop?.experiment !== current.experiment) return "";
+  const seconds = (value) => (value === null ? "unknown" : `${value.toFixed(3)} s`);
+  return `Standstill after ${seconds(stop.stands_after_s)}: decided ${seconds(stop.decided_after_s)}, sent ${seconds(stop.sent_after_s)}.`;
 }
 
 // A reason begins with a small letter and its cure with a capital; split after each full stop before a small letter.

@@ -56,20 +56,27 @@ const GEL_HIGH = 1.6;
 export function drawGel(canvas, tip, conductivity, k, sigma) {
   const { pen, width, height } = fitted(canvas);
   const room = { left: 8, right: 42, top: 14, bottom: 30 };
-  const scale = Math.min((width - room.left - room.right) / tip.width_cm, (height - room.top - room.bottom) / tip.height_cm);
-  const [w, h] = [tip.width_cm * scale, tip.height_cm * scale];
+  const [wide, high] = [0, 1].map((axis) => Math.max(...tip.contour.map((point) => point[axis])));
+  const scale = Math.min((width - room.left - room.right) / wide, (height - room.top - room.bottom) / high);
+  const [w, h] = [wide * scale, high * scale];
   const [x0, y0] = [room.left, room.top];
-  const yOf = (cm) => y0 + h - cm * scale;
+  const [xOf, yOf] = [(cm) => x0 + cm * scale, (cm) => y0 + h - cm * scale];
+  const edge = new Path2D();
+  for (const [x, y] of tip.contour) edge.lineTo(xOf(x), yOf(y));
+  edge.closePath();
   if (conductivity) {
     const last = conductivity.length - 1;
+    pen.save();
+    pen.clip(edge);
     for (let row = 0; row < h; row += 1) {
       const value = conductivity[Math.round((1 - row / h) * last)];
       pen.fillStyle = css(shade((value - GEL_LOW) / (GEL_HIGH - GEL_LOW)));
       pen.fillRect(x0, y0 + row, w, 1.5);
     }
-    levels(pen, conductivity, tip, x0, w, yOf);
+    levels(pen, conductivity, high, x0, w, yOf);
+    pen.restore();
     for (const [cm, text] of [[k, "k"], [k - sigma, "k−σ"], [k + sigma, "k+σ"]]) {
-      if (cm < 0 || cm > tip.height_cm) continue;
+      if (cm < 0 || cm > high) continue;
       pen.setLineDash(text === "k" ? [] : [4, 4]);
       pen.strokeStyle = INK;
       pen.lineWidth = 1.5;
@@ -83,12 +90,21 @@ export function drawGel(canvas, tip, conductivity, k, sigma) {
   } else {
     label(pen, "no conductivity", x0 + w / 2, y0 + h / 2, "center");
   }
-  electrodes(pen, tip, x0, y0, scale, yOf);
-  label(pen, `${tip.width_cm} × ${tip.height_cm} cm, 32 electrodes`, x0, y0 + h + 17);
+  pen.strokeStyle = INK;
+  pen.lineWidth = 1.5;
+  pen.stroke(edge);
+  pen.lineWidth = 6;
+  for (const [[x1, y1], [x2, y2]] of tip.electrodes) {
+    pen.beginPath();
+    pen.moveTo(xOf(x1), yOf(y1));
+    pen.lineTo(xOf(x2), yOf(y2));
+    pen.stroke();
+  }
+  label(pen, `${wide} × ${high} cm, ${tip.electrodes.length} electrodes`, x0, y0 + h + 17);
 }
 
-function levels(pen, conductivity, tip, x0, w, yOf) {
-  const step = tip.height_cm / (conductivity.length - 1);
+function levels(pen, conductivity, high, x0, w, yOf) {
+  const step = high / (conductivity.length - 1);
   let labelledAt = -Infinity;
   for (let i = 0; i + 1 < conductivity.length; i += 1) {
     for (const level of [0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6]) {
@@ -103,25 +119,10 @@ function levels(pen, conductivity, tip, x0, w, yOf) {
       pen.lineTo(x0 + w, y);
       pen.stroke();
       pen.setLineDash([]);
-      if (Math.abs(y - labelledAt) > 16 && Math.min(y - yOf(tip.height_cm), yOf(0) - y) > 9) {
+      if (Math.abs(y - labelledAt) > 16 && Math.min(y - yOf(high), yOf(0) - y) > 9) {
         label(pen, level.toFixed(1), x0 + w / 2, y, "center");
         labelledAt = y;
       }
-    }
-  }
-}
-
-function electrodes(pen, tip, x0, y0, scale, yOf) {
-  const [w, h, half] = [tip.width_cm * scale, tip.height_cm * scale, (tip.electrode_width_cm * scale) / 2];
-  pen.strokeStyle = INK;
-  pen.lineWidth = 1.5;
-  pen.strokeRect(x0, y0, w, h);
-  pen.fillStyle = INK;
-  for (const { side, centre_cm: centre } of tip.electrodes) {
-    if (side === "left" || side === "right") {
-      pen.fillRect(side === "left" ? x0 - 5 : x0 + w, yOf(centre) - half, 5, 2 * half);
-    } else {
-      pen.fillRect(x0 + centre * scale - half, side === "top" ? y0 - 5 : y0 + h, 2 * half, 5);
     }
   }
 }

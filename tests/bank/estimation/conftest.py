@@ -9,7 +9,7 @@ import pytest
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.bank_file import Bank, BankDefinition, write_bank
-from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, TactileFrame, fit
 
 PERIOD_S = 0.54
@@ -30,8 +30,8 @@ class Tip:
 
 def tip(number: int) -> Tip:
     rng = np.random.default_rng(1000 + number)
-    idle = rng.uniform(0.05, 0.5, N_CHANNELS)
-    return Tip(idle, *(idle * rng.normal(0, scale, N_CHANNELS) for scale in (0.06, 0.04, 0.02, 0.01)))
+    idle = rng.uniform(0.05, 0.5, PAPER_TABLE.n_channels)
+    return Tip(idle, *(idle * rng.normal(0, scale, PAPER_TABLE.n_channels) for scale in (0.06, 0.04, 0.02, 0.01)))
 
 
 def series(
@@ -75,7 +75,9 @@ def slices(n_repeats: int = 5, seed: int = 0, noise_v: float = 0.0008) -> FrameS
     """Return |differences| of ten rising torques, repeated, with a drift that grows from repeat to repeat."""
     rng = np.random.default_rng(seed)
     shape = np.random.default_rng(77)
-    base, slope, bend, drift = (np.abs(shape.normal(0, scale, N_CHANNELS)) for scale in (6e-3, 1e-3, 2e-4, 6e-4))
+    base, slope, bend, drift = (
+        np.abs(shape.normal(0, scale, PAPER_TABLE.n_channels)) for scale in (6e-3, 1e-3, 2e-4, 6e-4)
+    )
     torque = np.tile(np.linspace(0.01, 0.14, 10), n_repeats) + rng.normal(0, 0.002, 10 * n_repeats)
     z = (torque - 0.075) / 0.04
     wandering = np.linspace(0, 1, len(torque)) + rng.normal(0, 0.1, len(torque))
@@ -96,7 +98,7 @@ def kept(whole: FrameSeries, rows: BoolArray) -> FrameSeries:
 
 def mixed(own: FrameSeries, share: float) -> FrameSeries:
     """Return slices mixed with a share of a foreign one."""
-    foreign = own.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(N_CHANNELS)]
+    foreign = own.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(PAPER_TABLE.n_channels)]
     return replace(own, channels=(1 - share) * own.channels + share * foreign)
 
 

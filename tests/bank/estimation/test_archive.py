@@ -1,6 +1,10 @@
+import hashlib
+import io
+import tracemalloc
 import zipfile
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import yaml
 from hypothesis import given, settings
@@ -79,6 +83,31 @@ def _with_header(calibration, path, content=None, **changes):
         written.writestr("calibration.yaml", yaml.safe_dump(header))
         for member in header["sha256"]:
             written.writestr(member, read.read(member))
+
+
+def test_members_that_would_fill_the_memory_are_refused(tmp_path):
+    large = tmp_path / "large.cal"
+    with zipfile.ZipFile(large, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("a.npy", "w") as member:
+        for _ in range(200):
+            member.write(bytes(1 << 20))
+    tracemalloc.start()
+    with pytest.raises(CalibrationError, match="its members are larger than the file"):
+        Calibration.load(large)
+    assert tracemalloc.get_traced_memory()[1] < 16e6
+    tracemalloc.stop()
+
+
+def test_an_array_without_its_data_is_refused(tmp_path):
+    text = io.BytesIO()
+    np.lib.format.write_array_header_1_0(text, {"descr": "<f8", "fortran_order": False, "shape": (10**15,)})
+    array = text.getvalue()
+    header = {"kind": "shearloop estimator calibration", "sha256": {"a.npy": hashlib.sha256(array).hexdigest()}}
+    hollow = tmp_path / "hollow.cal"
+    with zipfile.ZipFile(hollow, "w") as archive:
+        archive.writestr("calibration.yaml", yaml.safe_dump(header))
+        archive.writestr("a.npy", array)
+    with pytest.raises(CalibrationError, match="holds a member that is no array; calibrate again"):
+        Calibration.load(hollow)
 
 
 def test_values_that_cannot_be_kept_and_files_that_cannot_be_written_are_errors(tmp_path, motion_calibration):

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import Calibration, EstimatorSession, FrameSeries, Measured, TactileFrame, fit
 
 COPIES: dict[str, Callable[[EstimatorSession], EstimatorSession]] = {
@@ -37,7 +37,10 @@ def faulty(series: FrameSeries, faults: list[tuple[str, int, int, int]]) -> list
     usable = np.ones(channels.shape, dtype=np.bool_)
     for kind, first, n, seed in faults:
         random, frames = np.random.default_rng(seed), slice(first, first + n)
-        side, some = random.integers(len(series.sides)), random.permutation(N_CHANNELS)[: random.integers(1, 120)]
+        side, some = (
+            random.integers(len(series.sides)),
+            random.permutation(PAPER_TABLE.n_channels)[: random.integers(1, 120)],
+        )
         match kind:
             case "dead":
                 usable[frames, side, some] = False

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import Estimate, EstimatorSession, FrameSeries, TactileFrame
 from shearloop.bank.estimation.session_state import Motion, SessionState
 from tests.bank.estimation.conftest import IDLE_S, PERIOD_S, judged
@@ -14,7 +14,10 @@ GRIPPED = round(IDLE_S / PERIOD_S) + 2
 def without(dead: slice, kind: str, series: FrameSeries) -> list[TactileFrame]:
     """Return a session in some frames of which one side's electrode, or a fifth of all, are dead or lost."""
     usable = np.ones(series.channels.shape, dtype=np.bool_)
-    electrode, some = (CHANNELS == 5).any(axis=1), np.random.default_rng(0).uniform(size=N_CHANNELS) < 0.2
+    electrode, some = (
+        (PAPER_TABLE.electrodes == 5).any(axis=1),
+        np.random.default_rng(0).uniform(size=PAPER_TABLE.n_channels) < 0.2,
+    )
     if kind == "a fifth":
         usable[dead, :, some] = False
     else:

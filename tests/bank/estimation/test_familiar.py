@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import FrameSeries
 from shearloop.bank.estimation.bank_match import BankMatch
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor, Mixtures, Ridge, fit_interval_regressor
@@ -23,7 +24,7 @@ def beyond(series: FrameSeries, below_nm: float) -> np.ndarray:
 
 def test_a_frame_far_out_along_the_calibrations_own_directions_is_refused(sliced):
     series = sliced()
-    guard = NoveltyDetector.fit(series.channels[:, 0])
+    guard = NoveltyDetector.fit(series.channels[:, 0], PAPER_TABLE)
     near, far = (beyond(series, nm)[0] for nm in (0.01, 0.15))
     assert guard.assess(near, ALL).reasons == ()
     # Its misfit is as small as any: only how far it lies out tells of it.
@@ -42,7 +43,7 @@ def test_channels_that_vary_much_do_not_drown_the_others():
     rng = np.random.default_rng(0)
     scale = np.where(np.arange(896) < 90, 1e-2, 1e-4)
     frames = 5e-2 + scale * rng.normal(size=(30, 896))
-    guard = NoveltyDetector.fit(frames)
+    guard = NoveltyDetector.fit(frames, PAPER_TABLE)
     # Ten times its own spread on every quiet channel is nothing beside one spread of the loud ones, in volts.
     odd = frames[3] + np.where(np.arange(896) < 90, 0.0, 1e-3) * np.where(np.arange(896) % 2, 1, -1)
     assert guard.assess(odd, ALL).reasons
@@ -183,7 +184,7 @@ def test_a_slice_is_measured_against_the_calibration_once(sliced, sliced_calibra
 
 def test_a_judgement_holds_what_intervals_go_by(sliced):
     frames = sliced().channels[:, 0]
-    guard = NoveltyDetector.fit(frames[:30])
+    guard = NoveltyDetector.fit(frames[:30], PAPER_TABLE)
     for frame in frames[30:]:
         judged = guard.assess(frame, ALL)
         assert judged.reasons == ()
@@ -193,7 +194,7 @@ def test_a_judgement_holds_what_intervals_go_by(sliced):
 
 def test_how_much_is_the_own_response_is_told_whatever_the_torque_does(sliced):
     frames = sliced().channels[:, 0]
-    guard = NoveltyDetector.fit(frames)
+    guard = NoveltyDetector.fit(frames, PAPER_TABLE)
     own = guard.response_share(frames[35], ALL)
     assert own == pytest.approx(1.0, abs=0.1)
     assert guard.response_share(0.8 * frames[35], ALL) == pytest.approx(0.8 * own)
@@ -205,7 +206,7 @@ def test_how_much_is_the_own_response_is_told_whatever_the_torque_does(sliced):
 
 def test_a_judgement_says_how_much_of_the_own_response_may_be_missing(sliced):
     frames = sliced().channels[:, 0]
-    guard = NoveltyDetector.fit(frames)
+    guard = NoveltyDetector.fit(frames, PAPER_TABLE)
     less = 0.8 * frames[35]
     assert guard.assess(less, ALL).missing_share == pytest.approx(
         1 - guard.response_share(less, ALL) / guard.typical_response

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, Physics, TactileFrame, fit
 from shearloop.bank.estimation.regressors import ChannelImputer
 from tests.bank.estimation import conftest
@@ -15,11 +15,11 @@ from tests.bank.estimation.conftest import judged
 
 # Some seconds into the first grip.
 DEATH = 60
-ELECTRODE = (CHANNELS == 5).any(axis=1)
+ELECTRODE = (PAPER_TABLE.electrodes == 5).any(axis=1)
 DEAD = {
     "an electrode": ELECTRODE,
-    "an electrode that measures": (CHANNELS[:, 2:] == 5).any(axis=1),
-    "a fifth": np.random.default_rng(0).uniform(size=N_CHANNELS) < 0.2,
+    "an electrode that measures": (PAPER_TABLE.electrodes[:, 2:] == 5).any(axis=1),
+    "a fifth": np.random.default_rng(0).uniform(size=PAPER_TABLE.n_channels) < 0.2,
 }
 
 

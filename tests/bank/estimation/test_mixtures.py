@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import FrameSeries, fit
 from shearloop.bank.estimation.fitting import ContaminationTest, Mixtures
 from shearloop.bank.estimation.interval_regressor import Ridge, fit_interval_regressor
@@ -77,7 +78,7 @@ def test_a_streams_intervals_know_nothing_of_mixtures(motion_calibration):
 def test_mixtures_are_those_that_the_guard_of_the_earlier_slices_lets_pass():
     differences = shrinking(0).channels[:, 0]
     past, future = np.arange(30), np.arange(30, 50)
-    guard = NoveltyDetector.fit(differences[past])
+    guard = NoveltyDetector.fit(differences[past], PAPER_TABLE)
     usable = np.ones(896, dtype=bool)
     mixtures = ContaminationTest(differences, np.arange(50.0), MotionRegression(np.ones((1, 896))), None)
     passing = mixtures.accepted(past, future)

@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.channels import CHANNELS
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import EstimatorSession, Physics, TactileFrame, fit
@@ -11,9 +11,9 @@ from shearloop.bank.estimation.bank_match import (
     NOT_TURNED,
     ElectrodeNumbering,
     RefinedMatcher,
-    find_numbering,
+    find_numberings,
     image_matrix,
-    resolve_half_turn,
+    resolve_symmetry,
 )
 from tests.bank.estimation.conftest import slices_of
 
@@ -23,17 +23,17 @@ from tests.bank.estimation.conftest import slices_of
 def test_the_numbering_of_the_electrodes_is_found(rotation, reflected):
     rng = np.random.default_rng(1)
     homogeneous = rng.normal(size=896)
-    turned = ElectrodeNumbering(rotation, reflected).model_channels()
-    found = find_numbering(np.abs(homogeneous[turned]) + 0.2 * np.abs(rng.normal(size=896)), homogeneous)
-    assert (found.rotation, found.reflected) == (rotation, reflected)
-    assert found.score > found.runner_up + 0.3
+    turned = ElectrodeNumbering(rotation, reflected).model_channels(PAPER_TABLE)
+    idle = np.abs(homogeneous[turned]) + 0.2 * np.abs(rng.normal(size=896))
+    found = find_numberings(idle, homogeneous, PAPER_TABLE)
+    assert [(one.rotation, one.reflected) for one in found] == [(rotation, reflected), (rotation + 16, reflected)]
 
 
 @pytest.mark.parametrize("turned", [ElectrodeNumbering(5, False), ElectrodeNumbering(9, True)])
 def test_a_turned_channel_measures_between_the_turned_electrodes(turned):
-    electrode = (turned.rotation + (-1 if turned.reflected else 1) * CHANNELS) % 32
-    model = CHANNELS[turned.model_channels()]
-    assert sorted(turned.model_channels()) == list(range(896))
+    electrode = (turned.rotation + (-1 if turned.reflected else 1) * PAPER_TABLE.electrodes) % 32
+    model = PAPER_TABLE.electrodes[turned.model_channels(PAPER_TABLE)]
+    assert sorted(turned.model_channels(PAPER_TABLE)) == list(range(896))
     np.testing.assert_array_equal(np.sort(model[:, :2]), np.sort(electrode[:, :2]))
     np.testing.assert_array_equal(np.sort(model[:, 2:]), np.sort(electrode[:, 2:]))
 
@@ -41,9 +41,10 @@ def test_a_turned_channel_measures_between_the_turned_electrodes(turned):
 @pytest.mark.parametrize("rotation", [5, 21])
 def test_a_touch_settles_the_half_turn(bank, rotation):
     true = ElectrodeNumbering(rotation, False)
-    touch = np.abs(bank.signals[4, 7].astype(np.float64))[true.model_channels()]
-    for found in (true, ElectrodeNumbering((rotation + 16) % 32, False)):
-        assert resolve_half_turn(found, touch, bank).rotation == rotation
+    touch = np.abs(bank.signals[4, 7].astype(np.float64))[true.model_channels(PAPER_TABLE)]
+    numberings = [true, ElectrodeNumbering((rotation + 16) % 32, False)]
+    for found in (numberings, numberings[::-1]):
+        assert resolve_symmetry(found, touch, bank).rotation == rotation
 
 
 def test_a_place_between_cells_is_found_to_a_fraction_of_one(bank):
@@ -96,7 +97,7 @@ def test_an_image_shows_where_and_which_way(fingertip):
     """A patch that conducts better comes back as the image's largest change, near where it is."""
     model = ForwardModel(fingertip)
     centres = fingertip.nodes[fingertip.triangles].mean(axis=1)
-    matrix = image_matrix(fingertip)
+    matrix = image_matrix(fingertip, PAPER_TABLE)
     low = fingertip.nodes.min(axis=0)
     size = float(np.ptp(fingertip.nodes, axis=0).max()) / 12
     cells = np.unique(np.floor((centres - low) / size).astype(int) @ [1, 1000])

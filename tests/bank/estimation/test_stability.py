@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.channels import CHANNELS
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import FrameSeries, fit
 from shearloop.bank.estimation.fingertip_validator import mask_saturated
 from shearloop.bank.estimation.novelty import NoveltyDetector
@@ -15,7 +15,7 @@ STEP_V = 0.00215
 
 
 def without_electrodes(series: FrameSeries, electrodes: tuple[int, ...], start: int) -> FrameSeries:
-    lost = np.isin(CHANNELS, electrodes).any(axis=1)
+    lost = np.isin(PAPER_TABLE.electrodes, electrodes).any(axis=1)
     channels = series.channels.copy()
     channels[start:, :, lost] = STEP_V
     return replace(series, channels=channels)
@@ -80,7 +80,7 @@ def test_a_drift_does_not_lead_a_regression_astray(twisting):
 
 def test_the_less_a_difference_is_explained_the_wider_the_interval(sliced):
     series = sliced()
-    guard = NoveltyDetector.fit(series.channels[:, 0])
+    guard = NoveltyDetector.fit(series.channels[:, 0], PAPER_TABLE)
     usable = np.ones(896, dtype=np.bool_)
     noise = np.random.default_rng(1).normal(0.0, 1.0, 896)
     frame = series.channels[10, 0]

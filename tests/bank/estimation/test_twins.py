@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.forward import BatchForwardModel
-from shearloop.bank.estimation.novelty import _FIRST, _SECOND, NoveltyDetector, ReciprocityCheck, _coordinates
+from shearloop.bank.estimation.novelty import NoveltyDetector, ReciprocityCheck, _coordinates
 from tests.bank.conftest import small_fingertip
 
 ALL = np.ones(896, dtype=np.bool_)
@@ -23,14 +24,14 @@ def test_opposite_injections_read_the_same_magnitudes():
     forward = BatchForwardModel(small_fingertip())
     cells = np.random.default_rng(1).uniform(0.5, 2.0, (1, len(forward.mesh.triangles)))
     (voltages,) = np.abs(forward.voltages(cells))
-    np.testing.assert_allclose(voltages[_FIRST], voltages[_SECOND], rtol=1e-9)
-    assert sorted([*_FIRST, *_SECOND]) == list(range(896))
+    np.testing.assert_allclose(voltages[PAPER_TABLE.twins[0]], voltages[PAPER_TABLE.twins[1]], rtol=1e-9)
+    assert sorted(PAPER_TABLE.twins.ravel()) == list(range(896))
 
 
 def test_the_misfit_of_noise_is_that_of_noise():
     """By the chi-squared distribution: twice the noise is four times the median square, which has a closed form."""
     frames = slices(400, 2)
-    twins = ReciprocityCheck.fit(frames[:200])
+    twins = ReciprocityCheck.fit(frames[:200], PAPER_TABLE)
     expected = float(chi2.median(1)) * np.median(frames[:200].var(axis=0)) / 2 / np.median(twins.spread**2)
     quiet = np.median([twins.residual(one, ALL) for one in frames[200:]])
     assert quiet == pytest.approx(expected * 1e-6 / np.median(frames[:200].var(axis=0)), rel=0.15)
@@ -40,7 +41,7 @@ def test_the_misfit_of_noise_is_that_of_noise():
 
 def test_drift_in_a_few_channels_is_familiar_and_a_share_of_a_foreign_frame_is_not():
     frames = slices(60, 3)
-    guard, later = NoveltyDetector.fit(frames[:40]), frames[50]
+    guard, later = NoveltyDetector.fit(frames[:40], PAPER_TABLE), frames[50]
     drifted = later + np.where(np.arange(896) % 28 < 2, 4e-3, 0.0)
     foreign = 0.85 * later + 0.15 * later[np.random.default_rng(4).permutation(896)]
     by_mean, by_twins = (
@@ -55,9 +56,9 @@ def test_drift_in_a_few_channels_is_familiar_and_a_share_of_a_foreign_frame_is_n
 
 def test_what_one_of_the_two_does_not_say_is_left_out():
     frames = slices(50, 5)
-    twins = ReciprocityCheck.fit(frames[:40])
+    twins = ReciprocityCheck.fit(frames[:40], PAPER_TABLE)
     usable = ALL.copy()
-    usable[_SECOND[:100]] = False
+    usable[PAPER_TABLE.twins[1][:100]] = False
     wrong = np.where(usable, frames[45], 1e3)
     assert twins.residual(wrong, usable) == pytest.approx(twins.residual(frames[45], usable), rel=1e-12)
     assert twins.residual(wrong, usable) < twins.largest_residual < twins.residual(wrong, ALL)

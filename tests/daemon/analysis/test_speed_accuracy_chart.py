@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.text import Annotation, Text
 
-from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.estimation import FrameSeries
 from shearloop.daemon.analysis.charts import scene
@@ -153,7 +153,7 @@ def test_an_unwritable_folder_is_reported_before_anything_is_measured(monkeypatc
 
 
 def test_doubts_about_a_design_are_printed_with_its_chart(monkeypatch, tmp_path, capsys):
-    t_s, frames = np.arange(12.0), np.random.default_rng(1).normal(0.0, 0.01, (12, 1, N_CHANNELS))
+    t_s, frames = np.arange(12.0), np.random.default_rng(1).normal(0.0, 0.01, (12, 1, PAPER_TABLE.n_channels))
     series = FrameSeries("difference", ("right",), t_s, frames, t_s, t_s, np.full(12, np.nan))
     parts = [Split(f"{name}, slices, first 60%", series, series, series) for name in ("good", "bad")]
     # One design per recording, with the attributes that the doubts need.

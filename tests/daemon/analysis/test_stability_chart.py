@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import mannwhitneyu
 
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import CHANNELS
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import Estimate, EstimatorSession, FrameSeries, Physics, fit
 from shearloop.bank.estimation.novelty import ReciprocityCheck
 from shearloop.daemon.analysis.charts import fault_sweeps, stability
@@ -129,8 +129,8 @@ def test_the_passing_share_of_a_foreign_frame_follows_from_its_size():
     series = drifting(100, 4)
     found = stability.detect_mixtures(series, origins=(0.6,))
     past, later = series.channels[:60, 0], series.channels[60:, 0]
-    opposite = CHANNELS[:, 0] >= 16
-    order = np.lexsort((CHANNELS[:, 2], CHANNELS[:, 0] % 16, opposite)).reshape(2, 448)
+    opposite = PAPER_TABLE.electrodes[:, 0] >= 16
+    order = np.lexsort((PAPER_TABLE.electrodes[:, 2], PAPER_TABLE.electrodes[:, 0] % 16, opposite)).reshape(2, 448)
     pairs, foreign = past[:, order].mean(axis=1), later.mean(axis=0)[np.random.default_rng(7).permutation(896)]
     spread = np.sqrt(0.5 * pairs.var(axis=0) + 0.5 * np.median(pairs.var(axis=0)))
     directions = np.linalg.svd((pairs - pairs.mean(axis=0)) / spread, full_matrices=False)[2][:12]
@@ -139,7 +139,7 @@ def test_the_passing_share_of_a_foreign_frame_follows_from_its_size():
         scaled = (frames[..., order].mean(axis=-2) - pairs.mean(axis=0)) / spread
         return scaled - scaled @ directions.T @ directions
 
-    limit = ReciprocityCheck.fit(past).largest_residual
+    limit = ReciprocityCheck.fit(past, PAPER_TABLE).largest_residual
     own = [one for one in found if one.kind == "another fingertip"]
     # What is off adds channel by channel: the two, in their shares.
     expected = [

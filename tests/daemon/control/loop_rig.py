@@ -40,6 +40,8 @@ class Rig:
         self.silent: set[str] = set()
         # What the load cell says too much, and whether it says nothing of use.
         self.offset_nm, self.void = 0.0, False
+        # When the fingertip's estimator has seen enough of the grip.
+        self.warm_from_s, self.warm_up_s = 0.0, 0.0
         self.arm = ArmStatus(0.3, 0)
         self.hand = GripperStatus(0, 140.0, holding=False, moving=False)
         self.pending: list[tuple[int, Action]] = []
@@ -82,7 +84,9 @@ class Rig:
         if self.tick % 68 == 0 and "right" not in self.silent:
             middle = now - round(EIT.window_s * 0.5e9)
             value = float(np.mean(self.window) + self.random.normal(0.0, self.noise_nm))
-            self.control_loop.on_torque(TorqueSample("right", value, "", middle, now))
+            cold = now < self.warm_from_s * 1e9
+            sample = None if cold else value
+            self.control_loop.on_torque(TorqueSample("right", sample, "too recently" if cold else "", middle, now))
         if self.tick % 11 == 0 and "load_cell" not in self.silent:
             value = torque_nm + self.offset_nm + float(self.random.normal(0.0, 0.0005))
             self.control_loop.on_torque(
@@ -94,6 +98,7 @@ class Rig:
             holds = action.expect_object or self.meets
             self.force_n = action.force_n if holds else 0.0
             self.width_mm = 30.0 if holds else action.width_mm
+            self.warm_from_s = self.t_ns / 1e9 + self.warm_up_s
             # As the gripper's task does, before it says that the fingers have closed.
             self.control_loop.on_gripper(replace(self.hand, t_ns=self.t_ns, holding=holds, width_mm=self.width_mm))
         self.control_loop.on_action_ended()

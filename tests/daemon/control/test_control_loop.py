@@ -6,10 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase, GripTo
 from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, TareStep
+from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.control.safety import FaultCode, Response
-from tests.daemon.control.loop_rig import EIT, GRIP, TICK_S, Rig, new_loop, phase, started
+from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, TICK_S, Rig, new_loop, phase, started
 
 
 @pytest.mark.parametrize("drive", ["right", "load_cell"])
@@ -115,6 +117,62 @@ def test_a_gripper_that_tells_only_after_the_start_that_it_does_not_know_stops_w
     )
     assert rig.control_loop.experiment.stop_reason.endswith("; put a `grip` or a `release` before it")
     assert rig.speed == 0.0
+
+
+WARM_UP_S = 14.0
+TWIST_NOW = {"do": "twist", "angles_rad": [0.1], "hold_s": 0.5}
+TIGHTEN = {"do": "tighten", "until_torque_nm": 0.05, "until_angle_rad": 1.0, "direction": "counterclockwise"}
+
+
+def gripping(*steps: dict[str, Any], warm_up_s: float, **keys: Any) -> Rig:
+    """Return a rig whose fingertip measures `warm_up_s` after a grip, and is expected to within WARM_UP_S."""
+    sources = {"right": replace(EIT, warm_up_s=WARM_UP_S), "load_cell": LOAD}
+    rig = Rig(ControlLoop(CONFIG, sources, ("gripper", "right")))
+    rig.warm_up_s = warm_up_s
+    return started(rig, GRIP, *steps, **keys)
+
+
+@pytest.mark.parametrize("drive", ["right", "load_cell"])
+@pytest.mark.parametrize("step", [{"do": "identify"}, TWIST_NOW, TIGHTEN], ids=lambda one: one["do"])
+def test_a_step_that_turns_the_tool_waits_for_the_first_torque_after_the_grip(step, drive):
+    rig = gripping(step, warm_up_s=7.0, torque_source=drive)
+    while rig.t_ns < rig.warm_from_s * 1e9 or not rig.warm_from_s:
+        rig.step()
+        assert rig.speed == 0.0
+        assert rig.control_loop.status.phase == "running"
+    assert rig.control_loop.status.activity.startswith("waiting for the first torque of right: too recently")
+    rig.run(120)
+    assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
+
+
+def test_a_torque_that_does_not_come_after_the_grip_is_a_fault():
+    rig = gripping({"do": "identify"}, warm_up_s=1000.0)
+    rig.run(WARM_UP_S + 4)
+    assert rig.control_loop.status.phase == "held"
+    rig.run(5)
+    assert phase(rig) is ExperimentPhase.STOPPED
+    assert "right says: too recently" in rig.control_loop.experiment.stop_reason
+
+
+def test_an_arm_that_a_start_enables_is_no_fault_until_then():
+    rig = Rig(new_loop())
+    rig.arm = replace(rig.arm, blocked="Motion has not been enabled.", enabled_by_start=True)
+    rig.run(1)
+    assert rig.control_loop.status.decision.reasons == ()
+    file = ExperimentFile.model_validate({"name": "one", "steps": [{"do": "wait", "wait_s": 1}]})
+    assert "Motion has not been enabled" in rig.control_loop.start(file, rig.t_ns)
+
+
+def test_fingers_that_open_are_no_torque_of_a_fingertip():
+    rig = gripping({"do": "release"}, warm_up_s=0.0)
+    while rig.force_n == 0.0 or rig.control_loop.experiment.step_number < 2:
+        rig.step()
+    rig.control_loop.on_torque(TorqueSample("right", 0.6, "", rig.t_ns, rig.t_ns))
+    rig.step()
+    assert phase(rig) is ExperimentPhase.RUNNING
+    rig.control_loop.on_torque(TorqueSample("load_cell", 0.6, "", rig.t_ns, rig.t_ns))
+    rig.step()
+    assert FaultCode.TORQUE_LIMIT in {fault.code for fault in rig.control_loop.status.decision.faults}
 
 
 def test_a_silent_board_holds_the_wrist_and_then_stops_it():

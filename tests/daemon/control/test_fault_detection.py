@@ -5,6 +5,7 @@ import pytest
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.fault_detection import (
     ARM_STALE_S,
+    Grip,
     LatestInputs,
     Watched,
     compared_for_s,
@@ -44,7 +45,7 @@ def watched(driving: TorqueSource, supervising: tuple[TorqueSource, ...]) -> Wat
         fresh_s=fresh_for_s((driving, *supervising), LoopConfig()),
         limits=ExperimentLimits(),
         torque_needed=True,
-        gripped=True,
+        grip=Grip.HELD,
         twisted_rad=0.0,
     )
 
@@ -136,7 +137,7 @@ def devices(
 ) -> list[tuple[FaultCode, str]]:
     """Return what is said of the devices while nothing moves."""
     senses = LatestInputs(10.0, arm=arm, gripper=hand, lost=lost)
-    idle = replace(watched(EIT, ()), torque_needed=False, gripped=False, required=("robot", "gripper"))
+    idle = replace(watched(EIT, ()), torque_needed=False, grip=Grip.NONE, required=("robot", "gripper"))
     return [(each.code, each.detail) for each in detect_faults(senses, idle, LoopConfig(), NOW_NS)]
 
 

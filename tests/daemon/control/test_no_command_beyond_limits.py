@@ -73,11 +73,11 @@ class CheckedArm(FakeArm):
             self.target = 0.0
         super().cycle()
 
-    def wrist(self, command: WristSpeed) -> bool:
+    def wrist(self, command: WristSpeed, left_s: float) -> bool:
         assert abs(command.rad_per_s) <= LIMITS.wrist_speed_rad_per_s.inner, command
         assert 0 < command.acceleration_rad_per_s2 <= LIMITS.wrist_acceleration_rad_per_s2.hard, command
         assert self.reading.safety_mode == 1 or command.rad_per_s == 0, "a robot in a safety stop was told to move"
-        return super().wrist(command)
+        return super().wrist(command, left_s)
 
     def move(self, command: MoveLinear) -> bool:
         box = LIMITS.workspace

@@ -9,8 +9,9 @@ from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.runner import WRENCH
 from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.messaging.messages import LoopStop
 from shearloop.drivers.ur.messages import MoveLinear, Stop, WristSpeed
-from tests.daemon.control.cell import GRIP, MOVE, TWIST, driven, experiment, no_tick
+from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, driven, experiment, no_tick
 from tests.drivers.ur.flight import SETTINGS
 
 
@@ -262,3 +263,51 @@ async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none()
         told = " ".join(cell.control_loop.status.decision.reasons)
         assert "not connected" in told
         assert "a command was refused" not in told
+
+
+def stops(cell: Cell) -> list[LoopStop]:
+    return [one for one in cell.published.messages if isinstance(one, LoopStop)]
+
+
+async def test_times_of_a_stop_are_published_once():
+    async with driven(TWIST, cycles=50) as cell:
+        assert cell.state.motion == "wrist"
+        cause_ns = cell.robot.flight.now_ns
+        cell.exceed_torque()
+        await cell.until_ended(10)
+        assert not stops(cell), "the wrist still turns"
+        await cell.cycles(60)
+        (stop,) = stops(cell)
+        assert (stop.t_mono_ns, stop.response, stop.experiment) == (cause_ns, "stop and release", "test")
+        assert "the torque is beyond its limit" in stop.cause
+        assert 0 <= stop.decided_after_s <= stop.sent_after_s <= 0.05
+        assert stop.sent_after_s < stop.stands_after_s <= 0.2
+        assert cell.state.rests
+
+
+async def test_cause_of_a_requested_stop_is_the_request():
+    async with driven(TWIST, cycles=50) as cell:
+        asked_ns = cell.robot.flight.now_ns
+        cell.runner.stop("the operator stopped it")
+        await cell.cycles(60)
+        (stop,) = stops(cell)
+        assert (stop.t_mono_ns, stop.cause) == (asked_ns, "the operator stopped it")
+        assert stop.decided_after_s <= 0.02
+
+
+async def test_standstill_that_nothing_measures_is_unknown():
+    async with driven(TWIST, cycles=50) as cell:
+        cell.robot.dies_of = ValueError("not a float")
+        await cell.until_ended(10)
+        cell.task.cancel()
+        await asyncio.gather(cell.task, return_exceptions=True)
+        (stop,) = stops(cell)
+        assert (stop.sent_after_s, stop.stands_after_s) == (None, None)
+
+
+async def test_an_experiment_that_is_done_has_no_stop():
+    async with driven({"do": "wait", "wait_s": 0.1}) as cell:
+        await cell.until_ended()
+        await cell.cycles(10)
+        assert cell.phase is ExperimentPhase.DONE
+        assert not stops(cell)

@@ -5,9 +5,11 @@ from types import SimpleNamespace
 
 import pytest
 
+from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.experiment import MoveToAngle
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
 from shearloop.daemon.control.runner import CommandSender
+from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.control.wrist_controller import WristController
 from shearloop.drivers.ur.messages import Command, CommandReply, WristSpeed
 from tests.drivers.ur.flight import SETTINGS, flying
@@ -78,7 +80,7 @@ async def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500
 
     robot = SimpleNamespace(settings=SETTINGS, state=None, send=send)
     brain = SimpleNamespace(on_speed_sent=wrist.on_speed_sent, on_command_refused=pytest.fail, on_crash=pytest.fail)
-    commands = CommandSender(robot, brain)
+    commands = CommandSender(robot, brain, StopTimeline(), Clock())
     origin_rad, errors = flight.state.wrist_rad, []
     for _ in range(cycles):
         flight.fly(1)

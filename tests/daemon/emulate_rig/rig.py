@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shearloop.bank.eit.channels import CHANNELS, ZERO_SLOTS
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.drivers.connection import LinkMonitor, LinkObserver
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.load_cell import LoadCalibration, LoadSample
@@ -32,8 +32,8 @@ DEADLINE_S = 30
 N_FRAMES, N_SAMPLES = 6, 20
 PERIOD_NS = round(0.5408e9 / SPEED)
 CM_PER_NM = (1.25 - 1.85) / 0.14
-PATTERN = np.cos(CHANNELS @ [0.3, 0.1, 0.2, 0.5])
-HOMOGENEOUS = 0.5 * np.sin(CHANNELS @ [0.1, 0.2, 0.3, 0.4]) + 0.9
+PATTERN = np.cos(PAPER_TABLE.electrodes @ [0.3, 0.1, 0.2, 0.5])
+HOMOGENEOUS = 0.5 * np.sin(PAPER_TABLE.electrodes @ [0.1, 0.2, 0.3, 0.4]) + 0.9
 # What a centimetre of σ does to a channel in volts, by the synthesiser's scaling of a bank.
 VOLTS_PER_CM = 0.17 * 0.13 / np.abs(HOMOGENEOUS).mean() * PATTERN
 # Our sketch's scale: 420 counts a gram on a lever arm of 35 mm.
@@ -70,7 +70,7 @@ async def open_gripper_at(rig: RigProcess) -> AsyncIterator[RobotiqGripper]:
 
 def kit_at(rig: RigProcess, side: str, observer: LinkObserver | None = None) -> EitKit:
     path, monitor = rig.run_dir / f"eit-{side}", LinkMonitor(observer)
-    return EitKit(zero_slots=ZERO_SLOTS, path=path, frame_period_s=0.5408 / SPEED, monitor=monitor)
+    return EitKit(zero_slots=PAPER_TABLE.zero_slots, path=path, frame_period_s=0.5408 / SPEED, monitor=monitor)
 
 
 @asynccontextmanager

@@ -2,7 +2,6 @@ import asyncio
 import os
 import socket
 import threading
-from collections import Counter
 from collections.abc import Mapping
 from functools import partial
 from types import SimpleNamespace
@@ -18,7 +17,7 @@ from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.client import receive_messages, send_command
-from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer, RateLimit
+from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer, RequestExecutor
 from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
@@ -36,14 +35,13 @@ def handlers() -> Mapping[str, Any]:
     return {"tare": tare, "unlock": unlock}
 
 
-class Unbound(CommandServer):
+class Unbound(RequestExecutor):
     """The deciding half of the server, without its socket."""
 
     def __init__(self) -> None:
-        self._handlers = handlers()
-        self._limit = RateLimit()
-        self._running = set()
-        self.refused = Counter()
+        refusals = Refusals()
+        super().__init__(handlers(), refusals)
+        self.refused = refusals.counts
 
     async def reply(self, payload: bytes, *, t_ns: int = 0) -> dict[str, Any]:
         ready = self.check(b"somebody", [payload], t_ns)
@@ -65,7 +63,7 @@ async def test_each_request_gets_one_reply():
 async def test_req_and_dealer_clients_are_answered():
     with zmq.asyncio.Context() as context:
         server = CommandServer(context, "tcp://127.0.0.1:*", handlers(), Refusals())
-        address = server._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        address = server.address
         serving = asyncio.create_task(server.run())
         assert (await asyncio.to_thread(send_command, address, {"command": "tare"}, 5.0))["tared"] == ["right"]
         with context.socket(zmq.REQ) as client:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import AsyncMock
 
+import pytest
 import zmq
 import zmq.asyncio
 
@@ -80,6 +81,7 @@ def malformed_frames(count: int) -> Iterator[bytes]:
             yield chance.randbytes(chance.randrange(80)).replace(b"\n", b"") + b"\n"
 
 
+@pytest.mark.usefixtures("ur_rtde")
 async def test_a_flood_of_malformed_frames_and_requests(config, tiny_bank, monkeypatch):
     arm = AsyncMock(return_value=CommandReply())
     monkeypatch.setattr(UrRobot, "send", arm)

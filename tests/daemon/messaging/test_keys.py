@@ -1,7 +1,9 @@
 """CURVE on anything but loopback and ipc, keys by `shearloop keys`, an allow-list, and no way round them."""
 
+import asyncio
 import json
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +13,19 @@ import zmq.asyncio
 
 from shearloop.daemon.cli import main
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.addresses import has_valid_port, is_local, local_stop_address, needs_keys
-from shearloop.daemon.messaging.keys import ClientKeys, KeyPair, load_key_pair, load_public_key, load_server_keys
+from shearloop.daemon.messaging.addresses import has_valid_port, is_local, needs_keys
+from shearloop.daemon.messaging.connections import bind
+from shearloop.daemon.messaging.keys import (
+    ClientKeys,
+    KeyPair,
+    Refusals,
+    load_key_pair,
+    load_public_key,
+    load_server_keys,
+)
 from shearloop.daemon.messaging.messages import decode, encode
-from shearloop.daemon.messaging.publisher import bind
-from tests.daemon.conftest import running_daemon
+from shearloop.daemon.messaging.stop_socket import send_to_stop_socket
+from tests.daemon.conftest import DEADLINE_S, running_daemon
 
 NETWORK = "tcp://0.0.0.0:*"
 # How long somebody is waited for who is not to be heard.
@@ -57,7 +67,7 @@ def test_valid_ports():
         assert not has_valid_port(f"tcp://127.0.0.1:{port}"), port
     assert not has_valid_port("tcp://127.0.0.1")
     with zmq.Context() as context, pytest.raises(UserError, match=r"has no valid port \(a whole number"):
-        bind(context.socket(zmq.PUB), "tcp://127.0.0.1:70000", "publish")
+        bind(context, context.socket(zmq.PUB), "tcp://127.0.0.1:70000", "publish", Refusals())
 
 
 @pytest.mark.parametrize("command", ["run", "check"])
@@ -106,7 +116,7 @@ def address_of(socket: Any) -> str:
 async def test_only_allowed_clients_connect_and_only_encrypted(config, keys, connect):
     path = config(publish=NETWORK, commands=NETWORK, curve=curve(keys))
     async with running_daemon(path) as daemon:
-        commands = address_of(daemon._tasks["commands"]._socket)
+        commands = daemon._tasks["commands"].address.replace("//0.0.0.0:", "//127.0.0.1:")
         published = address_of(daemon.publisher._socket)
         known = ada(keys)
         asking = connect(zmq.DEALER, commands, known)
@@ -125,18 +135,11 @@ async def test_only_allowed_clients_connect_and_only_encrypted(config, keys, con
             assert not await asking.poll(SILENCE_MS), who
             assert not await hearing.poll(0), who
         assert daemon.health.tasks()["commands"]["errors"]["key is not allowed"] >= 1
-        anyone = connect(zmq.DEALER, address_of(daemon._tasks["open_stop"]._socket), None)
+        anyone = partial(asyncio.to_thread, send_to_stop_socket, commands)
         for name in ("start", "resume", "unlock", "tare", "pause"):
-            await anyone.send(encode({"command": name}))
-            assert "this command needs a key" in decode(await anyone.recv())["reason"]
-        await anyone.send(encode({"command": "stop"}))
-        assert decode(await anyone.recv())["ok"]
+            assert "this command needs a key" in (await anyone({"command": name}, DEADLINE_S))["reason"]
+        assert (await anyone({"command": "stop"}, DEADLINE_S))["ok"]
         await daemon._stop.wait()
-
-
-def test_the_local_stop_socket_is_named_by_the_port():
-    for address in ("tcp://0.0.0.0:7762", "tcp://127.0.0.1:7762"):
-        assert local_stop_address(address) == "ipc://@shearloop-stop-7762"
 
 
 def test_a_client_needs_keys_for_another_machine(tmp_path, monkeypatch, capsys):

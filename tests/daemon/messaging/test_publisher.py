@@ -1,3 +1,4 @@
+import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -8,7 +9,7 @@ import zmq
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.messages import LoadTorque, decode, encode
-from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.messaging.publisher import MAX_UNKNOWN_TOPICS, Publisher
 from tests.daemon.conftest import DEADLINE_S
 from tests.daemon.sample_messages import sample
 
@@ -35,12 +36,12 @@ def connect(tmp_path) -> Iterator[Connect]:
     with zmq.Context() as context:
 
         def connected(*topics: str, kind: int = zmq.SUB) -> "zmq.Socket[bytes]":
-            socket = context.socket(kind)
-            socket.setsockopt(zmq.RCVTIMEO, DEADLINE_S * 1000)
-            socket.connect(f"ipc://{tmp_path}/publish")
+            client = context.socket(kind)
+            client.setsockopt(zmq.RCVTIMEO, DEADLINE_S * 1000)
+            client.connect(f"ipc://{tmp_path}/publish")
             for topic in topics:
-                socket.subscribe(topic)
-            return socket
+                client.subscribe(topic)
+            return client
 
         yield connected
 
@@ -68,7 +69,7 @@ def test_an_unsendable_message_does_not_affect_the_next(publisher, connect):
 
 def test_subscriptions_to_unknown_topics_are_not_kept(publisher, connect):
     with connect(kind=zmq.XSUB) as stranger:
-        for number in range(300):
+        for number in range(MAX_UNKNOWN_TOPICS - 2):
             stranger.send(b"\x01eit.%d" % number)
         stranger.send(b"no subscription")
         stranger.send(b"\x01health")
@@ -110,3 +111,26 @@ def test_a_subscriber_is_warned_once_and_receives_a_later_daemon(tmp_path, monke
         with closing(receive_messages(address, ["health"], on_quiet=comes)) as heard:
             assert [next(heard)[1]["seq"] for _ in range(2)] == [0, 1]
     assert told == ["quiet"]
+
+
+def test_a_client_with_many_unknown_topics_is_disconnected(publisher, connect, tmp_path):
+    with connect("health") as known, socket.socket(socket.AF_UNIX) as stranger:
+        until(lambda: publisher.has_subscriber("health"))
+        stranger.connect(f"{tmp_path}/publish")
+        # ZMTP 3.0: the greeting without security, then READY.
+        stranger.sendall(b"\xff%b\x7f\x03\x00NULL%b" % (bytes(8), bytes(48)))
+        stranger.sendall(b"\x04\x19\x05READY\x0bSocket-Type\x00\x00\x00\x03SUB")
+        answer = b""
+        while b"XPUB" not in answer:
+            answer += stranger.recv(1000)
+
+        def subscribe() -> None:
+            for number in range(100_000):
+                stranger.sendall(b"\x00\x33\x01%050d" % number)
+                publisher.publish(sample(LoadTorque))
+
+        with pytest.raises(ConnectionError):
+            subscribe()
+        assert publisher.diagnostics() == {"errors": {"too many unknown topics": 1}}
+        publisher.forward("health", {"number": 1})
+        assert known.recv_multipart()[0] == b"health"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from shearloop.bank.eit.channels import line_of_channels
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.daemon.recording.matlab import import_mat
 
 PERIOD_S = 0.5408
@@ -19,7 +19,7 @@ def datenum(t_s):
 
 
 def lines(n: int, seed: int = 0) -> np.ndarray:
-    return line_of_channels(np.round(np.random.default_rng(seed).uniform(0.01, 0.5, (n, 896)), 4))
+    return PAPER_TABLE.line_of_channels(np.round(np.random.default_rng(seed).uniform(0.01, 0.5, (n, 896)), 4))
 
 
 @pytest.fixture

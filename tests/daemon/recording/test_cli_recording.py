@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from shearloop.bank.eit.channels import line_of_channels
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.daemon.cli import main
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.writer import RecordingWriter
 
-LINES = line_of_channels(np.round(np.random.default_rng(0).uniform(0, 1, (4, 896)), 4))
+LINES = PAPER_TABLE.line_of_channels(np.round(np.random.default_rng(0).uniform(0, 1, (4, 896)), 4))
 
 
 @pytest.fixture
@@ -111,3 +111,16 @@ def test_mistakes_end_in_one_sentence(arguments, message, recording, tmp_path, c
     assert main(["recording", *given]) == 2
     assert message in capsys.readouterr().err
     assert not list(tmp_path.glob("*.tmp"))
+
+
+def test_a_topic_of_another_version_is_named(tmp_path, capsys, monkeypatch):
+    path = tmp_path / "new.mcap"
+    with monkeypatch.context() as newer:
+        newer.setattr("shearloop.daemon.recording.schema.schema_name", lambda _: "load.torque")
+        newer.setattr("shearloop.daemon.recording.schema.software_version", lambda: "99.1")
+        with RecordingWriter(path, "a bench") as writer:
+            writer._add("arm.temperature", 10**18, {"torque_nm": 0.5})
+    assert main(["recording", "export", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert "has no topic 'arm.temperature'; version 99.1 wrote this recording" in said
+    assert "KeyError" not in said

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.channels import channels_of_line
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.matlab import read_diameter_slices, read_line, read_torque_slices
 from shearloop.daemon.recording.matlab_slices import SliceRecorder
@@ -32,7 +32,7 @@ class Sweep:
     """What a daemon publishes while angles are held for five seconds each; the torque is in every channel."""
 
     def __init__(self, folder: Path, slices: str = "torque", *, tared: bool = True) -> None:
-        self.recorder, self.t_s, self.slices = SliceRecorder(folder), 0.0, slices
+        self.recorder, self.t_s, self.slices = SliceRecorder(folder, PAPER_TABLE), 0.0, slices
         self.rest = np.random.default_rng(0).uniform(0.05, 0.25, 1024)
         if tared:
             self._loop(step_name="tare")
@@ -50,7 +50,7 @@ class Sweep:
             frame = {
                 "source": "right",
                 "t_mono_ns": round(self.t_s * S),
-                "channels": channels_of_line(line).astype("<f4").tobytes(),
+                "channels": PAPER_TABLE.channels_of_line(line).astype("<f4").tobytes(),
                 "line": line.tobytes(),
                 "repeated": repeated,
             }
@@ -214,7 +214,7 @@ def test_slices_need_a_request_of_the_experiment(tmp_path):
 def test_a_folder_that_cannot_be_made_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot be made"):
-        SliceRecorder(tmp_path / "file" / "slices")
+        SliceRecorder(tmp_path / "file" / "slices", PAPER_TABLE)
 
 
 @pytest.fixture(params=["full", "gone"])

@@ -13,7 +13,7 @@ import pytest
 import zmq.asyncio
 from mcap.reader import make_reader
 
-from shearloop.bank.eit.channels import LINE_SLOTS, line_of_channels
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import load_daemon_config
@@ -32,8 +32,8 @@ IDENTITY = Identity(basic_identity("a test"), (AttachedFile("configuration.json"
 
 def frame(number: int) -> dict:
     rng = np.random.default_rng(number)
-    channels = np.round(rng.uniform(0.01, 0.5, len(LINE_SLOTS)), 4)
-    arrays = {"channels": channels, "line": line_of_channels(channels)}
+    channels = np.round(rng.uniform(0.01, 0.5, len(PAPER_TABLE.line_slots)), 4)
+    arrays = {"channels": channels, "line": PAPER_TABLE.line_of_channels(channels)}
     times = {"t_mono_ns": time.monotonic_ns() - 300_000_000, "age_s": 0.3}
     message = sample(EitFrame, source="right", frame=number, repeated=False, **arrays, **times)
     return wire_map(message, Clock().unix_s(message.t_mono_ns), number)

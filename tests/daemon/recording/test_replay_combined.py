@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from shearloop.bank.eit.channels import channels_of_line, line_of_channels
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import FrameSeries, Measured, fit
 from shearloop.drivers.eit_kit import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, running_daemon, shearloop
@@ -46,8 +46,8 @@ def twists(tmp_path_factory) -> Twists:
         idle, grip, twist = random.integers(40, 200, 896), random.integers(-15, 16, 896), random.normal(0, 5, 896)
         steps = idle + random.integers(-1, 2, (N_FRAMES, 896)) + np.round(np.outer(TORQUE_NM / 0.1, twist)).astype(int)
         steps[GRIPPED] += grip
-        lines = np.round(line_of_channels(steps * ADC_STEP_V), 4)
-        channels.append([channels_of_line(line) for line in lines])
+        lines = np.round(PAPER_TABLE.line_of_channels(steps * ADC_STEP_V), 4)
+        channels.append([PAPER_TABLE.channels_of_line(line) for line in lines])
         boards[side] = folder / f"{side}.mat"
         savemat(boards[side], {variable: np.column_stack([739_588 + t_s / 86_400, lines])})
     series = FrameSeries(

@@ -34,7 +34,7 @@ def coarse_fingertip(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def coarse_mesh(coarse_fingertip) -> Mesh:
-    return load_geometry(coarse_fingertip)
+    return load_geometry(coarse_fingertip).mesh
 
 
 @pytest.fixture(scope="session")

@@ -53,6 +53,7 @@ class FakeEstimator:
     """Estimates nothing; frame `fails` raises, frame `waits` waits for `go_on`. Keeps the frames after tares."""
 
     taring = False
+    reason = "nothing"
 
     def __init__(self, fails: int = -1, waits: int = -1) -> None:
         self.fails, self.waits = fails, waits
@@ -73,7 +74,7 @@ class FakeEstimator:
         if self._tared:
             self.tared_before.append(one.seq)
         self._tared = False
-        return Estimate(valid=False, reasons=("nothing",))
+        return Estimate(valid=False, reasons=(self.reason,))
 
 
 class FixedClock(Clock):
@@ -186,13 +187,29 @@ async def test_a_second_tare_replaces_the_first():
 async def test_waiting_for_a_tare_ends_when_it_is_complete():
     clock, estimator = FixedClock(), FakeEstimator()
     task = estimates("right", RecordingPublisher(), estimator, clock)
-    async with running(task.tare_and_wait()) as (waiting,):
+    async with running(task.tare_and_wait(60.0)) as (waiting,):
         await asyncio.sleep(0)
         await task.process(frame(0, clock.t_ns))
         await asyncio.sleep(0)
         assert not waiting.done(), "this frame was acquired before the tare"
         await task.process(frame(1, clock.t_ns + 2 * PERIOD_NS))
         await waiting
+
+
+async def test_tare_that_times_out_says_why_its_frames_were_refused():
+    clock, estimator = FixedClock(), FakeEstimator()
+    estimator.taring = True
+    task = estimates("right", RecordingPublisher(), estimator, clock)
+    async with running(task.tare_and_wait(0.2)) as (waiting,):
+        await asyncio.sleep(0)
+        for seq, reason in enumerate(("3 channels jumped", "nothing", "5 channels jumped", "7 channels jumped"), 2):
+            estimator.reason = reason
+            await task.process(frame(seq, clock.t_ns + seq * PERIOD_NS))
+        error = await waiting
+    said = "the homogeneous frame of right could not be taken within 0.2 s"
+    assert error == f"{said}: 3 frames: 7 channels jumped, 1 frame: nothing"
+    async with running(task.tare_and_wait(0.01)) as (waiting,):
+        assert (await waiting).endswith("no frame came")
 
 
 def test_the_configured_frame_period_is_the_boards():

@@ -11,8 +11,9 @@ until_so() {
 }
 systemctl start shearloop
 echo "started: $?"
-until_so alive StatusText "3 tasks are alive"
+until_so alive StatusText "5 tasks are alive"
 echo "user: $(of User)"
+echo "stop socket: $(grep -c '@shearloop-stop-' /proc/net/unix)"
 echo "policy: $(chrt -p "$(of MainPID)" | grep -o 'SCHED_[A-Z]*')"
 echo "capabilities: $(grep CapEff "/proc/$(of MainPID)/status" | cut -f2)"
 if [ -e /run/exchange/start_only ]; then
@@ -23,11 +24,11 @@ if [ -e /run/exchange/start_only ]; then
 fi
 kill -KILL "$(of MainPID)"
 until_so killed NRestarts 1
-until_so again StatusText "3 tasks are alive"
+until_so again StatusText "5 tasks are alive"
 # A daemon that hangs does not feed the watchdog.
 kill -STOP "$(of MainPID)"
 until_so hung NRestarts 2
-until_so again StatusText "3 tasks are alive"
+until_so again StatusText "5 tasks are alive"
 systemctl stop shearloop
 echo "stopped: $(of Result) $(of ExecMainStatus)"
 echo "fingertipz: 1" >>/etc/shearloop/shearloop.yaml

@@ -3,8 +3,8 @@
 import re
 import subprocess
 import sys
+import tomllib
 import zipfile
-from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -83,13 +83,14 @@ def test_a_wheel_carries_every_file_of_the_service_and_of_the_page(tmp_path):
     )
     subprocess.run([sys.executable, "-c", build, str(tmp_path)], cwd=source, check=True, capture_output=True)
     (wheel,) = tmp_path.glob("*.whl")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     with zipfile.ZipFile(wheel) as archive:
         assert "-py3-none-any" in wheel.name
         assert {name.split("/")[0] for name in archive.namelist()} == {
             "shearloop",
-            f"shearloop-{version('shearloop')}.dist-info",
+            f"shearloop-{project['version']}.dist-info",
         }
-        for path in (path.relative_to(ROOT) for path in (ROOT / "config").rglob("*.yaml")):
+        for path in (path.relative_to(ROOT) for path in (ROOT / "config").rglob("*.*")):
             assert f"shearloop/{path}" in archive.namelist()
         assert "shearloop/py.typed" in archive.namelist()
         for name in (*PLACES, "realtime.conf", "shearloop.yaml"):

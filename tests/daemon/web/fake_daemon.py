@@ -66,7 +66,10 @@ def made(given: Mapping[str, Any]) -> Message:
 
 
 def said(folder: Path) -> list[Message]:
-    """Return what is to be said now: all MESSAGES with their changes, without those that are changed to nothing."""
+    """Return what is to be said now: all MESSAGES with their changes, without those that are changed to nothing.
+
+    `end` is said only where it is changed.
+    """
     changed = json.loads((folder / "changed").read_text())["messages"]
     now_ns = Clock().now_ns()
     # A name that MESSAGES has not is one more estimate.
@@ -74,7 +77,7 @@ def said(folder: Path) -> list[Message]:
     return [
         made({"t_mono_ns": now_ns, **values, **changed.get(name, {})})
         for name, values in given.items()
-        if changed.get(name, {}) is not None
+        if changed.get(name, {}) is not None and (name != "end" or name in changed)
     ]
 
 

@@ -1,5 +1,6 @@
 import os
 import stat
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -7,7 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.web.server import default_token_path, host_allowed, load_token, origin_allowed, token_valid
+from shearloop.daemon.web.server import (
+    WRONG_BURST,
+    TokenCheck,
+    default_token_path,
+    host_allowed,
+    load_token,
+    origin_allowed,
+    token_valid,
+)
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.1:7760", "localhost:9000", "LOCALHOST:1", "[::1]:7760"])
@@ -88,3 +97,12 @@ def test_the_default_token_path_follows_xdg(monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", "not/absolute")
     monkeypatch.setenv("HOME", "/home/somebody")
     assert default_token_path() == Path("/home/somebody/.local/state/shearloop/view-token")
+
+
+def test_guessing_the_token_is_slowed_to_one_try_per_second():
+    tokens, guesses = TokenCheck("abc"), 1000
+    statuses = [tokens.refusal("start", f"Bearer {number}", number * 1_000_000)[0] for number in range(guesses)]
+    assert Counter(statuses) == {403: WRONG_BURST, 429: guesses - WRONG_BURST}, "1000 guesses in a second"
+    assert tokens.refusal("start", "Bearer abc", 999_000_000)[0] == 429, "the right one waits too"
+    assert tokens.refusal("start", "Bearer abc", 3 * 10**9) is None
+    assert tokens.refusal("start", "Bearer abc", 3 * 10**9) is None, "the right one is never counted"

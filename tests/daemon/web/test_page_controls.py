@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from tests.daemon.web.fake_daemon import REASONS
+from tests.daemon.web.fake_daemon import MESSAGES, REASONS
 
 pytestmark = pytest.mark.usefixtures("fresh")
 COMMANDS = ("tare", "start", "pause", "resume", "unlock")
@@ -115,6 +115,23 @@ def test_a_dead_daemon_is_shown_within_two_seconds(browsed):
         if told_after_s[-1] < 2.0:
             break
     assert min(told_after_s) < 2.0
+
+
+def test_a_daemon_that_ends_well_is_shown_as_done_with_its_summary(browsed):
+    page = browsed.open()
+    browsed.until("#link-state", "● live")
+    silent = dict.fromkeys(name for name in MESSAGES if name != "end")
+    browsed.daemon.say(**silent, end={})
+    browsed.until("#link-state", "✓ DONE")
+    browsed.until("#summary-text", "What happened: 'hold 0.10 N·m' was done")
+    browsed.daemon.kill()
+    page.wait_for_timeout(2500)  # longer than a silent daemon stays unnoticed
+    assert browsed.text("#link-state") == "✓ DONE"
+    browsed.until_old(0)
+    browsed.daemon.say()
+    browsed.daemon.start()
+    browsed.until("#link-state", "● live")
+    assert not page.is_visible("#summary")
 
 
 def test_a_lost_viewer_is_shown_and_reconnects(browsed):

@@ -113,6 +113,16 @@ async def test_motion_needs_the_token_and_stop_does_not(tmp_path):
         assert page.asked == ["stop", "start", "pause"]
 
 
+async def test_wrong_tokens_are_soon_refused_unread_and_seldom_logged(tmp_path, log):
+    async with served(tmp_path) as page:
+        statuses = [(await post(page, "/commands/start", Authorization="Bearer wrong"))[0] for _ in range(200)]
+        assert statuses[0] == 403
+        assert statuses[-1] == 429
+        assert log.said.count("refused") <= 6
+        assert await post(page, "/stop") == (200, {"ok": True, "stopped": "test"})
+        assert page.asked == ["stop"]
+
+
 @pytest.mark.parametrize(
     "headers",
     [

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.bank.eit.channels import ZERO_SLOTS
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.drivers.connection import SerialPort
 from shearloop.drivers.eit_kit import FrameError, read_line
 from shearloop.drivers.emulators.boards import BoardFault, EitKitBoard, format_line, parse_fault
@@ -29,8 +29,8 @@ def test_a_line_is_what_the_board_sends_byte_for_byte():
 
 @given(st.integers(0, 2**32))
 def test_what_it_sends_is_what_the_driver_reads(seed):
-    values = np.where(ZERO_SLOTS, 0, np.random.default_rng(seed).integers(1, 22_000, 1024) / 10_000)
-    read = read_line(format_line(values).removesuffix(b"\n"), ZERO_SLOTS)
+    values = np.where(PAPER_TABLE.zero_slots, 0, np.random.default_rng(seed).integers(1, 22_000, 1024) / 10_000)
+    read = read_line(format_line(values).removesuffix(b"\n"), PAPER_TABLE.zero_slots)
     assert not isinstance(read, FrameError)
     np.testing.assert_array_equal(read, values)
 
@@ -58,7 +58,7 @@ def test_invalid_faults_are_refused(text, sentence):
 
 
 async def test_it_says_nothing_before_it_is_started_and_is_silent_after_its_last_frame():
-    line = np.where(ZERO_SLOTS, 0, 0.25)
+    line = np.where(PAPER_TABLE.zero_slots, 0, 0.25)
     board = EitKitBoard([line, line], period_s=0.001)
     async with running(board.run()):
         with SerialPort(board.port.path) as port:
@@ -72,7 +72,7 @@ async def test_it_says_nothing_before_it_is_started_and_is_silent_after_its_last
 
 
 async def test_faults_can_be_switched_on_while_it_runs():
-    line = np.where(ZERO_SLOTS, 0, 0.25)
+    line = np.where(PAPER_TABLE.zero_slots, 0, 0.25)
     board = EitKitBoard([line, line], period_s=0.001)
     board.command("nan")
     async with running(board.run()):

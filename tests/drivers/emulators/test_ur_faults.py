@@ -11,11 +11,12 @@ def test_faults_are_carried_out_and_ended():
     controller = Controller(Robot())
     robot = controller.robot
     for line in (
-        "registers-in-use", "local-control", "refuse-protocol", "stop-hangs 2", "protective-stop",
-        "emergency-stop",
+        "registers-in-use", "local-control", "refuse-protocol", "mute-dashboard", "stop-hangs 2", "protective-stop",
+        "emergency-stop", "version 5.0.0.0", "payload 2.5",
     ):  # fmt: skip
         controller.command(line)
-    assert controller.faults == ConnectionFaults(True, True, True, 2)
+    assert controller.faults == ConnectionFaults(True, True, True, True, 2)
+    assert (robot.spec.payload_kg, robot.spec.version) == (2.5, (5, 0, 0, 0))
     assert robot.safety.safety_mode == 7
     controller.command("normal")
     assert (controller.faults, robot.safety.safety_mode) == (ConnectionFaults(), 1)
@@ -23,7 +24,12 @@ def test_faults_are_carried_out_and_ended():
 
 @pytest.mark.parametrize(
     ("line", "said"),
-    [("fire", "there are protective-stop, emergency-stop"), ("silence long", "long"), ("silence", "nothing")],
+    [
+        ("version 5", "'5' is not a version such as 5.4.0.0"),
+        ("fire", "there are protective-stop, emergency-stop"),
+        ("silence long", "long"),
+        ("silence", "nothing"),
+    ],
 )
 def test_unknown_fault_is_refused(line, said):
     with pytest.raises(ValueError, match=said):

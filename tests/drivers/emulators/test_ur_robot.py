@@ -1,4 +1,4 @@
-"""The emulated controller without I/O: registers, watchdog, safety."""
+"""The emulated controller without I/O, with ur-rtde's script: registers, watchdog, safety."""
 
 import math
 
@@ -6,10 +6,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shearloop.drivers.emulators import ur_robot as control_script
-from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, PAUSED, STOPPED, Robot
+from shearloop.drivers.emulators.ur_robot import (
+    MODE_IDLE,
+    MODE_POWER_OFF,
+    MODE_RUNNING,
+    PAUSED,
+    STOPPED,
+    ControllerSpec,
+    Robot,
+)
+from tests.drivers.ur.robots import DELIVERED, control_script
 
 DT_S = 0.002
+MOVE_J, MOVE_L, ZERO_FT, SPEED_J, SPEED_STOP, STOP_J, SET_WATCHDOG = 1, 3, 8, 9, 15, 34, 35
 
 
 def wait(robot: Robot, seconds: float) -> None:
@@ -40,7 +49,7 @@ def do(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) 
 
 
 def turn(robot: Robot, speed: float, acceleration: float = 2.0) -> None:
-    send(robot, control_script.SPEED_J, 0, 0, 0, 0, 0, speed, acceleration, 0)
+    send(robot, SPEED_J, 0, 0, 0, 0, 0, speed, acceleration, 0)
 
 
 def down(robot: Robot, metres: float = 0.2) -> list[float]:
@@ -50,8 +59,8 @@ def down(robot: Robot, metres: float = 0.2) -> list[float]:
 
 
 def started(**spec: float) -> Robot:
-    robot = Robot(control_script.ControllerSpec(**spec))  # numbers only in these tests
-    robot.upload()
+    robot = Robot(ControllerSpec(**spec))
+    robot.upload(control_script())
     wait(robot, DT_S)
     return robot
 
@@ -73,7 +82,8 @@ def moving_asynchronously(robot: Robot) -> bool:
 
 
 def test_speed_is_reached_with_the_acceleration_and_held():
-    robot = turning(0.1)
+    # The thread for speeds starts in the cycle after the command's.
+    robot = turning(0.1 + DT_S)
     assert robot.arm.qd_rad_per_s[5] == pytest.approx(0.2)
     wait(robot, 0.9)
     # 0.4²/2·2 to get up to speed, then 0.8 s at 0.4 rad/s.
@@ -88,7 +98,7 @@ def test_without_a_watchdog_the_speed_outlives_its_client():
 
 def test_watchdog_ends_the_motion_of_a_dead_client():
     robot = started()
-    do(robot, control_script.SET_WATCHDOG, 10.0)
+    do(robot, SET_WATCHDOG, 10.0)
     turn(robot, 0.4)
     wait(robot, 0.05)
     turn(robot, 0.4)
@@ -102,20 +112,16 @@ def test_watchdog_ends_the_motion_of_a_dead_client():
 
 def test_watchdog_ends_with_its_program():
     robot = started()
-    do(robot, control_script.SET_WATCHDOG, 10.0)
-    robot.upload()
+    do(robot, SET_WATCHDOG, 10.0)
+    robot.upload(control_script())
     wait(robot, 1.0)
     assert robot.program_running
 
 
 def test_script_may_arm_its_watchdog_by_itself():
-    text = b'  rtde_set_watchdog("input_int_register_0", watchdog_min_frequency, "stop")\n'
-    assert control_script.armed_hz(text) == 0.0
-    own_hz = control_script.armed_hz(text + b'rtde_set_watchdog("input_int_register_0", 12.5, "stop")\n')
-    assert own_hz == 12.5
     robot = started()
     robot.registers.write("input_int_register_0", 0, robot.time_s)
-    robot.upload(own_hz)
+    robot.upload(control_script(DELIVERED))
     wait(robot, 0.06)
     assert robot.program_running
     wait(robot, 0.06)
@@ -124,8 +130,8 @@ def test_script_may_arm_its_watchdog_by_itself():
 
 def test_watchdog_ends_the_program_under_a_blocking_move():
     robot = started()
-    do(robot, control_script.SET_WATCHDOG, 10.0)
-    send(robot, control_script.MOVE_L, *down(robot))
+    do(robot, SET_WATCHDOG, 10.0)
+    send(robot, MOVE_L, *down(robot))
     wait(robot, 0.2)
     assert not robot.program_running
 
@@ -135,7 +141,7 @@ def test_new_program_obeys_old_registers():
     robot.end_program("test")
     wait(robot, 0.2)
     assert not robot.arm.qd_rad_per_s.any()
-    robot.upload()
+    robot.upload(control_script())
     wait(robot, 0.1)
     assert robot.arm.qd_rad_per_s[5] > 0, "a driver has to clear the registers"
 
@@ -146,7 +152,7 @@ def test_linear_move_arrives_at_the_pose_on_a_straight_line():
     target = begin.copy()
     target[:3] += (0.05, -0.03, -0.1)
     target[3:] = (Rotation.from_rotvec(begin[3:]) * Rotation.from_rotvec([0.2, 0, 0.3])).as_rotvec()
-    do(robot, control_script.MOVE_L, *target, 0.1, 0.5, asynchronous=True)
+    do(robot, MOVE_L, *target, 0.1, 0.5, asynchronous=True)
     assert moving_asynchronously(robot)
     way = target[:3] - begin[:3]
     while moving_asynchronously(robot):
@@ -162,7 +168,7 @@ def test_linear_move_arrives_at_the_pose_on_a_straight_line():
 
 def test_linear_move_out_of_reach_ends_in_a_protective_stop():
     robot = started()
-    send(robot, control_script.MOVE_L, 2.0, 0.0, 0.5, 0, math.pi, 0, 1.0, 1.0, asynchronous=True)
+    send(robot, MOVE_L, 2.0, 0.0, 0.5, 0, math.pi, 0, 1.0, 1.0, asynchronous=True)
     wait(robot, 4.0)
     assert happened(robot, "protective-stop")
     assert not robot.arm.qd_rad_per_s.any()
@@ -171,9 +177,9 @@ def test_linear_move_out_of_reach_ends_in_a_protective_stop():
 def test_asynchronous_move_is_stopped_on_command():
     robot = started()
     z_m = robot.arm.pose[2]
-    do(robot, control_script.MOVE_L, *down(robot), asynchronous=True)
+    do(robot, MOVE_L, *down(robot), asynchronous=True)
     wait(robot, 0.3)
-    do(robot, control_script.STOP_J, 2.0, asynchronous=True)
+    do(robot, STOP_J, 2.0, asynchronous=True)
     assert moving_asynchronously(robot)
     wait(robot, 0.3)
     assert not moving_asynchronously(robot)
@@ -183,7 +189,7 @@ def test_asynchronous_move_is_stopped_on_command():
 
 def test_two_threads_may_not_move_the_arm():
     robot = turning(0.1)
-    send(robot, control_script.MOVE_L, *down(robot), asynchronous=True)
+    send(robot, MOVE_L, *down(robot), asynchronous=True)
     wait(robot, 0.1)
     assert not robot.program_running
     assert "another thread" in robot._events[-1].detail or "another thread" in robot._events[-2].detail
@@ -191,8 +197,8 @@ def test_two_threads_may_not_move_the_arm():
 
 def test_after_speed_stop_a_move_is_possible():
     robot = turning(0.3)
-    assert do(robot, control_script.SPEED_STOP, 2.0) == pytest.approx(0.2, abs=0.01)
-    do(robot, control_script.MOVE_L, *down(robot), asynchronous=True)
+    assert do(robot, SPEED_STOP, 2.0) == pytest.approx(0.2, abs=0.01)
+    do(robot, MOVE_L, *down(robot), asynchronous=True)
     wait(robot, 0.1)
     assert robot.program_running
 
@@ -221,12 +227,12 @@ def test_emergency_stop_cuts_power_that_returns_in_two_steps():
     robot.release()
     robot.safety.begin_power_step(MODE_POWER_OFF, robot.time_s)
     wait(robot, 0.6)
-    robot.upload()
+    robot.upload(control_script())
     assert not robot.program_running, "the brakes are on"
     robot.safety.begin_power_step(MODE_IDLE, robot.time_s)
     wait(robot, 0.6)
     assert robot.safety.robot_mode == MODE_RUNNING
-    robot.upload()
+    robot.upload(control_script())
     assert robot.program_running
 
 
@@ -243,15 +249,15 @@ class Spring:
 
 def test_wrench_is_the_plants_torque_about_the_tool_axis():
     robot = Robot(plant=Spring())
-    robot.upload()
+    robot.upload(control_script())
     turn(robot, 0.5, 10.0)
     wait(robot, 1.0)
     expected = -2.0 * robot.arm.q_rad[5]
     # The tool points down: its axis is -z of the base.
     assert robot.arm.wrench == pytest.approx([0, 0, 0, 0, 0, -expected], abs=1e-9)
     robot.registers.write("input_int_register_0", 0, robot.time_s)
-    do(robot, control_script.SPEED_STOP, 10.0)
-    do(robot, control_script.ZERO_FT)
+    do(robot, SPEED_STOP, 10.0)
+    do(robot, ZERO_FT)
     assert robot.arm.wrench == pytest.approx(np.zeros(6), abs=1e-9)
 
 
@@ -259,7 +265,7 @@ def test_fast_arm_motion_keeps_the_controllers_time():
     springs = Spring(), Spring()
     robots = [Robot(plant=spring, pace=pace) for spring, pace in zip(springs, (1.0, 20.0), strict=True)]
     for robot, spring in zip(robots, springs, strict=True):
-        robot.upload()
+        robot.upload(control_script())
         turn(robot, 0.1, 4.0)
         wait(robot, 0.5)
         assert robot.arm.qd_rad_per_s[5] == pytest.approx(0.1), "in its own time it turns at the commanded speed"
@@ -272,9 +278,16 @@ def test_fast_arm_motion_keeps_the_controllers_time():
     assert fast.program_running
 
 
-def test_unknown_command_ends_the_program():
+def test_command_with_an_unknown_function_ends_the_program():
     robot = started()
-    send(robot, 45)
+    send(robot, MOVE_J, *[0.0] * 8)
     wait(robot, DT_S)
     assert not robot.program_running
-    assert "45" in robot._events[-1].detail
+    assert "movej" in robot._events[-1].detail
+
+
+def test_text_that_is_no_program_is_refused():
+    robot = Robot()
+    robot.upload("def unfinished():\n  while True:\nend\n")
+    assert not robot.program_running
+    assert "block" in robot._events[-1].detail

@@ -4,6 +4,7 @@ import asyncio
 import struct
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -108,6 +109,17 @@ def test_registers_in_use_and_unknown_variables_are_refused_by_name():
     assert answer == b"\x00IN_USE,IN_USE"
     ((_, answer),) = replies(rtde.receive(package(ord("O"), struct.pack(">d", 125.0) + b"timestamp,ft_raw_wrench")))
     assert answer == b"\x00DOUBLE,NOT_FOUND"
+
+
+def test_reported_tool_speed_is_the_change_of_the_pose():
+    robot = Robot()
+    robot.arm.turn(np.array([0.2, -0.1, 0.3, 0.1, -0.2, 0.4]), 100.0)
+    robot.arm.advance(0.1)
+    before, speed = np.array(variable(robot, "actual_TCP_pose")), np.array(variable(robot, "actual_TCP_speed"))
+    robot.arm.advance(1e-5)
+    change = (np.array(variable(robot, "actual_TCP_pose")) - before)[:3] / 1e-5
+    assert speed[:3] == pytest.approx(change, abs=1e-4)
+    assert np.linalg.norm(speed[:3]) > 0.1
 
 
 def test_short_vector_is_dropped():

@@ -30,11 +30,15 @@ AT_REST = messages.RtdeSample(
     q_rad=(0.0, -1.5, 1.5, -1.5, -1.5, 0.0),
     qd_rad_per_s=(0.0,) * 6,
     tcp_pose=(-0.5, -0.1, 0.5, 0.0, math.pi, 0.0),
+    tcp_speed=(0.0,) * 6,
     wrench=(0.0,) * 6,
     robot_mode=7,
     safety_mode=1,
     runtime_state=2,
     speed_scaling=1.0,
+    payload_kg=1.0,
+    payload_cog_m=(0.0, 0.0, 0.06),
+    tcp_offset=(0.0,) * 6,
     moving_linearly=False,
 )
 CYCLE_NS, WATCHDOG_NS = 8_000_000, 100_000_000
@@ -72,6 +76,7 @@ class FakeArm:
         self.reading = dataclasses.replace(
             self.reading,
             t_mono_ns=self.reading.t_mono_ns + CYCLE_NS,
+            timestamp_s=self.reading.timestamp_s + CYCLE_NS / 1e9,
             q_rad=(*self.reading.q_rad[:5], wrist),
             qd_rad_per_s=(0.0, 0.0, 0.0, 0.0, 0.0, now),
         )
@@ -100,7 +105,7 @@ class FakeArm:
         self.calls.append(call)
         self._since_call_ns = 0
 
-    def wrist(self, command: messages.WristSpeed) -> bool:
+    def wrist(self, command: messages.WristSpeed, _left_s: float) -> bool:
         self.note("wrist")
         if self.accepts:
             self.target, self.acceleration = command.rad_per_s, command.acceleration_rad_per_s2
@@ -123,7 +128,7 @@ class FakeArm:
             self.be(moving_linearly=False)
         return self.accepts
 
-    def send_heartbeat(self) -> bool:
+    def send_heartbeat(self, _left_s: float | None = None) -> bool:
         self.note("send_heartbeat")
         return True
 
@@ -171,8 +176,10 @@ class FakeArm:
 class Flight:
     """A handler, its arm and the time."""
 
-    def __init__(self, settings: UrSettings = SETTINGS, *, takes_over: bool = False) -> None:
-        self.arm = FakeArm()
+    def __init__(
+        self, settings: UrSettings = SETTINGS, *, arm: FakeArm | None = None, takes_over: bool = False
+    ) -> None:
+        self.arm = arm or FakeArm()
         self.now_ns = 10**12
         self.number = self.cycle = 0
         self.decided: dict[int, messages.CommandReply] = {}
@@ -227,8 +234,8 @@ class Flight:
         return self.arm.reading.qd_rad_per_s[5]
 
 
-def flying(settings: UrSettings = SETTINGS) -> Flight:
-    flight = Flight(settings)
+def flying(settings: UrSettings = SETTINGS, arm: FakeArm | None = None) -> Flight:
+    flight = Flight(settings, arm=arm)
     flight.fly(5)
     assert flight.ask(messages.Enable()).accepted
     flight.arm.calls.clear()

@@ -3,22 +3,39 @@
 import asyncio
 import contextlib
 import dataclasses
+import re
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+
+import pytest
 
 from shearloop.drivers.connection import LinkMonitor, LinkObserver
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, RobotState
+from shearloop.drivers.ur.script import guard_script
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 
 ROOT = Path(__file__).parents[3]
 
 
+DELIVERED = read_settings(ROOT / "config" / "ur.yaml")
+# Controllers whose scripts differ.
+VERSIONS = [(3, 10), (5, 4), (5, 17), (5, 25), (10, 10)]
+
+
+def control_script(settings: UrSettings | None = None, version: tuple[int, int] = (5, 17)) -> str:
+    """Return the control script as a controller receives it: ur-rtde's own, or with the limits of these settings."""
+    script_client = pytest.importorskip("script_client", reason="ur-rtde has wheels for CPython up to 3.12 only")
+    text = script_client.ScriptClient("", *version).getScript()
+    script = guard_script(text, settings) if settings is not None else f"def rtde_control():\n{text}end\n"
+    # ur-rtde inserts the registers' numbers when it sends it.
+    return re.sub(r"(# (?:float|int) register offset\n)", r"\g<1>0", script)
+
+
 def settings_for(host: str, **changes: object) -> UrSettings:
     """Return the delivered settings, with a wrist speed that holds until its test has seen it."""
-    delivered = read_settings(ROOT / "config" / "ur.yaml")
     changes = {"command_timeout_s": 0.3, "silence_timeout_s": 0.3, **changes}
-    return dataclasses.replace(delivered, host=host, **changes)
+    return dataclasses.replace(DELIVERED, host=host, **changes)
 
 
 @contextlib.asynccontextmanager

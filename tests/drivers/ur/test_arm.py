@@ -11,11 +11,13 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from shearloop.drivers.ur.controller import ReceivedSample
+from shearloop.drivers.ur.controller import ProbeError, ReceivedSample
 from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
 from tests.drivers.ur.flight import SETTINGS
 
 SIX = (0.0,) * 6
+FIVE = (SIX,) * 5
+TOOL = (1.0, (0.0, 0.0, 0.06), SIX)
 VERSION = "5.17.3.0"
 
 
@@ -28,11 +30,14 @@ class Client:
         self.connected = True
 
     def getScript(self) -> str:  # noqa: N802 - ur-rtde's name
-        return "        keep_running = True\n"
+        return "    thread speed_thread():\n    end\n        keep_running = True\n"
+
+    def write_deadline(self, script_s: float) -> None:
+        """Take it."""
 
     def latest(self) -> ReceivedSample:
         """Return a sample of a program that ended during a command."""
-        return ReceivedSample(1.0, SIX, SIX, SIX, SIX, 7, 1, 1, 1.0, 2)
+        return ReceivedSample(1.0, *FIVE, 7, 1, 1, 1.0, *TOOL, 2)
 
 
 @pytest.fixture
@@ -55,7 +60,7 @@ def test_sample_that_waited_in_the_socket_is_old(arm, monkeypatch):
     monkeypatch.setattr(arm.time, "monotonic_ns", lambda: now_ns)
     monkeypatch.setattr(reader, "_control", SimpleNamespace(isConnected=lambda: True))
     for number, waited_ns in enumerate([0, 0, 200_000_000]):
-        sample = ReceivedSample(50.0 + 0.008 * number, SIX, SIX, SIX, SIX, 7, 1, 2, 1.0, 1)
+        sample = ReceivedSample(50.0 + 0.008 * number, *FIVE, 7, 1, 2, 1.0, *TOOL, 1)
         monkeypatch.setattr(reader, "_receiver", SimpleNamespace(latest=lambda it=sample: it, connected=True))
         now_ns = 10**12 + 8_000_000 * number + waited_ns
         assert reader.read().age_ns == pytest.approx(waited_ns, abs=3_000_000)
@@ -107,14 +112,16 @@ def test_progress_is_queried_only_for_a_linear_move(arm, monkeypatch):
         arm,
         "RtdeReceiver",
         lambda *_: SimpleNamespace(
-            connected=True, latest=lambda: ReceivedSample(float(next(times_s)), SIX, SIX, SIX, SIX, 7, 1, 2, 1.0, 1)
+            connected=True,
+            latest=lambda: ReceivedSample(float(next(times_s)), *FIVE, 7, 1, 2, 1.0, *TOOL, 1),
+            write_deadline=lambda _: None,
         ),
     )
     one = arm.UrArm(SETTINGS, VERSION)
     assert not one.read().moving_linearly
     one.move(MoveLinear(SIX, 0.1, 0.1))
     assert [one.read().moving_linearly for _ in range(3)] == [True] * 3
-    one.wrist(WristSpeed(0.1, 1.0))
+    one.wrist(WristSpeed(0.1, 1.0), 0.1)
     assert not one.read().moving_linearly
     assert one._control.asked == 3
 
@@ -145,7 +152,7 @@ def test_no_call_blocks_when_no_program_runs(arm, monkeypatch):
     one = arm.UrArm(SETTINGS, VERSION)
     assert one.zero_wrench()
     assert not one.send_heartbeat()
-    assert not one.wrist(WristSpeed(0.1, 1.0))
+    assert not one.wrist(WristSpeed(0.1, 1.0), 0.1)
     assert not one.move(MoveLinear(SIX, 0.1, 0.1))
     assert not one.stop_move(1.0)
     assert not one.end_speed(1.0)
@@ -202,19 +209,28 @@ def test_sent_script_arms_its_watchdog(arm, monkeypatch):
         def setCustomScriptFile(self, path: str) -> None:  # noqa: N802 - ur-rtde's name
             self.sent = Path(path).read_text()
 
-        def reuploadScript(self) -> bool:  # noqa: N802
-            self.sent = "its own"
-            return True
-
     monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Sending)
     one = arm.UrArm(SETTINGS, VERSION)
     assert one.upload()
     assert 'rtde_set_watchdog("input_int_register_0", 10, "stop")' in one._control.sent
 
+
+def test_unknown_script_is_refused(arm, monkeypatch):
+    """Without its deadline the wrist could turn on."""
     monkeypatch.setattr(arm.script_client.ScriptClient, "getScript", lambda _: "of another form\n")
-    other = arm.UrArm(SETTINGS, VERSION)
-    assert other.upload()
-    assert other._control.sent == "its own"
+    with pytest.raises(ProbeError, match="unknown, so that its limits"):
+        arm.UrArm(SETTINGS, VERSION)
+
+
+def test_deadline_counts_from_the_latest_sample(arm, monkeypatch):
+    written: list[float] = []
+    sample = ReceivedSample(1.0, *FIVE, 7, 1, 2, 1.0, *TOOL, 1, 20.0)
+    receiver = SimpleNamespace(latest=lambda: sample, write_deadline=written.append, connected=True)
+    monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Controlled)
+    monkeypatch.setattr(arm, "RtdeReceiver", lambda *_: receiver)
+    one = arm.UrArm(SETTINGS, VERSION)
+    assert one.wrist(WristSpeed(0.1, 1.0), 0.07)
+    assert written == [pytest.approx(20.07)]
 
 
 def test_connection_that_takes_no_script_is_lost(arm, monkeypatch, capsys):

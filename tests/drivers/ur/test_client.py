@@ -13,6 +13,7 @@ import pytest
 from shearloop.drivers.connection import LinkObserver
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed, ZeroForceTorque
+from shearloop.drivers.ur.settings import InstalledTool
 from tests.drivers.ur.robots import ROOT, enable, pid_of, running, settings_for, until
 from tests.emulator_process import EmulatorProcess as ControllerProcess
 from tests.running import LinkEvents
@@ -225,7 +226,11 @@ async def test_silent_controller_is_reported_and_the_robot_stops(controller):
     [
         ("registers-in-use", "registers-in-use", "EtherNet/IP or PROFINET"),
         ("local-control", "local-control", "switch it to remote control"),
-        ("refuse-protocol", "version", "PolyScope 3.10 or 5.4"),
+        ("refuse-protocol", "version", "PolyScope 3.10 (CB3) or 5.4 (e-Series)"),
+        ("version 5.0.0.0", "version", "has PolyScope 5.0.0.0, which cannot be driven"),
+        ("version 3.9.1.0", "version", "has PolyScope 3.9.1.0, which cannot be driven"),
+        ("version 10.7.0.0", "version", "has PolyScope 10.7.0.0, which cannot be driven"),
+        ("mute-dashboard", "silent", "while asking its dashboard server (port 29999): it is starting, hangs"),
     ],
 )
 async def test_connection_that_is_refused_is_explained(controller, fault, kind, said):
@@ -238,6 +243,40 @@ async def test_connection_that_is_refused_is_explained(controller, fault, kind, 
         assert said in (await robot.send(Enable())).refusal
 
 
+async def test_unsupported_controller_does_not_restart_the_worker(controller):
+    await controller.fault("version 5.3.9.0")
+    link = LinkEvents()
+    async with running(settings_for(controller.host), link) as robot:
+        await link.down()
+        # The first pause of other losses is 0.2 s.
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(1.0):
+                await link.down(2)
+        assert robot.losses == {"version": 1}
+
+
+async def test_controller_that_is_newer_than_the_tested_ones_is_driven_with_a_warning(controller):
+    await controller.fault("version 5.18.0.0")
+    link = LinkEvents()
+    async with running(settings_for(controller.host), link) as robot:
+        await enable(robot)
+        assert "PolyScope 5.18.0.0 is newer than 5.17.3" in robot.link.latest.sentence
+
+
+async def test_another_payload_than_the_configured_one_refuses_motion(controller):
+    async with running(
+        settings_for(controller.host, tool=InstalledTool(payload_kg=1.0, tcp_offset=(0.0,) * 6))
+    ) as robot:
+        await enable(robot)
+        await controller.fault("payload 1.4")
+        state = await until(robot, lambda state: state.payload_kg == 1.4)
+        assert "The controller has payload_kg 1.4, the robot's settings have 1:" in state.blocked
+        assert "payload_kg" in (await robot.send(Enable())).refusal
+        await controller.fault("payload 1.0")
+        await until(robot, lambda state: state.payload_kg == 1.0)
+        assert (await robot.send(Enable())).accepted
+
+
 @pytest.mark.parametrize("told", [None, signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 async def test_leaving_stops_the_arm_and_ends_the_program(told, controller):
     """Also when a terminal or service manager signals every process."""
@@ -248,7 +287,7 @@ async def test_leaving_stops_the_arm_and_ends_the_program(told, controller):
     stopped = await controller.event("motion-stopped", left_ns)
     ended = await controller.event("program-ended", left_ns)
     assert ended["t_mono_ns"] >= stopped["t_mono_ns"]
-    assert ended["detail"] == "the client ended it"
+    assert ended["detail"] == "it has run to its end"
 
 
 DAEMON = """
@@ -258,7 +297,7 @@ from shearloop.drivers.ur.messages import Enable, WristSpeed
 from tests.drivers.ur.robots import pid_of, settings_for, until
 
 async def main():
-    robot = UrRobot(settings_for(sys.argv[1]))
+    robot = UrRobot(settings_for(sys.argv[1], command_timeout_s=0.1, silence_timeout_s=0.1))
     task = asyncio.create_task(robot.run())
     await until(robot, lambda state: state.program_running and not state.recovering)
     await robot.send(Enable())
@@ -270,6 +309,25 @@ async def main():
 
 asyncio.run(main())
 """
+
+
+@pytest.mark.parametrize("worker_hangs", [False, True])
+async def test_wrist_stops_when_the_daemon_hangs(controller, worker_hangs):
+    daemon = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", DAEMON, controller.host, stdout=asyncio.subprocess.PIPE, cwd=ROOT
+    )
+    worker = int(await daemon.stdout.readline())
+    hung_ns = time.monotonic_ns()
+    daemon.send_signal(signal.SIGSTOP)
+    if worker_hangs:
+        os.kill(worker, signal.SIGSTOP)
+    try:
+        stopped = await controller.event("motion-stopped", hung_ns)
+        assert stopped_after_s(stopped, hung_ns) <= STOPPED_WITHIN_S
+    finally:
+        for pid in (daemon.pid, worker):
+            os.kill(pid, signal.SIGKILL)
+        await daemon.communicate()
 
 
 async def test_killed_daemon_leaves_a_resting_robot_and_no_process(controller):
@@ -289,5 +347,5 @@ async def test_killed_daemon_leaves_a_resting_robot_and_no_process(controller):
     finally:
         asyncio.get_running_loop().remove_reader(worker)
         os.close(worker)
-    assert (await controller.event("program-ended", killed_ns))["detail"] == "the client ended it"
+    assert (await controller.event("program-ended", killed_ns))["detail"] == "it has run to its end"
     await daemon.communicate()

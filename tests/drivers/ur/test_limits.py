@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -9,9 +10,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, WristSpeed
+from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
 from shearloop.drivers.ur.motion import clip_linear, clip_stop, clip_wrist, is_close, line_violation, violation
-from tests.drivers.ur.flight import AT_REST, LIMITS, SETTINGS
+from shearloop.drivers.ur.settings import InstalledTool
+from tests.drivers.ur.flight import AT_REST, LIMITS, POSE, SETTINGS, flying
 
 CYCLE_S = 0.008
 
@@ -96,14 +98,102 @@ def test_linear_move_ends_within_the_workspace_and_reports_clipping(asked):
     assert len(reasons) == changes
 
 
-def test_every_hard_limit_is_named():
-    assert violation(AT_REST, LIMITS) == ""
-    assert "Joint 3" in violation(dataclasses.replace(AT_REST, q_rad=(0.0, 0.0, 3.01, 0.0, 0.0, 0.0)), LIMITS)
-    assert "z = -0.010 m" in violation(dataclasses.replace(AT_REST, tcp_pose=(0.0, 0.0, -0.01, 0.0, 0.0, 0.0)), LIMITS)
-    assert "Wrist speed" in violation(reading(speed=-1.01), LIMITS)
-    assert "Force is 60.10 N" in violation(reading(force_n=60.1), LIMITS)
-    assert "Torque" in violation(reading(torque_nm=6.1), LIMITS)
-    assert "no numbers" in violation(reading(force_n=math.nan), LIMITS)
+def six(index: int, value: float) -> tuple[float, ...]:
+    """Return zeros with one value."""
+    return tuple(value if index == number else 0.0 for number in range(6))
+
+
+JOINTS, BOX = LIMITS.joints, LIMITS.workspace
+# Each measured value: the words of its message, the changes of the sample, and its hard limit.
+MEASURED: list[tuple[str, Callable[[float], dict[str, object]], float]] = [
+    *((f"Joint {n + 1} is at", lambda v, n=n: {"q_rad": six(n, v)}, JOINTS.upper_rad[n]) for n in range(6)),
+    *((f"Joint {n + 1} is at", lambda v, n=n: {"q_rad": six(n, -v)}, -JOINTS.lower_rad[n]) for n in range(6)),
+    *((f"at {'xyz'[n]} =", lambda v, n=n: {"tcp_pose": six(n, v)}, BOX.upper_m[n]) for n in range(3)),
+    *((f"at {'xyz'[n]} =", lambda v, n=n: {"tcp_pose": six(n, -v)}, -BOX.lower_m[n]) for n in range(3)),
+    *((f"Joint {n + 1} speed", lambda v, n=n: {"qd_rad_per_s": six(n, v)}, LIMITS.wrist_speed_rad_per_s.hard)
+      for n in range(5)),
+    ("Wrist speed", lambda v: {"qd_rad_per_s": six(5, -v)}, LIMITS.wrist_speed_rad_per_s.hard),
+    *(("Tool speed", lambda v, n=n: {"tcp_speed": six(n, v)}, LIMITS.linear_speed_m_per_s.hard) for n in range(3)),
+    *(("Force", lambda v, n=n: {"wrench": six(n, -v)}, LIMITS.force_n.hard) for n in range(3)),
+    *(("Torque", lambda v, n=n: {"wrench": six(n, v)}, LIMITS.torque_nm.hard) for n in range(3, 6)),
+]  # fmt: skip
+
+
+@settings(max_examples=3, deadline=None)
+@pytest.mark.parametrize("command", [WristSpeed(0.3, 4.0), MoveLinear(POSE, 0.1, 0.1)], ids=["twist", "line"])
+@pytest.mark.parametrize(("named", "changes", "hard"), MEASURED)
+@given(share=st.floats(1.001, 100.0))
+def test_measured_value_beyond_its_hard_limit_stops_every_motion(command, named, changes, hard, share):
+    flight = flying()
+    assert flight.ask(command).accepted
+    flight.fly(20)
+    moving = flight.state.motion
+    flight.arm.be(**changes(max(share * hard, hard + 1e-6)))
+    flight.fly(1)
+    assert flight.state.motion == "stopping" != moving
+    assert named in flight.state.end_reason
+    assert named in flight.ask(command).refusal
+
+
+@settings(max_examples=20, deadline=None)
+@pytest.mark.parametrize(
+    ("named", "command", "changes", "bound"),
+    [
+        ("Wrist acceleration", WristSpeed(0.3, 4.0), "qd_rad_per_s", LIMITS.wrist_acceleration_rad_per_s2),
+        ("Tool acceleration", WristSpeed(0.3, 4.0), "tcp_speed", LIMITS.linear_acceleration_m_per_s2),
+        ("Tool acceleration", MoveLinear(POSE, 0.1, 0.1), "tcp_speed", LIMITS.linear_acceleration_m_per_s2),
+    ],
+)
+@given(share=st.floats(0.01, 0.99) | st.floats(1.01, 2.0), index=st.integers(0, 2))
+def test_measured_acceleration_beyond_its_hard_limit_stops_the_motion(named, command, changes, bound, share, index):
+    flight = flying()
+    assert flight.ask(command).accepted
+    for cycle in range(8):
+        speed = share * bound.hard * CYCLE_S * cycle
+        flight.arm.be(**{changes: six(5 if changes == "qd_rad_per_s" else index, speed)})
+        flight.fly(1)
+    assert (named in flight.state.end_reason) == (share > 1)
+
+
+def test_a_stop_may_brake_harder_than_a_motion_may_accelerate():
+    flight = flying()
+    assert flight.ask(WristSpeed(0.3, 4.0)).accepted
+    flight.fly(20)
+    assert flight.ask(Stop(4.0)).accepted
+    for speed in (0.1, 0.0, 0.0, 0.0):
+        flight.arm.be(tcp_speed=six(0, speed))
+        flight.fly(1)
+    flight.fly_until(lambda state: state.motion == "idle")
+    assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
+    flight.fly(10)
+    assert flight.state.motion == "linear"
+
+
+@pytest.mark.parametrize(
+    ("configured", "reported", "differs"),
+    [
+        ({}, {}, ""),
+        ({}, {"payload_kg": math.nan, "tcp_offset": (math.nan,) * 6}, ""),
+        ({"payload_kg": 1.0, "payload_cog_m": (0.0, 0.0, 0.06), "tcp_offset": (0.0,) * 6}, {}, ""),
+        ({"payload_kg": 1.0}, {"payload_kg": 1.009}, ""),
+        ({"payload_kg": 1.0}, {"payload_kg": 1.02}, "payload_kg 1.02, the robot's settings have 1:"),
+        ({"payload_kg": 0.0}, {"payload_kg": math.nan}, "payload_kg unknown, the robot's settings have 0:"),
+        ({"payload_cog_m": (0.0, 0.0, 0.06)}, {"payload_cog_m": (0.0, 0.002, 0.06)}, "payload_cog_m 0, 0.002, 0.06"),
+        ({"tcp_offset": (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)}, {}, "tcp_offset 0, 0, 0, 0, 0, 0"),
+        ({"tcp_offset": (0.0,) * 6}, {"tcp_offset": (0.0, 0.0, 0.0, 0.01, 0.0, 0.0)}, "tcp_offset"),
+    ],
+)
+def test_tool_must_be_as_configured(configured, reported, differs):
+    found = violation(
+        dataclasses.replace(AT_REST, **reported), dataclasses.replace(SETTINGS, tool=InstalledTool(**configured))
+    )
+    assert differs in found if differs else not found
+
+
+def test_values_that_are_no_numbers_stop():
+    assert violation(AT_REST, SETTINGS) == ""
+    assert "no numbers" in violation(reading(force_n=math.nan), SETTINGS)
+    assert "no numbers" in violation(dataclasses.replace(AT_REST, tcp_speed=six(0, math.nan)), SETTINGS)
 
 
 def test_linear_move_is_watched_at_the_inner_limits():

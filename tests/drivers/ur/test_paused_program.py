@@ -24,7 +24,7 @@ PAUSED = 4
 async def begin_foreign_program(controller: ControllerProcess) -> None:
     since_ns = time.monotonic_ns()
     _, writer = await asyncio.open_connection(controller.host, SCRIPT_PORT)
-    writer.write(b"def theirs():\n  sync()\nend\n")
+    writer.write(b"def theirs():\n  while True:\n    sync()\n  end\nend\n")
     await controller.event("program-started", since_ns)
     writer.close()
     await writer.wait_closed()

@@ -1,10 +1,12 @@
 """RTDE samples from bytes and on a connection."""
 
 import errno
+import math
 import socket
 import struct
 import threading
 from collections.abc import Callable, Iterator
+from typing import Any
 from unittest import mock
 
 import pytest
@@ -15,17 +17,22 @@ from shearloop.drivers.errors import ProtocolError
 from shearloop.drivers.ur import controller as receiver_module
 from shearloop.drivers.ur.controller import ProbeError, ReceivedSample, RtdeReceiver, SampleParser
 
-TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,INT32"
+TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,INT32,DOUBLE"
+TOOL_TYPES = TYPES + b",DOUBLE,VECTOR3D,VECTOR6D"
+# The answer of a controller before PolyScope 5.5.1.
+WITHOUT_TOOL = TYPES + b",NOT_FOUND,NOT_FOUND,NOT_FOUND"
+TOOL = (1.5, 0.1, 0.2, 0.3, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 
 
 def package(kind: bytes, payload: bytes) -> bytes:
     return struct.pack(">Hc", 3 + len(payload), kind) + payload
 
 
-def data(number: int) -> bytes:
+def data(number: int, *, tool: bool = True) -> bytes:
     """Return the package of a sample with this timestamp."""
-    values = [number + 0.01 * index for index in range(24)]
-    return package(b"U", b"\x01" + struct.pack(">d24diiIdi", number, *values, 7, -1, 2, 0.5, 1))
+    values = [round(number + 0.01 * index, 2) for index in range(30)]
+    content = struct.pack(">d30diiIdid", number, *values, 7, -1, 2, 0.5, 1, 9.5)
+    return package(b"U", b"\x01" + content + (struct.pack(">10d", *TOOL) if tool else b""))
 
 
 def text(length: int) -> bytes:
@@ -39,12 +46,17 @@ def test_sample_has_the_values_in_their_order():
         q_rad=(3.0, 3.01, 3.02, 3.03, 3.04, 3.05),
         qd_rad_per_s=(3.06, 3.07, 3.08, 3.09, 3.1, 3.11),
         tcp_pose=(3.12, 3.13, 3.14, 3.15, 3.16, 3.17),
-        wrench=(3.18, 3.19, 3.2, 3.21, 3.22, 3.23),
+        tcp_speed=(3.18, 3.19, 3.2, 3.21, 3.22, 3.23),
+        wrench=(3.24, 3.25, 3.26, 3.27, 3.28, 3.29),
         robot_mode=7,
         safety_mode=-1,
         runtime_state=2,
         speed_scaling=0.5,
+        payload_kg=1.5,
+        payload_cog_m=(0.1, 0.2, 0.3),
+        tcp_offset=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0),
         script_state=1,
+        script_s=9.5,
     )
 
 
@@ -73,24 +85,30 @@ def test_invalid_package_is_refused(bad):
 class Controller:
     """A controller's port with scripted answers."""
 
-    def __init__(self, types: bytes = TYPES, started: bytes = b"\x01") -> None:
+    def __init__(
+        self, types: tuple[bytes, ...] = (TOOL_TYPES,), started: bytes = b"\x01", inputs: bytes = b"\x01DOUBLE"
+    ) -> None:
         self._listening = socket.create_server(("127.0.0.1", 0))
         self.port = self._listening.getsockname()[1]
-        self._answers = {b"V": b"\x01", b"O": b"\x01" + types, b"S": started}
+        self._answers = {b"V": [b"\x01"], b"O": [b"\x01" + one for one in types], b"I": [inputs], b"S": [started]}
         self.asked: dict[bytes, bytes] = {}
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
 
     def _serve(self) -> None:
         self._peer, _ = self._listening.accept()
-        while len(self.asked) < len(self._answers):
+        while any(self._answers.values()):
             header = self._peer.recv(3, socket.MSG_WAITALL)
             if not header:
                 return
             size, kind = struct.unpack(">Hc", header)
             self.asked[kind] = self._peer.recv(size - 3, socket.MSG_WAITALL)
-            self._peer.sendall(package(kind, self._answers[kind]))
-        self._peer.sendall(data(1))
+            self._peer.sendall(package(kind, self._answers[kind].pop(0)))
+        self._peer.sendall(data(1, tool=self.asked[b"O"].endswith(b"tcp_offset")))
+
+    def receive(self, size: int) -> bytes:
+        self._thread.join()
+        return self._peer.recv(size, socket.MSG_WAITALL)
 
     def send(self, stream: bytes) -> None:
         self._thread.join()
@@ -106,7 +124,7 @@ class Controller:
 def play(monkeypatch) -> Iterator[Callable[..., Controller]]:
     played: list[Controller] = []
 
-    def begin(*answers: bytes) -> Controller:
+    def begin(*answers: Any) -> Controller:
         played.append(Controller(*answers))
         monkeypatch.setattr(receiver_module, "RTDE_PORT", played[-1].port)
         return played[-1]
@@ -139,6 +157,27 @@ def test_outputs_are_requested_at_the_rate_and_the_newest_kept(play):
     assert not receiver.wait(5.0)
 
 
+def test_deadline_is_written_to_its_register(play):
+    controller = play((TOOL_TYPES,), b"\x01", b"\x05DOUBLE")
+    receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
+    assert controller.asked[b"I"] == b"input_double_register_24"
+    receiver.write_deadline(20.25)
+    assert controller.receive(12) == package(b"U", b"\x05" + struct.pack(">d", 20.25))
+    receiver.close()
+    receiver.write_deadline(20.5)
+    assert not receiver.connected
+
+
+def test_controller_without_payload_and_tool_centre_point_is_accepted(play):
+    play((WITHOUT_TOOL, TYPES))
+    receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
+    sample = receiver.latest()
+    receiver.close()
+    assert sample.script_state == 1
+    assert math.isnan(sample.payload_kg)
+    assert all(map(math.isnan, (*sample.payload_cog_m, *sample.tcp_offset)))
+
+
 @pytest.mark.parametrize("last", [b"", package(b"U", bytes(8))])
 def test_closed_or_invalid_stream_is_a_lost_connection(play, last):
     controller = play()
@@ -167,7 +206,11 @@ def test_network_error_is_a_lost_connection(play, number):
 
 @pytest.mark.parametrize(
     ("answers", "told"),
-    [((TYPES.replace(b"UINT32", b"NOT_FOUND"),), "NOT_FOUND"), ((TYPES, b"\x00"), "does not send its state")],
+    [
+        (((TOOL_TYPES.replace(b"UINT32", b"NOT_FOUND"), TYPES.replace(b"UINT32", b"NOT_FOUND")),), "NOT_FOUND"),
+        (((TOOL_TYPES,), b"\x00"), "does not send its state"),
+        (((TOOL_TYPES,), b"\x01", b"\x00IN_USE"), "already in use by another RTDE client"),
+    ],
 )
 def test_controller_without_the_needed_outputs_is_refused(play, answers, told):
     play(*answers)

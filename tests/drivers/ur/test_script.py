@@ -1,12 +1,13 @@
-"""The control script as sent: ur-rtde's own, with its watchdog armed before its loop."""
+"""The control script as sent: ur-rtde's own, with our limits."""
 
 import asyncio
+import difflib
 import sys
 
 import pytest
 
-from shearloop.drivers.ur.arm import arm_watchdog_in
-from tests.drivers.ur.robots import ROOT
+from shearloop.drivers.ur.script import guard_script
+from tests.drivers.ur.robots import DELIVERED, ROOT, control_script
 
 # Uploads the script, and is gone before the watchdog is armed by a command.
 DIES_TOO_SOON = """
@@ -21,24 +22,25 @@ os._exit(0)
 """
 
 
-def test_script_differs_by_one_line_before_its_loop():
-    script_client = pytest.importorskip("script_client", reason="ur-rtde has wheels for CPython up to 3.12 only")
-    text = script_client.ScriptClient("", 5, 17).getScript()
-    program = arm_watchdog_in(text, 10.0)
-    lines, its = program.splitlines(), ["def rtde_control():", *text.splitlines(), "end"]
-    (at,) = [number for number, line in enumerate(lines) if "rtde_set_watchdog(" in line and ", 10," in line]
-    assert lines[at].strip() == 'rtde_set_watchdog("input_int_register_0", 10, "stop")'
-    assert lines[:at] + lines[at + 1 :] == its
-    (loop,) = [number for number, line in enumerate(lines) if line.strip() == "while keep_running:"]
-    assert at < loop
+def test_script_differs_in_its_speed_thread_and_before_its_loop():
+    own, guarded = control_script().splitlines(), control_script(DELIVERED).splitlines()
+    *speeds, start = [
+        change
+        for change in difflib.SequenceMatcher(None, own, guarded, autojunk=False).get_opcodes()
+        if change[0] != "equal"
+    ]
+    first, after = own.index("    thread speed_thread():"), own.index("    thread servo_thread():")
+    assert all(first <= begin <= end < after for _, begin, end, *_ in speeds)
+    _, begin, end, here, _ = start
+    assert begin == end < own.index("        while keep_running:")
+    assert guarded[here].strip() == 'rtde_set_watchdog("input_int_register_0", 10, "stop")'
     # What comes before it in the program itself, beside functions, reads nothing.
-    assert not any("read_input" in line for line in lines[at:loop])
-    assert program.endswith("\nend\n")
+    assert not any("read_input" in line for line in own[own.index("# HEADER_END") : begin])
 
 
-def test_unknown_script_is_not_changed():
-    assert not arm_watchdog_in("def other():\n  sync()\nend\n", 10.0)
-    assert not arm_watchdog_in("        keep_running = True\n" * 2, 10.0)
+def test_unknown_script_is_not_guarded():
+    assert not guard_script("def other():\n  sync()\nend\n", DELIVERED)
+    assert not guard_script("        keep_running = True\n" * 2, DELIVERED)
 
 
 @pytest.mark.real_time

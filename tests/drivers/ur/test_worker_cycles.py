@@ -33,9 +33,9 @@ def test_command_is_sent_on_arrival_and_in_each_cycle(timed):
     sent_s: list[float] = []
 
     class Turned(TimedArm):
-        def wrist(self, command: WristSpeed) -> bool:
+        def wrist(self, command: WristSpeed, left_s: float) -> bool:
             sent_s.append(worker.time.monotonic() - 1000.0)
-            return super().wrist(command)
+            return super().wrist(command, left_s)
 
     timed((0.1, Enable()), (0.203, WristSpeed(0.1, 4.0)), (0.3, Disconnect()), arm=Turned())
     assert sent_s[:4] == pytest.approx([0.203, 0.208, 0.216, 0.224])
@@ -45,9 +45,9 @@ def test_command_is_sent_on_arrival_and_in_each_cycle(timed):
 @pytest.mark.parametrize("stopped_s", [0.2001, 0.2005, 0.2079])
 def test_protective_stop_seen_late_is_reported_as_such(timed, stopped_s):
     class Late(TimedArm):
-        def wrist(self, command: WristSpeed) -> bool:
+        def wrist(self, command: WristSpeed, left_s: float) -> bool:
             self.accepts = worker.time.monotonic() < 1000.0 + stopped_s
-            return super().wrist(command)
+            return super().wrist(command, left_s)
 
         def read(self) -> RtdeSample:
             if worker.time.monotonic() > 1000.003 + stopped_s and self.reading.safety_mode == 1:

@@ -1,11 +1,10 @@
-"""Records the emulated rig and calibrates its fingertips: `python -m shearloop.daemon.cli.calibrate_demo`.
+"""Records the emulated rig and calibrates its fingertips, for `shearloop demo`.
 
 As on a real rig, a recording holds idle frames, a grip, twists with the load cell's torque, and idle frames again, for
 several cylinders. It runs on the emulated rig's physics in simulated time, so that a seed always gives the same files:
 `rig-DDmm.mcap`, `rig.cal` for both fingertips together, and one calibration for each of them.
 """
 
-import argparse
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -14,10 +13,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.bank.eit.channels import channels_of_line
+from shearloop.bank.eit.channels import ChannelTable
 from shearloop.bank.estimation import Calibration, FrameSeries, fit, measure_timing
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.series import series_of
+from shearloop.daemon.cli.terminal import progress_bar
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.schema import DIAMETER_NOTE
 from shearloop.daemon.recording.writer import RecordingWriter
@@ -30,6 +30,9 @@ from shearloop.drivers.emulators.scene import Scene
 
 # Three diameters are enough to interpolate; five halve the interval.
 DIAMETERS_MM = (10.0, 17.5, 25.0, 32.5, 40.0)
+# Each seed gives other noise and other twists.
+SEED = 7
+SOURCE = "the emulated rig, by `shearloop demo`"
 # The time step; about the duration of an injection.
 STEP_S = 0.02
 IDLE_S, SETTLE_S = 12.0, 10.0
@@ -44,7 +47,7 @@ Sides = tuple[str, ...]
 
 
 def lines_of(scene: Scene, frames: RigFrames) -> list[NDArray[np.float64]]:
-    """Return the lines of both boards, (1024,) in volts, for frames that end now."""
+    """Return the lines of both boards, (v,) in volts, for frames that end now."""
     gel = scene.frame(FRAME_PERIOD_S)
     return [frames.line(gel.grip, sign * gel.shear_torque_nm, gel.diameter_mm) for sign in SIDES.values()]
 
@@ -53,6 +56,7 @@ def lines_of(scene: Scene, frames: RigFrames) -> list[NDArray[np.float64]]:
 class RecordedTwists:
     """Frames and torques with their simulated times."""
 
+    table: ChannelTable
     frame_s: list[float] = field(default_factory=list)
     lines: list[list[NDArray[np.float64]]] = field(default_factory=list)
     torque_s: list[float] = field(default_factory=list)
@@ -61,14 +65,16 @@ class RecordedTwists:
     def series(self, diameter_mm: float) -> FrameSeries:
         """Return the series that a reader makes of the recording."""
         t_s = np.array(self.frame_s)
-        channels = np.array([[channels_of_line(line) for line in pair] for pair in self.lines])
+        channels = np.array([[self.table.channels_of_line(line) for line in pair] for pair in self.lines])
         torque = np.array(self.torque_s), np.array(self.torque_nm)
-        return FrameSeries("raw", tuple(SIDES), t_s, channels, *torque, np.full(len(t_s), diameter_mm))
+        return FrameSeries(
+            "raw", tuple(SIDES), t_s, channels, *torque, np.full(len(t_s), diameter_mm), table=self.table
+        )
 
     def write(self, path: Path, diameter_mm: float) -> None:
         """Write a recording that begins at the Unix time 0."""
         notes = {DIAMETER_NOTE: f"{diameter_mm:g}"}
-        with RecordingWriter(path, "the emulated rig, by shearloop.daemon.cli.calibrate_demo", notes) as writer:
+        with RecordingWriter(path, SOURCE, notes, self.table) as writer:
             for t_s, pair in zip(self.frame_s, self.lines, strict=True):
                 for side, line in zip(SIDES, pair, strict=True):
                     writer.add_frame(side, round(t_s * 1e9), round((t_s + FRAME_PERIOD_S / 2) * 1e9), line)
@@ -80,7 +86,7 @@ class TwistPlayer:
     """One scene with a tool, and its recording."""
 
     def __init__(self, frames: RigFrames, diameter_mm: float, seed: int) -> None:
-        self.recorded = RecordedTwists()
+        self.recorded = RecordedTwists(frames.table)
         self._random = np.random.default_rng(seed)
         self._frames = frames
         self._gripper = Gripper(object_mm=diameter_mm)
@@ -149,35 +155,26 @@ def record(
 def calibrate(recordings: list[FrameSeries], sides: Sides) -> Calibration:
     """Return the default estimator's calibration for these fingertips."""
     chosen = [one.select_sides(sides) for one in recordings]
-    source = "the emulated rig, by shearloop.daemon.cli.calibrate_demo"
-    return fit("motion_regression", chosen, source, timing=measure_timing(chosen, recordings))
+    return fit("motion_regression", chosen, SOURCE, timing=measure_timing(chosen, recordings))
 
 
-def main() -> None:
-    """Record, calibrate, and print the calibrations' accuracy on a separate recording."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--bank", type=Path, required=True)
-    parser.add_argument("--out", type=Path, required=True, help="folder for recordings and calibrations")
-    parser.add_argument("--seed", type=int, default=7)
-    args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
+def calibrate_rig(bank: Path, folder: Path) -> None:
+    """Record and calibrate into a folder, and print the calibrations' accuracy on a separate recording."""
     recordings = []
-    for diameter_mm, recorded in record(args.bank, args.seed):
-        path = args.out / f"rig-{diameter_mm:g}mm.mcap"
-        recorded.write(path, diameter_mm)
-        recordings.append(series_of(read_recording(path)))
-    apart = [recorded.series(mm) for mm, recorded in record(args.bank, args.seed + 100, (20.0,))]
+    with progress_bar("recordings", len(DIAMETERS_MM), "cylinder") as show:
+        for number, (diameter_mm, recorded) in enumerate(record(bank, SEED), 1):
+            path = folder / f"rig-{diameter_mm:g}mm.mcap"
+            recorded.write(path, diameter_mm)
+            recordings.append(series_of(read_recording(path)))
+            show(number)
+    apart = [recorded.series(mm) for mm, recorded in record(bank, SEED + 100, (20.0,))]
     both: Sides = tuple(SIDES)
     for sides in itertools.chain([both], ((side,) for side in both)):
         calibration = calibrate(recordings, sides)
-        path = args.out / ("rig.cal" if sides == both else f"rig-{sides[0]}.cal")
+        path = folder / ("rig.cal" if sides == both else f"rig-{sides[0]}.cal")
         calibration.save(path)
         figures = figures_of([estimate_series(calibration, one) for one in apart])
         print(
             f"{path}: torque ± {figures['rmse_nm']:.4f} N·m, diameter ± {figures['diameter_rmse_mm']:.1f} mm, "
             f"valid {figures['valid_fraction']:.2f} of the frames, intervals cover {figures['coverage_95']:.2f}"
         )
-
-
-if __name__ == "__main__":
-    main()

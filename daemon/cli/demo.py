@@ -1,0 +1,119 @@
+"""`shearloop demo`: run the emulated rig in closed loop, and show it."""
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+from shearloop.daemon.cli import bank, init
+from shearloop.daemon.cli import run as run_command
+from shearloop.daemon.cli.options import add_option, writing
+
+if TYPE_CHECKING:
+    from shearloop.daemon.config import DaemonConfig
+
+# The page's process needs some of it to close its sockets.
+STOP_S = 2.0
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `demo`."""
+    text = "folder for configuration, bank and calibrations, kept for later runs (default: %(default)s)"
+    add_option(parser, "--folder", Path, "DIR", text, default=Path("shearloop-demo"))
+    parser.add_argument("--prepare", action="store_true", help="only write the files; do not run")
+    text = "play this .mat recording on one fingertip, without a robot"
+    add_option(parser, "--recording", Path, "FILE", text)
+    parser.epilog = (
+        "Builds a bank and calibrations, emulates the whole rig, grips a tool, identifies it, holds 0.10 N·m on it and "
+        "lets go. Prints the address of the live page, which needs the extra `view`."
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Prepare the folder, then run the daemon and its page."""
+    from shearloop.daemon.config import load_daemon_config
+    from shearloop.daemon.rig import robot_settings
+
+    folder = args.folder / "config"
+    files = init.packaged_files()
+    init.write_files(folder, {path: content for path, content in files.items() if not (folder / path).exists()})
+    name = "demo.yaml" if args.recording is None else "fingertip_demo.yaml"
+    played = [] if args.recording is None else ["--recording", str(args.recording)]
+    config = load_daemon_config(folder / name)
+    if config.robot is not None and not args.prepare:
+        # Without the robot's library nothing needs to be built.
+        robot_settings(config.robot)
+    _prepare(folder, args.folder / "run", calibrated=args.recording is None)
+    if args.prepare:
+        return 0
+    with page(config):
+        return _call(run_command, str(folder / name), "--show", *played)
+
+
+def _prepare(config: Path, data: Path, *, calibrated: bool) -> None:
+    """Make the bank and, if `calibrated`, the calibrations, where they are missing or outdated."""
+    from shearloop.daemon.bank_config import load_bank_plans
+
+    with writing(data, "the folder"):
+        data.mkdir(exist_ok=True)
+    definition, signals = config / "banks" / "demo.yaml", data / "demo.bank"
+    if not bank.is_built(signals, load_bank_plans(definition)[""]):
+        _call(bank, "build", "--config", str(definition), "--out", str(signals))
+    if calibrated and not _is_calibrated(data, signals):
+        from shearloop.daemon.cli.emulated_calibration import calibrate_rig
+
+        calibrate_rig(signals, data)
+
+
+def _is_calibrated(data: Path, signals: Path) -> bool:
+    """Return whether the calibrations are there, newer than the bank, and of this version's format."""
+    from shearloop.bank.errors import CalibrationError
+    from shearloop.bank.estimation import Calibration
+
+    try:
+        for name in ("rig.cal", "rig-right.cal", "rig-left.cal"):
+            Calibration.load(data / name)
+            if (data / name).stat().st_mtime < signals.stat().st_mtime:
+                return False
+    except CalibrationError:
+        return False
+    return True
+
+
+@contextmanager
+def page(config: "DaemonConfig") -> Iterator[None]:
+    """Serve the live page in a process of its own."""
+    if find_spec("aiohttp") is None:
+        print("The live page needs aiohttp: `pip install 'shearloop[view]'`", flush=True)
+        yield
+        return
+    options = ("--connect", config.publish, "--commands", config.commands, "--port", "0", "--json")
+    process = subprocess.Popen([sys.executable, "-m", "shearloop", "view", *options], stdout=subprocess.PIPE)
+    try:
+        # Empty where the page has ended; its own sentence says why.
+        if process.stdout is not None and (line := process.stdout.readline()):
+            print(f"The live page, for a browser of this computer: {json.loads(line)['url_with_token']}", flush=True)
+        yield
+    finally:
+        process.terminate()
+        try:
+            process.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+def _call(command: ModuleType, *arguments: str) -> int:
+    """Run another command in this process and return its exit status."""
+    parser = argparse.ArgumentParser()
+    command.configure(parser)
+    status: int = command.run(parser.parse_args(arguments))
+    return status

@@ -1,0 +1,89 @@
+"""The stop socket: a Unix datagram socket that accepts `stop` and `status` from every user of this machine.
+
+A datagram needs no connection, so that the socket works when ZeroMQ's sockets are flooded and when the process has no
+descriptors left. Its abstract name follows from the address of `commands`. Requests and replies are those of the
+command server, one datagram each, without keys.
+"""
+
+import asyncio
+import os
+import socket
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.client import decode_reply, no_reply
+from shearloop.daemon.messaging.command_server import Handler, Reply, RequestExecutor
+from shearloop.daemon.messaging.keys import Refusals
+from shearloop.daemon.messaging.messages import encode
+
+LARGEST_DATAGRAM_BYTES = 1024
+# Of the path; a whole name has at most 107 bytes (unix(7)).
+_NAME_BYTES = 80
+_LARGEST_REPLY_BYTES = 1 << 18
+
+
+def stop_name(address: str) -> bytes:
+    """Return the abstract name of the stop socket of a daemon, by the port or the path of its `commands`."""
+    return b"\0shearloop-stop-" + os.fsencode(address.rpartition(":")[2])[-_NAME_BYTES:]
+
+
+class StopSocket:
+    """Receives requests and sends the replies, one at a time."""
+
+    def __init__(self, address: str, handlers: Mapping[str, Handler], refusals: Refusals) -> None:
+        """Bind the stop socket of the command address; raises UserError if another daemon has it."""
+        self._requests = RequestExecutor(handlers, refusals)
+        self._refusals = refusals
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        try:
+            self._socket.bind(stop_name(address))
+        except OSError as error:
+            self._socket.close()
+            raise UserError(
+                f"the stop socket of `commands: {address}` cannot be bound ({error.strerror}); is another daemon "
+                "running? Stop it, or choose another port"
+            ) from error
+
+    async def run(self) -> None:
+        """Serve requests until cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            data, client = await loop.sock_recvfrom(self._socket, LARGEST_DATAGRAM_BYTES)
+            # A datagram that has already arrived does not yield to other tasks.
+            await asyncio.sleep(0)
+            checked = self._requests.check(os.fsencode(client or ""), [data], time.monotonic_ns())
+            reply = checked if isinstance(checked, dict) else await self._requests.execute(*checked)
+            # A client without a name wants no reply.
+            if client:
+                self._reply(client, reply)
+
+    def _reply(self, client: Any, reply: Reply) -> None:
+        try:
+            self._socket.sendto(encode(reply), client)
+        except OSError:
+            self._refusals.counts["client does not read its replies"] += 1
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any] | None:
+    """Send `stop` or `status` to the local daemon with this command address; return its reply, None without a daemon.
+
+    Raises UserError if no reply comes in time.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
+        client.settimeout(timeout_s)
+        # The kernel chooses an abstract name.
+        client.bind("")
+        try:
+            client.connect(stop_name(address))
+            client.send(encode(content))
+            return decode_reply(client.recv(_LARGEST_REPLY_BYTES), address)
+        except ConnectionError:
+            return None
+        except TimeoutError as error:
+            raise no_reply(address, timeout_s, None) from error

@@ -1,0 +1,121 @@
+"""The control script on the robot: ur-rtde's own, with a watchdog and limits that need no client.
+
+The client gives each motion a deadline, by the script's own clock, in an input register that ur-rtde leaves free, and
+extends it. The script turns the wrist no further than the deadline, its range and its largest force and torque allow. A
+linear move that its client does not stop ends with the program.
+"""
+
+import re
+
+from shearloop.drivers.ur.settings import UrSettings
+
+# RTDE guide: other clients may use the double registers from 24 on; ur-rtde uses lower ones.
+DEADLINE_REGISTER, CLOCK_REGISTER = "input_double_register_24", "output_double_register_24"
+# A deadline lies this much further ahead at most: a cycle of the slowest controller, for rounding.
+_SLACK_S = 0.008
+# The client has this time to stop a linear move after its deadline.
+_GRACE_S = 0.05
+
+# ur-rtde 1.6.5: the line before the main loop, and the thread that carries out speeds.
+_BEFORE_LOOP = "        keep_running = True\n"
+_SPEED_THREAD = re.compile(r"^    thread speed_thread\(\):\n.*?^    end\n", re.MULTILINE | re.DOTALL)
+
+# speedj returns after a cycle, so that each cycle checks. The clock starts at 0 in each program, and a deadline too far
+# ahead is an older program's. An overload stops the wrist until the client asks for rest.
+_GUARD = """\
+    global guard_s = 0.0
+
+    thread guard_clock():
+        while (True):
+            guard_s = guard_s + {step}
+            write_output_float_register(24, guard_s)
+            if move_thrd != 0 and guard_s > read_input_float_register(24) + {grace}:
+                halt
+            end
+            sync()
+        end
+    end
+
+    def guard_is_overloaded():
+        load = get_tcp_force()
+        force_n = norm([load[0], load[1], load[2]])
+        torque_nm = norm([load[3], load[4], load[5]])
+        return force_n > {force} or torque_nm > {torque}
+    end
+
+    def guard_largest_speed(asked):
+        left = read_input_float_register(24) - guard_s
+        q = get_actual_joint_positions()
+        room = ({upper}) - q[5]
+        if asked < 0:
+            room = q[5] - ({lower})
+        end
+        if left < 0 or left > {longest} or room <= 0:
+            return 0.0
+        end
+        largest = sqrt(2 * {braking} * room)
+        if largest > {speed}:
+            return {speed}
+        end
+        return largest
+    end
+
+    thread speed_thread():
+        overloaded = False
+        while (True):
+            enter_critical
+            asked = speed_target[5]
+            acceleration = speed_acceleration
+            exit_critical
+            overloaded = asked != 0 and (overloaded or guard_is_overloaded())
+            largest = guard_largest_speed(asked)
+            if overloaded:
+                largest = 0.0
+            end
+            if norm(asked) > largest:
+                acceleration = {hardest}
+                if asked < 0:
+                    asked = 0.0 - largest
+                else:
+                    asked = largest
+                end
+            end
+            if acceleration > {hardest}:
+                acceleration = {hardest}
+            end
+            speedj([0, 0, 0, 0, 0, asked], a=acceleration, t={step})
+        end
+    end
+"""
+_START = """\
+        rtde_set_watchdog("input_int_register_0", {watchdog_hz:g}, "stop")
+        clock_thrd = run guard_clock()
+"""
+
+
+def guard_script(script: str, settings: UrSettings) -> str:
+    """Return ur-rtde's script as a program with its watchdog and its limits, or "" where it is of an unknown form.
+
+    ur-rtde arms the watchdog by a command once the script runs. Until then a script would outlive its client. URScript
+    manual, `rtde_set_watchdog`: a program's watchdogs end with it.
+    """
+    if script.count(_BEFORE_LOOP) != 1 or len(_SPEED_THREAD.findall(script)) != 1:
+        return ""
+    limits = settings.limits
+    margin = limits.joints.margin_rad
+    values = {
+        # CB3 controllers do not have the function; their cycle takes 8 ms.
+        "step": "get_steptime()" if "get_steptime()" in script else "0.008",
+        "watchdog_hz": settings.watchdog_hz,
+        "grace": _GRACE_S,
+        "longest": settings.command_timeout_s + _SLACK_S,
+        "lower": limits.joints.lower_rad[5] + margin,
+        "upper": limits.joints.upper_rad[5] - margin,
+        "speed": limits.wrist_speed_rad_per_s.inner,
+        "braking": limits.wrist_acceleration_rad_per_s2.inner,
+        "hardest": limits.wrist_acceleration_rad_per_s2.hard,
+        "force": limits.force_n.hard,
+        "torque": limits.torque_nm.hard,
+    }
+    script = _SPEED_THREAD.sub(lambda _: _GUARD.format(**values), script)
+    return f"def rtde_control():\n{script.replace(_BEFORE_LOOP, _START.format(**values) + _BEFORE_LOOP)}end\n"

@@ -1,0 +1,92 @@
+"""What a user starts with: `init`, `schema`, and the files of `demo`."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from jsonschema import Draft202012Validator
+
+from shearloop.daemon.cli import demo, main
+from shearloop.daemon.config import DaemonConfig, load_daemon_config
+from shearloop.daemon.config_file import load_yaml_model
+from shearloop.daemon.config_schema import MODELS
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+
+CONFIG = Path(__file__).parents[3] / "config"
+# A calibration is written by a command, not by people.
+WRITTEN_BY_PEOPLE = sorted(set(CONFIG.rglob("*.yaml")) - set(CONFIG.glob("calibrations/*")))
+
+
+def schema_for(path: Path) -> Draft202012Validator:
+    """Return the schema that a file names for editors."""
+    first = path.read_text(encoding="utf-8").splitlines()[0]
+    named = path.parent / first.removeprefix("# yaml-language-server: $schema=")
+    return Draft202012Validator(json.loads(named.read_text(encoding="utf-8")))
+
+
+@pytest.mark.parametrize("path", WRITTEN_BY_PEOPLE, ids=lambda path: path.name)
+def test_an_editor_accepts_the_files_of_config_and_refuses_an_unknown_key(path):
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    schema_for(path).validate(content)
+    assert not schema_for(path).is_valid({**content, "unknown": 1})
+
+
+@pytest.mark.parametrize(
+    ("angles", "accepted"), [("1.45:1.65:10", True), (0.1, True), ([0.1], True), ([], False), ("1", False)]
+)
+def test_an_editor_accepts_angles_as_the_program_does(angles, accepted):
+    step = {"do": "twist", "angles_rad": angles}
+    schema = schema_for(CONFIG / "experiments" / "tighten.yaml")
+    assert schema.is_valid({"name": "twists", "steps": [step]}) == accepted
+
+
+def test_schema_prints_every_kind(capsys):
+    for kind in MODELS:
+        assert main(["schema", kind]) == 0
+        Draft202012Validator.check_schema(json.loads(capsys.readouterr().out))
+
+
+def test_init_writes_files_that_load_and_changes_none(tmp_path, capsys):
+    folder = tmp_path / "my" / "rig"
+    assert main(["init", str(folder)]) == 0
+    assert f"shearloop check {folder / 'rig.yaml'}" in capsys.readouterr().out
+    config = load_daemon_config(folder / "rig.yaml")
+    assert config.robot == folder / "ur.yaml"
+    assert not config.emulators
+    assert load_yaml_model(folder / "experiments" / "tighten.yaml", ExperimentFile).steps
+    schema_for(folder / "banks" / "paper.yaml")
+    (folder / "rig.yaml").write_text("mine")
+    (folder / "ur.yaml").unlink()
+    assert main(["init", str(folder)]) == 2
+    assert "nothing was written; choose another folder" in capsys.readouterr().err
+    assert (folder / "rig.yaml").read_text() == "mine"
+    assert not (folder / "ur.yaml").exists()
+    assert main(["init", str(folder / "rig.yaml")]) == 2
+    assert "cannot be written: Not a directory; choose another path" in capsys.readouterr().err
+
+
+def test_the_demos_page_lasts_as_long_as_the_demo(tmp_path, monkeypatch, capsys):
+    """The page's address is printed before the loop starts."""
+    aiohttp = pytest.importorskip("aiohttp", reason="the live view needs the extra `view`")
+    import asyncio
+
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    content = {"fingertips": {"right": {"device": {"path": "/dev/null"}}}}
+    config = DaemonConfig(publish=f"ipc://{tmp_path}/publish", commands=f"ipc://{tmp_path}/commands", **content)
+
+    async def status(url: str) -> int:
+        async with aiohttp.ClientSession() as http, http.get(url) as page:
+            return page.status
+
+    with demo.page(config):
+        url = capsys.readouterr().out.rsplit(" ", 1)[1].strip()
+        assert asyncio.run(status(url)) == 200
+    with pytest.raises(aiohttp.ClientConnectorError):
+        asyncio.run(status(url))
+
+
+def test_the_demo_without_aiohttp_says_what_the_page_needs(monkeypatch, capsys):
+    monkeypatch.setattr(demo, "find_spec", lambda _: None)
+    with demo.page(DaemonConfig(fingertips={"right": {"device": {"path": "/dev/null"}}})):
+        assert "pip install 'shearloop[view]'" in capsys.readouterr().out

@@ -1,0 +1,122 @@
+"""A flood of connections: the bound holds, the processor rests, open clients stay, and `stop` gets through."""
+
+import asyncio
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import ExitStack, closing, suppress
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shearloop.daemon.cli import main
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.client import receive_messages
+from shearloop.daemon.messaging.command_server import CommandRefusedError, Reply, Request
+from shearloop.daemon.messaging.connections import MAX_CONNECTIONS, RESERVED_DESCRIPTORS, most_connections
+from shearloop.daemon.messaging.keys import Refusals
+from shearloop.daemon.messaging.stop_socket import StopSocket, send_to_stop_socket, stop_name
+from shearloop.daemon.process import MAX_DESCRIPTORS
+from tests.daemon.conftest import DEADLINE_S
+from tests.daemon.web.test_with_keys import free_port
+
+DESCRIPTORS, CONNECTIONS = 512, 1200
+
+
+@given(st.integers(0, 1 << 20))
+def test_both_sockets_leave_descriptors_in_reserve(descriptors):
+    both = 2 * most_connections(descriptors)
+    assert 0 < both <= max(32, descriptors - RESERVED_DESCRIPTORS)
+    assert most_connections(MAX_DESCRIPTORS) == MAX_CONNECTIONS
+
+
+def test_the_limit_of_descriptors_is_raised_as_far_as_the_system_allows():
+    for hard, raised in ((512, 512), (MAX_DESCRIPTORS + 1, MAX_DESCRIPTORS)):
+        code = (
+            "import resource as r; from shearloop.daemon.process import raise_descriptor_limit\n"
+            f"r.setrlimit(r.RLIMIT_NOFILE, (64, {hard})); raise_descriptor_limit()\n"
+            "print(r.getrlimit(r.RLIMIT_NOFILE)[0])"
+        )
+        assert int(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout) == raised
+
+
+@pytest.mark.parametrize("key", ["publish", "commands"])
+async def test_stop_is_fast_in_a_flood_of_idle_connections(key, config):
+    addresses = {one: f"tcp://127.0.0.1:{free_port()}" for one in ("publish", "commands")}
+    port = int(addresses[key].rpartition(":")[2])
+    command = f"ulimit -n {DESCRIPTORS}; exec {sys.executable} -m shearloop run {config(**addresses)}"
+    daemon = await asyncio.create_subprocess_shell(command, stderr=asyncio.subprocess.PIPE)
+    health = receive_messages(addresses["publish"], ["health"], DEADLINE_S)
+    with closing(health), ExitStack() as stack:
+        stack.callback(lambda: daemon.returncode is None and daemon.kill())
+        await asyncio.to_thread(next, health)
+        await asyncio.to_thread(open_connections, ("127.0.0.1", port), stack)
+        # The subscriber from before is still served, and the processor rests.
+        heard = [(await asyncio.to_thread(next, health))[1] for _ in range(4)]
+        assert min(one["cpu_percent"] for one in heard) < 30
+        assert heard[-1]["tasks"][key]["errors"]["too many connections"] >= 1
+        assert len(os.listdir(f"/proc/{daemon.pid}/fd")) < DESCRIPTORS
+        begun_s = time.monotonic()
+        for name in ("status", "stop"):
+            assert await asyncio.to_thread(main, ["command", name, "--connect", addresses["commands"]]) == 0
+        assert time.monotonic() - begun_s < 1.0
+        _, told = await daemon.communicate()
+    assert daemon.returncode == 0
+    assert f"clients are connected to `{key}`; others wait until one has disconnected" in told.decode()
+
+
+async def test_the_stop_socket_answers_in_a_flood_of_datagrams():
+    async def handle(_request: Request) -> Reply:
+        return {"stopped": "test"}
+
+    async def refuse(_request: Request) -> Reply:
+        raise CommandRefusedError("not here")
+
+    refusals, address = Refusals(), f"tcp://127.0.0.1:{free_port()}"
+    stop = StopSocket(address, {"stop": handle, "start": refuse}, refusals)
+    with pytest.raises(UserError, match="is another daemon running"):
+        StopSocket(address, {}, refusals)
+    flooding = threading.Event()
+    flood = threading.Thread(target=send_garbage, args=(stop_name(address), flooding))
+    serving = asyncio.create_task(stop.run())
+    flooding.set()
+    flood.start()
+    try:
+        for name, reply in (("stop", {"ok": True, "stopped": "test"}), ("start", {"ok": False, "reason": "not here"})):
+            replied = await asyncio.to_thread(send_to_stop_socket, address, {"command": name}, DEADLINE_S)
+            assert replied == reply
+        assert sum(refusals.counts.values()) > 1
+    finally:
+        flooding.clear()
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+        stop.close()
+        flood.join()
+    assert send_to_stop_socket(address, {"command": "stop"}, DEADLINE_S) is None
+    assert send_to_stop_socket("ipc:///" + "ä" * 500, {"command": "stop"}, DEADLINE_S) is None
+    assert stop_name("tcp://0.0.0.0:7762") == stop_name("tcp://127.0.0.1:7762")
+
+
+def open_connections(address: tuple[str, int], stack: ExitStack) -> None:
+    """Open connections one after another; once one has to wait, begin the others without waiting."""
+    wait_s = 1.0
+    for _ in range(CONNECTIONS):
+        client = stack.enter_context(socket.socket())
+        client.settimeout(wait_s)
+        try:
+            client.connect(address)
+        except (TimeoutError, BlockingIOError):
+            wait_s = 0.0
+
+
+def send_garbage(name: bytes, flooding: threading.Event) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
+        client.bind("")
+        client.setblocking(False)
+        while flooding.is_set():
+            with suppress(OSError):
+                client.sendto(b"\x81" * 1000, name)

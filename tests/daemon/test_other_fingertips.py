@@ -1,0 +1,83 @@
+"""Fingertips of other kinds, from their YAML alone: from the bank to a torque in the daemon."""
+
+from itertools import cycle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.build import build_bank
+from shearloop.bank.estimation import fit
+from shearloop.bank.estimation.estimator import Physics
+from shearloop.daemon.analysis.series import read_series
+from shearloop.daemon.bank_config import load_bank_plan
+from shearloop.daemon.cli.emulated_calibration import TwistPlayer
+from shearloop.daemon.synthetic_frames import RigFrames
+from shearloop.drivers.defaults import FRAME_PERIOD_S
+from shearloop.drivers.emulators.boards import EitKitBoard
+from tests.daemon.conftest import collector, running_daemon
+from tests.running import running
+
+SPEED = 50
+
+
+@pytest.fixture(scope="module", params=["round", "long"])
+def bank(request, tmp_path_factory) -> Path:
+    """Build a bank of a fingertip from its YAML."""
+    folder = tmp_path_factory.mktemp(request.param)
+    grid = {"low": 2.9, "high": 4.1, "count": 9}
+    content = {
+        "fingertip": str(Path(f"config/fingertips/{request.param}.yaml").resolve()),
+        "mesh_size_cm": 0.3,
+        "model": "gaussian_derivative",
+        "k": grid,
+        "sigma": {"low": 0.9, "high": 2.3, "count": 15},
+    }
+    (folder / "bank.yaml").write_text(yaml.safe_dump(content))
+    plan = load_bank_plan(folder / "bank.yaml")
+    build_bank(plan.mesh, plan.definition, folder / f"{request.param}.bank")
+    return folder / f"{request.param}.bank"
+
+
+@pytest.fixture(scope="module")
+def twists(bank) -> tuple[TwistPlayer, Path]:
+    """Record twists of an emulated rig with this fingertip on both sides."""
+    player = TwistPlayer(RigFrames(bank, seed=3), 20.0, 3)
+    player.run()
+    player.recorded.write(bank.with_name("twists.mcap"), 20.0)
+    return player, bank.with_name("twists.mcap")
+
+
+@pytest.mark.parametrize("estimator", ["motion_regression", "bank"])
+async def test_a_fingertip_of_another_kind_gives_its_torque(estimator, bank, twists, config, tmp_path):
+    player, recording = twists
+    table = Bank.open(bank).table
+    assert table.n_channels == {"round.bank": 208, "long.bank": 896}[bank.name]
+    (series,) = read_series(recording, ("right",))
+    calibration = tmp_path / "right.cal"
+    fit(estimator, [series], "emulated twists", Physics(bank=Bank.open(bank))).save(calibration)
+    lines = [pair[0] for pair in player.recorded.lines]
+    path = config(
+        fingertips={
+            "right": {
+                "device": {"path": "eit-right"},
+                "bank": str(bank),
+                "calibration": str(calibration),
+                "matching": "zero_lag",
+                "frame_period_s": FRAME_PERIOD_S / SPEED,
+            }
+        }
+    )
+    board = EitKitBoard(cycle(lines), period_s=FRAME_PERIOD_S / SPEED, link=tmp_path / "eit-right")
+    truth_nm, errors_nm = series.torque_at_frames(), []
+    async with running(board.run()), running_daemon(path) as daemon:
+        estimates = collector(daemon, "eit.estimate")
+        for _ in range(len(lines)):
+            estimate = await estimates.get()
+            if estimate["torque_nm"] is not None:
+                assert 2.9 <= estimate["k"] <= 4.1
+                errors_nm.append(estimate["torque_nm"] - truth_nm[estimate["seq"] % len(lines)])
+    assert len(errors_nm) > 100
+    assert np.std(errors_nm) < 0.3 * np.nanstd(truth_nm)

@@ -1,0 +1,292 @@
+"""Worker and script stop the wrist independently: each with the other disabled, on the script itself."""
+
+import dataclasses
+import itertools
+
+import pytest
+
+from shearloop.drivers.emulators.ur_robot import Robot
+from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
+from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER
+from tests.drivers.ur.flight import AT_REST, CYCLE_NS, FakeArm, Flight, flying
+from tests.drivers.ur.robots import DELIVERED, VERSIONS, control_script
+
+LIMITS, TIMEOUT_S = DELIVERED.limits, DELIVERED.command_timeout_s
+FASTEST = LIMITS.wrist_speed_rad_per_s.inner
+HARDEST = LIMITS.wrist_acceleration_rad_per_s2.hard
+PROMISED_S = 0.2
+STEP_S, STEPS = 0.002, 4
+MOVE_L, SPEED_J, SPEED_STOP, STOP_J, SET_WATCHDOG = 3, 9, 15, 34, 35
+
+
+class ScriptedArm(FakeArm):
+    """An arm whose controller runs a control script; writes the registers that `UrArm` and ur-rtde write."""
+
+    def __init__(self, script: str) -> None:
+        super().__init__()
+        self.robot, self._script = Robot(), script
+
+    def cycle(self) -> None:
+        for _ in range(STEPS):
+            self.robot.step(STEP_S)
+        arm = self.robot.arm
+        self.reading = dataclasses.replace(
+            AT_REST,
+            t_mono_ns=self.reading.t_mono_ns + CYCLE_NS,
+            timestamp_s=self.robot.clock_s,
+            q_rad=tuple(arm.q_rad),
+            qd_rad_per_s=tuple(arm.qd_rad_per_s),
+            wrench=tuple(arm.wrench),
+            runtime_state=self.robot.runtime_state,
+            moving_linearly=bool(int(self.robot.registers["output_int_register_2"]) & 1 << 15),
+        )
+
+    def _write(self, command: int, *values: float) -> bool:
+        for number, value in enumerate(values):
+            self.robot.registers.write(f"input_double_register_{number}", value, self.robot.time_s)
+        self.robot.registers.write("input_int_register_0", command, self.robot.time_s)
+        return True
+
+    def _write_deadline(self, left_s: float) -> None:
+        until_s = self.robot.registers[CLOCK_REGISTER] + left_s
+        self.robot.registers.write(DEADLINE_REGISTER, until_s, self.robot.time_s)
+
+    def wrist(self, command: WristSpeed, left_s: float) -> bool:
+        self._write_deadline(left_s)
+        return self.repeat(command)
+
+    def repeat(self, command: WristSpeed) -> bool:
+        """Send a speed without another deadline, as a worker does that decides nothing."""
+        return self._write(SPEED_J, 0, 0, 0, 0, 0, command.rad_per_s, command.acceleration_rad_per_s2, 0)
+
+    def end_speed(self, deceleration_rad_per_s2: float) -> bool:
+        return self._write(SPEED_STOP, deceleration_rad_per_s2)
+
+    def _run_once(self, command: int, *values: float) -> bool:
+        """Run an asynchronous command as ur-rtde does: until it is done, and until the script is ready again."""
+        self.robot.registers.write("input_int_register_1", 1, self.robot.time_s)
+        for written, state in ((command, 2), (0, 1)):
+            self._write(written, *values)
+            while self.robot.registers["output_int_register_0"] != state:
+                self.robot.step(STEP_S)
+        return True
+
+    def move(self, command: MoveLinear) -> bool:
+        self._write_deadline(DELIVERED.silence_timeout_s)
+        return self._run_once(MOVE_L, *command.pose, command.speed_m_per_s, command.acceleration_m_per_s2)
+
+    def stop_move(self, deceleration_rad_per_s2: float) -> bool:
+        return self._run_once(STOP_J, deceleration_rad_per_s2)
+
+    def send_heartbeat(self, left_s: float | None = None) -> bool:
+        if left_s is not None:
+            self._write_deadline(left_s)
+        return self._write(0)
+
+    def clear_command(self) -> bool:
+        return self._write(0)
+
+    def upload(self) -> bool:
+        self.robot.upload(self._script)
+        return True
+
+    def arm_watchdog(self) -> bool:
+        return self._write(SET_WATCHDOG, DELIVERED.watchdog_hz)
+
+
+def guarded_arm() -> ScriptedArm:
+    """Return an arm that runs our script, without a worker; its watchdog is fed as long as something is written."""
+    arm = ScriptedArm(control_script(DELIVERED))
+    arm.send_heartbeat()
+    arm.upload()
+    arm.cycle()
+    return arm
+
+
+def turn(arm: ScriptedArm, command: WristSpeed, seconds: float) -> list[RtdeSample]:
+    """Decide on a speed in each cycle, and return the samples."""
+    found = []
+    for _ in range(round(seconds / (STEPS * STEP_S))):
+        arm.wrist(command, TIMEOUT_S)
+        arm.cycle()
+        found.append(arm.reading)
+    return found
+
+
+def at_full_speed(script: str) -> tuple[Flight, WristSpeed]:
+    """Return a flight at the largest speed, at the moment of a decision, and the command."""
+    flight = flying(DELIVERED, ScriptedArm(script))
+    for _ in range(50):
+        command = WristSpeed(FASTEST, LIMITS.wrist_acceleration_rad_per_s2.inner, flight.now_ns)
+        assert flight.ask(command).accepted
+        flight.fly(1)
+    assert flight.wrist_speed == pytest.approx(FASTEST)
+    assert flight.ask(dataclasses.replace(command, decided_ns=flight.now_ns)).accepted
+    return flight, command
+
+
+def test_worker_alone_stops_the_wrist_in_time():
+    """ur-rtde's own script has no deadline; the daemon is alive and decides nothing."""
+    flight, _ = at_full_speed(control_script())
+    decided_ns = flight.now_ns
+    while not flight.arm.reading.rests:
+        flight.fly(1)
+        assert flight.now_ns - decided_ns <= PROMISED_S * 1e9
+    assert "was not renewed" in flight.state.end_reason
+
+
+@pytest.mark.parametrize("guarded", [True, False], ids=["guarded", "own"])
+def test_script_alone_stops_the_wrist_in_time(guarded):
+    """The worker repeats its last command for ever, which feeds the watchdog. Without our script the wrist turns on."""
+    flight, command = at_full_speed(control_script(DELIVERED if guarded else None))
+    arm, rested_s = flight.arm, None
+    for cycle in range(1, 126):
+        arm.repeat(command)
+        arm.cycle()
+        rested_s = rested_s or (cycle * CYCLE_NS / 1e9 if arm.reading.rests else None)
+    assert arm.reading.program_running
+    assert arm.reading.rests == guarded
+    if guarded:
+        # The deadline and the time to brake, and no earlier than that.
+        assert TIMEOUT_S - CYCLE_NS / 1e9 < rested_s - FASTEST / HARDEST <= PROMISED_S - FASTEST / HARDEST
+        # A new decision turns it again.
+        turn(arm, command, 0.3)
+        assert arm.reading.qd_rad_per_s[5] == pytest.approx(FASTEST)
+
+
+def moving_at_full_speed(script: str) -> Flight:
+    """Return a flight in a linear move at its largest speed, at the moment of the daemon's last message."""
+    flight = flying(DELIVERED, ScriptedArm(script))
+    flight.fly(1)
+    x, y, z, *turn = flight.arm.robot.arm.pose
+    inner = LIMITS.linear_speed_m_per_s.inner
+    assert flight.ask(MoveLinear((x, y, z - 0.2, *turn), inner, LIMITS.linear_acceleration_m_per_s2.inner)).accepted
+    flight.fly(60)
+    assert flight.state.motion == "linear"
+    assert not flight.arm.reading.rests
+    return flight
+
+
+def test_worker_alone_stops_a_linear_move_in_time():
+    flight = moving_at_full_speed(control_script())
+    flight.fly(round(PROMISED_S * 1e9 / CYCLE_NS), daemon_alive=False)
+    assert flight.arm.reading.rests
+    assert "was silent" in flight.state.end_reason
+
+
+@pytest.mark.parametrize("guarded", [True, False], ids=["guarded", "own"])
+def test_script_alone_ends_a_linear_move_in_time(guarded):
+    """The worker feeds the watchdog for ever, and does not stop."""
+    flight = moving_at_full_speed(control_script(DELIVERED if guarded else None))
+    for _ in range(round(PROMISED_S * 1e9 / CYCLE_NS)):
+        flight.arm.send_heartbeat()
+        flight.arm.cycle()
+    assert flight.arm.reading.rests == guarded
+    assert flight.arm.reading.program_running != guarded
+
+
+@pytest.mark.parametrize("guarded", [True, False], ids=["guarded", "own"])
+def test_linear_move_of_a_living_daemon_arrives(guarded):
+    flight = moving_at_full_speed(control_script(DELIVERED if guarded else None))
+    state = flight.fly_until(lambda state: state.motion != "linear")
+    assert state.end_reason == "arrived"
+    assert not state.blocked
+
+
+def test_killed_worker_stops_the_wrist_in_time():
+    """Nothing is written: the deadline and the watchdog."""
+    flight, _ = at_full_speed(control_script(DELIVERED))
+    for _ in range(round(PROMISED_S * 1e9 / CYCLE_NS)):
+        flight.arm.cycle()
+    assert flight.arm.reading.rests
+    assert not flight.arm.reading.program_running
+
+
+def test_gentle_stop_of_the_worker_stays_gentle():
+    flight, _ = at_full_speed(control_script(DELIVERED))
+    assert flight.ask(Stop(1.0)).accepted
+    flight.fly(40)
+    assert flight.wrist_speed == pytest.approx(FASTEST - 1.0 * 40 * CYCLE_NS / 1e9, abs=0.02)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.09, 0.11, 0.5])
+def test_decision_that_comes_late_does_not_turn_the_wrist(delay_s):
+    """The deadline counts from the sample before the decision, so that a slow network does not prolong it."""
+    arm = guarded_arm()
+    until_s = arm.robot.registers[CLOCK_REGISTER] + TIMEOUT_S
+    for _ in range(round(delay_s / STEP_S / STEPS)):
+        arm.send_heartbeat()
+        arm.cycle()
+    arm.robot.registers.write(DEADLINE_REGISTER, until_s, arm.robot.time_s)
+    arm.repeat(WristSpeed(FASTEST, HARDEST))
+    arm.cycle()
+    assert arm.reading.rests == (delay_s > TIMEOUT_S)
+
+
+def test_deadline_of_an_earlier_program_does_not_count():
+    arm = guarded_arm()
+    arm.robot.registers.write(DEADLINE_REGISTER, 3600.0, arm.robot.time_s)
+    arm.repeat(WristSpeed(FASTEST, HARDEST))
+    arm.cycle()
+    assert arm.reading.rests
+
+
+def test_script_clips_speed_and_acceleration():
+    samples = turn(guarded_arm(), WristSpeed(-3.0, 40.0), 0.5)
+    speeds = [sample.qd_rad_per_s[5] for sample in samples]
+    assert min(speeds) == pytest.approx(-FASTEST)
+    steps = [abs(later - earlier) for earlier, later in itertools.pairwise([0.0, *speeds])]
+    assert max(steps) == pytest.approx(HARDEST * CYCLE_NS / 1e9)
+
+
+@pytest.mark.parametrize("direction", [-1.0, 1.0])
+def test_script_keeps_the_wrist_within_its_range(direction):
+    arm = guarded_arm()
+    samples = turn(arm, WristSpeed(direction * FASTEST, 4.0), 16.0)
+    inner = LIMITS.joints.upper_rad[5] - LIMITS.joints.margin_rad
+    assert LIMITS.joints.lower_rad[5] == -LIMITS.joints.upper_rad[5]
+    assert max(abs(sample.wrist_rad) for sample in samples) == pytest.approx(inner, abs=0.005)
+    assert arm.reading.rests
+    turn(arm, WristSpeed(-direction * FASTEST, 4.0), 0.5)
+    assert arm.reading.qd_rad_per_s[5] == pytest.approx(-direction * FASTEST)
+
+
+@pytest.mark.parametrize(
+    ("part", "hard"),
+    [(slice(0, 3), LIMITS.force_n.hard), (slice(3, 6), LIMITS.torque_nm.hard)],
+    ids=["force", "torque"],
+)
+def test_script_stops_beyond_the_hard_force_and_torque_until_rest_is_asked_for(part, hard):
+    arm, command = guarded_arm(), WristSpeed(FASTEST, 4.0)
+    load = arm.robot.arm._wrench
+    load[part] = 0.57 * hard
+    assert not turn(arm, command, 0.3)[-1].rests
+    # The norm of three such components.
+    load[part] = 0.58 * hard
+    assert turn(arm, command, 0.1)[-1].rests
+    load[part] = 0.0
+    assert turn(arm, command, 0.3)[-1].rests
+    turn(arm, WristSpeed(0.0, 4.0), 0.1)
+    assert not turn(arm, command, 0.1)[-1].rests
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_each_version_of_the_script_can_be_guarded(version):
+    robot = Robot()
+    robot.registers.write("input_int_register_0", 0, 0.0)
+    robot.upload(control_script(DELIVERED, version))
+    for _ in range(10):
+        robot.step(0.008)
+    assert robot.program_running
+    # A thread starts in the cycle after the one that starts it.
+    assert robot.registers[CLOCK_REGISTER] == pytest.approx(0.072)
+
+
+def test_deadline_counts_during_a_gentle_ramp():
+    """ur-rtde's own thread looks at nothing until its speed is reached."""
+    arm, command = guarded_arm(), WristSpeed(FASTEST, 0.5)
+    assert 0.1 < turn(arm, command, 0.3)[-1].qd_rad_per_s[5] < 0.2
+    for _ in range(round(PROMISED_S * 1e9 / CYCLE_NS)):
+        arm.repeat(command)
+        arm.cycle()
+    assert arm.reading.rests

@@ -3,6 +3,7 @@
 import asyncio
 import os
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -31,6 +32,16 @@ def test_both_sockets_leave_descriptors_in_reserve(descriptors):
     both = 2 * most_connections(descriptors)
     assert 0 < both <= max(32, descriptors - RESERVED_DESCRIPTORS)
     assert most_connections(MAX_DESCRIPTORS) == MAX_CONNECTIONS
+
+
+def test_the_limit_of_descriptors_is_raised_as_far_as_the_system_allows():
+    for hard, raised in ((512, 512), (MAX_DESCRIPTORS + 1, MAX_DESCRIPTORS)):
+        code = (
+            "import resource as r; from shearloop.daemon.process import raise_descriptor_limit\n"
+            f"r.setrlimit(r.RLIMIT_NOFILE, (64, {hard})); raise_descriptor_limit()\n"
+            "print(r.getrlimit(r.RLIMIT_NOFILE)[0])"
+        )
+        assert int(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout) == raised
 
 
 @pytest.mark.parametrize("key", ["publish", "commands"])

@@ -1,11 +1,11 @@
-"""The shear skin's models: time against error, both readings of the paper, calibrations, and contact solves.
+"""The shear skin's models: time against error, readings of the paper, calibrations, depths, and contact solves.
 
     python -m benchmarks.skin
 
 The models follow one loading to 1 N and one hysteresis loop between ± 1 N under 1 N of normal force. Errors are the
 largest difference from the 2-D model at finite strain, relative to its largest response. Times are the best of several
-runs, per load step. The readings are origin slopes up to 1.2 N. The contact solver follows random load paths on random
-skins and meshes.
+runs, per load step. The readings of the paper are origin slopes up to 1.2 N. The contact solver follows random load
+paths on random skins and meshes.
 """
 
 import time
@@ -46,6 +46,7 @@ from shearloop.bank.skin.plane_strain import (
     apply_load,
     condense,
     gauge_responses,
+    gauge_strains,
     line_strain,
     states_along,
     unloaded,
@@ -137,6 +138,15 @@ def compare_calibrations() -> None:
         print(table_row(name, found.friction, found.slope_per_n, found.prediction_half_width_n), flush=True)
 
 
+def compare_depths() -> None:
+    """Print the strains of both gauges at 1 N of both forces, by their depth outwards from mid-thickness."""
+    print("\n" + table_head("depth, mm", "stretched side", "slack side", "ratio"))
+    for depth_mm in (-0.35, -0.026, 0.0, 0.35):
+        skin = condense(replace(PAPER_SECTION, gauge_depth_mm=depth_mm))
+        stretched, slack = gauge_strains(skin, states_along(skin, NORMAL_N, loading(AMPLITUDE_N).tolist()))[-1].tolist()
+        print(table_row(depth_mm, f"{stretched:.2%}", f"{slack:.2%}", slack / stretched))
+
+
 def random_states(seed: int) -> Iterator[tuple[CondensedSkin, ContactState]]:
     """Yield a random skin with its state after each step of a random load path.
 
@@ -179,6 +189,7 @@ def main() -> None:
     compare_models()
     compare_readings()
     compare_calibrations()
+    compare_depths()
     count_steps()
 
 

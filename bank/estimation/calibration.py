@@ -29,7 +29,7 @@ from shearloop.bank.estimators import estimator_class
 from shearloop.bank.polynomial import Polynomial
 from shearloop.files import replace_file
 
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 # First bytes of a zip that is not empty.
 ARCHIVE_MAGIC = b"PK\x03\x04"
 _FILE_KIND = "shearloop estimator calibration"

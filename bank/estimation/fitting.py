@@ -24,13 +24,14 @@ from shearloop.bank.estimation.estimator import (
     Reading,
 )
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator, segment_grip
-from shearloop.bank.estimation.interval_regressor import Mixtures, fit_interval_regressor
+from shearloop.bank.estimation.interval_regressor import IntervalRegressor, Mixtures, fit_interval_regressor
 from shearloop.bank.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
 from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.bank.estimation.regressors import later_origins
 from shearloop.bank.estimation.session_state import ProcessedFrame, SessionState
 from shearloop.bank.estimation.values import FrameSeries, Measured, TactileFrame, check_finite, distinct
 from shearloop.bank.estimators import EstimatorName, estimator_class
+from shearloop.bank.gain import GainCorrection
 
 # With more variance left on a tool of another diameter, the tools have no torque in common.
 _TOOLS_MAY_LEAVE = 0.75
@@ -138,7 +139,8 @@ def _fit_raw(
         bounds = least_nm, largest_nm
     estimator = calibration.estimator.with_imputer(np.array([row.position for row in rows]), calibration.validators)
     features, torque_nm = np.array([row.features for row in rows]), np.array([row.torque_nm for row in rows])
-    estimator, regressor, unexplained = estimator.fit_torque(features, torque_nm, bounds)
+    recording = np.array([row.recording for row in rows])
+    estimator, regressor, unexplained = estimator.fit_torque(features, torque_nm, bounds, recording)
     # By age within the recordings, so that every part has all tools.
     known = sorted((row for row in rows if np.isfinite(row.diameter_mm)), key=lambda row: row.age_s)
     enough = len({row.diameter_mm for row in known}) >= LEAST_DIAMETERS
@@ -152,6 +154,43 @@ def _fit_raw(
             )
         torque = None
     return replace(calibration, estimator=estimator, torque=torque, diameter=diameter)
+
+
+def adapt(
+    calibration: Calibration,
+    recordings: Sequence[FrameSeries],
+    source: str,
+    physics: Physics | None = None,
+    *,
+    first_frames: Sequence[int] = (),
+) -> tuple[Calibration, GainCorrection]:
+    """Return a calibration with the gain of each fingertip corrected by recordings of known torque, and the correction.
+
+    `source` describes them in words. Twists count from each recording's frame of `first_frames` on. The correction is
+    shrunk by how much these can tell. Raises CalibrationError for recordings without a torque estimate under load, and
+    for a calibration without such a gain.
+    """
+    torque = calibration.torque
+    if calibration.kind != "raw" or torque is None or not isinstance(regressor := torque.regressor, IntervalRegressor):
+        raise CalibrationError("only the torque of raw frames has a gain to correct; calibrate on raw recordings")
+    matcher = calibration.matcher((physics or Physics()).bank)
+    check_finite(recordings)
+    rows = [
+        row
+        for i, one in enumerate(recordings)
+        for row in _replay(calibration, matcher, i, one.select_sides(calibration.sides), 1)
+        if not first_frames or row.frame >= first_frames[i]
+    ]
+    if not rows:
+        raise CalibrationError("no frame is gripped and undisturbed for long enough; twist the gripped tool again")
+    adapted, correction = regressor.adapt(
+        np.array([row.features[calibration.estimator.columns["torque"]] for row in rows]),
+        np.array([row.torque_nm for row in rows]),
+        calibration.estimator.side_of_features(len(regressor.mean_feature)),
+    )
+    model = OutputModel(adapted, None, torque.k_range)
+    adapted_to = replace(calibration, torque=model, source=f"{calibration.source}, adapted on {source}")
+    return adapted_to, correction
 
 
 def _replay(

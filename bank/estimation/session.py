@@ -201,7 +201,10 @@ class EstimatorSession:
         if len(errors):
             changed = [self._regressor_inputs(quantity, reading, frame.difference + one) for one in errors]
             error = TWO_SIDED_95 * math.hypot(*(model.regressor.predict(one)[0] - value[0] for one in changed))
-            if 2 * error > value[1] + value[2]:
+            # The gain's error is the same with all channels.
+            reach = model.regressor.gain.reach(value[0])
+            own = [math.sqrt(max(ends[0] ** 2 - ends[1] ** 2, 0.0)) for ends in zip(value[1:], reach, strict=True)]
+            if 2 * error > sum(own):
                 # The dead channels carried the value; the imputed ones are a guess.
                 dead = _dead_channel_reasons(self.calibration.validators, frame.usable)
             value = value[0], math.hypot(value[1], error), math.hypot(value[2], error)

@@ -12,7 +12,7 @@ import numpy as np
 from shearloop.bank.eit.matching import best_match
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import MatchingError
-from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS, EitEstimate, EitHeatmap
+from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS, DaemonEnd, EitEstimate, EitHeatmap
 
 # Pairs of topic and source. A rig has nine topics and two fingertips.
 MAX_STREAMS = 64
@@ -58,6 +58,8 @@ class MessageStore:
         self._models: dict[str, str] = {}
         self._samples: dict[tuple[str, str], deque[tuple[float, dict[str, Any]]]] = {}
         self.number = 0
+        # Whether the latest message says that the daemon has ended.
+        self._ended = False
         self.refused: Counter[str] = Counter()
 
     def add(self, topic: str, content: Mapping[str, Any], now_s: float) -> None:
@@ -77,6 +79,7 @@ class MessageStore:
                 self.refused["message without a JSON form"] += 1
                 return
             self.number += 1
+            self._ended = topic == DaemonEnd.topic
             self._stored[topic, source] = StoredMessage(self.number, now_s, text.removeprefix("{"))
             if topic in CHARTED:
                 sample = {key: json_value(content.get(key)) for key in ("timestamp", *CHARTED[topic])}
@@ -91,7 +94,8 @@ class MessageStore:
             for message in stored
             if message.number > after
         )
-        head = json.dumps({"quiet_s": quiet_s, "refused": dict(self.refused), **other}, allow_nan=False)
+        state = {"quiet_s": quiet_s, "ended": self._ended, "refused": dict(self.refused)}
+        head = json.dumps({**state, **other}, allow_nan=False)
         return f'{head.removesuffix("}")}, "messages": [{messages}]}}'
 
     def history(self, now_s: float) -> list[dict[str, Any]]:

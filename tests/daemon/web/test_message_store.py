@@ -53,6 +53,7 @@ def test_a_new_page_gets_the_last_minute():
 
 def test_quiet_time_is_unknown_without_messages():
     assert batch(MessageStore(3.6))["quiet_s"] is None
+    assert not batch(MessageStore(3.6))["ended"]
 
 
 def test_invalid_messages_are_counted_by_kind_and_do_not_end_the_silence():

@@ -56,7 +56,7 @@ const GEL_HIGH = 1.6;
 // Draw the gel: shades and level lines of its conductivity over the height, electrodes, and marks [cm, text] at heights.
 export function drawGel(canvas, tip, conductivity, marks) {
   const { pen, width, height } = fitted(canvas);
-  const room = { left: 8, right: 52, top: 16, bottom: 16 };
+  const room = { left: 8, right: 52, top: 22, bottom: 22 };
   const [wide, high] = [0, 1].map((axis) => Math.max(...tip.contour.map((point) => point[axis])));
   const scale = Math.min((width - room.left - room.right) / wide, (height - room.top - room.bottom) / high);
   const [w, h] = [wide * scale, high * scale];
@@ -76,7 +76,7 @@ export function drawGel(canvas, tip, conductivity, marks) {
     }
     levels(pen, conductivity, high, x0, w, yOf);
     pen.restore();
-    for (const [cm, text] of marks) mark(pen, cm, text, high, x0 + w, yOf);
+    drawMarks(pen, marks, high, x0 + w, yOf);
   } else {
     label(pen, "no conductivity", x0 + w / 2, y0 + h / 2, "center");
   }
@@ -92,17 +92,21 @@ export function drawGel(canvas, tip, conductivity, marks) {
   }
 }
 
-// One that lies outside the gel is an arrow at its edge.
-function mark(pen, cm, text, high, x, yOf) {
-  const inside = cm >= 0 && cm <= high;
-  const y = yOf(Math.min(high, Math.max(0, cm)));
+function drawMarks(pen, marks, high, x, yOf) {
   pen.strokeStyle = colours.ink;
   pen.lineWidth = 1.5;
-  pen.beginPath();
-  pen.moveTo(x, y);
-  pen.lineTo(x + (inside ? 8 : 0), y);
-  pen.stroke();
-  label(pen, inside ? text : `${text} ${cm > high ? "↑" : "↓"}`, x + 11, inside ? y : y + (cm > high ? -9 : 9));
+  for (const [cm, text] of marks) {
+    if (cm < 0 || cm > high) continue;
+    pen.beginPath();
+    pen.moveTo(x, yOf(cm));
+    pen.lineTo(x + 8, yOf(cm));
+    pen.stroke();
+    label(pen, text, x + 11, yOf(cm));
+  }
+  const outside = (beyond) => marks.filter(([cm]) => beyond(cm)).map(([, text]) => text).join(", ");
+  const [above, below] = [outside((cm) => cm > high), outside((cm) => cm < 0)];
+  if (above) label(pen, `${above} ↑`, x, yOf(high) - 10, "right");
+  if (below) label(pen, `${below} ↓`, x, yOf(0) + 11, "right");
 }
 
 function levels(pen, conductivity, high, x0, w, yOf) {

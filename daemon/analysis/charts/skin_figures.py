@@ -6,7 +6,7 @@ import numpy as np
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.skin.characterisation import WARM_K, Characterisation, ResponseCurve
-from shearloop.bank.skin.membrane import PAPER_SECTION, warming_change
+from shearloop.bank.skin.membrane import PAPER_SECTION, THICK_SECTION, loading_response, warming_change
 from shearloop.daemon.errors import UserError
 
 try:
@@ -128,10 +128,14 @@ def _figure_7(found: Characterisation) -> Figure:
     for normal_n, curve in found.wide_by_normal.items():
         (marks,) = axes.plot(*_both_sides(curve, curve.two_d), MARKERS[normal_n], label=f"2-D, Fn = {normal_n} N")
         marks.set(mfc="none", color=TWO_D, ms=5)
-        axes.plot(*_both_sides(curve, curve.membrane), color=ONE_D, lw=0.8, label="1-D" if normal_n == 2.0 else None)
+        sheet = np.array([loading_response(THICK_SECTION, normal_n, shear_n) for shear_n in curve.shear_n.tolist()])
+        last = normal_n == max(found.wide_by_normal)
+        axes.plot(*_both_sides(curve, curve.membrane), color=ONE_D, lw=0.8, label="1-D" if last else None)
+        label = "finite strain, 0.88 mm" if last else None
+        axes.plot(*_both_sides(curve, sheet), color="black", ls=":", lw=1, label=label)
     for end in (-PAPER_LINEAR_N, PAPER_LINEAR_N):
         axes.axvline(end, color=GREY, ls=":", lw=1)
-    note = "beyond 1.2 N the paper's skin\nturns up; the models do not"
+    note = "beyond 1.2 N the paper's skin\nturns up more than any model"
     axes.text(PAPER_LINEAR_N - 0.03, -0.13, note, color=GREY, ha="right")
     axes.legend(loc="upper left", fontsize=8)
     return made

@@ -215,14 +215,14 @@ def draw_tracks(tracks: Sequence[EstimateTrack], names: Sequence[str], title: st
             np.array([getattr(one, key) if getattr(one, key) is not None else np.nan for one in track.estimates])
             for key in (quantity, *bounds)
         )
-        style = "o" if slices else "-"
+        style, shown = "o" if slices else "-", "estimate with its 95 % interval"
         axes.plot(t_s, truth, f"k{style}", linewidth=1.0, markersize=5, label="truth")
         if slices:
-            axes.errorbar(t_s, value, [value - low, high - value], fmt="s", markersize=4, label="estimate with its 95 % interval")
+            axes.errorbar(t_s, value, [value - low, high - value], fmt="s", markersize=4, label=shown)
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         else:
             axes.fill_between(t_s, low, high, alpha=0.25, linewidth=0)
-            axes.plot(t_s, value, linewidth=1.2, label="estimate with its 95 % interval")
+            axes.plot(t_s, value, linewidth=1.2, label=shown)
             axes.fill_between(
                 t_s, 0, 1, where=np.isnan(value), transform=axes.get_xaxis_transform(), color="0.92", linewidth=0,
                 label="no valid estimate",

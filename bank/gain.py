@@ -7,7 +7,7 @@ gain only as far as twists of one recording agree.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -22,6 +22,8 @@ PRIOR_SPREAD, _PRIOR_RECORDINGS = 0.28, 3
 # Twists of a recording differ at least by this; a few alike are chance.
 _LEAST_WITHIN = 0.05
 _LEAST_NOISE, _LEAST_ZERO, _ROUNDS = 1e-3, 1e-6, 200
+# Furthest diameter beyond the calibrated ones, as a ratio, and rounds that the gains of recordings need to settle.
+_REACH, _GAIN_ROUNDS = 1.5, 8
 # A frame is loaded above this share of the largest torque.
 LOADED_SHARE = 0.1
 # A twist that is missed, or read the other way round, counts as one of these.
@@ -122,6 +124,57 @@ class GainCorrection:
     offset_nm: float
     spread: GainSpread
     twists: int
+
+
+@dataclass(frozen=True, slots=True)
+class ToolLaw:
+    """Gain over the tool's diameter: ln gain = intercept + slope · ln diameter, and its error on a diameter left out.
+
+    The diameters in mm reach from low_mm to high_mm.
+    """
+
+    intercept: float
+    slope: float
+    spread: float
+    low_mm: float
+    high_mm: float
+
+    @classmethod
+    def fit(cls, diameters_mm: FloatArray, gains: FloatArray) -> Self:
+        """Fit to (n,) gains of tools of three diameters or more."""
+        x, y = np.log(diameters_mm), np.log(gains)
+        slope, intercept = np.polyfit(x, y, 1)
+        errors = [
+            y[x == one] - np.polyval(np.polyfit(x[x != one], y[x != one], 1), one) for one in np.unique(x).tolist()
+        ]
+        spread = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+        return cls(float(intercept), float(slope), spread, float(diameters_mm.min()), float(diameters_mm.max()))
+
+    def gain(self, diameter_mm: float) -> float | None:
+        """Return the gain on a tool, None too far from the calibrated ones."""
+        if not self.low_mm / _REACH <= diameter_mm <= self.high_mm * _REACH:
+            return None
+        return math.exp(self.intercept + self.slope * math.log(diameter_mm))
+
+
+def gains_of_recordings(
+    numbers: IntArray, torque_nm: FloatArray, predict: Callable[[IntArray, IntArray, FloatArray], FloatArray]
+) -> FloatArray:
+    """Return the gain of each recording, whose number each of (n,) rows has, in one unit of motion.
+
+    predict(kept, out, values (n,)) fits values on some rows and predicts them on others. The gains are those that make
+    each recording's torque predictable from the others'.
+    """
+    each = [np.flatnonzero(numbers == one) for one in np.unique(numbers)]
+    gains = np.array([np.sqrt((torque_nm[rows] ** 2).mean()) for rows in each])
+    for _ in range(_GAIN_ROUNDS):
+        values = torque_nm / gains[numbers]
+        found = [
+            loaded_gain(predict(np.flatnonzero(numbers != one), rows, values), values[rows])
+            for one, rows in enumerate(each)
+        ]
+        gains *= found / np.exp(np.log(found).mean())
+    return gains
 
 
 def find_twists(torque_nm: FloatArray) -> list[IntArray]:

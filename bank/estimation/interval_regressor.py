@@ -280,6 +280,21 @@ class IntervalRegressor:
             above = max(above, self.range.highest - value)
         return value, below, above
 
+    def scaled(self, factor: float, spread: float) -> "IntervalRegressor":
+        """Return the regressor of values larger by a factor, whose gain and zero have this spread."""
+        point, span = self.point, self.range
+        if isinstance(point, CensoredRidge):
+            point = replace(point, sigma=factor * point.sigma)
+        if isinstance(point, InverseCalibration):
+            raise CalibrationError("a curve of slices has no gain")
+        return replace(
+            self,
+            point=replace(point, weights=factor * point.weights, offset=factor * point.offset),
+            intervals=Intervals(factor * self.intervals.edges, factor * self.intervals.half_widths),
+            range=ValueRange(*(factor * end for end in (span.low, span.high, span.lowest, span.highest))),
+            gain=replace(self.gain, between=spread, zero=spread, noise_nm=factor * self.gain.noise_nm),
+        )
+
     def adapt(
         self, features: FloatArray, torque_nm: FloatArray, sides: IntArray
     ) -> "tuple[IntervalRegressor, GainCorrection]":

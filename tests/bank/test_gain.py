@@ -6,7 +6,7 @@ import pytest
 
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.interval_regressor import CensoredRidge, Ridge, fit_interval_regressor
-from shearloop.bank.gain import PRIOR_SPREAD, GainSpread, find_twists, loaded_gain
+from shearloop.bank.gain import PRIOR_SPREAD, GainSpread, ToolLaw, find_twists, gains_of_recordings, loaded_gain
 
 TWISTS = np.tile([0.0, 0.0, 0.0, 0.03, 0.05, 0.04, 0.0, 0.0], 10)
 
@@ -114,3 +114,23 @@ def test_the_gain_of_a_missed_load_is_bounded():
     assert loaded_gain(np.zeros(80), TWISTS) == 5.0
     assert loaded_gain(-TWISTS, TWISTS) == 0.2
     assert loaded_gain(TWISTS / 1.5, TWISTS) == pytest.approx(1.5)
+
+
+def test_a_law_over_tools_predicts_those_left_out_and_says_how_far_it_is_off():
+    diameters_mm = np.array([10.0, 20.0, 30.0, 40.0])
+    exact = ToolLaw.fit(diameters_mm, 5.0 * diameters_mm**-3.0)
+    assert exact.gain(25.0) == pytest.approx(5.0 * 25.0**-3)
+    assert exact.spread < 1e-9
+    scattered = ToolLaw.fit(diameters_mm, 5.0 * diameters_mm**-3.0 * [1.5, 1 / 1.5, 1.5, 1 / 1.5])
+    assert scattered.spread > math.log(1.5)
+    assert ToolLaw.fit(diameters_mm[1:], diameters_mm[1:]).gain(10.0) is None
+
+
+def test_gains_of_recordings_make_their_torques_one():
+    rng = np.random.default_rng(2)
+    true, numbers = np.array([1.0, 0.2, 0.03]), np.repeat([0, 1, 2], 50)
+    motion = rng.uniform(0, 1, 150)
+    gains = gains_of_recordings(
+        numbers, true[numbers] * motion, lambda kept, out, values: motion[out] * (values[kept] / motion[kept]).mean()
+    )
+    np.testing.assert_allclose(gains / gains[0], true, rtol=1e-3)

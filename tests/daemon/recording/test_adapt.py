@@ -46,3 +46,26 @@ def test_what_cannot_be_adapted_is_refused(grips, slices_folder, capsys):
     assert main(["calibrate", str(slices_folder), "--estimator", "regression", "--out", str(grips / "s.cal")]) == 0
     assert main(["adapt", str(grips / "s.cal"), str(grips / "2.mcap"), *out]) == 2
     assert "raw" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("tool", "others"), [("20mm_1", "10mm_1 30mm_1 30mm_2 40mm_1"), ("40mm_1", "10mm_1 20mm_1 30mm_1 30mm_2")]
+)
+def test_other_diameters_and_two_twists_estimate_the_torque_on_a_tool(shared, tmp_path, capsys, tool, others):
+    folder = shared / "recordings" / "streams" / "cylinders"
+    for name in [tool, *others.split()]:
+        files = [str(folder / f"{name}_{what}.mat") for what in ("right", "truth")]
+        assert main(["import", "mat", *files, "--out", str(tmp_path / f"{name}.mcap")]) == 0
+    recordings = [str(tmp_path / f"{name}.mcap") for name in others.split()]
+    out, new, tested = (str(tmp_path / name) for name in ("tools.cal", "new.cal", f"{tool}.mcap"))
+    assert main(["calibrate", *recordings, "--load-cell-delay-s", "0", "--out", out]) == 0
+    before = loaded(out, tested, capsys)
+    assert before["coverage_95"] > 0.9, "a tool that was not calibrated"
+    assert main(["adapt", out, tested, "--time-range", "0:0.28", "--out", new]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", new, tested, "--time-range", "0.28:1", "--json"]) == 0
+    after = json.loads(capsys.readouterr().out)
+    # A plateau is nearly the loaded frames' root mean square.
+    assert after["rmse_nm"] < 0.2 * after["loaded"]["zero_rmse_nm"]
+    assert after["coverage_95"] >= 0.9
+    assert after["frames"] * after["valid_fraction"] > 40

@@ -150,6 +150,24 @@ def _options(parser) -> set[str]:
     return found
 
 
+@pytest.mark.parametrize("page", PAGES[1:], ids=lambda page: page.name)
+def test_a_page_is_short_in_the_site_and_leads_to_the_glossary(page):
+    text = page.read_text()
+    # Tables that are made from the code are for looking up.
+    written = re.sub(r"<!-- generated: .*?<!-- end -->", "", text, flags=re.DOTALL)
+    assert len(written.split()) <= 1200
+    assert "(glossary.md)" in text or page.name == "glossary.md"
+    assert f"- {page.name}\n" in (ROOT / "mkdocs.yml").read_text()
+
+
+def test_the_readme_is_short_and_begins_with_what_for_whom_and_why():
+    lines = (ROOT / "README.md").read_text().splitlines()
+    assert len(lines) <= 150
+    first_screen = "\n".join(lines[:25])
+    for part in ("**What.**", "**For whom.**", "**Why.**", "](docs/images/live-view.png)", "shearloop demo"):
+        assert part in first_screen
+
+
 @pytest.fixture(scope="module")
 def notebook_run(tmp_path_factory) -> tuple[dict[str, str], Path]:
     """Runs the notebook; its results as text by the name that each shows, and the folder of its files."""

@@ -116,9 +116,8 @@ class GainSpread:
 class GainCorrection:
     """Factors (m,) on the torques of m fingertips with their standard errors, and what is added to their sum.
 
-       `spread` is the gain's spread that remains, `twists` their number.
-    Where an estimator combines its fingertips
-       otherwise, m is 1.
+    `spread` is the gain's spread that remains, `twists` their number. Where an estimator combines its fingertips
+    otherwise, m is 1.
     """
 
     factors: FloatArray

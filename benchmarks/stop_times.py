@@ -42,6 +42,7 @@ from benchmarks.common import (
 from shearloop.bank.eit.bank_file import BankDefinition, write_bank
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, TOPICS, decode
+from shearloop.drivers.defaults import FRAME_PERIOD_S, LOAD_CELL_RATE_HZ
 
 PROMISE_S = 0.2
 DEADLINE_S = 60.0
@@ -104,19 +105,35 @@ def write_rig_bank(path: Path) -> None:
 class RunningRig:
     """One emulated rig, and a daemon that is started again when it ends."""
 
-    def __init__(self, folder: Path, stack: ExitStack) -> None:
-        """Start both."""
+    def __init__(self, folder: Path, stack: ExitStack, speed: int = 1, **content: Any) -> None:
+        """Start both, with boards, gel and fingers so many times as fast, and further keys of the configuration."""
         write_rig_bank(folder / "rig.bank")
         os.mkfifo(folder / "cause")
         self._causes = stack.enter_context((folder / "cause").open("r+b", buffering=0))
-        options = ("--paper-sketch", "--unlock-wait-s", "0.5", "--power-on-s", "0.2", "--gel-stiffness", "0.02")
+        options: tuple[str, ...] = (
+            "--paper-sketch",
+            "--unlock-wait-s",
+            "0.5",
+            "--power-on-s",
+            "0.2",
+            "--gel-stiffness",
+            "0.02",
+        )
+        options += ("--speed", str(speed))
         self._rig = stack.enter_context(emulated_rig(folder, folder / "rig.bank", *options))
         os.set_blocking(self._events.fileno(), False)
         self._config = write_rig_config(
             folder,
             "config/ur.yaml",
-            fingertips={"right": {"device": {"path": "eit-right"}, "bank": "rig.bank"}},
-            load_cell={"device": {"path": "load-cell"}},
+            fingertips={
+                "right": {
+                    "device": {"path": "eit-right"},
+                    "bank": "rig.bank",
+                    "frame_period_s": FRAME_PERIOD_S / speed,
+                }
+            },
+            load_cell={"device": {"path": "load-cell"}, "rate_hz": LOAD_CELL_RATE_HZ * speed},
+            **content,
         )
         self._folder = folder
         self._unread = b""
@@ -134,7 +151,8 @@ class RunningRig:
             (self._folder / name).unlink(missing_ok=True)
         self.daemon, _ = self._daemons.enter_context(running_daemon(self._config, "benchmarks.breakable_daemon"))
 
-    def _worker_pid(self) -> int:
+    def worker_pid(self) -> int:
+        """Return the robot's process."""
         children = Path(f"/proc/{self.daemon.pid}/task/{self.daemon.pid}/children").read_text().split()
         for pid in children:
             if b"shearloop.drivers.ur.worker" in Path(f"/proc/{pid}/cmdline").read_bytes():
@@ -187,7 +205,7 @@ class RunningRig:
         """Bring a cause about; return its time in ns."""
         if cause.command:
             return self.order(cause.command)
-        pids = {"daemon": self.daemon.pid, "worker": self._worker_pid()}
+        pids = {"daemon": self.daemon.pid, "worker": self.worker_pid()}
         began_ns = time.monotonic_ns()
         for process, number in cause.signals:
             os.kill(pids[process], number)

@@ -59,6 +59,10 @@ _LEAST_LOADED = 3
 _LEAST_RELEASED = 10
 
 
+# The threshold's largest share of the way from idle to the weakest grip.
+_LARGEST_RISE = 1 / 3
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FingertipValidator:
     """One fingertip at calibration: mean frames idle and gripped, noise (c,), all in volts, and grip discriminant.
@@ -115,7 +119,10 @@ class FingertipValidator:
         weights = discriminant(slice(None))
         idle_scores = np.concatenate([one[0] @ weights for one in relative])
         rise = max(_IDLE_DEVIATIONS * float(idle_scores.std()), _LEAST_RISE)
-        threshold = float(np.quantile(idle_scores, 0.99)) + rise
+        highest_idle = float(np.quantile(idle_scores, 0.99))
+        weakest_grip = min(float(np.quantile(one[1] @ weights, 0.01)) for one in relative)
+        # Idle scores of different tools scatter further than the weakest grip of them.
+        threshold = highest_idle + min(rise, _LARGEST_RISE * max(weakest_grip - highest_idle, 0.0))
         step_limit = fall_limit = np.inf
         if not any(len(released) for _, _, released in recordings):
             gripped = [frames for _, frames, _ in recordings]

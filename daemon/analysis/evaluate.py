@@ -31,6 +31,12 @@ class EstimateTrack:
     estimates: tuple[Estimate, ...]
     latency_ms: FloatArray
 
+    def since(self, first_frame: int) -> "EstimateTrack":
+        """Return the part from a frame of the recording on."""
+        first = first_frame - self.series.first_frame
+        series = self.series.between(first, len(self.estimates))
+        return EstimateTrack(series, self.estimates[first:], self.latency_ms[first:])
+
 
 def estimate_series(calibration: Calibration, series: FrameSeries, bank: Bank | None = None) -> EstimateTrack:
     """Estimate every frame of a series in order, as live; raises CalibrationError for a series of other sides."""

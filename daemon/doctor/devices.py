@@ -316,7 +316,7 @@ def _expected_rates(config: DaemonConfig) -> dict[tuple[str, str], float]:
         ("health", "daemon"): TOPICS["health"].rate_hz,
         **{("eit.frame", name): 1.0 / one.frame_period_s for name, one in config.fingertips.items()},
         ("load.torque", "load_cell"): cell.rate_hz if cell is not None else None,
-        ("skin.shear", "skin"): skin.daq.rate_hz if skin is not None else None,
+        ("skin.shear", "skin"): 1.0 / skin.daq.sample_period_s if skin is not None else None,
         ("robot.state", "robot"): TOPICS["robot.state"].rate_hz if config.robot is not None else None,
         ("gripper.state", "gripper"): TOPICS["gripper.state"].rate_hz if config.gripper is not None else None,
     }

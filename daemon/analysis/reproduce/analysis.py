@@ -133,7 +133,6 @@ class TorqueResult:
     focused: Matches
     wide: Matches
     r_focused: float | None
-    r_wide: float | None
     groups: IntArray
     grouping: str
     r_clustered: float | None
@@ -142,6 +141,11 @@ class TorqueResult:
     rmse_nm: float | None
     held_out: str
     notes: tuple[str, ...]
+
+    @property
+    def r_wide(self) -> float | None:
+        """The correlation on the wide bank."""
+        return correlation(self.wide.sigma, self.slices.torque_nm)
 
     @property
     def group_torque_nm(self) -> FloatArray:
@@ -231,7 +235,6 @@ def analyse_torque(slices: Slices, on_focused: Matches, on_wide: Matches) -> Tor
         focused=on_focused,
         wide=on_wide,
         r_focused=correlation(sigma, torque),
-        r_wide=correlation(on_wide.sigma, torque),
         groups=groups,
         grouping=grouping,
         r_clustered=r_clustered,

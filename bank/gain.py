@@ -89,8 +89,10 @@ class GainSpread:
         prior = np.append(np.full(m, m * spread.between**2), (max(self.zero, _LEAST_ZERO) * load_nm) ** 2)
         weighted, information = np.zeros((len(truth), m + 1)), np.diag(1.0 / prior)
         for rows in twists:
-            error = self.noise_nm**2 * np.eye(len(rows)) + self.within**2 * np.outer(truth[rows], truth[rows])
-            weighted[rows] = np.linalg.solve(error, columns[rows])
+            # One equation a twist, along its torque: its shape would tell of delays, not of the gain.
+            along, power = truth[rows], float(truth[rows] @ truth[rows])
+            variance = power * (self.noise_nm**2 + self.within**2 * power)
+            weighted[rows] = np.outer(along, along @ columns[rows]) / variance
         # The unloaded frames before a twist have one error in common.
         weighted[unloaded] = columns[unloaded] * len(twists) / (max(len(unloaded), 1) * self.noise_nm**2)
         covariance = np.linalg.inv(information + weighted.T @ columns)
@@ -104,8 +106,8 @@ class GainSpread:
         covariance = np.linalg.inv(information + weighted[telling].T @ columns[telling])
         factors = np.clip(1.0 + change[:m], _LEAST_GAIN, _LARGEST_GAIN)
         corrected = parts @ factors + change[m]
-        variance = np.einsum("ni,ij,nj->n", columns[loaded], covariance, columns[loaded]).mean()
-        relative = float(np.sqrt(variance / (corrected[loaded] ** 2).mean()))
+        spread_nm2 = np.einsum("ni,ij,nj->n", columns[loaded], covariance, columns[loaded]).mean()
+        relative = float(np.sqrt(spread_nm2 / (corrected[loaded] ** 2).mean()))
         spread = replace(spread, between=min(relative, spread.between))
         return GainCorrection(factors, np.sqrt(np.diag(covariance))[:m], float(change[m]), spread, len(twists))
 

@@ -104,17 +104,18 @@ def _repair(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace) -> int:
-    from shearloop.daemon.recording.export import count_messages, export
+    from shearloop.daemon.recording.export import export
+    from shearloop.daemon.recording.tables import RecordedTopics
 
     stem = args.recording.name.partition(".mcap")[0]
     out = args.out or args.recording.with_name(f"{stem}.mat" if args.format == "mat" else f"{stem}_{args.format}")
     if args.format == "mat":
         check_overwrite(out, "a MATLAB file", b"MATLAB")
-    counts = count_messages(args.recording)
+    counts = RecordedTopics(args.recording).counts
     unknown = [topic for topic in args.topic or () if topic not in counts]
     if unknown:
-        raise UserError(f"{args.recording} has no topic {unknown[0]!r}; it has {', '.join(sorted(counts))}")
-    topics = args.topic or sorted(topic for topic, count in counts.items() if count)
+        raise UserError(f"{args.recording} has no topic {unknown[0]!r}; it has {', '.join(counts)}")
+    topics = args.topic or list(counts)
     with progress_bar(args.format, sum(counts[topic] for topic in topics), "message") as progress:
         written = export(args.recording, args.format, out, topics, progress)
     return print_result({"files": [str(path) for path in written]}, map(str, written), as_json=args.json)

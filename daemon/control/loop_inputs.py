@@ -14,7 +14,7 @@ NotNegative = Annotated[float, Field(ge=0)]
 
 
 class LoopConfig(ConfigModel):
-    """Settings of the closed loop; docs/safety.md lists what each fault leads to."""
+    """Settings of the closed loop; docs/faults.md lists what each fault leads to."""
 
     allowed_noise_nm: float = Field(default=0.0025, gt=0, le=1, description="true torque's std that noise may cause")
     kp: float | None = Field(default=None, gt=0, le=1, description="fixes the gain, which else follows from the noise")

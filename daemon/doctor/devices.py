@@ -287,7 +287,7 @@ def check_daemon(
             yield note(f"estimate of {name}", "not valid", str(reason), "see docs/troubleshooting.md")
     states = received.get(("loop.state", "loop"))
     if states and (reasons := states[-1].get("reasons")):
-        yield note("loop", str(states[-1].get("phase")), str(reasons), "see docs/safety.md")
+        yield note("loop", str(states[-1].get("phase")), str(reasons), "see docs/faults.md")
 
 
 def check_task(name: str, status: Mapping[str, Any]) -> Finding:

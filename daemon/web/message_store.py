@@ -29,6 +29,15 @@ CHARTED: Mapping[str, tuple[str, ...]] = {
 }
 # Points of a conductivity profile: finer than a pixel of the drawing.
 HEIGHTS = 145
+# What k and σ mean as heights: factors of σ from k with their labels, and a sentence.
+HEIGHT_MARKS: Mapping[str, tuple[Mapping[str, float], str]] = {
+    "step": ({"k": 0.0}, "k is the height of the step"),
+    "linear": ({"k": 0.0}, "k is the height without change"),
+    "gaussian_derivative": (
+        {"k": 0.0, "k−σ": -1.0, "k+σ": 1.0},
+        "k is the height without change, k−σ and k+σ are those of the largest rise and fall",
+    ),
+}
 
 
 class StoredMessage(NamedTuple):
@@ -105,7 +114,11 @@ class MessageStore:
             return {"peaks": _peaks(content.get("scores"))}
         k, sigma = content.get("k"), content.get("sigma")
         if topic == EitEstimate.topic and isinstance(k, float) and isinstance(sigma, float):
-            return {"conductivity": conductivity_profile(self._models.get(source, ""), k, sigma, self._height_cm)}
+            model = self._models.get(source, "")
+            offsets, meaning = HEIGHT_MARKS.get(model, ({}, ""))
+            marks = [(json_value(k + offset * sigma), label) for label, offset in offsets.items()]
+            profile = conductivity_profile(model, k, sigma, self._height_cm)
+            return {"conductivity": profile, "marks": marks if profile else [], "meaning": meaning if profile else ""}
         return {}
 
 

@@ -65,7 +65,7 @@ def test_each_fingertip_has_its_own_gain():
     shares = rng.uniform(0.0, 2.0, 80)
     features = np.column_stack([shares * TWISTS / 1.3, (2 - shares) * TWISTS / 0.8])
     _, correction = before.adapt(features, TWISTS, np.array([0, 1]))
-    np.testing.assert_allclose(correction.factors, [1.3, 0.8], atol=0.05)
+    np.testing.assert_allclose(correction.factors, [1.3, 0.8], atol=0.1)
 
 
 def test_twists_that_disagree_correct_little():
@@ -134,3 +134,13 @@ def test_gains_of_recordings_make_their_torques_one():
         numbers, true[numbers] * motion, lambda kept, out, values: motion[out] * (values[kept] / motion[kept]).mean()
     )
     np.testing.assert_allclose(gains / gains[0], true, rtol=1e-3)
+
+
+def test_the_shape_of_a_twist_does_not_count_as_gain():
+    """Estimates that fall earlier than the torque have the right gain all the same."""
+    truth = np.array([0.0, 0.025, 0.056, 0.058, 0.053, 0.028, 0.0])
+    early = np.array([0.0, 0.050, 0.058, 0.057, 0.033, 0.005, 0.0])
+    spread = GainSpread(between=0.3, within=0.2, noise_nm=0.006)
+    assert loaded_gain(early, truth) == pytest.approx(1.0, abs=0.06)
+    factor = spread.correct(early[:, None], truth, find_twists(truth), bounded=True).factors[0]
+    assert factor == pytest.approx(1.0, abs=0.1)

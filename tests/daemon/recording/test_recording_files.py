@@ -11,12 +11,12 @@ from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.config import RecordingConfig, load_daemon_config
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.export import count_messages
 from shearloop.daemon.recording.matlab import import_mat
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.recorder import daemon_identity
 from shearloop.daemon.recording.replay import RecordedRun
 from shearloop.daemon.recording.schema import LOAD_DOUBT_NOTE
+from shearloop.daemon.recording.tables import RecordedTopics
 from shearloop.daemon.recording.writer import RecordingWriter
 
 
@@ -61,7 +61,7 @@ def test_an_unfinished_recording_stays_partial(tmp_path):
     assert read_recording(tmp_path / "a.mcap.partial").torque_nm.tolist() == [1.0]
 
 
-@pytest.mark.parametrize("read", [read_recording, RecordedRun, count_messages])
+@pytest.mark.parametrize("read", [read_recording, RecordedRun, RecordedTopics])
 def test_foreign_and_outdated_files_are_refused(tmp_path, monkeypatch, read):
     (tmp_path / "text.mcap").write_text("hello")
     with (tmp_path / "other.mcap").open("wb") as file:

@@ -107,7 +107,6 @@ export class FingertipPanel {
     put(this.part("latency"), said.latency_s === undefined ? "–" : number(1000 * said.latency_s, 0, "ms"));
     warn(this.part("invalid"), estimate && !said.valid ? `not valid: ${said.reason}` : "");
     if (this.drawn.gel !== estimate || !estimate) this.drawGel(estimate);
-    show(this.part("map").parentElement, heatmap !== undefined);
     if (this.drawn.map !== heatmap) this.drawMap(heatmap);
     if (heatmap) this.mapText(heatmap, said);
   }

@@ -9,10 +9,10 @@ def times(count: int) -> str:
 
 
 def system_reason(error: OSError) -> str:
-    """Return the system's words for an error, such as `Connection refused`; a timeout has none."""
+    """Return the system's words for an error, such as `Connection refused`, or our own; a timeout has none."""
     if error.errno is not None and error.errno > 0:
         return os.strerror(error.errno)
-    return error.strerror or "no answer"
+    return error.strerror or str(error) or "no answer"
 
 
 class DriverError(Exception):

@@ -340,7 +340,7 @@ def test_no_bound_is_below_its_score(cell, noise, seed):
     """Also of frames that are a cell's own signal, where next to nothing is left out of the bank's basis."""
     _, fast = PAIRS[1]
     noisy = BANK[0][cell] + noise * np.random.default_rng(seed).normal(size=PAPER_TABLE.n_channels)
-    (frame,) = unit_magnitudes(noisy[None])
+    (frame,) = unit_magnitudes(noisy[None], 896)
     signals = np.abs(BANK[0][BANK[1]].astype(np.float64))
     scores = (signals @ frame) / np.linalg.norm(signals, axis=1)
     found = ZeroLagBounds(fast.compressed, frame)
@@ -370,7 +370,7 @@ def test_no_group_of_cells_is_bounded_below_one_of_them():
 def test_no_bound_at_any_lag_is_below_its_score(cell, noise, seed):
     slow, fast = PAIRS[0]
     frame = BANK[0][cell] + noise * np.random.default_rng(seed).normal(size=PAPER_TABLE.n_channels)
-    found = AllLagsBounds(fast, unit_magnitudes(frame[None])[0])
+    found = AllLagsBounds(fast, unit_magnitudes(frame[None], 896)[0])
     scores = slow.heatmap(frame)[BANK[1]]
     best, reached = found.reached
     assert 0 < reached <= scores[best] + 1e-12

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from scipy.io import savemat
 
-from shearloop.daemon.errors import UserError
+from shearloop.daemon.errors import require
 from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.reader import check_identity, open_recording
+from shearloop.daemon.recording.reader import check_identity, open_recording, read_messages
 
 Rows = list[dict[str, Any]]
 Progress = Callable[[int], None]
@@ -29,41 +29,35 @@ def export(path: Path, form: str, out: Path, topics: list[str], progress: Progre
     """Write topics as `form` (csv, parquet or mat) and return the files.
 
     For csv and parquet `out` is a folder, for mat a file. `progress` receives the number of messages so far. Raises
-    UserError for a recording that cannot be read and for files that cannot be written.
+    UserError for a recording that cannot be read and OSError for files that cannot be written.
     """
     done = itertools.count(1)
 
     def rows(topic: str) -> Rows:
         return _read_rows(path, topic, lambda: progress(next(done)))
 
-    try:
-        if form == "mat":
-            structs = {topic.replace(".", "_").replace("-", "_"): _matlab_struct(rows(topic)) for topic in topics}
-            # savemat changes names and hides the reason if it opens the file itself.
-            with out.open("wb") as file:
-                # The stubs allow only names.
-                savemat(file, structs, long_field_names=True, oned_as="column", do_compression=True)  # type: ignore[arg-type]
-            return [out]
-        out.mkdir(parents=True, exist_ok=True)
-        write = {"csv": _write_csv, "parquet": _write_parquet}[form]
-        written = [out / f"{topic}.{form}" for topic in topics]
-        for topic, file_path in zip(topics, written, strict=True):
-            write(file_path, rows(topic))
-    except OSError as error:
-        raise UserError(f"{out}: the export cannot be written: {error.strerror or error}") from error
+    if form == "mat":
+        structs = {topic.replace(".", "_").replace("-", "_"): _matlab_struct(rows(topic)) for topic in topics}
+        # savemat changes names and hides the reason if it opens the file itself.
+        with out.open("wb") as file:
+            # The stubs allow only names.
+            savemat(file, structs, long_field_names=True, oned_as="column", do_compression=True)  # type: ignore[arg-type]
+        return [out]
+    out.mkdir(parents=True, exist_ok=True)
+    write = {"csv": _write_csv, "parquet": _write_parquet}[form]
+    written = [out / f"{topic}.{form}" for topic in topics]
+    for topic, file_path in zip(topics, written, strict=True):
+        write(file_path, rows(topic))
     return written
 
 
 def _read_rows(path: Path, topic: str, count: Callable[[], None]) -> Rows:
     """Return a topic's messages by time: log_time_ns first, maps as JSON text, None for a missing value."""
     rows = []
-    with open_recording(path) as recording:
-        live = schema.schema_name(topic)
-        for _, message in recording.messages([topic]):
-            content = schema.with_missing_keys(live, json.loads(message.data))
-            row = {key: json.dumps(value) if isinstance(value, dict) else value for key, value in content.items()}
-            rows.append({"log_time_ns": message.log_time, **row})
-            count()
+    for _, content, message in read_messages(path, [topic]):
+        row = {key: json.dumps(value) if isinstance(value, dict) else value for key, value in content.items()}
+        rows.append({"log_time_ns": message.log_time, **row})
+        count()
     return rows
 
 
@@ -90,11 +84,10 @@ def _write_csv(path: Path, rows: Rows) -> None:
 
 
 def _write_parquet(path: Path, rows: Rows) -> None:
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ModuleNotFoundError as error:
-        raise UserError("Parquet needs pyarrow: `pip install 'shearloop[export]'`") from error
+    require("pyarrow", "export", "Parquet")
+    import pyarrow
+    import pyarrow.parquet
+
     pyarrow.parquet.write_table(pyarrow.table(_columns(rows)), path)
 
 

@@ -128,8 +128,8 @@ def emulated_rig(folder: Path, bank: Path, *options: str) -> Iterator["subproces
 
 
 @contextlib.contextmanager
-def running_daemon(config: Path) -> Iterator[tuple["subprocess.Popen[bytes]", float]]:
-    """Run a daemon in its own process; yield it and the seconds until it was ready."""
+def running_daemon(config: Path, module: str = "shearloop") -> Iterator[tuple["subprocess.Popen[bytes]", float]]:
+    """Run a daemon in its own process, by the module's command line; yield it and the seconds until it was ready."""
     folder = config.parent
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready, (folder / "daemon.log").open("wb") as log:
         ready.bind(str(folder / "notify"))
@@ -138,7 +138,7 @@ def running_daemon(config: Path) -> Iterator[tuple["subprocess.Popen[bytes]", fl
         kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
         begun = time.monotonic()
         process = subprocess.Popen(
-            [sys.executable, "-m", "shearloop", "run", str(config)],
+            [sys.executable, "-m", module, "run", str(config)],
             env={**kept, "NOTIFY_SOCKET": str(folder / "notify")},
             stderr=log,
         )

@@ -77,17 +77,11 @@ class FingertipConfig(ConfigModel):
     bank: Path | None = Field(None, description="of `shearloop bank build`; for k, sigma, heatmaps, estimator `paper`")
     calibration: Path | None = Field(None, description="without one, k and sigma are published, but no torque")
     estimator: EstimatorName | None = Field(None, description="default: the calibration's")
-    matching: Literal["all_lags", "zero_lag"] = Field(
-        "all_lags", description="shifts of the frame along its channels that the search tries"
-    )
-    baseline_frames: int = Field(
-        BASELINE_FRAMES, ge=2, le=1000, description="frames averaged into the homogeneous frame"
-    )
+    matching: Literal["all_lags", "zero_lag"] = Field("all_lags", description="shifts of a frame to search")
+    baseline_frames: int = Field(BASELINE_FRAMES, ge=2, le=1000, description="frames of the homogeneous frame")
     average_frames: int = Field(1, ge=1, le=100, description="latest frames averaged before matching")
     creep: CreepConfig | None = Field(None, description="of the gel; subtracted from the loop's torque")
-    frame_period_s: float = Field(
-        FRAME_PERIOD_S, gt=0, le=60, description="the board's frame period before it is measured"
-    )
+    frame_period_s: float = Field(FRAME_PERIOD_S, gt=0, le=60, description="frame period before it is measured")
     heatmap: Literal["on_request", "always"] = Field("on_request", description="when to compute eit.heatmap")
 
 
@@ -131,9 +125,7 @@ class ScannerConfig(ConfigModel):
 
     socket: InstrumentSocket = Field(description="its network address")
     channels: tuple[Channel, Channel] = Field(SCANNER_CHANNELS, description="of gauge 1 and 2")
-    range_v: float = Field(
-        SCANNER_RANGE_V, gt=0, le=300, description="measuring range, above the voltage of each gauge"
-    )
+    range_v: float = Field(SCANNER_RANGE_V, gt=0, le=300, description="measuring range, above each gauge's voltage")
 
     @model_validator(mode="after")
     def _two_channels(self) -> "ScannerConfig":
@@ -155,8 +147,21 @@ class SkinDaqConfig(ConfigModel):
     scanner: ScannerConfig | None = Field(None, description="a scanning multimeter; else `adc`")
     adc: AdcConfig | None = Field(None, description="a converter board; else `scanner`")
     rate_hz: float = Field(DAQ_RATE_HZ, ge=1, le=1000, description="readings of both gauges per second")
+    average_s: float = Field(
+        0.0, ge=0, le=10, description="time over which readings are averaged into one sample; the paper's is 1"
+    )
 
     _one_way_in = either("scanner", "adc")
+
+    @property
+    def averaged(self) -> int:
+        """The readings of one sample."""
+        return max(round(self.average_s * self.rate_hz), 1)
+
+    @property
+    def sample_period_s(self) -> float:
+        """The time from sample to sample."""
+        return self.averaged / self.rate_hz
 
 
 class SkinConfig(ConfigModel):
@@ -166,13 +171,9 @@ class SkinConfig(ConfigModel):
     daq: SkinDaqConfig = Field(description="the instrument that reads the voltages")
     calibration: Path = Field(description="made by `shearloop skin calibrate`")
     normal_n: float = Field(1.0, ge=0, le=100, description="normal force on the skin, for its friction")
-    tool_radius_mm: float | None = Field(
-        None, gt=0, le=200, description="from the wrist's axis to the skin, for torque"
-    )
+    tool_radius_mm: float | None = Field(None, gt=0, le=200, description="from wrist axis to skin, for torque")
     zero_samples: int = Field(20, ge=10, le=1000, description="readings averaged into the zero")
-    drift_per_hour: float = Field(
-        DRIFT_PER_HOUR, ge=0, le=1, description="95 % bound on the response's drift; the paper's"
-    )
+    drift_per_hour: float = Field(DRIFT_PER_HOUR, ge=0, le=1, description="95 % bound of the response's drift")
 
 
 class GripperSocket(ConfigModel):
@@ -227,9 +228,7 @@ class DaemonConfig(ConfigModel):
     publish: Address = Field(addresses.PUBLISH_ADDRESS, description="ZeroMQ address of the messages")
     commands: Address = Field(addresses.COMMAND_ADDRESS, description="ZeroMQ address of the commands")
     curve: CurveConfig | None = Field(None, description="keys for addresses that are open to the network")
-    fingertips: dict[FingertipName, FingertipConfig] = Field(
-        default_factory=dict, description="EIT fingertips by name: right and left"
-    )
+    fingertips: dict[FingertipName, FingertipConfig] = Field(default_factory=dict, description="by name: right, left")
     combined: CombinedConfig | None = Field(None, description="one estimate of both fingertips")
     skin: SkinConfig | None = Field(None, description="the shear skin")
     load_cell: LoadCellConfig | None = Field(None, description="the load cell")

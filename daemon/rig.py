@@ -1,6 +1,7 @@
 """The rig: builds gripper, robot and control loop from the configuration, and checks its experiment."""
 
 from collections.abc import Mapping
+from difflib import get_close_matches
 from pathlib import Path
 
 from shearloop.daemon.clock import Clock
@@ -177,8 +178,8 @@ class Rig:
 def read_experiment(path: Path) -> experiment_schema.ExperimentFile:
     """Return the experiment of a file; raises UserError for an invalid one, or one that exceeds its own limits."""
     file = load_yaml_model(path, experiment_schema.ExperimentFile)
-    if error := experiment_schema.check_limits(file):
-        raise UserError(f"{path}: {error}")
+    if errors := experiment_schema.check_limits(file):
+        raise UserError("\n".join(f"{path}: {error}" for error in errors))
     return file
 
 
@@ -194,21 +195,25 @@ def check_experiment(
         return None
     file = read_experiment(path)
     driving = [*(name for name, source in sources.items() if source.measures_torque), WRENCH]
+    errors = []
     if file.torque_source not in driving:
+        near = "".join(f"; did you mean {name}?" for name in get_close_matches(file.torque_source, driving, 1))
         reason = _why_not_driving(file.torque_source, config)
-        raise UserError(f"{path}: `torque_source: {file.torque_source}` {reason}; there are {', '.join(driving)}")
+        errors.append(f"`torque_source: {file.torque_source}` {reason}; there are {', '.join(driving)}{near}")
     if config.gripper is None:
-        for number, step in enumerate(file.steps, 1):
-            if isinstance(step, experiment_schema.GripStep | experiment_schema.ReleaseStep):
-                raise UserError(
-                    f"{path}: step {number} is `{step.do}`, and no gripper is configured; "
-                    "add a `gripper` section to the configuration, or take the step out"
-                )
+        errors += [
+            f"step {number} is `{step.do}`, and no gripper is configured; "
+            "add a `gripper` section to the configuration, or take the step out"
+            for number, step in enumerate(file.steps, 1)
+            if isinstance(step, experiment_schema.GripStep | experiment_schema.ReleaseStep)
+        ]
     if (unidentified := _holds_unidentified(file)) is not None:
-        raise UserError(
-            f"{path}: step {unidentified} is `hold_torque`, and the tool is not identified then; put an `identify` "
+        errors.append(
+            f"step {unidentified} is `hold_torque`, and the tool is not identified then; put an `identify` "
             "step before it, after the last `tare`, `grip` or `release`"
         )
+    if errors:
+        raise UserError("\n".join(f"{path}: {error}" for error in errors))
     return file
 
 

@@ -95,7 +95,7 @@ class RunSummary:
         if topic == "loop.state":
             self._on_loop_state(content)
         elif topic == "loop.stop":
-            self._write(f"{stop_sentence(content)}\n")
+            self._add(stop_sentence(content))
         elif self._run is not None:
             _on_sample(self._run, topic, content)
 
@@ -110,12 +110,13 @@ class RunSummary:
             self._run = None
             rig = self._emulated
             lines = _lines(run, None, ()) if rig is None else _lines(run, rig.torques(), rig.sent)
-            self.text = "\n".join(lines)
-            self._write(f"\n{self.text}\n\n")
+            self.text = ""
+            self._add("\n".join(lines))
 
-    def _write(self, text: str) -> None:
+    def _add(self, text: str) -> None:
+        self.text = f"{self.text}\n{text}".lstrip("\n")
         if self._out is not None:
-            self._out.write(text)
+            self._out.write(f"\n{text}\n\n")
 
 
 def stop_sentence(content: Mapping[str, Any]) -> str:

@@ -17,6 +17,8 @@ RADIUS_MM = 15.0
 NORMAL_N = 1.0
 # The paper's std of the response over an hour; each gauge has half of its variance. The time constant is assumed.
 DRIFT_STD, DRIFT_TIME_S = 1.48e-4, 600.0
+# The slack gauge's share of the stretched one's change: the 2-D reference at mid-thickness.
+SLACK_RATIO = -0.125
 # The paper's response to 2 N of normal force alone.
 CROSSTALK_PER_N = 1.24e-4 / 2
 
@@ -24,8 +26,16 @@ CROSSTALK_PER_N = 1.24e-4 / 2
 class SyntheticSkin:
     """One skin and the tool on it. Forces in N; positive shear stretches gauge 1."""
 
-    def __init__(self, *, radius_mm: float = RADIUS_MM, normal_n: float = NORMAL_N, seed: int = 0) -> None:
+    def __init__(
+        self,
+        *,
+        radius_mm: float = RADIUS_MM,
+        normal_n: float = NORMAL_N,
+        slack_ratio: float = SLACK_RATIO,
+        seed: int = 0,
+    ) -> None:
         self.membrane = paper_membrane()
+        self.slack_ratio = slack_ratio
         self.radius_mm = radius_mm
         self.normal_n = normal_n
         self.shear_n = 0.0
@@ -77,11 +87,11 @@ class SyntheticSkin:
 
     def resistances_ohm(self) -> tuple[float, float]:
         """Return R₁ and R₂ now, without measurement noise."""
-        factor = self.membrane.gauge_factor
-        crosstalk = CROSSTALK_PER_N * self.normal_n
-        tensions = self._state.gauge_tension_1_n, self._state.gauge_tension_2_n
-        strain_1, strain_2 = (tension / self.membrane.axial_stiffness_n for tension in tensions)
-        changes = (factor * strain_1 + crosstalk, factor * strain_2)
+        response = self.membrane.response(self._state)
+        stretched = abs(response) / (1.0 - self.slack_ratio)
+        slack = self.slack_ratio * stretched
+        changes = (stretched, slack) if response >= 0 else (slack, stretched)
+        changes = changes[0] + CROSSTALK_PER_N * self.normal_n, changes[1]
         r1, r2 = (
             rest * (1.0 + change + wander) for rest, change, wander in zip(REST_OHM, changes, self._wander, strict=True)
         )

@@ -23,6 +23,11 @@ def test_every_public_name_can_be_imported_and_is_documented(name):
     assert getattr(shearloop, name).__doc__
 
 
+def test_importing_the_package_imports_no_library():
+    code = "import sys, shearloop; print(sorted({'numpy', 'zmq', 'pydantic', 'pandas', 'yaml'} & set(sys.modules)))"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "[]\n"
+
+
 def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'banks'"):
         _ = shearloop.banks

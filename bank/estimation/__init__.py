@@ -2,7 +2,7 @@
 
 from shearloop.bank.estimation.calibration import Calibration
 from shearloop.bank.estimation.estimator import Estimator, Physics
-from shearloop.bank.estimation.fitting import fit
+from shearloop.bank.estimation.fitting import adapt, fit
 from shearloop.bank.estimation.load_delay import TRUSTED, LoadTiming, measure_timing
 from shearloop.bank.estimation.session import EstimatorSession
 from shearloop.bank.estimation.values import Estimate, FrameSeries, Measured, TactileFrame, combine
@@ -18,6 +18,7 @@ __all__ = [
     "Measured",
     "Physics",
     "TactileFrame",
+    "adapt",
     "combine",
     "fit",
     "measure_timing",

@@ -8,7 +8,7 @@ import hashlib
 import io
 import types
 import zipfile
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Self, Union, get_args, get_origin, get_type_hints
 
@@ -23,13 +23,14 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatcher
 from shearloop.bank.estimation.estimator import Estimator, OutputModel, PaperEstimator, Quantity
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
-from shearloop.bank.estimation.interval_regressor import PolynomialRegressor
-from shearloop.bank.estimation.values import INLINE, Kind
+from shearloop.bank.estimation.interval_regressor import IntervalRegressor, PolynomialRegressor
+from shearloop.bank.estimation.values import INLINE, Kind, Measured
 from shearloop.bank.estimators import estimator_class
+from shearloop.bank.gain import ToolLaw
 from shearloop.bank.polynomial import Polynomial
 from shearloop.files import replace_file
 
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 # First bytes of a zip that is not empty.
 ARCHIVE_MAGIC = b"PK\x03\x04"
 _FILE_KIND = "shearloop estimator calibration"
@@ -53,7 +54,7 @@ class Calibration:
 
     sides is empty where nothing is known of the fingertip but the paper's curves over k and sigma. validators are for
     raw frames. bank_identity is empty for an estimator without a bank. tool_mm is the diameter of the only tool in the
-    recordings, else NaN.
+    recordings, else NaN. With `tools` the torque is in units of their gain (`for_tool`).
     """
 
     estimator: Estimator = field(metadata=INLINE)
@@ -66,6 +67,31 @@ class Calibration:
     torque: OutputModel | None = None
     diameter: OutputModel | None = None
     assumptions: tuple[Assumption, ...] = ()
+    tools: ToolLaw | None = None
+
+    def for_tool(self, tool: Measured | None) -> Self:
+        """Return the calibration for a tool, or itself where it is for it; raises CalibrationError for another tool.
+
+        On a tool of another diameter the same motion of the gel is another torque: four times as much on one of 10 mm
+        as on one of 20 mm.
+        """
+        law, own_mm = self.tools, self.tool_mm
+        if law is None or self.torque is None or not isinstance(self.torque.regressor, IntervalRegressor):
+            if tool is None or not abs(tool.value - own_mm) > LARGEST_TOOL_SHARE * own_mm + tool.half_width:
+                return self
+            raise CalibrationError(
+                f"the tool has {tool.value:.3g} mm, and the calibration was made with a tool of {own_mm:g} mm; its "
+                "torque differs: calibrate with this tool"
+            )
+        tools = f"tools of {law.low_mm:g} to {law.high_mm:g} mm, whose torques differ"
+        if tool is None:
+            raise CalibrationError(f"the calibration is of {tools}: name the held tool's diameter")
+        if (gain := law.gain(tool.value)) is None:
+            raise CalibrationError(
+                f"the tool has {tool.value:.3g} mm, too far from the calibration's {tools}: calibrate with this tool"
+            )
+        regressor = self.torque.regressor.scaled(gain, law.spread)
+        return replace(self, torque=replace(self.torque, regressor=regressor), tools=None, tool_mm=tool.value)
 
     @classmethod
     def uncalibrated(cls, bank_identity: str, table: ChannelTable = PAPER_TABLE) -> Self:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 
-from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.estimation.bank_match import (
@@ -220,9 +220,9 @@ class Estimator:
         return self.ridge
 
     def fit_torque(
-        self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None
+        self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None, recordings: IntArray
     ) -> tuple[Self, IntervalRegressor, float]:
-        """Return the torque's regressor on raw frames, and the estimator with the features that it uses.
+        """Return the torque's regressor on raw frames of numbered recordings (n,), and the estimator as it uses them.
 
         The third value is the share of the torque's variance that a tool's motion leaves unexplained on later frames,
         0 where that is not tested.
@@ -236,8 +236,14 @@ class Estimator:
             limit_features=self.limits_features,
             left_out=later_origins(len(torque_nm)),
             bounds=bounds,
+            recordings=recordings,
+            fingertips=len(self.scale),
         )
         return self, regressor, 0.0
+
+    def side_of_features(self, n_features: int) -> IntArray:
+        """Return the side (d,) that each of the torque's features comes from: one number where they have no side."""
+        return np.zeros(n_features, dtype=np.int64)
 
     def fit_diameter(self, rows: list[CalibrationRow]) -> OutputModel:
         """Return the diameter's model from rows of known diameters, by age."""

@@ -24,16 +24,26 @@ from shearloop.bank.estimation.estimator import (
     Reading,
 )
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator, segment_grip
-from shearloop.bank.estimation.interval_regressor import Mixtures, fit_interval_regressor
+from shearloop.bank.estimation.interval_regressor import (
+    CensoredRidge,
+    IntervalRegressor,
+    Mixtures,
+    fit_interval_regressor,
+)
 from shearloop.bank.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
 from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.bank.estimation.regressors import later_origins
 from shearloop.bank.estimation.session_state import ProcessedFrame, SessionState
 from shearloop.bank.estimation.values import FrameSeries, Measured, TactileFrame, check_finite, distinct
 from shearloop.bank.estimators import EstimatorName, estimator_class
+from shearloop.bank.gain import LOADED_SHARE, GainCorrection, ToolLaw, gains_of_recordings
 
 # With more variance left on a tool of another diameter, the tools have no torque in common.
 _TOOLS_MAY_LEAVE = 0.75
+# Share of a recording's frames below its released torque, and the penalty while tools are compared.
+_RELEASED, _TOOLS_STRENGTH = 0.05, 1e-5
+# Tools have a torque in common where their gains differ by less than this factor.
+_TOOLS_DIFFER = 2.0
 # Foreign frames: every eighth of a turn, plain and mirrored, except the own numbering. Of a few numberings alone the
 # result depends on the choice: single ones give half to twice the median.
 _NUMBERINGS = [(eighth, mirrored) for eighth in range(8) for mirrored in (False, True)][1:]
@@ -138,20 +148,92 @@ def _fit_raw(
         bounds = least_nm, largest_nm
     estimator = calibration.estimator.with_imputer(np.array([row.position for row in rows]), calibration.validators)
     features, torque_nm = np.array([row.features for row in rows]), np.array([row.torque_nm for row in rows])
-    estimator, regressor, unexplained = estimator.fit_torque(features, torque_nm, bounds)
+    recording = np.array([row.recording for row in rows])
+    estimator, regressor, unexplained = estimator.fit_torque(features, torque_nm, bounds, recording)
     # By age within the recordings, so that every part has all tools.
     known = sorted((row for row in rows if np.isfinite(row.diameter_mm)), key=lambda row: row.age_s)
     enough = len({row.diameter_mm for row in known}) >= LEAST_DIAMETERS
     diameter = estimator.fit_diameter(known) if enough else None
-    torque: OutputModel | None = OutputModel(regressor, None, estimator.k_range(features))
-    if len(tools := _tools_of(recordings)) > 1 and unexplained > _TOOLS_MAY_LEAVE:
-        if diameter is None:
+    law = None
+    if len(tools := _tools_of(recordings)) > 1:
+        diameters_mm = np.array([np.nan if one.tool_mm is None else one.tool_mm.value for one in recordings])
+        fitted = _fit_tools(estimator, features, torque_nm, recording, diameters_mm) if enough else None
+        if fitted is not None:
+            estimator, regressor, law = fitted
+        elif unexplained > _TOOLS_MAY_LEAVE:
             raise CalibrationError(
                 f"the tools of {' and '.join(f'{one.value:.3g}' for one in tools)} mm turn so differently that they "
-                "have no torque in common; calibrate on each alone"
+                "have no torque in common; calibrate on each alone, or on three diameters"
             )
-        torque = None
-    return replace(calibration, estimator=estimator, torque=torque, diameter=diameter)
+    torque = OutputModel(regressor, None, estimator.k_range(features))
+    return replace(calibration, estimator=estimator, torque=torque, diameter=diameter, tools=law)
+
+
+def _fit_tools(
+    estimator: Estimator, features: FloatArray, torque_nm: FloatArray, recording: IntArray, diameters_mm: FloatArray
+) -> tuple[Estimator, IntervalRegressor, ToolLaw] | None:
+    """Return the regressor of torques in units of each tool's gain, and the law of these gains.
+
+    None where the tools have the torque in common, or were twisted both ways. Motion shows how torque changes after
+    the grip, so a recording counts from its least torque on.
+    """
+    known = np.isfinite(diameters_mm)[recording]
+    diameters_mm = diameters_mm[np.unique(recording[known])]
+    features, torque_nm = features[known], torque_nm[known].copy()
+    recording = np.unique(recording[known], return_inverse=True)[1]
+    for rows in (np.flatnonzero(recording == one) for one in range(len(diameters_mm))):
+        if torque_nm[rows].min() < -LOADED_SHARE * torque_nm[rows].max():
+            return None
+        torque_nm[rows] -= np.quantile(torque_nm[rows], _RELEASED)
+
+    def predict(kept: IntArray, out: IntArray, values: FloatArray) -> FloatArray:
+        return np.maximum(CensoredRidge.fit(features[kept], values[kept], _TOOLS_STRENGTH).predict(features[out]), 0.0)
+
+    gains = gains_of_recordings(recording, torque_nm, predict)
+    if gains.max() < _TOOLS_DIFFER * gains.min():
+        return None
+    estimator, regressor, _ = estimator.fit_torque(features, torque_nm / gains[recording], None, recording)
+    return estimator, regressor, ToolLaw.fit(diameters_mm, gains)
+
+
+def adapt(
+    calibration: Calibration,
+    recordings: Sequence[FrameSeries],
+    source: str,
+    physics: Physics | None = None,
+    *,
+    first_frames: Sequence[int] = (),
+) -> tuple[Calibration, GainCorrection]:
+    """Return a calibration with the gain of each fingertip corrected by recordings of known torque, and the correction.
+
+    `source` describes them in words. Twists count from each recording's frame of `first_frames` on. The correction is
+    shrunk by how much these can tell. Raises CalibrationError for recordings without a torque estimate under load, and
+    for a calibration without such a gain.
+    """
+    if len(tools := _tools_of(recordings)) > 1:
+        raise CalibrationError("the recordings are of several tools; adapt to one at a time")
+    calibration = calibration.for_tool(tools[0] if tools else None)
+    torque = calibration.torque
+    if calibration.kind != "raw" or torque is None or not isinstance(regressor := torque.regressor, IntervalRegressor):
+        raise CalibrationError("only the torque of raw frames has a gain to correct; calibrate on raw recordings")
+    matcher = calibration.matcher((physics or Physics()).bank)
+    check_finite(recordings)
+    rows = [
+        row
+        for i, one in enumerate(recordings)
+        for row in _replay(calibration, matcher, i, one.select_sides(calibration.sides), 1)
+        if not first_frames or row.frame >= first_frames[i]
+    ]
+    if not rows:
+        raise CalibrationError("no frame is gripped and undisturbed for long enough; twist the gripped tool again")
+    adapted, correction = regressor.adapt(
+        np.array([row.features[calibration.estimator.columns["torque"]] for row in rows]),
+        np.array([row.torque_nm for row in rows]),
+        calibration.estimator.side_of_features(len(regressor.mean_feature)),
+    )
+    model = OutputModel(adapted, None, torque.k_range)
+    adapted_to = replace(calibration, torque=model, source=f"{calibration.source}, adapted on {source}")
+    return adapted_to, correction
 
 
 def _replay(

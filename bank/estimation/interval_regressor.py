@@ -1,21 +1,21 @@
 """Ridges from features to a value, with 95 % prediction intervals, and their fit.
 
-`Ridge` is for features that contain the value linearly. `TobitRidge` is for a load cell that a lever pushes from one
-side only: where it reads nothing the twist may be anything below, so these frames bound the value (Tobin 1958).
+`Ridge` is for features that contain the value linearly. `CensoredRidge` is for a load cell that a lever pushes from one
+side only: where it reads nothing the twist may be anything below, so these frames bound the value.
 
 Intervals come from residuals on frames later than those fitted to: split-conformal in strata of the prediction (Vovk
 2012), namely free of load, about to touch, loaded. In each stratum the half width is the 95 % quantile of the absolute
 residuals with the correction for a finite sample, so that many easy frames do not narrow the intervals of few hard
-ones.
+ones. On torques of another recording the error of the gain is added, which grows with the torque.
 """
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol, Self, TypeAlias
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Protocol, Self, TypeAlias
 
 import numpy as np
-from scipy.special import log_ndtr, stdtrit
+from scipy.special import stdtrit
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
@@ -25,12 +25,15 @@ from shearloop.bank.estimation.regressors import (
     left_out_blocks,
 )
 from shearloop.bank.estimation.values import INLINE
+from shearloop.bank.gain import LOADED_SHARE, GainCorrection, GainSpread, find_twists, loaded_gain
 from shearloop.bank.polynomial import TWO_SIDED_95, Polynomial
 
 LEVEL = 0.95
 # Readings below this share of the largest torque mean that the lever does not touch.
 CENSORED_SHARE = 0.02
-_LEAST_SIGMA_SHARE, _EM_ROUNDS = 0.01, 100
+# Their bound lies this share of it below zero. Of 0 to 0.3 this has the least error on recorded twists left out.
+_MARGIN_SHARE = 0.05
+_LEAST_SIGMA_SHARE, _HINGE_ROUNDS = 0.01, 50
 LEAST_IN_STRATUM = 20
 _LEAST_RESIDUALS = 5
 # Narrowest interval as a share of the calibrated range: load cells are noisy too.
@@ -54,8 +57,8 @@ _LEAST_DISTANCE = 0.05
 _UNSEEN = 2.0
 # Distance beyond the range that decides from where on a prediction may hide a value beyond: more doubts more good ones.
 _LIKELY_UNSEEN = 0.5
-# Loads are torques above this share of the largest; this share of them must lie within their intervals.
-_LOADED_SHARE, _LEAST_COVERED = 0.1, 0.75
+# This share of the loads must lie within their intervals.
+_LEAST_COVERED = 0.75
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,8 +102,8 @@ class Ridge:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TobitRidge(Ridge):
-    """A ridge with readings of no load as bounds; `sign` is the direction of the lever's push.
+class CensoredRidge(Ridge):
+    """A ridge with readings of no load as upper bounds; `sign` is the direction of the lever's push.
 
     It predicts a latent value along the sign. Where that is below zero, the lever does not touch: no torque.
     """
@@ -110,39 +113,31 @@ class TobitRidge(Ridge):
 
     @classmethod
     def fit(cls, features: FloatArray, values: FloatArray, strength: float) -> Self:
-        """Fit by expectation–maximisation to (n, d) features and (n,) values of one sign."""
+        """Fit to (n, d) features and (n,) values of one sign; `sigma` is the error of frames with load.
+
+        A frame without load counts only while it is predicted above its bound (squared hinge loss, by Newton steps).
+        """
         largest = float(values[np.argmax(np.abs(values))])
         sign = 1.0 if largest > 0 else -1.0
         y = sign * values
         touching = y >= CENSORED_SHARE * y.max()
-        mean = features.mean(axis=0)
-        u, s, vt = np.linalg.svd(features - mean, full_matrices=False)
-        gain = s / (s**2 + strength * float((s**2).sum()))
-        latent, sigma = y.copy(), max(float(y[touching].std()), _LEAST_SIGMA_SHARE * y.max())
-        for _ in range(_EM_ROUNDS):
-            offset = float(latent.mean())
-            coefficients = gain * (u.T @ (latent - offset))
-            predicted = offset + u @ (s * coefficients)
-            expected, variance = _moments_below_zero(predicted[~touching], sigma)
-            latent = y.copy()
-            latent[~touching] = expected
-            sigma = max(
-                float(np.sqrt((((latent - predicted) ** 2).sum() + variance.sum()) / len(y))),
-                _LEAST_SIGMA_SHARE * float(y.max()),
-            )
-        offset = float(latent.mean())
-        weights = vt.T @ (gain * (u.T @ (latent - offset)))
-        return cls(mean, weights, offset, strength, sigma, sign)
+        bound = -_MARGIN_SHARE * float(y.max())
+        y, centred = np.where(touching, y, bound), features - features.mean(axis=0)
+        penalty = strength * float((centred**2).sum()) * np.eye(features.shape[1])
+        counting: BoolArray = np.ones(len(y), dtype=np.bool_)
+        for _ in range(_HINGE_ROUNDS):
+            mean, offset = features[counting].mean(axis=0), float(y[counting].mean())
+            moved = features[counting] - mean
+            weights = np.linalg.solve(moved.T @ moved + penalty, moved.T @ (y[counting] - offset))
+            predicted = offset + (features - mean) @ weights
+            before, counting = counting, touching | (predicted > bound)
+            if (counting == before).all():
+                break
+        error = float(np.sqrt(((y - predicted)[touching] ** 2).mean()))
+        return cls(mean, weights, offset, strength, max(error, _LEAST_SIGMA_SHARE * float(y.max())), sign)
 
 
-def _moments_below_zero(mean: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
-    """Return mean and variance of Gaussians of this mean and sigma, given that they are below zero."""
-    u = -mean / sigma
-    ratio = np.exp(-0.5 * u**2 - 0.5 * np.log(2 * np.pi) - log_ndtr(u))
-    return mean - sigma * ratio, sigma**2 * np.clip(1 - u * ratio - ratio**2, 0.0, 1.0)
-
-
-Regressor: TypeAlias = Ridge | TobitRidge | InverseCalibration
+Regressor: TypeAlias = Ridge | CensoredRidge | InverseCalibration
 RegressorFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Regressor]
 
 
@@ -233,7 +228,7 @@ class IntervalRegressor:
     left-out loads lay outside their intervals, so every interval spans the calibrated range. contamination_below and
     _above are how far the truth may lie below and above a prediction because of foreign signals, at the limit of
     detection (0 where that was not tested). timing_widening is the factor on the loads' intervals for unknown load
-    timing.
+    timing. `gain` is how much a torque's gain changes between recordings.
     """
 
     point: Regressor
@@ -245,6 +240,7 @@ class IntervalRegressor:
     contamination_below: float = 0.0
     contamination_above: float = 0.0
     timing_widening: float = 1.0
+    gain: GainSpread = field(default=GainSpread(), metadata=INLINE)
 
     def predict(
         self,
@@ -263,15 +259,16 @@ class IntervalRegressor:
         """
         rows = features[None] if complete is None else np.array([features, complete])
         raws = self.point.predict(rows)
-        lever = self.point if isinstance(self.point, TobitRidge) else None
+        lever = self.point if isinstance(self.point, CensoredRidge) else None
         # No torque where the lever would not touch.
         reported = raws if lever is None else lever.sign * np.maximum(raws, 0.0)
         raw, (value, *others) = float(raws[0]), reported.tolist()
         widening /= math.sqrt(max(usable_share, 0.1))
         half = widening * float(self.intervals.half_widths[self.intervals.edges.searchsorted(raw)])
         moved = others[0] - value if others else 0.0
-        below = max(half + max(-moved, 0.0), limit_share * self.contamination_below)
-        above = max(half + max(moved, 0.0), limit_share * self.contamination_above)
+        down, up = self.gain.reach(value)
+        below = max(math.hypot(half, down) + max(-moved, 0.0), limit_share * self.contamination_below)
+        above = max(math.hypot(half, up) + max(moved, 0.0), limit_share * self.contamination_above)
         if self.misses_loads:
             below, above = below + max(value - self.range.low, 0.0), above + max(self.range.high - value, 0.0)
         if lever is not None and raw < 0:
@@ -282,6 +279,56 @@ class IntervalRegressor:
         if value >= self.range.high_end:
             above = max(above, self.range.highest - value)
         return value, below, above
+
+    def scaled(self, factor: float, spread: float) -> "IntervalRegressor":
+        """Return the regressor of values larger by a factor, whose gain and zero have this spread."""
+        point, span = self.point, self.range
+        if isinstance(point, CensoredRidge):
+            point = replace(point, sigma=factor * point.sigma)
+        if isinstance(point, InverseCalibration):
+            raise CalibrationError("a curve of slices has no gain")
+        return replace(
+            self,
+            point=replace(point, weights=factor * point.weights, offset=factor * point.offset),
+            intervals=Intervals(factor * self.intervals.edges, factor * self.intervals.half_widths),
+            range=ValueRange(*(factor * end for end in (span.low, span.high, span.lowest, span.highest))),
+            gain=replace(self.gain, between=spread, zero=spread, noise_nm=factor * self.gain.noise_nm),
+        )
+
+    def adapt(
+        self, features: FloatArray, torque_nm: FloatArray, sides: IntArray
+    ) -> "tuple[IntervalRegressor, GainCorrection]":
+        """Return the regressor with each side's gain corrected by (n, d) features of known torques (n,).
+
+        `sides` (d,) is the side of each feature. Raises CalibrationError without a load that is large enough to show
+        the gain.
+        """
+        point, span = self.point, self.range
+        least_nm = LOADED_SHARE * max(abs(span.low), abs(span.high))
+        twists = [one for one in find_twists(torque_nm) if np.abs(torque_nm[one]).max() >= least_nm]
+        if isinstance(point, InverseCalibration) or not twists:
+            raise CalibrationError(
+                f"no twist reaches {least_nm:.3g} N·m while an estimate is possible; twist further, some seconds "
+                "after the grip"
+            )
+        lever = isinstance(point, CensoredRidge)
+        sign = point.sign if isinstance(point, CensoredRidge) else 1.0
+        m, weighted = int(sides.max()) + 1, features * point.weights
+        constant = point.offset - float(point.mean @ point.weights)
+        parts = np.array([weighted[:, sides == side].sum(axis=1) + constant / m for side in range(m)]).T
+        correction = self.gain.correct(parts, sign * torque_nm, twists, bounded=lever)
+        factors, loaded = correction.factors, np.concatenate(twists)
+        total = float((parts[loaded] @ factors).sum() / parts[loaded].sum())
+        weights, larger = point.weights * factors[sides], max(total, 1.0)
+        offset = constant * float(factors.mean()) + float(point.mean @ weights) + correction.offset_nm
+        adapted = replace(
+            self,
+            point=replace(point, weights=weights, offset=offset),
+            intervals=Intervals(self.intervals.edges * total, self.intervals.half_widths * larger),
+            range=ValueRange(*(larger * end for end in (span.low, span.high, span.lowest, span.highest))),
+            gain=correction.spread,
+        )
+        return adapted, correction
 
     def range_reasons(self, value: float, features: FloatArray, quantity: str, unit: str) -> tuple[str, ...]:
         """Return the reason against a value or features beyond the calibration, if there is one."""
@@ -300,6 +347,8 @@ class IntervalRegressor:
 @dataclass(frozen=True, slots=True)
 class PolynomialRegressor:
     """The paper's curve over the first feature, sigma or k in cm, with its prediction interval."""
+
+    gain: ClassVar[GainSpread] = GainSpread()
 
     symbol: str
     polynomial: Polynomial
@@ -323,7 +372,7 @@ class PolynomialRegressor:
 
 def _reported(point: Regressor, raw: FloatArray) -> FloatArray:
     """Return the values that (n,) raw predictions mean: no torque where the lever would not touch."""
-    return point.sign * np.maximum(raw, 0.0) if isinstance(point, TobitRidge) else raw
+    return point.sign * np.maximum(raw, 0.0) if isinstance(point, CensoredRidge) else raw
 
 
 def fit_interval_regressor(
@@ -337,6 +386,8 @@ def fit_interval_regressor(
     test: SlicesTest | None = None,
     bounds: tuple[FloatArray, FloatArray] | None = None,
     full_range: bool = False,
+    recordings: IntArray | None = None,
+    fingertips: int = 1,
 ) -> IntervalRegressor:
     """Fit to (n, d) features and (n,) values in time order.
 
@@ -344,23 +395,24 @@ def fit_interval_regressor(
     residuals are in units of its growth (normalised conformal prediction, Papadopoulos et al. 2002), intervals cover
     the error of accepted mixtures, and extrapolation beyond the range is tested, unless the values cover the
     `full_range` that will ever occur. `bounds` are the least and largest value (n,) that each frame may have: intervals
-    extend to the further one. Raises CalibrationError where the data does not determine the fit.
+    extend to the further one. With the number of each row's recording, `recordings` (n,), intervals allow for the gain
+    of another recording of as many `fingertips`. Raises CalibrationError where the data does not determine the fit.
     """
-    if len(values) < _LEAST_FRAMES or np.ptp(values) == 0:
-        raise CalibrationError(
-            f"{len(values)} frames with values between {np.min(values, initial=np.inf):.3g} and "
-            f"{np.max(values, initial=-np.inf):.3g} determine no calibration; record more, at different loads"
-        )
+    _check_values(values)
     strength = strengths[0] if len(strengths) == 1 else best_strength(features, values, fit, strengths)[0]
     blocks = list(left_out or left_out_blocks(len(values)))
-    parts = [fit(features[past], values[past], strength) for past, _ in blocks]
+
+    def refit(rows: IntArray) -> Regressor:
+        return fit(features[rows], values[rows], strength)
+
+    parts = [refit(past) for past, _ in blocks]
     raw = [part.predict(features[future]) for part, (_, future) in zip(parts, blocks, strict=True)]
     reported = np.concatenate([_reported(part, one) for part, one in zip(parts, raw, strict=True)])
     predicted, rows = np.concatenate(raw), np.concatenate([future for _, future in blocks])
     point, truth = fit(features, values, strength), values[rows]
     residuals = reported - truth
     scale = 1.0 if test is None else np.concatenate([test.growth(*block) for block in blocks])
-    edges = (-point.sigma, 0.0, 0.4 * float(np.abs(values).max())) if isinstance(point, TobitRidge) else ()
+    edges = (-point.sigma, 0.0, 0.4 * float(np.abs(values).max())) if isinstance(point, CensoredRidge) else ()
     inflation = 1.0 if isinstance(point, InverseCalibration) else _INFLATION
     if left_out:
         inflation = student_inflation(len(np.unique(rows)))
@@ -386,12 +438,32 @@ def fit_interval_regressor(
         tested = ((part, test.accepted(*block)) for part, block in zip(parts, blocks, strict=True))
         contamination = _contamination(features, values, tested, inflation)
         if not full_range:
-            ends = (
-                _range_end(point, features, values, lambda rows: fit(features[rows], values[rows], strength), sign)
-                for sign in (1, -1)
-            )
+            ends = (_range_end(point, features, values, refit, sign) for sign in (1, -1))
             span = ValueRange(low, high, span.lowest, span.highest, *ends)
-    return IntervalRegressor(point, intervals, span, centre, deviation, misses_loads, *contamination, widening)
+    gains = [] if recordings is None else _gains_of_recordings(features, values, recordings, refit)
+    gain = GainSpread() if recordings is None else GainSpread.fit(reported, truth, gains, fingertips)
+    return IntervalRegressor(point, intervals, span, centre, deviation, misses_loads, *contamination, widening, gain)
+
+
+def _check_values(values: FloatArray) -> None:
+    if len(values) < _LEAST_FRAMES or np.ptp(values) == 0:
+        raise CalibrationError(
+            f"{len(values)} frames with values between {np.min(values, initial=np.inf):.3g} and "
+            f"{np.max(values, initial=-np.inf):.3g} determine no calibration; record more, at different loads"
+        )
+
+
+def _gains_of_recordings(
+    features: FloatArray, values: FloatArray, recordings: IntArray, refit: Callable[[IntArray], Regressor]
+) -> list[float]:
+    """Return the gain of each recording that the others can predict."""
+    gains: list[float] = []
+    for one in np.unique(recordings):
+        kept, out = np.flatnonzero(recordings != one), np.flatnonzero(recordings == one)
+        if len(kept) and np.ptp(values[kept]) > 0 and np.ptp(values[out]) > 0:
+            part = refit(kept)
+            gains.append(loaded_gain(_reported(part, part.predict(features[out])), values[out]))
+    return gains
 
 
 def _contamination(
@@ -454,18 +526,23 @@ def _misses_loads(truth: FloatArray, inside: BoolArray) -> bool:
     Most frames of a stream are free of load. Their small residuals say nothing of a load that an estimator misses, so
     loads are a stratum of their own, by their truth (label-conditional, Vovk 2012).
     """
-    loaded = np.abs(truth) > _LOADED_SHARE * float(np.abs(truth).max())
+    loaded = np.abs(truth) > LOADED_SHARE * float(np.abs(truth).max())
     return bool(loaded.any() and not loaded.all() and inside[loaded].mean() < _LEAST_COVERED)
 
 
 def best_strength(
-    features: FloatArray, values: FloatArray, fit: RegressorFit, strengths: Sequence[float]
+    features: FloatArray,
+    values: FloatArray,
+    fit: RegressorFit,
+    strengths: Sequence[float],
+    left_out: Iterable[tuple[IntArray, IntArray]] = (),
 ) -> tuple[float, float]:
-    """Return the strength with the least mean squared error on later parts, and that error; of equals, the strongest.
+    """Return the strength with the least mean squared error on rows left out, and that error; of equals, the strongest.
 
-    Raises CalibrationError where the values do not change within the earlier parts.
+    By default these are later parts. Raises CalibrationError where the values do not change within the rest.
     """
-    splits = [(past, future) for past, future in later_splits(len(values)) if np.ptp(values[past]) > 0]
+    pairs = list(left_out) or later_splits(len(values))
+    splits = [(past, future) for past, future in pairs if np.ptp(values[past]) > 0]
     if not splits:
         raise CalibrationError("the values do not change within the earlier part; begin with the calibration's loads")
 

@@ -128,6 +128,28 @@ def find_load_delay(series: FrameSeries) -> LoadDelay | None:
     return best if best is None or n >= _SURE_FRAMES else replace(best, few_frames=n)
 
 
+@dataclass(frozen=True, slots=True)
+class MeasuredDelay:
+    """A sure delay, and how far in s the torques are stamped later than a load cell stamps them, 0 if as usual."""
+
+    delay: LoadDelay
+    late_s: float
+
+
+def measured_delay(fingertips: Sequence[FrameSeries]) -> MeasuredDelay | None:
+    """Return the delay in the series of the fingertip that shows it best, None where none does."""
+    found: list[tuple[LoadDelay, FrameSeries]] = []
+    for one in fingertips:
+        with contextlib.suppress(CalibrationError):
+            if (delay := find_load_delay(one)) is not None and not delay.few_frames:
+                found.append((delay, one))
+    if not found:
+        return None
+    delay, series = max(found, key=lambda each: each[0].explained)
+    unusual = _unusual(series, delay)
+    return MeasuredDelay(delay, delay.delay_s - unusual[1] if unusual else 0.0)
+
+
 def load_delay_warning(series: FrameSeries) -> str:
     """Return a doubt about the times of a recording's torques, empty without any."""
     if series.kind != "raw" or not np.abs(series.torque_nm).any():
@@ -135,13 +157,13 @@ def load_delay_warning(series: FrameSeries) -> str:
     try:
         return _doubt(series, find_load_delay(series))
     except CalibrationError:
-        return ""
+        return series.load_doubt
 
 
 def _doubt(series: FrameSeries, found: LoadDelay | None) -> str:
     """Return why a delay is unusual. With few gripped frames it can be chance: a warning and not a refusal."""
     if found is None or (found.few_frames and found.explained < _WARN_EXPLAINED):
-        return ""
+        return series.load_doubt
     if not (unusual := _unusual(series, found)):
         return ""
     what, usual_s = unusual

@@ -12,7 +12,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.defaults import BASELINE_FRAMES
 from shearloop.bank.eit.channels import ChannelTable, smoothed_along_channels
 from shearloop.bank.errors import CalibrationError
@@ -30,26 +30,26 @@ from shearloop.bank.estimation.estimator import (
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.interval_regressor import (
     LEAST_HALF_WIDTH,
+    CensoredRidge,
     IntervalRegressor,
     Intervals,
     PolynomialRegressor,
     RegressorFit,
     Ridge,
-    TobitRidge,
     ValueRange,
     best_strength,
     fit_interval_regressor,
     is_one_sided,
 )
 from shearloop.bank.estimation.novelty import fitted_parts
-from shearloop.bank.estimation.regressors import InverseCalibration
+from shearloop.bank.estimation.regressors import InverseCalibration, left_out_blocks
 from shearloop.bank.estimation.session_state import Motion
 from shearloop.bank.polynomial import TWO_SIDED_95
 
 # Directions of motion per fingertip, and frames back: 13 frames are 7 s, about twice the gel's creep.
 _N_DIRECTIONS, _N_LAGS = 4, 12
 # A hundred features of a few directions need little penalty.
-_MOTION_STRENGTHS = (1e-6, 1e-5, 1e-4)
+_MOTION_STRENGTHS = (1e-6, 1e-5, 1e-4, 1e-3)
 # Positions drift between recordings, motion does not. So motion alone is preferred unless it leaves more than the first
 # share of the torque's variance unexplained on later frames and the position lowers the error by the second.
 _MOTION_MAY_LEAVE, _POSITION_MUST_GAIN = 0.5, 0.5
@@ -178,22 +178,32 @@ class MotionRegression(Estimator):
         return TWO_SIDED_95 * math.sqrt(weights @ weights)
 
     def fit_torque(
-        self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None
+        self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None, recordings: IntArray
     ) -> tuple[Self, IntervalRegressor, float]:
-        """Return the torque's regressor, and the estimator with position where that does better on later frames."""
-        fit = TobitRidge.fit if is_one_sided(torque_nm) else Ridge.fit_scaled
+        """Return the torque's regressor, and the estimator with position where that does better on blocks left out."""
+        fit = CensoredRidge.fit if is_one_sided(torque_nm) else Ridge.fit_scaled
         if (temporal := self.temporal) is None:
             raise ValueError("raw frames have motion")
-        n_motion = temporal.n_lags * temporal.directions.shape[0] * temporal.directions.shape[1]
-        choices = {False: features[:, :n_motion], True: features}
-        errors = {used: best_strength(one, torque_nm, fit, _MOTION_STRENGTHS)[1] for used, one in choices.items()}
-        unexplained = errors[False] / float(torque_nm.var())
-        used = unexplained > _MOTION_MAY_LEAVE and errors[True] < _POSITION_MUST_GAIN * errors[False]
+        m = temporal.directions.shape[0]
+        n_motion = temporal.n_lags * m * temporal.directions.shape[1]
+        choices, variance = {False: features[:, :n_motion], True: features}, float(torque_nm.var())
+        best = {
+            used: best_strength(one, torque_nm, fit, _MOTION_STRENGTHS, left_out_blocks(len(torque_nm)))
+            for used, one in choices.items()
+        }
+        alone, with_position = best[False][1], best[True][1]
+        used = alone > _MOTION_MAY_LEAVE * variance and with_position < _POSITION_MUST_GAIN * alone
+        strength, error = best[used]
         regressor = fit_interval_regressor(
-            choices[used], torque_nm, fit, strengths=_MOTION_STRENGTHS, limit_features=True, bounds=bounds
-        )
-        chosen = replace(self, temporal=replace(temporal, uses_position=used))
-        return chosen, regressor, errors[used] / float(torque_nm.var())
+            choices[used], torque_nm, fit, strengths=(strength,), limit_features=True, bounds=bounds,
+            recordings=recordings, fingertips=m,
+        )  # fmt: skip
+        return replace(self, temporal=replace(temporal, uses_position=used)), regressor, error / variance
+
+    def side_of_features(self, n_features: int) -> IntArray:
+        """Return the side (d,) that each of the torque's features comes from."""
+        m, p, _ = self.temporal.directions.shape if self.temporal is not None else (1, 1, 0)
+        return np.tile(np.repeat(np.arange(m), p), n_features // (m * p))
 
     def fit_diameter(self, rows: list[CalibrationRow]) -> OutputModel:
         """Return the diameter's model from rows of known diameters, by age."""

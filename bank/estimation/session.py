@@ -11,7 +11,7 @@ from shearloop.bank.defaults import BASELINE_FRAMES, MAX_GAP_S
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatch, BankMatcher
-from shearloop.bank.estimation.calibration import LARGEST_TOOL_SHARE, Calibration
+from shearloop.bank.estimation.calibration import Calibration
 from shearloop.bank.estimation.estimator import NO_ERRORS, OutputModel, Quantity, Reading
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.novelty import FAMILIAR, Novelty
@@ -57,7 +57,6 @@ class EstimatorSession:
         self._averaging = (average_frames, max_gap_s)
         self._baseline_frames = baseline_frames
         self._matcher = matcher or calibration.matcher(bank)
-        self._outputs = calibration.outputs
         self._position_noise_mm = 0.0
         if calibration.diameter is not None:
             self._position_noise_mm = calibration.estimator.position_noise_mm(calibration.diameter.regressor)
@@ -65,18 +64,12 @@ class EstimatorSession:
         self.reset()
 
     def set_tool(self, tool: Measured | None) -> None:
-        """Set the diameter in mm of the held tool, None where unknown.
-
-        On a tool of another diameter than the calibration's the same motion of the gel is another torque: four times
-        as much on one of 10 mm as on one of 20 mm.
-        """
-        own_mm = self.calibration.tool_mm
+        """Set the diameter in mm of the held tool, None where unknown."""
         self._tool_reasons: tuple[str, ...] = ()
-        if tool is not None and abs(tool.value - own_mm) > LARGEST_TOOL_SHARE * own_mm + tool.half_width:
-            self._tool_reasons = (
-                f"the tool has {tool.value:.3g} mm, and the calibration was made with a tool of {own_mm:g} mm; its "
-                "torque differs: calibrate with this tool",
-            )
+        try:
+            self._outputs = self.calibration.for_tool(tool).outputs
+        except CalibrationError as error:
+            self._outputs, self._tool_reasons = self.calibration.outputs, (str(error),)
 
     def tare(self, frames: int | None = None) -> None:
         """Forget the session and average the next `frames` usable frames, of untouched fingertips, into the idle frame.
@@ -151,7 +144,9 @@ class EstimatorSession:
             reasons |= dict.fromkeys(against)
             if not against:
                 values[quantity] = value[0], value[0] - value[1], value[0] + value[2]
-        torque_missing = calibration.torque is not None and "torque" not in values
+        # Tools of several diameters have a diameter where they have no torque.
+        several = calibration.tools is not None and bool(self._tool_reasons)
+        torque_missing = calibration.torque is not None and "torque" not in values and not several
         if calibration.kind == "raw" and (torque_missing or (curves_only and reasons)):
             # A frame beyond the calibrated torques is beyond the calibrated diameters too.
             values.clear()
@@ -201,7 +196,10 @@ class EstimatorSession:
         if len(errors):
             changed = [self._regressor_inputs(quantity, reading, frame.difference + one) for one in errors]
             error = TWO_SIDED_95 * math.hypot(*(model.regressor.predict(one)[0] - value[0] for one in changed))
-            if 2 * error > value[1] + value[2]:
+            # The gain's error is the same with all channels.
+            reach = model.regressor.gain.reach(value[0])
+            own = [math.sqrt(max(ends[0] ** 2 - ends[1] ** 2, 0.0)) for ends in zip(value[1:], reach, strict=True)]
+            if 2 * error > sum(own):
                 # The dead channels carried the value; the imputed ones are a guess.
                 dead = _dead_channel_reasons(self.calibration.validators, frame.usable)
             value = value[0], math.hypot(value[1], error), math.hypot(value[2], error)

@@ -38,7 +38,7 @@ class FrameSeries:
     t_s (n,) is the middle of each acquisition in seconds; channels (n, m, c) in volts for m sides. torque_nm (p,)
     was measured at torque_t_s (p,) on the same clock. diameter_mm (n,) is NaN where unknown; gripper_mm is then the
     gripper's width, if there was a gripper. Diameters are not fitted to gripper_mm. first_frame is the first frame's
-    number in the whole recording.
+    number in the whole recording, load_doubt why the torque's times may be wrong.
     Raises CalibrationError for shapes that do not match and for times that decrease.
     """
 
@@ -52,6 +52,7 @@ class FrameSeries:
     gripper_mm: Measured | None = None
     table: ChannelTable = PAPER_TABLE
     first_frame: int = 0
+    load_doubt: str = ""
 
     def __post_init__(self) -> None:
         """Check shapes and times."""

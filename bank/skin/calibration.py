@@ -14,6 +14,7 @@ than the band demands (the inverse of a play).
 import csv
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -34,7 +35,7 @@ from shearloop.bank.skin.membrane import (
 )
 from shearloop.yaml_files import read_yaml, save_yaml, validated
 
-FORMAT = "shearloop skin calibration 1"
+FORMAT = "shearloop skin calibration 2"
 COLUMNS = ("r1_ohm", "r2_ohm", "shear_n", "normal_n")
 # A load cell at rest may read slightly negative; a skin cannot be pulled off its core.
 MAX_PULL_N = 0.05
@@ -76,6 +77,9 @@ class SkinCalibration(BaseModel):
 
     `response_half_width` is the 95 % prediction interval of one response. `rows` were fitted; `rows_beyond` lie outside
     the curve, too few for a piece of their own. `rest_ohm` are R₁ and R₂ without load, to judge a later zero by.
+    `slack` is the slack gauge's change ΔR/R₀ at each response of the curve, within `slack_half_width` (95 %). The slack
+    side bends, so it depends on `gauge_depth_mm`, outwards from mid-thickness of the paper's section; None where no
+    depth within the skin gives this ratio.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
@@ -86,6 +90,9 @@ class SkinCalibration(BaseModel):
     tension_n: tuple[float, ...] = Field(min_length=2, strict=False)
     response: tuple[float, ...] = Field(min_length=2, strict=False)
     response_half_width: float = Field(ge=0)
+    slack: tuple[float, ...] = Field(min_length=2, strict=False)
+    slack_half_width: float = Field(ge=0)
+    gauge_depth_mm: float | None
     rows: int = Field(ge=1)
     rows_beyond: int = Field(ge=0)
     rest_ohm: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = Field(strict=False)
@@ -105,6 +112,23 @@ class SkinCalibration(BaseModel):
         ends = np.clip([-self.linear_to_n, self.linear_to_n], self.tension_n[0], self.tension_n[-1])
         low, high = np.interp(ends, self.tension_n, self.response)
         return float((high - low) / (ends[1] - ends[0]))
+
+    @property
+    def slack_ratio(self) -> float:
+        """The slack gauge's change over the stretched one's, in the middle piece of the curve; both sides' mean."""
+        ends = np.clip([-self.linear_to_n, self.linear_to_n], self.tension_n[0], self.tension_n[-1])
+        size = abs(np.interp(ends, self.tension_n, self.response))
+        slack = np.interp(ends, self.tension_n, self.slack)
+        return float(slack.sum() / (size + slack).sum())
+
+    def slack_deviation(self, response_1: float, response_2: float) -> float:
+        """Return how far the slack gauge's change lies beyond its 95 % interval, signed; 0 within it."""
+        # As a function of the stretched gauge, which a drift of the slack one leaves alone.
+        knots = [at + math.copysign(1.0, at) * slack for at, slack in zip(self.response, self.slack, strict=True)]
+        slack, stretched = sorted((response_1, response_2))
+        expected = _slack_at(math.copysign(1.0, response_1 - response_2) * stretched, knots, self.slack)
+        left = slack - expected
+        return left - min(max(left, -self.slack_half_width), self.slack_half_width)
 
     @property
     def prediction_half_width_n(self) -> float:
@@ -195,7 +219,10 @@ def fit_calibration(table: CalibrationTable, *, friction: float | None = None) -
     Raises CalibrationError where the table has too few rows, no row at rest or does not determine friction, and where
     the response does not rise with the force.
     """
-    response, loading = _responses(table)
+    changes, loading = _changes(table)
+    response = changes[:, 0] - changes[:, 1]
+    from shearloop.bank.skin.plane_strain import gauge_depth_mm
+
     loaded, idle = loading > 0, loading == 0
     forces = np.column_stack([loading, table.shear_n, table.normal_n])[loaded]
     nominal = _tensions(forces, PAPER_SECTION.friction if friction is None else friction)
@@ -214,21 +241,45 @@ def fit_calibration(table: CalibrationTable, *, friction: float | None = None) -
     if friction is None:
         friction = curve.best_friction()
     knots, responses, half_width = curve.fit(friction)
-    return SkinCalibration(
+    slack, slack_half_width = _fit_slack(changes[loaded][kept], responses)
+    found = SkinCalibration(
         friction=friction,
         gauge_angle_deg=math.degrees(PAPER_SECTION.gauge_angle_rad),
         linear_to_n=LINEAR_TO_N,
         tension_n=tuple(knots.tolist()),
         response=tuple(responses.tolist()),
         response_half_width=half_width,
+        slack=tuple(slack.tolist()),
+        slack_half_width=slack_half_width,
         rows=len(curve.response),
         rows_beyond=int((~kept).sum()),
         rest_ohm=(float(table.r1_ohm[idle].mean()), float(table.r2_ohm[idle].mean())),
+        gauge_depth_mm=None,
     )
+    return found.model_copy(update={"gauge_depth_mm": gauge_depth_mm(PAPER_SECTION, found.slack_ratio)})
 
 
-def _responses(table: CalibrationTable) -> tuple[FloatArray, IntArray]:
-    """Return the (rows,) responses and each row's loading, counted from 1; 0 for rows without load.
+def _slack_at(response: float, knots: Sequence[float], slack: Sequence[float]) -> float:
+    """Return the slack gauge's change at a response: straight between the curve's knots and the origin."""
+    grid = dict(sorted({**dict(zip(knots, slack, strict=True)), 0.0: 0.0}.items()))
+    return float(np.interp(response, list(grid), list(grid.values())))
+
+
+def _fit_slack(changes: FloatArray, knots: FloatArray) -> tuple[FloatArray, float]:
+    """Return the slack gauge's change at the curve's responses (knots,), and ± its 95 % interval.
+
+    `changes` (rows, 2) are those of both gauges.
+    """
+    response, slack = changes[:, 0] - changes[:, 1], changes.min(axis=1)
+    hats = np.eye(len(knots))
+    design = np.array([[_slack_at(at, knots.tolist(), hat) for hat in hats.tolist()] for at in response.tolist()])
+    values = np.linalg.lstsq(design, slack)[0]
+    left, freedom = slack - design @ values, len(slack) - len(knots)
+    return values, float(stdtrit(freedom, 0.975)) * math.sqrt(float(left @ left) / freedom)
+
+
+def _changes(table: CalibrationTable) -> tuple[FloatArray, IntArray]:
+    """Return both gauges' ΔR/R₀ (rows, 2) and each row's loading, counted from 1; 0 for rows without load.
 
     Each loading begins with rows without load; their mean resistances normalise it, as in the paper.
     """
@@ -239,13 +290,12 @@ def _responses(table: CalibrationTable) -> tuple[FloatArray, IntArray]:
             "it gives the resistances at rest."
         )
     loading = np.cumsum(idle & ~np.concatenate([[False], idle[:-1]]))
-    response = np.empty(len(idle))
+    changes = np.empty((len(idle), 2))
     for number in range(1, loading[-1] + 1):
         rows = loading == number
-        # Equation (1): ΔR₁/R₁₀ − ΔR₂/R₂₀.
-        relative = (ohm[rows] / ohm[rows & idle].mean() for ohm in (table.r1_ohm, table.r2_ohm))
-        response[rows] = np.subtract(*relative)
-    return response, np.where(idle, 0, loading)
+        for gauge, ohm in enumerate((table.r1_ohm, table.r2_ohm)):
+            changes[rows, gauge] = ohm[rows] / ohm[rows & idle].mean() - 1.0
+    return changes, np.where(idle, 0, loading)
 
 
 def _tensions(forces: FloatArray, friction: float) -> FloatArray:

@@ -13,6 +13,7 @@ from scipy.special import ndtri, stdtrit
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
+from shearloop.bank.skin.finite_strain import FiniteStrainSkin
 from shearloop.bank.skin.membrane import (
     EXCITATION_A,
     GAUGE_RESISTANCE_OHM,
@@ -24,18 +25,21 @@ from shearloop.bank.skin.membrane import (
     loading_response,
     paper_membrane,
     sensitivity_per_n,
+    warming_change,
 )
 from shearloop.bank.skin.plane_strain import (
     ContactState,
     apply_load,
     condense,
     gauge_responses,
-    midline_strain,
+    line_strain,
     states_along,
     unloaded,
 )
 
 FULL_RANGE_N = 5.0
+# From 25 °C to 40 °C.
+WARM_K = 15.0
 # By the normal force in N.
 PAPER_MEASURED_SENSITIVITY = {0.5: "0.078", 1.0: "0.076", 1.5: "0.080", 2.0: "0.080"}
 
@@ -157,17 +161,16 @@ def estimated_figures(membrane: Membrane, true: SkinFigures, rng: np.random.Gene
     wandering = rng.normal(0, true.drift_std, 36)
     normal_n = np.array([0.5, 1.0, 1.5, 2.0])
     pressed = true.crosstalk * normal_n / 2 + rng.normal(0, noise / np.sqrt(600), len(normal_n))
-    warm_k = 15.0
     cold, hot = (
         fit_line(shear_n, shear_n * factor + rng.normal(0, noise / np.sqrt(10), len(shear_n))).slope_per_n
-        for factor in (sensitivity, sensitivity * (1 + true.sensitivity_per_k * warm_k))
+        for factor in (sensitivity, sensitivity * (1 + true.sensitivity_per_k * WARM_K))
     )
     return SkinFigures(
         noise_floor_n=noise_floor_n(time_s, still, sensitivity),
         prediction_half_width_n=line.prediction_half_width_n(0.0),
         drift_std=float(np.std(wandering, ddof=1)),
         crosstalk=float(abs(pressed).max()),
-        sensitivity_per_k=(hot / cold - 1) / warm_k,
+        sensitivity_per_k=(hot / cold - 1) / WARM_K,
     )
 
 
@@ -197,14 +200,16 @@ class ResponseCurve:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Characterisation:
-    """The table, and the data of figures 5 to 7.
+    """The table, and the data of figures 4 to 8.
 
-    `strain_profiles` is (11, m): ε_θθ at `midline_deg` under 1 N of normal force and 0, 0.1, … 1 N of shear.
+    `strain_maps` are places (2, elements, 3, 3) and strains under 1 N of normal force, by shear force.
+    `strain_profiles` is (11, m): ε_θθ at `line_deg` under 1 N of normal force and 0, 0.1, … 1 N of shear.
     `near_zero` and `wide` are loadings from zero under 1 N; `wide_by_normal` by normal force, up to 1.6 N.
     """
 
     rows: tuple[FigureOfMerit, ...]
-    midline_deg: FloatArray
+    strain_maps: dict[float, tuple[FloatArray, FloatArray]]
+    line_deg: FloatArray
     strain_profiles: FloatArray
     near_zero: ResponseCurve
     wide: ResponseCurve
@@ -212,14 +217,17 @@ class Characterisation:
 
 
 def characterise(rng: np.random.Generator) -> Characterisation:
-    """Return the contents of the paper's table 1 and figures 5 to 7, from the models; takes a few seconds."""
+    """Return the contents of the paper's table 1 and figures 4 to 8, from the models; takes about ten seconds."""
     models = _Models()
     pressed = apply_load(models.skin, unloaded(models.skin), 1.0, 0.0)
     profiles = [pressed, *states_along(models.skin, 1.0, loading(1.0))]
+    finite = FiniteStrainSkin(PAPER_SECTION)
+    steps = finite.states_along(1.0, loading(1.0))
     return Characterisation(
         rows=(*_model_rows(models, profiles[-1]), *_estimator_rows(models, rng)),
-        midline_deg=models.skin.midline_deg,
-        strain_profiles=np.array([midline_strain(models.skin, state) for state in profiles]),
+        strain_maps={state.shear_n: finite.strain_map(state) for state in (steps[4], steps[-1])},
+        line_deg=models.skin.line_deg,
+        strain_profiles=np.array([line_strain(models.skin, state) for state in profiles]),
         near_zero=models.curve(loading(0.15, 0.005), 1.0),
         wide=models.curve(loading(1.0, 0.02), 1.0),
         wide_by_normal={normal_n: models.curve(loading(1.6), normal_n) for normal_n in PAPER_MEASURED_SENSITIVITY},
@@ -263,8 +271,8 @@ def _model_rows(models: _Models, fully_loaded: ContactState) -> list[FigureOfMer
         slopes, name = (origin_slope(*line) for line in lines(normal_n)), "sensitivity, fit through origin"
         rows.append(FigureOfMerit(f"{name}, Fn = {normal_n} N", "1/N", "0.078", measured, *slopes))
     fitted = [fit_line(*line) for line in lines(1.0)]
-    strain = midline_strain(skin, fully_loaded)
-    flank = strain[(skin.midline_deg > 15) & (skin.midline_deg < 75)]
+    strain = line_strain(skin, fully_loaded)
+    flank = strain[(skin.line_deg > 15) & (skin.line_deg < 75)]
     falls = 100 * (1 - float(np.exp(-PAPER_SECTION.friction * np.radians(60))))
     strain_1, strain_2 = skin.gauge_weights @ strain
     without = sensitivity_per_n(replace(PAPER_SECTION, friction=0.0))
@@ -275,16 +283,26 @@ def _model_rows(models: _Models, fully_loaded: ContactState) -> list[FigureOfMer
         *rows,
         FigureOfMerit("slope beyond the deadband, Fn = 1 N", "1/N", "", "", *(line.slope_per_n for line in fitted)),
         FigureOfMerit("slope without friction", "1/N", "0.088", "", without, PAPER_SENSITIVITY_PER_N, no_friction),
+        FigureOfMerit("slope within the deadband, Fn = 1 N", "1/N", "0", "0", *_deadband_slopes(models)),
         FigureOfMerit("deadband, Fn = 1 N", "N", "0.04", "0.04", *(line.kink_n for line in fitted)),
         FigureOfMerit(
             "fall of tension between 75° and 15°", "%", "< 4", "", falls, falls, 100 * np.ptp(flank) / flank.max()
         ),
         FigureOfMerit("|ε₂/ε₁|, Fn = Ft = 1 N", "", "much lower", "much lower", 0.0, 0.0, abs(strain_2 / strain_1)),
         FigureOfMerit("response to 2 N of normal force alone", "", "", "< 1.24e-4", 0.0, 0.0, abs(pressed)),
+        FigureOfMerit(
+            "change of sensitivity over 15 K, zero from before", "%", "", "< 2", *[100 * warming_change(WARM_K)] * 3
+        ),
         FigureOfMerit("gauge resistance", "Ω", "25", "25", GAUGE_RESISTANCE_OHM),
         FigureOfMerit("power of a gauge at 5 mA", "mW", "", "", 1e3 * power_w),
         FigureOfMerit("Joule heating at 5 mA", "K", "< 5", "", joule_heating_k(power_w)),
     ]
+
+
+def _deadband_slopes(models: _Models) -> list[float]:
+    """Return the slopes over the first half of the deadband."""
+    shear_n = np.array([0.02])
+    return [float(model(shear_n, 1.0)[0] / 0.02) for model in (models.in_closed_form, models.in_1d, models.in_2d)]
 
 
 def _estimator_rows(models: _Models, rng: np.random.Generator) -> list[FigureOfMerit]:

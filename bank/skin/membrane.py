@@ -33,7 +33,8 @@ class Section:
     The paper's load coordinates, (0, −6.35) on the outer surface and (0, −6) on the mid-line, give the radii. They
     contradict its fabrication text (mid-line at 6.3 mm, 0.6 mm thick), but its computed results belong to them. The
     width is the sheet's, 20 mm, loaded evenly. The gauge strips are 3 mm long, 28.65° on the mid-line. The paper
-    places them "adjacent to the nail bed"; here they begin at 15°, two thicknesses clear of the bracket.
+    places them "adjacent to the nail bed"; here they begin at 15°, two thicknesses clear of the bracket. Their depth
+    counts from mid-thickness, outwards.
     """
 
     mid_radius_mm: float = 6.0
@@ -44,6 +45,7 @@ class Section:
     friction: float = 0.04
     gauge_from_deg: float = 15.0
     gauge_to_deg: float = 43.65
+    gauge_depth_mm: float = 0.0
     load_arc_deg: float = 5.0
 
     def __post_init__(self) -> None:
@@ -59,6 +61,10 @@ class Section:
             raise GeometryError(f"The skin's poisson_ratio is {self.poisson_ratio!r}; it must lie in [0, 0.5).")
         if not 0 <= self.friction <= 1:
             raise GeometryError(f"The skin's friction is {self.friction!r}; it must lie in [0, 1].")
+        if not abs(self.gauge_depth_mm) <= self.thickness_mm / 2:
+            raise GeometryError(
+                f"The skin's gauge_depth_mm {self.gauge_depth_mm} lies outside its thickness_mm {self.thickness_mm}."
+            )
         if not 0 < self.gauge_from_deg < self.gauge_to_deg < 90 - self.load_arc_deg / 2:
             raise GeometryError(
                 f"The gauge from {self.gauge_from_deg}° to {self.gauge_to_deg}° must lie between bracket (0°) and load."
@@ -81,6 +87,8 @@ class Section:
 
 
 PAPER_SECTION = Section()
+# The other reading of the paper: the thickness that its F/(EA) = 0.088 1/N needs, below the same load.
+THICK_SECTION = Section(mid_radius_mm=5.91, thickness_mm=0.88)
 
 
 def joule_heating_k(power_w: float) -> float:
@@ -91,9 +99,19 @@ def joule_heating_k(power_w: float) -> float:
     return power_w / (CONVECTION_W_M2_K * SENSOR_AREA_M2)
 
 
-# The closed form balances moments about the core's centre. The tension at mid-thickness, N = F_t R_out/R, is shared by
-# the two sides, and ε₁ − ε₂ does not depend on how. Plane strain and the core's pressure, −σ_r ≈ N/(2 R w) at
-# mid-thickness, turn N into strain. Friction takes e^(−μφ) on the way to the gauge and μ F_n R_in/R_out at the load.
+# Of the paper's eutectic and elastomer: 1.1 % over 15 K, and the linear expansion.
+RESISTIVITY_PER_K, EXPANSION_PER_K = 0.011 / 15, 3.2e-4
+
+
+def warming_change(kelvin: float) -> float:
+    """Return ΔR/R of a gauge that warms: its liquid conducts less, and its channel expands in all directions."""
+    return (1 + RESISTIVITY_PER_K * kelvin) / (1 + EXPANSION_PER_K * kelvin) - 1
+
+
+# At small strain the closed form balances moments about the core's centre. The tension at mid-thickness, F_t R_out/R,
+# is shared by the two sides, and ε₁ − ε₂ does not depend on how. Plane strain and the core's pressure, −σ_r ≈ N/(2 R w)
+# at mid-thickness, turn tension N into strain. Friction takes e^(−μφ) on the way to the gauge and μ F_n R_in/R_out at
+# the load.
 
 
 def sensitivity_per_n(section: Section) -> float:
@@ -106,11 +124,49 @@ def sensitivity_per_n(section: Section) -> float:
     return GAUGE_FACTOR * flat * pressed * lever * capstan
 
 
+# The closed form at finite strain. The stretched side is a sheet of neo-Hookean rubber: T = E w t/(1−ν²) (λ − λ⁻³)/4.
+# The load turns by the sheet's lengthening, α = π/2 (λ − 1), and keeps its direction: its normal force pulls along the
+# skin by F_n sin α. The slack side is a quarter of a ring that bends; its stiffness against the rotation of its end
+# about the core, over the sheet's, goes with (t/R)².
+SLACK_STIFFNESS = math.pi / 2 / (12 * (math.pi / 2 - 8 / (math.pi + 2)))
+# The ring's compliance grows with the slip in thicknesses: fitted to the finite-strain reference.
+SLACK_SOFTENING = 0.72
+
+
 def loading_response(section: Section, normal_n: float, shear_n: float) -> float:
-    """Return the closed-form response while a shear force rises from zero; the skin slips beyond μ F_n R_in/R_out."""
-    deadband_n = section.friction * normal_n * section.inner_radius_mm / section.outer_radius_mm
-    beyond = max(abs(shear_n) - deadband_n, 0.0)
-    return math.copysign(sensitivity_per_n(section) * beyond, shear_n)
+    """Return the closed-form response λ₁² − λ₂² at finite strain while a shear force rises from zero.
+
+    The skin slips beyond μ F_n R_in/R_out. One Newton step solves for the stretch.
+    """
+    radius, thickness, nu = section.mid_radius_mm, section.thickness_mm, section.poisson_ratio
+    inner, outer = section.inner_radius_mm / radius, section.outer_radius_mm / radius
+    size, friction = abs(shear_n), section.friction
+
+    def pull(turned: float) -> tuple[float, float]:
+        """Return the net tension at the load and its derivative."""
+        sine, cosine = math.sin(turned), math.cos(turned)
+        along, across = size * cosine + normal_n * sine, normal_n * cosine - size * sine
+        return outer * along - friction * inner * across, outer * across + friction * inner * along
+
+    if pull(0.0)[0] <= 0:
+        return 0.0
+    axial_n = section.young_mpa / (1 - nu**2) * section.width_mm * thickness
+    slack_share = 1 - 1 / (1 + SLACK_STIFFNESS * (thickness / radius) ** 2)
+    pressed = 1 + nu / (1 - nu) * thickness / (2 * radius)
+    capstan = math.exp(-friction * section.gauge_angle_rad)
+    per_n = pressed * capstan * (1 - slack_share) / axial_n
+    small = per_n * pull(0.0)[0]
+    stretch = 1 + small * (1 + 1.5 * small)
+    tension_n, change = pull(math.pi / 2 * (stretch - 1))
+    slope = (1 + 3 * stretch**-4) / 4 - per_n * change * math.pi / 2
+    stretch -= ((stretch - stretch**-3) / 4 - per_n * tension_n) / slope
+    turned = math.pi / 2 * (stretch - 1)
+    begin, end = math.radians(section.gauge_from_deg), math.radians(section.gauge_to_deg)
+    # Mean of sin θ + cos θ, the course of the ring's axial force from the bracket, over the gauge.
+    course = (math.sin(end) - math.cos(end) - math.sin(begin) + math.cos(begin)) / (end - begin)
+    compressed = 4 / (math.pi + 2) * course * slack_share * pull(turned)[0] / axial_n
+    compressed /= 1 + SLACK_SOFTENING * turned * radius / thickness
+    return math.copysign(stretch**2 - 1 + GAUGE_FACTOR * compressed, shear_n)
 
 
 class Direction(Enum):

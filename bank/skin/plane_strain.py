@@ -14,8 +14,9 @@ linear system of that guess, and goes along it as far as Φ falls. Where that do
 the same conditions as a linear complementarity problem.
 """
 
+import math
 from collections.abc import Iterable
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from itertools import cycle
 from typing import NamedTuple
 
@@ -57,9 +58,9 @@ class MeshSize:
     layers: int = 2
 
     def __post_init__(self) -> None:
-        """Refuse a mesh without elements or without nodes and facets at mid-thickness."""
-        if min(self.bracket, self.gauge, self.flank, self.load) < 1 or self.layers < 2 or self.layers % 2:
-            raise GeometryError(f"{self} needs at least one element per stretch and an even number of layers.")
+        """Refuse a mesh without elements."""
+        if min(astuple(self)) < 1:
+            raise GeometryError(f"{self} needs at least one element per stretch and one layer.")
 
     def refined(self, times: int) -> "MeshSize":
         """Return the size with every element cut into times × times."""
@@ -97,7 +98,7 @@ def plane_strain_stiffness(basis: skfem.Basis, young_mpa: float, poisson_ratio: 
 
 @dataclass(frozen=True, slots=True)
 class CondensedSkin:
-    """The skin as seen from its n contact nodes and m mid-line facets; forces in N, displacements in mm.
+    """The skin as seen from its n contact nodes and m elements at the gauges' depth; forces in N, displacements in mm.
 
     `compliance` is (2n, 2n), radial components first. `load_displacement` (2n, 2) and `load_strain` (m, 2) answer a
     unit normal force (towards the core) and a unit shear force. `strain_of_contact` is (m, 2n). `gauge_weights` (2, m)
@@ -108,7 +109,7 @@ class CondensedSkin:
     contact_deg: FloatArray
     compliance: FloatArray
     load_displacement: FloatArray
-    midline_deg: FloatArray
+    line_deg: FloatArray
     strain_of_contact: FloatArray
     load_strain: FloatArray
     gauge_weights: FloatArray
@@ -116,33 +117,36 @@ class CondensedSkin:
 
 def condense(section: Section, size: MeshSize = MESH_112) -> CondensedSkin:
     """Return the skin condensed to its contact nodes: clamped at both brackets, loaded evenly on the load's arc."""
-    whole = _Assembly(section, size)
-    contact, contact_deg = whole.contact_rotation()
-    strain, midline_deg, weights = whole.midline_strain()
-    clamped = whole.mesh.facets_satisfying(lambda x: abs(x[1]) < 1e-9, boundaries_only=True)
-    free = whole.basis.complement_dofs(whole.basis.get_dofs(clamped).flatten())
-    stiffness = section.width_mm * plane_strain_stiffness(whole.basis, section.young_mpa, section.poisson_ratio)
-    factor = splu(stiffness[free][:, free].tocsc())
-    contact, strain = contact[:, free], strain[:, free]
-    by_load, by_contact = factor.solve(whole.load()[free]), factor.solve(contact.T.toarray())
+    mesh = SkinMesh(section, size)
+    nodes, theta = mesh.contact_nodes()
+    contact = mesh.contact_frame(nodes, theta).T[:, mesh.free]
+    line = mesh.gauge_line()
+    strain = line.mean_strain()[:, mesh.free]
+    stiffness = section.width_mm * plane_strain_stiffness(mesh.basis, section.young_mpa, section.poisson_ratio)
+    factor = splu(stiffness[mesh.free][:, mesh.free].tocsc())
+    by_load, by_contact = factor.solve(mesh.load()[mesh.free]), factor.solve(contact.T.toarray())
     return CondensedSkin(
         section=section,
-        contact_deg=contact_deg,
+        contact_deg=np.degrees(theta),
         compliance=contact @ by_contact,
         load_displacement=contact @ by_load,
-        midline_deg=midline_deg,
+        line_deg=line.degrees,
         strain_of_contact=strain @ by_contact,
         load_strain=strain @ by_load,
-        gauge_weights=weights,
+        gauge_weights=line.weights,
     )
 
 
-class _Assembly:
+class SkinMesh:
+    """A section's mesh with its basis, its dofs that are not clamped, and its places of contact, gauges and load."""
+
     def __init__(self, section: Section, size: MeshSize) -> None:
         self.section = section
         self.mesh = annulus_mesh(section, size)
-        self.element = skfem.ElementVector(skfem.ElementQuad2())
-        self.basis = skfem.Basis(self.mesh, self.element, intorder=4)
+        self.basis = skfem.Basis(self.mesh, skfem.ElementVector(skfem.ElementQuad2()), intorder=4)
+        clamped = self.mesh.facets_satisfying(lambda x: abs(x[1]) < 1e-9, boundaries_only=True)
+        self.free: IntArray = self.basis.complement_dofs(self.basis.get_dofs(clamped).flatten())
+        self._layers = size.layers
 
     def _facets_at(self, radius_mm: float) -> IntArray:
         """Return the facets along a circle; all three nodes of such a curved facet lie on it."""
@@ -150,61 +154,91 @@ class _Assembly:
         on_circle = (abs(r - radius_mm) < 1e-9 * radius_mm).all(axis=0)
         return np.flatnonzero(on_circle)
 
-    def contact_rotation(self) -> tuple[csc_matrix, FloatArray]:
-        """Return the (2n, dofs) matrix of radial and circumferential displacement of the contact nodes, and their θ."""
+    def contact_nodes(self) -> tuple[IntArray, FloatArray]:
+        """Return the (2, n) dofs of x and y of the nodes that may touch the core, and their θ (n,), rising."""
         facets = self._facets_at(self.section.inner_radius_mm)
         nodes = np.unique(self.mesh.facets[:, facets])
         pairs = np.hstack([self.basis.nodal_dofs[:, nodes], self.basis.facet_dofs[:, facets]])
-        theta = _angle(self.basis.doflocs[:, pairs[0]])
+        theta = angle(self.basis.doflocs[:, pairs[0]])
         kept = (theta > 1e-9) & (theta < np.pi - 1e-9)
         order = np.flatnonzero(kept)[np.argsort(theta[kept])]
-        pairs, theta = pairs[:, order], theta[order]
-        n = len(theta)
-        radial, along = np.array([-np.cos(theta), -np.sin(theta)]), _along(theta)
-        rows = np.concatenate([np.arange(n), np.arange(n), n + np.arange(n), n + np.arange(n)])
-        columns = np.concatenate([pairs[0], pairs[1], pairs[0], pairs[1]])
-        values = np.concatenate([*radial, *along])
-        return csc_matrix((values, (rows, columns)), shape=(2 * n, self.basis.N)), np.degrees(theta)
+        return pairs[:, order], theta[order]
 
-    def midline_strain(self) -> tuple[csc_matrix, FloatArray, FloatArray]:
-        """Return the (m, dofs) matrix of facet means of ε_θθ, the facets' angles, and the gauges' weights on them."""
-        facets = self._facets_at(self.section.mid_radius_mm)
-        theta = _angle(self.mesh.p[:, self.mesh.facets[:, facets]].mean(axis=1))
-        facets, theta = facets[np.argsort(theta)], np.sort(theta)
-        basis = skfem.InteriorFacetBasis(self.mesh, self.element, facets=facets, side=0, intorder=5)
-        dofs, values = [], []
-        lengths = basis.dx.sum(axis=1)
-        along = _along(_angle(np.asarray(basis.global_coordinates())))
-        for i in range(basis.Nbfun):
-            strain = np.einsum("i...,ij...,j...->...", along, grad(basis.basis[i][0]), along)
-            values.append((strain * basis.dx).sum(axis=1) / lengths)
-            dofs.append(basis.element_dofs[i])
-        m = len(facets)
-        rows = np.tile(np.arange(m), basis.Nbfun)
-        matrix = csc_matrix((np.concatenate(values), (rows, np.concatenate(dofs))), shape=(m, self.basis.N))
-        degrees = np.degrees(theta)
+    def contact_frame(self, nodes: IntArray, theta: FloatArray) -> csc_matrix:
+        """Return the (dofs, 2n) unit vectors at these nodes: radial ones first, then along the core."""
+        n = len(theta)
+        columns = np.tile(np.arange(n), 2)
+        values = np.concatenate([*radial(theta), *along(theta)])
+        rows = np.concatenate([nodes.ravel(), nodes.ravel()])
+        return csc_matrix((values, (rows, np.concatenate([columns, n + columns]))), shape=(self.basis.N, 2 * n))
+
+    def gauge_line(self) -> "GaugeLine":
+        """Return the elements at the gauges' depth."""
+        height = self._layers * (0.5 + self.section.gauge_depth_mm / self.section.thickness_mm)
+        layer = min(int(height), self._layers - 1)
+        corners = self.mesh.p[:, self.mesh.t]
+        inner, step = self.section.inner_radius_mm, self.section.thickness_mm / self._layers
+        elements = np.flatnonzero((np.hypot(*corners).mean(axis=0) - inner) // step == layer)
+        theta = np.degrees(angle(corners[:, :, elements]))
+        order = np.argsort(theta.mean(axis=0))
+        elements, theta = elements[order], theta[:, order]
+        # The first reference coordinate goes along the skin, the second outwards.
+        places, shares = np.polynomial.legendre.leggauss(3)
+        points = np.vstack([(places + 1) / 2, np.full(3, height - layer)])
+        basis = skfem.Basis(self.mesh, self.basis.elem, elements=elements, quadrature=(points, shares / 2))
+        degrees, spans = theta.mean(axis=0), np.ptp(theta, axis=0)
         in_gauge = (degrees > self.section.gauge_from_deg) & (degrees < self.section.gauge_to_deg)
-        weights = np.array([in_gauge * lengths, in_gauge[::-1] * lengths])
-        return matrix, degrees, weights / weights.sum(axis=1, keepdims=True)
+        weights = np.array([in_gauge * spans, in_gauge[::-1] * spans])
+        return GaugeLine(basis, degrees, weights / weights.sum(axis=1, keepdims=True), shares / 2)
 
     def load(self) -> FloatArray:
         """Return the (dofs, 2) nodal forces of 1 N towards the core and of 1 N of shear, even over the loaded arc."""
         facets = self._facets_at(self.section.outer_radius_mm)
-        theta = _angle(self.mesh.p[:, self.mesh.facets[:, facets]].mean(axis=1))
+        theta = angle(self.mesh.p[:, self.mesh.facets[:, facets]].mean(axis=1))
         facets = facets[abs(np.degrees(theta) - 90) < self.section.load_arc_deg / 2]
-        basis = skfem.FacetBasis(self.mesh, self.element, facets=facets, intorder=5)
+        basis = skfem.FacetBasis(self.mesh, self.basis.elem, facets=facets, intorder=5)
         length = basis.dx.sum()
         normal = skfem.LinearForm(lambda v, _: v[1] / length).assemble(basis)
         shear = skfem.LinearForm(lambda v, _: v[0] / length).assemble(basis)
         return np.column_stack([normal, shear])
 
 
-def _angle(points: FloatArray) -> FloatArray:
+@dataclass(frozen=True, slots=True, eq=False)
+class GaugeLine:
+    """The m elements at the gauges' depth, by rising angle: middles, the gauges' weights (2, m), shares of 3 points."""
+
+    basis: skfem.Basis
+    degrees: FloatArray
+    weights: FloatArray
+    shares: FloatArray
+
+    def mean_strain(self) -> csc_matrix:
+        """Return the (m, dofs) matrix of each element's mean ε_θθ."""
+        basis = self.basis
+        directions = along(angle(np.asarray(basis.global_coordinates())))
+        values = [
+            np.einsum("i...,ij...,j...->...", directions, grad(basis.basis[i][0]), directions) @ self.shares
+            for i in range(basis.Nbfun)
+        ]
+        m = len(self.degrees)
+        rows = np.tile(np.arange(m), basis.Nbfun)
+        places = rows, np.concatenate([basis.element_dofs[i] for i in range(basis.Nbfun)])
+        return csc_matrix((np.concatenate(values), places), shape=(m, basis.N))
+
+
+def angle(points: FloatArray) -> FloatArray:
+    """Return the paper's angle θ of points (2, …), in rad."""
     theta: FloatArray = np.arctan2(-points[1], -points[0])
     return theta
 
 
-def _along(theta: FloatArray) -> FloatArray:
+def radial(theta: FloatArray) -> FloatArray:
+    """Return the (2, …) unit vectors away from the core."""
+    return np.array([-np.cos(theta), -np.sin(theta)])
+
+
+def along(theta: FloatArray) -> FloatArray:
+    """Return the (2, …) unit vectors along the core, towards larger angles."""
     return np.array([np.sin(theta), -np.cos(theta)])
 
 
@@ -259,8 +293,8 @@ def states_along(
     return states
 
 
-def midline_strain(skin: CondensedSkin, state: ContactState) -> FloatArray:
-    """Return the (m,) circumferential strain at mid-thickness, at the angles `skin.midline_deg`."""
+def line_strain(skin: CondensedSkin, state: ContactState) -> FloatArray:
+    """Return the (m,) circumferential strain at the gauges' depth, at the angles `skin.line_deg`."""
     strain: FloatArray = skin.strain_of_contact @ state.contact_force_n
     strain += skin.load_strain @ (state.normal_n, state.shear_n)
     return strain
@@ -268,7 +302,22 @@ def midline_strain(skin: CondensedSkin, state: ContactState) -> FloatArray:
 
 def gauge_strains(skin: CondensedSkin, states: Iterable[ContactState]) -> FloatArray:
     """Return the (states, 2) mean circumferential strains of the two gauges."""
-    return np.array([skin.gauge_weights @ midline_strain(skin, state) for state in states])
+    return np.array([skin.gauge_weights @ line_strain(skin, state) for state in states])
+
+
+def gauge_depth_mm(section: Section, slack_ratio: float) -> float | None:
+    """Return the depth (mm, outwards from mid-thickness) at which the slack gauge reads this share of the other one.
+
+    The slack side bends, so the share rises outwards. None where no depth within the skin has this share.
+    """
+    depths = np.linspace(-0.5, 0.5, 5) * section.thickness_mm
+    shares = []
+    for depth in depths.tolist():
+        skin = condense(replace(section, gauge_depth_mm=depth))
+        strain_1, strain_2 = gauge_strains(skin, states_along(skin, 1.0, [1.0]))[0]
+        shares.append(strain_2 / strain_1)
+    depth = float(np.interp(slack_ratio, shares, depths, left=math.nan, right=math.nan))
+    return None if math.isnan(depth) else depth
 
 
 def gauge_responses(skin: CondensedSkin, states: Iterable[ContactState]) -> FloatArray:
@@ -285,17 +334,24 @@ class ContactSolution(NamedTuple):
 
 
 def solve_contact(
-    compliance: FloatArray, displacement: FloatArray, along_before: FloatArray, friction: float, start: FloatArray
+    compliance: FloatArray,
+    displacement: FloatArray,
+    along_before: FloatArray,
+    friction: float,
+    start: FloatArray,
+    stiffness: FloatArray | None = None,
 ) -> ContactSolution:
     """Return the contact forces of one increment.
 
-    `compliance` (2n, 2n) mm/N, symmetric and positive definite; `displacement` (2n,) mm without contact;
-    `along_before` (n,) mm at the previous increment; `start` (2n,) N. Raises ContactError for a load that is not a
+    `compliance` (2n, 2n) mm/N; `displacement` (2n,) mm without contact; `along_before` (n,) mm at the previous
+    increment; `start` (2n,) N; `stiffness` (2n,) N/mm, positive, of each node, the compliance's own unless given.
+    There is a solution wherever the compliance is positive definite. Raises ContactError for a load that is not a
     number.
     """
     if not (np.isfinite(displacement).all() and np.isfinite(start).all()):
         raise ContactError("The skin's load is not a number; give its normal and shear force in N.")
-    problem = _Problem(compliance, displacement, along_before, friction)
+    stiffness = 1 / np.diag(compliance) if stiffness is None else stiffness
+    problem = _Problem(compliance, displacement, along_before, friction, stiffness)
     found, converged = problem.newton(start)
     if converged:
         return found
@@ -317,6 +373,8 @@ class _Problem:
     displacement: FloatArray
     along_before: FloatArray
     friction: float
+    # Scales displacements to forces; any positive numbers give the same solution.
+    stiffness: FloatArray
 
     def newton(self, force: FloatArray) -> tuple[ContactSolution, bool]:
         """Return where a semismooth Newton method comes from these forces, and whether it converged."""
@@ -348,8 +406,7 @@ class _Problem:
         n = len(self.along_before)
         moved = self.compliance @ force + self.displacement
         moved[n:] -= self.along_before
-        # The stiffness scales displacements to forces; any positive number gives the same solution.
-        trial = force - weight / np.diag(self.compliance) * moved
+        trial = force - weight * self.stiffness * moved
         pressing = np.maximum(trial[:n], 0.0)
         bound = self.friction * pressing
         wanted = np.concatenate([pressing, np.clip(trial[n:], -bound, bound)])
@@ -388,7 +445,7 @@ class _Problem:
         ray (Cottle, Pang & Stone, The Linear Complementarity Problem, section 4.4).
         """
         n = len(self.along_before)
-        scale = 1 / np.sqrt(np.diag(self.compliance))
+        scale = np.sqrt(self.stiffness)
         scaled, moved = self.compliance * np.outer(scale, scale), self.displacement.copy()
         moved[n:] -= self.along_before
         moved *= scale

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from shearloop.bank.estimation import TRUSTED, Calibration, FrameSeries, LoadTiming, Physics, fit, measure_timing
+from shearloop.bank.estimation import TRUSTED, Calibration, FrameSeries, LoadTiming, Physics, adapt, fit, measure_timing
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor
 from shearloop.bank.estimators import EstimatorName
+from shearloop.bank.gain import GainCorrection
 from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, part_of, read_series, series_of
 from shearloop.daemon.recording.reader import read_recording
 
@@ -97,8 +98,10 @@ def calibrate(
     delay_s = options.load_cell_delay_s
     chosen: list[tuple[Path, FrameSeries]] = []
     others: list[tuple[str, FrameSeries]] = []
+    all_live = True
     for path in paths:
-        own, beside = _read(path, options)
+        own, beside, live = _read(path, options)
+        all_live = all_live and live
         chosen += [(path, part_of(one, *options.time_range)) for one in own]
         others += [(f"{path.name}, {one.sides[0]}", part_of(one, *options.time_range)) for one in beside]
     parts = [part for _, part in chosen]
@@ -106,6 +109,9 @@ def calibrate(
     if delay_s:
         parts = [replace(one, torque_t_s=one.torque_t_s - delay_s) for one in parts]
     timing = TRUSTED if delay_s is not None else measure_timing(parts, [one for _, one in others])
+    if all_live:
+        # One clock stamped frames and torques as they arrived, whatever the motion shows.
+        timing = replace(timing, uncertainty_s=0.0)
     calibration = fit(
         estimator, parts, _source(paths, options), physics, timing=timing, full_range=options.assume_full_range
     )
@@ -115,16 +121,42 @@ def calibrate(
     return CalibrationResult(calibration, sum(len(one.t_s) for one in parts), timing, doubts)
 
 
-def _read(path: Path, options: CalibrationOptions) -> tuple[list[FrameSeries], list[FrameSeries]]:
-    """Return a path's series, and those of its other sides: these may show the load cell's delay better."""
+def adapt_to_recordings(
+    calibration: Calibration,
+    paths: Sequence[Path],
+    physics: Physics,
+    *,
+    time_range: tuple[float, float],
+    load_cell_delay_s: float = 0.0,
+    tool_mm: float | None = None,
+) -> tuple[Calibration, GainCorrection]:
+    """Return a calibration adapted to the twists within these shares of recordings, and the correction of its gain.
+
+    Raises UserError for recordings that are given twice, and CalibrationError for those that show no gain.
+    """
+    check_paths_differ(paths)
+    start, stop = time_range
+    series = [one for path in paths for one in read_series(path, calibration.sides, tool_mm)]
+    # Earlier frames show the session the idle fingertip.
+    until = [part_of(replace(one, torque_t_s=one.torque_t_s - load_cell_delay_s), 0.0, stop) for one in series]
+    first = [part_of(one, start, stop).first_frame for one in series]
+    options = CalibrationOptions(time_range=time_range, load_cell_delay_s=load_cell_delay_s)
+    return adapt(calibration, until, _source(paths, options), physics, first_frames=first)
+
+
+def _read(path: Path, options: CalibrationOptions) -> tuple[list[FrameSeries], list[FrameSeries], bool]:
+    """Return a path's series, those of its other sides, and whether a daemon recorded them.
+
+    Other sides may show the load cell's delay better.
+    """
     if path.is_dir():
-        return read_series(path), []
+        return read_series(path), [], False
     recording, sides = read_recording(path), options.sides
     own = series_of(recording, sides, options.tool_mm)
-    if sides is None or options.load_cell_delay_s is not None:
-        return [own], []
-    others = [side for side in recording.sides if side not in sides]
-    return [own], [series_of(recording, (side,), options.tool_mm) for side in others]
+    others = []
+    if sides is not None and options.load_cell_delay_s is None:
+        others = [side for side in recording.sides if side not in sides]
+    return [own], [series_of(recording, (side,), options.tool_mm) for side in others], recording.live
 
 
 def _source(paths: Sequence[Path], options: CalibrationOptions) -> str:

@@ -31,6 +31,12 @@ class EstimateTrack:
     estimates: tuple[Estimate, ...]
     latency_ms: FloatArray
 
+    def since(self, first_frame: int) -> "EstimateTrack":
+        """Return the part from a frame of the recording on."""
+        first = first_frame - self.series.first_frame
+        series = self.series.between(first, len(self.estimates))
+        return EstimateTrack(series, self.estimates[first:], self.latency_ms[first:])
+
 
 def estimate_series(calibration: Calibration, series: FrameSeries, bank: Bank | None = None) -> EstimateTrack:
     """Estimate every frame of a series in order, as live; raises CalibrationError for a series of other sides."""
@@ -199,7 +205,9 @@ def draw_tracks(tracks: Sequence[EstimateTrack], names: Sequence[str], title: st
     for axes, track, row_name in zip(rows, tracks, names, strict=True):
         truth, quantity = track.series.torque_at_frames(), "torque_nm"
         label, bounds = "torque in N·m", ("torque_low_nm", "torque_high_nm")
-        if np.isfinite(track.series.diameter_mm).any():
+        slices = track.series.kind == "difference"
+        # A stream has one tool, whose diameter would be a flat line.
+        if slices and np.isfinite(track.series.diameter_mm).any():
             truth, quantity = track.series.diameter_mm, "diameter_mm"
             label, bounds = "diameter in mm", ("diameter_low_mm", "diameter_high_mm")
         t_s = track.series.t_s
@@ -207,15 +215,14 @@ def draw_tracks(tracks: Sequence[EstimateTrack], names: Sequence[str], title: st
             np.array([getattr(one, key) if getattr(one, key) is not None else np.nan for one in track.estimates])
             for key in (quantity, *bounds)
         )
-        slices = track.series.kind == "difference"
-        style = "o" if slices else "-"
+        style, shown = "o" if slices else "-", "estimate with its 95 % interval"
         axes.plot(t_s, truth, f"k{style}", linewidth=1.0, markersize=5, label="truth")
         if slices:
-            axes.errorbar(t_s, value, [value - low, high - value], fmt="s", markersize=4, label="estimate, 95 %")
+            axes.errorbar(t_s, value, [value - low, high - value], fmt="s", markersize=4, label=shown)
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         else:
             axes.fill_between(t_s, low, high, alpha=0.25, linewidth=0)
-            axes.plot(t_s, value, linewidth=1.2, label="estimate, 95 %")
+            axes.plot(t_s, value, linewidth=1.2, label=shown)
             axes.fill_between(
                 t_s, 0, 1, where=np.isnan(value), transform=axes.get_xaxis_transform(), color="0.92", linewidth=0,
                 label="no valid estimate",

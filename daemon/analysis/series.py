@@ -18,7 +18,7 @@ from shearloop.daemon.recording.matlab import (
     read_torque_slices,
 )
 from shearloop.daemon.recording.reader import Recording, read_recording
-from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, SIDES
+from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, LOAD_DOUBT_NOTE, SIDES
 
 # Slices do not name their side.
 SLICE_SIDE = "right"
@@ -88,6 +88,7 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_m
         np.full(len(t_s), diameter_mm),
         gripper_mm,
         recording.table,
+        load_doubt=recording.notes.get(LOAD_DOUBT_NOTE, ""),
     )
 
 

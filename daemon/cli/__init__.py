@@ -38,6 +38,7 @@ COMMANDS = {
         ("recording", "cli.recording", "inspect recordings, repair them, and export them as tables"),
         ("replay", "cli.replay", "send a recording through the same estimators again, as if live"),
         ("evaluate", "cli.evaluate", "judge a calibrated estimator on recordings or slices"),
+        ("adapt", "cli.adapt", "correct a calibration's gain by one or a few twists of known torque"),
         ("chart", "cli.chart", "chart speed against accuracy, stability, and how much model is needed"),
         ("check", "cli.check", "check a configuration and the files it names"),
         ("schema", "cli.schema", "print the JSON Schema of a configuration, an experiment or another file"),

@@ -49,15 +49,15 @@ def run(args: argparse.Namespace) -> int:
     if config.robot is not None and not args.prepare:
         # Without the robot's library nothing needs to be built.
         robot_settings(config.robot)
-    _prepare(folder, args.folder / "run")
+    _prepare(folder, args.folder / "run", calibrated=args.recording is None)
     if args.prepare:
         return 0
     with page(config):
         return _call(run_command, str(folder / name), "--show", *played)
 
 
-def _prepare(config: Path, data: Path) -> None:
-    """Make the bank and the calibrations that are missing or outdated."""
+def _prepare(config: Path, data: Path, *, calibrated: bool) -> None:
+    """Make the bank and, if `calibrated`, the calibrations, where they are missing or outdated."""
     from shearloop.daemon.bank_config import load_bank_plans
 
     with writing(data, "the folder"):
@@ -65,7 +65,7 @@ def _prepare(config: Path, data: Path) -> None:
     definition, signals = config / "banks" / "demo.yaml", data / "demo.bank"
     if not bank.is_built(signals, load_bank_plans(definition)[""]):
         _call(bank, "build", "--config", str(definition), "--out", str(signals))
-    if not _is_calibrated(data, signals):
+    if calibrated and not _is_calibrated(data, signals):
         from shearloop.daemon.cli.emulated_calibration import calibrate_rig
 
         calibrate_rig(signals, data)

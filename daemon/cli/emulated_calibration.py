@@ -1,4 +1,4 @@
-"""Records the emulated rig and calibrates its fingertips, for `shearloop demo`.
+"""Records the emulated rig and calibrates its fingertips, for `shearloop demo` and for notebooks.
 
 As on a real rig, a recording holds idle frames, a grip, twists with the load cell's torque, and idle frames again, for
 several cylinders. It runs on the emulated rig's physics in simulated time, so that a seed always gives the same files:
@@ -8,15 +8,20 @@ several cylinders. It runs on the emulated rig's physics in simulated time, so t
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shearloop.bank.eit.build import build_bank
 from shearloop.bank.eit.channels import ChannelTable
 from shearloop.bank.estimation import Calibration, FrameSeries, fit, measure_timing
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.series import series_of
+from shearloop.daemon.bank_config import load_bank_plan
+from shearloop.daemon.cli.bank import is_built
+from shearloop.daemon.cli.options import checked_jobs, writing
 from shearloop.daemon.cli.terminal import progress_bar
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.schema import DIAMETER_NOTE
@@ -32,7 +37,7 @@ from shearloop.drivers.emulators.scene import Scene
 DIAMETERS_MM = (10.0, 17.5, 25.0, 32.5, 40.0)
 # Each seed gives other noise and other twists.
 SEED = 7
-SOURCE = "the emulated rig, by `shearloop demo`"
+SOURCE = "the emulated rig"
 # The time step; about the duration of an injection.
 STEP_S = 0.02
 IDLE_S, SETTLE_S = 12.0, 10.0
@@ -158,13 +163,37 @@ def calibrate(recordings: list[FrameSeries], sides: Sides) -> Calibration:
     return fit("motion_regression", chosen, SOURCE, timing=measure_timing(chosen, recordings))
 
 
+def write_recordings(bank: Path, folder: Path, diameters_mm: tuple[float, ...], seed: int) -> Iterator[Path]:
+    """Write the recording of each cylinder, and yield its path."""
+    for diameter_mm, recorded in record(bank, seed, diameters_mm):
+        path = folder / f"rig-{diameter_mm:g}mm.mcap"
+        recorded.write(path, diameter_mm)
+        yield path
+
+
+def emulate_recordings(
+    folder: str | Path, diameters_mm: tuple[float, ...] = DIAMETERS_MM, seed: int = SEED
+) -> list[Path]:
+    """Record twists of the emulated rig, a file for each tool, and return the files; the same seed gives the same ones.
+
+    The folder also gets `demo.bank`, the bank that the frames are made of. Raises UserError where it cannot be written.
+    """
+    folder = Path(folder)
+    bank = folder / "demo.bank"
+    with writing(folder, "the folder"):
+        folder.mkdir(parents=True, exist_ok=True)
+    with resources.as_file(resources.files("shearloop") / "config") as config:
+        plan = load_bank_plan(config / "banks" / "demo.yaml")
+    if not is_built(bank, plan):
+        build_bank(*plan, bank, jobs=checked_jobs(None))
+    return list(write_recordings(bank, folder, diameters_mm, seed))
+
+
 def calibrate_rig(bank: Path, folder: Path) -> None:
     """Record and calibrate into a folder, and print the calibrations' accuracy on a separate recording."""
     recordings = []
     with progress_bar("recordings", len(DIAMETERS_MM), "cylinder") as show:
-        for number, (diameter_mm, recorded) in enumerate(record(bank, SEED), 1):
-            path = folder / f"rig-{diameter_mm:g}mm.mcap"
-            recorded.write(path, diameter_mm)
+        for number, path in enumerate(write_recordings(bank, folder, DIAMETERS_MM, SEED), 1):
             recordings.append(series_of(read_recording(path)))
             show(number)
     apart = [recorded.series(mm) for mm, recorded in record(bank, SEED + 100, (20.0,))]

@@ -75,7 +75,10 @@ def run(args: argparse.Namespace) -> int:
     check_no_copies([(str(path), part) for (path, _), part in zip(named, parts, strict=True)])
     shared = (calibration, None if bank is None else str(args.bank.resolve()))
     with open_executor(args.cluster) as pool:
-        tracks = in_order(pool.map(estimate_in_worker, shared, parts))
+        # Frames before the part show the idle fingertip, as live.
+        whole = [part_of(one, 0.0, stop) for _, one in named]
+        estimated = in_order(pool.map(estimate_in_worker, shared, whole))
+    tracks = [track.since(part.first_frame) for track, part in zip(estimated, parts, strict=True)]
     if args.estimates is not None:
         with writing(args.estimates, "the estimates"):
             write_estimates(tracks, [str(path) for path, _ in named], args.estimates)

@@ -89,7 +89,7 @@ def client_keys(args: argparse.Namespace) -> "ClientKeys | None":
     """Return the keys for the address, None for an address on this machine; raises UserError for missing keys."""
     if args.key is None and args.server_key is None and not needs_keys(args.connect):
         return None
-    from shearloop.daemon.messaging.keys import ClientKeys, load_key_pair, load_public_key
+    from shearloop.daemon.messaging.keys import ClientKeys
 
     folder = user_key_folder()
     key = args.key or folder / "client.key_secret"
@@ -102,7 +102,7 @@ def client_keys(args: argparse.Namespace) -> "ClientKeys | None":
             raise UserError(
                 f"{args.connect} is not on this machine, and there is no key {path}: {cure}, or give {option}"
             )
-    return ClientKeys(load_key_pair(key), load_public_key(server_key))
+    return ClientKeys.load(key, server_key)
 
 
 def checked_jobs(jobs: int | None) -> int:

@@ -110,19 +110,20 @@ def _repair(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace) -> int:
-    from shearloop.daemon.recording.export import count_messages, export
+    from shearloop.daemon.recording.export import export
     from shearloop.daemon.recording.schema import INPUT
+    from shearloop.daemon.recording.tables import RecordedTopics
 
     path, form = args.recording, args.format
     stem, kind = path.name.partition(".mcap")[0], _SINGLE_FILES.get(form)
     out = args.out or path.with_name(f"{stem}.{form}" if kind else f"{stem}_{form}")
     if kind:
         check_overwrite(out, *kind)
-    counts = count_messages(path)
+    counts = RecordedTopics(path).counts
     unknown = [topic for topic in args.topic or () if topic not in counts]
     if unknown:
-        raise UserError(f"{path} has no topic {unknown[0]!r}; it has {', '.join(sorted(counts))}")
-    topics = args.topic or sorted(topic for topic, count in counts.items() if count)
+        raise UserError(f"{path} has no topic {unknown[0]!r}; it has {', '.join(counts)}")
+    topics = args.topic or list(counts)
     if form in ("rrd", "lerobot"):
         topics = [topic for topic in topics if not topic.startswith(f"{INPUT}.")]
     with progress_bar(form, sum(counts[topic] for topic in topics), "message") as progress, writing(out, "the export"):

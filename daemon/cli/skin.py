@@ -20,7 +20,8 @@ SEED = 2017
 COLUMNS = ("quantity", "unit", "paper: computed", "measured", "closed form", "1-D", "2-D", "synthetic")
 EXPLANATION = """\
 Sensitivity: least squares through the origin over one loading in 0.1 N steps, from the first step up to Fn.
-1-D: membrane with the paper's own F/(EA). 2-D: plane strain, 112 elements, nothing tuned; w = 20 mm is assumed.
+Closed form: a sheet at finite strain. 1-D: membrane with the paper's own F/(EA).
+2-D: plane strain, small strain, 112 elements, nothing tuned; w = 20 mm is assumed.
 Synthetic: the estimator's result on a synthetic recording with the paper's measured value."""
 
 
@@ -29,7 +30,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     summary = "compare the paper's table with the models'"
     characterise = add_action(actions, "characterise", summary, _characterise)
-    add_option(characterise, "--out", Path, "DIR", "draw figures 5, 6 and 7 here, PNG and SVG")
+    add_option(characterise, "--out", Path, "DIR", "draw figures 4 to 8 and the deadband here, PNG and SVG")
     add_json(characterise)
     calibrate = add_action(actions, "calibrate", "fit a calibration to a recorded table", _calibrate)
     add_option(calibrate, "table", Path, "TABLE", "CSV with r1_ohm, r2_ohm, shear_n, normal_n")
@@ -80,7 +81,12 @@ def _calibrate(args: argparse.Namespace) -> int:
         raise UserError(f"{args.table}: {error}") from error
     save_calibration(calibration, args.out)
     source = "fitted" if args.friction is None else "given"
-    named = ("friction", "slope_per_n", "prediction_half_width_n", "linear_to_n", "rows", "rows_beyond")
+    named = (
+        "friction", "slope_per_n", "prediction_half_width_n", "linear_to_n", "slack_ratio", "gauge_depth_mm",
+        "rows", "rows_beyond",
+    )  # fmt: skip
+    depth_mm = calibration.gauge_depth_mm
+    depth = "not that of a depth in the paper's skin" if depth_mm is None else f"{1e3 * depth_mm:+.0f} µm"
     result = {
         "path": str(args.out),
         "friction_given": args.friction is not None,
@@ -93,6 +99,8 @@ def _calibrate(args: argparse.Namespace) -> int:
         f"95 % prediction interval             ± {calibration.prediction_half_width_n:.4f} N",
         f"straight to {calibration.linear_to_n} N; tension calibrated  "
         f"{calibration.tension_n[0]:.2f} … {calibration.tension_n[-1]:.2f} N",
+        f"slack gauge's share of the stretched {calibration.slack_ratio:+.3f}",
+        f"gauge depth outwards from mid-skin    {depth}",
         f"rows fitted                          {calibration.rows}",
         f"rows left out beyond the curve       {calibration.rows_beyond}",
         f"written: {args.out}",

@@ -207,9 +207,6 @@ def task_row(name: str, facts: Mapping[str, Any]) -> tuple[str, str, str, str]:
     down = facts.get("connected") is False
     state = "DEAD" if facts.get("alive") is False else "not connected" if down else "alive"
     state = "done" if facts.get("done") else state
-    rate = "" if facts.get("rate_hz") is None else f"{facts['rate_hz']:.2f} Hz"
-    if rate and facts.get("expected_hz") is not None:
-        rate += f" of {facts['expected_hz']:.2f}"
     notes = [f"restarted {times(facts['restarts'])}"] if facts.get("restarts") else []
     errors = dict(facts.get("errors") or {})
     lost = sum(errors.pop(kind, 0) for kind in LINK_ERRORS) or (facts.get("connections") or 1) - 1
@@ -218,7 +215,13 @@ def task_row(name: str, facts: Mapping[str, Any]) -> tuple[str, str, str, str]:
     notes += [f"{kind} {times(count)}" for kind, count in errors.items()]
     if error := facts.get("error") or facts.get("last_error"):
         notes.append(error)
-    return name, state, rate, ", ".join(notes)
+    return name, state, _rate(facts.get("rate_hz"), facts.get("expected_hz")), ", ".join(notes)
+
+
+def _rate(rate_hz: float | None, expected_hz: float | None) -> str:
+    if rate_hz is None:
+        return ""
+    return f"{rate_hz:.2f} Hz" if expected_hz is None else f"{rate_hz:.2f} of {expected_hz:.2f} Hz"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -234,7 +237,11 @@ def _columns(topic: str, content: Mapping[str, Any]) -> str:
     fields = dataclasses.fields(TOPICS[topic]) if topic in TOPICS else ()
     units = {item.name: f" {item.metadata['unit']}" for item in fields if item.metadata.get("unit")}
     hidden = (*ENVELOPE, "topic")
-    own = {key: value for key, value in content.items() if key not in hidden and value is not None and value != ""}
+    own = {
+        key: value
+        for key, value in content.items()
+        if key not in hidden and value is not None and not (isinstance(value, str) and not value)
+    }
     return "  ".join(f"{key} {_value(value)}{units.get(key, '')}" for key, value in own.items())
 
 

@@ -59,9 +59,7 @@ class ExperimentLimits(ConfigModel):
 
 
 class _Step(ConfigModel):
-    timeout_s: Annotated[float, Field(gt=0, le=24 * 3600)] | None = Field(
-        None, description="a step that takes longer stops the experiment"
-    )
+    timeout_s: float | None = Field(None, gt=0, le=24 * 3600, description="a longer step stops the experiment")
     limits: ExperimentLimits | None = Field(None, description="tighter limits for this step")
 
 
@@ -70,9 +68,7 @@ class ApproachStep(_Step):
 
     do: Literal["approach"]
     pose_m_rad: Pose | None = Field(None, description="x, y, z and rotation vector; else `along_tool_m`")
-    along_tool_m: Annotated[float, Field(ge=-0.5, le=0.5)] | None = Field(
-        None, description="distance along the tool's axis; else `pose_m_rad`"
-    )
+    along_tool_m: float | None = Field(None, ge=-0.5, le=0.5, description="along the tool's axis; else `pose_m_rad`")
     speed_m_per_s: float = Field(0.1, gt=0, le=0.5, description="speed of the tool centre")
 
     _one_end = either("pose_m_rad", "along_tool_m")
@@ -188,9 +184,7 @@ class ExperimentFile(ConfigModel):
         "right", description="torque that drives the loop: a fingertip's name, `skin`, `load_cell` or `wrench`"
     )
     limits: ExperimentLimits = Field(ExperimentLimits(), description="limits of all steps")
-    tool_mm: Annotated[float, Field(gt=0, lt=140)] | None = Field(
-        None, description="diameter of the tool; recordings store it, and calibrations use it"
-    )
+    tool_mm: float | None = Field(None, gt=0, lt=140, description="diameter of the tool, for recordings")
     slices: Literal["torque", "diameter"] | None = Field(
         None,
         description="kind of samples that `shearloop run --slices DIR` stores for each held angle; none by default",
@@ -215,18 +209,17 @@ def first_turn_before_grip(file: ExperimentFile) -> int | None:
     return None
 
 
-def check_limits(file: ExperimentFile) -> str:
-    """Return a sentence on the first step that exceeds its limits, or an empty string."""
+def check_limits(file: ExperimentFile) -> list[str]:
+    """Return a sentence on each step that exceeds its limits."""
+    found = []
     for number, step in enumerate(file.steps):
         limits, (torque_nm, angle_rad) = file.limits_of(step), _reach(step)
         torque = torque_nm, limits.torque_nm, "N·m", "torque_nm"
         for value, limit, unit, key in (torque, (angle_rad, limits.angle_rad, "rad", "angle_rad")):
             if value >= limit:
-                return (
-                    f"`steps[{number}]` ({step.do}) asks for {value:g} {unit}, and its limit is {limit:g} {unit}; "
-                    f"raise `limits.{key}`, or ask for less"
-                )
-    return ""
+                asks = f"steps[{number}]: {step.do} asks for {value:g} {unit}, and its limit is {limit:g} {unit}"
+                found.append(f"{asks}; raise limits.{key}, or ask for less")
+    return found
 
 
 def _reach(step: Step) -> tuple[float, float]:

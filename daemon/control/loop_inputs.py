@@ -14,18 +14,14 @@ NotNegative = Annotated[float, Field(ge=0)]
 
 
 class LoopConfig(ConfigModel):
-    """Settings of the closed loop; docs/safety.md lists what each fault leads to."""
+    """Settings of the closed loop; docs/faults.md lists what each fault leads to."""
 
     allowed_noise_nm: float = Field(default=0.0025, gt=0, le=1, description="true torque's std that noise may cause")
     kp: float | None = Field(default=None, gt=0, le=1, description="fixes the gain, which else follows from the noise")
     deadband_nm: float = Field(default=0.001, ge=0, le=1, description="error below which the wrist rests")
     disagreement_nm: float = Field(default=0.05, gt=0, le=5, description="largest difference of two torque sources")
-    max_innovation_nm: float = Field(
-        default=0.08, gt=0, le=5, description="largest difference of the torque from the expected one"
-    )
-    max_offset_drift_nm: float = Field(
-        default=0.06, gt=0, le=5, description="drift of the torque at a fixed angle: slip"
-    )
+    max_innovation_nm: float = Field(default=0.08, gt=0, le=5, description="largest error of the expected torque")
+    max_offset_drift_nm: float = Field(default=0.06, gt=0, le=5, description="drift at a fixed angle: slip")
     wrist_speed_rad_per_s: float = Field(default=0.5, gt=0, le=3.14, description="largest wrist speed of the loop")
     stale_after_s: float = Field(default=0.1, ge=0, le=10, description="no torque that is younger counts as stale")
     wrist_acceleration_rad_per_s2: float = Field(default=4.0, gt=0, le=1000, description="given to the robot")

@@ -157,10 +157,14 @@ class ControlLoopRunner:
         return experiment
 
     async def halt_and_wait(self) -> None:
-        """Halt moving fingers, and wait for the end of the last release or halt."""
+        """Halt moving fingers, and wait for the end of the last release or halt, and for the arm's standstill."""
         if self._actions.fingers_move:
             self._actions.cancel()
         await self._actions.halt_and_wait()
+        with suppress(TimeoutError):
+            async with asyncio.timeout(BRAKE_S):
+                while self._running and self._stops.pending:
+                    await self._states.changed.wait()
 
     async def unlock(self) -> str | None:
         """Enable robot and gripper after a stop, on the operator's command; return None, or why not."""

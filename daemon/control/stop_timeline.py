@@ -32,7 +32,7 @@ class StopTimeline:
         return self._stop is not None
 
     def request(self, now_ns: int) -> None:
-        """Note that a person, or the daemon's end, asks for the next stop."""
+        """Note that a person, or the daemon's end, asks for a stop; it counts until the next `update`."""
         self._requested_ns = now_ns
 
     def begin(self, experiment: str, reason: str, decision: SafetyDecision, now_ns: int) -> None:
@@ -61,7 +61,7 @@ class StopTimeline:
 
     def update(self, robot: RobotState | None, now_ns: int) -> LoopStop | None:
         """Return the whole stop once, when a state after the decision shows the arm at rest, or after `LONGEST_NS`."""
-        stop = self._stop
+        stop, self._requested_ns = self._stop, None
         if stop is None:
             return None
         measured_ns = now_ns if robot is None else robot.t_mono_ns - robot.age_ns

@@ -287,7 +287,7 @@ def check_daemon(
             yield note(f"estimate of {name}", "not valid", str(reason), "see docs/troubleshooting.md")
     states = received.get(("loop.state", "loop"))
     if states and (reasons := states[-1].get("reasons")):
-        yield note("loop", str(states[-1].get("phase")), str(reasons), "see docs/safety.md")
+        yield note("loop", str(states[-1].get("phase")), str(reasons), "see docs/faults.md")
 
 
 def check_task(name: str, status: Mapping[str, Any]) -> Finding:
@@ -316,7 +316,7 @@ def _expected_rates(config: DaemonConfig) -> dict[tuple[str, str], float]:
         ("health", "daemon"): TOPICS["health"].rate_hz,
         **{("eit.frame", name): 1.0 / one.frame_period_s for name, one in config.fingertips.items()},
         ("load.torque", "load_cell"): cell.rate_hz if cell is not None else None,
-        ("skin.shear", "skin"): skin.daq.rate_hz if skin is not None else None,
+        ("skin.shear", "skin"): 1.0 / skin.daq.sample_period_s if skin is not None else None,
         ("robot.state", "robot"): TOPICS["robot.state"].rate_hz if config.robot is not None else None,
         ("gripper.state", "gripper"): TOPICS["gripper.state"].rate_hz if config.gripper is not None else None,
     }

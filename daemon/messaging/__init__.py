@@ -1,1 +1,1 @@
-"""ZeroMQ messages and commands: the table of topics, publisher, client, command server, addresses and keys."""
+"""ZeroMQ messages and commands: the table of topics, publisher, client, servers of commands, keys."""

@@ -1,18 +1,109 @@
 """Clients of a daemon: receive its messages, send it a command."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
+from typing import Any, Self
 
 import zmq
+import zmq.asyncio
 
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.addresses import LARGEST_PORT, has_valid_port, needs_keys
+from shearloop.daemon.messaging.addresses import LARGEST_PORT, PUBLISH_ADDRESS, has_valid_port, needs_keys
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.messages import ENVELOPE, decode, encode
 
 # A running daemon sends `health` every second.
 QUIET_S = 3.0
 LONGEST_TIMEOUT_S = 86_400
+
+
+class Subscriber:
+    """Messages of a daemon as (topic, content), for `for` and for `async for`; close it, or use `with`.
+
+    It receives the topics that start with one of `topics`, or all. Raises UserError for a malformed address, for
+    messages of another program, and if no message arrives for `timeout_s`.
+    """
+
+    def __init__(
+        self,
+        address: str = PUBLISH_ADDRESS,
+        topics: Iterable[str] = (),
+        timeout_s: float | None = None,
+        keys: ClientKeys | None = None,
+    ) -> None:
+        """Connect; an address on another computer needs keys."""
+        self._address, self._timeout_s, self._keys = address, timeout_s, keys
+        self._context = zmq.asyncio.Context()
+        self._socket = self._context.socket(zmq.SUB)
+        self._blocking: zmq.Socket[bytes] = zmq.Socket.shadow(self._socket.underlying)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        try:
+            connect(self._socket, address, keys)
+        except Exception:
+            self.close()
+            raise
+        for topic in tuple(topics) or ("",):
+            self._socket.setsockopt(zmq.SUBSCRIBE, topic.encode())
+
+    def wait(self, timeout_s: float | None) -> bool:
+        """Return whether a message arrives within these seconds; None waits without end."""
+        return bool(self._blocking.poll(_milliseconds(timeout_s)))
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._socket.close()
+        self._context.term()
+
+    def __enter__(self) -> Self:
+        """Return the subscriber itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Disconnect."""
+        self.close()
+
+    def __iter__(self) -> Self:
+        """Return the subscriber itself."""
+        return self
+
+    def __next__(self) -> tuple[str, dict[str, Any]]:
+        """Wait for the next message and return it."""
+        if not self.wait(self._timeout_s):
+            raise self._no_message()
+        return self._decoded(self._blocking.recv_multipart())
+
+    def __aiter__(self) -> Self:
+        """Return the subscriber itself."""
+        return self
+
+    async def __anext__(self) -> tuple[str, dict[str, Any]]:
+        """Wait for the next message and return it."""
+        if not await self._socket.poll(_milliseconds(self._timeout_s)):
+            raise self._no_message()
+        return self._decoded(await self._socket.recv_multipart())
+
+    def _no_message(self) -> UserError:
+        return UserError(
+            f"no message came from {self._address} for {self._timeout_s:g} s; start the daemon with "
+            "`shearloop run CONFIG`, or give the address of its `publish` key with --connect"
+            f"{keys_hint(self._keys)}"
+        )
+
+    def _decoded(self, parts: list[bytes]) -> tuple[str, dict[str, Any]]:
+        try:
+            name, payload = parts
+            content = decode(payload)
+            if missing := ENVELOPE - content.keys():
+                raise ValueError(f"it lacks {', '.join(sorted(missing))}")
+        except ValueError as error:
+            raise UserError(
+                f"the messages of {self._address} are not shearloop's ({error}); give the address of the daemon's "
+                "`publish` key with --connect"
+            ) from error
+        return name.decode(errors="replace"), content
+
+
+def _milliseconds(seconds: float | None) -> int | None:
+    return None if seconds is None else int(1000 * seconds)
 
 
 def receive_messages(
@@ -22,37 +113,11 @@ def receive_messages(
     keys: ClientKeys | None = None,
     on_quiet: Callable[[], None] = lambda: None,
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield (topic, content) of each message with a topic that starts with one of `topics`, or of all messages.
-
-    Calls `on_quiet` if no message arrives in the first QUIET_S. Raises UserError for a malformed address, and if no
-    message arrives for `timeout_s`.
-    """
-    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
-        socket.setsockopt(zmq.LINGER, 0)
-        connect(socket, address, keys)
-        for topic in tuple(topics) or ("",):
-            socket.setsockopt(zmq.SUBSCRIBE, topic.encode())
-        if timeout_s is None and not socket.poll(int(QUIET_S * 1000)):
+    """Yield the messages of a Subscriber; calls `on_quiet` if none arrives in the first QUIET_S."""
+    with Subscriber(address, topics, timeout_s, keys) as subscriber:
+        if timeout_s is None and not subscriber.wait(QUIET_S):
             on_quiet()
-        while True:
-            if timeout_s is not None and not socket.poll(int(timeout_s * 1000)):
-                raise UserError(
-                    f"no message came from {address} for {timeout_s:g} s; start the daemon with "
-                    "`shearloop run CONFIG`, or give the address of its `publish` key with --connect"
-                    f"{keys_hint(keys)}"
-                )
-            parts = socket.recv_multipart()
-            try:
-                name, payload = parts
-                content = decode(payload)
-                if missing := ENVELOPE - content.keys():
-                    raise ValueError(f"it lacks {', '.join(sorted(missing))}")
-            except ValueError as error:
-                raise UserError(
-                    f"the messages of {address} are not shearloop's ({error}); give the address of the daemon's "
-                    "`publish` key with --connect"
-                ) from error
-            yield name.decode(errors="replace"), content
+        yield from subscriber
 
 
 def send_command(

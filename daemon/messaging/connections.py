@@ -52,9 +52,12 @@ class Connections:
     permissions of its file decide who may connect.
     """
 
-    def __init__(self, context: "zmq.Context[Any]", bound: "zmq.Socket[Any]", address: str, refusals: Refusals) -> None:
-        """Bind the socket; raises zmq.ZMQError."""
+    def __init__(
+        self, context: "zmq.Context[Any]", bound: "zmq.Socket[Any]", address: str, key: str, refusals: Refusals
+    ) -> None:
+        """Bind the socket, named `key` in the log; raises zmq.ZMQError."""
         self._bound = bound
+        self._key = key
         self._refusals = refusals
         self._limit = most_connections(resource.getrlimit(resource.RLIMIT_NOFILE)[0])
         self._open: set[int] = set()
@@ -96,7 +99,7 @@ class Connections:
         if not self._full and len(self._open) >= self._limit:
             self._full = True
             self._listener.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, _FILTER)
-            reason = f"{self._limit} clients are connected; others wait until one has disconnected"
+            reason = f"{self._limit} clients are connected to `{self._key}`; others wait until one has disconnected"
             self._refusals.add("too many connections", reason, frequent=True)
         elif self._full and len(self._open) <= self._limit * 3 // 4:
             self._full = False
@@ -148,7 +151,7 @@ def bind(
                 "use e.g. tcp://127.0.0.1:7761"
             )
         _check_ipc_path(address, key)
-        return Connections(context, bound, address, refusals)
+        return Connections(context, bound, address, key, refusals)
     except UserError:
         bound.close()
         raise

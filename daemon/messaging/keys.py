@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import structlog
 import zmq
@@ -48,6 +48,11 @@ class ClientKeys:
 
     own: KeyPair
     server_public: bytes
+
+    @classmethod
+    def load(cls, key: str | Path, server_key: str | Path) -> Self:
+        """Return the keys of `client.key_secret` and `server.key`; raises UserError if they are missing or damaged."""
+        return cls(load_key_pair(Path(key)), load_public_key(Path(server_key)))
 
     def apply(self, socket: "zmq.Socket[Any]") -> None:
         """Make an unconnected socket a CURVE client of that daemon."""

@@ -9,7 +9,7 @@ import re
 import struct
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -18,9 +18,11 @@ from scipy.ndimage import minimum_filter1d
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.channels import PAPER_TABLE
+from shearloop.bank.estimation import FrameSeries
+from shearloop.bank.estimation.load_delay import measured_delay
 from shearloop.bank.estimation.values import LARGEST_TORQUE_NM
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, SIDES
+from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, LOAD_DOUBT, LOAD_DOUBT_NOTE, SIDES
 from shearloop.daemon.recording.writer import RecordingWriter
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import slope_below
@@ -46,6 +48,8 @@ LOAD_PERIOD_S = 0.0916
 _CYLINDER = re.compile(r"(\d+(?:\.\d+)?)mm[_.]")
 # Stamps of frames and load that differ less than this, row by row, come from one loop.
 _ONE_LOOP_S = 0.02
+# A loop waited for its load values where this many end within this time of the line below all of them.
+_LEAST_PACED, _PACED_S = 3, 0.03
 _HDF5_SIGNATURE = b"\x89HDF"
 
 _HEADER_BYTES = 128
@@ -215,20 +219,37 @@ def import_mat(sources: Sequence[Path], out: Path) -> ImportResult:
     if not streams:
         raise UserError("the files hold no frames of a fingertip; name those of the right or left side as well")
     remarks: list[str] = []
-    torque_t_s, torque_nm = _corrected_load(load, streams, remarks)
-    notes = {"remarks": " ".join(remarks)} if remarks else {}
+    notes: dict[str, str] = {}
+    sure = True
+    if load is None:
+        load = Stream(np.zeros(0), np.zeros((0, 1)))
+    elif any(_is_one_loop(load.unix_s, stream.unix_s) for stream in streams.values()):
+        load, streams, sure = _loop_times(load, streams, remarks)
+    load = _valid_load(load, remarks)
+    arrivals = {side: [round(float(unix_s) * 1e9) for unix_s in one.unix_s] for side, one in streams.items()}
+    middles = {side: frame_middles(one) for side, one in arrivals.items()}
+    found = measured_delay([_series_of_side(side, one, middles[side], load) for side, one in streams.items()])
+    if found is not None and found.late_s:
+        load = replace(load, unix_s=load.unix_s - found.late_s)
+        remarks.append(
+            f"The load was stamped {found.late_s:.2f} ± {found.delay.error_s:.2f} s too late against the gel's motion, "
+            "and its times were corrected."
+        )
+    if found is None and not sure:
+        notes[LOAD_DOUBT_NOTE] = LOAD_DOUBT
+    if remarks:
+        notes["remarks"] = " ".join(remarks)
     if (diameter := _diameter_mm(files)) is not None:
         notes[DIAMETER_NOTE] = diameter
     with RecordingWriter(out, ", ".join(sorted(path.name for path in files)), notes) as writer:
         for side in (side for side in SIDES if side in streams):
-            arrivals = [round(float(unix_s) * 1e9) for unix_s in streams[side].unix_s]
-            for middle_ns, arrival_ns, line in zip(
-                frame_middles(arrivals), arrivals, streams[side].values, strict=True
-            ):
+            rows = zip(middles[side], arrivals[side], streams[side].values, strict=True)
+            for middle_ns, arrival_ns, line in rows:
                 writer.add_frame(side, middle_ns, arrival_ns, line)
-        for t_s, torque in zip(torque_t_s, torque_nm, strict=True):
+        for t_s, torque in zip(load.unix_s, load.values[:, 0], strict=True):
             writer.add_torque(round(float(t_s) * 1e9), float(torque))
-    return ImportResult({side: len(stream.unix_s) for side, stream in streams.items()}, len(torque_nm), tuple(remarks))
+    counts = {side: len(stream.unix_s) for side, stream in streams.items()}
+    return ImportResult(counts, len(load.unix_s), tuple(remarks))
 
 
 def frame_middles(arrivals_ns: Sequence[int]) -> list[int]:
@@ -245,27 +266,79 @@ def frame_middles(arrivals_ns: Sequence[int]) -> list[int]:
     return [arrivals_ns[0] + round(low + (n - 0.5) * period) for n, low in enumerate(lowest)]
 
 
-def _corrected_load(
-    load: Stream | None, streams: dict[str, Stream], remarks: list[str]
-) -> tuple[FloatArray, FloatArray]:
-    """Return the times in s and torques in N·m of the valid load values; appends to `remarks`."""
-    if load is None:
-        return np.zeros(0), np.zeros(0)
-    t_s, torque = load.unix_s, load.values[:, 0]
-    if any(_is_one_loop(t_s, stream.unix_s) for stream in streams.values()):
-        # The loop read one line per frame and the board sends six. The rest waited in the port's buffer.
-        t_s = t_s[0] + LOAD_PERIOD_S * np.arange(len(t_s))
-        remarks.append(
-            f"The load cell was read once per frame but sends a value every {1e3 * LOAD_PERIOD_S:.1f} ms, so its "
-            f"values waited in a buffer. They got the times at which they were sent, {t_s[-1] - t_s[0]:.0f} s in all."
+@dataclass(frozen=True, slots=True)
+class _LoopClock:
+    """When a loop's lines were sent: the first load value load_late_s after the first stamp, frames frames_late_s after
+    theirs. `sure` is whether the stamps show this.
+    """
+
+    load_late_s: float = 0.0
+    frames_late_s: float = 0.0
+    sure: bool = False
+
+    @classmethod
+    def of(cls, stamps_s: FloatArray) -> "_LoopClock":
+        """Return the clock of a loop with (n,) stamps, which reads one line of each board per row.
+
+        A row is stamped before it is read, so its lines were sent before the next stamp. After a stall the loop empties
+        the fingertips' buffers, and waits for the load alone: then the load was sent at the next stamp. Frames were
+        sent between the two stamps, in the middle on average.
+        """
+        if len(stamps_s) <= _LEAST_PACED:
+            return cls()
+        latest_s = stamps_s[1:] - stamps_s[0] - LOAD_PERIOD_S * np.arange(len(stamps_s) - 1)
+        if np.count_nonzero(latest_s <= latest_s.min() + _PACED_S) < _LEAST_PACED:
+            return cls()
+        return cls(float(latest_s.min()), float(np.median(np.diff(stamps_s))) / 2, sure=True)
+
+    @property
+    def remark(self) -> str:
+        """What is known of the times, in a sentence."""
+        if not self.sure:
+            return f"Warning: {LOAD_DOUBT}."
+        moved_s = self.load_late_s - self.frames_late_s
+        return (
+            f"The loop waited for its first load values, so the load's times were moved by {moved_s:.2f} ± "
+            f"{self.frames_late_s:.2f} s against the frames."
         )
-    valid = np.abs(torque) <= LARGEST_TORQUE_NM
+
+
+def _loop_times(load: Stream, streams: dict[str, Stream], remarks: list[str]) -> tuple[Stream, dict[str, Stream], bool]:
+    """Return the streams of one loop with the times at which they were sent, and whether these are sure."""
+    # The loop read one line per frame and the board sends six. The rest waited in the port's buffer.
+    clock = _LoopClock.of(load.unix_s)
+    t_s = load.unix_s[0] + clock.load_late_s + LOAD_PERIOD_S * np.arange(len(load.unix_s))
+    remarks.append(
+        f"The load cell was read once per frame but sends a value every {1e3 * LOAD_PERIOD_S:.1f} ms, so its "
+        f"values waited in a buffer. Their times are now one period apart, {t_s[-1] - t_s[0]:.0f} s in all."
+    )
+    remarks.append(clock.remark)
+    if not clock.sure:
+        return replace(load, unix_s=t_s), streams, False
+    late_s = clock.frames_late_s
+    frames = {
+        # The next stamp less half a period: the first rows were stamped before the loop waited for its frames.
+        side: replace(one, unix_s=np.append(one.unix_s[1:] - late_s, one.unix_s[-1] + late_s))
+        for side, one in streams.items()
+    }
+    return replace(load, unix_s=t_s), frames, True
+
+
+def _series_of_side(side: str, stream: Stream, middles_ns: Sequence[int], load: Stream) -> FrameSeries:
+    t_s = np.array(middles_ns) / 1e9
+    channels = PAPER_TABLE.channels_of_line(stream.values)[:, None]
+    return FrameSeries("raw", (side,), t_s, channels, load.unix_s, load.values[:, 0], np.full(len(t_s), np.nan))
+
+
+def _valid_load(load: Stream, remarks: list[str]) -> Stream:
+    """Return the valid load values by rising time; appends to `remarks`."""
+    valid = np.abs(load.values[:, 0]) <= LARGEST_TORQUE_NM
     if not valid.all():
         remarks.append(
             f"{np.count_nonzero(~valid)} load values beyond {LARGEST_TORQUE_NM:g} N·m are damaged and were left out."
         )
-    order = np.argsort(t_s[valid], kind="stable")
-    return t_s[valid][order], torque[valid][order]
+    order = np.flatnonzero(valid)[np.argsort(load.unix_s[valid], kind="stable")]
+    return Stream(load.unix_s[order], load.values[order])
 
 
 def _is_one_loop(load_s: FloatArray, frame_s: FloatArray) -> bool:

@@ -60,6 +60,8 @@ class Recording:
     # The tools that a calibrated gripper held: since when (Unix ns), and the diameter or None for no tool.
     tools: tuple[tuple[int, Measured | None], ...] = ()
     table: ChannelTable = PAPER_TABLE
+    # Whether a daemon recorded it: frames and torques are then stamped on arrival by one clock.
+    live: bool = False
 
 
 class OpenRecording:
@@ -173,6 +175,7 @@ def read_recording(path: str | Path) -> Recording:
         prefix = f"{schema.FRAME_TOPIC}."
         sides = {topic: topic.removeprefix(prefix) for topic in recording.counts if topic.startswith(prefix)}
         inputs = [schema.input_topic(side) for side in sides.values()]
+        topics = set(recording.counts)
         for channel, message in recording.messages([schema.LOAD_TOPIC, *sides, *inputs]):
             topic, t_ns = channel.topic, message.log_time
             try:
@@ -205,6 +208,7 @@ def read_recording(path: str | Path) -> Recording:
         np.array([torque for _, torque in torques], dtype=np.float64),
         tuple(tools),
         table,
+        live=bool(sides) and all(schema.input_topic(side) in topics for side in sides.values()),
     )
 
 

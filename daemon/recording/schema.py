@@ -47,6 +47,10 @@ SIDES = ("right", "left")
 DIAMETER_NOTE = "diameter_mm"
 LARGEST_DIAMETER_MM = 140.0
 
+# Metadata key of a doubt about the load cell's times, and the doubt of an import.
+LOAD_DOUBT_NOTE = "load_doubt"
+LOAD_DOUBT = "the load's values waited in a buffer, and nothing shows for how long: its times may be seconds off"
+
 _FINGERTIP_TOPICS = (EitFrame.topic, EitEstimate.topic, EitHeatmap.topic)
 _SCALARS = {float: "number", int: "integer", str: "string", bool: "boolean"}
 _TIME = {"type": "integer", "description": "CLOCK_MONOTONIC in ns"}

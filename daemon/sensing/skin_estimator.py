@@ -18,10 +18,7 @@ from shearloop.bank.skin.membrane import Direction, ShearInterval
 from shearloop.drivers.defaults import DRIFT_PER_HOUR
 from shearloop.drivers.shear_skin.skin import SkinSample
 
-# The slack gauge is compressed by at most this share of the other's stretch (0.125 in the 2-D reference, see
-# docs/skin-models.md).
-MAX_COMPRESSION = 0.15
-# A larger deviation from that makes the zero invalid.
+# A larger deviation of the slack gauge from the calibration makes the zero invalid.
 MAX_DEVIATION = 0.02
 # A larger trend while the zero is taken means that the skin was touched or drifts (the paper's noise: 1e-4).
 MAX_TREND = 1e-3
@@ -196,7 +193,7 @@ class SkinEstimator:
         response = response_1 - response_2
         time_s = sample.t_mid_ns / 1e9
         direction = self._finder.update(time_s, response)
-        deviation, reasons = _deviation(response_1, response_2)
+        deviation, reasons = _deviation(self._calibration, response_1, response_2)
         wider = self.zero.uncertainty + self._drift_per_s * (time_s - self._zero_s) + deviation
         interval = self._calibration.shear_from_response(response, self._normal_n, direction, wider)
         if math.isinf(interval.low_n) or math.isinf(interval.high_n):
@@ -237,20 +234,20 @@ class SkinEstimator:
             self._finder.restart()
 
 
-def _deviation(response_1: float, response_2: float) -> tuple[float, tuple[str, ...]]:
+def _deviation(calibration: SkinCalibration, response_1: float, response_2: float) -> tuple[float, tuple[str, ...]]:
     """Return how far the gauges deviate from any load, and the reasons if that is too far.
 
-    One gauge is stretched, the slack one reads its zero or a little less. The rest is an error of the zero or a drift.
+    The rest is an error of the zero or a drift.
     """
-    slack, stretched = sorted((response_1, response_2))
-    lowest = -MAX_COMPRESSION * max(stretched, 0.0)
-    if slack > MAX_DEVIATION:
-        reason = f"both gauges read at least {100 * slack:.1f} % longer than at their zero: one drifts, or it is warmer"
-    elif slack < lowest - MAX_DEVIATION:
-        reason = (
-            f"gauge {1 if response_1 < response_2 else 2} reads {-100 * slack:.1f} % shorter than at its zero, "
-            "which no load does: the zero was taken under load, or the gauge drifts"
-        )
+    deviation = calibration.slack_deviation(response_1, response_2)
+    if abs(deviation) <= MAX_DEVIATION:
+        return abs(deviation), ()
+    gauge = 1 if response_1 < response_2 else 2
+    if deviation > 0:
+        reason = f"gauge {gauge} reads {100 * deviation:.1f} % too long for any load: it drifts, or it is warmer"
     else:
-        return max(slack, lowest - slack, 0.0), ()
+        reason = (
+            f"gauge {gauge} reads {-100 * deviation:.1f} % shorter than any load makes it: "
+            "the zero was taken under load, or the gauge drifts"
+        )
     return 0.0, (f"{reason}; take the load off and tare",)

@@ -12,7 +12,7 @@ import numpy as np
 from shearloop.bank.eit.matching import best_match
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import MatchingError
-from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS, EitEstimate, EitHeatmap
+from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS, DaemonEnd, EitEstimate, EitHeatmap
 
 # Pairs of topic and source. A rig has nine topics and two fingertips.
 MAX_STREAMS = 64
@@ -29,6 +29,15 @@ CHARTED: Mapping[str, tuple[str, ...]] = {
 }
 # Points of a conductivity profile: finer than a pixel of the drawing.
 HEIGHTS = 145
+# What k and σ mean as heights: factors of σ from k with their labels, and a sentence.
+HEIGHT_MARKS: Mapping[str, tuple[Mapping[str, float], str]] = {
+    "step": ({"k": 0.0}, "k is the height of the step"),
+    "linear": ({"k": 0.0}, "k is the height without change"),
+    "gaussian_derivative": (
+        {"k": 0.0, "k−σ": -1.0, "k+σ": 1.0},
+        "k is the height without change, k−σ and k+σ are those of the largest rise and fall",
+    ),
+}
 
 
 class StoredMessage(NamedTuple):
@@ -49,6 +58,8 @@ class MessageStore:
         self._models: dict[str, str] = {}
         self._samples: dict[tuple[str, str], deque[tuple[float, dict[str, Any]]]] = {}
         self.number = 0
+        # Whether the latest message says that the daemon has ended.
+        self._ended = False
         self.refused: Counter[str] = Counter()
 
     def add(self, topic: str, content: Mapping[str, Any], now_s: float) -> None:
@@ -68,6 +79,7 @@ class MessageStore:
                 self.refused["message without a JSON form"] += 1
                 return
             self.number += 1
+            self._ended = topic == DaemonEnd.topic
             self._stored[topic, source] = StoredMessage(self.number, now_s, text.removeprefix("{"))
             if topic in CHARTED:
                 sample = {key: json_value(content.get(key)) for key in ("timestamp", *CHARTED[topic])}
@@ -82,7 +94,8 @@ class MessageStore:
             for message in stored
             if message.number > after
         )
-        head = json.dumps({"quiet_s": quiet_s, "refused": dict(self.refused), **other}, allow_nan=False)
+        state = {"quiet_s": quiet_s, "ended": self._ended, "refused": dict(self.refused)}
+        head = json.dumps({**state, **other}, allow_nan=False)
         return f'{head.removesuffix("}")}, "messages": [{messages}]}}'
 
     def history(self, now_s: float) -> list[dict[str, Any]]:
@@ -101,7 +114,11 @@ class MessageStore:
             return {"peaks": _peaks(content.get("scores"))}
         k, sigma = content.get("k"), content.get("sigma")
         if topic == EitEstimate.topic and isinstance(k, float) and isinstance(sigma, float):
-            return {"conductivity": conductivity_profile(self._models.get(source, ""), k, sigma, self._height_cm)}
+            model = self._models.get(source, "")
+            offsets, meaning = HEIGHT_MARKS.get(model, ({}, ""))
+            marks = [(json_value(k + offset * sigma), label) for label, offset in offsets.items()]
+            profile = conductivity_profile(model, k, sigma, self._height_cm)
+            return {"conductivity": profile, "marks": marks if profile else [], "meaning": meaning if profile else ""}
         return {}
 
 

@@ -120,7 +120,7 @@ def probe_controller(host: str, timeout_s: float) -> str:
     if not accepted or numbers[0] not in OLDEST or numbers < OLDEST[numbers[0]]:
         raise ProbeError(
             "version",
-            f"The UR controller at {host} has PolyScope {version}, which cannot be driven: install PolyScope 3.10 "
+            f"The UR controller at {host} has PolyScope {version}, which cannot be driven; install PolyScope 3.10 "
             "(CB3) or 5.4 (e-Series), or a newer 3.x or 5.x, and restart the daemon.",
         )
     return version

@@ -199,9 +199,6 @@ class MotionExecutor:
         """Note the arm's accelerations, and whether an idle arm rests; call this in every cycle."""
         if self._motion is not None or sample.fastest_rad_per_s < ASTRAY_RAD_PER_S:
             self._rested_ns = now_ns
-        if isinstance(self._motion, _Braking):
-            # A stop may brake harder than a motion may accelerate.
-            self._accelerations.clear()
         self._accelerations.add(sample)
 
     def violation(self, sample: RtdeSample) -> str:
@@ -417,14 +414,13 @@ _SAFETY = {
 
 
 class Accelerations:
-    """The measured accelerations of wrist and tool: the changes of their speeds over `ACCELERATION_S`. No clock."""
+    """The measured accelerations of wrist and tool: the changes of their speeds over `ACCELERATION_S`. No clock.
+
+    What gets slower does not count: a stop brakes up to the hard limit, and the robot's own stops brake harder.
+    """
 
     def __init__(self) -> None:
         self._samples: deque[RtdeSample] = deque()
-
-    def clear(self) -> None:
-        """Begin anew with the next sample."""
-        self._samples.clear()
 
     def add(self, sample: RtdeSample) -> None:
         """Take a sample; one without a later timestamp begins anew, unless it is the latest again."""
@@ -443,8 +439,10 @@ class Accelerations:
         span_s = last.timestamp_s - first.timestamp_s
         if span_s < ACCELERATION_S - 1e-6:
             return ""
-        wrist = abs(last.qd_rad_per_s[WRIST] - first.qd_rad_per_s[WRIST]) / span_s
-        tool = math.dist(last.tcp_speed[:3], first.tcp_speed[:3]) / span_s
+        before, after = first.qd_rad_per_s[WRIST], last.qd_rad_per_s[WRIST]
+        wrist = abs(after - before) / span_s if abs(after) >= abs(before) else 0.0
+        faster = last.tcp_speed_m_per_s >= first.tcp_speed_m_per_s
+        tool = math.dist(last.tcp_speed[:3], first.tcp_speed[:3]) / span_s if faster else 0.0
         return _beyond("wrist acceleration", wrist, limits.wrist_acceleration_rad_per_s2, "rad/s²") or _beyond(
             "tool acceleration", tool, limits.linear_acceleration_m_per_s2, "m/s²"
         )

@@ -17,10 +17,16 @@ Estimate the torque along a recording:
         estimate = session.estimate(shearloop.TactileFrame.of(t_s, channels))
         print(t_s, estimate.torque_nm)
 
-Follow a running daemon:
+Read what a daemon recorded, as arrays and as pandas frames:
 
-    for topic, message in shearloop.subscribe("tcp://127.0.0.1:7761", ["eit.estimate"]):
-        print(message["torque_nm"])
+    recording = shearloop.read("twists.mcap")
+    print(recording["load.torque"]["torque_nm"].max(), recording.frame("load.torque").describe())
+
+Follow a running daemon, with `for` or `async for`:
+
+    with shearloop.Subscriber(topics=["eit.estimate"]) as subscriber:
+        for topic, message in subscriber:
+            print(message["torque_nm"])
 """
 
 import importlib
@@ -29,35 +35,62 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from shearloop.bank.eit.bank_file import Bank
     from shearloop.bank.eit.pruned_matching import PrunedMatcher as Matcher
-    from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, TactileFrame, fit
+    from shearloop.bank.estimation import (
+        Calibration,
+        Estimate,
+        EstimatorSession,
+        FrameSeries,
+        Physics,
+        TactileFrame,
+        fit,
+    )
+    from shearloop.daemon.analysis.evaluate import estimate_series, figures_by_load
     from shearloop.daemon.analysis.series import read_series
+    from shearloop.daemon.cli.emulated_calibration import emulate_recordings
+    from shearloop.daemon.messaging.client import Subscriber
     from shearloop.daemon.messaging.client import receive_messages as subscribe
+    from shearloop.daemon.messaging.keys import ClientKeys
     from shearloop.daemon.recording.reader import read_recording
+    from shearloop.daemon.recording.tables import read
 
 __all__ = [
     "Bank",
     "Calibration",
+    "ClientKeys",
     "Estimate",
     "EstimatorSession",
     "FrameSeries",
     "Matcher",
+    "Physics",
+    "Subscriber",
     "TactileFrame",
+    "emulate_recordings",
+    "estimate_series",
+    "figures_by_load",
     "fit",
+    "read",
     "read_recording",
     "read_series",
     "subscribe",
 ]
 
-# ImportResult on first use: the command line answers at once.
+# Imported on first use: the command line answers at once.
 _HOMES = {
     "Bank": "shearloop.bank.eit.bank_file:Bank",
     "Calibration": "shearloop.bank.estimation:Calibration",
+    "ClientKeys": "shearloop.daemon.messaging.keys:ClientKeys",
     "Estimate": "shearloop.bank.estimation:Estimate",
     "EstimatorSession": "shearloop.bank.estimation:EstimatorSession",
     "FrameSeries": "shearloop.bank.estimation:FrameSeries",
     "Matcher": "shearloop.bank.eit.pruned_matching:PrunedMatcher",
+    "Physics": "shearloop.bank.estimation:Physics",
+    "Subscriber": "shearloop.daemon.messaging.client:Subscriber",
     "TactileFrame": "shearloop.bank.estimation:TactileFrame",
+    "emulate_recordings": "shearloop.daemon.cli.emulated_calibration:emulate_recordings",
+    "estimate_series": "shearloop.daemon.analysis.evaluate:estimate_series",
+    "figures_by_load": "shearloop.daemon.analysis.evaluate:figures_by_load",
     "fit": "shearloop.bank.estimation:fit",
+    "read": "shearloop.daemon.recording.tables:read",
     "read_recording": "shearloop.daemon.recording.reader:read_recording",
     "read_series": "shearloop.daemon.analysis.series:read_series",
     "subscribe": "shearloop.daemon.messaging.client:receive_messages",

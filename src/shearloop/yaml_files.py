@@ -306,6 +306,8 @@ def _schema_at(schema: Mapping[str, Any], location: Sequence[int | str], root: M
 
 
 def _allowed(schema: Mapping[str, Any]) -> str:
+    if "enum" in schema:
+        return ", ".join(map(str, schema["enum"]))
     bounds = []
     for name, word in (
         ("exclusiveMinimum", "above"),
@@ -315,8 +317,6 @@ def _allowed(schema: Mapping[str, Any]) -> str:
     ):
         if name in schema:
             bounds.append(f"{word} {schema[name]:g}")
-    if "enum" in schema:
-        return ", ".join(map(str, schema["enum"]))
     return " ".join(bounds)
 
 

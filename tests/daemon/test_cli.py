@@ -28,7 +28,7 @@ from shearloop.daemon.cli.completion import full_parser
 from shearloop.daemon.cli.terminal import StatusLine, message_json, message_line, table, task_row
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.runner import WRENCH
-from shearloop.daemon.messaging.messages import EitEstimate, decode, encode, wire_map
+from shearloop.daemon.messaging.messages import EitEstimate, RobotStateMessage, decode, encode, wire_map
 from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from tests.daemon.sample_messages import sample
@@ -273,6 +273,10 @@ def test_messages_are_readable():
     line = message_line("eit.estimate", content)
     assert "torque +0.0500 N·m [+0.0200, +0.0800]   diameter  31.0 mm   k 3.500  sigma 1.500 cm   score 0.750" in line
     assert message_json("eit.estimate", content).startswith('{"topic": "eit.estimate", "timestamp": 0.0')
+    robot = decode(encode(wire_map(sample(RobotStateMessage, blocked=""), timestamp=0.0, seq=1)))
+    shown = message_line("robot.state", {**robot, "safety_mode": None})
+    assert "joints_rad (" in shown
+    assert not any(word in shown for word in ("blocked", "safety_mode", "None"))
     invalid = {**content, "valid": False, "reason": "no signal"}
     assert message_line("eit.estimate", invalid).endswith("no estimate: no signal")
 
@@ -281,7 +285,7 @@ def test_tasks_are_told_in_words_without_what_is_not_known():
     facts = {"alive": True, "done": False, "restarts": 0, "last_error": "", "rate_hz": None, "errors": {}}
     for changes, told in (
         ({}, ("alive", "", "")),
-        ({"rate_hz": 1.85, "expected_hz": 1.849}, ("alive", "1.85 Hz of 1.85", "")),
+        ({"rate_hz": 1.85, "expected_hz": 1.849}, ("alive", "1.85 of 1.85 Hz", "")),
         ({"connected": True, "errors": {"unreachable": 1}}, ("alive", "", "reconnected once")),
         ({"connected": True, "connections": 3}, ("alive", "", "reconnected twice")),
         ({"connected": False, "error": "No board."}, ("not connected", "", "No board.")),

@@ -63,7 +63,7 @@ def test_every_topic_and_key_is_listed(written):
 
 def test_every_row_of_the_safety_table_is_on_the_page(written):
     for rule in TABLE.values():
-        assert rule.cure in written["safety.md"]
+        assert rule.cure in written["faults.md"]
 
 
 async def test_the_python_subscriber_prints_estimates(tmp_path):

@@ -3,6 +3,7 @@
 import ast
 import importlib.util
 import re
+import runpy
 import shlex
 import textwrap
 from pathlib import Path
@@ -59,7 +60,7 @@ def test_every_block_is_valid(block, tmp_path):
     if re.match(r"\w+:(\s|$)", block):
         check_yaml(block, tmp_path)
     elif block.startswith("import "):
-        compile(block, "block", "exec")  # test_newcomer runs it
+        compile(block, "block", "exec")
     elif block.startswith("#"):
         (schema,) = re.findall(r"\$schema=(\S+)", block)
         assert (ROOT / "config" / schema).exists()
@@ -147,3 +148,61 @@ def _options(parser) -> set[str]:
             for below in action.choices.values():
                 found |= _options(below)
     return found
+
+
+@pytest.mark.parametrize("page", PAGES[1:], ids=lambda page: page.name)
+def test_a_page_is_short_in_the_site_and_leads_to_the_glossary(page):
+    text = page.read_text()
+    # Tables that are made from the code are for looking up.
+    written = re.sub(r"<!-- generated: .*?<!-- end -->", "", text, flags=re.DOTALL)
+    assert len(written.split()) <= 1200
+    assert "(glossary.md)" in text or page.name == "glossary.md"
+    assert f"- {page.name}\n" in (ROOT / "mkdocs.yml").read_text()
+
+
+def test_the_readme_is_short_and_begins_with_what_for_whom_and_why():
+    lines = (ROOT / "README.md").read_text().splitlines()
+    assert len(lines) <= 150
+    first_screen = "\n".join(lines[:25])
+    for part in ("**What.**", "**For whom.**", "**Why.**", "](docs/images/live-view.png)", "shearloop demo"):
+        assert part in first_screen
+
+
+@pytest.fixture(scope="module")
+def notebook_run(tmp_path_factory) -> tuple[dict[str, str], Path]:
+    """Runs the notebook; its results as text by the name that each shows, and the folder of its files."""
+    nbclient = pytest.importorskip("nbclient", reason="running a notebook needs nbclient")
+    for needed in ("ipykernel", "matplotlib", "pandas"):
+        pytest.importorskip(needed, reason="the notebook needs the extra `notebook`")
+    text = (ROOT / "docs/first-recording.ipynb").read_text(encoding="utf-8")
+    notebook = importlib.import_module("nbformat").reads(text, as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert not any(cell.outputs or cell.execution_count for cell in code), "strip its outputs"
+    folder = tmp_path_factory.mktemp("notebook")
+    nbclient.NotebookClient(notebook, resources={"metadata": {"path": str(folder)}}).execute()
+    shown = [cell for cell in code if cell.outputs]
+    results = {re.split(r"\W", cell.source.splitlines()[-1])[0]: cell.outputs[-1].data["text/plain"] for cell in shown}
+    return results, folder / "first-recording"
+
+
+def test_the_notebook_compares_estimators_on_loaded_frames(notebook_run):
+    results, _ = notebook_run
+    rows = re.findall(r"^.*(?:fingertips?|right)  +(\d+)\.0 +(\S+) +(\S+)", results["loaded"], re.MULTILINE)
+    assert len(rows) == 3
+    assert all(int(n) > 100 and float(rmse) < 0.3 * float(zero) for n, rmse, zero in rows)
+
+
+# test_publisher tests the subscriber, which needs a daemon.
+PROGRAMS = [one for one in blocks(ROOT / "docs/python.md") if "import shearloop" in one and "Subscriber" not in one]
+
+
+@pytest.mark.parametrize("program", PROGRAMS, ids=["read", "calibrate", "estimate", "match"])
+def test_the_programs_of_the_python_page_run(program, notebook_run, monkeypatch, capsys):
+    _, folder = notebook_run
+    for name, recorded in (("twists", "rig-15mm"), ("later", "rig-20mm")):
+        (folder / f"{name}.mcap").unlink(missing_ok=True)
+        (folder / f"{name}.mcap").symlink_to(f"{recorded}.mcap")
+    monkeypatch.chdir(folder)
+    Path("program.py").write_text(program)
+    runpy.run_path("program.py")
+    assert capsys.readouterr().out

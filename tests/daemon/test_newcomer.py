@@ -177,7 +177,7 @@ def test_the_readmes_path_from_the_demo_to_a_calibration_of_ones_own(tree):
     pytest.importorskip("aiohttp", reason="the live view needs the extra `view`")
     pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
     run, run_again, replay, calibrate, evaluate = (f"{PROGRAM} {command}" for command in readme_commands())
-    tree.shell(f"{PROGRAM} demo --folder . --prepare")
+    tree.shell(f"{PROGRAM} demo --folder . --prepare", 2 * DEADLINE_S)
     view = f"{PROGRAM} view --connect ipc://{tree.root}/publish --commands ipc://{tree.root}/commands --port 0 --json"
     with tree.started(run) as demo, tree.started(view) as viewer:
         address = json.loads(viewer.stdout.readline())["url"]

@@ -74,7 +74,7 @@ LIMITS = {"torque_nm": 0.2, "angle_rad": 1.0}
     [
         (
             {"do": "hold_torque", "torque_nm": -0.2},
-            "asks for 0.2 N·m, and its limit is 0.2 N·m; raise `limits.torque_nm`",
+            "asks for 0.2 N·m, and its limit is 0.2 N·m; raise limits.torque_nm",
         ),
         (
             {"do": "hold_torque", "torque_nm": 0.15, "limits": {"torque_nm": 0.1}},
@@ -87,13 +87,13 @@ LIMITS = {"torque_nm": 0.2, "angle_rad": 1.0}
         ({"do": "tighten", "until_torque_nm": 0.1, "until_angle_rad": 2}, "asks for 2 rad, and its limit is 1 rad"),
         (
             {"do": "twist", "angles_rad": "0.1:1.2:5"},
-            "asks for 1.2 rad, and its limit is 1 rad; raise `limits.angle_rad`",
+            "asks for 1.2 rad, and its limit is 1 rad; raise limits.angle_rad",
         ),
     ],
 )
 def test_a_step_that_asks_for_more_than_its_limit_is_refused_with_both_numbers(tmp_path, step, told):
     said = refusal(tmp_path, {"torque_source": "wrench", "limits": LIMITS, "steps": [*STEPS, step]})
-    assert f"`steps[2]` ({step['do']}) {told}" in said
+    assert f"steps[2]: {step['do']} {told}" in said
 
 
 @pytest.mark.parametrize("between", [[], [{"do": "tare"}], [{"do": "release"}], [{"do": "grip"}]])
@@ -105,6 +105,16 @@ def test_a_tool_of_which_nothing_is_known_is_not_held(tmp_path, between):
     assert f"step {1 + len(first) + len(between)} is `hold_torque`, and the tool is not identified then; put an" in told
     steps = [*between, identify, {"do": "wait", "wait_s": 1}, hold, hold]
     assert check_experiment(config(tmp_path, {"steps": steps}, gripper=gripper), SOURCES) is not None
+
+
+def test_every_mistake_of_an_experiment_is_told_on_a_line_of_its_own(tmp_path):
+    hold = {"do": "hold_torque", "torque_nm": 0.1}
+    told = refusal(tmp_path, {"torque_source": "rigth", "steps": [{"do": "grip"}, hold, {"do": "release"}]})
+    first, *others = told.splitlines()
+    assert first.endswith("there are right, wrench; did you mean right?")
+    assert [f"step {number} is" in line for number, line in zip((1, 3, 2), others, strict=True)] == [True] * 3
+    twist = {"do": "twist", "angles_rad": [2]}
+    assert len(refusal(tmp_path, {"limits": LIMITS, "steps": [twist, twist]}).splitlines()) == 2
 
 
 def test_a_file_that_is_none_is_told_with_its_name(tmp_path):

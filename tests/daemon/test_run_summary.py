@@ -9,7 +9,7 @@ import pytest
 from shearloop.daemon.run_summary import RunSummary, TorqueSeries
 
 S = 1_000_000_000
-TOPICS = {"loop": "loop.state", "robot": "robot.state", "load_cell": "load.torque"}
+TOPICS = {"loop": "loop.state", "robot": "robot.state", "load_cell": "load.torque", "stop": "loop.stop"}
 
 
 def loop_state(t_s: float, **changes: Any) -> dict[str, Any]:
@@ -149,3 +149,11 @@ def test_where_a_screw_ended_and_what_it_took_is_told():
     assert "    turned by -0.500 rad; torque source: load_cell" in text
     assert "    true       -0.1190 N·m at the end, -0.1800 at most" in text
     assert "    load_cell  -0.1210 N·m at the end, -0.1760 at most" in text
+
+
+def test_the_times_of_a_stop_follow_the_summary():
+    times = {"decided_after_s": 0.004, "sent_after_s": 0.006, "stands_after_s": None}
+    stop = {"source": "stop", "t_mono_ns": 5 * S, **times}
+    text = summary_of(loop_state(0), loop_state(5, phase="stopped"), stop)
+    sentence = "The stop, from its cause: decided after 0.004 s, sent after 0.006 s, standstill after an unknown time."
+    assert text.index("STOPPED before its end") < text.index(sentence)

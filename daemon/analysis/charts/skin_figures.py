@@ -1,12 +1,12 @@
-"""Figures 5, 6 and 7 of the shear skin's paper, redrawn from the models."""
+"""Figures 4 to 8 of the shear skin's paper, redrawn from the models, and the slope within the deadband."""
 
 from pathlib import Path
 
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.skin.characterisation import Characterisation, ResponseCurve
-from shearloop.bank.skin.membrane import PAPER_SECTION
+from shearloop.bank.skin.characterisation import WARM_K, Characterisation, ResponseCurve
+from shearloop.bank.skin.membrane import PAPER_SECTION, THICK_SECTION, loading_response, warming_change
 from shearloop.daemon.errors import UserError
 
 try:
@@ -23,13 +23,21 @@ PAPER_PREDICTION_N, PAPER_SENSITIVITY_PER_N, PAPER_LINEAR_N = 0.0802, 0.078, 1.2
 
 
 def draw(found: Characterisation, out: Path) -> list[Path]:
-    """Write the three figures as PNG and SVG into a folder and return their paths."""
+    """Write the figures as PNG and SVG into a folder and return their paths."""
     written = []
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for number, drawn in enumerate((_figure_5(found), _figure_6(found), _figure_7(found)), start=5):
+        drawn_by_name = {
+            "figure_4": _figure_4(found),
+            "figure_5": _figure_5(found),
+            "figure_6": _figure_6(found),
+            "figure_7": _figure_7(found),
+            "figure_8": _figure_8(found),
+            "deadband": _deadband(found),
+        }
+        for name, drawn in drawn_by_name.items():
             for suffix in ("png", "svg"):
-                written.append(out / f"figure_{number}.{suffix}")
+                written.append(out / f"{name}.{suffix}")
                 drawn.savefig(written[-1], dpi=150)
     except OSError as error:
         raise UserError(f"{out}: the figures cannot be written: {error}.") from error
@@ -44,6 +52,28 @@ def _new(title: str, xlabel: str, ylabel: str) -> tuple[Figure, Axes]:
     return made, axes
 
 
+def _figure_4(found: Characterisation) -> Figure:
+    made = figure(10.0, 4.4)
+    panels = np.atleast_1d(made.subplots(1, len(found.strain_maps)))
+    most = 100 * max(abs(strain).max() for _, strain in found.strain_maps.values())
+    core = np.radians(np.linspace(0, 180, 181))
+    for axes, (shear_n, (places, strain)) in zip(panels, found.strain_maps.items(), strict=True):
+        for (x, y), value in zip(places.swapaxes(0, 1), 100 * strain, strict=True):
+            painted = axes.pcolormesh(x, y, value, shading="gouraud", cmap="RdBu_r", vmin=-most, vmax=most)
+            painted.set_rasterized(True)
+        radius = PAPER_SECTION.inner_radius_mm
+        axes.fill(-radius * np.cos(core), -radius * np.sin(core), facecolor="#eeeeee", edgecolor=GREY, lw=0.8)
+        arrow = {"arrowstyle": "->", "lw": 1.6}
+        below = -PAPER_SECTION.outer_radius_mm - 0.15
+        axes.annotate("", xy=(2.4 * shear_n, below), xytext=(0, below), arrowprops=arrow)
+        axes.annotate("", xy=(0, below), xytext=(0, below - 1.6), arrowprops=arrow)
+        axes.set(title=f"Fn = 1 N, Ft = {shear_n:g} N", xlabel="x, mm", ylabel="y, mm", aspect="equal")
+        axes.set(xlim=(-7.6, 7.6), ylim=(below - 1.9, 0.6))
+    made.colorbar(painted, ax=list(panels), label="circumferential strain, %", shrink=0.8)
+    made.suptitle("Figure 4: strain and bulging (2-D, finite strain)")
+    return made
+
+
 def _figure_5(found: Characterisation) -> Figure:
     made, axes = _new(
         "Figure 5: strain at mid-thickness, Fn = 1 N (2-D)",
@@ -53,7 +83,7 @@ def _figure_5(found: Characterisation) -> Figure:
     last = len(found.strain_profiles) - 1
     for i, profile in enumerate(found.strain_profiles):
         shade = 0.25 + 0.75 * i / last
-        axes.plot(found.midline_deg, 100 * profile, color=TWO_D, alpha=shade, lw=1.2)
+        axes.plot(found.line_deg, 100 * profile, color=TWO_D, alpha=shade, lw=1.2)
     tip = 60, 100 * found.strain_profiles[last].max() * 0.75
     axes.annotate("", xy=tip, xytext=(60, 0.15), arrowprops={"arrowstyle": "->", "color": GREY})
     axes.text(47, 4.9, "Ft = 0, 0.1, … 1 N", color=GREY)
@@ -98,10 +128,42 @@ def _figure_7(found: Characterisation) -> Figure:
     for normal_n, curve in found.wide_by_normal.items():
         (marks,) = axes.plot(*_both_sides(curve, curve.two_d), MARKERS[normal_n], label=f"2-D, Fn = {normal_n} N")
         marks.set(mfc="none", color=TWO_D, ms=5)
-        axes.plot(*_both_sides(curve, curve.membrane), color=ONE_D, lw=0.8, label="1-D" if normal_n == 2.0 else None)
+        sheet = np.array([loading_response(THICK_SECTION, normal_n, shear_n) for shear_n in curve.shear_n.tolist()])
+        last = normal_n == max(found.wide_by_normal)
+        axes.plot(*_both_sides(curve, curve.membrane), color=ONE_D, lw=0.8, label="1-D" if last else None)
+        label = "finite strain, 0.88 mm" if last else None
+        axes.plot(*_both_sides(curve, sheet), color="black", ls=":", lw=1, label=label)
     for end in (-PAPER_LINEAR_N, PAPER_LINEAR_N):
         axes.axvline(end, color=GREY, ls=":", lw=1)
-    note = "beyond 1.2 N the paper's skin\nturns up; the models do not"
+    note = "beyond 1.2 N the paper's skin\nturns up more than any model"
     axes.text(PAPER_LINEAR_N - 0.03, -0.13, note, color=GREY, ha="right")
     axes.legend(loc="upper left", fontsize=8)
+    return made
+
+
+def _figure_8(found: Characterisation) -> Figure:
+    made, axes = _new("Figure 8: response at 25 °C and 40 °C, Fn = 1 N", "shear force, N", "normalised response")
+    curve, change = found.wide, warming_change(WARM_K)
+    shear_n, cold = _both_sides(curve, curve.two_d)
+    # Equation (1): what changes both gauges' resistance by the same factor cancels against a zero at that temperature.
+    warm = (1 + change) * cold
+    axes.plot(shear_n[::5], cold[::5], "o", mfc="none", color=TWO_D, label="25 °C")
+    axes.plot(shear_n[::5], (warm / (1 + change))[::5], "x", color=ONE_D, label="40 °C, with a zero at 40 °C")
+    axes.plot(shear_n, warm, color=GREY, lw=1, label=f"40 °C, with the zero of 25 °C: {100 * change:+.2f} %")
+    axes.legend(loc="upper left", fontsize=8)
+    return made
+
+
+def _deadband(found: Characterisation) -> Figure:
+    made, axes = _new("Slope of the response within the deadband, Fn = 1 N", "shear force, N", "slope, 1/N")
+    near = found.near_zero
+    shear_n = np.concatenate([[0.0], near.shear_n])
+    for response, style, color, label in (
+        (near.two_d, "-", TWO_D, "2-D"),
+        (near.membrane, "--", ONE_D, "1-D"),
+        (near.two_d_slippery, ":", GREY, "2-D, no friction"),
+    ):
+        slope = np.diff(np.concatenate([[0.0], response])) / np.diff(shear_n)
+        axes.stairs(slope, shear_n, ls=style, color=color, baseline=None, label=label)
+    axes.legend(loc="lower right", fontsize=8)
     return made

@@ -1,6 +1,7 @@
 // The page: receives messages and redraws thirty times a second.
 
 import { TimeChart } from "./chart.js";
+import { colours, onColours } from "./colours.js";
 import { Controls } from "./controls.js";
 import { Link } from "./link.js";
 import { estimatesFirst, FingertipPanel, gripperPanel, healthPanel, isFingertip, loopPanel, robotPanel, shearPanel, torquePanel, wantedNow } from "./panels.js";
@@ -9,10 +10,12 @@ import { age, byId, number, put, show } from "./text.js";
 
 const REDRAWS_PER_S = 30;
 // Estimates differ in shape, and in lightness of blue and brown.
-const TIPS = [{ stroke: "#0b4f8a", fill: "#0b4f8a33" }, { stroke: "#8a4b00", fill: "#8a4b0033", hollow: true }, { stroke: "#4a4a4a", fill: "#4a4a4a33", dash: [2, 4] }];
+const TIPS = [{ colour: "first" }, { colour: "second", hollow: true }, { colour: "third", dash: [2, 4] }];
+// Alpha of the band between the ends of an interval.
+const BAND = "33";
 
 // Stop works before any message arrives.
-new Controls();
+const controls = new Controls();
 const settings = await (await fetch("settings.json")).json();
 
 const torques = new Series();
@@ -52,16 +55,17 @@ function chartLines() {
   const sources = estimatesFirst(link).filter((source) => torques.columns.get(source)?.some((value) => value != null));
   const lines = sources.slice(0, TIPS.length).map((source, i) => ({
     ...TIPS[i],
+    stroke: colours[TIPS[i].colour],
     name: source,
     points: true,
     label: i === 0 ? `estimate of ${source}, with its 95 % interval` : `estimate of ${source}`,
-    ...(i === 0 ? { low: `${source} low`, high: `${source} high` } : { fill: undefined, width: 1 }),
+    ...(i === 0 ? { low: `${source} low`, high: `${source} high`, fill: colours.first + BAND } : { width: 1 }),
   }));
-  if (link.get("load.torque")) lines.push({ name: "load", label: "load cell", stroke: "#10212e", width: 1.5 });
+  if (link.get("load.torque")) lines.push({ name: "load", label: "load cell", stroke: colours.ink, width: 1.5 });
   if (link.get("skin.shear")?.content.torque_nm != null || torques.columns.get("skin")?.some((value) => value != null)) {
-    lines.push({ name: "skin", label: "shear skin", stroke: "#3d6b1f", width: 2, dash: [2, 3] });
+    lines.push({ name: "skin", label: "shear skin", stroke: colours.skin, width: 2, dash: [2, 3] });
   }
-  if (link.get("loop.state")) lines.push({ name: "wanted", label: "wanted", stroke: "#9d1c12", width: 2.5, dash: [9, 5] });
+  if (link.get("loop.state")) lines.push({ name: "wanted", label: "wanted", stroke: colours.wanted, width: 2.5, dash: [9, 5] });
   return lines;
 }
 
@@ -73,11 +77,22 @@ function fingertips() {
       tips.delete(source);
     }
   }
-  document.querySelector("main").classList.toggle("two-tips", sources.length > 1);
   for (const source of sources) {
     if (!tips.has(source)) tips.set(source, new FingertipPanel(source, settings.fingertip));
     tips.get(source).update(link);
   }
+}
+
+// Panels move to the column that has room: fingertips stand on the right, two to a column.
+function arrange() {
+  const shear = link.get("skin.shear") !== undefined;
+  const right = tips.size + (shear ? 1 : 0);
+  into(shear && tips.size > 1 ? "left" : "right", "shear");
+  into(right < 2 ? "right" : "machine", "gripper");
+}
+
+function into(place, name) {
+  if (byId(name).parentElement !== byId(place)) byId(place).append(byId(name));
 }
 
 function linkLine() {
@@ -105,6 +120,8 @@ function draw() {
   loopPanel(link);
   torquePanel(link);
   fingertips();
+  arrange();
+  controls.update(link);
   shearPanel(link);
   robotPanel(link);
   gripperPanel(link);
@@ -112,7 +129,7 @@ function draw() {
   torqueChart.setLines(chartLines());
   torqueChart.draw(torques, link.unixNow());
   if (link.get("skin.shear")) {
-    shearChart.setLines([{ name: "shear", low: "shear low", high: "shear high", label: "shear force, with its interval", stroke: "#0b4f8a", fill: "#0b4f8a33", width: 2 }]);
+    shearChart.setLines([{ name: "shear", low: "shear low", high: "shear high", label: "shear force, with its interval", stroke: colours.first, fill: colours.first + BAND, width: 2 }]);
     shearChart.draw(forces, link.unixNow());
   }
   const refused = Object.entries(link.refused).map(([kind, count]) => `${count} ${kind}`).join(", ");
@@ -128,6 +145,8 @@ function tellRate(now) {
   put(byId("rate"), `${number(rate.count / passed, 1)} redraws/s, ${number(rate.spent / rate.count, 1, "ms")} each`);
   Object.assign(rate, { count: 0, spent: 0, since: now });
 }
+
+onColours(() => tips.forEach((panel) => panel.redraw()));
 
 let due = performance.now();
 function onFrame() {

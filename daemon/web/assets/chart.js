@@ -1,7 +1,8 @@
 // A scrolling minute of torques or forces. Lines differ in shape: points, solid, dashed.
 
+import { colours, onColours } from "./colours.js";
+
 const SPAN_S = 60;
-const INK = "#10212e";
 
 const clock = (t) => new Date(t * 1000).toLocaleTimeString([], { hour12: false });
 
@@ -15,6 +16,7 @@ export class TimeChart {
     this.least = least;
     this.lines = [];
     new ResizeObserver(() => this.resize()).observe(element);
+    onColours(() => { this.lines = []; });
   }
 
   setLines(lines) {
@@ -39,10 +41,10 @@ export class TimeChart {
         stroke: line.stroke,
         width: line.width ?? 1.5,
         dash: line.dash,
-        points: line.points ? { show: true, size: 8, stroke: line.stroke, fill: line.hollow ? "#fff" : line.stroke, width: 2 } : { show: false },
+        points: line.points ? { show: true, size: 8, stroke: line.stroke, fill: line.hollow ? colours.panel : line.stroke, width: 2 } : { show: false },
       });
     }
-    const axis = { stroke: INK, grid: { stroke: "#dfe4e8", width: 1 }, ticks: { stroke: INK, width: 1 }, font: "13px system-ui, DejaVu Sans, sans-serif" };
+    const axis = { stroke: colours.ink, grid: { stroke: colours.grid, width: 1 }, ticks: { stroke: colours.ink, width: 1 }, font: "13px system-ui, DejaVu Sans, sans-serif" };
     return {
       ...this.size(),
       series,
@@ -102,7 +104,7 @@ export class TimeChart {
       pen.lineWidth = 2;
       pen.beginPath();
       pen.arc(22, 7, 4, 0, 7);
-      pen.fillStyle = line.hollow ? "#fff" : line.stroke;
+      pen.fillStyle = line.hollow ? colours.panel : line.stroke;
       pen.fill();
       pen.stroke();
     }

@@ -1,8 +1,10 @@
 // The buttons: stop needs no token, every motion needs it.
 
+import { ACTIVE } from "./panels.js";
 import { byId, put } from "./text.js";
 
 const KEY = "shearloop-token";
+const TOKEN_NEEDED = "needs the token: open the address that `shearloop view` printed";
 // A daemon answers within milliseconds; `unlock` takes longer.
 const LATE_MS = 65000;
 const STOP_LATE_MS = 4000;
@@ -10,6 +12,7 @@ const STOP_LATE_MS = 4000;
 export class Controls {
   constructor() {
     this.takeTokenFromAddress();
+    this.reasons = {};
     byId("stop").addEventListener("click", () => this.stop());
     document.addEventListener("keydown", (event) => {
       if (event.key === "Escape" && !event.repeat) this.stop();
@@ -39,13 +42,25 @@ export class Controls {
     this.refresh();
   }
 
+  // Disable what the rig would refuse now, with the reason.
+  update(link) {
+    this.reasons = refusals(link);
+    this.refresh();
+  }
+
   refresh() {
     const token = sessionStorage.getItem(KEY);
+    const names = new Map();
     for (const button of this.buttons()) {
-      button.disabled = !token;
-      button.title = token ? "" : "needs the token: open the address that `shearloop view` printed";
+      const { command } = button.dataset;
+      const reason = token ? this.reasons[command] ?? "" : TOKEN_NEEDED;
+      if (button.disabled !== (reason !== "")) button.disabled = reason !== "";
+      if (button.title !== reason) button.title = reason;
+      if (reason) names.set(reason, [...(names.get(reason) ?? []), command]);
     }
-    byId("token-form").hidden = Boolean(token);
+    const sentences = [...names].map(([reason, commands]) => `${commands.join(", ")}: ${reason}`);
+    put(byId("controls-reason"), token ? sentences.join("; ") : "");
+    if (byId("token-form").hidden !== Boolean(token)) byId("token-form").hidden = Boolean(token);
   }
 
   async stop() {
@@ -78,4 +93,28 @@ export class Controls {
     answer.dataset.kind = kind;
     put(answer, sentence);
   }
+}
+
+// Why each command cannot work now. What the page cannot know, the daemon refuses.
+function refusals(link) {
+  const state = link.state();
+  const all = (reason) => ({ tare: reason, start: reason, pause: reason, resume: reason, unlock: reason });
+  if (state !== "live") return all(state === "ended" ? "the daemon has ended" : "nothing answers");
+  const loop = link.get("loop.state")?.content;
+  if (!loop) {
+    const waiting = "loop" in (link.get("health")?.content.tasks ?? {});
+    return { ...all(waiting ? "the loop has not begun" : "the configuration has no robot"), tare: "" };
+  }
+  const { phase, response } = loop;
+  const stopped = response.startsWith("stop");
+  const busy = ACTIVE.has(phase) ? "an experiment runs" : "";
+  const idle = busy ? "" : "no experiment runs";
+  const locked = stopped || link.get("robot.state")?.content.blocked || link.get("gripper.state")?.content.fault;
+  return {
+    tare: busy,
+    start: busy || (stopped ? "unlock first" : ""),
+    pause: idle || (phase === "paused" ? "it is paused" : ""),
+    resume: idle || (phase === "running" ? "nothing is paused" : ""),
+    unlock: locked ? "" : "nothing is locked",
+  };
 }

@@ -5,8 +5,6 @@ const RETRY_MS = 500;
 const LOST_AFTER_S = 1.0;
 // Messages that are further from now come from a replay; a step back by more than this starts it again.
 const REPLAYED_S = 5.0;
-// The arrival of one message, found twice, differs by less.
-const SAME_S = 0.2;
 
 const seconds = () => performance.now() / 1000;
 
@@ -16,6 +14,7 @@ export class Link {
     this.settings = settings;
     this.latest = new Map();
     this.refused = {};
+    this.ended = false;
     this.onMessage = onMessage;
     this.batchAt = null;
     this.daemonAt = null;
@@ -42,6 +41,7 @@ export class Link {
     this.batchAt = now;
     this.offset = batch.now - now;
     this.refused = batch.refused;
+    this.ended = batch.ended;
     for (const message of batch.history) this.onMessage(message);
     if (batch.quiet_s !== null) this.daemonAt = now - batch.quiet_s;
     for (const message of batch.messages) {
@@ -79,10 +79,7 @@ export class Link {
   }
 
   // The daemon's last message, until another one arrives.
-  end() {
-    const end = this.get("daemon.end");
-    return end && this.daemonAt - end.at < SAME_S ? end : undefined;
-  }
+  end() { return this.ended ? this.get("daemon.end") : undefined; }
 
   ageOf(message) { return seconds() - message.at; }
 

@@ -9,7 +9,7 @@ const SAFETY_MODES = { 1: "normal", 2: "reduced", 3: "protective stop", 4: "reco
 const MARK_OLD_AFTER_S = 1;
 
 // Phases with a set point.
-const ACTIVE = new Set(["running", "paused", "held"]);
+export const ACTIVE = new Set(["running", "paused", "held"]);
 
 export const wantedNow = (loop) => (ACTIVE.has(loop.phase) ? loop.ramp_nm : null);
 
@@ -48,7 +48,7 @@ export function torquePanel(link) {
   put(byId("torque-source"), said ? `estimate of ${said.source}${said.source === driving ? ", drives the loop" : ""}` : "estimate");
   const valid = said?.valid ?? false;
   put(byId("torque-now"), valid ? number(said.torque_nm, 4, "N·m", { signed: true }) : "–");
-  put(byId("torque-interval"), valid && said.torque_low_nm !== undefined ? interval(said.torque_low_nm, said.torque_high_nm, 4) : "");
+  put(byId("torque-interval"), valid && said.torque_low_nm !== undefined ? `${interval(said.torque_low_nm, said.torque_high_nm, 4)} (95 %)` : "");
   const load = link.get("load.torque");
   const silent = load && !load.content.valid && !link.isOld(load) ? `load cell: ${load.content.reason}` : "";
   warn(byId("torque-reason"), [said && !valid ? `no estimate: ${said.reason}` : "", silent].filter(Boolean).join("; "));
@@ -85,10 +85,12 @@ export class FingertipPanel {
     this.panel = byId("fingertip-template").content.firstElementChild.cloneNode(true);
     this.panel.dataset.source = source;
     put(this.part("name"), source);
-    byId("torque").after(this.panel);
-    this.drawn = {};
-    new ResizeObserver(() => { this.drawn = {}; }).observe(this.panel);
+    byId("right").prepend(this.panel);
+    this.redraw();
+    new ResizeObserver(() => this.redraw()).observe(this.panel);
   }
+
+  redraw() { this.drawn = {}; }
 
   part(name) { return this.panel.querySelector(`.${name}`); }
 
@@ -112,10 +114,12 @@ export class FingertipPanel {
   drawGel(estimate) {
     if (this.drawn.gel === (estimate ?? null)) return;
     this.drawn.gel = estimate ?? null;
-    const { k, sigma } = estimate?.content ?? {};
     const conductivity = estimate?.conductivity ?? null;
     const canvas = this.part("gel");
-    drawGel(canvas, this.geometry, conductivity, k, sigma);
+    drawGel(canvas, this.geometry, conductivity, estimate?.marks ?? []);
+    const [wide, high] = [0, 1].map((axis) => Math.max(...this.geometry.contour.map((point) => point[axis])));
+    const size = `${wide} × ${high} cm, ${this.geometry.electrodes.length} electrodes`;
+    put(this.part("gel-text"), [size, "conductivity, untouched gel = 1", estimate?.meaning].filter(Boolean).join("; "));
     canvas.setAttribute("aria-label", conductivity
       ? `conductivity over the height, from ${Math.min(...conductivity).toFixed(2)} to ${Math.max(...conductivity).toFixed(2)} of the untouched gel's`
       : "no conductivity is known");
@@ -131,7 +135,7 @@ export class FingertipPanel {
   mapText(heatmap, said) {
     const [rows, columns] = heatmap.content.scores.shape;
     const late = said.frame !== undefined && said.frame !== heatmap.content.frame ? `, frame ${heatmap.content.frame}` : "";
-    put(this.part("map-text"), `scores of ${rows} k × ${columns} σ${late}`);
+    put(this.part("map-text"), `scores of ${rows} k × ${columns} σ${late}; blank cells have no valid signal`);
     const cell = (peak) => (peak ? `row ${peak[0]}, column ${peak[1]}` : "none");
     this.part("map").setAttribute("aria-label", `heatmap of ${rows} by ${columns} cells; maximum at ${cell(heatmap.peaks?.best)}, runner-up at ${cell(heatmap.peaks?.runner_up)}`);
   }
@@ -142,7 +146,6 @@ export class FingertipPanel {
 export function shearPanel(link) {
   const message = link.get("skin.shear");
   show(byId("shear"), message !== undefined);
-  document.querySelector("main").classList.toggle("with-shear", message !== undefined);
   markAge(byId("shear"), link, message);
   if (!message) return;
   const said = message.content;
@@ -198,34 +201,31 @@ export function healthPanel(link, drawn) {
   markAge(byId("health"), link, message);
   if (message === drawn.health) return;
   drawn.health = message;
-  if (!message) {
-    byId("tasks").replaceChildren();
-    put(byId("process"), "");
-    return;
-  }
-  const tasks = Object.entries(message.content.tasks);
-  const rows = byId("tasks").rows;
-  while (rows.length > tasks.length) byId("tasks").deleteRow(-1);
-  tasks.forEach(([name, facts], i) => fillRow(rows[i] ?? newRow(), name, facts));
-  const said = message.content;
-  put(byId("process"), `${number(said.memory_mb, 0, "MB")}, ${number(said.cpu_percent, 1, "%")} of a core, event loop ${number(1000 * said.loop_lag_s, 1, "ms")} late`);
+  const said = message?.content;
+  const tasks = Object.entries(said?.tasks ?? {});
+  const chips = byId("tasks");
+  while (chips.children.length > tasks.length) chips.lastElementChild.remove();
+  tasks.forEach(([name, facts], i) => fillChip(chips.children[i] ?? newChip(), name, facts));
+  put(byId("process"), said ? `${number(said.memory_mb, 0, "MB")}, ${number(said.cpu_percent, 1, "%")} of a core, event loop ${number(1000 * said.loop_lag_s, 1, "ms")} late` : "");
 }
 
-function newRow() {
-  const row = byId("tasks").insertRow();
-  for (let i = 0; i < 6; i += 1) row.insertCell();
-  return row;
+function newChip() {
+  const chip = byId("chip-template").content.firstElementChild.cloneNode(true);
+  byId("tasks").append(chip);
+  return chip;
 }
 
-function fillRow(row, name, facts) {
+// A chip opens to show what the task reports.
+function fillChip(chip, name, facts) {
   const dead = facts.alive === false && !facts.done;
-  const alive = facts.done ? "✓ done" : facts.alive === undefined ? "–" : dead ? "✗ DEAD" : "✓ alive";
-  row.className = dead ? "dead" : "";
+  const error = facts.error || facts.last_error || "";
+  const [state, text] = dead ? ["dead", `✗ ${name}: DEAD`] : facts.done ? ["done", `✓ ${name}: done`] : facts.error ? ["warned", `! ${name}: error`] : ["alive", `✓ ${name}`];
+  chip.dataset.state = state;
   const rate = facts.rate_hz == null ? "" : `${number(facts.rate_hz, 2)}${facts.expected_hz == null ? "" : ` of ${number(facts.expected_hz, 2)}`} Hz`;
   const errors = Object.entries(facts.errors ?? {}).map(([kind, count]) => `${count} ${kind}`).join(", ");
-  const error = facts.error || facts.last_error || "";
-  const texts = [name, alive, rate, errors || "0", String(facts.restarts ?? ""), error];
-  texts.forEach((text, i) => put(row.cells[i], text));
+  put(chip.querySelector("summary"), text);
+  const restarts = facts.restarts ? `restarted ${facts.restarts === 1 ? "once" : `${facts.restarts} times`}` : "";
+  put(chip.querySelector("p"), [rate, errors && `errors: ${errors}`, restarts, error].filter(Boolean).join("; ") || "no errors");
 }
 
 // The loop's phase, and every reason for a hold.

@@ -1,8 +1,9 @@
 // Draws the fingertip with its conductivity, and the heatmap. Shades go from dark to light and work in grey.
 
+import { colours } from "./colours.js";
+
 // Anchors of a colour scale with even lightness (after cividis).
 const ANCHORS = [[0, 32, 76], [40, 66, 108], [92, 97, 112], [124, 123, 120], [166, 157, 117], [209, 193, 99], [253, 233, 69]];
-const INK = "#10212e";
 const FONT = "system-ui, DejaVu Sans, sans-serif";
 
 export function shade(share) {
@@ -26,14 +27,14 @@ function fitted(canvas) {
   return { pen, width, height };
 }
 
-// Text with a light edge, readable on every shade.
+// Text with an edge of the panel's colour, readable on every shade.
 function label(pen, text, x, y, align = "left") {
   pen.textAlign = align;
   pen.textBaseline = "middle";
   pen.lineWidth = 3;
-  pen.strokeStyle = "#fff";
+  pen.strokeStyle = colours.panel;
   pen.strokeText(text, x, y);
-  pen.fillStyle = INK;
+  pen.fillStyle = colours.ink;
   pen.fillText(text, x, y);
 }
 
@@ -42,7 +43,7 @@ function scaleBar(pen, x, y, height, low, high, digits) {
     pen.fillStyle = css(shade(1 - i / height));
     pen.fillRect(x, y + i, 10, 1.5);
   }
-  pen.strokeStyle = INK;
+  pen.strokeStyle = colours.ink;
   pen.lineWidth = 1;
   pen.strokeRect(x, y, 10, height);
   label(pen, high.toFixed(digits), x + 14, y + 6);
@@ -52,10 +53,10 @@ function scaleBar(pen, x, y, height, low, high, digits) {
 const GEL_LOW = 0.4;
 const GEL_HIGH = 1.6;
 
-// Draw the gel: shades and level lines of its conductivity over the height, electrodes, and the curve.
-export function drawGel(canvas, tip, conductivity, k, sigma) {
+// Draw the gel: shades and level lines of its conductivity over the height, electrodes, and marks [cm, text] at heights.
+export function drawGel(canvas, tip, conductivity, marks) {
   const { pen, width, height } = fitted(canvas);
-  const room = { left: 8, right: 42, top: 14, bottom: 30 };
+  const room = { left: 8, right: 52, top: 22, bottom: 22 };
   const [wide, high] = [0, 1].map((axis) => Math.max(...tip.contour.map((point) => point[axis])));
   const scale = Math.min((width - room.left - room.right) / wide, (height - room.top - room.bottom) / high);
   const [w, h] = [wide * scale, high * scale];
@@ -75,22 +76,11 @@ export function drawGel(canvas, tip, conductivity, k, sigma) {
     }
     levels(pen, conductivity, high, x0, w, yOf);
     pen.restore();
-    for (const [cm, text] of [[k, "k"], [k - sigma, "k−σ"], [k + sigma, "k+σ"]]) {
-      if (cm < 0 || cm > high) continue;
-      pen.setLineDash(text === "k" ? [] : [4, 4]);
-      pen.strokeStyle = INK;
-      pen.lineWidth = 1.5;
-      pen.beginPath();
-      pen.moveTo(x0 + w, yOf(cm));
-      pen.lineTo(x0 + w + 8, yOf(cm));
-      pen.stroke();
-      pen.setLineDash([]);
-      label(pen, text, x0 + w + 12, Math.min(y0 + h - 4, Math.max(y0 + 4, yOf(cm))));
-    }
+    drawMarks(pen, marks, high, x0 + w, yOf);
   } else {
     label(pen, "no conductivity", x0 + w / 2, y0 + h / 2, "center");
   }
-  pen.strokeStyle = INK;
+  pen.strokeStyle = colours.ink;
   pen.lineWidth = 1.5;
   pen.stroke(edge);
   pen.lineWidth = 6;
@@ -100,7 +90,23 @@ export function drawGel(canvas, tip, conductivity, k, sigma) {
     pen.lineTo(xOf(x2), yOf(y2));
     pen.stroke();
   }
-  label(pen, `${wide} × ${high} cm, ${tip.electrodes.length} electrodes`, x0, y0 + h + 17);
+}
+
+function drawMarks(pen, marks, high, x, yOf) {
+  pen.strokeStyle = colours.ink;
+  pen.lineWidth = 1.5;
+  for (const [cm, text] of marks) {
+    if (cm < 0 || cm > high) continue;
+    pen.beginPath();
+    pen.moveTo(x, yOf(cm));
+    pen.lineTo(x + 8, yOf(cm));
+    pen.stroke();
+    label(pen, text, x + 11, yOf(cm));
+  }
+  const outside = (beyond) => marks.filter(([cm]) => beyond(cm)).map(([, text]) => text).join(", ");
+  const [above, below] = [outside((cm) => cm > high), outside((cm) => cm < 0)];
+  if (above) label(pen, `${above} ↑`, x, yOf(high) - 10, "right");
+  if (below) label(pen, `${below} ↓`, x, yOf(0) + 11, "right");
 }
 
 function levels(pen, conductivity, high, x0, w, yOf) {
@@ -111,7 +117,7 @@ function levels(pen, conductivity, high, x0, w, yOf) {
       const [a, b] = [conductivity[i] - level, conductivity[i + 1] - level];
       if (a === b || a * b > 0 || b === 0) continue;
       const y = yOf((i + a / (a - b)) * step);
-      pen.strokeStyle = "#fff";
+      pen.strokeStyle = colours.panel;
       pen.lineWidth = level === 1 ? 2 : 1;
       pen.setLineDash(level < 1 ? [6, 4] : []);
       pen.beginPath();
@@ -140,7 +146,7 @@ export function drawMap(canvas, map, peaks) {
   }
   pen.imageSmoothingEnabled = false;
   pen.drawImage(pixels(scores, low, high), x0, y0, w, h);
-  pen.strokeStyle = INK;
+  pen.strokeStyle = colours.ink;
   pen.lineWidth = 1;
   pen.strokeRect(x0, y0, w, h);
   label(pen, k[1].toFixed(1), x0 - 5, y0 + 6, "right");
@@ -148,8 +154,7 @@ export function drawMap(canvas, map, peaks) {
   label(pen, "k, cm", x0 - 5, y0 + h / 2, "right");
   label(pen, sigma[0].toFixed(1), x0, y0 + h + 10);
   label(pen, sigma[1].toFixed(1), x0 + w, y0 + h + 10, "right");
-  label(pen, "σ, cm", x0 + w / 2, y0 + h + 10, "center");
-  if (scores.values.some(Number.isNaN)) label(pen, "blank: no valid signal", x0, y0 + h + 27);
+  label(pen, "σ, cm", x0 + w / 2, y0 + h + 27, "center");
   if (high >= low) scaleBar(pen, x0 + w + 8, y0, h, low, high, 2);
   if (!peaks) return;
   const at = ([row, column]) => [x0 + ((column + 0.5) / columns) * w, y0 + h - ((row + 0.5) / rows) * h];
@@ -174,7 +179,7 @@ function pixels(scores, low, high) {
 }
 
 function twice(pen, path) {
-  for (const [colour, lineWidth] of [["#fff", 6], [INK, 2.5]]) {
+  for (const [colour, lineWidth] of [[colours.panel, 6], [colours.ink, 2.5]]) {
     pen.strokeStyle = colour;
     pen.lineWidth = lineWidth;
     pen.beginPath();

@@ -32,9 +32,12 @@ def test_characterise_holds_the_models_against_the_paper_and_draws_its_figures(t
     assert rows["dynamic range to 5 N"]["synthetic"] > 10
 
     drawn = sorted((tmp_path / "figures").iterdir())
-    assert [path.name for path in drawn] == [f"figure_{n}.{kind}" for n in (5, 6, 7) for kind in ("png", "svg")]
+    names = ["deadband", *(f"figure_{number}" for number in range(4, 9))]
+    assert [path.name for path in drawn] == [f"{name}.{kind}" for name in names for kind in ("png", "svg")]
+    assert 0 < rows["slope within the deadband, Fn = 1 N"]["two_d"] < 0.01
+    assert 0 < rows["change of sensitivity over 15 K, zero from before"]["two_d"] < 2
     assert all(path.stat().st_size > 10_000 for path in drawn)
-    assert printed.err.count("drawn: ") == 6
+    assert printed.err.count("drawn: ") == 12
 
     table = _table(tuple(FigureOfMerit(**row) for row in rows.values()))
     assert len(table.splitlines()[1:]) > len(rows)

@@ -3,6 +3,7 @@
 import asyncio
 import os
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -33,6 +34,16 @@ def test_both_sockets_leave_descriptors_in_reserve(descriptors):
     assert most_connections(MAX_DESCRIPTORS) == MAX_CONNECTIONS
 
 
+def test_the_limit_of_descriptors_is_raised_as_far_as_the_system_allows():
+    for hard, raised in ((512, 512), (MAX_DESCRIPTORS + 1, MAX_DESCRIPTORS)):
+        code = (
+            "import resource as r; from shearloop.daemon.process import raise_descriptor_limit\n"
+            f"r.setrlimit(r.RLIMIT_NOFILE, (64, {hard})); raise_descriptor_limit()\n"
+            "print(r.getrlimit(r.RLIMIT_NOFILE)[0])"
+        )
+        assert int(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout) == raised
+
+
 @pytest.mark.parametrize("key", ["publish", "commands"])
 async def test_stop_is_fast_in_a_flood_of_idle_connections(key, config):
     addresses = {one: f"tcp://127.0.0.1:{free_port()}" for one in ("publish", "commands")}
@@ -55,7 +66,7 @@ async def test_stop_is_fast_in_a_flood_of_idle_connections(key, config):
         assert time.monotonic() - begun_s < 1.0
         _, told = await daemon.communicate()
     assert daemon.returncode == 0
-    assert b"clients are connected; others wait until one has disconnected" in told
+    assert f"clients are connected to `{key}`; others wait until one has disconnected" in told.decode()
 
 
 async def test_the_stop_socket_answers_in_a_flood_of_datagrams():

@@ -7,8 +7,9 @@ import pytest
 import zmq
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.messaging.client import receive_messages
-from shearloop.daemon.messaging.messages import LoadTorque, decode, encode
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.client import Subscriber, receive_messages
+from shearloop.daemon.messaging.messages import EitFrame, LoadTorque, decode, encode
 from shearloop.daemon.messaging.publisher import MAX_UNKNOWN_TOPICS, Publisher
 from tests.daemon.conftest import DEADLINE_S
 from tests.daemon.sample_messages import sample
@@ -111,6 +112,29 @@ def test_a_subscriber_is_warned_once_and_receives_a_later_daemon(tmp_path, monke
         with closing(receive_messages(address, ["health"], on_quiet=comes)) as heard:
             assert [next(heard)[1]["seq"] for _ in range(2)] == [0, 1]
     assert told == ["quiet"]
+
+
+async def test_a_subscriber_is_iterated_with_and_without_asyncio(publisher, tmp_path):
+    address = f"ipc://{tmp_path}/publish"
+    with Subscriber(address, ["health", "load."], DEADLINE_S) as one, Subscriber(address, timeout_s=0.01) as empty:
+        until(lambda: publisher.has_subscriber("load.torque") and publisher.has_subscriber("health"))
+        for _ in range(2):
+            publisher.publish(sample(EitFrame))
+            publisher.publish(sample(LoadTorque))
+        assert one.wait(DEADLINE_S)
+        topic, content = next(one)
+        assert (topic, content["seq"], content["torque_nm"]) == ("load.torque", 0, 0.5)
+        topic, content = await anext(one)
+        assert (topic, content["seq"]) == ("load.torque", 1)
+        # The other one has no topic, so it receives all.
+        received = [next(empty) for _ in range(2)] + [await anext(empty) for _ in range(2)]
+        assert [topic for topic, _ in received] == ["eit.frame", "load.torque"] * 2
+        assert received[0][1]["channels"].shape == (2, 3)
+        with pytest.raises(UserError, match=r"no message came from .* for 0.01 s"):
+            next(empty)
+        with pytest.raises(UserError, match=r"no message came from .* for 0.01 s"):
+            await anext(empty)
+    until(lambda: not publisher.has_subscribers())
 
 
 def test_a_client_with_many_unknown_topics_is_disconnected(publisher, connect, tmp_path):

@@ -1,14 +1,18 @@
 import csv
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.io import loadmat
 
+import shearloop
 from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.daemon.cli import main
+from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.reader import read_recording
+from shearloop.daemon.recording.tables import arrays
 from shearloop.daemon.recording.writer import RecordingWriter
 
 LINES = PAPER_TABLE.line_of_channels(np.round(np.random.default_rng(0).uniform(0, 1, (4, 896)), 4))
@@ -89,6 +93,43 @@ def test_csv_parquet_and_matlab_exports_agree(recording, tmp_path, capsys):
     np.testing.assert_array_equal(struct["eit_frame_right"]["line"], LINES)
     np.testing.assert_allclose(struct["load_torque"]["torque_nm"], 0.01 * np.arange(4))
     assert struct["load_torque"]["log_time_ns"].tolist() == [10**18 + i for i in range(4)]
+
+
+def test_a_recording_is_read_into_arrays_and_frames(recording, monkeypatch):
+    read = shearloop.read(recording)
+    assert dict(read.counts) == {"eit.frame.right": 4, "load.torque": 4}
+    assert read.metadata["source"] == "a bench"
+    np.testing.assert_array_equal(read["eit.frame.right"]["line"], LINES)
+    np.testing.assert_array_equal(read["load.torque"]["log_time_ns"], 10**18 + np.arange(4))
+    with pytest.raises(KeyError, match=r"has no topic 'health'; it has eit.frame.right, load.torque"):
+        read.frame("health")
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "pandas", None)
+        with pytest.raises(UserError, match=r"needs pandas: `pip install 'shearloop\[notebook\]'`"):
+            read.frame("load.torque")
+    pandas = pytest.importorskip("pandas", reason="frames need the extra `notebook`")
+    frame = read.frame("eit.frame.right")
+    assert list(frame.columns[:2]) == ["arrival_unix_ns", "line_0"]
+    np.testing.assert_array_equal(frame.iloc[:, 1:], LINES)
+    assert frame.index[1] - frame.index[0] == pandas.Timedelta(541, "ms")
+    assert frame.index[0] == pandas.Timestamp("2001-09-09T01:46:40Z")
+
+
+@pytest.mark.parametrize(
+    ("values", "kind", "expected"),
+    [
+        ([1, 2], np.int64, [1, 2]),
+        ([1, None], np.float64, [1, np.nan]),
+        ([True, False], np.bool_, [True, False]),
+        (["a", None], np.object_, ["a", ""]),
+        ([[1.0, None], [2.0]], np.float64, [[1, np.nan], [2, np.nan]]),
+        ([None], np.float64, [np.nan]),
+    ],
+)
+def test_arrays_have_the_types_of_their_values(values, kind, expected):
+    found = arrays([{"key": value} for value in values])["key"]
+    assert found.dtype == kind
+    np.testing.assert_array_equal(found, np.array(expected, dtype=kind))
 
 
 @pytest.mark.parametrize(

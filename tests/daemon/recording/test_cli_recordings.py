@@ -14,7 +14,7 @@ from shearloop.bank.estimation.interval_regressor import Ridge, fit_interval_reg
 from shearloop.bank.estimation.load_delay import LoadDelay, LoadTiming
 from shearloop.bank.estimators import ESTIMATORS
 from shearloop.daemon.analysis.calibrate import CalibrationResult
-from shearloop.daemon.analysis.evaluate import EstimateTrack, InvalidReason, figures_of, invalid_reasons
+from shearloop.daemon.analysis.evaluate import EstimateTrack, InvalidReason, draw_tracks, figures_of, invalid_reasons
 from shearloop.daemon.cli import main
 from shearloop.daemon.cli.calibrate.recording import sentences_of
 
@@ -322,3 +322,25 @@ def test_a_time_that_could_not_be_checked_is_told_as_probable(unsure_s):
     assert late == f"The load is {'probably ' if unsure_s else ''}stamped 0.16 s after the frames move."
     assert ("widening" in result.figures()) == bool(unsure_s) == bool(sentences)
     assert all("so the intervals are wider, for loads 1.9 times. Record more" in one for one in sentences)
+
+
+@pytest.mark.usefixtures("fonts")
+@pytest.mark.parametrize(("kind", "drawn"), [("raw", "torque in N·m"), ("difference", "diameter in mm")])
+def test_the_picture_of_a_stream_shows_torque_also_with_a_named_tool(kind, drawn, tmp_path):
+    t, tool_mm = np.arange(4.0), np.full(4, 20.0)
+    series = FrameSeries(kind, ("right",), t, np.zeros((4, 1, 896)), t, np.full(4, 0.1), tool_mm)
+    estimates = tuple(
+        Estimate(
+            valid=True,
+            reasons=(),
+            torque_nm=0.1,
+            torque_low_nm=0.05,
+            torque_high_nm=0.15,
+            diameter_mm=19.0,
+            diameter_low_mm=15.0,
+            diameter_high_mm=25.0,
+        )
+        for _ in t
+    )
+    draw_tracks([EstimateTrack(series, estimates, np.ones(4))], ["one"], "title", tmp_path / "a.svg")
+    assert f"<!-- {drawn} -->" in (tmp_path / "a.svg").read_text()

@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 from shearloop.daemon.cli import main
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.export import count_messages, export
+from shearloop.daemon.recording.export import export
 from shearloop.daemon.recording.reader import read_recording, repair, summarise
 from shearloop.daemon.recording.recorder import AttachedFile, Identity, Recorder
 from shearloop.daemon.recording.replay import RecordedRun
 from shearloop.daemon.recording.schema import basic_identity
+from shearloop.daemon.recording.tables import RecordedTopics
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.recording.test_recorder import frame, torque
 
@@ -51,7 +52,7 @@ def happened(path: Path) -> list[Any]:
 
 
 def exported(path: Path) -> list[bytes]:
-    return [one.read_bytes() for one in export(path, "csv", path.parent / "csv", sorted(count_messages(path)))]
+    return [one.read_bytes() for one in export(path, "csv", path.parent / "csv", list(RecordedTopics(path)))]
 
 
 def told(path: Path) -> list[tuple[str, int]]:
@@ -64,7 +65,7 @@ def told(path: Path) -> list[tuple[str, int]]:
 
 def repaired(path: Path) -> int:
     done = repair(path, path.with_name("repaired.mcap"))
-    assert sum(count_messages(done.path).values()) == done.messages
+    assert sum(RecordedTopics(done.path).counts.values()) == done.messages
     return 0
 
 

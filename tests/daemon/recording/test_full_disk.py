@@ -14,9 +14,9 @@ import pytest
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import recorder as recorder_module
-from shearloop.daemon.recording.export import count_messages
 from shearloop.daemon.recording.reader import repair, summarise
 from shearloop.daemon.recording.recorder import Recorder
+from shearloop.daemon.recording.tables import RecordedTopics
 from tests.daemon.conftest import deadline
 from tests.daemon.recording.test_recorder import IDENTITY, frame, topics, torque
 
@@ -92,7 +92,7 @@ def test_no_data_is_missing_when_the_disk_has_room_again(tmp_path, disks):
     recorder.close()
     (path,) = recorder.finished
     assert [one["frame"] for one in topics(path)["eit.frame.right"]] == list(range(20))
-    assert count_messages(path)["eit.frame.right"] == 20, "the checksums are those of one write"
+    assert RecordedTopics(path).counts["eit.frame.right"] == 20, "the checksums are those of one write"
 
 
 def test_a_file_that_cannot_be_started_is_removed(tmp_path, monkeypatch, disks):

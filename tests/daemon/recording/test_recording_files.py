@@ -6,16 +6,17 @@ import pytest
 from mcap.writer import Writer
 from scipy.io import savemat
 
-from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.config import RecordingConfig, load_daemon_config
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.export import count_messages
 from shearloop.daemon.recording.matlab import import_mat
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.recorder import daemon_identity
 from shearloop.daemon.recording.replay import RecordedRun
+from shearloop.daemon.recording.schema import LOAD_DOUBT_NOTE
+from shearloop.daemon.recording.tables import RecordedTopics
 from shearloop.daemon.recording.writer import RecordingWriter
 
 
@@ -60,19 +61,20 @@ def test_an_unfinished_recording_stays_partial(tmp_path):
     assert read_recording(tmp_path / "a.mcap.partial").torque_nm.tolist() == [1.0]
 
 
-@pytest.mark.parametrize("read", [read_recording, RecordedRun, count_messages])
+@pytest.mark.parametrize("read", [read_recording, RecordedRun, RecordedTopics])
 def test_foreign_and_outdated_files_are_refused(tmp_path, monkeypatch, read):
     (tmp_path / "text.mcap").write_text("hello")
     with (tmp_path / "other.mcap").open("wb") as file:
         other = Writer(file)
         other.start()
         other.finish()
+    # The digest is cached in the table once it is read.
     for name, owner, key, value in (
-        ("stale", ChannelTable, "digest", "0" * 64),
+        ("stale", PAPER_TABLE, "digest", "0" * 64),
         ("old", schema, "FORMAT_VERSION", "1"),
     ):
         with monkeypatch.context() as outdated:
-            outdated.setattr(owner, key, value)
+            outdated.setitem(vars(owner), key, value)
             written(tmp_path / f"{name}.mcap")
     for name, why in (
         ("text", r"text\.mcap: this is not an MCAP file"),
@@ -123,6 +125,24 @@ def test_a_load_read_once_per_frame_gets_its_own_period(mat_folder, tmp_path):
     found = read_recording(tmp_path / "a.mcap")
     np.testing.assert_allclose(np.diff(found.torque_t_ns) / 1e9, 0.0916, atol=1e-6)
     assert "read once per frame" in found.notes["remarks"]
+
+
+def test_a_loop_that_waits_for_its_load_gives_the_times_of_both(mat_folder, tmp_path):
+    """A row is stamped, then waits for its frame and for its load value; the load cell begins late."""
+    frame_s, load_s, stamps = 0.8 + PERIOD_S * np.arange(60), 2.6 + 0.0916 * np.arange(60), [0.0]
+    for ends in zip(frame_s[:-1], load_s[:-1], strict=True):
+        stamps.append(max(stamps[-1], *ends))
+    late = list(enumerate(np.array(stamps) - PERIOD_S * np.arange(1, 61)))
+    told = import_mat([mat_folder(one_loop=True, late=late)], tmp_path / "a.mcap")
+    found = read_recording(tmp_path / "a.mcap")
+    start_ns = found.torque_t_ns[0] - 2.6e9
+    np.testing.assert_allclose((found.torque_t_ns - start_ns) / 1e9, load_s, atol=1e-3)
+    middle_s = (found.sides["right"].t_mid_ns - start_ns) / 1e9
+    assert np.abs(frame_s - PERIOD_S / 2 - middle_s).max() <= PERIOD_S / 2 + 0.01
+    assert "the load's times were moved by 2.33 ± 0.27 s against the frames" in told.remarks[1]
+    assert LOAD_DOUBT_NOTE not in found.notes
+    import_mat([mat_folder("regular", one_loop=True)], tmp_path / "b.mcap")
+    assert "times may be seconds off" in read_series(tmp_path / "b.mcap")[0].load_doubt
 
 
 def test_damaged_load_values_are_counted_and_left_out(mat_folder, tmp_path):

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from shearloop.daemon.cli import main
-from shearloop.daemon.recording.export import count_messages
+from shearloop.daemon.recording.tables import RecordedTopics
 from tests.daemon.recording.test_replay import measured, replayed
 from tests.daemon.skin.test_skin_run import played
 
@@ -45,7 +45,7 @@ async def recorded(folder: Path, *, socket: bool) -> list[tuple[str, dict[str, A
 def test_a_skin_replay_gives_equal_forces(tmp_path, socket, capsys):
     live = asyncio.run(recorded(tmp_path, socket=socket))
     (path,) = (tmp_path / "recordings").iterdir()
-    assert {"skin.shear", "input.skin", "input.skin.source", "input.skin.daq"} <= set(count_messages(path))
+    assert {"skin.shear", "input.skin", "input.skin.source", "input.skin.daq"} <= set(RecordedTopics(path).counts)
     again, comparison = asyncio.run(replayed(path, math.inf))
     assert comparison.different == Counter(), comparison.examples
     assert comparison.compared["skin.shear"] > 50

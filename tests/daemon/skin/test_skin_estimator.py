@@ -95,6 +95,26 @@ def bench(calibration) -> Bench:
     return Bench(calibration).zeroed()
 
 
+@pytest.mark.parametrize("slack_ratio", [-0.45, -0.15, 0.18])
+def test_a_gauge_at_any_depth_is_believed_once_it_is_calibrated(slack_ratio):
+    """The inner face, 26 µm off mid-thickness and the outer face: the slack side bends, and its fibres differ."""
+    calibrated = fit_calibration(calibration_table(SyntheticSkin(slack_ratio=slack_ratio, seed=7), NOISE))
+    assert calibrated.slack_ratio == pytest.approx(slack_ratio, abs=0.005)
+    bench = Bench(calibrated)
+    bench.skin.slack_ratio = slack_ratio
+    bench.zeroed()
+    for shear_n in (4.0, -4.0):
+        readings = list(bench.to(shear_n))
+        assert all(reading.valid for reading in readings)
+        assert holds(readings[-1], shear_n)
+
+
+def test_a_slack_gauge_beyond_the_calibrated_ratio_is_refused(calibration):
+    bench = Bench(calibration)
+    bench.skin.slack_ratio = -0.45
+    assert "shorter than any load makes it" in bench.zeroed().push(4.0).reasons[0]
+
+
 def holds(reading: SkinReading, shear_n: float) -> bool:
     interval = reading.interval
     return interval is not None and interval.low_n <= shear_n <= interval.high_n
@@ -105,6 +125,8 @@ def test_the_demo_s_calibration_is_that_of_the_emulated_skin(calibration):
     assert anew.friction == pytest.approx(calibration.friction, abs=1e-3)
     assert anew.slope_per_n == pytest.approx(calibration.slope_per_n, rel=2e-3)
     assert anew.rest_ohm == pytest.approx(REST_OHM, rel=1e-3)
+    assert anew.slack_ratio == pytest.approx(calibration.slack_ratio, abs=1e-3)
+    assert anew.gauge_depth_mm == pytest.approx(0.0, abs=5e-3)
 
 
 def test_the_zero_comes_first_and_then_every_sample_is_a_force(calibration):

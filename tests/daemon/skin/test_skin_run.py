@@ -137,7 +137,7 @@ BAD = [
     ("short 2", "gauge 2 is shorted"),
     ("reversed 1", "the sense wires of gauge 1 are reversed"),
     ("leads 500", "in compliance"),
-    ("swapped", "than at its zero"),
+    ("swapped", "than any load makes it"),
     ("source unplug", "the current source does not answer"),
     ("drift 2 -0.02", "drifts"),
 ]

@@ -53,6 +53,7 @@ def test_a_new_page_gets_the_last_minute():
 
 def test_quiet_time_is_unknown_without_messages():
     assert batch(MessageStore(3.6))["quiet_s"] is None
+    assert not batch(MessageStore(3.6))["ended"]
 
 
 def test_invalid_messages_are_counted_by_kind_and_do_not_end_the_silence():
@@ -135,3 +136,22 @@ def test_the_profile_equals_the_banks_conductivity():
     assert conductivity_profile("no such model", 1.0, 1.0, 3.6) is None
     assert conductivity_profile("linear", 1.0, 0.0, 3.6) is None
     assert conductivity_profile("linear", float("nan"), 1.0, 3.6) is None
+
+
+@pytest.mark.parametrize(
+    ("model", "labels", "meaning"),
+    [
+        ("gaussian_derivative", ["k", "k−σ", "k+σ"], "k is the height without change"),
+        ("step", ["k"], "k is the height of the step"),
+        ("modulated_gaussian", [], ""),
+    ],
+)
+def test_k_and_sigma_are_marked_only_where_they_are_heights(model, labels, meaning):
+    latest = MessageStore(3.6)
+    latest.add("eit.heatmap", message(model=model), 1.0)
+    latest.add("eit.estimate", message(k=2.0, sigma=0.5), 2.0)
+    shown = batch(latest)["messages"][-1]
+    offsets = {"k": 0.0, "k−σ": -0.5, "k+σ": 0.5}
+    assert shown["marks"] == [[2.0 + offsets[label], label] for label in labels]
+    assert shown["meaning"].startswith(meaning)
+    assert bool(shown["meaning"]) == bool(meaning)

@@ -53,7 +53,7 @@ def test_the_page_shows_the_messages_numbers(browsed):
     browsed.until(".fingertip .map-text", "100 k × 100 σ")
     said = {name: dict(given) for name, given in MESSAGES.items()}
     estimate, load, shear, robot = said["estimate"], said["load"], said["shear"], said["robot"]
-    interval = f"{signed(estimate['torque_low_nm'], 4)} to {signed(estimate['torque_high_nm'], 4)}"
+    interval = f"{signed(estimate['torque_low_nm'], 4)} to {signed(estimate['torque_high_nm'], 4)} (95 %)"
     shown = {
         "#torque-source": "estimate of right, drives the loop",
         "#torque-now": f"{signed(estimate['torque_nm'], 4)} N·m",
@@ -93,12 +93,15 @@ def test_the_page_shows_the_messages_numbers(browsed):
         "#process": "142 MB, 6.0 % of a core, event loop 1.3 ms late",
     }
     browsed.until_shown(shown)
-    rows = browsed.page.locator("#tasks tr").all_inner_texts()
-    assert [row.split("\t") for row in rows] == [
-        ["right", "✓ alive", "1.85 of 1.85 Hz", "3 wrong length, 1 not a number", "2", "look at the cable"],
-        ["loop", "✗ DEAD", "", "0", "1", "RuntimeError: a bug"],
-        ["experiment", "✓ done", "", "0", "0", ""],
+    chips = browsed.page.locator("#tasks .chip")
+    assert chips.locator("summary").all_inner_texts() == ["! right: error", "✗ loop: DEAD", "✓ experiment: done"]
+    assert chips.locator("p").all_text_contents() == [
+        "1.85 of 1.85 Hz; errors: 3 wrong length, 1 not a number; restarted 2 times; look at the cable",
+        "restarted once; RuntimeError: a bug",
+        "no errors",
     ]
+    chips.first.click()
+    browsed.page.wait_for_selector("#tasks .chip p >> nth=0", state="visible")
     assert "maximum at row 90, column 10, runner-up at row 70, column 30" in str(
         browsed.page.get_attribute(".fingertip .map", "aria-label")
     )
@@ -146,7 +149,7 @@ def test_lines_break_at_invalid_values_and_continue_past_other_sources(browsed):
 
 
 def test_a_replay_is_drawn_at_its_own_times(browsed):
-    browsed.daemon.say(**{name: {"ago_s": 3600.0} for name in MESSAGES})
+    browsed.daemon.say(**{name: {"ago_s": 3600.0} for name in MESSAGES if name != "end"})
     browsed.open()
     for chart in ("#torque-chart", "#shear-chart"):
         browsed.page.wait_for_function(COLOURED, arg=chart)

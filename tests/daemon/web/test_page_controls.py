@@ -8,7 +8,35 @@ from tests.daemon.web.fake_daemon import MESSAGES, REASONS
 
 pytestmark = pytest.mark.usefixtures("fresh")
 COMMANDS = ("tare", "start", "pause", "resume", "unlock")
-SIZES = {"tablet": (1024, 768), "upright tablet": (768, 1024), "screen": (1920, 1080), "phone": (390, 844)}
+SIZES = {
+    "phone": (390, 844),
+    "upright tablet": (820, 1180),
+    "tablet": (1024, 768),
+    "laptop": (1400, 900),
+    "screen": (1920, 1080),
+}
+# A phase of the loop, with what the robot reports, and the commands that work in it.
+PHASES = [
+    ("idle", {}, {"tare", "start"}),
+    ("running", {}, {"pause"}),
+    ("paused", {}, {"resume"}),
+    ("held", {}, {"pause", "resume"}),
+    ("stopped", {"loop": {"response": "stop and keep grip"}}, {"tare", "unlock"}),
+    ("idle", {"robot": {"blocked": "The robot is in a protective stop."}}, {"tare", "start", "unlock"}),
+]
+# Text that is wider than its element, and labels that end outside the screen.
+CUT = """() => [...document.querySelectorAll('button, dt, dd, summary, figcaption, h2, p, .legend span')]
+  .filter((element) => element.offsetParent)
+  .filter((element) => element.scrollWidth > element.clientWidth + 1 && getComputedStyle(element).display !== 'inline'
+    || element.getBoundingClientRect().right > innerWidth)
+  .map((element) => element.textContent)"""
+# The share of main that panels cover, and what lies within the first screen.
+COVERED = """() => {
+  const area = ({ width, height }) => width * height;
+  const panels = [...document.querySelectorAll('main .panel')].filter((element) => element.offsetParent);
+  return panels.map((panel) => area(panel.getBoundingClientRect())).reduce((a, b) => a + b)
+    / area(document.querySelector('main').getBoundingClientRect());
+}"""
 
 
 def test_stop_needs_no_token_and_motion_does(browsed):
@@ -21,8 +49,8 @@ def test_stop_needs_no_token_and_motion_does(browsed):
     assert browsed.daemon.asked == ["stop", "stop"]
     page.fill("#token", "not the token")
     page.click("#token-form button")
-    page.click("[data-command=start]")
-    browsed.until("#answer", "start was refused: start needs the token")
+    page.click("[data-command=pause]")
+    browsed.until("#answer", "pause was refused: pause needs the token")
     assert page.locator("#token-form").is_visible(), "it is asked for anew"
     assert browsed.daemon.asked == ["stop", "stop"]
 
@@ -30,17 +58,39 @@ def test_stop_needs_no_token_and_motion_does(browsed):
 def test_commands_reach_the_daemon_with_the_token(browsed):
     page = browsed.open(token=True)
     assert "token" not in page.url, "it does not stay in the address bar"
-    for name in COMMANDS:
-        page.click(f"[data-command={name}]")
-        browsed.until("#answer", f"{name}: done")
-    assert browsed.daemon.asked == list(COMMANDS)
+    sent = []
+    for phase, changed, enabled in PHASES:
+        browsed.daemon.say(**{**changed, "loop": {"phase": phase, **changed.get("loop", {})}})
+        page.wait_for_function(
+            """names => [...document.querySelectorAll('[data-command]:enabled')].map((b) => b.dataset.command).join()
+              === names""",
+            arg=",".join(name for name in COMMANDS if name in enabled),
+        )
+        reasons = browsed.text("#controls-reason")
+        assert all(name in reasons for name in set(COMMANDS) - enabled)
+        for name in sorted(enabled):
+            page.click(f"[data-command={name}]")
+            browsed.until("#answer", f"{name}: done")
+            sent.append(name)
+    assert browsed.daemon.asked == sent
     browsed.daemon.say(refusal="no experiment is running")
-    page.click("[data-command=pause]")
+    page.click("[data-command=pause]:enabled")
     browsed.until("#answer", "pause was refused: no experiment is running")
+
+
+def test_a_rig_without_a_robot_offers_only_tare(browsed):
+    page = browsed.open(token=True)
+    browsed.viewer.kill()
+    browsed.daemon.say(loop=None, health={"tasks": {"right": {"alive": True}}})
+    browsed.viewer.start()
+    browsed.until("#controls-reason", "start, pause, resume, unlock: the configuration has no robot")
+    assert page.locator("[data-command]:enabled").all_inner_texts() == ["Tare"]
 
 
 def test_the_keyboard_reaches_everything_and_stop_first(browsed):
     page = browsed.open(token=True)
+    browsed.daemon.say(loop={"phase": "idle"})
+    page.wait_for_selector("[data-command=tare]:enabled")
     reached: list[dict[str, Any]] = []
     for _ in range(8):
         page.keyboard.press("Tab")
@@ -53,8 +103,8 @@ def test_the_keyboard_reaches_everything_and_stop_first(browsed):
                 }"""
             )
         )
-    assert [each["name"] for each in reached][:6] == ["stop", *COMMANDS]
-    assert all(each["ring"] != "none" for each in reached[:6]), "where the keyboard is can be seen"
+    assert [each["name"] for each in reached][:4] == ["stop", "tare", "start", "SUMMARY"]
+    assert all(each["ring"] != "none" for each in reached[:4]), "where the keyboard is can be seen"
     page.focus("#stop")
     page.keyboard.press("Enter")
     browsed.until("#answer", "stopped: hold 0.10 N·m")
@@ -70,9 +120,10 @@ def test_the_page_fits_and_stop_stays_visible(size, browsed):
     page.set_viewport_size({"width": size[0], "height": size[1]})
     browsed.daemon.say(loop={"phase": "held", "response": "hold", "reasons": REASONS})
     browsed.until("#holding-title", "Holding")
-    found = browsed.layout()
+    found, cut = browsed.layout(), page.evaluate(CUT)
     page.set_viewport_size({"width": 1024, "height": 700})
     assert found["wide"] <= 0
+    assert cut == []
     assert found["spilt"] == []
     assert found["stop"]["top"] >= 0
     assert found["stop"]["bottom"] <= size[1]
@@ -84,6 +135,56 @@ def test_the_page_fits_and_stop_stays_visible(size, browsed):
         for other in panels[n + 1 :]:
             apart = one["right"] <= other["left"] or other["right"] <= one["left"]
             assert apart or one["bottom"] <= other["top"] or other["bottom"] <= one["top"]
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{}, {"shear": None}, {"left": {"source": "left"}, "shear": None}, {"robot": None, "gripper": None}],
+    ids=["skin", "one fingertip", "two fingertips", "no robot"],
+)
+def test_a_wide_page_has_no_empty_part_and_begins_with_what_drives_the_loop(changed, browsed):
+    browsed.viewer.kill()
+    browsed.daemon.say(**changed)
+    browsed.viewer.start()
+    page = browsed.open(token=True)
+    page.set_viewport_size({"width": 1400, "height": 900})
+    browsed.until("#torque-interval", "(95 %)")
+    page.wait_for_selector(f".fingertip >> nth={1 if 'left' in changed else 0}")
+    covered = page.evaluate(COVERED)
+    boxes = {
+        name: page.locator(name).bounding_box()
+        for name in ("#stop", "#tasks .chip >> nth=2", "#torque-source", "#torque-now", "#torque-interval")
+    }
+    page.set_viewport_size({"width": 1024, "height": 700})
+    assert covered > 0.93
+    for name, box in boxes.items():
+        assert box["y"] >= 0, name
+        assert box["y"] + box["height"] <= 800, name
+
+
+def test_the_page_turns_dark_with_its_charts(browsed):
+    page = browsed.open()
+    page.wait_for_selector("#torque-chart canvas")
+    lightness = """async () => {
+      // The change of colours comes with a redraw.
+      for (let i = 0; i < 3; i += 1) await new Promise(requestAnimationFrame);
+      const { colours } = await import('/assets/colours.js');
+      const light = (colour) => {
+        const pen = new OffscreenCanvas(1, 1).getContext('2d');
+        pen.fillStyle = colour;
+        pen.fillRect(0, 0, 1, 1);
+        return pen.getImageData(0, 0, 1, 1).data.slice(0, 3).reduce((a, b) => a + b) / 765;
+      };
+      const page = light(getComputedStyle(document.querySelector('#torque')).backgroundColor);
+      return [page, ...['ink', 'first', 'second', 'wanted'].map((name) => light(colours[name]))];
+    }"""
+    page.emulate_media(color_scheme="dark")
+    dark = page.evaluate(lightness)
+    page.emulate_media(color_scheme="light")
+    light = page.evaluate(lightness)
+    assert max(light[1:]) < 0.5 < light[0]
+    assert dark[0] < 0.2
+    assert min(dark[1:]) > 0.5
 
 
 def test_a_dead_daemon_is_shown_within_two_seconds(browsed):

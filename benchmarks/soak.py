@@ -1,0 +1,84 @@
+"""A long run with faults of every device: memory and descriptors stay flat, and every recording is complete.
+
+    python -m benchmarks.soak --out run/soak.json [--minutes 10] [--speed 30] [--seed 1]
+
+The real daemon and drivers on the emulated rig, whose boards, gel and fingers are `--speed` times as fast. Every
+experiment turns the tool until a device fails, in the random order of the seed; then the device works again. The daemon
+records all the time. Writes the memory and the descriptors of the daemon and of the robot's process before each fault.
+"""
+
+import random
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from benchmarks.common import parser_of, table_head, table_row, write_figures
+from benchmarks.stop_times import CAUSES, RunningRig
+from shearloop.daemon.recording.reader import read_recording
+
+FAULTS = [cause for cause in CAUSES if cause.command]
+
+
+def usage(pid: int) -> tuple[float, int]:
+    """Return the memory in MB and the number of descriptors of a process."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    resident_kb = next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:"))
+    return resident_kb / 1024, len(list(Path(f"/proc/{pid}/fd").iterdir()))
+
+
+def soak(speed: int, seed: int, goes_on: Callable[[int], bool]) -> dict[str, Any]:
+    """Cause faults while `goes_on(number)`; return their counts, the usage before each, and what was recorded."""
+    chosen, counts = random.Random(seed), Counter[str]()
+    used: list[tuple[float, int, float, int]] = []
+    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
+        folder = Path(name)
+        rig = RunningRig(folder, stack, speed, recording={"folder": str(folder / "recordings")})
+        while goes_on(len(used)):
+            cause = chosen.choice(FAULTS)
+            rig.turn()
+            used.append((*usage(rig.daemon.pid), *usage(rig.worker_pid())))
+            rig.stood_ns(rig.cause(cause))
+            rig.recover(cause)
+            counts[cause.name] += 1
+        rig.send("stop")
+        rig.daemon.wait()
+        recordings = sorted((folder / "recordings").iterdir())
+        torques = sum(len(read_recording(path).torque_nm) for path in recordings if path.suffix == ".mcap")
+    quarter = max(1, len(used) // 4)
+    ends = [[median(column) for column in zip(*part, strict=True)] for part in (used[:quarter], used[-quarter:])]
+    names = ("daemon_mb", "daemon_descriptors", "worker_mb", "worker_descriptors")
+    return {
+        "faults": dict(sorted(counts.items())),
+        "first_quarter": dict(zip(names, ends[0], strict=True)),
+        "last_quarter": dict(zip(names, ends[1], strict=True)),
+        "recordings": len(recordings),
+        "incomplete_recordings": [path.name for path in recordings if path.suffix != ".mcap"],
+        "recorded_torques": torques,
+        "usage": used,
+    }
+
+
+def main() -> None:
+    """Soak, print a table and write all figures."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--minutes", type=float, default=10.0, help="duration (default: %(default)s)")
+    parser.add_argument("--speed", type=int, default=30, metavar="N", help="times as fast (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=1, help="of the order of faults (default: %(default)s)")
+    args = parser.parse_args()
+    end_s = time.monotonic() + 60 * args.minutes
+    found = soak(args.speed, args.seed, lambda _: time.monotonic() < end_s)
+    n_faults, damaged = sum(found["faults"].values()), ", ".join(found["incomplete_recordings"]) or "none"
+    print(f"{n_faults} faults, {found['recorded_torques']} recorded torques, incomplete recordings: {damaged}")
+    print(table_head("", *found["first_quarter"]))
+    for part in ("first_quarter", "last_quarter"):
+        print(table_row(part.replace("_", " "), *found[part].values()))
+    write_figures(args.out, found)
+
+
+if __name__ == "__main__":
+    main()

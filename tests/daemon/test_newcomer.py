@@ -78,17 +78,10 @@ class Tree:
         change(content)
         path.write_text(yaml.safe_dump(content))
 
-    def shell(self, command: str, timeout_s: float = DEADLINE_S) -> "subprocess.CompletedProcess[str]":
+    def shell(self, command: str) -> "subprocess.CompletedProcess[str]":
         """Run a command line as it is typed, to its end."""
-        done = subprocess.run(
-            ["/bin/sh", "-c", command],
-            cwd=self.root,
-            env=self.environment,
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=timeout_s,
-        )
+        line = ["/bin/sh", "-c", command]
+        done = subprocess.run(line, cwd=self.root, env=self.environment, capture_output=True, text=True, check=False)
         assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
         return done
 
@@ -151,7 +144,7 @@ async def seen_on_the_page(address: str, topics: set[str]) -> dict[str, Any]:
     import aiohttp
 
     latest: dict[str, Any] = {}
-    async with asyncio.timeout(DEADLINE_S), aiohttp.ClientSession() as http:
+    async with asyncio.timeout(2 * DEADLINE_S), aiohttp.ClientSession() as http:
         async with http.get(address) as page:
             assert "<html" in await page.text()
         async with http.ws_connect(f"{address}stream") as stream:
@@ -172,18 +165,19 @@ def only_twists(content: Any) -> None:
 
 
 @pytest.mark.real_time
-@pytest.mark.timeout(300)
+# The commands take a minute and a quarter of an idle computer, and have no other limit.
+@pytest.mark.timeout(450)
 def test_the_readmes_path_from_the_demo_to_a_calibration_of_ones_own(tree):
     pytest.importorskip("aiohttp", reason="the live view needs the extra `view`")
     pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
     run, run_again, replay, calibrate, evaluate = (f"{PROGRAM} {command}" for command in readme_commands())
-    tree.shell(f"{PROGRAM} demo --folder . --prepare", 2 * DEADLINE_S)
+    tree.shell(f"{PROGRAM} demo --folder . --prepare")
     view = f"{PROGRAM} view --connect ipc://{tree.root}/publish --commands ipc://{tree.root}/commands --port 0 --json"
     with tree.started(run) as demo, tree.started(view) as viewer:
         address = json.loads(viewer.stdout.readline())["url"]
         wanted = {"eit.estimate", "load.torque", "robot.state", "gripper.state", "loop.state", "health"}
         seen = asyncio.run(seen_on_the_page(address, wanted))
-        assert demo.wait(DEADLINE_S) == 0, tree.log.read_text()
+        assert demo.wait() == 0, tree.log.read_text()
     assert seen["loop.state"]["experiment"] == "hold 0.10 N·m"
     tree.change("experiments/hold_torque.yaml", only_twists)
     for ran in (tree.log.read_text(), tree.shell(run_again).stderr):

@@ -29,9 +29,6 @@ from shearloop.bank.eit.matching import ReferenceMatcher
 from shearloop.bank.eit.models import MODELS, conductivity
 from shearloop.bank.errors import CalibrationError, MatchingError
 
-# As in the paper: peaks of an envelope are this many channels apart, and a moving average smooths it.
-_PEAK_DISTANCE = 50
-_AVERAGED = 5
 # The share of the noise that each choice may add.
 ALLOWED = 1.0 / 3.0
 CHANNEL_S = 0.6e-3
@@ -44,9 +41,20 @@ _FINE_CM = (0.05, 0.035)
 _N_DRIFT = 2
 # Settings of the models are for this height, and scale with another one.
 _PAPER_HEIGHT_CM = 3.6
+_PLACES = np.linspace(0.1, 0.9, 9)
 _MIN_FRAMES = 8
 # A smaller share of a frame is rounding: the board's converter alone makes thousands of times as much noise.
 _MIN_NOISE = 1e-6
+
+
+class EnvelopeSettings(NamedTuple):
+    """Peaks of an envelope are `distance` channels apart or more, and a moving average over `averaged` smooths it."""
+
+    distance: int
+    averaged: int
+
+
+PAPER_ENVELOPE = EnvelopeSettings(50, 5)
 
 
 class Setting(NamedTuple):
@@ -69,9 +77,9 @@ def centred_settings(model: str, centre: float) -> list[Setting]:
     return [Setting(k, sigma) for k in places for sigma in widths]
 
 
-def searched_settings(model: str, height: float) -> list[Setting]:
-    """Return settings all over a fingertip of this height, in cm, to search for the best one."""
-    up, size = (_PAPER_HEIGHT_CM * np.linspace(0.1, 0.9, 9)).tolist(), height / _PAPER_HEIGHT_CM
+def searched_settings(model: str, height: float, places: FloatArray = _PLACES) -> list[Setting]:
+    """Return settings at places, shares of the height in cm, all over a fingertip, to search for the best one."""
+    up, size = (_PAPER_HEIGHT_CM * places).tolist(), height / _PAPER_HEIGHT_CM
     places, widths = {
         "step": (up, [1.0]),
         "linear": (up, [2.5, 4.0, 6.0, 10.0]),
@@ -91,32 +99,35 @@ def simulated_signals(forward: ForwardModel, model: str, settings: Sequence[Sett
     return np.array(signals).reshape(-1, forward.table.n_channels)
 
 
-def envelope(magnitudes: FloatArray) -> FloatArray:
+def envelope(magnitudes: FloatArray, settings: EnvelopeSettings = PAPER_ENVELOPE) -> FloatArray:
     """Return the (n,) smoothed curve over the peaks of (n,) magnitudes, the last channel followed by the first.
 
     Raises MatchingError where there are no two peaks to carry it.
     """
     thrice = np.tile(magnitudes, 3)
-    peaks, _ = find_peaks(thrice, distance=_PEAK_DISTANCE)
+    peaks, _ = find_peaks(thrice, distance=settings.distance)
     if len(peaks) < 2:
         raise MatchingError("a signal without peaks has no envelope")
     curve = CubicSpline(peaks, thrice[peaks])(np.arange(len(magnitudes), 2 * len(magnitudes)))
-    return _moving_average(curve)
+    return _moving_average(curve, settings.averaged)
 
 
-def envelope_score(difference: FloatArray, signal: FloatArray) -> float:
+def envelope_score(difference: FloatArray, signal: FloatArray, settings: EnvelopeSettings = PAPER_ENVELOPE) -> float:
     """Return Spearman's correlation of the envelopes of two (n,) signals, the largest over all circular shifts.
 
     The difference is smoothed beforehand. Raises MatchingError as `envelope` does.
     """
-    a, b = _ranks(envelope(_moving_average(np.abs(difference)))), _ranks(envelope(np.abs(signal)))
+    smooth = _moving_average(np.abs(difference), settings.averaged)
+    a, b = _ranks(envelope(smooth, settings)), _ranks(envelope(np.abs(signal), settings))
     correlations = np.fft.irfft(np.fft.rfft(a) * np.conj(np.fft.rfft(b)), len(a))
     return float(correlations.max())
 
 
-def mean_envelope_score(difference: FloatArray, signals: FloatArray) -> float:
+def mean_envelope_score(
+    difference: FloatArray, signals: FloatArray, settings: EnvelopeSettings = PAPER_ENVELOPE
+) -> float:
     """Return the mean of the envelope scores of (m, n) signals, for one (n,) difference."""
-    return float(np.mean([envelope_score(difference, signal) for signal in signals]))
+    return float(np.mean([envelope_score(difference, signal, settings) for signal in signals]))
 
 
 def matching_scores(differences: FloatArray, signals: FloatArray) -> FloatArray:
@@ -129,8 +140,8 @@ def matching_scores(differences: FloatArray, signals: FloatArray) -> FloatArray:
     return best
 
 
-def _moving_average(values: FloatArray) -> FloatArray:
-    return np.asarray(np.mean([np.roll(values, shift) for shift in range(_AVERAGED)], axis=0))
+def _moving_average(values: FloatArray, averaged: int) -> FloatArray:
+    return np.asarray(np.mean([np.roll(values, shift) for shift in range(averaged)], axis=0))
 
 
 def _ranks(values: FloatArray) -> FloatArray:

@@ -56,6 +56,7 @@ def _reproduce(args: argparse.Namespace, jobs: int) -> "tuple[Reproduction, dict
 
     from shearloop.daemon.analysis.reproduce import analysis
     from shearloop.daemon.analysis.reproduce.banks import GRIDS, cached_bank, choose_mesh, focused_grid
+    from shearloop.daemon.analysis.reproduce.dataset import read_twists, regress_on_channels
     from shearloop.daemon.analysis.reproduce.report import Reproduction
 
     inputs = analysis.read_inputs(args.recordings)
@@ -89,5 +90,7 @@ def _reproduce(args: argparse.Namespace, jobs: int) -> "tuple[Reproduction, dict
         if inputs.diameter is not None:
             with progress_bar("matching", len(inputs.diameter.differences), "slice") as show:
                 diameter = analysis.analyse_diameter(inputs.diameter, banks["wide"], show)
-    valid_cells = int(banks["wide"].valid.sum())
-    return Reproduction(origin, valid_cells, torque, diameter, models, tuple(notes)), banks
+    regressions = regress_on_channels(torque.slices, torque.parts) if torque else ()
+    twists = read_twists(args.recordings, notes) if torque else None
+    found = Reproduction(mesh, origin, banks["wide"], torque, diameter, models, regressions, twists, tuple(notes))
+    return found, banks

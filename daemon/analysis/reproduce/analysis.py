@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import PAPER_TABLE, smoothed_along_channels
 from shearloop.bank.eit.design import (
+    PAPER_ENVELOPE,
+    EnvelopeSettings,
     centred_settings,
     matching_scores,
     mean_envelope_score,
@@ -100,8 +101,12 @@ _BATCH = 8
 _RESTART_SHARE = 0.5
 # This share of a series' steps must rise: noise may swap neighbouring levels.
 _RISING_SHARE = 0.8
-# k-means runs from this many starts, and the tightest groups are kept.
-_STARTS = 20
+# The paper does not give the settings of its envelope: these around them show what the ranking depends on.
+ENVELOPES = tuple(
+    EnvelopeSettings(distance, averaged) for distance in (30, 40, 50, 60, 70) for averaged in (1, 3, 5, 7, 9)
+)
+# Shares of the height at which a model is tried for the matching score. More change it by less than 0.001.
+_PLACES = np.linspace(0.02, 0.98, 49)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,22 +125,27 @@ class TorqueResult:
     """The torque slices' results. Correlations are Pearson's, between torque and the best match's sigma.
 
     `groups` (n,) are levels of torque, `r_clustered` is between their means, and `fit` is the parabola through these.
-    `rmse_nm` is of single slices, each predicted by a parabola fitted without its part of the recording. `grouping` and
-    `held_out` describe the groups and the parts.
+    `parts` (n,) are parts of the recording. `rmse_nm` is of single slices, each predicted by a parabola fitted without
+    its part. `grouping` and `held_out` describe the groups and the parts.
     """
 
     slices: Slices
     focused: Matches
     wide: Matches
     r_focused: float | None
-    r_wide: float | None
     groups: IntArray
     grouping: str
     r_clustered: float | None
+    parts: IntArray
     fit: Polynomial | None
     rmse_nm: float | None
     held_out: str
     notes: tuple[str, ...]
+
+    @property
+    def r_wide(self) -> float | None:
+        """The correlation on the wide bank."""
+        return correlation(self.wide.sigma, self.slices.torque_nm)
 
     @property
     def group_torque_nm(self) -> FloatArray:
@@ -153,7 +163,7 @@ class DiameterResult:
     """The diameter slices' results: Pearson's correlation between diameter and the best match's k.
 
     `single` is slice by slice. `accumulated` has one match per diameter (d,), of its mean heatmap; `fit` is the line
-    through its k.
+    through its k. `running_k` (n,) are of the sum of a cylinder's heatmaps up to each slice.
     """
 
     slices: Slices
@@ -162,19 +172,24 @@ class DiameterResult:
     diameters_mm: FloatArray
     accumulated: Matches
     r_accumulated: float | None
+    running_k: FloatArray
+    r_running_sum: float | None
     fit: Polynomial | None
     notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelScores:
-    """The score of each basis model in two measures (see bank.eit.model_scores), None where it is undefined.
+    """The score of each basis model in two measures (see bank.eit.design), None where it is undefined.
 
-    `envelope` needs the raw frame; `matching` is over the torque slices.
+    `envelope` needs the raw frame; `matching` is over the torque slices. `n_slices` counts the slices that a model
+    matches best, and `n_envelopes` the settings of the envelope by which it is first.
     """
 
     envelope: dict[str, float | None] | None
     matching: dict[str, float | None]
+    n_slices: dict[str, int]
+    n_envelopes: dict[str, int]
 
     @property
     def chosen(self) -> dict[str, float | None]:
@@ -220,10 +235,10 @@ def analyse_torque(slices: Slices, on_focused: Matches, on_wide: Matches) -> Tor
         focused=on_focused,
         wide=on_wide,
         r_focused=correlation(sigma, torque),
-        r_wide=correlation(on_wide.sigma, torque),
         groups=groups,
         grouping=grouping,
         r_clustered=r_clustered,
+        parts=parts,
         fit=fit,
         rmse_nm=rmse_nm,
         held_out=held_out,
@@ -238,6 +253,9 @@ def analyse_diameter(slices: Slices, wide: Bank, progress: Progress) -> Diameter
     heatmaps = np.array([single.heatmaps[slices.diameter_mm == each].mean(axis=0) for each in diameters])
     accumulated = _best_matches(heatmaps, wide)
     r_accumulated = correlation(accumulated.k, diameters)
+    sums = [single.heatmaps[slices.diameter_mm == each].cumsum(axis=0) for each in diameters]
+    # Slices stand by rising diameter.
+    running_k = _best_matches(np.concatenate(sums), wide).k
     notes: list[str] = []
     if r_accumulated is None:
         notes.append(f"{len(diameters)} diameters, or too few distinct k, do not make a correlation of k with diameter")
@@ -248,6 +266,8 @@ def analyse_diameter(slices: Slices, wide: Bank, progress: Progress) -> Diameter
         diameters_mm=diameters,
         accumulated=accumulated,
         r_accumulated=r_accumulated,
+        running_k=running_k,
+        r_running_sum=correlation(running_k, slices.diameter_mm),
         fit=_fit_or_note(accumulated.k, diameters, DIAMETER_DEGREE, "diameter over k", notes),
         notes=tuple(notes),
     )
@@ -257,18 +277,40 @@ def score_models(slices: Slices, raw_difference: FloatArray | None, mesh: Mesh) 
     """Score the five basis models on a mesh against the slices and, if given, a raw (896,) difference."""
     forward = ForwardModel(mesh)
     middle = float(mesh.nodes[:, 1].min() + mesh.nodes[:, 1].max()) / 2
-    envelope: dict[str, float | None] = {}
-    matching: dict[str, float | None] = {}
+    of_slices: dict[str, FloatArray] = {}
+    envelopes: dict[str, dict[EnvelopeSettings, float]] = {}
     for model in MODELS:
-        searched = simulated_signals(forward, model, searched_settings(model, mesh.height_cm))
-        matching[model] = float(matching_scores(slices.differences, searched).mean()) if len(searched) else None
+        searched = simulated_signals(forward, model, searched_settings(model, mesh.height_cm, _PLACES))
+        if len(searched):
+            of_slices[model] = matching_scores(slices.differences, searched)
         if raw_difference is not None:
-            centred = simulated_signals(forward, model, centred_settings(model, middle))
-            envelope[model] = None
-            # A signal without peaks has no score.
-            with suppress(MatchingError):
-                envelope[model] = mean_envelope_score(raw_difference, centred) if len(centred) else None
-    return ModelScores(envelope or None, matching)
+            envelopes[model] = _envelope_scores(
+                raw_difference, simulated_signals(forward, model, centred_settings(model, middle))
+            )
+    by_slice = [{model: float(found[i]) for model, found in of_slices.items()} for i in range(len(slices.numbers))]
+    by_envelope = [{model: found[one] for model, found in envelopes.items() if one in found} for one in ENVELOPES]
+    return ModelScores(
+        envelope={model: found.get(PAPER_ENVELOPE) for model, found in envelopes.items()} or None,
+        matching={model: float(of_slices[model].mean()) if model in of_slices else None for model in MODELS},
+        n_slices=_times_first(by_slice),
+        n_envelopes=_times_first(by_envelope),
+    )
+
+
+def _envelope_scores(difference: FloatArray, signals: FloatArray) -> dict[EnvelopeSettings, float]:
+    """Return the scores of (m, n) signals by the envelope's settings, without those that are undefined."""
+    found = {}
+    for settings in ENVELOPES if len(signals) else ():
+        # A signal without peaks has no score.
+        with suppress(MatchingError):
+            found[settings] = mean_envelope_score(difference, signals, settings)
+    return found
+
+
+def _times_first(rankings: list[dict[str, float]]) -> dict[str, int]:
+    """Return how often each model has the largest score."""
+    first = [max(scores, key=lambda model: scores[model]) for scores in rankings if scores]
+    return {model: first.count(model) for model in MODELS}
 
 
 def correlation(x: FloatArray, y: FloatArray) -> float | None:
@@ -357,21 +399,30 @@ def _rising_levels(cost: FloatArray) -> IntArray:
     return levels
 
 
-def kmeans_groups(values: FloatArray, n_groups: int, seed: int = 0) -> IntArray:
-    """Return the group of each of (n,) values, numbered from 0 by rising mean; at most as many groups as values differ.
+def kmeans_groups(values: FloatArray, n_groups: int) -> IntArray:
+    """Return the group of each of (n,) values, numbered from 0 by rising mean: the k-means groups of least squares.
 
-    The same values and seed give the same groups.
+    Groups of numbers are intervals, so the best ends are found exactly (Wang and Song 2011, dynamic programming).
+    `n_groups` may be at most the number of distinct values.
     """
-    points, generator = values[:, None], np.random.default_rng(seed)
-    distinct = np.unique(points, axis=0)
-    best, least = np.zeros(len(values), dtype=np.int64), np.inf
-    for _ in range(_STARTS):
-        start = distinct[generator.choice(len(distinct), n_groups, replace=False)]
-        centres, labels = kmeans2(points, start, iter=100, minit="matrix", missing="raise")
-        distance = float(((points - centres[labels]) ** 2).sum())
-        if distance < least:
-            best, least = labels.astype(np.int64), distance
-    return np.argsort(np.argsort(group_means(values, best)))[best]
+    distinct, of_value, weight = np.unique(values, return_inverse=True, return_counts=True)
+    centred = distinct - distinct.mean()
+    total = [np.concatenate([[0.0], np.cumsum(weight * centred**power)]) for power in (0, 1, 2)]
+    n = len(distinct)
+    # least[j]: the least sum of squares of the first j values in the groups so far; begin[g][j] begins the last group.
+    least, begin = np.where(np.arange(n + 1) == 0, 0.0, np.inf), []
+    for _ in range(n_groups):
+        cost = np.full((n + 1, n + 1), np.inf)
+        for j in range(1, n + 1):
+            m, s, q = (each[j] - each[:j] for each in total)
+            cost[j, :j] = least[:j] + q - s**2 / m
+        begin.append(cost.argmin(axis=1))
+        least = cost.min(axis=1)
+    groups, end = np.empty(n, dtype=np.int64), n
+    for group in reversed(range(n_groups)):
+        start = int(begin[group][end])
+        groups[start:end], end = group, start
+    return groups[of_value]
 
 
 def group_means(values: FloatArray, groups: IntArray) -> FloatArray:

@@ -1,6 +1,7 @@
 """The numbers and figures of a reproduction, next to the paper's."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,16 +16,27 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.matching import Match
+from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration
 from shearloop.bank.polynomial import Polynomial
+from shearloop.daemon.analysis.charts.bank_figures import models_figure, signal_figure
 from shearloop.daemon.analysis.charts.drawing import figure, lay_out
 from shearloop.daemon.analysis.reproduce.analysis import DiameterResult, Matches, ModelScores, TorqueResult
+from shearloop.daemon.analysis.reproduce.dataset import (
+    PAPER_CHANNELS,
+    PAPER_SHARE,
+    ChannelRegression,
+    Twists,
+    dataset_figure,
+)
 
 PAPER = "Trehan, Hardman and Iida 2025, Sensors 25, 5159"
 # As published, without signs: sigma falls with rising torque, and k with rising diameter.
 PAPER_TORQUE_R, PAPER_TORQUE_CLUSTERED_R, PAPER_DIAMETER_R = 0.6552, 0.9588, 0.9746
+# "The model correlates with experimental data for k > 3.5, σ > 0.6", in cm (its section 4).
+PAPER_REGION_CM = (3.5, 0.6)
 # The bars of figure 5.
 PAPER_MODEL_SCORES = {
     "step": 0.65126,
@@ -39,12 +51,28 @@ PAPER_MODEL_SCORES = {
 class Reproduction:
     """The results on a mesh; None where the recordings are missing."""
 
+    mesh: Mesh
     mesh_origin: str
-    bank_valid_cells: int
+    wide: Bank
     torque: TorqueResult | None
     diameter: DiameterResult | None
     models: ModelScores | None
+    regressions: tuple[ChannelRegression, ...]
+    twists: Twists | None
     notes: tuple[str, ...]
+
+    @property
+    def bank_valid_cells(self) -> int:
+        """The number of valid cells of the wide bank."""
+        return int(self.wide.valid.sum())
+
+    def region_agreement(self) -> dict[str, float]:
+        """Return the share of the wide bank's cells whose validity agrees with the paper's region, by its reading."""
+        in_k, in_sigma = (self.wide.k_grid > PAPER_REGION_CM[0])[:, None], self.wide.sigma_grid > PAPER_REGION_CM[1]
+        return {
+            "or": float((self.wide.valid == (in_k | in_sigma)).mean()),
+            "and": float((self.wide.valid == (in_k & in_sigma)).mean()),
+        }
 
 
 def json_text(found: Reproduction) -> str:
@@ -56,9 +84,15 @@ def json_text(found: Reproduction) -> str:
         "torque_sigma_r_clustered": torque.r_clustered if torque else None,
         "diameter_k_r_single": diameter.r_single if diameter else None,
         "diameter_k_r_accumulated": diameter.r_accumulated if diameter else None,
+        "diameter_k_r_running_sum": diameter.r_running_sum if diameter else None,
         "model_scores": models.chosen if models else dict.fromkeys(MODELS),
         "torque_rmse_nm_cross_validated": torque.rmse_nm if torque else None,
+        "torque_regression_r_share": found.regressions[0].r_share_at(PAPER_CHANNELS) if found.regressions else None,
+        "torque_regression_channels_for_80_percent_of_r2": (
+            found.regressions[0].counts_reaching(PAPER_SHARE) if found.regressions else None
+        ),
         "bank_valid_cells": found.bank_valid_cells,
+        "paper_region_agreement": found.region_agreement(),
     }
     return json.dumps(numbers, indent=2, allow_nan=False)
 
@@ -75,11 +109,25 @@ def table(found: Reproduction) -> str:
             ("torque of a single slice, RMSE cross-validated, N·m", "", _number(torque.rmse_nm)),
             ("   beside the torques' standard deviation, N·m", "", _number(float(torque.slices.torque_nm.std()))),
         ]
+    if found.regressions:
+        share, needed = (
+            found.regressions[0].r_share_at(PAPER_CHANNELS),
+            found.regressions[0].counts_reaching(PAPER_SHARE),
+        )
+        rows += [
+            (f"linear regression: r of {PAPER_CHANNELS} channels over r of all", f"{PAPER_SHARE:.4f}", _number(share)),
+            ("linear regression: channels for 80 % of R²", str(PAPER_CHANNELS), _count_range(needed)),
+        ]
     if found.diameter:
         diameter = found.diameter
         rows += [
             ("diameter and k, r, single slices", "", _number(diameter.r_single)),
-            ("diameter and k, r, heatmaps accumulated", f"{PAPER_DIAMETER_R:.4f}", _number(diameter.r_accumulated)),
+            ("diameter and k, r, one point per cylinder", f"{PAPER_DIAMETER_R:.4f}", _number(diameter.r_accumulated)),
+            (
+                "diameter and k, r, running sums, one per slice",
+                f"{PAPER_DIAMETER_R:.4f}",
+                _number(diameter.r_running_sum),
+            ),
         ]
     if found.models:
         what = "matching" if found.models.envelope is None else "envelope"
@@ -93,6 +141,10 @@ def table(found: Reproduction) -> str:
                 for name, score in found.models.matching.items()
             ]
     rows.append(("cells of the wide bank that are valid", "", str(found.bank_valid_cells)))
+    rows += [
+        (f"cells where that is the paper's region, k > 3.5 {word} σ > 0.6", "", f"{share:.1%}")
+        for word, share in found.region_agreement().items()
+    ]
     width = max(len(name) for name, *_ in rows)
     lines = [f"{name:<{width}}  {paper:>8}  {here:>9}".rstrip() for name, paper, here in rows]
     return "\n".join([*lines, "", *explanations(found)])
@@ -106,19 +158,36 @@ def explanations(found: Reproduction) -> list[str]:
             f"Torque: {len(found.torque.slices.torque_nm)} slices, grouped {found.torque.grouping}.",
             f"RMSE: a parabola for single slices, {found.torque.held_out}; no other recording is tried.",
         ]
+    if found.regressions:
+        sentences.append(_regression_explanation(found.regressions))
     if found.diameter:
         n_slices, n_diameters = len(found.diameter.slices.diameter_mm), len(found.diameter.diameters_mm)
-        sentences.append(f"Diameter: {n_slices} slices of {n_diameters} diameters, smoothed along the channels.")
+        sentences.append(
+            f"Diameter: {n_slices} slices of {n_diameters} diameters, smoothed along the channels. The heatmaps of a "
+            "cylinder are added up to one point, or up to each slice in turn (running sums)."
+        )
     if found.models:
         sentences += _model_explanations(found.models)
     results = (found.torque, found.diameter)
     return [*sentences, *found.notes, *(note for result in results if result for note in result.notes)]
 
 
+def _regression_explanation(regressions: Sequence[ChannelRegression]) -> str:
+    by_all, by_fitted = (_count_range(one.counts_reaching(PAPER_SHARE)) for one in regressions)
+    return (
+        "Linear regression: least squares on the best channels, each part of the recording left out and predicted. "
+        "R² first has 80 % of all channels' at the smaller number and keeps it from the larger one: "
+        f"{by_all} with channels ranked by all slices, {by_fitted} ranked without the part. "
+        "Between them the fit has about as many channels as slices and follows the noise."
+    )
+
+
 def _model_explanations(models: ModelScores) -> list[str]:
+    ranked = sorted((score for score in models.matching.values() if score is not None), reverse=True)
     matching = (
         "Matching score: the largest normalised cross-correlation over lags and settings, averaged over the slices; "
-        f"first is {_first(models.matching)}."
+        f"first is {_first(models.matching)} by {ranked[0] - ranked[1]:.4f}, and it matches best in "
+        f"{max(models.n_slices.values())} of {sum(models.n_slices.values())} slices."
     )
     if models.envelope is None:
         return [f"{matching} The paper's own measure needs TorqueSlice.mat and TorqueSliceHom.mat in torque_slices."]
@@ -127,8 +196,18 @@ def _model_explanations(models: ModelScores) -> list[str]:
         "Envelope score: the paper's measure, Spearman's correlation of the envelopes of one raw difference and the "
         "simulated signal at the best circular shift, averaged over settings of a centred model; first is "
         f"{_first(models.envelope)}, and the largest difference from the paper's is {max(gaps, default=0.0):.3f}.",
+        f"The ranking depends on the envelope's settings: by {sum(models.n_envelopes.values())} pairs of peak distance "
+        f"and moving average around the paper's, first is {_first_counts(models.n_envelopes)}.",
         matching,
     ]
+
+
+def _first_counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{MODELS[name].title} {count}×" for name, count in counts.items() if count)
+
+
+def _count_range(counts: tuple[int, int] | None) -> str:
+    return "none" if counts is None else f"{counts[0]} to {counts[1]}" if counts[0] < counts[1] else str(counts[0])
 
 
 def save_calibrations(found: Reproduction, banks: dict[str, Bank], recordings: Path, folder: Path) -> list[Path]:
@@ -171,6 +250,12 @@ _HEATMAPS_SHOWN = 4
 def draw_all(found: Reproduction, banks: dict[str, Bank], folder: Path) -> list[Path]:
     """Draw the figures of all existing results as PNG and SVG, and return the paths; raises OSError."""
     figures: dict[str, Figure] = {}
+    if found.torque:
+        figures["figure_3_dataset"] = dataset_figure(
+            found.torque.slices, found.torque.parts, found.regressions, found.twists
+        )
+    figures["figure_4_models"] = models_figure(found.mesh)
+    figures["figure_6_bank"] = signal_figure(found.wide)
     if found.models:
         figures["figure_5_models"] = model_figure(found.models)
     if found.torque:

@@ -94,6 +94,15 @@ def test_diameter_is_related_to_the_k_of_the_best_match(signals, bank):
     np.testing.assert_allclose(found.single.heatmaps, ReferenceMatcher.from_bank(bank).heatmaps(smooth), atol=1e-14)
     np.testing.assert_allclose(found.accumulated.heatmaps[2], found.single.heatmaps[3:].mean(axis=0), atol=1e-14)
     assert max(found.r_single, found.r_accumulated) < -0.9
+    sums = [
+        found.single.heatmaps[:1],
+        found.single.heatmaps[:2],
+        *([heatmap] for heatmap in found.single.heatmaps[2:4]),
+    ]
+    sums.append(found.single.heatmaps[3:])
+    running = [best_match(np.sum(one, axis=0), bank.k_grid, bank.sigma_grid).k for one in sums]
+    assert found.running_k.tolist() == running
+    assert found.r_running_sum == pytest.approx(np.corrcoef(running, slices.diameter_mm)[0, 1], abs=1e-12)
 
 
 def test_two_diameters_make_no_correlation(signals, bank):
@@ -115,6 +124,8 @@ def test_without_a_raw_frame_models_are_scored_by_the_matching(signals, coarse_m
     assert scores.envelope is None
     assert scores.chosen is scores.matching
     assert max(scores.matching, key=lambda name: scores.matching[name] or 0) == "gaussian_derivative"
+    assert scores.n_slices["gaussian_derivative"] == sum(scores.n_slices.values()) == 2
+    assert sum(scores.n_envelopes.values()) == 0
     silent = score_models(slices, np.zeros(896), coarse_mesh)
     assert set(silent.chosen.values()) == {None}
 
@@ -230,6 +241,34 @@ def test_kmeans_finds_groups_that_are_there_and_the_same_ones_each_time():
     groups = kmeans_groups(values, 4)
     assert groups.tolist() == kmeans_groups(values, 4).tolist() == truth.tolist()
     np.testing.assert_allclose(group_means(values, groups), [0, 10, 20, 30], atol=1)
+
+
+@given(
+    values=st.lists(st.integers(0, 12), min_size=3, max_size=9).filter(lambda one: len(set(one)) >= 3),
+    n_groups=st.integers(1, 3),
+)
+def test_kmeans_groups_have_the_least_squares_of_all_groups(values, n_groups):
+    ordered = np.sort(np.array(values, dtype=float))
+
+    def squares(parts) -> float:
+        return sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
+
+    groups = kmeans_groups(np.array(values, dtype=float), n_groups)
+    assert sorted(set(groups.tolist())) == list(range(n_groups))
+    cuts = combinations(range(1, len(values)), n_groups - 1)
+    least = min(squares(np.split(ordered, list(cut))) for cut in cuts)
+    found = squares([np.array(values, dtype=float)[groups == one] for one in range(n_groups)])
+    assert found == pytest.approx(least, abs=1e-9)
+
+
+def test_ten_groups_are_found_where_kmeans_loses_some():
+    """SciPy's k-means ends in ClusterError here, from one of twenty random starts."""
+    values = np.array(
+        [0, 143, 165, 92, 55, 109, 54, 82, 1, 0, 515, 604, 3, 46, 869, 11, 27, 154, 107, 38, 38, 1, 54, 123, 8]
+    )
+    groups = kmeans_groups(values / 100, 10)
+    assert np.unique(groups).tolist() == list(range(10))
+    assert (np.diff(group_means(values / 100, groups)) > 0).all()
 
 
 def test_kmeans_takes_as_many_groups_as_there_are_values():

@@ -20,11 +20,16 @@ KEYS = [
     "torque_sigma_r_clustered",
     "diameter_k_r_single",
     "diameter_k_r_accumulated",
+    "diameter_k_r_running_sum",
     "model_scores",
     "torque_rmse_nm_cross_validated",
+    "torque_regression_r_share",
+    "torque_regression_channels_for_80_percent_of_r2",
     "bank_valid_cells",
+    "paper_region_agreement",
 ]
-FIGURES = {"figure_5_models", "figure_7_heatmap", "figure_8_torque", "figure_9_diameter"}
+OF_ANY = {"figure_4_models", "figure_6_bank"}
+FIGURES = OF_ANY | {"figure_3_dataset", "figure_5_models", "figure_7_heatmap", "figure_8_torque", "figure_9_diameter"}
 
 
 def test_numbers_figures_and_calibrations_are_made(make_recordings, coarse_fingertip, tmp_path, capsys, monkeypatch):
@@ -39,6 +44,9 @@ def test_numbers_figures_and_calibrations_are_made(make_recordings, coarse_finge
     assert found["torque_sigma_r_focused"] < -0.99
     assert found["torque_sigma_r_clustered"] < -0.99
     assert found["diameter_k_r_accumulated"] < -0.95
+    assert found["diameter_k_r_running_sum"] < -0.95
+    # All σ are above 0.6 and all cells are valid; of seven k one is above 3.5.
+    assert found["paper_region_agreement"] == {"or": 1.0, "and": pytest.approx(1 / 7)}
     assert 0 < found["torque_rmse_nm_cross_validated"] < 0.01
     assert set(found["model_scores"]) == set(PAPER_MODEL_SCORES)
     assert found["bank_valid_cells"] == 56
@@ -66,6 +74,8 @@ def test_numbers_figures_and_calibrations_are_made(make_recordings, coarse_finge
     assert f"{found['torque_sigma_r_focused']:.5f}" in said.out
     assert "0.6552" in said.out
     assert "grouped by place in 3 repeated series" in said.out
+    assert "The ranking depends on the envelope's settings: by 25 pairs" in said.out
+    assert f"{tmp_path / 'site' / 'recordings' / 'streams'} has no recording of twists" in said.out
 
 
 @pytest.mark.parametrize("present", ["torque", "diameter"])
@@ -82,7 +92,7 @@ def test_one_kind_of_slice_is_enough(make_recordings, coarse_fingertip, tmp_path
     assert f"nothing about {absent}" in printed
     assert ("needs TorqueSlice.mat and TorqueSliceHom.mat" in printed) == (present == "torque")
     drawn = {path.stem for path in out.glob("*.png")}
-    assert drawn == ({"figure_9_diameter"} if present == "diameter" else FIGURES - {"figure_9_diameter"})
+    assert drawn == (OF_ANY | {"figure_9_diameter"} if present == "diameter" else FIGURES - {"figure_9_diameter"})
 
 
 def test_the_papers_mesh_is_taken_where_it_is_beside_the_recordings(make_recordings, tmp_path, shared):

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from shearloop.daemon.cli.options import add_cluster, add_option, checked_jobs
-from shearloop.daemon.errors import UserError
+from shearloop.daemon.errors import UserError, require
 
 NAMES = {
     "speed-accuracy": "latency against torque error of every estimator, forward methods, and the loop's window",
@@ -31,10 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Draw one chart and print its paths."""
     _check_arguments(args)
-    try:
-        import matplotlib as _  # noqa: F401 - its absence is reported before anything is measured
-    except ModuleNotFoundError as error:
-        raise UserError("charts need matplotlib: `pip install 'shearloop[plot]'`") from error
+    require("matplotlib", "plot", "a chart")
     from shearloop.daemon.analysis.charts import scene, speed_accuracy, stability
     from shearloop.daemon.analysis.charts.drawing import check_takes_pictures
     from shearloop.daemon.analysis.charts.sources import bank_of, mesh_of, splits

@@ -5,6 +5,7 @@ import codecs
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import needs_keys
 
 if TYPE_CHECKING:
+    from shearloop.bank.eit.fingertip import Fingertip
     from shearloop.bank.estimation import Calibration, FrameSeries
     from shearloop.daemon.messaging.keys import ClientKeys
 
@@ -61,6 +63,20 @@ def add_connection(parser: argparse.ArgumentParser, default: str, purpose: str) 
     parser.add_argument("--connect", default=default, metavar="ADDRESS", help=f"{purpose} (default: %(default)s)")
     add_option(parser, "--key", Path, "FILE", "your .key_secret, for a daemon on the network (default: in ~/.config)")
     add_option(parser, "--server-key", Path, "FILE", "that daemon's .key (default: in ~/.config)")
+
+
+def add_fingertip(parser: argparse.ArgumentParser) -> None:
+    """Add `--fingertip`, which `load_fingertip` reads."""
+    add_option(parser, "--fingertip", Path, "FILE", "the fingertip's dimensions; by default the paper's fingertip")
+
+
+def load_fingertip(path: Path | None) -> "Fingertip":
+    """Return the fingertip of a file, or the paper's; raises UserError for a file that cannot be used."""
+    from shearloop.daemon.bank_config import FingertipGeometryConfig
+    from shearloop.daemon.config_file import load_yaml_model
+
+    with resources.as_file(resources.files("shearloop.daemon.web") / "assets" / "fingertip.yaml") as paper:
+        return load_yaml_model(path or paper, FingertipGeometryConfig).fingertip()
 
 
 def user_key_folder() -> Path:

@@ -10,10 +10,13 @@ from typing import TYPE_CHECKING
 from shearloop.daemon.cli.options import (
     PAPERS_RECORDINGS,
     add_action,
+    add_fingertip,
     add_json,
     add_option,
     check_overwrite,
+    load_fingertip,
     run_action,
+    writing,
 )
 from shearloop.daemon.cli.terminal import print_result, progress_bar
 from shearloop.daemon.errors import UserError
@@ -21,6 +24,8 @@ from shearloop.daemon.errors import UserError
 if TYPE_CHECKING:
     from shearloop.daemon.recording.reader import RecordingSummary
 
+# Exports in one file, and how it begins.
+_SINGLE_FILES = {"mat": ("a MATLAB file", b"MATLAB"), "rrd": ("a file of Rerun", b"RRF")}
 
 run = run_action
 
@@ -43,12 +48,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(repair, "recording", Path, "REC", "e.g. NAME.mcap.partial; it is not changed")
     add_option(repair, "--out", Path, "FILE", "recording to write (default: NAME.mcap, or NAME.repaired.mcap)")
     add_json(repair)
-    export = add_action(parts, "export", "write a recording's topics as CSV, Parquet or for MATLAB", _export)
+    export = add_action(parts, "export", "write a recording as tables, or for MATLAB, Rerun or LeRobot", _export)
     add_option(export, "recording", Path, "REC", "a recording (.mcap or .mcap.partial)")
-    text = "format of the tables (default: %(default)s)"
-    export.add_argument("--format", choices=("csv", "parquet", "mat"), default="csv", help=text)
-    add_option(export, "--out", Path, "PATH", "folder of one file per topic; for mat a file (default: next to REC)")
+    choices = ("csv", "parquet", "mat", "rrd", "lerobot")
+    export.add_argument("--format", choices=choices, default="csv", help="(default: %(default)s)")
+    add_option(export, "--out", Path, "PATH", "folder to write; for mat and rrd a file (default: next to REC)")
     export.add_argument("--topic", action="append", metavar="TOPIC", help="export only this topic; repeatable")
+    add_fingertip(export)
     add_json(export)
 
 
@@ -105,19 +111,32 @@ def _repair(args: argparse.Namespace) -> int:
 
 def _export(args: argparse.Namespace) -> int:
     from shearloop.daemon.recording.export import export
+    from shearloop.daemon.recording.schema import INPUT
     from shearloop.daemon.recording.tables import RecordedTopics
 
-    stem = args.recording.name.partition(".mcap")[0]
-    out = args.out or args.recording.with_name(f"{stem}.mat" if args.format == "mat" else f"{stem}_{args.format}")
-    if args.format == "mat":
-        check_overwrite(out, "a MATLAB file", b"MATLAB")
-    counts = RecordedTopics(args.recording).counts
+    path, form = args.recording, args.format
+    stem, kind = path.name.partition(".mcap")[0], _SINGLE_FILES.get(form)
+    out = args.out or path.with_name(f"{stem}.{form}" if kind else f"{stem}_{form}")
+    if kind:
+        check_overwrite(out, *kind)
+    counts = RecordedTopics(path).counts
     unknown = [topic for topic in args.topic or () if topic not in counts]
     if unknown:
-        raise UserError(f"{args.recording} has no topic {unknown[0]!r}; it has {', '.join(counts)}")
+        raise UserError(f"{path} has no topic {unknown[0]!r}; it has {', '.join(counts)}")
     topics = args.topic or list(counts)
-    with progress_bar(args.format, sum(counts[topic] for topic in topics), "message") as progress:
-        written = export(args.recording, args.format, out, topics, progress)
+    if form in ("rrd", "lerobot"):
+        topics = [topic for topic in topics if not topic.startswith(f"{INPUT}.")]
+    with progress_bar(form, sum(counts[topic] for topic in topics), "message") as progress, writing(out, "the export"):
+        if form == "rrd":
+            from shearloop.daemon.recording.rerun import export_rerun
+
+            written = [export_rerun(path, out, topics, load_fingertip(args.fingertip), progress)]
+        elif form == "lerobot":
+            from shearloop.daemon.recording.lerobot import export_lerobot
+
+            written = export_lerobot(path, out, topics, progress)
+        else:
+            written = export(path, form, out, topics, progress)
     return print_result({"files": [str(path) for path in written]}, map(str, written), as_json=args.json)
 
 

@@ -3,13 +3,13 @@
 import argparse
 import asyncio
 import json
-from importlib import resources
-from importlib.util import find_spec
 from pathlib import Path
 
-from shearloop.daemon.cli.options import add_connection, add_option, client_keys
-from shearloop.daemon.errors import UserError
+from shearloop.daemon.cli.options import add_connection, add_fingertip, add_option, client_keys, load_fingertip
+from shearloop.daemon.cli.terminal import print_result
+from shearloop.daemon.errors import UserError, require
 from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS
+from shearloop.daemon.process import interrupt_status
 
 PORT = 7760
 
@@ -21,7 +21,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--commands", str, "ADDRESS", text, default=COMMAND_ADDRESS)
     text = "the page's port on 127.0.0.1; 0 for any free one (default: %(default)s)"
     add_option(parser, "--port", int, "PORT", text, default=PORT)
-    add_option(parser, "--fingertip", Path, "FILE", "the fingertip's dimensions; by default the paper's fingertip")
+    text = "serve Foxglove at this port of 127.0.0.1 instead of the page; 0 for any free one"
+    add_option(parser, "--foxglove", int, "PORT", text)
+    add_fingertip(parser)
     text = "the token that permits motion (default: ~/.local/state/shearloop/view-token)"
     add_option(parser, "--token-file", Path, "FILE", text)
     parser.add_argument("--new-token", action="store_true", help="make a new token; the old one becomes invalid")
@@ -31,20 +33,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until SIGINT, SIGTERM or SIGHUP."""
-    if find_spec("aiohttp") is None:
-        raise UserError("the live view needs aiohttp; install it with `pip install 'shearloop[view]'`")
-    if not 0 <= args.port <= 65535:
-        raise UserError(f"--port {args.port} is not a port; give one from 1 to 65535, or 0 for any free one")
-    from shearloop.daemon.bank_config import FingertipGeometryConfig
-    from shearloop.daemon.config_file import load_yaml_model
+    if not 0 <= (port := args.port if args.foxglove is None else args.foxglove) <= 65535:
+        raise UserError(f"{port} is not a port; give one from 1 to 65535, or 0 for any free one")
+    if args.foxglove is not None:
+        return _serve_foxglove(args)
+    require("aiohttp", "view", "the live view")
     from shearloop.daemon.logs import logging_to_stderr
     from shearloop.daemon.web.server import DaemonAddress, default_token_path, load_token, serve
 
     address = DaemonAddress(args.connect, args.commands, client_keys(args))
     path = args.token_file or default_token_path()
     token = load_token(path, new=args.new_token)
-    with resources.as_file(resources.files("shearloop.daemon.web") / "assets" / "fingertip.yaml") as paper:
-        fingertip = load_yaml_model(args.fingertip or paper, FingertipGeometryConfig).fingertip()
+    fingertip = load_fingertip(args.fingertip)
 
     def print_address(port: int) -> None:
         page = f"http://127.0.0.1:{port}/"
@@ -57,4 +57,20 @@ def run(args: argparse.Namespace) -> int:
 
     with logging_to_stderr():
         asyncio.run(serve(address, args.port, token, fingertip, print_address))
+    return 0
+
+
+def _serve_foxglove(args: argparse.Namespace) -> int:
+    from shearloop.daemon.messaging.client import receive_messages
+    from shearloop.daemon.web.foxglove import FoxgloveServer
+
+    try:
+        with FoxgloveServer(args.foxglove) as server:
+            url = f"ws://127.0.0.1:{server.port}"
+            sentence = f"{url}: open this connection in Foxglove, with the layout config/foxglove.json"
+            print_result({"url": url}, [sentence], as_json=args.json)
+            for topic, content in receive_messages(args.connect, (), keys=client_keys(args)):
+                server.publish(topic, content)
+    except KeyboardInterrupt as interrupt:
+        return interrupt_status(interrupt)
     return 0

@@ -8,7 +8,7 @@ from typing import Any
 
 from scipy.io import savemat
 
-from shearloop.daemon.errors import UserError
+from shearloop.daemon.errors import UserError, require
 from shearloop.daemon.recording.tables import Rows, arrays, columns_of, read_rows
 
 Progress = Callable[[int], None]
@@ -60,9 +60,8 @@ def _write_csv(path: Path, rows: Rows) -> None:
 
 
 def _write_parquet(path: Path, rows: Rows) -> None:
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ModuleNotFoundError as error:
-        raise UserError("Parquet needs pyarrow: `pip install 'shearloop[export]'`") from error
+    require("pyarrow", "export", "Parquet")
+    import pyarrow
+    import pyarrow.parquet
+
     pyarrow.parquet.write_table(pyarrow.table(columns_of(rows)), path)

@@ -21,6 +21,7 @@ from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
+from pydantic_core import from_json
 
 from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.estimation import Measured
@@ -126,6 +127,14 @@ def open_recording(path: Path) -> Iterator[OpenRecording]:
                 f"{path}: shearloop {schema.software_version()} has no topic {str(error)!r}; version {written} wrote "
                 "this recording: read it with that version, or export other topics"
             ) from error
+
+
+def read_messages(path: Path, topics: Iterable[str]) -> Iterator[tuple[str, dict[str, Any], Message]]:
+    """Yield topic, content and message by log time, None for keys without a value; raises UserError."""
+    with open_recording(path) as recording:
+        for channel, message in recording.messages(topics):
+            live = schema.schema_name(channel.topic)
+            yield channel.topic, schema.with_missing_keys(live, from_json(message.data)), message
 
 
 def check_magic(path: Path, file: IO[bytes]) -> None:

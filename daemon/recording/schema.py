@@ -40,6 +40,8 @@ METADATA = "shearloop"
 EXPERIMENT_METADATA = "shearloop.experiment"
 END_METADATA = "shearloop.end"
 CONFIGURATION = "configuration.json"
+# The numbers of k and sigma of a heatmap; other arrays have one dimension.
+SCORES_SHAPE = "scores_shape"
 SIDES = ("right", "left")
 # Metadata key of the tool's diameter in mm. The gripper opens no wider than the largest.
 DIAMETER_NOTE = "diameter_mm"
@@ -145,16 +147,16 @@ def with_missing_keys(topic: str, content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def message_json(topic: str, content: Mapping[str, Any], offset_ns: int) -> bytes:
-    """Return a message's map as JSON: arrays as flat lists, without keys that have no value."""
+    """Return a message's map as JSON: float32 arrays or their bytes as flat lists, without keys that have no value."""
     plain: dict[str, Any] = {}
     for key, value in content.items():
         if isinstance(value, float):
             if math.isfinite(value):
                 plain[key] = value
-        elif isinstance(value, bytes):
+        elif isinstance(value, bytes | np.ndarray):
             # To a microvolt or microradian. Elements that are not finite become null.
             plain[key] = np.round(np.frombuffer(value, "<f4").astype(np.float64), 6).tolist()
-        elif value is not None and not key.endswith("_shape"):
+        elif value is not None and (not key.endswith("_shape") or key == SCORES_SHAPE):
             plain[key] = value
     if topic == EitFrame.topic:
         plain["arrival_unix_ns"] = content["t_mono_ns"] + round(content["age_s"] * 1e9) + offset_ns
@@ -211,6 +213,9 @@ def _message_schema(topic: str) -> dict[str, Any]:
         properties["arrival_unix_ns"] = {"type": "integer", "description": "arrival of the line's last byte"}
         # An imported frame has no other keys.
         required = ["arrival_unix_ns", "line"]
+    elif topic == EitHeatmap.topic:
+        numbers = {"type": "array", "items": {"type": "integer"}}
+        properties[SCORES_SHAPE] = {**numbers, "description": "numbers of k and of sigma"}
     elif topic == LOAD_TOPIC:
         required = []
     return _object(topic, properties, required)

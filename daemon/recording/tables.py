@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.reader import check_identity, open_recording
+from shearloop.daemon.recording.reader import check_identity, open_recording, read_messages
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -77,13 +77,10 @@ def read(path: str | Path) -> RecordedTopics:
 def read_rows(path: Path, topic: str, on_row: Callable[[], None] = lambda: None) -> Rows:
     """Return a topic's messages by time: log_time_ns first, maps as JSON text, None for a missing value."""
     rows = []
-    with open_recording(path) as recording:
-        live = schema.schema_name(topic)
-        for _, message in recording.messages([topic]):
-            content = schema.with_missing_keys(live, json.loads(message.data))
-            row = {key: json.dumps(value) if isinstance(value, dict) else value for key, value in content.items()}
-            rows.append({"log_time_ns": message.log_time, **row})
-            on_row()
+    for _, content, message in read_messages(path, [topic]):
+        row = {key: json.dumps(value) if isinstance(value, dict) else value for key, value in content.items()}
+        rows.append({"log_time_ns": message.log_time, **row})
+        on_row()
     return rows
 
 

@@ -1,0 +1,142 @@
+"""Writes a recording for the Rerun viewer: scalars with their intervals, images of the bank's match, and the robot."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from shearloop.bank.eit.fingertip import Fingertip
+from shearloop.daemon.errors import require
+from shearloop.daemon.messaging.messages import ENVELOPE, EitEstimate, EitHeatmap, RobotStateMessage
+from shearloop.daemon.recording import schema
+from shearloop.daemon.recording.reader import Progress, read_messages
+from shearloop.daemon.web.message_store import conductivity_profile
+
+TIMELINE = "time"
+# Values of an entity that are sent at once.
+_BATCH = 1000
+# Longer arrays are frames and heatmaps.
+_LONGEST_SCALARS = 8
+# One chart for each unit, by the end of the keys.
+_CHARTS = {"torque (N·m)": "_nm", "diameter (mm)": "_mm", "shear force (N)": "_n", "angle (rad)": "_rad"}
+
+
+class _RerunFile:
+    """Adds messages to a Rerun file, scalars in batches."""
+
+    def __init__(self, out: Path, fingertip: Fingertip) -> None:
+        import rerun
+
+        self._rr = rerun
+        self._height_cm = fingertip.height_cm
+        self._width_cm = float(np.ptp([x for x, _ in fingertip.outline().contour]))
+        # The SDK may be switched off by an environment variable, and would then write nothing.
+        self._stream = rerun.RecordingStream("shearloop", default_enabled=True)
+        self._stream.save(out)
+        self._waiting: dict[str, tuple[list[int], list[Any]]] = {}
+        self._models: dict[str, str] = {}
+        self._images: dict[str, None] = {}
+        self._poses: dict[str, None] = {}
+
+    def add(self, topic: str, content: Mapping[str, Any], t_ns: int) -> None:
+        """Add one message of a recorded topic."""
+        entity = topic.replace(".", "/")
+        for key, value in content.items():
+            if (isinstance(value, list) and len(value) > _LONGEST_SCALARS) or key in (*ENVELOPE, schema.SCORES_SHAPE):
+                continue
+            if isinstance(value, bool | int | float | list):
+                self._add(f"{entity}/{key}", value, t_ns)
+        live = schema.schema_name(topic)
+        if live == EitHeatmap.topic:
+            self._models[content["source"]] = content["model"]
+            # Recordings of 0.1 have no shape.
+            if shape := content.get(schema.SCORES_SHAPE):
+                scores = np.array(content["scores"], dtype=np.float64).reshape(shape)
+                self._add_image(f"{entity}/scores", scores, t_ns)
+        elif live == EitEstimate.topic and content["k"] is not None and content["sigma"] is not None:
+            model = self._models.get(content["source"], "")
+            profile = conductivity_profile(model, content["k"], content["sigma"], self._height_cm)
+            if profile is not None:
+                # The top comes first, and twice the untouched gel's is white.
+                column = np.array(profile)[::-1, None] / 2
+                width = round(len(column) * self._width_cm / self._height_cm)
+                self._add_image(f"{entity}/conductivity", np.repeat(column, width, axis=1), t_ns)
+        elif live == RobotStateMessage.topic and None not in content["tcp_pose"]:
+            self._add_pose(f"{entity}/tool_centre", content["tcp_pose"], t_ns)
+
+    def close(self) -> None:
+        """Write what waits, and the layout of the viewer."""
+        for entity in self._waiting:
+            self._send(entity)
+        self._stream.send_blueprint(self._layout())
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def _add(self, entity: str, value: Any, t_ns: int) -> None:
+        times, values = self._waiting.setdefault(entity, ([], []))
+        times.append(t_ns)
+        values.append(value)
+        if len(times) == _BATCH:
+            self._send(entity)
+
+    def _send(self, entity: str) -> None:
+        times, waiting = self._waiting[entity]
+        if times:
+            index = self._rr.TimeColumn(TIMELINE, timestamp=np.array(times, "datetime64[ns]"))
+            # A number that is not finite is null in a recording.
+            values = np.array(waiting, dtype=np.float64)
+            columns = self._pose_columns(values) if entity in self._poses else self._rr.Scalars.columns(scalars=values)
+            self._stream.send_columns(entity, [index], columns)
+        times.clear()
+        waiting.clear()
+
+    def _pose_columns(self, poses: NDArray[np.float64]) -> Any:
+        turns = Rotation.from_rotvec(poses[:, 3:]).as_quat()
+        return self._rr.Transform3D.columns(translation=poses[:, :3], quaternion=turns)
+
+    def _add_image(self, entity: str, share: NDArray[np.float64], t_ns: int) -> None:
+        """Add a grey image; 0 is black and 1 is white."""
+        pixels = np.round(255 * np.clip(np.nan_to_num(share), 0, 1)).astype(np.uint8)
+        self._images[entity] = None
+        self._log(entity, self._rr.Image(pixels, color_model="L"), t_ns)
+
+    def _add_pose(self, entity: str, pose: list[float], t_ns: int) -> None:
+        if entity not in self._poses:
+            self._poses[entity] = None
+            self._stream.log(entity, self._rr.TransformAxes3D(0.1), static=True)
+        self._add(entity, pose, t_ns)
+
+    def _log(self, entity: str, shown: Any, t_ns: int) -> None:
+        self._stream.set_time(TIMELINE, timestamp=np.datetime64(t_ns, "ns"))
+        self._stream.log(entity, shown)
+
+    def _layout(self) -> Any:
+        from rerun import blueprint
+
+        charted = {name: [one for one in self._waiting if one.endswith(end)] for name, end in _CHARTS.items()}
+        charts = [blueprint.TimeSeriesView(name=name, contents=lines) for name, lines in charted.items() if lines]
+        images = [blueprint.Spatial2DView(name=one, origin=one) for one in self._images]
+        poses = [blueprint.Spatial3DView(name=one, contents=[one]) for one in self._poses]
+        columns = [blueprint.Vertical(*views) for views in (charts, [*images, *poses]) if views]
+        return blueprint.Blueprint(blueprint.Horizontal(*columns))
+
+
+def export_rerun(
+    path: Path, out: Path, topics: list[str], fingertip: Fingertip, progress: Progress = lambda _: None
+) -> Path:
+    """Write topics of a recording as a .rrd file and return it; the conductivity is drawn for `fingertip`.
+
+    Raises OSError for a file that cannot be written, UserError without rerun-sdk and for an unreadable recording.
+    """
+    require("rerun", "rerun", "a file for Rerun")
+    # The SDK's own error is a sentence of its internals.
+    out.open("wb").close()
+    file = _RerunFile(out, fingertip)
+    for number, (topic, content, message) in enumerate(read_messages(path, topics), start=1):
+        file.add(topic, content, message.log_time)
+        progress(number)
+    file.close()
+    return out

@@ -35,12 +35,18 @@ CHANNEL_S = 0.6e-3
 # Above 0.5 cm the electrodes determine the mesh.
 MESH_SIZES_CM = (0.5, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.05)
 COUNTS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 150)
+RANKS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+# Places along k and along sigma that judge a rank.
+_RANKED = 17
+_N_CHANNEL_COUNTS = 16
 _FOLDS = 8
 # Errors of linear elements are proportional to the mesh size: two fine meshes extrapolate to the limit.
 _FINE_CM = (0.05, 0.035)
 _N_DRIFT = 2
 # Settings of the models are for this height, and scale with another one.
 _PAPER_HEIGHT_CM = 3.6
+# The mesh of simulated frames.
+_SIMULATED_CM = 0.1
 _PLACES = np.linspace(0.1, 0.9, 9)
 _MIN_FRAMES = 8
 # A smaller share of a frame is rounding: the board's converter alone makes thousands of times as much noise.
@@ -244,12 +250,14 @@ class Design:
     mesh: DesignChoice
     k_count: DesignChoice
     sigma_count: DesignChoice
+    rank: DesignChoice
+    channels: DesignChoice
     injections: DesignChoice
 
     @property
     def choices(self) -> tuple[DesignChoice, ...]:
         """All choices."""
-        return self.mesh, self.k_count, self.sigma_count, self.injections
+        return self.mesh, self.k_count, self.sigma_count, self.rank, self.channels, self.injections
 
 
 def design_bank(measured: MeasuredFrames, fingertip: Fingertip) -> Design:
@@ -269,6 +277,7 @@ def design_bank(measured: MeasuredFrames, fingertip: Fingertip) -> Design:
     else:
         alike = DesignStep(1, 0.0, "the model does not depend on sigma")
         sigma_count = DesignChoice("cells along sigma", "cells", (alike,))
+    channels, injections = _board_choices(measured, table)
     return Design(
         relative_noise=noise,
         models=models,
@@ -278,8 +287,28 @@ def design_bank(measured: MeasuredFrames, fingertip: Fingertip) -> Design:
         mesh=_mesh_choice(fingertip, model, middle, noise),
         k_count=_count_choice(forward, model, middle, "k", k_range, noise),
         sigma_count=sigma_count,
-        injections=_injection_choice(measured, table),
+        rank=_rank_choice(forward, model, k_range, sigma_range, noise),
+        channels=channels,
+        injections=injections,
     )
+
+
+def simulated_frames(design: Design, fingertip: Fingertip, n: int = 49, seed: int = 0) -> MeasuredFrames:
+    """Return n frames that a designed-for grip gives on another fingertip, with the same share of noise.
+
+    Torque and σ change along the design's range, in the proportions of the paper's fingertip. Amplitudes are the
+    model's voltages and torques have no unit: a design depends on neither.
+    """
+    forward = ForwardModel(replace(fingertip, mesh_size_cm=_SIMULATED_CM).mesh(), fingertip.table)
+    size = forward.mesh.height_cm / _PAPER_HEIGHT_CM
+    sigmas = np.linspace(*design.sigma_range, n)
+    k = sum(design.k_range) / 2
+    k_unit = 1 / size if MODELS[design.model].k_unit == "rad/cm" else size
+    settings = _positive(forward, design.model, [Setting(k * k_unit, sigma * size) for sigma in sigmas.tolist()])
+    frames = np.abs(simulated_signals(forward, design.model, settings))
+    noise_v = design.relative_noise * float(np.sqrt((frames**2).mean()))
+    noisy = frames + np.random.default_rng(seed).normal(0.0, noise_v, frames.shape)
+    return MeasuredFrames(noisy, noise_v, np.array([-setting.sigma for setting in settings]))
 
 
 def _positive(forward: ForwardModel, model: str, settings: Sequence[Setting]) -> list[Setting]:
@@ -368,11 +397,28 @@ def _count_choice(
     return DesignChoice(f"cells along {name}", "cells", tuple(steps))
 
 
-def _injection_choice(measured: MeasuredFrames, table: ChannelTable) -> DesignChoice:
-    """Choose injections by the torque's standard deviation, each the best to add to those before.
+def _rank_choice(
+    forward: ForwardModel, model: str, k: tuple[float, float], sigma: tuple[float, float], noise: float
+) -> DesignChoice:
+    """Choose how many directions of all signals' shapes a bank needs."""
+    ks, sigmas = (np.unique(np.linspace(*ends, _RANKED)).tolist() for ends in (k, sigma))
+    settings = _positive(forward, model, [Setting(a, b) for a in ks for b in sigmas])
+    signals = np.abs(simulated_signals(forward, model, settings))
+    squares = np.linalg.svd(signals / np.linalg.norm(signals, axis=1, keepdims=True), compute_uv=False) ** 2
+    n = signals.shape[1]
+    steps = [
+        DesignStep(rank, float(np.sqrt(squares[rank:].sum() / squares.sum())) / noise, f"{rank} numbers a cell, of {n}")
+        for rank in RANKS
+    ]
+    return DesignChoice("rank of the bank", "directions", tuple(steps))
 
-    The recording gives the frames' slope over torque, their drift about it and their noise. Without a known torque the
-    main direction of the frames' variation replaces the slope.
+
+def _board_choices(measured: MeasuredFrames, table: ChannelTable) -> tuple[DesignChoice, DesignChoice]:
+    """Choose channels and injections by the torque's standard deviation.
+
+    Channels come in the order of their weight in a torque that is read without the drift; each injection is the best
+    to add to those before. The recording gives the frames' slope over torque, their drift about it and their noise.
+    Without a known torque the main direction of the frames' variation replaces the slope.
     """
     frames = np.abs(measured.differences)
     centred = frames - frames.mean(axis=0)
@@ -396,12 +442,22 @@ def _injection_choice(measured: MeasuredFrames, table: ChannelTable) -> DesignCh
         return np.flatnonzero(np.isin(table.electrodes[:, 0], injections))
 
     least = variance(np.arange(table.n_channels))
+
+    def step(setting: int, channels: IntArray, more: str = "") -> DesignStep:
+        rate = f"{1.0 / (len(channels) * CHANNEL_S):.2f} frames/s at {1e3 * CHANNEL_S:g} ms a channel"
+        return DesignStep(setting, float(np.sqrt(max(variance(channels) / least - 1.0, 0.0))), rate + more)
+
+    inner = np.linalg.inv(np.eye(_N_DRIFT) * measured.noise_v**2 + drift.T @ drift)
+    order = np.argsort(-np.abs(slope - drift @ (inner @ (drift.T @ slope))), kind="stable")
+    counts = np.rint(table.n_channels * np.arange(1, _N_CHANNEL_COUNTS + 1) / _N_CHANNEL_COUNTS).astype(int).tolist()
+    of_channels = tuple(step(count, order[:count]) for count in counts)
     taken: list[int] = []
-    steps = []
+    of_injections = []
     while rest := [one for one in range(table.n_electrodes) if one not in taken]:
         taken.append(min(rest, key=lambda one: variance(channels_of([*taken, one]))))
-        channels = channels_of(taken)
-        rate = f"{1.0 / (len(channels) * CHANNEL_S):.2f} frames/s at {1e3 * CHANNEL_S:g} ms a channel"
-        added = float(np.sqrt(max(variance(channels) / least - 1.0, 0.0)))
-        steps.append(DesignStep(len(taken), added, f"{rate}; injections {', '.join(map(str, sorted(taken)))}"))
-    return DesignChoice("injections", f"of {table.n_electrodes}", tuple(steps))
+        numbers = ", ".join(map(str, sorted(taken)))
+        of_injections.append(step(len(taken), channels_of(taken), f"; injections {numbers}"))
+    return (
+        DesignChoice("channels", f"of {table.n_channels}", of_channels),
+        DesignChoice("injections", f"of {table.n_electrodes}", tuple(of_injections)),
+    )

@@ -1,5 +1,6 @@
 """How well models explain frames, and the design that follows from the noise: more noise, less model."""
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from shearloop.bank.eit.design import (
     DesignStep,
     MeasuredFrames,
     Setting,
-    _injection_choice,
+    _board_choices,
     centred_settings,
     design_bank,
     envelope,
@@ -24,6 +25,7 @@ from shearloop.bank.eit.design import (
     matching_scores,
     mean_envelope_score,
     searched_settings,
+    simulated_frames,
     simulated_signals,
 )
 from shearloop.bank.eit.fingertip import Fingertip
@@ -133,7 +135,10 @@ def test_injections_cost_what_generalised_least_squares_loses_without_them():
     drift = np.where(PAPER_TABLE.electrodes[:, 0] % 2 == 0, 2 * slope, 0.2 * slope) + other
     torque, shift = rng.normal(size=(2, 1500))
     frames = 0.1 + np.outer(torque, slope) + np.outer(shift, drift) + rng.normal(0, 3e-3, (1500, 896))
-    injections = _injection_choice(MeasuredFrames(frames, 3e-3, torque), PAPER_TABLE)
+    channels, injections = _board_choices(MeasuredFrames(frames, 3e-3, torque), PAPER_TABLE)
+    assert channels.steps[-1].setting == PAPER_TABLE.n_channels
+    assert channels.steps[-1].added == pytest.approx(0.0, abs=1e-6)
+    assert [one.added for one in channels.steps] == sorted((one.added for one in channels.steps), reverse=True)
 
     def spread(taken: list[int]) -> float:
         rows = np.isin(PAPER_TABLE.electrodes[:, 0], taken)
@@ -144,6 +149,28 @@ def test_injections_cost_what_generalised_least_squares_loses_without_them():
         taken = [int(one) for one in step.cost.split("injections ")[1].split(", ")]
         expected = np.sqrt((spread(taken) / spread(list(range(32)))) ** 2 - 1)
         assert step.added == pytest.approx(expected, rel=0.1, abs=0.01)
+
+
+def test_the_rank_keeps_what_a_projection_onto_as_many_directions_loses(quiet, noisy, forward):
+    places = itertools.product(np.linspace(*quiet.k_range, 9).tolist(), np.linspace(*quiet.sigma_range, 9).tolist())
+    signals = np.abs(simulated_signals(forward, "gaussian_derivative", [Setting(*place) for place in places]))
+    signals /= np.linalg.norm(signals, axis=1, keepdims=True)
+    _, _, directions = np.linalg.svd(signals, full_matrices=False)
+    basis = directions[: int(quiet.rank.chosen.setting)]
+    lost = np.sqrt(((signals - signals @ basis.T @ basis) ** 2).sum(axis=1).mean())
+    assert lost / quiet.relative_noise <= ALLOWED
+    assert noisy.rank.chosen.setting <= quiet.rank.chosen.setting
+
+
+def test_a_grip_on_another_fingertip_is_designed_for_with_the_same_noise(noisy):
+    path = FINGERTIP.with_name("round.yaml")
+    fingertip = load_yaml_model(path, FingertipGeometryConfig).fingertip()
+    frames = simulated_frames(noisy, fingertip)
+    assert frames.differences.shape[1] == fingertip.table.n_channels == 208
+    assert frames.relative_noise == pytest.approx(noisy.relative_noise, rel=0.01)
+    found = design_bank(frames, fingertip)
+    assert found.model == noisy.model
+    assert all(choice.enough for choice in found.choices)
 
 
 def test_a_model_without_a_sigma_gets_one_cell_along_it(fingertip, forward):

@@ -1,4 +1,4 @@
-"""`shearloop chart scene`: how much model a recording needs, by its own noise."""
+"""`shearloop chart scene`: how much model a recording needs, by its own noise, on each fingertip."""
 
 import sys
 from collections.abc import Sequence
@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from shearloop.bank.eit.design import ALLOWED, Design, DesignChoice, MeasuredFrames, design_bank
+from shearloop.bank.eit.design import ALLOWED, Design, DesignChoice, MeasuredFrames, design_bank, simulated_frames
 from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.daemon.analysis.bank_design import doubts, scene_of
 from shearloop.daemon.analysis.charts.drawing import SHADES, figure, save, slug
 from shearloop.daemon.analysis.charts.sources import Split, own_fingertip
+from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP
+from shearloop.daemon.bank_config import FingertipGeometryConfig
+from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.executors import Executor, in_order
 
 _MESH_SIZE_CM = 0.07
@@ -20,7 +23,10 @@ _LEAST_SHOWN, _MOST_TICKS = 1e-3, 12
 
 
 def chart(parts: Sequence[Split], out: Path, executor: Executor) -> list[Path]:
-    """Design for each recording, draw and write; print doubts about a design on stderr, as `bank design` does."""
+    """Design for each recording on each fingertip, draw and write; print doubts on stderr, as `bank design` does.
+
+    Recordings are of the paper's fingertip. On the others the same grip is simulated with the same share of noise.
+    """
     scenes = [scene_of(split.whole) for split in parts]
     found = in_order(executor.map(designed_on, own_fingertip(_MESH_SIZE_CM), scenes))
     written = []
@@ -29,7 +35,18 @@ def chart(parts: Sequence[Split], out: Path, executor: Executor) -> list[Path]:
         for sentence in doubts(design):
             print(f"shearloop chart: {title}: {sentence}", file=sys.stderr)
         written += write(title, design, out)
+    for name, fingertip in other_fingertips().items():
+        elsewhere = in_order(executor.map(designed_elsewhere, fingertip, found))
+        for split, design in zip(parts, elsewhere, strict=True):
+            title = split.title.split(",", maxsplit=1)[0]
+            written += write(f"{title} {name}, simulated", design, out)
     return written
+
+
+def other_fingertips() -> dict[str, Fingertip]:
+    """Return the fingertips of the configuration that are not the paper's, by name."""
+    paths = sorted(path for path in OWN_FINGERTIP.parent.glob("*.yaml") if path != OWN_FINGERTIP)
+    return {path.stem: load_yaml_model(path, FingertipGeometryConfig).fingertip() for path in paths}
 
 
 def designed_on(fingertip: Fingertip, scene: MeasuredFrames) -> Design:
@@ -37,14 +54,19 @@ def designed_on(fingertip: Fingertip, scene: MeasuredFrames) -> Design:
     return design_bank(scene, fingertip)
 
 
+def designed_elsewhere(fingertip: Fingertip, design: Design) -> Design:
+    """Return a design's counterpart on another fingertip; a task for the workers."""
+    return design_bank(simulated_frames(design, fingertip), fingertip)
+
+
 def write(title: str, design: Design, out: Path) -> list[Path]:
     """Draw and write a design."""
-    made = figure(17, 9)
-    grid = made.add_gridspec(2, 4)
-    for column, choice in enumerate(design.choices):
-        _draw_choice(made.add_subplot(grid[0, column]), choice)
-    _draw_models(made.add_subplot(grid[1, 0]), design)
-    _draw_table(made.add_subplot(grid[1, 1:]), design.choices)
+    made = figure(17, 12)
+    grid = made.add_gridspec(3, 3, height_ratios=[1, 1, 0.9])
+    for number, choice in enumerate(design.choices):
+        _draw_choice(made.add_subplot(grid[divmod(number, 3)]), choice)
+    _draw_models(made.add_subplot(grid[2, 0]), design)
+    _draw_table(made.add_subplot(grid[2, 1:]), design.choices)
     made.suptitle(
         f"How much model {title} needs: its noise is {design.relative_noise:.1%} of a difference frame; "
         "ring: the coarsest that adds less than a third of it",
@@ -64,9 +86,10 @@ def _draw_choice(axes: Axes, choice: DesignChoice) -> None:
     scale = "linear" if len(settings) > _MOST_TICKS else "log"
     axes.set(xscale=scale, yscale="log", xlabel=f"{choice.name}, {choice.unit}", ylabel="added error / noise")
     axes.axhline(ALLOWED, color="black", linestyle="--", linewidth=1)
+    # Errors fall to the right, so the corner above the line is free there.
     axes.annotate(
-        "a third of the noise", (0.02, ALLOWED), xycoords=("axes fraction", "data"), xytext=(0, -10),
-        textcoords="offset points", fontsize=8, ha="left",
+        "a third of the noise", (0.98, ALLOWED), xycoords=("axes fraction", "data"), xytext=(0, 3),
+        textcoords="offset points", fontsize=8, ha="right",
     )  # fmt: skip
     chosen = choice.chosen
     ring = max(chosen.added, _LEAST_SHOWN)

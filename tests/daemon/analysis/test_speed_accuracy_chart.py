@@ -164,8 +164,10 @@ def test_doubts_about_a_design_are_printed_with_its_chart(monkeypatch, tmp_path,
         return SimpleNamespace(models=[SimpleNamespace(penalised=penalised)], relative_noise=noise)
 
     monkeypatch.setattr(scene, "designed_on", designed_on)
+    monkeypatch.setattr(scene, "designed_elsewhere", lambda *_: None)
     monkeypatch.setattr(scene, "write", lambda title, _, out: [out / title])
-    assert scene.chart(parts, tmp_path, SerialExecutor()) == [tmp_path / "good", tmp_path / "bad"]
+    titles = ["good", "bad", *(f"{one} {name}, simulated" for name in ("long", "round") for one in ("good", "bad"))]
+    assert scene.chart(parts, tmp_path, SerialExecutor()) == [tmp_path / title for title in titles]
     first, second = capsys.readouterr().err.splitlines()
     assert first.startswith("shearloop chart: bad: even the best model leaves 90.0% of a frame unexplained")
     assert second.startswith("shearloop chart: bad: the noise is 50.0% of a difference frame")

@@ -51,7 +51,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     export = add_action(parts, "export", "write a recording as tables, or for MATLAB, Rerun or LeRobot", _export)
     add_option(export, "recording", Path, "REC", "a recording (.mcap or .mcap.partial)")
     choices = ("csv", "parquet", "mat", "rrd", "lerobot")
-    export.add_argument("--format", choices=choices, default="csv", help="(default: %(default)s)")
+    export.add_argument("--format", choices=choices, default="csv", help="files to write (default: %(default)s)")
     add_option(export, "--out", Path, "PATH", "folder to write; for mat and rrd a file (default: next to REC)")
     export.add_argument("--topic", action="append", metavar="TOPIC", help="export only this topic; repeatable")
     add_fingertip(export)

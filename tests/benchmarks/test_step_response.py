@@ -70,7 +70,7 @@ def test_the_benchmark_writes_its_numbers(tmp_path, monkeypatch):
 
 def test_the_default_estimator_holds_a_torque_on_both_fingertips(bank):
     figures = estimator_in_the_loop(bank, rig_calibration(bank, 7), (0, 1))
-    assert figures["time_in_band_mean"] > 0.9
+    assert figures["time_in_band_mean"] > 0.85
     assert figures["overshoot_worst_seed"] < 0.2
     assert figures["not_valid_share"] < 0.02
     assert figures["coverage_95"] > 0.9

@@ -13,7 +13,9 @@ systemctl start shearloop
 echo "started: $?"
 until_so alive StatusText "5 tasks are alive"
 echo "user: $(of User)"
-echo "stop socket: $(grep -c '@shearloop-stop-' /proc/net/unix)"
+# Other daemons may run on this machine.
+ls -l "/proc/$(of MainPID)/fd" >/run/files
+echo "stop socket: $(awk '/@shearloop-stop-/ {print "socket:[" $7 "]"}' /proc/net/unix | grep -cFf - /run/files)"
 echo "policy: $(chrt -p "$(of MainPID)" | grep -o 'SCHED_[A-Z]*')"
 echo "capabilities: $(grep CapEff "/proc/$(of MainPID)/status" | cut -f2)"
 if [ -e /run/exchange/start_only ]; then

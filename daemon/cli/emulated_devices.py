@@ -69,7 +69,8 @@ class EmulatedDevices:
                 self._truth = Path(folder) / "truth.jsonl"
             processes: list[subprocess.Popen[bytes]] = []
             ready: list[threading.Event] = []
-            stack.callback(_stop, processes)
+            readers: list[threading.Thread] = []
+            stack.callback(_stop, processes, readers)
             for emulator in self._emulators:
                 # An emulator ends when its standard input is closed.
                 process = subprocess.Popen(
@@ -77,7 +78,8 @@ class EmulatedDevices:
                 )
                 processes.append(process)
                 ready.append(threading.Event())
-                threading.Thread(target=_read_lines, args=(process.stdout, ready[-1]), daemon=True).start()
+                readers.append(threading.Thread(target=_read_lines, args=(process.stdout, ready[-1]), daemon=True))
+                readers[-1].start()
                 self._alive.append((emulator.device, process))
                 self._waiting += [(event, process) for event in emulator.events]
             until_s = time.monotonic() + READY_S
@@ -144,7 +146,7 @@ def _read_lines(output: IO[bytes], ready: threading.Event) -> None:
     ready.set()
 
 
-def _stop(processes: "list[subprocess.Popen[bytes]]") -> None:
+def _stop(processes: "list[subprocess.Popen[bytes]]", readers: list[threading.Thread]) -> None:
     for process in processes:
         process.terminate()
     for process in processes:
@@ -157,3 +159,6 @@ def _stop(processes: "list[subprocess.Popen[bytes]]") -> None:
             # Closing flushes unread input to a process that has ended.
             with contextlib.suppress(BrokenPipeError):
                 process.stdin.close()
+    # A device has closed its output by now.
+    for reader in readers:
+        reader.join(STOP_S)

@@ -13,6 +13,9 @@ from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, Drive
 from shearloop.drivers.robotiq.messages import ActivationStatus, GripperCommand
 from tests.drivers.robotiq.gripper_rig import WAYS, a_rig
 
+# A reply over Modbus has 0.3 s, which a busy computer exceeds.
+pytestmark = pytest.mark.real_time
+
 
 @WAYS
 async def test_silence_is_a_loss_and_clears_the_state(way, tmp_path):

@@ -8,6 +8,7 @@ import pytest
 from benchmarks import stop_times
 
 pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
+pytestmark = pytest.mark.real_time
 
 
 def test_the_benchmark_measures_a_stop_and_draws_it(tmp_path, monkeypatch, capsys):

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import ctypes
 import errno
+import itertools
 import os
 import resource
 import socket
@@ -32,6 +33,8 @@ _OPTIONS = {
 }
 _EVENTS = zmq.EVENT_LISTENING | zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED
 _EVENT = struct.Struct("=HI")
+# Numbers of the events' addresses. libzmq frees an address some time after its socket is closed, so none is used twice.
+_MONITORS = itertools.count()
 EVENTS_AT_ONCE = 100
 # socket(7) and linux/filter.h: a program of the one instruction "return 0", with which the kernel drops every packet.
 _SO_ATTACH_FILTER, _SO_DETACH_FILTER = 26, 27
@@ -64,7 +67,7 @@ class Connections:
         self._full = False
         for option, value in _OPTIONS.items():
             bound.setsockopt(option, value)
-        monitor = f"inproc://connections-{id(self)}"
+        monitor = f"inproc://connections-{next(_MONITORS)}"
         bound.monitor(monitor, _EVENTS)
         self._events: zmq.Socket[bytes] = zmq.Socket(context, zmq.PAIR)
         # Without a bound: a full queue would stop libzmq's thread.

@@ -39,7 +39,7 @@ LONGEST = (
     *("test_workers_commands.py", "test_stability_map.py", "test_batch_forward.py", "test_load_delay.py"),
     *("test_emulate.py", "test_cli_reproduce.py", "test_runner_any_order.py", "test_client_process.py"),
     *("test_workers.py", "test_with_keys.py", "test_replay_combined.py", "test_cli_recordings.py", "test_mixtures.py"),
-    *("test_matlab_slices.py", "test_fuzz.py", "test_cylinders.py", "test_scene.py"),
+    *("test_fuzz.py", "test_cylinders.py", "test_scene.py"),
     *("test_design.py", "test_cli_bank.py", "test_copies.py", "test_tracker.py", "test_exit_status.py"),
     *("test_wrist_controller.py", "test_familiar.py", "test_recorder.py", "test_stability_chart.py"),
 )

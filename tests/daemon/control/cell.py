@@ -203,7 +203,7 @@ class Cell:
             self.robot.cycle()
             # A state is read, decided on and answered in a few turns of the event loop: until nothing else is ready.
             await asyncio.sleep(0)
-            while asyncio.get_running_loop()._ready:
+            while asyncio.get_running_loop()._ready:  # noqa: ASYNC110 - it waits for nothing but the loop itself
                 await asyncio.sleep(0)
 
     def exceed_torque(self) -> None:

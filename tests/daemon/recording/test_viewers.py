@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import csv
 import dataclasses
 import io
 import json
@@ -102,6 +103,20 @@ def columns(chunks: list[Any], entity: str) -> dict[str, list[Any]]:
     """Return the values of an entity that change with time, by component."""
     (one,) = (one for one in chunks if one.entity_path == entity and not one.is_static)
     return one.to_record_batch().to_pydict()
+
+
+def test_tables_hold_every_score_of_a_heatmap(tmp_path, monkeypatch):
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    monkeypatch.setattr("shearloop.daemon.recording.export._BATCH", 30)
+    recording = write(tmp_path / "a.mcap", RIG)
+    assert [main(["recording", "export", str(recording), "--format", form]) for form in ("csv", "parquet")] == [0, 0]
+    with (tmp_path / "a_csv/eit.heatmap.right.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    found = [[float(row[f"scores_{i}"] or "nan") for i in range(6)] for row in rows]
+    np.testing.assert_array_equal(found, [SCORES.ravel()] * 4)
+    assert [row["model"] for row in rows] == ["linear"] * 4
+    table = parquet.read_table(tmp_path / "a_parquet/eit.heatmap.right.parquet").to_pydict()
+    np.testing.assert_array_equal(np.array(table["scores"], dtype=float), found)
 
 
 def test_a_dataset_holds_what_was_known_and_names_its_origin(tmp_path):

@@ -77,7 +77,8 @@ def check_yaml(block: str, folder: Path) -> None:
     path = folder / "here" / "file.yaml"
     if "steps" in content:
         path.write_text(block)
-        sources = {name: TorqueSource(name=name, period_s=0.5) for name in ("right", "left", "combined", "load_cell")}
+        names = ("right", "left", "combined", "load_cell")
+        sources = {name: TorqueSource(name=name, period_s=0.5, has_gain=name != "load_cell") for name in names}
         demo = load_daemon_config(ROOT / "config/demo.yaml").model_copy(update={"experiment": path})
         assert check_experiment(demo, sources) is not None
     elif "model" in content:

@@ -165,7 +165,7 @@ def test_the_readme_is_short_and_begins_with_what_for_whom_and_why():
     lines = (ROOT / "README.md").read_text().splitlines()
     assert len(lines) <= 150
     first_screen = "\n".join(lines[:25])
-    for part in ("**What.**", "**For whom.**", "**Why.**", "](docs/images/live-view.png)", "shearloop demo"):
+    for part in ("**What.**", "**For whom.**", "**Why.**", "](docs/images/overview.gif)", "shearloop demo"):
         assert part in first_screen
 
 

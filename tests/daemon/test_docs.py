@@ -77,7 +77,8 @@ def check_yaml(block: str, folder: Path) -> None:
     path = folder / "here" / "file.yaml"
     if "steps" in content:
         path.write_text(block)
-        sources = {name: TorqueSource(name=name, period_s=0.5) for name in ("right", "left", "combined", "load_cell")}
+        names = ("right", "left", "combined", "load_cell")
+        sources = {name: TorqueSource(name=name, period_s=0.5, has_gain=name != "load_cell") for name in names}
         demo = load_daemon_config(ROOT / "config/demo.yaml").model_copy(update={"experiment": path})
         assert check_experiment(demo, sources) is not None
     elif "model" in content:
@@ -164,7 +165,7 @@ def test_the_readme_is_short_and_begins_with_what_for_whom_and_why():
     lines = (ROOT / "README.md").read_text().splitlines()
     assert len(lines) <= 150
     first_screen = "\n".join(lines[:25])
-    for part in ("**What.**", "**For whom.**", "**Why.**", "](docs/images/live-view.png)", "shearloop demo"):
+    for part in ("**What.**", "**For whom.**", "**Why.**", "](docs/images/overview.gif)", "shearloop demo"):
         assert part in first_screen
 
 

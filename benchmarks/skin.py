@@ -33,10 +33,8 @@ from shearloop.bank.skin.membrane import (
     GAUGE_FACTOR,
     PAPER_SECTION,
     THICK_SECTION,
+    Membrane,
     Section,
-    loading_response,
-    paper_membrane,
-    section_membrane,
 )
 from shearloop.bank.skin.plane_strain import (
     MESH_112,
@@ -79,11 +77,7 @@ def at_finite_strain(section: Section, normal_n: float, path: FloatArray) -> Flo
 def models() -> dict[str, Model]:
     """Return the models by name."""
     return {
-        "closed form, finite strain": lambda path: np.array(
-            [loading_response(PAPER_SECTION, NORMAL_N, shear) for shear in path.tolist()]
-        ),
-        "1-D, paper's F/(EA)": partial(responses, paper_membrane(), normal_n=NORMAL_N),
-        "1-D, section's EA": partial(responses, section_membrane(), normal_n=NORMAL_N),
+        "1-D, finite strain": partial(responses, Membrane(PAPER_SECTION), normal_n=NORMAL_N),
         **{f"2-D, linear, {elements} elements": two_dimensional(mesh) for elements, mesh in MESHES.items()},
     }
 
@@ -124,15 +118,16 @@ def compare_readings() -> None:
 
 
 def compare_calibrations() -> None:
-    """Print what the run-time membrane finds on skins that follow the closed form at finite strain, without noise."""
+    """Print what the fit finds on skins that follow the membrane at finite strain, without noise."""
     print("\n" + table_head("recorded under", "friction", "slope, 1/N", "95 % interval, ± N"))
     for normal_forces in ((1.0,), (0.5, 1.0, 1.5, 2.0)):
         rows = []
-        for normal_n, sign in product(normal_forces, (1.0, -1.0)):
+        for normal_n, path in product(normal_forces, (READ, -READ)):
             rows += [(1.0, 1.0, 0.0, 0.0)] * 2
-            for shear_n in READ.tolist():
-                response = loading_response(THICK_SECTION, normal_n, sign * shear_n)
-                rows.append((1 + max(response, 0.0), 1 + max(-response, 0.0), sign * shear_n, normal_n))
+            for shear_n, response in zip(
+                path, responses(Membrane(THICK_SECTION), path.tolist(), normal_n), strict=True
+            ):
+                rows.append((1 + max(response, 0.0), 1 + max(-response, 0.0), shear_n, normal_n))
         found = fit_calibration(CalibrationTable(*np.array(rows).T))
         name = f"{normal_forces[0]} to {normal_forces[-1]} N" if len(normal_forces) > 1 else f"{normal_forces[0]} N"
         print(table_row(name, found.friction, found.slope_per_n, found.prediction_half_width_n), flush=True)

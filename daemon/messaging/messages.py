@@ -92,6 +92,24 @@ class EitEstimate(Message):
     latency_s: float = column("s", "from the arrival of the frame's last byte to this message")
 
 
+@message("eit.adapted", rate_hz=None)
+class EitAdapted(Message):
+    """A correction of a fingertip's gain by a known torque, valid until the next grip or tare."""
+
+    reference: str = column("", "source of the known torque: load_cell or wrench")
+    twists: int = column("", "twists since the grip that decided")
+    factor: tuple[float, ...] = column("", "factor on the torque of each fingertip of the calibration")
+    factor_std: tuple[float, ...] = column("", "their standard errors")
+    offset_nm: float = column("N·m", "what is added to the torque")
+    gain_before: float = column("", "mean estimate over the known torque under load, before the correction")
+    gain_after: float = column("", "the same after it")
+    rmse_before_nm: float = column("N·m", "root mean square error under load, before the correction")
+    rmse_after_nm: float = column("N·m", "the same after it")
+    spread_before: float = column("", "standard deviation of ln gain that the intervals allow for, before")
+    spread_after: float = column("", "the same after it")
+    frame: int = column("", "number of the first frame with the correction")
+
+
 @message("eit.heatmap", rate_hz=None)
 class EitHeatmap(Message):
     """The scores of all cells for one frame, NaN for invalid cells; sent only while there is a subscriber."""

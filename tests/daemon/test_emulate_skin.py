@@ -4,11 +4,11 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-import numpy as np
 import pytest
 
+from shearloop.bank.skin.membrane import THICK_SECTION, UNSTRETCHED, Membrane
 from shearloop.daemon.cli.emulate.rig import PushedSkin
-from shearloop.daemon.synthetic_skin import SLACK_RATIO, SyntheticSkin
+from shearloop.daemon.synthetic_skin import NORMAL_N, SLACK_RATIO, SyntheticSkin
 from shearloop.drivers.connection import Link, SerialLink, TcpLink
 from shearloop.drivers.emulators.gripper import GripperRegisters
 from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings
@@ -60,8 +60,8 @@ async def test_both_instruments_tied_by_one_skin_are_read_and_obey(tmp_path):
         async with read(SerialLink(path=places[1], baud=9600), board) as samples:
             assert (await until(samples)).r1_ohm == pytest.approx(24.6, rel=2e-3)
             await told(process, "shear 0.54")
-            # 0.5 N beyond the deadband, less what friction keeps on the way to the gauge and the slack gauge's share.
-            response = 0.088 * 0.5 / np.exp(0.04 * np.radians(60.7))
+            membrane = Membrane(THICK_SECTION)
+            response = membrane.response(membrane.step(UNSTRETCHED, 0.54, NORMAL_N))
             await until(samples, r1_ohm=24.6 * (1 + response / (1 - SLACK_RATIO)))
             await told(process, "open 1")
             await until(samples, SkinFault.COMPLIANCE, SkinFault.OPEN_1)

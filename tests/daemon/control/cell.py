@@ -182,7 +182,7 @@ class Cell:
             self.control_loop,
             self.robot,
             self.gripper,
-            (),
+            {},
             self.published,
             StepClock(self.robot.flight),
             self.died,

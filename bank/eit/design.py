@@ -101,8 +101,8 @@ def simulated_signals(forward: BatchForwardModel, model: str, settings: Sequence
     """Return the (m, n) difference signals of the settings whose conductivity is positive everywhere."""
     of = ConductivityModel(forward.mesh)
     cells = [cell for cell in (of.conductivity(model, *one) for one in settings) if cell.min() > 0]
-    homogeneous, *voltages = forward.voltages(np.array([np.ones(len(forward.mesh.triangles)), *cells]))
-    return np.array(voltages).reshape(-1, len(homogeneous)) - homogeneous
+    voltages = forward.voltages(np.array([np.ones(len(forward.mesh.triangles)), *cells]))
+    return voltages[1:] - voltages[0]
 
 
 def envelope(magnitudes: FloatArray, settings: EnvelopeSettings = PAPER_ENVELOPE) -> FloatArray:

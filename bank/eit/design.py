@@ -102,7 +102,8 @@ def simulated_signals(forward: BatchForwardModel, model: str, settings: Sequence
     of = ConductivityModel(forward.mesh)
     cells = [cell for cell in (of.conductivity(model, *one) for one in settings) if cell.min() > 0]
     voltages = forward.voltages(np.array([np.ones(len(forward.mesh.triangles)), *cells]))
-    return voltages[1:] - voltages[0]
+    signals: FloatArray = voltages[1:] - voltages[0]
+    return signals
 
 
 def envelope(magnitudes: FloatArray, settings: EnvelopeSettings = PAPER_ENVELOPE) -> FloatArray:

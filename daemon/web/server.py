@@ -41,6 +41,8 @@ TOKEN_BYTES = 32
 TOKEN_LENGTHS = range(32, 201)
 # Requests in progress get this long at the end.
 SHUTDOWN_S = 1.0
+# A daemon that ends together with the viewer is still shown as ended.
+LAST_MESSAGES_S = 0.1
 # Commands that move something, or change what moves it.
 NEEDS_TOKEN = ("tare", "start", "pause", "resume", "unlock")
 # Wrong tokens that are compared at once, and then per second.
@@ -212,7 +214,7 @@ async def serve(
                     f"the page cannot be served on {HOST}:{port} ({error.strerror}); give another --port"
                 ) from error
             for number in signals:
-                loop.add_signal_handler(number, receiving.cancel)
+                loop.add_signal_handler(number, loop.call_later, LAST_MESSAGES_S, receiving.cancel)
             on_ready(runner.addresses[0][1])
             # Without its subscription the page would show stale data: an error there ends the server.
             with contextlib.suppress(asyncio.CancelledError):

@@ -442,10 +442,7 @@ def fit_interval_regressor(
     if test is not None:
         tested = ((part, test.accepted(*block)) for part, block in zip(parts, blocks, strict=True))
         contamination = _contamination(features, values, tested, inflation)
-        span = _sign_range(values)
-        if not full_range:
-            span = _hiding_range(span, point, features, values, refit, refit_line)
-            line = refit_line(np.arange(len(values)))
+        span, line = _range_of_slices(point, features, values, refit, None if full_range else refit_line)
     gains = [] if recordings is None else _gains_of_recordings(features, values, recordings, refit)
     gain = GainSpread() if recordings is None else GainSpread.fit(reported, truth, gains, fingertips)
     return IntervalRegressor(
@@ -495,21 +492,22 @@ def _contamination(
     return max(float(np.quantile(found, LEVEL)), 0.0), max(float(-np.quantile(found, 1 - LEVEL)), 0.0)
 
 
-def _sign_range(values: FloatArray) -> ValueRange:
-    """Return the range of slices: peaks of twists one way are of one sign, and no load is always possible."""
+def _range_of_slices(
+    point: Regressor, features: FloatArray, values: FloatArray, refit: Refit, refit_line: Refit | None
+) -> tuple[ValueRange, Regressor | None]:
+    """Return the range of slices and the line that reads values beyond it, if any can occur.
+
+    Peaks of twists one way are of one sign, and no load is always possible.
+    """
     low, high, beyond = float(values.min()), float(values.max()), _UNSEEN * float(np.ptp(values))
-    return ValueRange(low, high, 0.0 if low >= 0 else low - beyond, 0.0 if high <= 0 else high + beyond)
-
-
-def _hiding_range(
-    span: ValueRange, point: Regressor, features: FloatArray, values: FloatArray, refit: Refit, refit_line: Refit
-) -> ValueRange:
-    """Return the range of slices with the ends that may hide values beyond."""
+    span = ValueRange(low, high, 0.0 if low >= 0 else low - beyond, 0.0 if high <= 0 else high + beyond)
+    if refit_line is None:
+        return span, None
     low_end, high_end = (_range_end(point, features, values, refit, refit_line, sign) for sign in (1, -1))
     if low_end > high_end:
         # Every prediction may hide a value beyond either end.
         low_end, high_end = math.inf, -math.inf
-    return replace(span, low_end=low_end, high_end=high_end)
+    return replace(span, low_end=low_end, high_end=high_end), refit_line(np.arange(len(values)))
 
 
 def _range_end(

@@ -227,7 +227,10 @@ def compare_methods(split: Split, bank: Bank, mesh: Mesh, rounds: int) -> Method
     else:
         chosen = dict.fromkeys((sides[:1], sides))
         methods = [method for some in chosen for method in estimators(split, physics, some)]
-    return MethodComparison(split, measure(methods, loaded_truth(split.future), rounds))
+    measured = measure(methods, loaded_truth(split.future), rounds)
+    if not measured:
+        print(f"{split.title} is left out: no method has two valid estimates of the later loaded frames")
+    return MethodComparison(split, measured)
 
 
 def loaded_truth(series: FrameSeries) -> FloatArray:

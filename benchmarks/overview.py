@@ -23,6 +23,8 @@ from benchmarks.common import parser_of
 OVERVIEW_S = 60.0
 INTERVAL_S = 1.0
 WIDTH_PX, HEIGHT_PX, GIF_WIDTH_PX, COLOURS = 1400, 860, 840, 128
+# The page's summary of the experiment, at the end.
+SUMMARY_PICTURES = 4
 # In the hold, as a share of the demo's time.
 HOLD = 0.82
 _ADDRESS = re.compile(r"http://\S+#token=\S+")
@@ -36,7 +38,7 @@ def pictures(page: Page, demo: "subprocess.Popen[str]") -> list[bytes]:
         taken.append(page.screenshot())
         due_s += INTERVAL_S
         page.wait_for_timeout(max(0.0, due_s - time.monotonic()) * 1000)
-    return taken
+    return [*taken, *[page.screenshot()] * SUMMARY_PICTURES]
 
 
 def write_gif(taken: list[bytes], path: Path) -> None:

@@ -50,10 +50,6 @@ class SyntheticSkin:
         """The torque of the shear force about the wrist's axis."""
         return self.shear_n * self.radius_mm * 1e-3
 
-    def press(self, normal_n: float) -> None:
-        """Press with another normal force."""
-        self.normal_n = normal_n
-
     def push(self, shear_n: float) -> None:
         """Set the shear force."""
         self.shear_n = shear_n

@@ -301,6 +301,7 @@ def _fit_slices(
             strengths=estimator.strengths,
             left_out=later_origins(n) if quantity == "torque" else (),
             test=test if quantity == "torque" else None,
+            fit_line=estimator.line_fit(),
             full_range=full_range,
         )
         models[quantity] = OutputModel(regressor, novelty, estimator.k_range(features))
@@ -339,11 +340,6 @@ class ContaminationTest:
         """Return the (d,) features of a (c,) difference at the time of a row."""
         frame = ProcessedFrame(difference[None], (), self._every[None])
         return self._estimator.features(Reading(frame, float(self._t_s[row]), self._matcher))[0]
-
-    def growth(self, past: IntArray, future: IntArray) -> FloatArray:
-        """Return the growth of the intervals of (q,) later slices, by a detector fitted to the earlier ones."""
-        detector = self._detector(past)
-        return np.array([detector.widening(one, self._every) for one in self._differences[future]])
 
     def accepted(self, past: IntArray, future: IntArray) -> Mixtures:
         """Return the mixtures of later slices that a detector fitted to the earlier ones accepts."""

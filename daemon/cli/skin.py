@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.options import add_action, add_json, add_option, check_overwrite, run_action
+from shearloop.daemon.cli.options import add_action, add_json, add_option, check_overwrite, run_action, writing
 from shearloop.daemon.cli.terminal import print_result
 from shearloop.daemon.errors import UserError
 
@@ -45,8 +45,11 @@ def _characterise(args: argparse.Namespace) -> int:
     from shearloop.bank.skin.characterisation import characterise
 
     if args.out is not None:
-        # First, to report a missing library at once.
+        # First, to report a missing library or folder at once.
         from shearloop.daemon.analysis.charts.skin_figures import draw
+
+        with writing(args.out, "the figures"):
+            args.out.mkdir(parents=True, exist_ok=True)
     found = characterise(np.random.default_rng(SEED))
     if args.json:
         print(json.dumps([asdict(row) for row in found.rows], indent=1, ensure_ascii=False))

@@ -26,7 +26,6 @@ def draw(found: Characterisation, out: Path) -> list[Path]:
     """Write the figures as PNG and SVG into a folder and return their paths."""
     written = []
     try:
-        out.mkdir(parents=True, exist_ok=True)
         drawn_by_name = {
             "figure_4": _figure_4(found),
             "figure_5": _figure_5(found),

@@ -317,7 +317,7 @@ def _draw_methods(axes: Axes, compared: MethodComparison) -> None:
     future = compared.split.future
     loaded = np.count_nonzero(np.isfinite(loaded_truth(future)))
     axes.set(
-        title=f"{compared.split.title}; judged on {loaded} loaded of {len(future.t_s)} later frames",
+        title=f"{compared.split.title}; {loaded} loaded of {len(future.t_s)} later frames",
         xlabel="latency of one frame, ms (one thread; bars: slowest and fastest round)",
         ylabel=f"torque error on loaded frames (≥ {LOADED_NM:g} N·m), RMS, N·m",
     )

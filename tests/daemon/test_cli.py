@@ -61,7 +61,7 @@ def test_a_calibration_without_torques_cannot_drive_the_loop(command, config, ti
     steps = {"name": "one", "torque_source": "right", "steps": [{"do": "wait", "wait_s": 1}]}
     (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(steps))
     said = mistake(capsys, command, str(config(fingertips=section, robot="ur.yaml", experiment="experiment.yaml")))
-    assert "`torque_source: right` has a calibration without torques" in said
+    assert "torque_source: `right` has a calibration without torques" in said
 
 
 @pytest.mark.parametrize("command", ["run", "check"])

@@ -64,6 +64,14 @@ def test_a_calibration_without_torques_cannot_drive_the_loop(command, config, ti
     assert "torque_source: `right` has a calibration without torques" in said
 
 
+def test_a_bank_that_is_not_built_hides_no_mistake_of_the_experiment(config, tmp_path, capsys):
+    (tmp_path / "experiment.yaml").write_text("name: one\nsteps: [{do: wiat}]\n")
+    section = {"right": {"device": {"path": "eit"}, "bank": "none.bank"}}
+    said = mistake(capsys, "check", str(config(fingertips=section, robot="ur.yaml", experiment="experiment.yaml")))
+    assert "none.bank: the bank cannot be read" in said
+    assert "steps[0].do: 'wiat' does not exist" in said
+
+
 @pytest.mark.parametrize("command", ["run", "check"])
 @pytest.mark.parametrize(
     ("changes", "parts"),

@@ -1,23 +1,25 @@
 """The shear skin's models: time against error, readings of the paper, calibrations, depths, and contact solves.
 
-    python -m benchmarks.skin
+    python -m benchmarks.skin --out DIR
 
 The models follow one loading to 1 N and one hysteresis loop between ± 1 N under 1 N of normal force. Errors are the
-largest difference from the 2-D model at finite strain, relative to its largest response. Times are the best of several
-runs, per load step. The readings of the paper are origin slopes up to 1.2 N. The contact solver follows random load
-paths on random skins and meshes.
+largest difference from the 2-D model at finite strain, relative to its largest response. Under a plate narrower than
+the skin the reference is that model's response times the width factor of the finest sheet. Times are the best of
+several runs, per load step. The chart `skin-speed-accuracy` goes to DIR. The readings of the paper are origin slopes up
+to 1.2 N. The contact solver follows random load paths on random skins and meshes.
 """
 
 import time
 import timeit
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common import table_head, table_row
+from benchmarks.common import parser_of, table_head, table_row
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.skin.calibration import CalibrationTable, fit_calibration
 from shearloop.bank.skin.characterisation import (
@@ -33,10 +35,9 @@ from shearloop.bank.skin.membrane import (
     GAUGE_FACTOR,
     PAPER_SECTION,
     THICK_SECTION,
+    Membrane,
     Section,
-    loading_response,
-    paper_membrane,
-    section_membrane,
+    sensitivity_per_n,
 )
 from shearloop.bank.skin.plane_strain import (
     MESH_112,
@@ -51,6 +52,7 @@ from shearloop.bank.skin.plane_strain import (
     states_along,
     unloaded,
 )
+from shearloop.bank.skin.sheet import PLATE_MM, SHEET_520, SheetSize, SheetSkin
 
 NORMAL_N, AMPLITUDE_N = 1.0, 1.0
 MESHES = {56: MeshSize(3, 4, 6, 2, 2), 112: MESH_112, 448: MESH_112.refined(2)}
@@ -59,8 +61,8 @@ READ = loading(1.2)
 Model = Callable[[FloatArray], FloatArray]
 
 
-def two_dimensional(mesh: MeshSize) -> Model:
-    """Return the linear 2-D model on a mesh."""
+def two_dimensional(mesh: MeshSize, _: float) -> Model:
+    """Return the linear 2-D model on a mesh, for a plate of any width."""
     return partial(linear_responses, condense(PAPER_SECTION, mesh), NORMAL_N)
 
 
@@ -76,31 +78,112 @@ def at_finite_strain(section: Section, normal_n: float, path: FloatArray) -> Flo
     return found
 
 
-def models() -> dict[str, Model]:
-    """Return the models by name."""
+def sheet(size: SheetSize, plate_mm: float) -> Model:
+    """Return the sheet under a plate; a plate of the skin's width has held edges, as plane strain does."""
+    skin = SheetSkin(PAPER_SECTION, plate_mm, size, held_edges=plate_mm == PAPER_SECTION.width_mm)
+    return lambda path: np.array([skin.response(NORMAL_N, shear_n) for shear_n in path.tolist()])
+
+
+def models() -> dict[str, Callable[[float], Model]]:
+    """Return the models by name, each as a function of the plate's width in mm; only the sheet depends on it."""
     return {
-        "closed form, finite strain": lambda path: np.array(
-            [loading_response(PAPER_SECTION, NORMAL_N, shear) for shear in path.tolist()]
-        ),
-        "1-D, paper's F/(EA)": partial(responses, paper_membrane(), normal_n=NORMAL_N),
-        "1-D, section's EA": partial(responses, section_membrane(), normal_n=NORMAL_N),
-        **{f"2-D, linear, {elements} elements": two_dimensional(mesh) for elements, mesh in MESHES.items()},
+        "1-D, finite strain": lambda _: partial(responses, Membrane(PAPER_SECTION), normal_n=NORMAL_N),
+        "sheet, 520 elements": partial(sheet, SHEET_520),
+        **{f"2-D, linear, {elements} elements": partial(two_dimensional, mesh) for elements, mesh in MESHES.items()},
     }
 
 
-def compare_models() -> None:
-    """Print each model's time and errors."""
-    up, there_and_back = loading(AMPLITUDE_N), loop(AMPLITUDE_N)
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """One model: set-up in ms, time per load step in µs, errors relative to the largest response."""
+
+    name: str
+    set_up_ms: float
+    step_us: float
+    loading: float
+    plate: float
+
+
+def compare_models() -> list[Measured]:
+    """Print and return each model's times and errors."""
+    up, there_and_back, whole_mm = loading(AMPLITUDE_N), loop(AMPLITUDE_N), PAPER_SECTION.width_mm
     begin = time.process_time()
     true_loop = at_finite_strain(PAPER_SECTION, NORMAL_N, there_and_back)
     finite_us = 1e6 * (time.process_time() - begin) / len(there_and_back)
-    true_up, scale = true_loop[: len(up)], abs(true_loop).max()
-    print(table_head("model", "µs per step", "loading", "whole loop"))
-    for name, model in models().items():
-        step_us = 1e6 * min(timeit.repeat(partial(model, there_and_back), number=1)) / len(there_and_back)
-        errors = abs(model(up) - true_up).max() / scale, abs(model(there_and_back) - true_loop).max() / scale
-        print(table_row(name, step_us, *(f"{error:.1%}" for error in errors)), flush=True)
-    print(table_row("2-D, finite strain, 112 elements", finite_us, "–", "–"), flush=True)
+    true_up = true_loop[: len(up)]
+    finest = SHEET_520.refined(3)
+    under_plate = true_up * sheet(finest, PLATE_MM)(up)[-1] / sheet(finest, whole_mm)(up)[-1]
+    found = []
+    print(table_head("model", "set-up, ms", "µs per step", "loading", "whole loop", "14 mm plate"))
+    for name, make in models().items():
+        set_up_ms = 1e3 * min(timeit.repeat(partial(make, PLATE_MM), number=1, repeat=3))
+        model = make(whole_mm)
+        step_us = 1e6 * min(timeit.repeat(partial(model, up), number=1)) / len(up)
+        errors = [_error(model(up), true_up), _error(make(PLATE_MM)(up), under_plate)]
+        found.append(Measured(name, set_up_ms, step_us, *errors))
+        around = "–" if "sheet" in name else f"{_error(model(there_and_back), true_loop):.1%}"
+        print(table_row(name, set_up_ms, step_us, f"{errors[0]:.1%}", around, f"{errors[1]:.1%}"), flush=True)
+    ignored = f"{_error(true_up, under_plate):.1%}"
+    print(table_row("2-D, finite strain, 112 elements", "–", finite_us, "–", "–", ignored), flush=True)
+    return found
+
+
+def _error(found: FloatArray, true: FloatArray) -> float:
+    return float(abs(found - true).max() / abs(true).max())
+
+
+def draw(found: Sequence[Measured], out: Path) -> None:
+    """Draw each model's error over its time per step, for an even load and for the plate, and write both."""
+    from shearloop.daemon.analysis.charts import drawing
+
+    made = drawing.figure(8.0, 4.6)
+    axes = made.subplots()
+    drawing.plain_log(axes)
+    points = []
+    for number, (scene, errors) in enumerate(
+        {
+            "even load over 20 mm": [each.loading for each in found],
+            "plate of 14 mm": [each.plate for each in found],
+        }.items()
+    ):
+        style = drawing.look(number) | {"linestyle": "none"}
+        axes.plot([each.step_us for each in found], [100 * error for error in errors], label=scene, **style)
+        points += [(each.step_us, 100 * error, each.name) for each, error in zip(found, errors, strict=True)]
+    axes.set(xlabel="time per load step, µs", ylabel="largest error while loading, %")
+    axes.set_title("The skin's models: speed against accuracy, Fn = 1 N")
+    axes.grid(alpha=0.25)
+    axes.legend(loc="lower right")
+    axes.margins(0.25, 0.15)
+    drawing.lay_out(made)
+    drawing.write_names(axes, points)
+    drawing.save(made, {"models": [asdict(each) for each in found]}, out, "skin-speed-accuracy")
+
+
+def compare_scenes() -> None:
+    """Print the slopes of the models that a scene distinguishes, and the crosstalk of a tilted normal force."""
+    print("\n" + table_head("scene", "closed form", "2-D", "sheet", "sheet, 0.88 mm"))
+    skin = condense(PAPER_SECTION)
+    closed, flat = sensitivity_per_n(PAPER_SECTION), fit_line(READ, linear_responses(skin, NORMAL_N, READ)).slope_per_n
+    for name, plate_mm, held in (
+        ("even load, edges held", 20.0, True), ("even load, edges free", 20.0, False),
+        ("plate of 14 mm", 14.0, False), ("plate of 10 mm", 10.0, False),
+    ):  # fmt: skip
+        slopes = [
+            SheetSkin(each, plate_mm, held_edges=held).response(0.0, 1.0) for each in (PAPER_SECTION, THICK_SECTION)
+        ]
+        print(table_row(name, closed, flat, *slopes))
+    sheet_14 = SheetSkin(PAPER_SECTION)
+    print(table_row("1 N across, response", 0, 0, f"{abs(sheet_14.response(NORMAL_N, 0.0, 1.0)):.0e}", "–"))
+    more = sheet_14.response(NORMAL_N, 0.5, 0.5) / sheet_14.response(NORMAL_N, 0.5) - 1
+    print(table_row("0.5 N across and 0.5 N along, against along alone", "–", "–", f"{more:+.1%}", "–"))
+    tilt = np.radians(0.25)
+    pressed_n, tilted_n = 2 * np.cos(tilt), 2 * np.sin(tilt)
+    pressed = apply_load(skin, unloaded(skin), pressed_n, 0.0)
+    tilted = gauge_responses(
+        skin, [apply_load(skin, start, pressed_n, tilted_n) for start in (unloaded(skin), pressed)]
+    ).tolist()
+    for name, response in zip(("2 N that rises at 0.25°", "2 N that then tilts by 0.25°"), tilted, strict=True):
+        print(table_row(name, 0, response, sheet_14.response(pressed_n, tilted_n), "–"))
 
 
 def compare_readings() -> None:
@@ -124,15 +207,16 @@ def compare_readings() -> None:
 
 
 def compare_calibrations() -> None:
-    """Print what the run-time membrane finds on skins that follow the closed form at finite strain, without noise."""
+    """Print what the fit finds on skins that follow the membrane at finite strain, without noise."""
     print("\n" + table_head("recorded under", "friction", "slope, 1/N", "95 % interval, ± N"))
     for normal_forces in ((1.0,), (0.5, 1.0, 1.5, 2.0)):
         rows = []
-        for normal_n, sign in product(normal_forces, (1.0, -1.0)):
+        for normal_n, path in product(normal_forces, (READ, -READ)):
             rows += [(1.0, 1.0, 0.0, 0.0)] * 2
-            for shear_n in READ.tolist():
-                response = loading_response(THICK_SECTION, normal_n, sign * shear_n)
-                rows.append((1 + max(response, 0.0), 1 + max(-response, 0.0), sign * shear_n, normal_n))
+            for shear_n, response in zip(
+                path, responses(Membrane(THICK_SECTION), path.tolist(), normal_n), strict=True
+            ):
+                rows.append((1 + max(response, 0.0), 1 + max(-response, 0.0), shear_n, normal_n))
         found = fit_calibration(CalibrationTable(*np.array(rows).T))
         name = f"{normal_forces[0]} to {normal_forces[-1]} N" if len(normal_forces) > 1 else f"{normal_forces[0]} N"
         print(table_row(name, found.friction, found.slope_per_n, found.prediction_half_width_n), flush=True)
@@ -185,8 +269,10 @@ def count_steps() -> None:
 
 
 def main() -> None:
-    """Measure and print the tables."""
-    compare_models()
+    """Measure, print the tables and draw the chart."""
+    args = parser_of(__doc__).parse_args()
+    draw(compare_models(), args.out)
+    compare_scenes()
     compare_readings()
     compare_calibrations()
     compare_depths()

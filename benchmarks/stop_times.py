@@ -187,7 +187,8 @@ class RunningRig:
         wrist_rad = self.wait_for(lambda topic, _: topic == "robot.state")["wrist_rad"]
         twist = {"do": "twist", "angles_rad": [-FAR_RAD if wrist_rad > 0 else FAR_RAD], "absolute": True,
                  "speed_rad_per_s": SPEED_RAD_PER_S, "return_to_start": False}  # fmt: skip
-        steps = [{"do": "release"}, {"do": "grip", "width_mm": 5, "force_n": 60}, twist]
+        grip = {"do": "grip", "width_mm": 5, "speed_mm_per_s": 250, "force_n": 60}
+        steps = [{"do": "release", "width_mm": 30}, grip, twist]
         limits = {"torque_nm": 0.3, "angle_rad": 6.28}
         path = self._folder / "twist.yaml"
         content = {"name": "twist", "torque_source": "load_cell", "limits": limits, "steps": steps}

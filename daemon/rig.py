@@ -128,14 +128,13 @@ class Rig:
         supervisor: Supervisor,
         recorder: Recorder | None = None,
     ) -> None:
-        """Read the robot's settings; it is not connected yet. `sensors` are those that an experiment tares."""
+        """Read the robot's settings; it is not connected yet. An experiment tares or adapts the `sensors`."""
         if config.robot is None:
             raise ValueError("a rig needs a robot")
         self.control_loop = loop
         self.gripper = gripper
         self.robot = UrRobot(robot_settings(config.robot), LinkMonitor(DeviceLink("robot", loop)))
-        zeroed, dead = sensors.values(), supervisor.dead
-        self.runner = ControlLoopRunner(loop, self.robot, gripper, zeroed, publisher, clock, dead)
+        self.runner = ControlLoopRunner(loop, self.robot, gripper, sensors, publisher, clock, supervisor.dead)
         self._recorder = recorder
         # Counts the operator's stops, also while an experiment starts.
         self._stops = 0
@@ -207,20 +206,43 @@ def check_experiment(
             for number, step in enumerate(file.steps, 1)
             if isinstance(step, experiment_schema.GripStep | experiment_schema.ReleaseStep)
         ]
+    errors += _unadaptable(file, sources)
     if (unidentified := _holds_unidentified(file)) is not None:
         errors.append(
             f"step {unidentified} is `hold_torque`, and the tool is not identified then; put an `identify` "
-            "step before it, after the last `tare`, `grip` or `release`"
+            "step before it, after the last `tare`, `grip`, `release` or `adapt`"
         )
     if errors:
         raise UserError("\n".join(f"{path}: {error}" for error in errors))
     return file
 
 
+def _unadaptable(file: experiment_schema.ExperimentFile, sources: Mapping[str, TorqueSource]) -> list[str]:
+    """Return a sentence on each `adapt` step without a known torque, a gain to correct, or a twist before it."""
+    found, twisted = [], False
+    for number, step in enumerate(file.steps, 1):
+        if step.do in ("tare", "grip", "release"):
+            twisted = False
+        twisted = twisted or step.do in ("identify", "twist", "hold_torque", "tighten")
+        if not isinstance(step, experiment_schema.AdaptStep):
+            continue
+        named = [name for name, source in sources.items() if source.has_gain]
+        if step.fingertip not in named:
+            known = f"choose one of {', '.join(named)}" if named else "calibrate one with `shearloop calibrate`"
+            found.append(f"step {number} adapts `{step.fingertip}`, which has no calibration on recordings; {known}")
+        if step.reference not in (*sources, WRENCH):
+            cure = "add a `load_cell` section to the configuration, or write `reference: wrench`"
+            found.append(f"step {number} is `adapt`, and no load cell measures the torque; {cure}")
+        if not twisted:
+            cure = "put an `identify` or a `twist` before it, after the last `tare`, `grip` or `release`"
+            found.append(f"step {number} is `adapt`, and the tool is not twisted before; {cure}")
+    return found
+
+
 def _holds_unidentified(file: experiment_schema.ExperimentFile) -> int | None:
     """Return the number of the first step that closes the loop on an unidentified tool, or None.
 
-    A new grip or a new zero invalidates an identification.
+    A new grip, a new zero, or another gain of the driving torque invalidates an identification.
     """
     identified = False
     for number, step in enumerate(file.steps, 1):
@@ -228,6 +250,8 @@ def _holds_unidentified(file: experiment_schema.ExperimentFile) -> int | None:
             case experiment_schema.IdentifyStep():
                 identified = True
             case experiment_schema.TareStep() | experiment_schema.GripStep() | experiment_schema.ReleaseStep():
+                identified = False
+            case experiment_schema.AdaptStep() if step.fingertip == file.torque_source:
                 identified = False
             case experiment_schema.HoldTorqueStep() if not identified:
                 return number

@@ -1,4 +1,4 @@
-"""A synthetic shear skin: the paper's membrane on a finger, pushed or turned by a tool. No I/O, no clock.
+"""A synthetic shear skin: the membrane at finite strain on a finger, pushed or turned by a tool. No I/O, no clock.
 
 The tool touches the skin at `radius_mm` from the wrist's axis, through an elastic contact.
 Wrist angle → stretch of contact and membrane in series → shear force → strain of the gauges → resistances.
@@ -7,7 +7,7 @@ Wrist angle → stretch of contact and membrane in series → shear force → st
 import math
 from random import Random
 
-from shearloop.bank.skin.membrane import PAPER_SECTION, UNSTRETCHED, paper_membrane
+from shearloop.bank.skin.membrane import THICK_SECTION, UNSTRETCHED, Membrane
 
 # Real gauges differ, so swapped ones can be recognised.
 REST_OHM = (24.6, 25.3)
@@ -21,6 +21,8 @@ DRIFT_STD, DRIFT_TIME_S = 1.48e-4, 600.0
 SLACK_RATIO = -0.125
 # The paper's response to 2 N of normal force alone.
 CROSSTALK_PER_N = 1.24e-4 / 2
+# Of the balance between contact and membrane: each step leaves at most a third of the error.
+TOLERANCE_N, MOST_STEPS = 1e-9, 30
 
 
 class SyntheticSkin:
@@ -34,7 +36,7 @@ class SyntheticSkin:
         slack_ratio: float = SLACK_RATIO,
         seed: int = 0,
     ) -> None:
-        self.membrane = paper_membrane()
+        self.membrane = Membrane(THICK_SECTION)
         self.slack_ratio = slack_ratio
         self.radius_mm = radius_mm
         self.normal_n = normal_n
@@ -44,18 +46,9 @@ class SyntheticSkin:
         self._wander = [self._random.gauss(0.0, DRIFT_STD / math.sqrt(2.0)) for _ in range(2)]
 
     @property
-    def stiffness_n_per_mm(self) -> float:
-        """The stiffness of the membrane's stretched side: EA over the arc from the load to the bracket."""
-        return self.membrane.axial_stiffness_n / (math.pi / 2 * PAPER_SECTION.mid_radius_mm)
-
-    @property
     def torque_nm(self) -> float:
         """The torque of the shear force about the wrist's axis."""
         return self.shear_n * self.radius_mm * 1e-3
-
-    def press(self, normal_n: float) -> None:
-        """Press with another normal force."""
-        self.normal_n = normal_n
 
     def push(self, shear_n: float) -> None:
         """Set the shear force."""
@@ -65,17 +58,20 @@ class SyntheticSkin:
     def turn(self, angle_rad: float) -> float:
         """Turn the tool to an angle, counted from its first contact; return the shear force.
 
-        Contact and membrane stretch together. While the skin sticks only the contact yields; once force and tension
-        differ by μFₙ the skin slips.
+        Contact and membrane stretch together. While the skin sticks only the contact yields.
         """
-        way_mm = angle_rad * self.radius_mm
-        contact, membrane = CONTACT_N_PER_MM, self.stiffness_n_per_mm
-        hold_n = self.membrane.friction * self.normal_n
-        net_n = self._state.net_tension_n
-        shear_n = contact * (way_mm - net_n / membrane)
-        if abs(shear_n - net_n) > hold_n:
-            slipping_n = math.copysign(hold_n, shear_n - net_n)
-            shear_n = (way_mm + slipping_n / membrane) / (1.0 / contact + 1.0 / membrane)
+        way_mm, outer_mm = angle_rad * self.radius_mm, self.membrane.section.outer_radius_mm
+        sticking_mm_per_n = 1.0 / CONTACT_N_PER_MM
+        slipping_mm_per_n = sticking_mm_per_n + math.pi / 2 * outer_mm * self.membrane.sheet_per_n
+        shear_n = self.shear_n
+        for _ in range(MOST_STEPS):
+            state = self.membrane.step(self._state, shear_n, self.normal_n)
+            beyond_mm = way_mm - sticking_mm_per_n * shear_n - outer_mm * self.membrane.turned_rad(state)
+            slips = state.net_tension_n != self._state.net_tension_n
+            change_n = beyond_mm / (slipping_mm_per_n if slips else sticking_mm_per_n)
+            shear_n += change_n
+            if abs(change_n) < TOLERANCE_N:
+                break
         self.push(shear_n)
         return shear_n
 

@@ -29,6 +29,7 @@ class InputKind(Enum):
     DATA = "data"  # bytes arrived
     TARE = "tare"  # a new zero was asked for, or found
     TOOL = "tool"  # the gripped tool changed
+    ADAPT = "adapt"  # the gain was corrected by the torques in `data`
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,13 +5,13 @@ import graphlib
 import re
 from collections import Counter
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import grimp
 import pytest
 
 FOLDERS = ("bank", "drivers", "daemon")
-MODULES = {path: ast.parse(path.read_text()) for folder in FOLDERS for path in sorted(Path(folder).rglob("*.py"))}
 LONGEST_FUNCTION = 60
 MOST_ATTRIBUTES = 12
 MOST_CALLABLES = 0.05
@@ -25,8 +25,14 @@ OF_LIBRARIES = ("parser", "action", "config", "tqdm", "sys")
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
+@cache
+def modules() -> dict[Path, ast.Module]:
+    """Return the syntax trees of all modules."""
+    return {path: ast.parse(path.read_text()) for folder in FOLDERS for path in sorted(Path(folder).rglob("*.py"))}
+
+
 def of_kind(kind: type | tuple[type, ...]) -> Iterator[tuple[Path, ast.AST]]:
-    return ((path, node) for path, tree in MODULES.items() for node in ast.walk(tree) if isinstance(node, kind))
+    return ((path, node) for path, tree in modules().items() for node in ast.walk(tree) if isinstance(node, kind))
 
 
 def body_lines(function: Function) -> int:
@@ -105,14 +111,14 @@ def test_an_object_is_complete_after_its_construction():
 
 def test_no_two_modules_import_each_other():
     graph = grimp.build_graph("shearloop", cache_dir=None)
-    modules = {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
-    graphlib.TopologicalSorter(modules).prepare()
+    imported = {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+    graphlib.TopologicalSorter(imported).prepare()
 
 
 @pytest.mark.parametrize("package", FOLDERS)
 def test_no_folder_holds_more_than_half_of_its_package(package):
     lines = Counter[str]()
-    for path in MODULES:
+    for path in modules():
         if path.parts[0] == package:
             lines[path.parts[1]] += len(path.read_text().splitlines())
     assert max(lines.values()) <= lines.total() / 2, lines

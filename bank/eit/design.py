@@ -24,9 +24,9 @@ from scipy.stats import rankdata
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.channels import ChannelTable
 from shearloop.bank.eit.fingertip import Fingertip
-from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.forward import BatchForwardModel, ForwardModel
 from shearloop.bank.eit.matching import ReferenceMatcher
-from shearloop.bank.eit.models import MODELS, conductivity
+from shearloop.bank.eit.models import MODELS, ConductivityModel, conductivity
 from shearloop.bank.errors import CalibrationError, MatchingError
 
 # The share of the noise that each choice may add.
@@ -97,12 +97,13 @@ def searched_settings(model: str, height: float, places: FloatArray = _PLACES) -
     return [Setting(k * k_unit, sigma * size) for k in places for sigma in widths]
 
 
-def simulated_signals(forward: ForwardModel, model: str, settings: Sequence[Setting]) -> FloatArray:
+def simulated_signals(forward: BatchForwardModel, model: str, settings: Sequence[Setting]) -> FloatArray:
     """Return the (m, n) difference signals of the settings whose conductivity is positive everywhere."""
-    homogeneous = forward.homogeneous()
-    cells = [conductivity(forward.mesh, model, k, sigma) for k, sigma in settings]
-    signals = [forward.voltages(cell) - homogeneous for cell in cells if cell.min() > 0]
-    return np.array(signals).reshape(-1, forward.table.n_channels)
+    of = ConductivityModel(forward.mesh)
+    cells = [cell for cell in (of.conductivity(model, *one) for one in settings) if cell.min() > 0]
+    voltages = forward.voltages(np.array([np.ones(len(forward.mesh.triangles)), *cells]))
+    signals: FloatArray = voltages[1:] - voltages[0]
+    return signals
 
 
 def envelope(magnitudes: FloatArray, settings: EnvelopeSettings = PAPER_ENVELOPE) -> FloatArray:
@@ -263,7 +264,7 @@ class Design:
 def design_bank(measured: MeasuredFrames, fingertip: Fingertip) -> Design:
     """Return the choices for frames of this fingertip. Raises BankError for a geometry that cannot be solved on."""
     table = fingertip.table
-    forward = ForwardModel(replace(fingertip, mesh_size_cm=0.2).mesh(), table)
+    forward = BatchForwardModel(replace(fingertip, mesh_size_cm=0.2).mesh(), table)
     searched = {name: _positive(forward, name, searched_settings(name, forward.mesh.height_cm)) for name in MODELS}
     signals = {name: np.abs(simulated_signals(forward, name, settings)) for name, settings in searched.items()}
     models = tuple(_model_fit(measured, name, signals[name], table) for name in MODELS)
@@ -299,7 +300,7 @@ def simulated_frames(design: Design, fingertip: Fingertip, n: int = 49, seed: in
     Torque and σ change along the design's range, in the proportions of the paper's fingertip. Amplitudes are the
     model's voltages and torques have no unit: a design depends on neither.
     """
-    forward = ForwardModel(replace(fingertip, mesh_size_cm=_SIMULATED_CM).mesh(), fingertip.table)
+    forward = BatchForwardModel(replace(fingertip, mesh_size_cm=_SIMULATED_CM).mesh(), fingertip.table)
     size = forward.mesh.height_cm / _PAPER_HEIGHT_CM
     sigmas = np.linspace(*design.sigma_range, n)
     k = sum(design.k_range) / 2
@@ -311,9 +312,10 @@ def simulated_frames(design: Design, fingertip: Fingertip, n: int = 49, seed: in
     return MeasuredFrames(noisy, noise_v, np.array([-setting.sigma for setting in settings]))
 
 
-def _positive(forward: ForwardModel, model: str, settings: Sequence[Setting]) -> list[Setting]:
+def _positive(forward: BatchForwardModel, model: str, settings: Sequence[Setting]) -> list[Setting]:
     """Return the settings with a positive conductivity."""
-    return [one for one in settings if conductivity(forward.mesh, model, *one).min() > 0]
+    of = ConductivityModel(forward.mesh)
+    return [one for one in settings if of.conductivity(model, *one).min() > 0]
 
 
 def _fit(frames: FloatArray, signals: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -362,19 +364,21 @@ def _shape_error(one: FloatArray, other: FloatArray) -> float:
 def _mesh_choice(fingertip: Fingertip, model: str, place: Setting, noise: float) -> DesignChoice:
     def solved(size: float) -> tuple[FloatArray, int]:
         forward = ForwardModel(replace(fingertip, mesh_size_cm=size).mesh(), fingertip.table)
-        return np.abs(simulated_signals(forward, model, [place])[0]), len(forward.mesh.triangles)
+        voltages = forward.voltages(conductivity(forward.mesh, model, *place))
+        return np.abs(voltages - forward.homogeneous()), len(forward.mesh.triangles)
 
-    coarse, fine = (solved(size)[0] for size in _FINE_CM)
+    found = {size: solved(size) for size in sorted({*MESH_SIZES_CM, *_FINE_CM}, reverse=True)}
+    coarse, fine = (found[size][0] for size in _FINE_CM)
     truth = fine + (fine - coarse) / (_FINE_CM[0] / _FINE_CM[1] - 1.0)
-    steps = []
-    for size in MESH_SIZES_CM:
-        signal, triangles = solved(size)
-        steps.append(DesignStep(size, _shape_error(truth, signal) / noise, f"{triangles} triangles"))
+    steps = [
+        DesignStep(size, _shape_error(truth, found[size][0]) / noise, f"{found[size][1]} triangles")
+        for size in MESH_SIZES_CM
+    ]
     return DesignChoice("mesh size", "cm", tuple(steps))
 
 
 def _count_choice(
-    forward: ForwardModel, model: str, middle: Setting, name: str, ends: tuple[float, float], noise: float
+    forward: BatchForwardModel, model: str, middle: Setting, name: str, ends: tuple[float, float], noise: float
 ) -> DesignChoice:
     """Choose the number of cells along `name` (k or sigma): the error is that of a frame half-way between two cells."""
     steps, unit = [], getattr(MODELS[model], f"{name}_unit")
@@ -398,7 +402,7 @@ def _count_choice(
 
 
 def _rank_choice(
-    forward: ForwardModel, model: str, k: tuple[float, float], sigma: tuple[float, float], noise: float
+    forward: BatchForwardModel, model: str, k: tuple[float, float], sigma: tuple[float, float], noise: float
 ) -> DesignChoice:
     """Choose how many directions of all signals' shapes a bank needs."""
     ks, sigmas = (np.unique(np.linspace(*ends, _RANKED)).tolist() for ends in (k, sigma))

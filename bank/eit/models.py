@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 _SUBDIVISIONS = 5
 # Triangles computed at a time: small enough for the processor's caches.
 _AT_ONCE = 1300
+# Of a height, in shares of the fingertip's, in which two triangles are alike.
+_DIGITS = 12
 # An axis turned this far lies across the fingertip.
 QUARTER_DEG = 90.0
 
@@ -139,7 +141,11 @@ class ConductivityModel:
         self._variation = variation
         turn, middle = np.deg2rad(variation.tilt_deg), (x.min() + x.max()) / 2
         heights = self._centre + (y - self._centre) * np.cos(turn) + (x - middle) * np.sin(turn) if turn else y
-        corners, self._alike = np.unique(heights[mesh.triangles], axis=0, return_inverse=True)
+        # A triangle's mean does not depend on the order of its corners, nor on rounding.
+        corners = np.sort(heights[mesh.triangles], axis=1)
+        rounded = np.round(corners / mesh.height_cm, _DIGITS)
+        _, first, self._alike = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+        corners = corners[first]
         points = corners @ averaging_points().T
         self._heights = [np.ascontiguousarray(part.T) for part in np.array_split(points, -(-len(points) // _AT_ONCE))]
 

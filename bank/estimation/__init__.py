@@ -4,11 +4,12 @@ from shearloop.bank.estimation.calibration import Calibration
 from shearloop.bank.estimation.estimator import Estimator, Physics
 from shearloop.bank.estimation.fitting import adapt, fit
 from shearloop.bank.estimation.load_delay import TRUSTED, LoadTiming, measure_timing
-from shearloop.bank.estimation.session import EstimatorSession
-from shearloop.bank.estimation.values import Estimate, FrameSeries, Measured, TactileFrame, combine
+from shearloop.bank.estimation.session import Adaptation, EstimatorSession
+from shearloop.bank.estimation.values import Estimate, FrameSeries, Measured, TactileFrame, combine, torque_at
 
 __all__ = [
     "TRUSTED",
+    "Adaptation",
     "Calibration",
     "Estimate",
     "Estimator",
@@ -22,4 +23,5 @@ __all__ = [
     "combine",
     "fit",
     "measure_timing",
+    "torque_at",
 ]

@@ -185,18 +185,15 @@ def image_matrix(mesh: "Mesh", table: ChannelTable) -> FloatArray:
     squares of the mesh's bounding box with at least one triangle.
     """
     # Imported here because only fitting needs it: it would slow the daemon's start.
-    from shearloop.bank.eit.forward import ForwardModel
+    from shearloop.bank.eit.forward import BatchForwardModel
 
-    model = ForwardModel(mesh, table)
     centres = mesh.nodes[mesh.triangles].mean(axis=1)
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     size = float((high - low).max()) / _PIXELS_ALONG
     _, pixel = np.unique(np.floor((centres - low) / size).astype(np.int64) @ [1, 1000], return_inverse=True)
-    columns = []
-    for one in range(int(pixel.max()) + 1):
-        step = np.where(pixel == one, _STEP, 0.0)
-        columns.append((model.voltages(1.0 + step) - model.voltages(1.0 - step)) / (2 * _STEP))
-    jacobian = np.array(columns).T
+    steps = np.where(pixel == np.arange(int(pixel.max()) + 1)[:, None], _STEP, 0.0)
+    up, down = np.split(BatchForwardModel(mesh, table).voltages(1.0 + np.concatenate([steps, -steps])), 2)
+    jacobian = (up - down).T / (2 * _STEP)
     normal = jacobian.T @ jacobian
     return np.asarray(np.linalg.solve(normal + _SMOOTHING * np.diag(np.diag(normal)), jacobian.T))
 

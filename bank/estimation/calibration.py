@@ -26,11 +26,11 @@ from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor, PolynomialRegressor
 from shearloop.bank.estimation.values import INLINE, Kind, Measured
 from shearloop.bank.estimators import estimator_class
-from shearloop.bank.gain import ToolLaw
+from shearloop.bank.gain import GainCorrection, ToolLaw
 from shearloop.bank.polynomial import Polynomial
 from shearloop.files import replace_file
 
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 # First bytes of a zip that is not empty.
 ARCHIVE_MAGIC = b"PK\x03\x04"
 _FILE_KIND = "shearloop estimator calibration"
@@ -92,6 +92,22 @@ class Calibration:
             )
         regressor = self.torque.regressor.scaled(gain, law.spread)
         return replace(self, torque=replace(self.torque, regressor=regressor), tools=None, tool_mm=tool.value)
+
+    def gain_regressor(self) -> IntervalRegressor:
+        """Return the torque's regressor, whose gain twists can correct; raises CalibrationError without one."""
+        if self.kind == "raw" and self.torque is not None and isinstance(self.torque.regressor, IntervalRegressor):
+            return self.torque.regressor
+        raise CalibrationError("only the torque of raw frames has a gain to correct; calibrate on raw recordings")
+
+    def correct_gain(self, features: FloatArray, torque_nm: FloatArray) -> tuple[Self, GainCorrection]:
+        """Return the calibration with the gain of each side corrected by (n, d) features of known torques (n,).
+
+        Raises CalibrationError as `gain_regressor` does, and without a load that is large enough to show the gain.
+        """
+        torque, regressor = self.torque, self.gain_regressor()
+        sides = self.estimator.side_of_features(len(regressor.mean_feature))
+        adapted, correction = regressor.adapt(features, torque_nm, sides)
+        return replace(self, torque=torque and replace(torque, regressor=adapted)), correction
 
     @classmethod
     def uncalibrated(cls, bank_identity: str, table: ChannelTable = PAPER_TABLE) -> Self:

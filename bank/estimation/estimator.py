@@ -219,6 +219,10 @@ class Estimator:
         """Return the fit to slices of (n,) values; raises CalibrationError where they do not determine it."""
         return self.ridge
 
+    def line_fit(self) -> RegressorFit:
+        """Return the fit of a line to slices, which reads torques beyond the calibrated ones."""
+        return self.ridge
+
     def fit_torque(
         self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None, recordings: IntArray
     ) -> tuple[Self, IntervalRegressor, float]:

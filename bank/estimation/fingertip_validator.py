@@ -322,9 +322,11 @@ def _discriminant(parts: list[FloatArray]) -> FloatArray:
     """
     means = [part.mean(axis=0) for part in parts]
     within = np.vstack([part - mean for part, mean in zip(parts, means, strict=True)])
-    # The first right singular vectors, five times as fast as by np.linalg.svd, which finds all.
-    first = within.shape[1] - _N_NUISANCE, within.shape[1] - 1
-    nuisance = list(linalg.eigh(within.T @ within, subset_by_index=first)[1].T)
+    # The first right singular vectors, by the smaller of the two Gram matrices: np.linalg.svd would find all.
+    few = len(within) < within.shape[1]
+    gram = within @ within.T if few else within.T @ within
+    vectors = linalg.eigh(gram, subset_by_index=(len(gram) - _N_NUISANCE, len(gram) - 1))[1]
+    nuisance = list((within.T @ vectors if few else vectors).T)
     step = means[1] - means[0]
     if len(parts) == 3:
         nuisance.append(means[2] - means[0])

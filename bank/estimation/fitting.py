@@ -213,9 +213,7 @@ def adapt(
     if len(tools := _tools_of(recordings)) > 1:
         raise CalibrationError("the recordings are of several tools; adapt to one at a time")
     calibration = calibration.for_tool(tools[0] if tools else None)
-    torque = calibration.torque
-    if calibration.kind != "raw" or torque is None or not isinstance(regressor := torque.regressor, IntervalRegressor):
-        raise CalibrationError("only the torque of raw frames has a gain to correct; calibrate on raw recordings")
+    calibration.gain_regressor()
     matcher = calibration.matcher((physics or Physics()).bank)
     check_finite(recordings)
     rows = [
@@ -226,14 +224,11 @@ def adapt(
     ]
     if not rows:
         raise CalibrationError("no frame is gripped and undisturbed for long enough; twist the gripped tool again")
-    adapted, correction = regressor.adapt(
+    adapted, correction = calibration.correct_gain(
         np.array([row.features[calibration.estimator.columns["torque"]] for row in rows]),
         np.array([row.torque_nm for row in rows]),
-        calibration.estimator.side_of_features(len(regressor.mean_feature)),
     )
-    model = OutputModel(adapted, None, torque.k_range)
-    adapted_to = replace(calibration, torque=model, source=f"{calibration.source}, adapted on {source}")
-    return adapted_to, correction
+    return replace(adapted, source=f"{calibration.source}, adapted on {source}"), correction
 
 
 def _replay(
@@ -306,6 +301,7 @@ def _fit_slices(
             strengths=estimator.strengths,
             left_out=later_origins(n) if quantity == "torque" else (),
             test=test if quantity == "torque" else None,
+            fit_line=estimator.line_fit(),
             full_range=full_range,
         )
         models[quantity] = OutputModel(regressor, novelty, estimator.k_range(features))
@@ -344,11 +340,6 @@ class ContaminationTest:
         """Return the (d,) features of a (c,) difference at the time of a row."""
         frame = ProcessedFrame(difference[None], (), self._every[None])
         return self._estimator.features(Reading(frame, float(self._t_s[row]), self._matcher))[0]
-
-    def growth(self, past: IntArray, future: IntArray) -> FloatArray:
-        """Return the growth of the intervals of (q,) later slices, by a detector fitted to the earlier ones."""
-        detector = self._detector(past)
-        return np.array([detector.widening(one, self._every) for one in self._differences[future]])
 
     def accepted(self, past: IntArray, future: IntArray) -> Mixtures:
         """Return the mixtures of later slices that a detector fitted to the earlier ones accepts."""

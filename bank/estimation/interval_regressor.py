@@ -139,13 +139,11 @@ class CensoredRidge(Ridge):
 
 Regressor: TypeAlias = Ridge | CensoredRidge | InverseCalibration
 RegressorFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Regressor]
+Refit: TypeAlias = Callable[[IntArray], Regressor]
 
 
 class SlicesTest(Protocol):
     """A test of later slices by detectors fitted to earlier ones."""
-
-    def growth(self, past: IntArray, future: IntArray) -> FloatArray:
-        """Return the growth of each later row's interval."""
 
     def accepted(self, past: IntArray, future: IntArray) -> Mixtures:
         """Return the accepted mixtures of later rows with foreign signals."""
@@ -209,13 +207,13 @@ class ValueRange:
     """The calibrated values, low to high, and what predictions at their ends may hide.
 
     Predictions at or below low_end may hide any lower value, those at or above high_end any higher one (−∞ and ∞ where
-    that was not tested); lowest and highest are the furthest such values.
+    none is hidden); lowest and highest are the furthest values that may occur.
     """
 
     low: float
     high: float
-    lowest: float
-    highest: float
+    lowest: float = -math.inf
+    highest: float = math.inf
     low_end: float = -math.inf
     high_end: float = math.inf
 
@@ -228,7 +226,7 @@ class IntervalRegressor:
     left-out loads lay outside their intervals, so every interval spans the calibrated range. contamination_below and
     _above are how far the truth may lie below and above a prediction because of foreign signals, at the limit of
     detection (0 where that was not tested). timing_widening is the factor on the loads' intervals for unknown load
-    timing. `gain` is how much a torque's gain changes between recordings.
+    timing. `gain` is how much a torque's gain changes between recordings. `line` reads values beyond the range.
     """
 
     point: Regressor
@@ -241,12 +239,12 @@ class IntervalRegressor:
     contamination_above: float = 0.0
     timing_widening: float = 1.0
     gain: GainSpread = field(default=GainSpread(), metadata=INLINE)
+    line: Regressor | None = None
 
     def predict(
         self,
         features: FloatArray,
         usable_share: float = 1.0,
-        widening: float = 1.0,
         limit_share: float = 0.0,
         complete: FloatArray | None = None,
     ) -> tuple[float, float, float]:
@@ -263,22 +261,28 @@ class IntervalRegressor:
         # No torque where the lever would not touch.
         reported = raws if lever is None else lever.sign * np.maximum(raws, 0.0)
         raw, (value, *others) = float(raws[0]), reported.tolist()
-        widening /= math.sqrt(max(usable_share, 0.1))
+        widening = 1.0 / math.sqrt(max(usable_share, 0.1))
         half = widening * float(self.intervals.half_widths[self.intervals.edges.searchsorted(raw)])
         moved = others[0] - value if others else 0.0
         down, up = self.gain.reach(value)
-        below = max(math.hypot(half, down) + max(-moved, 0.0), limit_share * self.contamination_below)
-        above = max(math.hypot(half, up) + max(moved, 0.0), limit_share * self.contamination_above)
+        below = max(math.hypot(half, down), limit_share * self.contamination_below) + max(-moved, 0.0)
+        above = max(math.hypot(half, up), limit_share * self.contamination_above) + max(moved, 0.0)
         if self.misses_loads:
             below, above = below + max(value - self.range.low, 0.0), above + max(self.range.high - value, 0.0)
         if lever is not None and raw < 0:
             other_way = widening * TWO_SIDED_95 * lever.sigma - raw
             below, above = (max(below, other_way), above) if lever.sign > 0 else (below, max(above, other_way))
-        if value <= self.range.low_end:
-            below = max(below, value - self.range.lowest)
-        if value >= self.range.high_end:
-            above = max(above, self.range.highest - value)
-        return value, below, above
+        span = self.range
+        if value <= span.low_end:
+            below = math.inf
+        if value >= span.high_end:
+            above = math.inf
+        if self.line is not None:
+            # A line reads at least half of the way beyond the range.
+            read = float(self.line.predict(features))
+            below = max(below, value - 2 * read + span.low if read < span.low else 0.0)
+            above = max(above, 2 * read - span.high - value if read > span.high else 0.0)
+        return value, min(below, max(value - span.lowest, 0.0)), min(above, max(span.highest - value, 0.0))
 
     def scaled(self, factor: float, spread: float) -> "IntervalRegressor":
         """Return the regressor of values larger by a factor, whose gain and zero have this spread."""
@@ -384,6 +388,7 @@ def fit_interval_regressor(
     limit_features: bool = False,
     left_out: Sequence[tuple[IntArray, IntArray]] = (),
     test: SlicesTest | None = None,
+    fit_line: RegressorFit | None = None,
     bounds: tuple[FloatArray, FloatArray] | None = None,
     full_range: bool = False,
     recordings: IntArray | None = None,
@@ -392,11 +397,11 @@ def fit_interval_regressor(
     """Fit to (n, d) features and (n,) values in time order.
 
     `left_out` are pairs of rows to fit to and rows to validate on; by default blocks of time in turn. With a `test`
-    residuals are in units of its growth (normalised conformal prediction, Papadopoulos et al. 2002), intervals cover
-    the error of accepted mixtures, and extrapolation beyond the range is tested, unless the values cover the
-    `full_range` that will ever occur. `bounds` are the least and largest value (n,) that each frame may have: intervals
-    extend to the further one. With the number of each row's recording, `recordings` (n,), intervals allow for the gain
-    of another recording of as many `fingertips`. Raises CalibrationError where the data does not determine the fit.
+    intervals cover the error of accepted mixtures and values keep their sign; unless they cover the `full_range` that
+    will ever occur, `fit_line` fits what reads values beyond it. `bounds` are the least and largest value (n,) that
+    each frame may have: intervals extend to the further one. With the number of each row's recording, `recordings`
+    (n,), intervals allow for the gain of another recording of as many `fingertips`. Raises CalibrationError where the
+    data does not determine the fit.
     """
     _check_values(values)
     strength = strengths[0] if len(strengths) == 1 else best_strength(features, values, fit, strengths)[0]
@@ -405,13 +410,15 @@ def fit_interval_regressor(
     def refit(rows: IntArray) -> Regressor:
         return fit(features[rows], values[rows], strength)
 
+    def refit_line(rows: IntArray) -> Regressor:
+        return (fit_line or fit)(features[rows], values[rows], strength)
+
     parts = [refit(past) for past, _ in blocks]
     raw = [part.predict(features[future]) for part, (_, future) in zip(parts, blocks, strict=True)]
     reported = np.concatenate([_reported(part, one) for part, one in zip(parts, raw, strict=True)])
     predicted, rows = np.concatenate(raw), np.concatenate([future for _, future in blocks])
     point, truth = fit(features, values, strength), values[rows]
     residuals = reported - truth
-    scale = 1.0 if test is None else np.concatenate([test.growth(*block) for block in blocks])
     edges = (-point.sigma, 0.0, 0.4 * float(np.abs(values).max())) if isinstance(point, CensoredRidge) else ()
     inflation = 1.0 if isinstance(point, InverseCalibration) else _INFLATION
     if left_out:
@@ -419,7 +426,7 @@ def fit_interval_regressor(
     centre = features.mean(axis=0)
     deviation = np.abs(features - centre).max(axis=0) if limit_features else np.zeros(0)
     least = LEAST_HALF_WIDTH * float(np.ptp(values))
-    intervals, widening = Intervals.fit(predicted, residuals / scale, edges, inflation, least), 1.0
+    intervals, widening = Intervals.fit(predicted, residuals, edges, inflation, least), 1.0
     # Before widening for unknown times: a load that is not seen is not seen at any time.
     half = np.array([intervals.half_width(one) for one in predicted])
     misses_loads = test is None and _misses_loads(truth, np.abs(residuals) <= half)
@@ -429,20 +436,18 @@ def fit_interval_regressor(
             inflation = student_inflation(len(blocks))
         errors = np.max([np.abs(truth + residuals - end[rows]) for end in bounds], axis=0)
         known = intervals.half_widths[-1]
-        intervals = Intervals.fit(predicted, errors / scale, edges, inflation, least)
+        intervals = Intervals.fit(predicted, errors, edges, inflation, least)
         widening = float(intervals.half_widths[-1] / known)
-    low, high, beyond = float(values.min()), float(values.max()), _UNSEEN * float(np.ptp(values))
-    # No load is always possible, at any distance from the range.
-    span, contamination = ValueRange(low, high, min(low - beyond, 0.0), max(high + beyond, 0.0)), (0.0, 0.0)
+    span, contamination, line = ValueRange(float(values.min()), float(values.max())), (0.0, 0.0), None
     if test is not None:
         tested = ((part, test.accepted(*block)) for part, block in zip(parts, blocks, strict=True))
         contamination = _contamination(features, values, tested, inflation)
-        if not full_range:
-            ends = (_range_end(point, features, values, refit, sign) for sign in (1, -1))
-            span = ValueRange(low, high, span.lowest, span.highest, *ends)
+        span, line = _range_of_slices(point, features, values, refit, None if full_range else refit_line)
     gains = [] if recordings is None else _gains_of_recordings(features, values, recordings, refit)
     gain = GainSpread() if recordings is None else GainSpread.fit(reported, truth, gains, fingertips)
-    return IntervalRegressor(point, intervals, span, centre, deviation, misses_loads, *contamination, widening, gain)
+    return IntervalRegressor(
+        point, intervals, span, centre, deviation, misses_loads, *contamination, widening, gain, line
+    )
 
 
 def _check_values(values: FloatArray) -> None:
@@ -453,9 +458,7 @@ def _check_values(values: FloatArray) -> None:
         )
 
 
-def _gains_of_recordings(
-    features: FloatArray, values: FloatArray, recordings: IntArray, refit: Callable[[IntArray], Regressor]
-) -> list[float]:
+def _gains_of_recordings(features: FloatArray, values: FloatArray, recordings: IntArray, refit: Refit) -> list[float]:
     """Return the gain of each recording that the others can predict."""
     gains: list[float] = []
     for one in np.unique(recordings):
@@ -489,14 +492,32 @@ def _contamination(
     return max(float(np.quantile(found, LEVEL)), 0.0), max(float(-np.quantile(found, 1 - LEVEL)), 0.0)
 
 
+def _range_of_slices(
+    point: Regressor, features: FloatArray, values: FloatArray, refit: Refit, refit_line: Refit | None
+) -> tuple[ValueRange, Regressor | None]:
+    """Return the range of slices and the line that reads values beyond it, if any can occur.
+
+    Peaks of twists one way are of one sign, and no load is always possible.
+    """
+    low, high, beyond = float(values.min()), float(values.max()), _UNSEEN * float(np.ptp(values))
+    span = ValueRange(low, high, 0.0 if low >= 0 else low - beyond, 0.0 if high <= 0 else high + beyond)
+    if refit_line is None:
+        return span, None
+    low_end, high_end = (_range_end(point, features, values, refit, refit_line, sign) for sign in (1, -1))
+    if low_end > high_end:
+        # Every prediction may hide a value beyond either end.
+        low_end, high_end = math.inf, -math.inf
+    return replace(span, low_end=low_end, high_end=high_end), refit_line(np.arange(len(values)))
+
+
 def _range_end(
-    point: Regressor, features: FloatArray, values: FloatArray, refit: Callable[[IntArray], Regressor], sign: int
+    point: Regressor, features: FloatArray, values: FloatArray, refit: Refit, refit_line: Refit, sign: int
 ) -> float:
     """Return the prediction at or below which (sign −1: above which) the truth may lie anywhere further out.
 
-    The outermost values are left out and predicted from the rest. If they are predicted at its end or even within it,
-    values beyond the whole range will be too, the more the further out they are; the end is then moved inwards for
-    values `_LIKELY_UNSEEN` spans beyond. Otherwise it is the end of the range.
+    The outermost values are left out and predicted from the rest. If a line predicts them at its end or even within it,
+    values beyond the whole range hide too, the more the further out they are; the end is then moved inwards for values
+    `_LIKELY_UNSEEN` spans beyond. Otherwise nothing hides: the end is infinite.
     """
     outward = sign * values
     order = np.argsort(outward, kind="stable")
@@ -511,13 +532,12 @@ def _range_end(
     if len(kept) < _LEAST_FRAMES or np.ptp(values[kept]) == 0:
         # Untestable: no prediction as far out as the outermost ones now is known to be right.
         return sign * max(end, outermost)
-    inside = float(outward[kept].min())
-    predicted, true = median(refit(kept), out), float(np.median(outward[out]))
-    if predicted - true > _LARGEST_SHORTFALL * (inside - true) > 0:
-        span = float(np.ptp(values))
-        shortfall = (predicted - inside) / max(inside - true, _LEAST_DISTANCE * span)
-        end = max(end, end + shortfall * _LIKELY_UNSEEN * span, outermost)
-    return sign * end
+    inside, true = float(outward[kept].min()), float(np.median(outward[out]))
+    if not median(refit_line(kept), out) - true > _LARGEST_SHORTFALL * (inside - true) > 0:
+        return -sign * math.inf
+    span = float(np.ptp(values))
+    shortfall = (median(refit(kept), out) - inside) / max(inside - true, _LEAST_DISTANCE * span)
+    return sign * max(end, end + shortfall * _LIKELY_UNSEEN * span, outermost)
 
 
 def _misses_loads(truth: FloatArray, inside: BoolArray) -> bool:

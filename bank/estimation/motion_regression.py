@@ -221,6 +221,11 @@ class MotionRegression(Estimator):
                 )
         return lambda frames, known, _: InverseCalibration.fit(frames, known, degree, n_drift, trend=trend)
 
+    def line_fit(self) -> RegressorFit:
+        """Return the fit of a line to slices, which reads torques beyond the calibrated ones."""
+        _, n_drift, trend = _CURVES["torque"]
+        return lambda frames, known, _: InverseCalibration.fit(frames, known, 1, n_drift, trend=trend)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CylinderGrip:
@@ -250,10 +255,8 @@ def fit_cylinders(grips: Sequence[CylinderGrip], table: ChannelTable) -> Interva
     # Each recording counts once, which is too few for a quantile.
     half_width = max(TWO_SIDED_95 * math.sqrt(np.mean(squares)), LEAST_HALF_WIDTH * float(np.ptp(diameters)))
     low, high = float(diameters.min()), float(diameters.max())
-    half_span = 0.5 * (high - low)
     intervals = Intervals(np.zeros(0), np.array([half_width]))
-    span = ValueRange(low, high, low - half_span, high + half_span)
-    return IntervalRegressor(line, intervals, span, line.mean, np.zeros(0))
+    return IntervalRegressor(line, intervals, ValueRange(low, high), line.mean, np.zeros(0))
 
 
 def fit_line(grips: Sequence[CylinderGrip], table: ChannelTable) -> Ridge:

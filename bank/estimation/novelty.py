@@ -29,9 +29,6 @@ _MOST_DIRECTIONS = 4
 _T2_DIRECTIONS = 2
 # A frame with less than half of its fingertip's own response counts as one with half.
 _MOST_MISSING = 0.5
-# Intervals grow by this power of Q. White noise alone would need a half, but common motion of many channels moves the
-# estimate too. Of 1, 1.5 and 2 this separates best later slices from those with a fifth of a foreign frame.
-_POWER = 2
 # Directions of slices that the reciprocity check ignores, and its margin beyond the largest residual of blocks left
 # out: later slices stay within 1.39 times of it after two repeats, and within 0.8 times after four.
 _RECIPROCITY_DIRECTIONS, _RECIPROCITY_MARGIN = 12, 1.5
@@ -84,13 +81,11 @@ class ReciprocityCheck:
 class Novelty:
     """The reasons against a difference, none for a familiar one, and their effect on its interval.
 
-    widening is the interval's growth because the difference is explained less well than is typical. limit_share is the
-    reciprocity residual over its limit: foreign signals raise it by the square of their share. missing_share is the
-    share of the fingertip's own response that foreign signals may have replaced.
+    limit_share is the reciprocity residual over its limit: foreign signals raise it by the square of their share.
+    missing_share is the share of the fingertip's own response that foreign signals may have replaced.
     """
 
     reasons: tuple[str, ...]
-    widening: float = 1.0
     limit_share: float = 0.0
     missing_share: float = 0.0
 
@@ -102,8 +97,7 @@ FAMILIAR = Novelty(())
 class NoveltyDetector:
     """Mean (c,) and spread (c,) in volts, directions (r, c) in units of spread with their variances (r,).
 
-    typical_q is the median Q residual of differences left out. typical_response is the response share at LEVEL of
-    them.
+    typical_response is the response share at LEVEL of differences left out.
     """
 
     mean: FloatArray
@@ -111,7 +105,6 @@ class NoveltyDetector:
     directions: FloatArray
     variances: FloatArray
     least_norm: float
-    typical_q: float
     largest_q: float
     largest_outlying: float
     largest_t2: float
@@ -137,7 +130,7 @@ class NoveltyDetector:
         least = 0.5 * float(np.linalg.norm(differences, axis=1).min() / np.sqrt(table.n_channels))
         return cls(
             whole.mean, whole.spread, whole.directions, whole.variances, least,
-            float(np.median(q_and_outlying, axis=0)[0]), _Q_MARGIN * float(largest_q),
+            _Q_MARGIN * float(largest_q),
             max(_Q_MARGIN * float(outlying), _LEAST_OUTLYING), _T2_MARGIN * largest_t2,
             ReciprocityCheck.fit(differences, table), float(np.quantile(responses, LEVEL)),
         )  # fmt: skip
@@ -154,7 +147,7 @@ class NoveltyDetector:
                 "the slices have no noise: they are multiples or sums of a few; record slices as they come"
             )
         variances = s[:rank] ** 2 / (len(differences) - 1)
-        return cls(mean, spread, vt[:rank], variances, 0.0, 1.0, np.inf, np.inf, np.inf, None, 0.0)
+        return cls(mean, spread, vt[:rank], variances, 0.0, np.inf, np.inf, np.inf, None, 0.0)
 
     def q_residual(self, difference: FloatArray, usable: BoolArray) -> tuple[float, float]:
         """Return the mean squared residual of a (c,) difference, and the share of outlying channels."""
@@ -184,13 +177,6 @@ class NoveltyDetector:
 
     def _scale(self, difference: FloatArray) -> FloatArray:
         return np.asarray((difference - self.mean) / self.spread)
-
-    def widening(self, difference: FloatArray, usable: BoolArray) -> float:
-        """Return the growth of an interval because a difference is explained less well than is typical."""
-        return self._widening(self.q_residual(difference, usable)[0])
-
-    def _widening(self, q: float) -> float:
-        return max(q / self.typical_q, 1.0) ** _POWER
 
     def assess(self, difference: FloatArray, usable: BoolArray) -> Novelty:
         """Return the novelty of a (c,) difference, by its usable channels."""
@@ -225,7 +211,7 @@ class NoveltyDetector:
                 f"outside the calibration: the frame lies {np.sqrt(t2):.1f} standard deviations from the calibrated "
                 f"ones (limit {np.sqrt(self.largest_t2):.1f})"
             )
-        return Novelty((), self._widening(q), limit_share, self._missing_share(difference, usable))
+        return Novelty((), limit_share, self._missing_share(difference, usable))
 
     def _missing_share(self, difference: FloatArray, usable: BoolArray) -> float:
         if self.typical_response <= 0:

@@ -88,8 +88,9 @@ class InverseCalibration:
         powers = np.vander(z, degree + 1, increasing=True)
         columns = np.hstack([powers, powers[:, :n_trend] * age[:, None]])
         # The trend's penalty is in units of its own spread.
-        penalties = [0.0, 0.0] + [_CURVATURE] * (degree - 1) + [_TREND * float(age.var())] * n_trend
-        coefficients = np.linalg.solve(columns.T @ columns + np.diag(penalties), columns.T @ frames)
+        penalties = np.diag([0.0, 0.0] + [_CURVATURE] * (degree - 1) + [_TREND * float(age.var())] * n_trend)
+        penalties[1, 1] = _slope_penalty(frames, columns, penalties)
+        coefficients = np.linalg.solve(columns.T @ columns + penalties, columns.T @ frames)
         _, s, vt = np.linalg.svd(frames - columns @ coefficients, full_matrices=False)
         freedom = n - columns.shape[1]
         noise = float(np.sqrt((s[n_drift:freedom] ** 2).sum() / (freedom - n_drift) / frames.shape[1]))
@@ -129,6 +130,20 @@ class InverseCalibration:
         before, here, after = cost[i - 1 : i + 2]
         bend = before - 2 * here + after
         return float(grid[i] + (0.5 * (before - after) / bend if bend > 0 else 0.0) * (grid[1] - grid[0]))
+
+
+def _slope_penalty(frames: FloatArray, columns: FloatArray, penalties: FloatArray) -> float:
+    """Return the penalty of the slopes of (n, q) frames over the second of (n, p) columns (empirical Bayes).
+
+    The channels that correlate best have slopes that are too steep by chance. The penalty is the variance of the noise
+    over that of the true slopes.
+    """
+    inverse = np.linalg.inv(columns.T @ columns + penalties)
+    coefficients = inverse @ columns.T @ frames
+    n, p = columns.shape
+    variance = float(((frames - columns @ coefficients) ** 2).mean()) * n / (n - p)
+    error = variance * float(inverse[1, 1])
+    return float(variance / max((coefficients[1] ** 2).mean() - error, error))
 
 
 def _spread_about_parabola(frames: FloatArray, z: FloatArray) -> FloatArray:

@@ -1,8 +1,10 @@
 """A session with a calibration: frames in, estimates out, causally."""
 
 import math
+from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -22,6 +24,7 @@ from shearloop.bank.estimation.session_state import (
     SliceState,
 )
 from shearloop.bank.estimation.values import Estimate, Measured, TactileFrame
+from shearloop.bank.gain import GainCorrection, find_twists
 from shearloop.bank.polynomial import TWO_SIDED_95
 
 REPEATED_FRAME = ("the board sent the same frame again",)
@@ -29,8 +32,47 @@ _UNITS: dict[Quantity, str] = {"torque": "N·m", "diameter": "mm"}
 _UNKNOWN = (None, None, None)
 _AMBIGUOUS = ("two positions of the bank far apart fit the frame equally well",)
 
+# Frames of a grip that can correct its gain: ten minutes.
+_ADAPTED_FRAMES = 1200
+
 # A value, and its 95 % interval: how far it extends below and above, or its ends.
 _Interval = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedFit:
+    """Estimates under load against a known torque: mean estimate over the torque, and root mean square error.
+
+    spread is the standard deviation of the gain's logarithm that the intervals allow for.
+    """
+
+    gain: float
+    rmse_nm: float
+    spread: float
+
+    @classmethod
+    def of(cls, model: OutputModel, features: FloatArray, torque_nm: FloatArray) -> Self:
+        """Compare the model on (n, d) features with the torques (n,)."""
+        found = np.array([model.regressor.predict(row)[0] for row in features])
+        gain = float((found * np.sign(torque_nm)).sum() / np.abs(torque_nm).sum())
+        return cls(gain, float(np.sqrt(((found - torque_nm) ** 2).mean())), model.regressor.gain.between)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Adaptation:
+    """A correction of this grip's gain, and the loaded frames that it was made from, before and after it."""
+
+    correction: GainCorrection
+    before: LoadedFit
+    after: LoadedFit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Grip:
+    """The latest frames of a grip with a torque: times and features; and the torque's model with the grip's gain."""
+
+    frames: deque[tuple[float, FloatArray]] = field(default_factory=lambda: deque(maxlen=_ADAPTED_FRAMES))
+    adapted: dict[Quantity, OutputModel] = field(default_factory=dict)
 
 
 class EstimatorSession:
@@ -67,9 +109,9 @@ class EstimatorSession:
         """Set the diameter in mm of the held tool, None where unknown."""
         self._tool_reasons: tuple[str, ...] = ()
         try:
-            self._outputs = self.calibration.for_tool(tool).outputs
+            self._calibration = self.calibration.for_tool(tool)
         except CalibrationError as error:
-            self._outputs, self._tool_reasons = self.calibration.outputs, (str(error),)
+            self._calibration, self._tool_reasons = self.calibration, (str(error),)
 
     def tare(self, frames: int | None = None) -> None:
         """Forget the session and average the next `frames` usable frames, of untouched fingertips, into the idle frame.
@@ -94,11 +136,32 @@ class EstimatorSession:
         # The (m, c) difference to the idle frame behind the last estimate, None where there was none.
         self.difference: FloatArray | None = None
         self._latest: FloatArray = np.full(calibration.estimator.scale.shape, np.nan)
+        self._grip = _Grip()
 
     @property
     def taring(self) -> bool:
         """Whether frames are being averaged into the idle frame."""
         return self._state.taring
+
+    @property
+    def grip_t_s(self) -> FloatArray:
+        """The times (n,) of this grip's frames, whose torques `adapt` takes."""
+        return np.array([t_s for t_s, _ in self._grip.frames])
+
+    def adapt(self, torque_nm: FloatArray) -> Adaptation:
+        """Correct the gain until the next grip or tare, by torques (n,) measured at `grip_t_s`, NaN where unknown.
+
+        Always starts from the calibration's gain. Raises CalibrationError as `Calibration.correct_gain` does.
+        """
+        calibration, grip, known = self._calibration, self._grip, np.isfinite(torque_nm)
+        width = len(calibration.gain_regressor().mean_feature)
+        features = np.array([row for _, row in grip.frames]).reshape(-1, width)[known]
+        adapted, correction = calibration.correct_gain(features, torque_nm[known])
+        before, after = (calibration.outputs | grip.adapted)["torque"], adapted.outputs["torque"]
+        grip.adapted["torque"] = after
+        rows = np.concatenate(find_twists(torque_nm[known]))
+        truth = torque_nm[known][rows]
+        return Adaptation(correction, *(LoadedFit.of(one, features[rows], truth) for one in (before, after)))
 
     def estimate(self, frame: TactileFrame) -> Estimate:
         """Return the estimate of a frame of the calibration's sides.
@@ -118,6 +181,8 @@ class EstimatorSession:
         if self._state.refuses_repeats and repeats:
             return Estimate(valid=False, reasons=REPEATED_FRAME)
         processed = self._state.process(frame)
+        if not processed.held_frames:
+            self._grip = _Grip()
         if processed.reasons:
             return Estimate(valid=False, reasons=processed.reasons)
         self.difference = processed.difference
@@ -138,6 +203,8 @@ class EstimatorSession:
         features, match = calibration.estimator.features(reading)
         if match is not None and match.ambiguous:
             return _estimate({}, _AMBIGUOUS, match)
+        if "torque" in outputs:
+            self._grip.frames.append((t_s, features[calibration.estimator.columns["torque"]]))
         values: dict[Quantity, _Interval] = {}
         for quantity, (model, novelty_result) in outputs.items():
             value, against = self._predict_quantity(quantity, model, novelty_result, reading, features, match, errors)
@@ -163,7 +230,7 @@ class EstimatorSession:
             return {}, {"no calibration is configured: k and sigma have no torque": None}
         outputs: dict[Quantity, tuple[OutputModel, Novelty]] = {}
         reasons: dict[str, None] = {}
-        for quantity, model in self._outputs.items():
+        for quantity, model in (self._calibration.outputs | self._grip.adapted).items():
             novelty = FAMILIAR
             if model.novelty is not None:
                 novelty = model.novelty.assess(frame.difference[0], frame.usable[0])
@@ -191,7 +258,7 @@ class EstimatorSession:
         if quantity == "torque" and novelty.missing_share and estimator.uses_amplitude:
             complete = self._regressor_inputs(quantity, reading, frame.difference / (1.0 - novelty.missing_share))
         usable_share = np.count_nonzero(frame.usable) / frame.usable.size
-        value = model.regressor.predict(features, usable_share, novelty.widening, novelty.limit_share, complete)
+        value = model.regressor.predict(features, usable_share, novelty.limit_share, complete)
         dead: tuple[str, ...] = ()
         if len(errors):
             changed = [self._regressor_inputs(quantity, reading, frame.difference + one) for one in errors]

@@ -46,9 +46,10 @@ _POOLED_FREEDOM = 30
 class ProcessedFrame:
     """A frame after the session's checks, with the reasons against it.
 
-    difference (m, c) is to the idle frame, mean_difference its mean over the grip's last held_frames. motion holds
-    features of the last frames' motion. usable (m, c) excludes channels that the board or the frame itself shows to
-    be lost or saturated. has_baseline is whether every fingertip was seen idle, lag_s the lag of an average.
+    difference (m, c) is to the idle frame, mean_difference its mean over the grip's last held_frames, 0 after a
+    release. motion holds features of the last frames' motion. usable (m, c) excludes channels that the board or the
+    frame itself shows to be lost or saturated. has_baseline is whether every fingertip was seen idle, lag_s the lag of
+    an average.
     """
 
     difference: FloatArray
@@ -374,7 +375,8 @@ class SessionState:
                 loose.append(one.side)
         if loose:
             self._memory.forget()
-            return ProcessedFrame(difference, (f"no grip at the {' and '.join(loose)} fingertip",), usable)
+            reason = f"no grip at the {' and '.join(loose)} fingertip"
+            return ProcessedFrame(difference, (reason,), usable, held_frames=0)
         memory = self._memory
         if reason := memory.remember(channels / self._idle.gains, difference, missing):
             return ProcessedFrame(difference, (reason,), usable)

@@ -71,13 +71,7 @@ class FrameSeries:
 
     def torque_at_frames(self) -> FloatArray:
         """Return the (n,) torque in N·m at the middle of each frame, NaN where no reading is near."""
-        if len(self.torque_t_s) == 0:
-            return np.full(len(self.t_s), np.nan)
-        after = np.searchsorted(self.torque_t_s, self.t_s).clip(0, len(self.torque_t_s) - 1)
-        around = self.torque_t_s[[np.maximum(after - 1, 0), after]]
-        known = np.abs(around - self.t_s).min(axis=0) <= _MAX_TORQUE_AGE_S
-        torque = np.interp(self.t_s, self.torque_t_s, self.torque_nm, left=np.nan, right=np.nan)
-        return np.where(known, torque, np.nan)
+        return torque_at(self.t_s, self.torque_t_s, self.torque_nm)
 
     def select_sides(self, sides: tuple[str, ...]) -> "FrameSeries":
         """Return the series with these sides only; raises CalibrationError for a side that is missing."""
@@ -154,6 +148,17 @@ class Estimate:
     score: float | None = None
     runner_up: float | None = None
     lag_s: float = 0.0
+
+
+def torque_at(t_s: FloatArray, torque_t_s: FloatArray, torque_nm: FloatArray) -> FloatArray:
+    """Return the (n,) torque at t_s (n,) from readings (p,) in time order, NaN where no reading is near."""
+    if len(torque_t_s) == 0:
+        return np.full(len(t_s), np.nan)
+    after = np.searchsorted(torque_t_s, t_s).clip(0, len(torque_t_s) - 1)
+    around = torque_t_s[[np.maximum(after - 1, 0), after]]
+    known = np.abs(around - t_s).min(axis=0) <= _MAX_TORQUE_AGE_S
+    torque = np.interp(t_s, torque_t_s, torque_nm, left=np.nan, right=np.nan)
+    return np.where(known, torque, np.nan)
 
 
 def check_finite(recordings: Sequence[FrameSeries]) -> None:

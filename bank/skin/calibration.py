@@ -2,9 +2,10 @@
 
 The curve is a straight line through the origin up to 1.2 N. Beyond, to 5 N and more, it has as many straight pieces as
 the recorded data support. Rising straight pieces invert without iteration. The fit reads a table of recorded
-resistances and forces: the membrane's two plays turn the forces into the tension at the gauges, friction included, and
-leave the coefficient of friction and the curve to be fitted. scipy.optimize is imported only to fit: the
-daemon loads calibrations.
+resistances and forces: the belt's two plays turn the forces into the tension at the gauges, friction included, and
+leave the coefficient of friction and the curve to be fitted. The stretched gauge gives the angle by which the load has
+turned with the skin, in the fit and in the inverse. scipy.optimize is imported only to fit: the daemon loads
+calibrations.
 
 Friction gives one response a band of forces. A rising or falling response proves slip, and the force is at an end of
 the band. A constant one leaves it anywhere within: it is then taken to be at its last known place, moved no further
@@ -28,14 +29,14 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.bank.skin.membrane import (
     PAPER_SECTION,
     UNSTRETCHED,
+    Belt,
     Direction,
-    Membrane,
     ShearInterval,
     direction_of,
 )
 from shearloop.yaml_files import read_yaml, save_yaml, validated
 
-FORMAT = "shearloop skin calibration 2"
+FORMAT = "shearloop skin calibration 3"
 COLUMNS = ("r1_ohm", "r2_ohm", "shear_n", "normal_n")
 # A load cell at rest may read slightly negative; a skin cannot be pulled off its core.
 MAX_PULL_N = 0.05
@@ -141,8 +142,8 @@ class SkinCalibration(BaseModel):
 
         Beyond the calibrated curve it is the band of the curve's end.
         """
-        tension = float(np.interp(response, self.response, self.tension_n))
-        return self._membrane.shear_from_tensions(tension, tension, tension, normal_n, direction)
+        low, high = self._shear_range(response, self._tension(response), normal_n, direction)
+        return ShearInterval((low + high) / 2, low, high)
 
     def shear_from_response(
         self, response: float, normal_n: float, direction: Direction = Direction.UNKNOWN, wider: float = 0.0
@@ -152,14 +153,31 @@ class SkinCalibration(BaseModel):
         A known direction of loading takes the deadband out; an unknown one adds it to the interval. An end beyond the
         calibrated curve is infinite. `wider` is a further uncertainty of the response, either way.
         """
-        half, curve = self.response_half_width + wider, (self.response, self.tension_n)
-        low = float(np.interp(response - half, *curve, left=-math.inf))
-        high = float(np.interp(response + half, *curve, right=math.inf))
-        return self._membrane.shear_from_tensions(low, float(np.interp(response, *curve)), high, normal_n, direction)
+        half, shear_n = self.response_half_width + wider, self.band(response, normal_n, direction).shear_n
+        ends = response - half, response + half
+        tensions = self._tension(ends[0], left=-math.inf), self._tension(ends[1], right=math.inf)
+        low, high = (
+            self._shear_range(end, tension, normal_n, direction)[side]
+            for side, (end, tension) in enumerate(zip(ends, tensions, strict=True))
+        )
+        if ends[0] <= 0 <= ends[1]:
+            slack = self._belt.shear_range(0.0, normal_n, 0.0, direction)
+            low, high = min(low, slack[0]), max(high, slack[1])
+        return ShearInterval(shear_n, low, high)
+
+    def _tension(self, response: float, left: float | None = None, right: float | None = None) -> float:
+        return float(np.interp(response, self.response, self.tension_n, left=left, right=right))
+
+    def _shear_range(
+        self, response: float, tension_n: float, normal_n: float, direction: Direction
+    ) -> tuple[float, float]:
+        slack = _slack_at(response, self.response, self.slack)
+        turned = math.copysign(float(turned_rad(abs(response) + slack)), response)
+        return self._belt.shear_range(tension_n, normal_n, turned, direction)
 
     @property
-    def _membrane(self) -> Membrane:
-        return Membrane(1.0, self.friction, math.radians(self.gauge_angle_deg), 1.0)
+    def _belt(self) -> Belt:
+        return Belt(self.friction, math.radians(self.gauge_angle_deg))
 
 
 def read_table(path: Path) -> CalibrationTable:
@@ -224,7 +242,8 @@ def fit_calibration(table: CalibrationTable, *, friction: float | None = None) -
     from shearloop.bank.skin.plane_strain import gauge_depth_mm
 
     loaded, idle = loading > 0, loading == 0
-    forces = np.column_stack([loading, table.shear_n, table.normal_n])[loaded]
+    turned = np.sign(response) * turned_rad(changes.max(axis=1))
+    forces = np.column_stack([loading, table.shear_n, table.normal_n, turned])[loaded]
     nominal = _tensions(forces, PAPER_SECTION.friction if friction is None else friction)
     upper, lower = _knots(nominal), _knots(-nominal)
     kept = (len(upper) > 0) | (nominal <= LINEAR_TO_N)
@@ -298,17 +317,26 @@ def _changes(table: CalibrationTable) -> tuple[FloatArray, IntArray]:
     return changes, np.where(idle, 0, loading)
 
 
+def turned_rad(stretched: FloatArray | float) -> FloatArray:
+    """Return the angle by which the load has turned about the core, from the stretched gauge's change λ² − 1.
+
+    The load moves by the lengthening of a quarter of the ring, π/2 (λ − 1).
+    """
+    turned: FloatArray = np.pi / 2 * (np.sqrt(np.maximum(1 + stretched, 0.0)) - 1)
+    return turned
+
+
 def _tensions(forces: FloatArray, friction: float) -> FloatArray:
-    """Return the net tension (rows,) at the gauges, in N, for rows (loading, shear force, normal force).
+    """Return the net tension (rows,) at the gauges, in N, for rows (loading, shear force, normal force, load's angle).
 
     Each loading starts from the unstretched skin.
     """
-    membrane = Membrane(1.0, friction, PAPER_SECTION.gauge_angle_rad, 1.0)
+    belt = Belt(friction, PAPER_SECTION.gauge_angle_rad)
     state, current, found = UNSTRETCHED, 0.0, []
-    for loading, shear_n, normal_n in forces.tolist():
-        state = membrane.step(state if loading == current else UNSTRETCHED, shear_n, normal_n)
+    for loading, *load in forces.tolist():
+        state = belt.step(state if loading == current else UNSTRETCHED, *load)
         current = loading
-        found.append(membrane.response(state))
+        found.append(state.gauge_tension_1_n - state.gauge_tension_2_n)
     return np.array(found)
 
 

@@ -1,4 +1,4 @@
-"""The skin in one dimension: cross-section, closed-form response, and the membrane model used at run time.
+"""The skin in one dimension: cross-section, small-strain slope, and the membrane at finite strain used at run time.
 
 Yin, Santos, Posner, "Bioinspired flexible microfluidic shear force sensor skin", Sensors and Actuators A 264 (2017).
 The angle θ is the paper's: 0° and 180° at the brackets, 90° under the load. A positive shear force pulls towards
@@ -6,7 +6,7 @@ larger θ and stretches the skin below 90°.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
@@ -22,8 +22,6 @@ SENSOR_AREA_M2 = 7e-3 * 3e-3
 CONVECTION_W_M2_K = 10.0
 # 1 + 2ν, the change of resistance per strain at small strain, of an incompressible elastomer.
 GAUGE_FACTOR = 2.0
-# The paper's own estimate of F/(EA); its E and width would make the skin 0.88 mm thick.
-PAPER_SENSITIVITY_PER_N = 0.088
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,51 +122,6 @@ def sensitivity_per_n(section: Section) -> float:
     return GAUGE_FACTOR * flat * pressed * lever * capstan
 
 
-# The closed form at finite strain. The stretched side is a sheet of neo-Hookean rubber: T = E w t/(1−ν²) (λ − λ⁻³)/4.
-# The load turns by the sheet's lengthening, α = π/2 (λ − 1), and keeps its direction: its normal force pulls along the
-# skin by F_n sin α. The slack side is a quarter of a ring that bends; its stiffness against the rotation of its end
-# about the core, over the sheet's, goes with (t/R)².
-SLACK_STIFFNESS = math.pi / 2 / (12 * (math.pi / 2 - 8 / (math.pi + 2)))
-# The ring's compliance grows with the slip in thicknesses: fitted to the finite-strain reference.
-SLACK_SOFTENING = 0.72
-
-
-def loading_response(section: Section, normal_n: float, shear_n: float) -> float:
-    """Return the closed-form response λ₁² − λ₂² at finite strain while a shear force rises from zero.
-
-    The skin slips beyond μ F_n R_in/R_out. One Newton step solves for the stretch.
-    """
-    radius, thickness, nu = section.mid_radius_mm, section.thickness_mm, section.poisson_ratio
-    inner, outer = section.inner_radius_mm / radius, section.outer_radius_mm / radius
-    size, friction = abs(shear_n), section.friction
-
-    def pull(turned: float) -> tuple[float, float]:
-        """Return the net tension at the load and its derivative."""
-        sine, cosine = math.sin(turned), math.cos(turned)
-        along, across = size * cosine + normal_n * sine, normal_n * cosine - size * sine
-        return outer * along - friction * inner * across, outer * across + friction * inner * along
-
-    if pull(0.0)[0] <= 0:
-        return 0.0
-    axial_n = section.young_mpa / (1 - nu**2) * section.width_mm * thickness
-    slack_share = 1 - 1 / (1 + SLACK_STIFFNESS * (thickness / radius) ** 2)
-    pressed = 1 + nu / (1 - nu) * thickness / (2 * radius)
-    capstan = math.exp(-friction * section.gauge_angle_rad)
-    per_n = pressed * capstan * (1 - slack_share) / axial_n
-    small = per_n * pull(0.0)[0]
-    stretch = 1 + small * (1 + 1.5 * small)
-    tension_n, change = pull(math.pi / 2 * (stretch - 1))
-    slope = (1 + 3 * stretch**-4) / 4 - per_n * change * math.pi / 2
-    stretch -= ((stretch - stretch**-3) / 4 - per_n * tension_n) / slope
-    turned = math.pi / 2 * (stretch - 1)
-    begin, end = math.radians(section.gauge_from_deg), math.radians(section.gauge_to_deg)
-    # Mean of sin θ + cos θ, the course of the ring's axial force from the bracket, over the gauge.
-    course = (math.sin(end) - math.cos(end) - math.sin(begin) + math.cos(begin)) / (end - begin)
-    compressed = 4 / (math.pi + 2) * course * slack_share * pull(turned)[0] / axial_n
-    compressed /= 1 + SLACK_SOFTENING * turned * radius / thickness
-    return math.copysign(stretch**2 - 1 + GAUGE_FACTOR * compressed, shear_n)
-
-
 class Direction(Enum):
     """Which way the magnitude of the shear force goes."""
 
@@ -191,77 +144,155 @@ class ShearInterval(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class MembraneState:
-    """The membrane at rest: net tension at the load (positive: side 1) and tension at both gauges, in N."""
+class BeltState:
+    """The belt at rest: net tension at the load (positive: side 1) and tension at both gauges, in N of load."""
 
     net_tension_n: float = 0.0
     gauge_tension_1_n: float = 0.0
     gauge_tension_2_n: float = 0.0
 
 
-UNSTRETCHED = MembraneState()
+UNSTRETCHED = BeltState()
 
 
 @dataclass(frozen=True, slots=True)
-class Membrane:
-    """A membrane over a rigid core: EA in N, friction coefficient μ, angle φ from load to gauge, gauge factor F.
+class Belt:
+    """Friction of a skin on its core: coefficient μ of the load's forces, and angle φ from load to gauge.
 
-    It carries tension only: the compressed side buckles. Coulomb friction μF_n acts under the load, capstan friction
-    along the arc. This is a hysteresis of two plays: the tension under the load follows the shear force within ±μF_n,
-    and the tension at a gauge follows that one within factors e^(±μφ). Slip starts at the load and runs outwards, so
-    `step` is the exact solution of the belt, not a time step.
+    It carries tension only: the compressed side buckles. Coulomb friction holds under the load, capstan friction along
+    the arc. This is a hysteresis of two plays: the tension under the load follows the shear force within ±μF_n, and the
+    tension at a gauge follows that one within factors e^(±μφ). Slip starts at the load and runs outwards, so this is
+    the exact solution of the belt, not a time step.
+
+    The load keeps its direction and moves with the skin. Where that has turned by α about the core, the load pulls
+    along it by F_t cos α + F_n sin α and presses by F_n cos α − F_t sin α. α and forces have the same sign.
     """
 
-    axial_stiffness_n: float
     friction: float
     gauge_angle_rad: float
-    gauge_factor: float = GAUGE_FACTOR
 
     def __post_init__(self) -> None:
         """Refuse values that no belt has."""
-        if not (self.axial_stiffness_n > 0 and self.friction >= 0 and self.gauge_angle_rad >= 0):
-            raise CalibrationError(f"{self}: the stiffness must be positive, friction and angle must not be negative.")
+        if not (self.friction >= 0 and self.gauge_angle_rad >= 0):
+            raise CalibrationError(f"{self}: friction and angle must not be negative.")
 
-    def step(self, state: MembraneState, shear_n: float, normal_n: float) -> MembraneState:
-        """Return the state after the forces (N) have gone straight to these values."""
-        hold = self.friction * max(normal_n, 0.0)
-        net = _clip(state.net_tension_n, shear_n - hold, shear_n + hold)
-        up = math.exp(self.friction * self.gauge_angle_rad)
+    def step(self, state: BeltState, shear_n: float, normal_n: float, turned_rad: float) -> BeltState:
+        """Return the state after the forces (N) have gone straight to these values and the load has turned."""
+        low, high = (self.pull(shear_n, normal_n, turned_rad, sign) for sign in (1.0, -1.0))
+        return self.follow(state, _clip(state.net_tension_n, low, high))
+
+    def pull(self, shear_n: float, normal_n: float, turned_rad: float, sign: float) -> float:
+        """Return the net tension (N) at which the skin slips under the load; a positive sign is towards side 2."""
+        cosine, sine = math.cos(turned_rad), math.sin(turned_rad)
+        pressing = max(normal_n * cosine - shear_n * sine, 0.0)
+        return shear_n * cosine + normal_n * sine - sign * self.friction * pressing
+
+    def follow(self, state: BeltState, net_tension_n: float) -> BeltState:
+        """Return the state with this net tension at the load."""
+        up, net = math.exp(self.friction * self.gauge_angle_rad), net_tension_n
         tension_1 = _clip(state.gauge_tension_1_n, max(net, 0.0) / up, max(net, 0.0) * up)
         tension_2 = _clip(state.gauge_tension_2_n, max(-net, 0.0) / up, max(-net, 0.0) * up)
-        return MembraneState(net, tension_1, tension_2)
+        return BeltState(net, tension_1, tension_2)
 
-    def response(self, state: MembraneState) -> float:
-        """Return F (ε₁ − ε₂), equation (1) of the paper."""
-        return self.gauge_factor * (state.gauge_tension_1_n - state.gauge_tension_2_n) / self.axial_stiffness_n
-
-    def shear_from_tensions(
-        self, low_n: float, tension_n: float, high_n: float, normal_n: float, direction: Direction
-    ) -> ShearInterval:
-        """Return the shear force for a net tension at the gauges (N) that lies between low and high.
+    def shear_range(
+        self, tension_n: float, normal_n: float, turned_rad: float, direction: Direction
+    ) -> tuple[float, float]:
+        """Return the lowest and the highest shear force (N) for a net tension at the gauges and a load that has turned.
 
         While the magnitude of the response rises or falls, the skin slips all the way to the gauge, and one tension
         gives one force. In an unknown direction it lies between the two; without tension, within the deadband.
         """
-        low, high = self._bounds(low_n, normal_n, direction)[0], self._bounds(high_n, normal_n, direction)[1]
-        if low_n <= 0 <= high_n:
-            slack = self._bounds(0.0, normal_n, direction)
-            low, high = min(low, slack[0]), max(high, slack[1])
-        inner = self._bounds(tension_n, normal_n, direction)
-        return ShearInterval((inner[0] + inner[1]) / 2, low, high)
-
-    def _bounds(self, tension_n: float, normal_n: float, direction: Direction) -> tuple[float, float]:
-        hold = self.friction * max(normal_n, 0.0)
         if tension_n == 0:
+            hold = self.friction * max(normal_n, 0.0)
             return -hold, hold
         up = math.exp(self.friction * self.gauge_angle_rad)
         sign = math.copysign(1.0, tension_n)
-        loading, unloading = tension_n * up + sign * hold, tension_n / up - sign * hold
+        loading = self._shear(tension_n * up, normal_n, turned_rad, sign)
+        unloading = self._shear(tension_n / up, normal_n, turned_rad, -sign)
         if direction is Direction.LOADING:
             return loading, loading
         if direction is Direction.UNLOADING:
             return unloading, unloading
         return min(loading, unloading), max(loading, unloading)
+
+    def _shear(self, net_n: float, normal_n: float, turned_rad: float, sign: float) -> float:
+        """Return the shear force whose `pull` is this net tension."""
+        normal_n, friction = max(normal_n, 0.0), sign * self.friction
+        cosine, sine = math.cos(turned_rad), math.sin(turned_rad)
+        shear_n = (net_n - normal_n * (sine - friction * cosine)) / (cosine + friction * sine)
+        return shear_n if normal_n * cosine > shear_n * sine else (net_n - normal_n * sine) / cosine
+
+
+# The slack side is a quarter of a ring that bends; its stiffness against the rotation of its end about the core, over
+# the sheet's, goes with (t/R)².
+SLACK_STIFFNESS = math.pi / 2 / (12 * (math.pi / 2 - 8 / (math.pi + 2)))
+# The ring's compliance grows with the slip in thicknesses: fitted to the finite-strain reference.
+SLACK_SOFTENING = 0.72
+# The first leaves 0.1 % at 5 N, the third 1e-5.
+NEWTON_STEPS = 3
+
+
+class Membrane:
+    """The skin of a section at finite strain: a sheet of neo-Hookean rubber on the stretched side, T ∝ (λ − λ⁻³)/4.
+
+    The load turns by the sheet's lengthening, α = π/2 (λ − 1). Forces and friction are those at the outer radius.
+    """
+
+    def __init__(self, section: Section) -> None:
+        radius, thickness, nu = section.mid_radius_mm, section.thickness_mm, section.poisson_ratio
+        self.section = section
+        self.belt = Belt(section.friction * section.inner_radius_mm / section.outer_radius_mm, section.gauge_angle_rad)
+        axial_n = section.young_mpa / (1 - nu**2) * section.width_mm * thickness
+        per_n = section.outer_radius_mm / radius / axial_n
+        slack_share = 1 - 1 / (1 + SLACK_STIFFNESS * (thickness / radius) ** 2)
+        begin, end = math.radians(section.gauge_from_deg), math.radians(section.gauge_to_deg)
+        # Mean of sin θ + cos θ, the course of the ring's axial force from the bracket, over the gauge.
+        course = (math.sin(end) - math.cos(end) - math.sin(begin) + math.cos(begin)) / (end - begin)
+        # Strains per N at small strain, of the sheet and of the slack gauge.
+        self.sheet_per_n = (1 + nu / (1 - nu) * thickness / (2 * radius)) * (1 - slack_share) * per_n
+        self._slack_per_n = 4 / (math.pi + 2) * course * slack_share * per_n
+        self._softening = SLACK_SOFTENING * radius / thickness
+
+    def step(self, state: BeltState, shear_n: float, normal_n: float) -> BeltState:
+        """Return the state after the forces (N) have gone straight to these values."""
+        normal_n, turned = max(normal_n, 0.0), self.turned_rad(state)
+        net = state.net_tension_n
+        if net < self.belt.pull(shear_n, normal_n, turned, 1.0):
+            net = self._slip(shear_n, normal_n, 1.0)
+        elif net > self.belt.pull(shear_n, normal_n, turned, -1.0):
+            net = self._slip(shear_n, normal_n, -1.0)
+        return self.belt.follow(state, net)
+
+    def response(self, state: BeltState) -> float:
+        """Return λ₁² − λ₂², the normalised response of equation (1) at finite strain."""
+        first, second = (stretch(self.sheet_per_n * t) for t in (state.gauge_tension_1_n, state.gauge_tension_2_n))
+        bent = 1 + self._softening * abs(self.turned_rad(state))
+        return first**2 - second**2 + GAUGE_FACTOR * self._slack_per_n * state.net_tension_n / bent
+
+    def turned_rad(self, state: BeltState) -> float:
+        """Return the angle by which the load has turned about the core."""
+        return self._turned(state.net_tension_n)[0]
+
+    def _turned(self, net_n: float) -> tuple[float, float]:
+        """Return the load's angle for a net tension, and its derivative."""
+        stretched = stretch(self.sheet_per_n * abs(net_n))
+        slope = 4 / (1 + 3 * stretched**-4) * self.sheet_per_n
+        return math.copysign(math.pi / 2 * (stretched - 1), net_n), math.pi / 2 * slope
+
+    def _slip(self, shear_n: float, normal_n: float, sign: float) -> float:
+        """Return the net tension of a skin that slips under the load: pull and angle depend on each other."""
+        net = self.belt.pull(shear_n, normal_n, 0.0, sign)
+        for _ in range(NEWTON_STEPS):
+            turned, slope = self._turned(net)
+            pressing = normal_n * math.cos(turned) - shear_n * math.sin(turned)
+            net -= (net - self.belt.pull(shear_n, normal_n, turned, sign)) / (1 - slope * pressing)
+        return net
+
+
+def stretch(small: float) -> float:
+    """Return λ with (λ − λ⁻³)/4 equal to the strain that the same tension makes at small strain, by a Newton step."""
+    start = 1 + small * (1 + 1.5 * small)
+    return start - ((start - start**-3) / 4 - small) / ((1 + 3 * start**-4) / 4)
 
 
 def direction_of(before: float, now: float, noise: float) -> Direction:
@@ -273,17 +304,6 @@ def direction_of(before: float, now: float, noise: float) -> Direction:
     if before * now < 0 or abs(change) <= noise:
         return Direction.UNKNOWN
     return Direction.LOADING if change > 0 else Direction.UNLOADING
-
-
-def paper_membrane() -> Membrane:
-    """Return the membrane with the paper's own F/(EA) = 0.088 1/N."""
-    return Membrane(GAUGE_FACTOR / PAPER_SENSITIVITY_PER_N, PAPER_SECTION.friction, PAPER_SECTION.gauge_angle_rad)
-
-
-def section_membrane() -> Membrane:
-    """Return the membrane with the stiffness that modulus and cross-section give in plane strain."""
-    stiffness = GAUGE_FACTOR / sensitivity_per_n(replace(PAPER_SECTION, friction=0.0))
-    return replace(paper_membrane(), axial_stiffness_n=stiffness)
 
 
 def _clip(value: float, low: float, high: float) -> float:

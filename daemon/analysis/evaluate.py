@@ -227,9 +227,19 @@ def draw_tracks(tracks: Sequence[EstimateTrack], names: Sequence[str], title: st
                 t_s, 0, 1, where=np.isnan(value), transform=axes.get_xaxis_transform(), color="0.92", linewidth=0,
                 label="no valid estimate",
             )  # fmt: skip
-        axes.set_title(row_name, loc="left", fontsize="medium")
+        judged = _loaded_text(track) if quantity == "torque_nm" else ""
+        axes.set_title(row_name + judged, loc="left", fontsize="medium")
         axes.set_xlabel("slice" if slices else "time in s")
         axes.set_ylabel(label)
         axes.legend(loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0, ncols=3, frameon=False, fontsize="small")
     figure.suptitle(title)
     figure.savefig(path, dpi=110)
+
+
+def _loaded_text(track: EstimateTrack) -> str:
+    """Return the errors of a track's loaded frames as the end of a title, empty without any."""
+    loaded = figures_by_load([track])["loaded"]
+    error, zero = loaded["rmse_nm"], loaded["zero_rmse_nm"]
+    if error is None or zero is None:
+        return ""
+    return f"; {loaded['n']} loaded frames: RMSE {error:.2g} N·m (always saying 0: {zero:.2g})"

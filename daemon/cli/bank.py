@@ -1,4 +1,4 @@
-"""`shearloop bank`: solve, build, inspect and draw banks of simulated signals."""
+"""`shearloop bank`: solve, design, build and inspect banks of simulated signals."""
 
 import argparse
 import json
@@ -53,10 +53,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     info = add_action(actions, "info", "check a bank's checksums and print its definition", _info)
     add_option(info, "path", Path, "PATH", "the bank file")
     add_json(info)
-    plot = add_action(actions, "plot", "draw a bank's signals, and the conductivities of the five models", _plot)
-    add_option(plot, "path", Path, "PATH", "draw this bank's signals", nargs="?")
-    add_option(plot, "--config", Path, "FILE", "draw the models on this configuration's mesh")
-    add_option(plot, "--out", Path, "DIR", "directory for the PNG and SVG files", required=True)
     solve = add_action(actions, "solve", "solve for the voltages of one conductivity", _solve)
     add_option(solve, "--mesh", Path, "FILE", "a mesh (.npz, EIDORS .mat) or a fingertip (.yaml)", required=True)
     solve.add_argument("--model", required=True, metavar="M", help=f"basis model: {MODEL_NAMES}")
@@ -216,30 +212,6 @@ def _text(value: object) -> str:
     if isinstance(value, list):
         return " × ".join(map(str, value))
     return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def _plot(args: argparse.Namespace) -> int:
-    if args.path is None and args.config is None:
-        raise UserError("give a bank's PATH, or --config FILE, or both")
-    try:
-        from shearloop.daemon.analysis.charts import bank_figures
-    except ModuleNotFoundError as error:
-        raise UserError(f"drawing needs {error.name}: install shearloop with the extra `plot`") from error
-    from shearloop.bank.eit.bank_file import Bank
-    from shearloop.daemon.bank_config import load_bank_plan
-
-    drawn = {}
-    if args.path is not None:
-        drawn["bank_signals"] = bank_figures.signal_figure(Bank.open(args.path))
-    if args.config is not None:
-        drawn["models"] = bank_figures.models_figure(load_bank_plan(args.config).mesh)
-    with writing(args.out, "the pictures"):
-        args.out.mkdir(parents=True, exist_ok=True)
-        for name, figure in drawn.items():
-            for suffix in ("png", "svg"):
-                figure.savefig(args.out / f"{name}.{suffix}", dpi=150)
-                print(args.out / f"{name}.{suffix}")
-    return 0
 
 
 def _solve(args: argparse.Namespace) -> int:

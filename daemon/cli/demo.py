@@ -49,9 +49,13 @@ def run(args: argparse.Namespace) -> int:
     if config.robot is not None and not args.prepare:
         # Without the robot's library nothing needs to be built.
         robot_settings(config.robot)
-    _prepare(folder, args.folder / "run", calibrated=args.recording is None)
     if args.prepare:
+        _prepare(folder, args.folder / "run", calibrated=args.recording is None)
         return 0
+    # In a process of its own: the daemon would keep the memory of the fits.
+    command = [sys.executable, "-m", "shearloop", "demo", "--prepare", "--folder", str(args.folder)]
+    if status := subprocess.call([*command, *played]):
+        return status
     with page(config):
         return _call(run_command, str(folder / name), "--show", *played)
 

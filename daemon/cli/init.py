@@ -8,13 +8,16 @@ from shearloop.daemon.cli.options import add_option, writing
 from shearloop.daemon.errors import UserError
 
 # Files and folders of the package's `config`.
-STARTERS = ("rig.yaml", "ur.yaml", "experiments", "banks", "fingertips", "schemas")
+STARTERS = ("rig.yaml", "ur.yaml", "experiments", "banks", "fingertips", "schemas", "foxglove.json")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `init`."""
     add_option(parser, "folder", Path, "DIR", "folder for the files; created if missing")
-    parser.epilog = "Writes rig.yaml, ur.yaml, experiments, banks and fingertips. Existing files are never changed."
+    parser.epilog = (
+        "Writes rig.yaml, ur.yaml, experiments, banks, fingertips and a layout for Foxglove. Existing files are never "
+        "changed."
+    )
 
 
 def run(args: argparse.Namespace) -> int:

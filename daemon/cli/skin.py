@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.options import add_action, add_json, add_option, check_overwrite, run_action
+from shearloop.daemon.cli.options import add_action, add_json, add_option, check_overwrite, run_action, writing
 from shearloop.daemon.cli.terminal import print_result
 from shearloop.daemon.errors import UserError
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 run = run_action
 
 SEED = 2017
-COLUMNS = ("quantity", "unit", "paper: computed", "measured", "closed form", "1-D", "2-D", "synthetic")
+COLUMNS = ("quantity", "unit", "paper: computed", "measured", "1-D", "2-D", "synthetic")
 EXPLANATION = """\
-Sensitivity: least squares through the origin over one loading in 0.1 N steps, from the first step up to Fn.
-Closed form: a sheet at finite strain. 1-D: membrane with the paper's own F/(EA).
-2-D: plane strain, small strain, 112 elements, nothing tuned; w = 20 mm is assumed.
+Sensitivity: least squares through the origin over one loading in 0.1 N steps, from the first step up to 1.2 N.
+1-D: membrane at finite strain, 0.88 mm thick, which the paper's F/(EA) needs.
+2-D: plane strain, small strain, 112 elements, 0.70 mm thick, nothing tuned; w = 20 mm is assumed.
 Synthetic: the estimator's result on a synthetic recording with the paper's measured value."""
 
 
@@ -45,8 +45,11 @@ def _characterise(args: argparse.Namespace) -> int:
     from shearloop.bank.skin.characterisation import characterise
 
     if args.out is not None:
-        # First, to report a missing library at once.
+        # First, to report a missing library or folder at once.
         from shearloop.daemon.analysis.charts.skin_figures import draw
+
+        with writing(args.out, "the figures"):
+            args.out.mkdir(parents=True, exist_ok=True)
     found = characterise(np.random.default_rng(SEED))
     if args.json:
         print(json.dumps([asdict(row) for row in found.rows], indent=1, ensure_ascii=False))

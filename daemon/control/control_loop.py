@@ -19,6 +19,7 @@ from shearloop.daemon.control.experiment import (
     TrackTorque,
 )
 from shearloop.daemon.control.experiment_schema import (
+    AdaptStep,
     ExperimentFile,
     ExperimentLimits,
     IdentifyStep,
@@ -43,6 +44,9 @@ from shearloop.daemon.control.loop_inputs import (
 )
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDecision, SafetyMonitor
 from shearloop.daemon.control.wrist_controller import WristController
+
+# An `adapt` step compares the fingertip with the torques of this time.
+ADAPTED_OVER_S = 600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +103,7 @@ class ControlLoop:
         Each source that measures torque may drive.
         """
         fresh_s = fresh_for_s(sources.values(), config)
-        self.inputs = LatestInputs(kept_s=compared_for_s(sources.values(), fresh_s))
+        self.inputs = LatestInputs(kept_s=max(ADAPTED_OVER_S, compared_for_s(sources.values(), fresh_s)))
         self.safety = SafetyMonitor()
         self.experiment: Experiment | None = None
         self.status = LoopStatus("idle", "", WristCommand(), SafetyDecision(Response.NOTE))
@@ -174,6 +178,9 @@ class ControlLoop:
         if experiment is None or not experiment.end_action(error) or error:
             return
         action, grip = experiment.command.action, self._grip
+        if isinstance(action, AdaptStep) and action.fingertip == self.wrist.source.name:
+            # The stiffness was identified with another gain.
+            self.wrist.reset()
         if not isinstance(action, TareStep | GripTo):
             return
         # The tool was identified with another zero, or in another grip.

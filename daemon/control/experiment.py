@@ -60,7 +60,7 @@ class GripTo:
 
 
 # An action of the devices or of the identification; a retreat is an approach as well.
-Action: TypeAlias = steps.ApproachStep | GripTo | steps.TareStep | steps.IdentifyStep
+Action: TypeAlias = steps.ApproachStep | GripTo | steps.TareStep | steps.IdentifyStep | steps.AdaptStep
 
 
 class ActionState(Enum):
@@ -278,6 +278,8 @@ def _program(step: Step, now_s: float) -> StepProgram:
             return _act(step, "taking the zero of every torque sensor")
         case steps.IdentifyStep():
             return _act(step, "measuring the tool's stiffness, delay and noise")
+        case steps.AdaptStep():
+            return _act(step, f"correcting the gain of {step.fingertip} by the {step.reference.replace('_', ' ')}")
         case steps.TurnToStep():
             return _turn_to(step)
         case steps.TwistStep():

@@ -103,6 +103,14 @@ class IdentifyStep(_Step):
     amplitude_rad: float = Field(0.2, gt=0, le=0.6, description="largest angle of the twists")
 
 
+class AdaptStep(_Step):
+    """Correct a fingertip's gain by a torque measured since the grip, until the next grip or tare."""
+
+    do: Literal["adapt"]
+    fingertip: str = Field(min_length=1, description="a fingertip's name or `combined`, calibrated on recordings")
+    reference: Literal["load_cell", "wrench"] = Field("load_cell", description="source of the known torque")
+
+
 class TwistStep(_Step):
     """Twist to angles, hold at each, and return."""
 
@@ -162,6 +170,7 @@ Step = Annotated[
     | GripStep
     | TareStep
     | IdentifyStep
+    | AdaptStep
     | TurnToStep
     | TwistStep
     | HoldTorqueStep
@@ -185,10 +194,6 @@ class ExperimentFile(ConfigModel):
     )
     limits: ExperimentLimits = Field(ExperimentLimits(), description="limits of all steps")
     tool_mm: float | None = Field(None, gt=0, lt=140, description="diameter of the tool, for recordings")
-    slices: Literal["torque", "diameter"] | None = Field(
-        None,
-        description="kind of samples that `shearloop run --slices DIR` stores for each held angle; none by default",
-    )
     steps: tuple[Step, ...] = Field(min_length=1, description="the steps in order")
 
     def limits_of(self, step: Step) -> ExperimentLimits:

@@ -34,7 +34,7 @@ class Grip(Enum):
 class LatestInputs:
     """The latest inputs; `lost` maps missing devices to a sentence.
 
-    Valid torques are kept for `kept_s`, to compare two sources at the same time: the times of measurement of each
+    Valid torques are kept for `kept_s`, to compare sources at the same time: the times of measurement of each
     source, ascending, and the torques.
     """
 

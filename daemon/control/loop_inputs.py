@@ -130,7 +130,7 @@ class TorqueSource:
     `has_friction_band`: friction hides the torque within a band; the wrist turns through it without a change.
     `from_robot`: the torque comes with the robot's state, so its age is checked there. `measures_torque` is False for a
     fingertip without a calibration; a silent one is a fault all the same. `warm_up_s`: the longest time from a grip to
-    the first torque; 0 for a source that measures without a grip.
+    the first torque; 0 for a source that measures without a grip. `has_gain`: an `adapt` step can correct its gain.
     """
 
     name: str
@@ -140,3 +140,4 @@ class TorqueSource:
     from_robot: bool = False
     measures_torque: bool = True
     warm_up_s: float = 0.0
+    has_gain: bool = False

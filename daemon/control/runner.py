@@ -1,7 +1,7 @@
 """The task that runs the control loop: robot states in, commands out, 125 times a second; and its messages."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Collection, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from functools import partial
 
@@ -10,7 +10,7 @@ import structlog
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment import Action, Experiment, ExperimentPhase, GripTo
-from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, TareStep
+from shearloop.daemon.control.experiment_schema import AdaptStep, ApproachStep, ExperimentFile, TareStep
 from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
@@ -18,7 +18,7 @@ from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateMessage
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH
-from shearloop.daemon.taring import LONGEST_TARE_S, Tareable, tare_all
+from shearloop.daemon.taring import LONGEST_TARE_S, Adaptable, Tareable, tare_all
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.command_handler import NOT_ENABLED
 from shearloop.drivers.ur.messages import (
@@ -69,12 +69,12 @@ class ControlLoopRunner:
         control_loop: ControlLoop,
         robot: UrRobot,
         gripper: GripperTask | None,
-        sensors: Collection[Tareable],
+        sensors: Mapping[str, Tareable],
         publisher: Publisher,
         clock: Clock,
         dead_tasks: Mapping[str, str],
     ) -> None:
-        """`sensors` are those that an experiment tares; `dead_tasks` has the error of each dead task."""
+        """`sensors` are those that an experiment tares or adapts; `dead_tasks` has the error of each dead task."""
         self._control_loop = control_loop
         self._robot = robot
         self._clock = clock
@@ -290,7 +290,7 @@ class ActionExecutor:
         self,
         robot: UrRobot,
         gripper: GripperTask | None,
-        sensors: Collection[Tareable],
+        sensors: Mapping[str, Tareable],
         velocity: CommandSender,
         control_loop: ControlLoop,
     ) -> None:
@@ -398,7 +398,14 @@ class ActionExecutor:
                 if error := await self._rest():
                     return error
                 reply = await self._robot.send(ZeroForceTorque())
-                return reply.refusal if not reply.accepted else await tare_all(self._sensors, until_s - loop.time())
+                if not reply.accepted:
+                    return reply.refusal
+                return await tare_all(self._sensors.values(), until_s - loop.time())
+            case AdaptStep():
+                sensor = self._sensors.get(action.fingertip)
+                if not isinstance(sensor, Adaptable):
+                    return f"{action.fingertip} is not a fingertip; name one that is calibrated on recordings"
+                return await sensor.adapt(action.reference)
             case _:
                 raise TypeError(f"{action} is not an action of the devices")
 
@@ -552,7 +559,6 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
         step=experiment.step_number if experiment is not None else 0,
         steps=len(experiment.file.steps) if experiment is not None else 0,
         step_name=experiment.step.do if experiment is not None else "",
-        slices=experiment.file.slices or "" if experiment is not None else "",
         hold=experiment.command.hold_number if experiment is not None else 0,
         activity=status.activity,
         progress=experiment.progress if experiment is not None else 0.0,

@@ -92,6 +92,24 @@ class EitEstimate(Message):
     latency_s: float = column("s", "from the arrival of the frame's last byte to this message")
 
 
+@message("eit.adapted", rate_hz=None)
+class EitAdapted(Message):
+    """A correction of a fingertip's gain by a known torque, valid until the next grip or tare."""
+
+    reference: str = column("", "source of the known torque: load_cell or wrench")
+    twists: int = column("", "twists since the grip that decided")
+    factor: tuple[float, ...] = column("", "factor on the torque of each fingertip of the calibration")
+    factor_std: tuple[float, ...] = column("", "their standard errors")
+    offset_nm: float = column("N·m", "what is added to the torque")
+    gain_before: float = column("", "mean estimate over the known torque under load, before the correction")
+    gain_after: float = column("", "the same after it")
+    rmse_before_nm: float = column("N·m", "root mean square error under load, before the correction")
+    rmse_after_nm: float = column("N·m", "the same after it")
+    spread_before: float = column("", "standard deviation of ln gain that the intervals allow for, before")
+    spread_after: float = column("", "the same after it")
+    frame: int = column("", "number of the first frame with the correction")
+
+
 @message("eit.heatmap", rate_hz=None)
 class EitHeatmap(Message):
     """The scores of all cells for one frame, NaN for invalid cells; sent only while there is a subscriber."""
@@ -187,7 +205,6 @@ class LoopState(Message):
     steps: int = column("", "number of steps")
     step_name: str = column("", "kind of the step, as the experiment names it")
     hold: int = column("", "number of the angle or torque of the step that is held now, from 1; 0 while none is")
-    slices: str = column("", "kind of slice that `shearloop run --slices` keeps of it: torque, diameter, or nothing")
     activity: str = column("", "what the loop does or waits for")
     progress: float = column("", "share of the experiment that is done, 0 to 1")
     remaining_s: float = column("s", "estimated time to the end")

@@ -3,65 +3,141 @@
 import csv
 import itertools
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from scipy.io import savemat
 
 from shearloop.daemon.errors import UserError, require
-from shearloop.daemon.recording.tables import Rows, arrays, columns_of, read_rows
+from shearloop.daemon.recording import schema
+from shearloop.daemon.recording.reader import read_messages
+from shearloop.daemon.recording.tables import arrays, columns_of, read_rows, row_of
 
 Progress = Callable[[int], None]
+# Numbers of a Parquet table that are written at once.
+_BATCH = 200_000
 
 
 def export(path: Path, form: str, out: Path, topics: list[str], progress: Progress = lambda _: None) -> list[Path]:
     """Write topics as `form` (csv, parquet or mat) and return the files.
 
-    For csv and parquet `out` is a folder, for mat a file. `progress` receives the number of messages so far. Raises
-    UserError for a recording that cannot be read and for files that cannot be written.
+    For csv and parquet `out` is a folder, for mat a file, which is made in memory. `progress` receives the number of
+    messages so far. Raises UserError for a recording that cannot be read and for files that cannot be written.
     """
-    done = itertools.count(1)
-
-    def rows(topic: str) -> Rows:
-        return read_rows(path, topic, lambda: progress(next(done)))
-
     try:
         if form == "mat":
-            structs = {topic.replace(".", "_").replace("-", "_"): arrays(rows(topic)) for topic in topics}
+            done = itertools.count(1)
+            found = {topic: arrays(read_rows(path, topic, lambda: progress(next(done)))) for topic in topics}
+            structs = {topic.replace(".", "_").replace("-", "_"): columns for topic, columns in found.items()}
             # savemat changes names and hides the reason if it opens the file itself.
             with out.open("wb") as file:
                 # The stubs allow only names.
                 savemat(file, structs, long_field_names=True, oned_as="column", do_compression=True)  # type: ignore[arg-type]
             return [out]
-        out.mkdir(parents=True, exist_ok=True)
-        write = {"csv": _write_csv, "parquet": _write_parquet}[form]
-        written = [out / f"{topic}.{form}" for topic in topics]
-        for topic, file_path in zip(topics, written, strict=True):
-            write(file_path, rows(topic))
+        return _export_tables(path, form, out, topics, progress)
     except OSError as error:
         raise UserError(f"{out}: the export cannot be written: {error.strerror or error}") from error
-    return written
 
 
-def _write_csv(path: Path, rows: Rows) -> None:
-    """Write a table with one column per array element: channels_0, channels_1, …"""
-    columns: dict[str, list[Any]] = {}
-    for key, values in columns_of(rows).items():
-        if any(isinstance(value, list) for value in values):
-            width = max(len(value or []) for value in values)
-            for i in range(width):
-                columns[f"{key}_{i}"] = [value[i] if value and i < len(value) else None for value in values]
-        else:
-            columns[key] = values
-    with path.open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow(columns)
-        table.writerows(zip(*columns.values(), strict=True))
+def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress: Progress) -> list[Path]:
+    if form == "parquet":
+        require("pyarrow", "export", "Parquet")
+    out.mkdir(parents=True, exist_ok=True)
+    files = {topic: out / f"{topic}.{form}" for topic in topics}
+    tables: dict[str, _CsvTable | _ParquetTable] = {}
+    # CSV takes the text of the longest arrays as it is.
+    as_text = "scores" if form == "csv" else ""
+    with ExitStack() as stack:
+        for number, (topic, content, message) in enumerate(read_messages(path, topics, as_text=as_text), start=1):
+            row = row_of(content, message.log_time)
+            if topic not in tables:
+                made = _CsvTable(files[topic], row) if form == "csv" else _ParquetTable(files[topic], topic, row)
+                stack.callback(made.close)
+                tables[topic] = made
+            tables[topic].add(row)
+            progress(number)
+    return list(files.values())
 
 
-def _write_parquet(path: Path, rows: Rows) -> None:
-    require("pyarrow", "export", "Parquet")
-    import pyarrow
-    import pyarrow.parquet
+class _CsvTable:
+    """A table with one column per array element: channels_0, channels_1, …; an array of JSON text comes last."""
 
-    pyarrow.parquet.write_table(pyarrow.table(columns_of(rows)), path)
+    def __init__(self, path: Path, first: dict[str, Any]) -> None:
+        """Write the names of the columns, those of the first row."""
+        self._path = path
+        self._file = path.open("w", newline="", encoding="utf-8")
+        self._table = csv.writer(self._file, lineterminator="")
+        names = []
+        for key, value in sorted(first.items(), key=lambda item: isinstance(item[1], bytes)):
+            elements = value.split(b",") if isinstance(value, bytes) else value
+            names += [f"{key}_{i}" for i in range(len(elements))] if isinstance(elements, list) else [key]
+        self._width = len(names)
+        self._table.writerow(names)
+        self._file.write("\r\n")
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Write one row; raises UserError if it has other columns than the first."""
+        values: list[Any] = []
+        text = b""
+        for value in row.values():
+            if isinstance(value, list):
+                values += value
+            elif isinstance(value, bytes):
+                text = b"," + value.replace(b"null", b"")
+            else:
+                values.append(value)
+        width = len(values) + text.count(b",")
+        if width != self._width:
+            raise UserError(
+                f"{self._path}: the first message has {self._width} values and a later one {width}; use --format mat"
+            )
+        self._table.writerow(values)
+        self._file.write(text.decode() + "\r\n")
+
+    def close(self) -> None:
+        """End the file."""
+        self._file.close()
+
+
+class _ParquetTable:
+    """A table whose types are those of the topic's schema, written in batches."""
+
+    def __init__(self, path: Path, topic: str, first: dict[str, Any]) -> None:
+        """Begin the file with the columns of the first row."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        types = {"number": "float64", "integer": "int64", "boolean": "bool", "string": "string", "object": "string"}
+
+        def arrow_type(described: dict[str, Any]) -> Any:
+            if described["type"] == "array":
+                return pa.list_(arrow_type(described["items"]))
+            return pa.type_for_alias(types[described["type"]])
+
+        described = {"log_time_ns": {"type": "integer"}, **schema.schemas()[schema.schema_name(topic)]["properties"]}
+        self._schema = pa.schema([(key, arrow_type(described[key])) for key in first])
+        # Measured values seldom repeat, so that a dictionary of them would only cost time.
+        self._writer = pq.ParquetWriter(path, self._schema, use_dictionary=False)
+        self._rows: list[dict[str, Any]] = []
+        self._waiting = 0
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Add one row."""
+        self._rows.append(row)
+        self._waiting += sum(len(value) if isinstance(value, list) else 1 for value in row.values())
+        if self._waiting > _BATCH:
+            self._write()
+
+    def close(self) -> None:
+        """Write what waits, and end the file."""
+        if self._rows:
+            self._write()
+        self._writer.close()
+
+    def _write(self) -> None:
+        import pyarrow as pa
+
+        self._writer.write_table(pa.table(columns_of(self._rows), schema=self._schema))
+        self._rows.clear()
+        self._waiting = 0

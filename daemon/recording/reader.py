@@ -129,12 +129,23 @@ def open_recording(path: Path) -> Iterator[OpenRecording]:
             ) from error
 
 
-def read_messages(path: Path, topics: Iterable[str]) -> Iterator[tuple[str, dict[str, Any], Message]]:
-    """Yield topic, content and message by log time, None for keys without a value; raises UserError."""
+def read_messages(
+    path: Path, topics: Iterable[str], *, as_text: str = ""
+) -> Iterator[tuple[str, dict[str, Any], Message]]:
+    """Yield topic, content and message by log time, None for keys without a value; raises UserError.
+
+    The elements of the array `as_text` stay JSON text.
+    """
+    array = f'"{as_text}":['.encode()
     with open_recording(path) as recording:
         for channel, message in recording.messages(topics):
             live = schema.schema_name(channel.topic)
-            yield channel.topic, schema.with_missing_keys(live, from_json(message.data)), message
+            data, found, rest = message.data.partition(array)
+            elements, _, after = rest.partition(b"]")
+            content = from_json(data + found + b"]" + after if found else data)
+            if found:
+                content[as_text] = elements
+            yield channel.topic, schema.with_missing_keys(live, content), message
 
 
 def check_magic(path: Path, file: IO[bytes]) -> None:

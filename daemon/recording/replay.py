@@ -16,18 +16,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import structlog
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.estimation import Measured
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.messages import EitEstimate, EitFrame, EitHeatmap, LoadTorque, SkinShear
+from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFrame, EitHeatmap, LoadTorque, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.reader import check_identity, open_recording, reading
 from shearloop.daemon.rig import load_cell_calibration
 from shearloop.daemon.sensing.estimators import COMBINED, FrameEstimator, open_combined, open_estimator
-from shearloop.daemon.sensing.fingertip_task import FramePairing, estimate_message, frame_message
+from shearloop.daemon.sensing.fingertip_task import (
+    FramePairing,
+    adapted_message,
+    estimate_message,
+    frame_message,
+    torques_from_bytes,
+)
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
 from shearloop.daemon.sensing.skin_task import SKIN, RecordedSkin
 from shearloop.daemon.sensing.tool_diameter import tool_from_bytes
@@ -37,7 +45,7 @@ from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.yaml_files import validated
 
 # Topics that a replay computes. All others are sent as they were recorded.
-COMPUTED_TOPICS = (EitFrame.topic, EitEstimate.topic, LoadTorque.topic, SkinShear.topic)
+COMPUTED_TOPICS = (EitFrame.topic, EitEstimate.topic, EitAdapted.topic, LoadTorque.topic, SkinShear.topic)
 # These depend on the computer, not on the measurement.
 NOT_COMPARED = ("latency_s", "timestamp", "arrival_unix_ns", "seq")
 _MAX_EXAMPLES = 5
@@ -56,13 +64,14 @@ class RecordedEvent:
 
 @dataclass(frozen=True, slots=True)
 class ReplayEvents:
-    """Events that the frames do not contain: tares and tools by source and frame number.
+    """Events that the frames do not contain, by source and frame number: tares, tools, and known torques of the grip.
 
     `frame_numbers` holds the frames' numbers by source and arrival; they continue from file to file.
     """
 
     tares: dict[str, set[int]]
     tools: dict[str, dict[int, Measured | None]]
+    adaptations: dict[str, dict[int, tuple[str, FloatArray]]]
     frame_numbers: dict[str, dict[int, int]]
 
 
@@ -117,7 +126,7 @@ class RecordedRun:
 
     def replay_events(self) -> ReplayEvents:
         """Return the events that the frames do not contain."""
-        found = ReplayEvents(defaultdict(set), defaultdict(dict), defaultdict(dict))
+        found = ReplayEvents(defaultdict(set), defaultdict(dict), defaultdict(dict), defaultdict(dict))
         for event in self.events() if self.has_inputs else ():
             raw, source = event.raw, event.source
             with reading(self.path):
@@ -129,6 +138,9 @@ class RecordedRun:
                 elif raw is not None and raw.kind is InputKind.TOOL:
                     frame, tool = tool_from_bytes(raw.data)
                     found.tools[source][frame] = tool
+                elif raw is not None and raw.kind is InputKind.ADAPT:
+                    frame, reference, torque_nm = torques_from_bytes(raw.data)
+                    found.adaptations[source][frame] = reference, torque_nm
         return found
 
 
@@ -201,10 +213,20 @@ class ReplayPipeline:
         if due:
             estimator.set_tool(tools[max(due)])
         self._latest_frame[source] = number
+        if known := self._events.adaptations.get(source, {}).get(number):
+            self._adapt(source, frames, *known)
         estimate = await estimator.estimate(*frames)
         # The replayed latency is 0; the recording holds the live one.
         arrival_ns = max(frame.t_arrival_ns for frame in frames)
         self._publisher.publish(estimate_message(source, frames, estimate, arrival_ns))
+
+    def _adapt(self, source: str, frames: tuple[Frame, ...], reference: str, torque_nm: FloatArray) -> None:
+        estimator = self._estimators[source]
+        if len(estimator.grip_t_s) != len(torque_nm):
+            reason = "the recording begins in the middle of the grip, so the correction of its gain is left out"
+            structlog.get_logger().warning(reason, source=source, frame=frames[0].seq)
+            return
+        self._publisher.publish(adapted_message(source, frames, reference, estimator.adapt(torque_nm)))
 
 
 class ReplayClock(Clock):

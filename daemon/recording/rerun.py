@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.daemon.errors import require
@@ -16,8 +15,8 @@ from shearloop.daemon.recording.reader import Progress, read_messages
 from shearloop.daemon.web.message_store import conductivity_profile
 
 TIMELINE = "time"
-# Values of an entity that are sent at once.
-_BATCH = 1000
+# Values of an entity that are sent at once, and images.
+_BATCH, _IMAGE_BATCH = 1000, 30
 # Longer arrays are frames and heatmaps.
 _LONGEST_SCALARS = 8
 # One chart for each unit, by the end of the keys.
@@ -25,7 +24,7 @@ _CHARTS = {"torque (N·m)": "_nm", "diameter (mm)": "_mm", "shear force (N)": "_
 
 
 class _RerunFile:
-    """Adds messages to a Rerun file, scalars in batches."""
+    """Adds messages to a Rerun file, in batches."""
 
     def __init__(self, out: Path, fingertip: Fingertip) -> None:
         import rerun
@@ -42,7 +41,7 @@ class _RerunFile:
         self._poses: dict[str, None] = {}
 
     def add(self, topic: str, content: Mapping[str, Any], t_ns: int) -> None:
-        """Add one message of a recorded topic."""
+        """Add one message of a recorded topic; `scores` are JSON text."""
         entity = topic.replace(".", "/")
         for key, value in content.items():
             if (isinstance(value, list) and len(value) > _LONGEST_SCALARS) or key in (*ENVELOPE, schema.SCORES_SHAPE):
@@ -54,8 +53,7 @@ class _RerunFile:
             self._models[content["source"]] = content["model"]
             # Recordings of 0.1 have no shape.
             if shape := content.get(schema.SCORES_SHAPE):
-                scores = np.array(content["scores"], dtype=np.float64).reshape(shape)
-                self._add_image(f"{entity}/scores", scores, t_ns)
+                self._add_image(f"{entity}/scores", _shares(content["scores"]).reshape(shape), t_ns)
         elif live == EitEstimate.topic and content["k"] is not None and content["sigma"] is not None:
             model = self._models.get(content["source"], "")
             profile = conductivity_profile(model, content["k"], content["sigma"], self._height_cm)
@@ -79,39 +77,43 @@ class _RerunFile:
         times, values = self._waiting.setdefault(entity, ([], []))
         times.append(t_ns)
         values.append(value)
-        if len(times) == _BATCH:
+        if len(times) == (_IMAGE_BATCH if entity in self._images else _BATCH):
             self._send(entity)
 
     def _send(self, entity: str) -> None:
         times, waiting = self._waiting[entity]
         if times:
             index = self._rr.TimeColumn(TIMELINE, timestamp=np.array(times, "datetime64[ns]"))
-            # A number that is not finite is null in a recording.
-            values = np.array(waiting, dtype=np.float64)
-            columns = self._pose_columns(values) if entity in self._poses else self._rr.Scalars.columns(scalars=values)
-            self._stream.send_columns(entity, [index], columns)
+            self._stream.send_columns(entity, [index], self._columns(entity, waiting))
         times.clear()
         waiting.clear()
 
-    def _pose_columns(self, poses: NDArray[np.float64]) -> Any:
-        turns = Rotation.from_rotvec(poses[:, 3:]).as_quat()
-        return self._rr.Transform3D.columns(translation=poses[:, :3], quaternion=turns)
+    def _columns(self, entity: str, waiting: list[Any]) -> Any:
+        rr = self._rr
+        if entity in self._images:
+            sizes = [{"height": len(pixels), "width": len(pixels.T)} for pixels in waiting]
+            formats = [rr.components.ImageFormat(**size, color_model="L", channel_datatype="U8") for size in sizes]
+            return rr.Image.columns(buffer=[pixels.tobytes() for pixels in waiting], format=formats)
+        # A number that is not finite is null in a recording.
+        values = np.array(waiting, dtype=np.float64)
+        if entity in self._poses:
+            turns = values[:, 3:]
+            half = np.linalg.norm(turns, axis=1, keepdims=True) / 2
+            quaternions = np.hstack([turns / 2 * np.sinc(half / np.pi), np.cos(half)])
+            return rr.Transform3D.columns(translation=values[:, :3], quaternion=quaternions)
+        return rr.Scalars.columns(scalars=values)
 
-    def _add_image(self, entity: str, share: NDArray[np.float64], t_ns: int) -> None:
+    def _add_image(self, entity: str, share: NDArray[np.floating[Any]], t_ns: int) -> None:
         """Add a grey image; 0 is black and 1 is white."""
-        pixels = np.round(255 * np.clip(np.nan_to_num(share), 0, 1)).astype(np.uint8)
+        pixels = np.round(255 * np.clip(share, 0, 1)).astype(np.uint8)
         self._images[entity] = None
-        self._log(entity, self._rr.Image(pixels, color_model="L"), t_ns)
+        self._add(entity, pixels, t_ns)
 
     def _add_pose(self, entity: str, pose: list[float], t_ns: int) -> None:
         if entity not in self._poses:
             self._poses[entity] = None
             self._stream.log(entity, self._rr.TransformAxes3D(0.1), static=True)
         self._add(entity, pose, t_ns)
-
-    def _log(self, entity: str, shown: Any, t_ns: int) -> None:
-        self._stream.set_time(TIMELINE, timestamp=np.datetime64(t_ns, "ns"))
-        self._stream.log(entity, shown)
 
     def _layout(self) -> Any:
         from rerun import blueprint
@@ -122,6 +124,24 @@ class _RerunFile:
         poses = [blueprint.Spatial3DView(name=one, contents=[one]) for one in self._poses]
         columns = [blueprint.Vertical(*views) for views in (charts, [*images, *poses]) if views]
         return blueprint.Blueprint(blueprint.Horizontal(*columns))
+
+
+def _shares(text: bytes) -> NDArray[np.float32]:
+    """Return the numbers of a JSON array from 0 to 1, to four decimals; 0 for null and for negative numbers.
+
+    A whole JSON parser would take most of the export's time for these numbers.
+    """
+    characters = np.frombuffer(text + b"," * 6, np.uint8)
+    ends = np.flatnonzero(characters == ord(","))[:-5]
+    starts = np.append(0, ends[:-1] + 1)
+    found = np.zeros(len(ends), np.float32)
+    # The first digit, and those after the point.
+    for place, weight in ((0, 1.0), (2, 0.1), (3, 0.01), (4, 0.001), (5, 0.0001)):
+        digits = characters[starts + place] - ord("0")
+        found += np.where((digits <= 9) & (starts + place < ends), digits, 0) * np.float32(weight)
+    # A number with an exponent, as 1e-6, is less than 0.00001.
+    found[(characters[starts] > ord("9")) | (characters[starts] < ord("0")) | (characters[ends - 3] == ord("e"))] = 0
+    return found
 
 
 def export_rerun(
@@ -135,7 +155,7 @@ def export_rerun(
     # The SDK's own error is a sentence of its internals.
     out.open("wb").close()
     file = _RerunFile(out, fingertip)
-    for number, (topic, content, message) in enumerate(read_messages(path, topics), start=1):
+    for number, (topic, content, message) in enumerate(read_messages(path, topics, as_text="scores"), start=1):
         file.add(topic, content, message.log_time)
         progress(number)
     file.close()

@@ -26,7 +26,7 @@ import numpy as np
 from pydantic_core import to_json
 
 from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
-from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitFrame, EitHeatmap, LoadTorque
+from shearloop.daemon.messaging.messages import TOPICS, EitAdapted, EitEstimate, EitFrame, EitHeatmap, LoadTorque
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
 FORMAT_VERSION = "2"
@@ -51,7 +51,7 @@ LARGEST_DIAMETER_MM = 140.0
 LOAD_DOUBT_NOTE = "load_doubt"
 LOAD_DOUBT = "the load's values waited in a buffer, and nothing shows for how long: its times may be seconds off"
 
-_FINGERTIP_TOPICS = (EitFrame.topic, EitEstimate.topic, EitHeatmap.topic)
+_FINGERTIP_TOPICS = (EitFrame.topic, EitEstimate.topic, EitAdapted.topic, EitHeatmap.topic)
 _SCALARS = {float: "number", int: "integer", str: "string", bool: "boolean"}
 _TIME = {"type": "integer", "description": "CLOCK_MONOTONIC in ns"}
 
@@ -125,8 +125,11 @@ def schemas() -> Mapping[str, dict[str, Any]]:
     raw = {
         INPUT: {
             "t_mono_ns": _TIME,
-            "kind": {"type": "string", "description": "opened or started (the board), asked, data, tare, or tool"},
-            "data": {"type": "string", "description": "the bytes as Latin-1 text, or the argument of a tare or a tool"},
+            "kind": {
+                "type": "string",
+                "description": "opened or started (board), asked, data, tare, tool or adapt",
+            },
+            "data": {"type": "string", "description": "the bytes as Latin-1 text, or the argument of another input"},
         },
         CLOCK_TOPIC: {
             "t_mono_ns": _TIME,

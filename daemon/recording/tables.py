@@ -75,13 +75,20 @@ def read(path: str | Path) -> RecordedTopics:
 
 
 def read_rows(path: Path, topic: str, on_row: Callable[[], None] = lambda: None) -> Rows:
-    """Return a topic's messages by time: log_time_ns first, maps as JSON text, None for a missing value."""
+    """Return a topic's messages by time."""
     rows = []
     for _, content, message in read_messages(path, [topic]):
-        row = {key: json.dumps(value) if isinstance(value, dict) else value for key, value in content.items()}
-        rows.append({"log_time_ns": message.log_time, **row})
+        # As arrays, heatmaps take a quarter of the memory.
+        held = {key: np.array(value, float) if isinstance(value, list) else value for key, value in content.items()}
+        rows.append(row_of(held, message.log_time))
         on_row()
     return rows
+
+
+def row_of(content: Mapping[str, Any], log_time_ns: int) -> dict[str, Any]:
+    """Return a message as a row: log_time_ns first, maps as JSON text, None for a missing value."""
+    row = {key: json.dumps(value) if isinstance(value, dict) else value for key, value in content.items()}
+    return {"log_time_ns": log_time_ns, **row}
 
 
 def columns_of(rows: Rows) -> dict[str, list[Any]]:
@@ -96,10 +103,11 @@ def arrays(rows: Rows) -> dict[str, NDArray[Any]]:
     for key, values in columns_of(rows).items():
         present = [value for value in values if value is not None]
         complete = bool(present) and len(present) == len(values)
-        if any(isinstance(value, list) for value in present):
+        if any(isinstance(value, np.ndarray) for value in present):
             matrix = np.full((len(values), max(map(len, present))), np.nan)
             for row, value in zip(matrix, values, strict=True):
-                row[: len(value or [])] = np.array(value or [], dtype=np.float64)
+                if value is not None:
+                    row[: len(value)] = value
             found[key] = matrix
         elif any(isinstance(value, str) for value in present):
             found[key] = np.array([value or "" for value in values], dtype=object)

@@ -14,9 +14,10 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, Measured, TactileFrame
+from shearloop.bank.estimation import Adaptation, Calibration, Estimate, EstimatorSession, Measured, TactileFrame
 from shearloop.bank.estimation.bank_match import PaperMatcher
 from shearloop.bank.estimation.estimator import PaperEstimator
+from shearloop.bank.estimation.interval_regressor import IntervalRegressor
 from shearloop.bank.estimation.session import REPEATED_FRAME
 from shearloop.daemon.config import CombinedConfig, DaemonConfig, FingertipConfig
 from shearloop.daemon.control.loop_inputs import TorqueSource
@@ -75,6 +76,12 @@ class FrameEstimator:
         return self.calibration.torque is not None
 
     @property
+    def has_gain(self) -> bool:
+        """Whether twists of known torque can correct its gain."""
+        torque = self.calibration.torque
+        return torque is not None and isinstance(torque.regressor, IntervalRegressor)
+
+    @property
     def warm_up_frames(self) -> int:
         """The gripped frames that the first torque after a grip needs."""
         return self.calibration.estimator.motion.n_lags + 1
@@ -102,6 +109,18 @@ class FrameEstimator:
     def set_tool(self, tool: Measured | None) -> None:
         """Set the diameter of the held tool: on another one than the calibration's there is no torque."""
         self._session.set_tool(tool)
+
+    @property
+    def grip_t_s(self) -> FloatArray:
+        """The times (n,) of this grip's frames with a torque, whose known torques `adapt` takes."""
+        return self._session.grip_t_s
+
+    def adapt(self, torque_nm: FloatArray) -> Adaptation:
+        """Correct the gain by torques (n,) at `grip_t_s`, NaN where unknown, until the next grip or tare.
+
+        Raises CalibrationError without a load that is large enough to show the gain.
+        """
+        return self._session.adapt(torque_nm)
 
     async def estimate(self, *frames: Frame) -> Estimate:
         """Return the estimate of frames of one time, one for each side.
@@ -216,6 +235,7 @@ def torque_sources(
             window_s=own.frame_period_s * own.average_frames,
             measures_torque=estimators[name].measures_torque,
             warm_up_s=_WARM_UP_SHARE * estimators[name].warm_up_frames * own.frame_period_s,
+            has_gain=estimators[name].has_gain,
         )
         for name, own in config.fingertips.items()
     }
@@ -227,6 +247,7 @@ def torque_sources(
             window_s=period_s,
             measures_torque=combined.measures_torque,
             warm_up_s=_WARM_UP_SHARE * combined.warm_up_frames * period_s,
+            has_gain=combined.has_gain,
         )
     if config.skin is not None and (skin := skin_source(config.skin)) is not None:
         sources[skin.name] = skin

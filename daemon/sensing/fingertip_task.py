@@ -10,12 +10,14 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from shearloop.bank.estimation import Estimate, Measured
+from shearloop.bank.arrays import FloatArray
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation import Adaptation, Estimate, Measured, torque_at
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.daemon.messaging.messages import EitEstimate, EitFrame, EitHeatmap
+from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFrame, EitHeatmap
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.estimators import FrameEstimator
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters, tool_as_bytes
@@ -27,6 +29,8 @@ Item = TypeVar("Item")
 
 # Largest distance in time of a pair of frames, as a share of the frame period.
 _MAX_APART_PERIODS = 0.75
+# A correction of the gain begins with a frame.
+_LONGEST_WAIT_S = 5.0
 
 
 class FramePairing(Generic[Item]):
@@ -128,11 +132,13 @@ class FingertipPipeline:
         self._inputs = inputs
         self._tare = _Tare()
         self._held: Measured | None = None
+        # The source of the known torque of a correction that waits for the next frame, and its result.
+        self._adapting: tuple[str, asyncio.Future[str]] | None = None
 
     async def process(self, *frames: Frame) -> None:
         """Estimate from the frames of one time, hand the estimate to the control loop, and publish it."""
         number, now_ns = frames[0].seq, self._clock.now_ns()
-        # A replay tares, and takes the held tool, before the same frame.
+        # A replay tares, takes the held tool, and corrects the gain before the same frame.
         if self._tare.is_due(min(frame.t_begin_ns for frame in frames)):
             self.estimator.tare()
             self._record(InputKind.TARE, now_ns, str(number).encode())
@@ -141,6 +147,10 @@ class FingertipPipeline:
             self._held = tool
             self.estimator.set_tool(tool)
             self._record(InputKind.TOOL, now_ns, tool_as_bytes(number, tool))
+        if self._adapting is not None:
+            reference, ended = self._adapting
+            if not ended.done():
+                ended.set_result(self._adapt(reference, frames, now_ns))
         estimate = await self.estimator.estimate(*frames)
         now_ns = self._clock.now_ns()
         message = estimate_message(self.name, frames, estimate, now_ns)
@@ -166,6 +176,29 @@ class FingertipPipeline:
         except TimeoutError:
             what = f"the homogeneous frame of {self.name} could not be taken within {within_s:.3g} s"
             return f"{what}: {self._tare.reasons or 'no frame came'}"
+        return ""
+
+    async def adapt(self, reference: str) -> str:
+        """Correct the gain by this source's torque during this grip; return why not, or an empty text."""
+        ended: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._adapting = reference, ended
+        try:
+            async with asyncio.timeout(_LONGEST_WAIT_S):
+                return await ended
+        except TimeoutError:
+            return f"{self.name} sent no frame within {_LONGEST_WAIT_S:g} s; check its board"
+        finally:
+            self._adapting = None
+
+    def _adapt(self, reference: str, frames: tuple[Frame, ...], now_ns: int) -> str:
+        times_ns, torques_nm = self._loop.inputs.history.get(reference, ([], [])) if self._loop else ([], [])
+        torque_nm = torque_at(self.estimator.grip_t_s, np.array(times_ns) / 1e9, np.array(torques_nm))
+        try:
+            adaptation = self.estimator.adapt(torque_nm)
+        except CalibrationError as error:
+            return f"{self.name} against {reference}: {error}"
+        self._record(InputKind.ADAPT, now_ns, torques_as_bytes(frames[0].seq, reference, torque_nm))
+        self._publisher.publish(adapted_message(self.name, frames, reference, adaptation))
         return ""
 
     def _record(self, kind: InputKind, t_ns: int, data: bytes) -> None:
@@ -290,13 +323,49 @@ def frame_message(name: str, frame: Frame) -> EitFrame:
     )
 
 
+def torques_as_bytes(frame: int, reference: str, torque_nm: FloatArray) -> bytes:
+    """Return the raw event's data: the known torques (n,) of the grip that correct the gain from a frame on."""
+    return " ".join([str(frame), reference, *map(repr, torque_nm.tolist())]).encode()
+
+
+def torques_from_bytes(data: bytes) -> tuple[int, str, FloatArray]:
+    """Return the frame, the source and the torques (n,) of a raw event; raises ValueError for other data."""
+    frame, reference, *torques = data.decode().split()
+    return int(frame), reference, np.array(torques, dtype=np.float64)
+
+
+def adapted_message(name: str, frames: tuple[Frame, ...], reference: str, adaptation: Adaptation) -> EitAdapted:
+    """Return the message of a correction that begins with the frames of one time."""
+    correction, before, after = adaptation.correction, adaptation.before, adaptation.after
+    return EitAdapted(
+        source=name,
+        t_mono_ns=_mean_ns(frames),
+        reference=reference,
+        twists=correction.twists,
+        factor=tuple(correction.factors.tolist()),
+        factor_std=tuple(correction.errors.tolist()),
+        offset_nm=correction.offset_nm,
+        gain_before=before.gain,
+        gain_after=after.gain,
+        rmse_before_nm=before.rmse_nm,
+        rmse_after_nm=after.rmse_nm,
+        spread_before=before.spread,
+        spread_after=after.spread,
+        frame=frames[0].seq,
+    )
+
+
+def _mean_ns(frames: tuple[Frame, ...]) -> int:
+    return sum(frame.t_mid_ns for frame in frames) // len(frames)
+
+
 def estimate_message(name: str, frames: tuple[Frame, ...], estimate: Estimate, now_ns: int) -> EitEstimate:
     """Return the message of an estimate from frames of one time, as published at now_ns."""
     values = asdict(estimate)
     del values["reasons"], values["lag_s"]
     return EitEstimate(
         source=name,
-        t_mono_ns=sum(map(attrgetter("t_mid_ns"), frames)) // len(frames),
+        t_mono_ns=_mean_ns(frames),
         **values,
         reason="; ".join(estimate.reasons),
         frame=frames[0].seq,

@@ -14,6 +14,7 @@ import stat
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,8 @@ TOKEN_BYTES = 32
 TOKEN_LENGTHS = range(32, 201)
 # Requests in progress get this long at the end.
 SHUTDOWN_S = 1.0
+# A daemon that ends together with the viewer is still shown as ended.
+LAST_MESSAGES_S = 0.1
 # Commands that move something, or change what moves it.
 NEEDS_TOKEN = ("tare", "start", "pause", "resume", "unlock")
 # Wrong tokens that are compared at once, and then per second.
@@ -212,7 +215,7 @@ async def serve(
                     f"the page cannot be served on {HOST}:{port} ({error.strerror}); give another --port"
                 ) from error
             for number in signals:
-                loop.add_signal_handler(number, receiving.cancel)
+                loop.add_signal_handler(number, partial(loop.call_later, LAST_MESSAGES_S, receiving.cancel))
             on_ready(runner.addresses[0][1])
             # Without its subscription the page would show stale data: an error there ends the server.
             with contextlib.suppress(asyncio.CancelledError):

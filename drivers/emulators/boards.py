@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.ports import PtyPort
-from shearloop.drivers.load_cell import COUNTS_MAX, COUNTS_MIN
 
 # Lateness of this process that is made up for, so that fast rates are kept on average.
 CATCH_UP_S = 0.05
@@ -25,6 +24,8 @@ CATCH_UP_S = 0.05
 LOAD_PERIOD_S = 1 / 10.9
 # A line of the paper's board without its beginning, "0.0000": 38 µN·m became 38 MN·m.
 CORRUPTED = 38399996
+# The ends of the HX711's 24 bits.
+COUNTS_MIN, COUNTS_MAX = -(1 << 23), (1 << 23) - 1
 TIMED_FAULTS = ("silence", "saturation", "stuck", "unplug")
 
 

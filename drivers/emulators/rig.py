@@ -1,6 +1,6 @@
-"""The whole rig in one process: arm, gripper, load cell, two EIT boards and a shear skin, tied by one physics.
+"""The whole rig in one process: arm, gripper, load cell and two EIT boards, tied by one physics.
 
-Arm → wrist angle → twin ← force of the fingers; twin → wrench, load cell, EIT frames and the skin's gauges. The
+Arm → wrist angle → twin ← force of the fingers; twin → wrench, load cell and EIT frames. The
 controller's cycle makes time pass, so that all devices see the same moment.
 """
 
@@ -16,7 +16,6 @@ from shearloop.drivers.emulators.boards import LOAD_PERIOD_S, EitKitBoard, Hx711
 from shearloop.drivers.emulators.gripper import Gripper, GripperPlayer, ModbusSlave, UrcapSession
 from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.drivers.emulators.scene import FloatArray, Joint, Scene, TwinSettings
-from shearloop.drivers.emulators.skin import Gauges, SkinInstruments
 from shearloop.drivers.emulators.ur_controller import FAULTS, Controller
 from shearloop.drivers.emulators.ur_robot import ControllerSpec, Robot
 
@@ -26,7 +25,7 @@ JOINTS = {joint.value: joint for joint in Joint}
 SIDES = {"right": 1.0, "left": -1.0}
 COMMANDS = (
     f"kick NM, slip [NM], joint {'|'.join(JOINTS)}, object MM|none, silence DEVICE [SECONDS], "
-    "unplug DEVICE [SECONDS], replug DEVICE, right|left|load|skin FAULT, "
+    "unplug DEVICE [SECONDS], replug DEVICE, right|left|load FAULT, "
     "gripper drop|fault CODE|…, a fault of the robot, or normal"
 )
 
@@ -36,13 +35,6 @@ class FrameSynthesiser(Protocol):
 
     def line(self, grip: FloatArray, shear_torque_nm: FloatArray, diameter_mm: float) -> FloatArray:
         """Return the board's line, (v,) in volts, for grip (0…1) and shear at each injection, (L,) each."""
-
-
-class RigSkin(Gauges, Protocol):
-    """A shear skin on one finger."""
-
-    def follow_grip(self, torque_nm: float, *, gripped: bool) -> None:
-        """Take the tool's torque."""
 
 
 class Commanded(Protocol):
@@ -71,33 +63,17 @@ class RigSettings:
     seed: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class RigPlant:
-    """What the wrist turns."""
-
-    scene: Scene
-    skin: RigSkin | None
-
-    def step(self, dt_s: float, wrist_rad: float) -> float:
-        """Advance by dt_s of real time; return the tool's resisting torque on the flange in N·m."""
-        torque_nm = self.scene.step(dt_s, wrist_rad)
-        if self.skin is not None:
-            state = self.scene.twin.state
-            self.skin.follow_grip(state.torque_nm, gripped=state.gripped)
-        return torque_nm
-
-
 class EmulatedRig:
     """All devices: `run` plays all but the robot, and the `controller`, iterated over, makes time pass.
 
     `command` applies faults, `scene` is the true state. `ports` get the path or address of each port when it appears.
     """
 
-    def __init__(self, settings: RigSettings, synthesiser: FrameSynthesiser, skin: RigSkin | None = None) -> None:
+    def __init__(self, settings: RigSettings, synthesiser: FrameSynthesiser) -> None:
         run_dir, speed, seed = settings.run_dir, settings.speed, settings.seed
         gripper = Gripper()
         self.scene = Scene(gripper, settings.twin, speed)
-        robot = Robot(settings.make, RigPlant(self.scene, skin), settings.arm_speed)
+        robot = Robot(settings.make, self.scene, settings.arm_speed)
         self.controller = Controller(robot, host=settings.host, rate_hz=settings.rate_hz)
         player = GripperPlayer(
             gripper,
@@ -123,16 +99,10 @@ class EmulatedRig:
             link=run_dir / "load-cell",
             seed=seed,
         )
-        self._played: list[EitKitBoard | Hx711Board | Server | SkinInstruments] = [*boards.values(), player.server]
+        self._played: list[EitKitBoard | Hx711Board | Server] = [*boards.values(), player.server]
         self._commanded: dict[str, Commanded] = {**boards, "gripper": player, "robot": self.controller}
         self.ports = {name: board.port.appearances for name, board in boards.items()}
         self.ports["gripper"] = player.server.appearances
-        self.skin: SkinInstruments | None = None
-        if skin is not None:
-            self.skin = SkinInstruments(skin, run_dir / "skin-source", run_dir / "skin-daq", speed=speed, seed=seed)
-            self._played.append(self.skin)
-            self._commanded["skin"] = self.skin
-            self.ports |= {"skin-source": self.skin.source_port, "skin-daq": self.skin.daq_port}
 
     async def run(self) -> None:
         """Play all but the robot until cancelled; OSError, in a group, if an address or port is not available."""

@@ -10,7 +10,7 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.build import build_bank
 from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.design import MeasuredFrames, Setting, design_bank, simulated_signals
-from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.forward import BatchForwardModel
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import NOT_TURNED, RefinedMatcher
 from shearloop.bank.estimation.values import FrameSeries
@@ -48,7 +48,7 @@ def step_frames() -> np.ndarray:
     """Return the model's frames (8, 896) of steps of eight sizes."""
     mesh = load_geometry(OWN_FINGERTIP).mesh
     steps = [Setting(k, 1.0) for k in np.linspace(1.2, 2.2, 8).tolist()]
-    return 0.01 * np.abs(simulated_signals(ForwardModel(mesh), "step", steps))
+    return 0.01 * np.abs(simulated_signals(BatchForwardModel(mesh), "step", steps))
 
 
 def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path):

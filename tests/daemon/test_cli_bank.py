@@ -210,20 +210,6 @@ def test_solve_refuses_a_conductivity_that_is_not_positive_and_writes_nothing(fo
     assert not out.exists()
 
 
-@pytest.fixture(scope="module")
-def pictures(folder):
-    """Draw for the whole module: matplotlib keeps its fonts' files open."""
-    out = folder / "pictures"
-    assert main(["bank", "plot", f"{folder}/a.bank", "--config", f"{folder}/bank.yaml", "--out", str(out)]) == 0
-    return out
-
-
-def test_plot_draws_signals_and_models(pictures):
-    names = ["bank_signals.png", "bank_signals.svg", "models.png", "models.svg"]
-    assert sorted(path.name for path in pictures.iterdir()) == names
-    assert (pictures / "models.png").read_bytes().startswith(b"\x89PNG")
-
-
 @pytest.mark.parametrize(
     ("options", "part"),
     [
@@ -248,8 +234,6 @@ def test_mistakes_of_build_are_one_sentence(folder, tmp_path, capsys, options, p
         (["info", "{folder}/tip.yaml"], "tip.yaml: this is not a bank"),
         (["info", "{folder}/tip.yaml"], "or make one with `shearloop bank build --config FILE --out NAME.bank`"),
         (["info", "{folder}/none"], "none: the bank cannot be read"),
-        (["plot", "--out", "{folder}/f"], "give a bank's PATH, or --config FILE, or both"),
-        (["plot", "{folder}/a.bank", "--out", "{folder}/tip.yaml"], "the pictures cannot be written: File exists"),
         ([*SOLVE, "--mesh", "{folder}/none"], "the mesh cannot be read"),
         ([*SOLVE, "--mesh", "{folder}/a.bank"], "is not a mesh"),
         ([*SOLVE, "--model", "x"], "no basis model"),
@@ -257,7 +241,6 @@ def test_mistakes_of_build_are_one_sentence(folder, tmp_path, capsys, options, p
         ([*SOLVE, "--out", "{folder}"], "the voltages cannot be written: Is a directory"),
     ],
 )
-@pytest.mark.usefixtures("pictures")
 def test_mistakes_of_the_others_are_one_sentence(folder, capsys, arguments, part):
     assert part in refused(capsys, *(argument.format(folder=folder) for argument in arguments))
     assert not (folder / "v").exists()

@@ -1,21 +1,17 @@
-"""The skin's emulators as processes of their own, met by the real drivers; and the skin on the emulated rig."""
+"""The skin's emulators as processes of their own, met by the real drivers."""
 
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-import numpy as np
 import pytest
 
-from shearloop.daemon.cli.emulate.rig import PushedSkin
-from shearloop.daemon.synthetic_skin import SLACK_RATIO, SyntheticSkin
+from shearloop.bank.skin.membrane import THICK_SECTION, UNSTRETCHED, Membrane
+from shearloop.daemon.synthetic_skin import NORMAL_N, SLACK_RATIO
 from shearloop.drivers.connection import Link, SerialLink, TcpLink
-from shearloop.drivers.emulators.gripper import GripperRegisters
-from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings
 from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
 from tests.daemon.conftest import DEADLINE_S, shearloop
-from tests.daemon.emulate_rig.test_mistakes import Blank
 from tests.running import pass_on, running
 
 SPEED = 20
@@ -60,8 +56,8 @@ async def test_both_instruments_tied_by_one_skin_are_read_and_obey(tmp_path):
         async with read(SerialLink(path=places[1], baud=9600), board) as samples:
             assert (await until(samples)).r1_ohm == pytest.approx(24.6, rel=2e-3)
             await told(process, "shear 0.54")
-            # 0.5 N beyond the deadband, less what friction keeps on the way to the gauge and the slack gauge's share.
-            response = 0.088 * 0.5 / np.exp(0.04 * np.radians(60.7))
+            membrane = Membrane(THICK_SECTION)
+            response = membrane.response(membrane.step(UNSTRETCHED, 0.54, NORMAL_N))
             await until(samples, r1_ohm=24.6 * (1 + response / (1 - SLACK_RATIO)))
             await told(process, "open 1")
             await until(samples, SkinFault.COMPLIANCE, SkinFault.OPEN_1)
@@ -85,33 +81,3 @@ async def test_source_and_scanner_are_played_on_sockets_too():
             await told(process, "mend")
             await told(process, "leads 1000")
             await until(samples, SkinFault.COMPLIANCE)
-
-
-def test_on_the_rig_the_robot_s_motion_shears_the_skin(tmp_path):
-    pushed = PushedSkin(SyntheticSkin(), lever_m=0.02)
-    rig = EmulatedRig(RigSettings(run_dir=tmp_path), Blank(), pushed)
-    robot, gripper = rig.controller.robot, rig.scene.gripper
-
-    def pass_s(seconds: float) -> None:
-        for _ in range(round(seconds / 0.008)):
-            robot.step(0.008)
-
-    pass_s(0.1)
-    r1, r2 = pushed.resistances_ohm()
-    gripper.write(GripperRegisters(act=True))
-    pass_s(8.0)
-    gripper.write(GripperRegisters(act=True, gto=True, pos=255, spe=255, force=67))
-    pass_s(1.0)
-    assert rig.scene.twin.state.gripped
-    robot.arm.q_rad[5] += 0.03
-    pass_s(0.1)
-    torque_nm = rig.scene.twin.state.torque_nm
-    assert pushed.skin.shear_n == pytest.approx(torque_nm / 0.02)
-    assert pushed.skin.shear_n > 0.5
-    stretched_1, stretched_2 = pushed.resistances_ohm()
-    assert stretched_1 / r1 - 1 > 0.04
-    assert stretched_2 / r2 - 1 == pytest.approx(SLACK_RATIO * (stretched_1 / r1 - 1), abs=1e-3)
-    rig.command("skin open 2")
-    assert rig.skin.circuit.faults == {("open", "2")}
-    rig.command("replug skin")
-    assert not rig.skin.circuit.faults

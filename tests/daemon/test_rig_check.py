@@ -1,5 +1,6 @@
 """An experiment that can never be carried out is refused before anything is opened."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +106,37 @@ def test_a_tool_of_which_nothing_is_known_is_not_held(tmp_path, between):
     assert f"step {1 + len(first) + len(between)} is `hold_torque`, and the tool is not identified then; put an" in told
     steps = [*between, identify, {"do": "wait", "wait_s": 1}, hold, hold]
     assert check_experiment(config(tmp_path, {"steps": steps}, gripper=gripper), SOURCES) is not None
+
+
+ADAPT = {"do": "adapt", "fingertip": "right"}
+IDENTIFY = {"do": "identify"}
+
+
+@pytest.mark.parametrize(
+    ("steps", "said"),
+    [
+        ([IDENTIFY, ADAPT], "step 2 is `adapt`, and no load cell measures the torque; add a `load_cell` section"),
+        (
+            [IDENTIFY, {**ADAPT, "fingertip": "left", "reference": "wrench"}],
+            "step 2 adapts `left`, which has no",
+        ),
+        (
+            [IDENTIFY, {"do": "tare"}, {**ADAPT, "reference": "wrench"}],
+            "step 3 is `adapt`, and the tool is not",
+        ),
+        (
+            [IDENTIFY, {**ADAPT, "reference": "wrench"}, {"do": "hold_torque", "torque_nm": 0.1}],
+            "step 3 is `hold_torque`, and the tool is not identified then",
+        ),
+    ],
+)
+def test_an_adaptation_that_nothing_is_known_for_is_refused(tmp_path, steps, said):
+    sources = {**SOURCES, "right": TorqueSource(name="right", period_s=0.5, has_gain=True)}
+    with pytest.raises(UserError, match=re.escape(said)):
+        check_experiment(config(tmp_path, {"steps": steps}), sources)
+    cell = {"load_cell": {"device": {"path": "load"}}}
+    fine = {"steps": [IDENTIFY, ADAPT, IDENTIFY, {"do": "hold_torque", "torque_nm": 0.1}]}
+    assert check_experiment(config(tmp_path, fine, **cell), {**sources, **LOAD}) is not None
 
 
 def test_every_mistake_of_an_experiment_is_told_on_a_line_of_its_own(tmp_path):

@@ -3,6 +3,7 @@
 import ast
 from collections import defaultdict
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -28,18 +29,22 @@ def module_of(path: Path) -> str:
     return ".".join(("shearloop", *path.relative_to(PACKAGE).with_suffix("").parts))
 
 
-TREES = {
-    module_of(path): ast.parse(path.read_text())
-    for folder in ("bank", "drivers", "daemon")
-    for path in (PACKAGE / folder).rglob("*.py")
-    if not any(word in str(path) for word in SIMULATED)
-}
+@cache
+def trees() -> dict[str, ast.Module]:
+    """Return the syntax trees of all modules but the simulated ones."""
+    paths = [path for folder in ("bank", "drivers", "daemon") for path in (PACKAGE / folder).rglob("*.py")]
+    return {
+        module_of(path): ast.parse(path.read_text())
+        for path in paths
+        if not any(word in str(path) for word in SIMULATED)
+    }
 
 
+@cache
 def constants() -> dict[Place, ast.expr]:
     """Return the values of the modules' constants."""
     found: dict[Place, ast.expr] = {}
-    for module, line in [(module, line) for module, tree in TREES.items() for line in tree.body]:
+    for module, line in [(module, line) for module, tree in trees().items() for line in tree.body]:
         if not isinstance(line, ast.Assign | ast.AnnAssign):
             continue
         targets = line.targets if isinstance(line, ast.Assign) else [line.target]
@@ -50,14 +55,16 @@ def constants() -> dict[Place, ast.expr]:
     return found
 
 
-CONSTANTS = constants()
-IMPORTS = {
-    (module, each.asname or each.name): (line.module, each.name)
-    for module, tree in TREES.items()
-    for line in ast.walk(tree)
-    if isinstance(line, ast.ImportFrom)
-    for each in line.names
-}
+@cache
+def imports() -> dict[Place, Place]:
+    """Return where each imported name comes from."""
+    return {
+        (module, each.asname or each.name): (line.module, each.name)
+        for module, tree in trees().items()
+        for line in ast.walk(tree)
+        if isinstance(line, ast.ImportFrom)
+        for each in line.names
+    }
 
 
 def origin(module: str, default: ast.expr | None) -> tuple[Place, object] | None:
@@ -69,18 +76,18 @@ def origin(module: str, default: ast.expr | None) -> tuple[Place, object] | None
         case ast.Constant(value=value) if not isinstance(value, bool) and value not in (None, 0, 1, "", ...):
             return (module, f"line {default.lineno}"), value
         case ast.Name(id=name):
-            module, name = IMPORTS.get((module, name), (module, name))
-        case ast.Attribute(value=ast.Name(id=owner), attr=name) if (module, owner) in IMPORTS:
-            module = ".".join(IMPORTS[module, owner])
+            module, name = imports().get((module, name), (module, name))
+        case ast.Attribute(value=ast.Name(id=owner), attr=name) if (module, owner) in imports():
+            module = ".".join(imports()[module, owner])
         case _:
             return None
-    found = origin(module, CONSTANTS.get((module, name)))
+    found = origin(module, constants().get((module, name)))
     return found if found is None or found[0][0] != module else ((module, name), found[1])
 
 
 def defaults() -> Iterator[tuple[str, Place, object]]:
     """Yield the name of each default of a class or of its constructor, where it is written out, and its value."""
-    classes = [(module, node) for module, tree in TREES.items() for node in ast.walk(tree)]
+    classes = [(module, node) for module, tree in trees().items() for node in ast.walk(tree)]
     bodies = [(module, node.body) for module, node in classes if isinstance(node, ast.ClassDef)]
     for module, line in [(module, line) for module, body in bodies for line in body]:
         pairs: list[tuple[str, ast.expr | None]] = []

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.skin.characterisation import WARM_K, Characterisation, ResponseCurve
-from shearloop.bank.skin.membrane import PAPER_SECTION, THICK_SECTION, loading_response, warming_change
+from shearloop.bank.skin.characterisation import PAPER_LINEAR_N, WARM_K, Characterisation, ResponseCurve
+from shearloop.bank.skin.membrane import PAPER_SECTION, warming_change
 from shearloop.daemon.errors import UserError
 
 try:
@@ -19,14 +19,13 @@ except ImportError as error:
 
 ONE_D, TWO_D, GREY = "#c44e52", "#1f4e79", "#888888"
 MARKERS = {0.5: "^", 1.0: "s", 1.5: "o", 2.0: "D"}
-PAPER_PREDICTION_N, PAPER_SENSITIVITY_PER_N, PAPER_LINEAR_N = 0.0802, 0.078, 1.2
+PAPER_PREDICTION_N, PAPER_SENSITIVITY_PER_N = 0.0802, 0.078
 
 
 def draw(found: Characterisation, out: Path) -> list[Path]:
     """Write the figures as PNG and SVG into a folder and return their paths."""
     written = []
     try:
-        out.mkdir(parents=True, exist_ok=True)
         drawn_by_name = {
             "figure_4": _figure_4(found),
             "figure_5": _figure_5(found),
@@ -104,8 +103,8 @@ def _both_sides(curve: ResponseCurve, response: FloatArray) -> tuple[FloatArray,
 
 def _figure_6(found: Characterisation) -> Figure:
     made, axes = _new("Figure 6: response to shear, Fn = 1 N", "shear force, N", "normalised response")
-    axes.plot(*_both_sides(found.wide, found.wide.two_d), color=TWO_D, label="2-D")
-    axes.plot(*_both_sides(found.wide, found.wide.membrane), color=ONE_D, ls="--", label="1-D")
+    axes.plot(*_both_sides(found.wide, found.wide.two_d), color=TWO_D, label="2-D, 0.70 mm")
+    axes.plot(*_both_sides(found.wide, found.wide.membrane), color=ONE_D, ls="--", label="1-D, 0.88 mm")
     ends = np.array([-1.0, 1.0])
     for sign, label in ((-1, None), (1, "paper: 0.078 /N ± 95 % prediction interval")):
         edge = PAPER_SENSITIVITY_PER_N * (ends + sign * PAPER_PREDICTION_N)
@@ -128,11 +127,8 @@ def _figure_7(found: Characterisation) -> Figure:
     for normal_n, curve in found.wide_by_normal.items():
         (marks,) = axes.plot(*_both_sides(curve, curve.two_d), MARKERS[normal_n], label=f"2-D, Fn = {normal_n} N")
         marks.set(mfc="none", color=TWO_D, ms=5)
-        sheet = np.array([loading_response(THICK_SECTION, normal_n, shear_n) for shear_n in curve.shear_n.tolist()])
         last = normal_n == max(found.wide_by_normal)
-        axes.plot(*_both_sides(curve, curve.membrane), color=ONE_D, lw=0.8, label="1-D" if last else None)
-        label = "finite strain, 0.88 mm" if last else None
-        axes.plot(*_both_sides(curve, sheet), color="black", ls=":", lw=1, label=label)
+        axes.plot(*_both_sides(curve, curve.membrane), color=ONE_D, lw=0.8, label="1-D, 0.88 mm" if last else None)
     for end in (-PAPER_LINEAR_N, PAPER_LINEAR_N):
         axes.axvline(end, color=GREY, ls=":", lw=1)
     note = "beyond 1.2 N the paper's skin\nturns up more than any model"

@@ -177,7 +177,7 @@ def judge(case: SkinLoopCase, calibration: SkinCalibration) -> tuple[SkinHold, S
     """Run one case; the settled end of each hold is judged."""
     loop = SkinLoop(case, calibration)
     phase = loop.run(200.0)
-    bound_n = 2.0 * loop.skin.membrane.friction * case.normal_n
+    bound_n = 2.0 * loop.skin.membrane.belt.friction * case.normal_n
     set_points, truth_n = np.round(loop.trace.set_point_n, 6), np.array(loop.trace.truth_n)
     changes = np.flatnonzero(np.diff(np.nan_to_num(set_points, nan=-1.0))) + 1
     settled = round(SETTLED_SHARE * case.hold_s / TICK_S)

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
+from shearloop.bank.defaults import LOADED_NM
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatcher
 from shearloop.bank.eit.mesh import Mesh
@@ -65,7 +66,10 @@ class MeasuredMethod:
 
 
 def measure(methods: list[TorqueMethod], truth_nm: FloatArray, rounds: int) -> list[MeasuredMethod]:
-    """Run all methods in turn, `rounds` times, so that a busy moment of the machine affects all alike."""
+    """Run all methods in turn, `rounds` times, so that a busy moment of the machine affects all alike.
+
+    Errors, correlations and valid shares are of the frames with a known truth.
+    """
     times: dict[str, list[float]] = {method.name: [] for method in methods}
     torques: dict[str, FloatArray] = {}
     for _ in range(rounds):
@@ -74,8 +78,8 @@ def measure(methods: list[TorqueMethod], truth_nm: FloatArray, rounds: int) -> l
             times[method.name].append(float(np.median(latency_ms)))
     found = []
     for method in methods:
-        valid = np.isfinite(torques[method.name])
-        judged = valid & np.isfinite(truth_nm)
+        known = np.isfinite(truth_nm)
+        judged = known & np.isfinite(torques[method.name])
         if judged.sum() < 2:
             continue
         value, truth = torques[method.name][judged], truth_nm[judged]
@@ -85,7 +89,7 @@ def measure(methods: list[TorqueMethod], truth_nm: FloatArray, rounds: int) -> l
             MeasuredMethod(
                 method.name, method.family, float(np.median(own)), min(own), max(own),
                 float(np.sqrt(((value - truth) ** 2).mean())),
-                float(np.corrcoef(value, truth)[0, 1]) if varies else None, float(valid.mean()),
+                float(np.corrcoef(value, truth)[0, 1]) if varies else None, float(judged.sum() / known.sum()),
             )
         )  # fmt: skip
     return found
@@ -223,7 +227,13 @@ def compare_methods(split: Split, bank: Bank, mesh: Mesh, rounds: int) -> Method
     else:
         chosen = dict.fromkeys((sides[:1], sides))
         methods = [method for some in chosen for method in estimators(split, physics, some)]
-    return MethodComparison(split, measure(methods, split.future.torque_at_frames(), rounds))
+    return MethodComparison(split, measure(methods, loaded_truth(split.future), rounds))
+
+
+def loaded_truth(series: FrameSeries) -> FloatArray:
+    """Return the (n,) torque of loaded frames, NaN for the others, which flatter an average."""
+    truth_nm = series.torque_at_frames()
+    return np.where(np.abs(truth_nm) >= LOADED_NM, truth_nm, np.nan)
 
 
 def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, own_mesh: Mesh | None, out: Path, rounds: int) -> list[Path]:
@@ -301,11 +311,12 @@ def _draw_methods(axes: Axes, compared: MethodComparison) -> None:
                 markerfacecolor=shade if i in best else "white", linestyle="none", zorder=2 + (i in best),
                 label=family if i == members[0] else None,
             )  # fmt: skip
-    frames = len(compared.split.future.t_s)
+    future = compared.split.future
+    loaded = np.count_nonzero(np.isfinite(loaded_truth(future)))
     axes.set(
-        title=f"{compared.split.title}; judged on the {frames} frames that follow",
+        title=f"{compared.split.title}; judged on {loaded} loaded of {len(future.t_s)} later frames",
         xlabel="latency of one frame, ms (one thread; bars: slowest and fastest round)",
-        ylabel="torque error on later frames, RMS, N·m",
+        ylabel=f"torque error on loaded frames (≥ {LOADED_NM:g} N·m), RMS, N·m",
     )
     axes.grid(alpha=0.25, which="both")
     # Leave room for the legend below the frontier.

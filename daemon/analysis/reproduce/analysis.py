@@ -19,7 +19,7 @@ from shearloop.bank.eit.design import (
     searched_settings,
     simulated_signals,
 )
-from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.forward import BatchForwardModel
 from shearloop.bank.eit.matching import Match, ReferenceMatcher, best_match
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS
@@ -275,7 +275,7 @@ def analyse_diameter(slices: Slices, wide: Bank, progress: Progress) -> Diameter
 
 def score_models(slices: Slices, raw_difference: FloatArray | None, mesh: Mesh) -> ModelScores:
     """Score the five basis models on a mesh against the slices and, if given, a raw (896,) difference."""
-    forward = ForwardModel(mesh)
+    forward = BatchForwardModel(mesh)
     middle = float(mesh.nodes[:, 1].min() + mesh.nodes[:, 1].max()) / 2
     of_slices: dict[str, FloatArray] = {}
     envelopes: dict[str, dict[EnvelopeSettings, float]] = {}

@@ -33,11 +33,10 @@ Commands, one a line on standard input:
   slip [NM]                   let the tool slip in the grip until NM (0) remain
   joint KIND                  put the tool on another joint: lever, tightening, seized, stripping
   object MM | object none     put something of that width between the fingers, or take it away
-  silence DEVICE [SECONDS]    silence a device: right, left, load, gripper, robot, skin
+  silence DEVICE [SECONDS]    silence a device: right, left, load, gripper, robot
   unplug DEVICE [SECONDS]     disconnect a device, without a number until `replug DEVICE`
   right|left FAULT            any fault of `emulate eit-kit`, for instance right cut-line
   load FAULT                  any fault of `emulate hx711`, for instance load spike
-  skin FAULT                  any fault of `emulate skin`, for instance skin open 1 or skin source silence
   gripper drop|fault CODE|…   the tool falls; or any command of `emulate gripper-socket`
   protective-stop, …          any fault of `emulate ur`
   normal                      end all faults, the robot's included
@@ -58,12 +57,10 @@ Commands, one a line on standard input:
 
 
 class PushedSkin:
-    """A synthetic skin that drifts with the clock, pushed by commands, by a robot's tool, or by a gripped tool."""
+    """A synthetic skin that drifts with the clock, pushed by commands or by a robot's tool."""
 
-    def __init__(self, skin: "SyntheticSkin", lever_m: float = 0.015) -> None:
+    def __init__(self, skin: "SyntheticSkin") -> None:
         self.skin = skin
-        self._normal_n = skin.normal_n
-        self._lever_m = lever_m
         self._rested_s = time.monotonic()
         self._first_rad: float | None = None
 
@@ -82,11 +79,6 @@ class PushedSkin:
         self.skin.turn(wrist_rad - self._first_rad)
         return -self.skin.torque_nm
 
-    def follow_grip(self, torque_nm: float, *, gripped: bool) -> None:
-        """Shear the skin by a gripped tool's torque at the lever; an open grip does not touch it."""
-        self.skin.press(self._normal_n if gripped else 0.0)
-        self.skin.push(torque_nm / self._lever_m if gripped else 0.0)
-
 
 def _configure_rig(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
@@ -94,8 +86,6 @@ def _configure_rig(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--bank", Path, "FILE", "synthesise frames from its signals", required=True)
     text = "folder for the ports eit-right, eit-left and load-cell"
     add_option(parser, "--run-dir", Path, "DIR", text, required=True)
-    text = "a shear skin on one finger too: skin-source and skin-daq in --run-dir"
-    parser.add_argument("--skin", action="store_true", help=text)
     parser.add_argument("--host", default="127.0.0.1", help="address of robot and gripper (default: %(default)s)")
     text = "its interface (default: %(default)s)"
     parser.add_argument("--gripper", choices=("socket", "modbus"), default="socket", help=text)
@@ -112,14 +102,11 @@ def _configure_rig(parser: argparse.ArgumentParser) -> None:
 
 def _run_rig(args: argparse.Namespace) -> int:
     from shearloop.daemon.synthetic_frames import RigFrames
-    from shearloop.daemon.synthetic_skin import SyntheticSkin
     from shearloop.drivers.emulators.rig import EmulatedRig
 
     settings = _rig_settings(args)
     frames = RigFrames(args.bank, args.seed, args.sigma)
-    # The skin bears half of the tool's torque; the other finger bears the other half.
-    skin = PushedSkin(SyntheticSkin(seed=args.seed), args.diameter_mm * 1e-3) if args.skin else None
-    rig = EmulatedRig(settings, frames, skin)
+    rig = EmulatedRig(settings, frames)
     with (
         nullcontext() if args.truth is None else _open_truth(args.truth) as file,
         console.report_busy_address(

@@ -103,7 +103,7 @@ function linkLine() {
   show(byId("summary"), state === "ended" && Boolean(end?.summary));
   put(byId("summary-text"), end?.summary ?? "");
   const [name, reason] = {
-    ended: [end?.finished ? "✓ DONE" : "ended", "the daemon has ended; the last values are shown"],
+    ended: [end?.finished ? "✓ DONE" : "ended", `the daemon ${link.viewerLost() ? "and the viewer have" : "has"} ended; the last values are shown`],
     live: ["● live", ""],
     connecting: ["connecting", "to the viewer on the rig's computer"],
     lost: ["✗ VIEWER LOST", `no word from the viewer for ${age(link.sinceBatch())}; what is shown is old, and it is tried again`],

@@ -65,14 +65,18 @@ export class Link {
 
   sinceBatch() { return this.batchAt === null ? Infinity : seconds() - this.batchAt; }
 
+  viewerLost() { return this.sinceBatch() > LOST_AFTER_S; }
+
   sinceDaemon() { return this.daemonAt === null ? Infinity : seconds() - this.daemonAt; }
 
   // live; ended: the daemon said that it ends; dead: no message from the daemon; lost: no message from the viewer.
   state() {
-    if (this.sinceBatch() > LOST_AFTER_S) {
+    if (this.viewerLost()) {
       // Close a socket that is open but silent, as after the computer slept.
       if (this.batchAt !== null && this.sinceBatch() > 3 && this.socket.readyState === WebSocket.OPEN) this.socket.close();
-      return this.batchAt === null ? "connecting" : "lost";
+      if (this.batchAt === null) return "connecting";
+      // A viewer that ends with its daemon loses nothing.
+      return this.end() ? "ended" : "lost";
     }
     if (this.end()) return "ended";
     return this.sinceDaemon() > this.settings.dead_after_s ? "dead" : "live";

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.bank_file import Bank, BankDefinition, write_bank
@@ -49,9 +50,8 @@ def series(
 
     cycle = np.clip((fine - IDLE_S) // CYCLE_S, 0, cycles - 1)
     torque = np.maximum(angle(fine) - 0.9, 0.0) / 0.1 * peak_nm * (1 + 0.03 * cycle)
-    crept = np.zeros_like(fine)
-    for i in range(1, len(fine)):
-        crept[i] = crept[i - 1] + (angle(fine[i : i + 1])[0] - crept[i - 1]) * 0.09 / CREEP_S
+    follows = 0.09 / CREEP_S
+    crept = lfilter([follows], [1.0, follows - 1.0], angle(fine))
     grip = ((t > IDLE_S) & (t < IDLE_S + gripped_s)).astype(float)
     at = {name: np.interp(t, fine, values) for name, values in (("torque", torque), ("crept", crept))}
     slow = np.cumsum(rng.normal(0, 0.02, len(t)))

@@ -68,8 +68,8 @@ def test_foreign_and_stale_files_are_refused(tmp_path, motion_calibration):
     _with_header(motion_calibration, stale, channel_table="0" * 64)
     with pytest.raises(CalibrationError, match="channel table 000000000000…, expected"):
         Calibration.load(stale)
-    _with_header(motion_calibration, stale, format_version=4)
-    with pytest.raises(CalibrationError, match="format version 4, expected 5; calibrate again"):
+    _with_header(motion_calibration, stale, format_version=5)
+    with pytest.raises(CalibrationError, match="format version 5, expected 6; calibrate again"):
         Calibration.load(stale)
 
 

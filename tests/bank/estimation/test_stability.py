@@ -8,7 +8,6 @@ import pytest
 from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import FrameSeries, fit
 from shearloop.bank.estimation.fingertip_validator import mask_saturated
-from shearloop.bank.estimation.novelty import NoveltyDetector
 from tests.bank.estimation.conftest import follow, judged
 
 STEP_V = 0.00215
@@ -76,14 +75,3 @@ def test_a_drift_does_not_lead_a_regression_astray(twisting):
         calibration, replace(later, channels=later.channels + np.linspace(0, 1, len(later.t_s))[:, None, None] * moved)
     )
     assert not any(one.valid for one in found[-60:-40])
-
-
-def test_the_less_a_difference_is_explained_the_wider_the_interval(sliced):
-    series = sliced()
-    guard = NoveltyDetector.fit(series.channels[:, 0], PAPER_TABLE)
-    usable = np.ones(896, dtype=np.bool_)
-    noise = np.random.default_rng(1).normal(0.0, 1.0, 896)
-    frame = series.channels[10, 0]
-    widths = [guard.widening(np.abs(frame + scale * guard.spread * noise), usable) for scale in (0.0, 0.8, 1.6)]
-    assert 1.0 <= widths[0] < 1.2
-    assert widths[0] < widths[1] < widths[2]

@@ -16,6 +16,8 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile, HoldTorqu
 from shearloop.daemon.executors import SerialExecutor
 
 CONFIG = Path(__file__).parents[3] / "config"
+# The section's 0.04, at the outer radius.
+FRICTION = 0.04 * 5.47 / 6.35
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +35,7 @@ def calibration() -> SkinCalibration:
 def test_a_force_is_held_without_a_limit_cycle_wider_than_friction_s_band(case, calibration):
     held, _ = judge(case, calibration)
     assert held.phase == "done"
-    assert held.bound_n == pytest.approx(2 * 0.04 * case.normal_n)
+    assert held.bound_n == pytest.approx(2 * FRICTION * case.normal_n)
     assert held.width_n <= held.bound_n / 4
     assert held.offset_n <= 0.02
 
@@ -71,7 +73,7 @@ def test_the_stability_chart_shows_the_limit_cycle(tmp_path, monkeypatch):
     paths = skin_loop.chart(tmp_path, SerialExecutor())
     assert [path.name for path in paths] == ["stability-skin.json", "stability-skin.svg", "stability-skin.png"]
     with_band, without_band = json.loads(paths[0].read_text())["held"]
-    assert with_band["width_n"] <= with_band["bound_n"] == pytest.approx(0.08)
+    assert with_band["width_n"] <= with_band["bound_n"] == pytest.approx(2 * FRICTION)
     assert without_band["case"]["band"] is False
     assert paths[2].stat().st_size > 20_000
 

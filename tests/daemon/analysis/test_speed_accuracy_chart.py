@@ -26,10 +26,13 @@ from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingert
 from shearloop.daemon.analysis.charts.speed_accuracy import (
     MeasuredMethod,
     MethodComparison,
+    TorqueMethod,
     _draw_loop,
     _draw_methods,
     _short,
     compare_methods,
+    loaded_truth,
+    measure,
     often_valid,
     write,
 )
@@ -68,6 +71,14 @@ def test_a_method_with_few_valid_frames_is_not_on_the_frontier(scratch):
         "often",
         "most",
     ]
+
+
+def test_frames_without_load_do_not_flatter_a_method_that_says_0():
+    t, torque_nm = np.arange(100.0), np.where(np.arange(100) < 4, 0.1, 0.001)
+    series = FrameSeries("raw", ("right",), t, np.zeros((100, 1, 896)), t, torque_nm, np.full(100, np.nan))
+    estimated = np.where(np.arange(100) == 0, np.nan, 0.0)
+    (found,) = measure([TorqueMethod("zero", "any", lambda: (estimated, np.ones(100)))], loaded_truth(series), 1)
+    assert (found.rmse_nm, found.valid_fraction) == (pytest.approx(0.1), 0.75)
 
 
 def test_marks_distinguish_the_noises_of_loops_at_one_window():

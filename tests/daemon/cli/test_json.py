@@ -17,7 +17,6 @@ WITHOUT = {
     "init": "it prints the next steps",
     "schema": "it prints JSON as it is",
     "bank design": "it prints the YAML that `bank build` takes",
-    "bank plot": "it prints the files drawn, one a line",
     "chart": "it prints the files drawn, one a line; its numbers are a JSON file among them",
 }
 

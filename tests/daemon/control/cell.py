@@ -83,7 +83,7 @@ class Robot(UrRobot):
             return
         # A real arm's move is under way until its end is told, though its joints rest.
         arm.stops_moves = not self.brakes_for
-        if self.flight.state.motion == "stopping" and self.brakes_for:
+        if self.brakes_for and self.flight.state.motion == "stopping":
             self.brakes_for -= 1
             arm.be(moving_linearly=bool(self.brakes_for))
         elif arm.reading.moving_linearly and self._goal is not None:
@@ -182,7 +182,7 @@ class Cell:
             self.control_loop,
             self.robot,
             self.gripper,
-            (),
+            {},
             self.published,
             StepClock(self.robot.flight),
             self.died,
@@ -201,8 +201,9 @@ class Cell:
         for _ in range(count):
             self.control_loop.on_gripper(GripperStatus(self.robot.flight.now_ns, 30.0, holding=True, moving=False))
             self.robot.cycle()
-            # A state is sensed, decided upon and answered within a few turns of the event loop.
-            for _ in range(8):
+            # A state is read, decided on and answered in a few turns of the event loop: until nothing else is ready.
+            await asyncio.sleep(0)
+            while asyncio.get_running_loop()._ready:  # noqa: ASYNC110 - it waits for nothing but the loop itself
                 await asyncio.sleep(0)
 
     def exceed_torque(self) -> None:

@@ -2,22 +2,15 @@ import asyncio
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from shearloop.bank.eit.bank_file import BankDefinition, write_bank
-from tests.daemon.emulate_rig.rig import HOMOGENEOUS, PACE, PATTERN, RigProcess
+from tests.daemon.emulate_rig.rig import PACE, RigProcess, write_rig_bank
 
 
 @pytest.fixture(scope="session")
 def bank(tmp_path_factory) -> Path:
     """A bank whose signals grow with σ along a known pattern."""
-    path = tmp_path_factory.mktemp("bank") / "rig.bank"
-    sigma = np.array([0.9, 2.3])
-    definition = BankDefinition("0" * 64, "gaussian_derivative", np.array([3.0, 4.0]), sigma)
-    signals = np.broadcast_to(sigma[None, :, None] * PATTERN, (2, 2, 896)).astype(np.float32)
-    write_bank(path, definition, HOMOGENEOUS, np.full((2, 2), 0.5), np.ones((2, 2), bool), signals)
-    return path
+    return write_rig_bank(tmp_path_factory.mktemp("bank") / "rig.bank")
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from shearloop.bank.eit.bank_file import BankDefinition, write_bank
 from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.drivers.connection import LinkMonitor, LinkObserver
 from shearloop.drivers.eit_kit import EitKit, Frame
@@ -54,6 +55,15 @@ class RigProcess(EmulatorProcess):
             while not condition(truth := await self.ask("truth", "truth")):
                 continue
             return truth
+
+
+def write_rig_bank(path: Path, strength: float = 1.0) -> Path:
+    """Write a bank whose signals grow with σ along the pattern."""
+    sigma = np.array([0.9, 2.3])
+    definition = BankDefinition("0" * 64, "gaussian_derivative", np.array([3.0, 4.0]), sigma)
+    signals = np.broadcast_to(strength * sigma[None, :, None] * PATTERN, (2, 2, 896)).astype(np.float32)
+    write_bank(path, definition, HOMOGENEOUS, np.full((2, 2), 0.5), np.ones((2, 2), bool), signals)
+    return path
 
 
 @asynccontextmanager

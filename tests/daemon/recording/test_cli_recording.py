@@ -102,7 +102,7 @@ def test_a_recording_is_read_into_arrays_and_frames(recording, monkeypatch):
     np.testing.assert_array_equal(read["eit.frame.right"]["line"], LINES)
     np.testing.assert_array_equal(read["load.torque"]["log_time_ns"], 10**18 + np.arange(4))
     with pytest.raises(KeyError, match=r"has no topic 'health'; it has eit.frame.right, load.torque"):
-        read.frame("health")
+        read["health"]
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "pandas", None)
         with pytest.raises(UserError, match=r"needs pandas: `pip install 'shearloop\[notebook\]'`"):
@@ -122,7 +122,7 @@ def test_a_recording_is_read_into_arrays_and_frames(recording, monkeypatch):
         ([1, None], np.float64, [1, np.nan]),
         ([True, False], np.bool_, [True, False]),
         (["a", None], np.object_, ["a", ""]),
-        ([[1.0, None], [2.0]], np.float64, [[1, np.nan], [2, np.nan]]),
+        ([np.array([1.0, np.nan]), np.array([2.0])], np.float64, [[1, np.nan], [2, np.nan]]),
         ([None], np.float64, [np.nan]),
     ],
 )

@@ -343,4 +343,7 @@ def test_the_picture_of_a_stream_shows_torque_also_with_a_named_tool(kind, drawn
         for _ in t
     )
     draw_tracks([EstimateTrack(series, estimates, np.ones(4))], ["one"], "title", tmp_path / "a.svg")
-    assert f"<!-- {drawn} -->" in (tmp_path / "a.svg").read_text()
+    picture = (tmp_path / "a.svg").read_text()
+    assert f"<!-- {drawn} -->" in picture
+    judged = "one; 4 loaded frames: RMSE 0 N·m (always saying 0: 0.1)"
+    assert (f"<!-- {judged} -->" in picture) == (kind == "raw")

@@ -33,8 +33,11 @@ from shearloop.daemon.recording.reader import read_recording
 
 # Five of the ten twists come before this share of the recording.
 HALF = 0.457
-# With three and with four of five repeats to fit: least r, largest RMSE in N·m and least coverage on the later ones.
-LATER_SLICES = {29: (0.97, 0.0150, 0.9), 39: (0.975, 0.0135, 0.9)}
+# By the slices fitted to: largest RMSE and interval score on the later ones, N·m.
+LATER_SLICES = {
+    19: (0.0125, 0.105), 24: (0.0095, 0.165), 29: (0.0095, 0.068), 34: (0.0095, 0.066), 39: (0.011, 0.064),
+    44: (0.004, 0.077),
+}  # fmt: skip
 
 
 def imported(out: Path, *sources: Path) -> FrameSeries:
@@ -159,33 +162,24 @@ def test_another_day_with_a_looser_grip_and_the_fingertips_exchanged_is_refused(
 
 def test_later_torque_slices(slices, earlier):
     """Fitted to the first 19 to 44 of 49 slices, judged on all that follow."""
-    errors, covered, widths_nm = [], [], []
-    for n in (19, 24, 29, 34, 39, 44):
-        followed = estimate_series(earlier("motion_regression", n), slices.between(n, 49))
-        figures = figures_of([followed])
-        r, rmse_nm, coverage = LATER_SLICES.get(n, (0.96, 0.018, 0.0))
-        assert figures["r"] >= r
+    for n, (rmse_nm, winkler_nm) in LATER_SLICES.items():
+        figures = figures_of([estimate_series(earlier("motion_regression", n), slices.between(n, 49))])
+        assert figures["r"] >= 0.96
         assert figures["rmse_nm"] <= rmse_nm
-        assert figures["coverage_95"] >= coverage
+        assert figures["winkler_nm"] <= winkler_nm
+        # Of good slices more lie inside than was promised: what cannot be seen in them has to lie inside too.
+        assert figures["coverage_95"] >= 0.95
         assert figures["valid_fraction"] == 1
-        errors.append(figures["rmse_nm"])
-        covered += [figures["coverage_95"]] * figures["frames"]
-        widths_nm += [one.torque_high_nm - one.torque_low_nm for one in followed.estimates]
-    assert np.mean(errors) <= 0.012
-    # Of good slices more lie inside than was promised: what cannot be seen in them has to lie inside too.
-    assert np.mean(covered) >= 0.95
-    # Which they would in any that are wide enough: the slices span 0.131 N·m.
-    assert np.median(widths_nm) <= 0.12
-    # Intervals of torques near the ends reach beyond them, unless somebody vouches for the range: 0.091 N·m after 29.
+    # A line reads torques beyond the range as such, so that a guarantee narrows only few intervals.
     vouched = fit("motion_regression", [slices.between(0, 29)], "earlier", full_range=True)
     found = estimate_series(vouched, slices.between(29, 49)).estimates
-    assert np.median([one.torque_high_nm - one.torque_low_nm for one in found]) <= 0.085
+    assert np.median([one.torque_high_nm - one.torque_low_nm for one in found]) <= 0.066
     without_ends = _without_ends(earlier("motion_regression", 29).torque.regressor)
     assert pickle.dumps(vouched.torque.regressor) == pickle.dumps(without_ends), "nothing else is another"
 
 
 def _without_ends(regressor):
-    return replace(regressor, range=replace(regressor.range, low_end=-np.inf, high_end=np.inf))
+    return replace(regressor, range=replace(regressor.range, low_end=-np.inf, high_end=np.inf), line=None)
 
 
 @pytest.mark.parametrize(
@@ -218,8 +212,8 @@ def _some(series: FrameSeries, chosen) -> FrameSeries:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["motion_regression", "regression"])
-def test_a_tenth_of_a_foreign_frame_in_later_slices_lies_within_the_intervals(name, slices, earlier):
+@pytest.mark.parametrize(("name", "widest_nm"), [("motion_regression", 0.066), ("regression", 0.095)])
+def test_a_tenth_of_a_foreign_frame_in_later_slices_lies_within_the_intervals(name, widest_nm, slices, earlier):
     """No check detects it. A quarter of the slices, a fifth with `regression`, would be false-valid."""
     calibration, later = earlier(name, 29), slices.between(29, 49)
     foreign = later.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(896)]
@@ -227,12 +221,8 @@ def test_a_tenth_of_a_foreign_frame_in_later_slices_lies_within_the_intervals(na
     figures = figures_of([estimate_series(calibration, spoilt)])
     assert figures["valid_fraction"] == 1
     assert figures["coverage_95"] >= 0.95
-    # It costs half as much again at most.
-    width_nm, was_nm = (
-        np.median([one.torque_high_nm - one.torque_low_nm for one in estimate_series(each, later).estimates])
-        for each in (calibration, _believing(calibration))
-    )
-    assert width_nm <= 1.5 * was_nm
+    good = estimate_series(calibration, later).estimates
+    assert np.median([one.torque_high_nm - one.torque_low_nm for one in good]) <= widest_nm
 
 
 def test_where_slices_tell_little_intervals_reach_to_what_may_be_hidden_in_them(slices, earlier):
@@ -387,11 +377,11 @@ def _streams_of(path: Path) -> tuple[str, ...]:
     return find_streams(path) if path.suffix == ".mat" else ()
 
 
-def test_evaluate_warns_of_times_that_nothing_shows(shared, twists_file, tmp_path, capsys):
-    glitch, calibration = tmp_path / "glitch.mcap", str(tmp_path / "a.cal")
+def test_evaluate_warns_of_times_that_nothing_shows(shared, twists_file, of_all_twists, tmp_path, capsys):
+    glitch, calibration = tmp_path / "glitch.mcap", tmp_path / "a.cal"
     import_mat([shared / "recordings/streams/glitch_20241202_173837"], glitch)
-    assert main(["calibrate", str(twists_file), "--estimator", "regression", "--out", calibration]) == 0
-    assert main(["evaluate", calibration, str(glitch), str(twists_file)]) == 0
+    of_all_twists.save(calibration)
+    assert main(["evaluate", str(calibration), str(glitch), str(twists_file)]) == 0
     assert re.findall(r"Warning: (\S+): the load's values waited", capsys.readouterr().err) == ["glitch.mcap"]
 
 

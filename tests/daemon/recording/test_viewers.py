@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import csv
 import dataclasses
 import io
 import json
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.daemon.cli import main
@@ -24,6 +26,7 @@ from tests.daemon.sample_messages import sample
 CONFIG = Path(__file__).parents[3] / "config"
 START_NS = 10**18
 FRAMES = np.round(np.random.default_rng(0).uniform(0.01, 0.5, (4, 1024)), 4)
+SCORES = np.array([[0.0, 0.25, 1e-5], [-0.5, np.nan, 1.0]])
 SENSORS = ("eit.frame", "eit.heatmap", "eit.estimate")
 RIG = (*SENSORS, "load.torque", "robot.state", "gripper.state", "loop.state", "health", "skin.shear")
 
@@ -40,7 +43,7 @@ def write(path: Path, topics: tuple[str, ...]) -> Path:
         for topic in topics:
             source = "right" if topic in SENSORS else "one"
             changes: dict[str, Any] = {"channels": FRAMES[i], "line": FRAMES[i]} if topic == "eit.frame" else {}
-            changes |= {"model": "linear"} if topic == "eit.heatmap" else {}
+            changes |= {"model": "linear", "scores": SCORES} if topic == "eit.heatmap" else {}
             changes |= {"torque_nm": None, "valid": False} if topic == "eit.estimate" and i == 3 else {}
             t_ns = i * 500_000_000
             wire = wire_map(sample(TOPICS[topic], source=source, t_mono_ns=t_ns, **changes), t_ns / 1e9, i)
@@ -78,13 +81,42 @@ def test_rerun_reads_scalars_images_and_the_pose(topics, tmp_path):
     reader = chunk.RrdReader(tmp_path / "a.rrd")
     assert len(reader.recordings()) == len(reader.blueprints()) == 1
     rows: dict[str, int] = {}
-    for one in reader.stream().to_chunks():
+    chunks = reader.stream().to_chunks()
+    for one in chunks:
         rows[one.entity_path] = rows.get(one.entity_path, 0) + one.num_rows * (not one.is_static)
     assert (rows["/eit/estimate/right/torque_nm"], rows["/eit/estimate/right/torque_low_nm"]) == (3, 4)
     assert rows.get("/robot/state/tool_centre") == (4 if topics == RIG else None)
     drawn = {"/eit/heatmap/right/scores", "/eit/estimate/right/conductivity"}
     assert drawn & rows.keys() == (drawn if topics == RIG else set())
     assert not any("channels" in entity or "line" in entity for entity in rows)
+    if topics == RIG:
+        image = columns(chunks, "/eit/heatmap/right/scores")
+        assert image["Image:buffer"] == [[[0, 64, 0, 0, 0, 255]]] * 4
+        assert {(one["width"], one["height"]) for (one,) in image["Image:format"]} == {(3, 2)}
+        pose = columns(chunks, "/robot/state/tool_centre")
+        np.testing.assert_allclose(pose["Transform3D:translation"], [[[0, 1, 2]]] * 4)
+        turn = Rotation.from_rotvec([3, 4, 5]).as_quat()
+        np.testing.assert_allclose(pose["Transform3D:quaternion"], [[turn]] * 4, rtol=1e-6)
+
+
+def columns(chunks: list[Any], entity: str) -> dict[str, list[Any]]:
+    """Return the values of an entity that change with time, by component."""
+    (one,) = (one for one in chunks if one.entity_path == entity and not one.is_static)
+    return one.to_record_batch().to_pydict()
+
+
+def test_tables_hold_every_score_of_a_heatmap(tmp_path, monkeypatch):
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    monkeypatch.setattr("shearloop.daemon.recording.export._BATCH", 30)
+    recording = write(tmp_path / "a.mcap", RIG)
+    assert [main(["recording", "export", str(recording), "--format", form]) for form in ("csv", "parquet")] == [0, 0]
+    with (tmp_path / "a_csv/eit.heatmap.right.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    found = [[float(row[f"scores_{i}"] or "nan") for i in range(6)] for row in rows]
+    np.testing.assert_array_equal(found, [SCORES.ravel()] * 4)
+    assert [row["model"] for row in rows] == ["linear"] * 4
+    table = parquet.read_table(tmp_path / "a_parquet/eit.heatmap.right.parquet").to_pydict()
+    np.testing.assert_array_equal(np.array(table["scores"], dtype=float), found)
 
 
 def test_a_dataset_holds_what_was_known_and_names_its_origin(tmp_path):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Estimate
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import FingertipConfig
@@ -161,6 +162,22 @@ async def test_a_tare_begins_with_the_first_frame_acquired_after_it(since_ms):
     began_ns = asked_ns + since_ms * MS + first * PERIOD_NS - PERIOD_NS - 80 * MS
     assert asked_ns <= began_ns < asked_ns + PERIOD_NS, "no later frame is skipped"
     assert [(one.kind, one.data) for one in raw] == [(InputKind.TARE, str(first).encode())], "as a replay finds it"
+
+
+async def test_a_gain_that_no_twist_shows_is_left_with_the_reason():
+    class Untwisted(FakeEstimator):
+        grip_t_s = np.zeros(0)
+
+        def adapt(self, torque_nm: np.ndarray) -> None:
+            raise CalibrationError(f"no twist in {len(torque_nm)} frames")
+
+    publisher = RecordingPublisher()
+    task = estimates("right", publisher, Untwisted())
+    adapting = asyncio.create_task(task.adapt("load_cell"))
+    await asyncio.sleep(0)
+    await task.process(frame(1))
+    assert await adapting == "right against load_cell: no twist in 0 frames"
+    assert publisher.messages == [("eit.estimate", "right", 1)]
 
 
 async def test_a_pair_with_one_earlier_frame_is_not_part_of_the_tare():

@@ -282,15 +282,17 @@ def test_a_force_beyond_the_curve_is_not_a_force(bench):
 
 def test_turning_the_tool_stretches_contact_and_skin_in_series():
     skin = SyntheticSkin(normal_n=1.0)
-    hold_n = skin.membrane.friction
-    contact = CONTACT_N_PER_MM * skin.radius_mm
-    series = 1 / (1 / CONTACT_N_PER_MM + 1 / skin.stiffness_n_per_mm) * skin.radius_mm
-    sticking_rad = hold_n / contact
+    hold_n = skin.membrane.belt.friction
+    sticking_rad = hold_n / (CONTACT_N_PER_MM * skin.radius_mm)
     assert skin.turn(0.5 * sticking_rad) == pytest.approx(0.5 * hold_n)
     loaded_n = skin.turn(0.05)
-    assert loaded_n == pytest.approx(hold_n + series * (0.05 - sticking_rad))
-    back_rad = hold_n / contact
-    assert skin.turn(0.05 - back_rad) == pytest.approx(loaded_n - hold_n), "stuck: only the contact gives way"
+    pushed = SyntheticSkin(normal_n=1.0)
+    pushed.push(loaded_n)
+    slipped = pushed.membrane.turned_rad(pushed._state)
+    outer_mm = skin.membrane.section.outer_radius_mm
+    assert loaded_n / CONTACT_N_PER_MM + outer_mm * slipped == pytest.approx(0.05 * skin.radius_mm)
+    assert slipped > 0.02
+    assert skin.turn(0.05 - sticking_rad) == pytest.approx(loaded_n - hold_n), "stuck: only the contact gives way"
     assert skin.turn(0.05) == pytest.approx(loaded_n)
     assert skin.turn(-0.05) == pytest.approx(-loaded_n)
     assert skin.torque_nm == pytest.approx(-loaded_n * 0.015)

@@ -118,7 +118,7 @@ async def test_a_shear_force_is_streamed_from_either_daq(tmp_path, socket):
         for number in range(80):
             bench.skin.push(0.8 * number / 79)
             content = await bench.shear.get()
-        content = await bench.until(lambda content: content["response"] > 0.0645)
+        content = await bench.until(lambda content: content["response"] > 0.0603)
         assert content["shear_low_n"] - 0.02 <= 0.8 <= content["shear_high_n"] + 0.02
         assert content["torque_nm"] == pytest.approx(content["shear_n"] * 0.015)
         assert content["response"] == pytest.approx(content["response_1"] - content["response_2"])
@@ -227,15 +227,15 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
         ),
         (
             {"skin": section(ADC, source={**SOURCE, "compliance_v": 0.2})},
-            "5 mA need 0.30 V at the end of the calibration, and `skin.source.compliance_v` is 0.2",
+            "5 mA need 0.31 V at the end of the calibration, and `skin.source.compliance_v` is 0.2",
         ),
         (
             {"skin": section({"adc": {**ADC["adc"], "full_scale_v": 0.15}})},
-            "5 mA make 0.18 V of a gauge at the end of the calibration, and `skin.daq.adc.full_scale_v` is 0.15",
+            "5 mA make 0.19 V of a gauge at the end of the calibration, and `skin.daq.adc.full_scale_v` is 0.15",
         ),
         (
             {"skin": section({"scanner": {**SCANNER["scanner"], "range_v": 0.1}})},
-            "5 mA make 0.18 V of a gauge at the end of the calibration, and `skin.daq.scanner.range_v` is 0.1",
+            "5 mA make 0.19 V of a gauge at the end of the calibration, and `skin.daq.scanner.range_v` is 0.1",
         ),
         (
             {"skin": section({"scanner": {**SCANNER["scanner"], "channels": [101, 101]}})},

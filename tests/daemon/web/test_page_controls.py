@@ -228,9 +228,13 @@ def test_a_daemon_that_ends_well_is_shown_as_done_with_its_summary(browsed):
     browsed.daemon.kill()
     page.wait_for_timeout(2500)  # longer than a silent daemon stays unnoticed
     assert browsed.text("#link-state") == "✓ DONE"
+    browsed.viewer.kill()
+    browsed.until("#link-reason", "the daemon and the viewer have ended; the last values are shown")
+    assert browsed.text("#link-state") == "✓ DONE"
     browsed.until_old(0)
     browsed.daemon.say()
     browsed.daemon.start()
+    browsed.viewer.start()
     browsed.until("#link-state", "● live")
     assert not page.is_visible("#summary")
 

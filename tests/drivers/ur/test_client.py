@@ -22,7 +22,7 @@ pytestmark = pytest.mark.real_time
 
 pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
 
-# What the issue asks of a twist whose client dies: the robot has stopped.
+# The promise for a twist whose client dies: the robot has stopped.
 STOPPED_WITHIN_S = 0.2
 
 

@@ -1,5 +1,6 @@
 """Mistakes that end a command with one sentence and exit status 2."""
 
+import sys
 from importlib.util import find_spec
 
 
@@ -10,4 +11,9 @@ class UserError(Exception):
 def require(module: str, extra: str, what: str) -> None:
     """Raise UserError if a module is not installed that `what` needs, and that `extra` of shearloop brings."""
     if find_spec(module) is None:
-        raise UserError(f"{what} needs {module}: `pip install 'shearloop[{extra}]'`")
+        raise missing(module, extra, what)
+
+
+def missing(module: str | None, extra: str, what: str) -> UserError:
+    """Return the error of a module that is not installed, with the command that installs it for this Python."""
+    return UserError(f"{what} needs {module}: `{sys.executable} -m pip install 'shearloop[{extra}]'`")

@@ -17,7 +17,7 @@ from multiprocessing import active_children, get_context
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
-from shearloop.daemon.errors import UserError
+from shearloop.daemon.errors import UserError, missing
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -147,7 +147,7 @@ def open_executor(cluster: str | None, jobs: int | None = None) -> "Iterator[Exe
     try:
         from distributed import Client
     except ImportError as error:
-        raise UserError(f"--cluster needs {error.name}: `pip install 'shearloop[cluster]'`") from error
+        raise missing(error.name, "cluster", "--cluster") from error
     # It logs a traceback for each lost connection; DaskExecutor reports them in one sentence.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     _check_scheduler(cluster)

@@ -1,6 +1,6 @@
 """The rig: builds gripper, robot and control loop from the configuration, and checks its experiment."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -30,6 +30,7 @@ from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
+from shearloop.yaml_files import located, read_yaml
 
 
 def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
@@ -177,8 +178,8 @@ class Rig:
 def read_experiment(path: Path) -> experiment_schema.ExperimentFile:
     """Return the experiment of a file; raises UserError for an invalid one, or one that exceeds its own limits."""
     file = load_yaml_model(path, experiment_schema.ExperimentFile)
-    if errors := experiment_schema.check_limits(file):
-        raise UserError("\n".join(f"{path}: {error}" for error in errors))
+    if mistakes := experiment_schema.check_steps(file):
+        raise UserError("\n".join(located(path, mistakes, UserError)))
     return file
 
 
@@ -192,35 +193,43 @@ def check_experiment(
     path = config.experiment
     if path is None:
         return None
-    file = read_experiment(path)
     driving = [*(name for name, source in sources.items() if source.measures_torque), WRENCH]
-    errors = []
-    if file.torque_source not in driving:
-        near = "".join(f"; did you mean {name}?" for name in get_close_matches(file.torque_source, driving, 1))
-        reason = _why_not_driving(file.torque_source, config)
-        errors.append(f"`torque_source: {file.torque_source}` {reason}; there are {', '.join(driving)}{near}")
+    try:
+        file = load_yaml_model(path, experiment_schema.ExperimentFile)
+    except UserError as error:
+        content = read_yaml(path, UserError, experiment_schema.ExperimentFile.what)
+        source = content.get("torque_source") if isinstance(content, dict) else None
+        mistakes = _undriven(source, driving, config) if isinstance(source, str) else []
+        raise UserError("\n".join([*located(path, mistakes, UserError), str(error)])) from error
+    mistakes = _undriven(file.torque_source, driving, config) + experiment_schema.check_steps(file)
     if config.gripper is None:
-        errors += [
-            f"step {number} is `{step.do}`, and no gripper is configured; "
-            "add a `gripper` section to the configuration, or take the step out"
-            for number, step in enumerate(file.steps, 1)
+        cure = "add a `gripper` section to the configuration, or take the step out"
+        mistakes += [
+            (("steps", number), f"{step.do} needs a gripper, and none is configured; {cure}")
+            for number, step in enumerate(file.steps)
             if isinstance(step, experiment_schema.GripStep | experiment_schema.ReleaseStep)
         ]
-    errors += _unadaptable(file, sources)
-    if (unidentified := _holds_unidentified(file)) is not None:
-        errors.append(
-            f"step {unidentified} is `hold_torque`, and the tool is not identified then; put an `identify` "
-            "step before it, after the last `tare`, `grip`, `release` or `adapt`"
-        )
-    if errors:
-        raise UserError("\n".join(f"{path}: {error}" for error in errors))
+    mistakes += _unadaptable(file, sources)
+    if mistakes:
+        raise UserError("\n".join(located(path, mistakes, UserError)))
     return file
 
 
-def _unadaptable(file: experiment_schema.ExperimentFile, sources: Mapping[str, TorqueSource]) -> list[str]:
-    """Return a sentence on each `adapt` step without a known torque, a gain to correct, or a twist before it."""
-    found, twisted = [], False
-    for number, step in enumerate(file.steps, 1):
+def _undriven(drive: str, driving: Sequence[str], config: DaemonConfig) -> list[experiment_schema.Mistake]:
+    """Return the mistake of a `torque_source` that measures no torque, if it is one."""
+    if drive in driving:
+        return []
+    near = "".join(f"; did you mean {name}?" for name in get_close_matches(drive, driving, 1))
+    return [(("torque_source",), f"`{drive}` {_why_not_driving(drive, config)}; there are {', '.join(driving)}{near}")]
+
+
+def _unadaptable(
+    file: experiment_schema.ExperimentFile, sources: Mapping[str, TorqueSource]
+) -> list[experiment_schema.Mistake]:
+    """Return each `adapt` step without a known torque, a gain to correct, or a twist before it."""
+    found: list[experiment_schema.Mistake] = []
+    twisted = False
+    for number, step in enumerate(file.steps):
         if step.do in ("tare", "grip", "release"):
             twisted = False
         twisted = twisted or step.do in ("identify", "twist", "hold_torque", "tighten")
@@ -229,33 +238,15 @@ def _unadaptable(file: experiment_schema.ExperimentFile, sources: Mapping[str, T
         named = [name for name, source in sources.items() if source.has_gain]
         if step.fingertip not in named:
             known = f"choose one of {', '.join(named)}" if named else "calibrate one with `shearloop calibrate`"
-            found.append(f"step {number} adapts `{step.fingertip}`, which has no calibration on recordings; {known}")
+            why = f"adapt corrects `{step.fingertip}`, which has no calibration on recordings; {known}"
+            found.append((("steps", number), why))
         if step.reference not in (*sources, WRENCH):
             cure = "add a `load_cell` section to the configuration, or write `reference: wrench`"
-            found.append(f"step {number} is `adapt`, and no load cell measures the torque; {cure}")
+            found.append((("steps", number), f"adapt needs a load cell, and none is configured; {cure}"))
         if not twisted:
             cure = "put an `identify` or a `twist` before it, after the last `tare`, `grip` or `release`"
-            found.append(f"step {number} is `adapt`, and the tool is not twisted before; {cure}")
+            found.append((("steps", number), f"adapt needs a twisted tool; {cure}"))
     return found
-
-
-def _holds_unidentified(file: experiment_schema.ExperimentFile) -> int | None:
-    """Return the number of the first step that closes the loop on an unidentified tool, or None.
-
-    A new grip, a new zero, or another gain of the driving torque invalidates an identification.
-    """
-    identified = False
-    for number, step in enumerate(file.steps, 1):
-        match step:
-            case experiment_schema.IdentifyStep():
-                identified = True
-            case experiment_schema.TareStep() | experiment_schema.GripStep() | experiment_schema.ReleaseStep():
-                identified = False
-            case experiment_schema.AdaptStep() if step.fingertip == file.torque_source:
-                identified = False
-            case experiment_schema.HoldTorqueStep() if not identified:
-                return number
-    return None
 
 
 def _why_not_driving(drive: str, config: DaemonConfig) -> str:

@@ -3,7 +3,7 @@
 An emulated rig adds the true torque and the disturbances.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, TextIO, TypeAlias
@@ -75,7 +75,8 @@ class _Run:
     held_s: float = 0.0
     hold_reasons: Counter[str] = field(default_factory=Counter)
     refused: Counter[str] = field(default_factory=Counter)
-    invalid: Counter[str] = field(default_factory=Counter)
+    # By source, the reasons without their numbers.
+    invalid: defaultdict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     torques: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
     diameters: dict[str, list[float]] = field(default_factory=dict)
 
@@ -136,7 +137,7 @@ def _on_sample(run: _Run, topic: str, content: Mapping[str, Any]) -> None:
     if topic in TORQUES and content.get("torque_nm") is not None and content.get("valid", True):
         run.torques.setdefault(source, []).append((content["t_mono_ns"], content["torque_nm"]))
     elif topic in TORQUES and not content.get("valid", True):
-        run.invalid[source] += 1
+        run.invalid[source][content["reason"].split(":")[0].split(",")[0]] += 1
     gripped = topic in ("eit.estimate", "gripper.state") and step is not None and step.holds
     if gripped and content.get("diameter_mm") is not None:
         run.diameters.setdefault(source, []).append(content["diameter_mm"])
@@ -259,9 +260,11 @@ def _counted(run: _Run) -> Iterator[str]:
         yield f"  the wrist was held for {run.held_s:.1f} s in all: {reasons}"
     else:
         yield "  the wrist was never held"
-    for source, count in run.invalid.items():
+    for source, reasons_of in run.invalid.items():
         # A source without any torque has another purpose.
         if source in run.torques:
-            yield f"  {count} of {count + len(run.torques[source])} torques of {source} were not valid and not used"
+            count, ((most, _),) = reasons_of.total(), reasons_of.most_common(1)
+            every = count + len(run.torques[source])
+            yield f"  {count} of {every} torques of {source} were not valid and not used, most often: {most}"
     refused = [f"  {times(count)} {reason}" for reason, count in run.refused.most_common()]
     yield from refused or ["  no command was refused"]

@@ -119,22 +119,16 @@ def envelope(magnitudes: FloatArray, settings: EnvelopeSettings = PAPER_ENVELOPE
     return _moving_average(curve, settings.averaged)
 
 
-def envelope_score(difference: FloatArray, signal: FloatArray, settings: EnvelopeSettings = PAPER_ENVELOPE) -> float:
-    """Return Spearman's correlation of the envelopes of two (n,) signals, the largest over all circular shifts.
+def envelope_score(difference: FloatArray, signals: FloatArray, settings: EnvelopeSettings = PAPER_ENVELOPE) -> float:
+    """Return Spearman's correlation of the envelopes of a (n,) difference and a signal, the mean over (m, n) signals.
 
-    The difference is smoothed beforehand. Raises MatchingError as `envelope` does.
+    Each is the largest over all circular shifts. The difference is smoothed beforehand. Raises MatchingError as
+    `envelope` does.
     """
     smooth = _moving_average(np.abs(difference), settings.averaged)
-    a, b = _ranks(envelope(smooth, settings)), _ranks(envelope(np.abs(signal), settings))
-    correlations = np.fft.irfft(np.fft.rfft(a) * np.conj(np.fft.rfft(b)), len(a))
-    return float(correlations.max())
-
-
-def mean_envelope_score(
-    difference: FloatArray, signals: FloatArray, settings: EnvelopeSettings = PAPER_ENVELOPE
-) -> float:
-    """Return the mean of the envelope scores of (m, n) signals, for one (n,) difference."""
-    return float(np.mean([envelope_score(difference, signal, settings) for signal in signals]))
+    measured = np.fft.rfft(_ranks(envelope(smooth, settings)))
+    simulated = np.fft.rfft([_ranks(envelope(one, settings)) for one in np.abs(signals)])
+    return float(np.fft.irfft(measured * np.conj(simulated), len(difference)).max(axis=1).mean())
 
 
 def matching_scores(differences: FloatArray, signals: FloatArray) -> FloatArray:

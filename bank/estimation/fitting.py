@@ -223,7 +223,10 @@ def adapt(
         if not first_frames or row.frame >= first_frames[i]
     ]
     if not rows:
-        raise CalibrationError("no frame is gripped and undisturbed for long enough; twist the gripped tool again")
+        raise CalibrationError(
+            "no frame is gripped and undisturbed for long enough; `shearloop evaluate` lists the reasons; "
+            "twist the gripped tool again"
+        )
     adapted, correction = calibration.correct_gain(
         np.array([row.features[calibration.estimator.columns["torque"]] for row in rows]),
         np.array([row.torque_nm for row in rows]),

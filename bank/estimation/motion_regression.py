@@ -62,7 +62,7 @@ _CLEAR, _LEAST_SHARE = 2.0, 0.2
 _ROUNDING = 1e-9
 # Inverse calibration over torque and over diameter: degree, directions of drift, trend. The torque's have the least
 # mean error over six origins (19 to 44 of 49 slices, evaluated on all later ones; docs/decisions/0042).
-_CURVES: dict[Quantity, tuple[int, int, bool]] = {"torque": (3, 3, True), "diameter": (1, 1, False)}
+_CURVES: dict[Quantity, tuple[int, int, bool]] = {"torque": (4, 3, True), "diameter": (1, 1, False)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,7 +133,7 @@ class MotionRegression(Estimator):
     name: ClassVar[str] = "motion_regression"
     strengths: ClassVar[tuple[float, ...]] = (0.0,)
     # With a block left out, enough remain for the torque's curve.
-    least_slices: ClassVar[int] = 14
+    least_slices: ClassVar[int] = 15
     ignores_nan: ClassVar[bool] = True
 
     temporal: TemporalFeatures | None = None

@@ -280,6 +280,7 @@ def _model_rows(models: _Models, fully_loaded: ContactState) -> list[FigureOfMer
         FigureOfMerit("slope without friction", "1/N", "0.088", "", *without),
         FigureOfMerit("slope within the deadband, Fn = 1 N", "1/N", "0", "0", *_deadband_slopes(models)),
         FigureOfMerit("deadband, Fn = 1 N", "N", "0.04", "0.04", *(line.kink_n for line in fitted)),
+        FigureOfMerit("response at 1.6 N above the line, Fn = 1 N", "%", "", "< 30", *_upturns(models)),
         FigureOfMerit("fall of tension between 75° and 15°", "%", "< 4", "", falls, 100 * np.ptp(flank) / flank.max()),
         FigureOfMerit("|ε₂/ε₁|, Fn = Ft = 1 N", "", "much lower", "much lower", None, abs(strain_2 / strain_1)),
         FigureOfMerit("response to 2 N of normal force alone", "", "", "< 1.24e-4", 0.0, abs(pressed)),
@@ -296,6 +297,13 @@ def _deadband_slopes(models: _Models) -> list[float]:
     """Return the slopes over the first half of the deadband."""
     shear_n = np.array([0.02])
     return [float(model(shear_n, 1.0)[0] / 0.02) for model in (models.in_1d, models.in_2d)]
+
+
+def _upturns(models: _Models) -> list[float]:
+    """Return by how much (%) the last response of a loading to 1.6 N exceeds the line through the origin to 1.2 N."""
+    shear_n, straight = loading(1.6), slice(len(loading(PAPER_LINEAR_N)))
+    found = [model(shear_n, 1.0) for model in (models.in_1d, models.in_2d)]
+    return [100 * (each[-1] / (1.6 * origin_slope(shear_n[straight], each[straight])) - 1) for each in found]
 
 
 def _estimator_rows(models: _Models, rng: np.random.Generator) -> list[FigureOfMerit]:

@@ -77,14 +77,14 @@ class SheetSkin:
     def gauge_strains(self, normal_n: float, shear_n: float, transverse_n: float = 0.0) -> FloatArray:
         """Return the (2,) mean strains of both gauges under forces (N) that rise from zero, the normal force first.
 
-        Friction under the load opposes the resultant of shear and transverse force. The shear force is not negative.
+        Friction under the load opposes the resultant of shear and transverse force.
         """
-        section, force = self.section, np.array([shear_n, transverse_n])
+        section, force = self.section, np.array([abs(shear_n), transverse_n])
         hold_n = section.friction * normal_n * section.inner_radius_mm / section.outer_radius_mm
         size_n = float(np.hypot(*force))
         slips = max(1 - hold_n / size_n, 0.0) if size_n > 0 else 0.0
         strains: FloatArray = self._gauges_per_n @ force * slips
-        return strains
+        return strains if shear_n >= 0 else strains[::-1]
 
     def response(self, normal_n: float, shear_n: float, transverse_n: float = 0.0) -> float:
         """Return F (ε₁ − ε₂), equation (1) of the paper."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_option
+from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.daemon.config import CurveConfig, DaemonConfig, SkinConfig
@@ -22,14 +23,38 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Load everything that `run` loads, without opening a device."""
-
-    from shearloop.daemon.cli.emulated_devices import check_emulators
+    from shearloop.bank.errors import BankError
     from shearloop.daemon.config import load_daemon_config
+    from shearloop.daemon.rig import read_experiment
+    from shearloop.drivers.errors import DriverError
+
+    config = load_daemon_config(args.config)
+    try:
+        parts = _parts(config, args.config)
+    except (BankError, DriverError) as error:
+        # A bank that is not built yet does not hide the mistakes of the experiment.
+        try:
+            if config.experiment is not None:
+                read_experiment(config.experiment)
+        except UserError as mistakes:
+            raise UserError(f"{error}\n{mistakes}") from error
+        raise
+    if args.json:
+        print(json.dumps({"config": str(args.config), "parts": parts}, ensure_ascii=False))
+        return 0
+    for name, text in parts.items():
+        print(f"{name}: {text}")
+    print(f"{args.config} is in order")
+    return 0
+
+
+def _parts(config: "DaemonConfig", path: Path) -> dict[str, str]:
+    """Return a sentence on each part of the configuration in this file."""
+    from shearloop.daemon.cli.emulated_devices import check_emulators
     from shearloop.daemon.rig import check_experiment
     from shearloop.daemon.sensing.estimators import open_combined, open_estimator, torque_sources
 
-    config = load_daemon_config(args.config)
-    check_emulators(config.emulators, args.config)
+    check_emulators(config.emulators, path)
     parts = {}
     if config.curve is not None:
         parts["keys"] = f"{_clients(config.curve)} may connect"
@@ -52,13 +77,7 @@ def run(args: argparse.Namespace) -> int:
         parts["experiment"] = f"{experiment.name!r}, {steps}"
         if warm_up_s := max((one.warm_up_s for one in sources.values() if one.measures_torque), default=0.0):
             parts["experiment"] += f"; after a grip it waits up to {warm_up_s:.0f} s for the first torques"
-    if args.json:
-        print(json.dumps({"config": str(args.config), "parts": parts}, ensure_ascii=False))
-        return 0
-    for name, text in parts.items():
-        print(f"{name}: {text}")
-    print(f"{args.config} is in order")
-    return 0
+    return parts
 
 
 def _torque(estimator: "FrameEstimator", *, calibrated: bool) -> str:

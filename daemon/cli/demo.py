@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from shearloop.daemon.cli import bank, init
 from shearloop.daemon.cli import run as run_command
 from shearloop.daemon.cli.options import add_option, writing
+from shearloop.daemon.errors import missing
 
 if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig
@@ -68,6 +69,7 @@ def _prepare(config: Path, data: Path, *, calibrated: bool) -> None:
         data.mkdir(exist_ok=True)
     definition, signals = config / "banks" / "demo.yaml", data / "demo.bank"
     if not bank.is_built(signals, load_bank_plans(definition)[""]):
+        print(f"The first time, a bank and calibrations are made in {data}, in about half a minute.", flush=True)
         _call(bank, "build", "--config", str(definition), "--out", str(signals))
     if calibrated and not _is_calibrated(data, signals):
         from shearloop.daemon.cli.emulated_calibration import calibrate_rig
@@ -94,7 +96,7 @@ def _is_calibrated(data: Path, signals: Path) -> bool:
 def page(config: "DaemonConfig") -> Iterator[None]:
     """Serve the live page in a process of its own."""
     if find_spec("aiohttp") is None:
-        print("The live page needs aiohttp: `pip install 'shearloop[view]'`", flush=True)
+        print(missing("aiohttp", "view", "the live page"), flush=True)
         yield
         return
     options = ("--connect", config.publish, "--commands", config.commands, "--port", "0", "--json")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.bank.defaults import LOADED_NM
 from shearloop.daemon.cli.options import add_cluster, add_json, add_option, writing
-from shearloop.daemon.errors import UserError
+from shearloop.daemon.errors import UserError, missing
 
 if TYPE_CHECKING:
     from shearloop.bank.estimation import Calibration
@@ -111,7 +111,7 @@ def _draw(tracks: "Sequence[EstimateTrack]", paths: "Sequence[Path]", calibratio
         with writing(out, "the figure"):
             draw_tracks(tracks, names, f"{calibration.estimator.name}, fitted to {calibration.source}", out)
     except ModuleNotFoundError as error:
-        raise UserError(f"the figure needs {error.name}: `pip install 'shearloop[plot]'`") from error
+        raise missing(error.name, "plot", "the figure") from error
     print(f"The figure is in {out}.", file=sys.stderr)
 
 

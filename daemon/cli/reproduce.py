@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import PAPERS_RECORDINGS, add_json, add_option, checked_jobs, writing
 from shearloop.daemon.cli.terminal import progress_bar
-from shearloop.daemon.errors import UserError
+from shearloop.daemon.errors import missing
 
 if TYPE_CHECKING:
     from shearloop.bank.eit.bank_file import Bank
@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         from shearloop.daemon.analysis.reproduce.report import draw_all
     except ModuleNotFoundError as error:
-        raise UserError(f"the figures need {error.name}; install it with `pip install 'shearloop[plot]'`") from error
+        raise missing(error.name, "plot", "a figure") from error
     from shearloop.daemon.analysis.reproduce.report import json_text, save_calibrations, table
 
     found, banks = _reproduce(args, jobs)

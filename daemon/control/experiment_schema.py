@@ -194,6 +194,10 @@ class ExperimentFile(ConfigModel):
     )
     limits: ExperimentLimits = Field(ExperimentLimits(), description="limits of all steps")
     tool_mm: float | None = Field(None, gt=0, lt=140, description="diameter of the tool, for recordings")
+    slices: Literal["torque", "diameter"] | None = Field(
+        None,
+        description="kind of samples that `shearloop run --slices DIR` stores for each held angle; none by default",
+    )
     steps: tuple[Step, ...] = Field(min_length=1, description="the steps in order")
 
     def limits_of(self, step: Step) -> ExperimentLimits:
@@ -214,17 +218,43 @@ def first_turn_before_grip(file: ExperimentFile) -> int | None:
     return None
 
 
-def check_limits(file: ExperimentFile) -> list[str]:
-    """Return a sentence on each step that exceeds its limits."""
-    found = []
+# A location in an experiment's file, and what is wrong there.
+Mistake = tuple[tuple[int | str, ...], str]
+
+
+def check_steps(file: ExperimentFile) -> list[Mistake]:
+    """Return each step that exceeds its limits, and the first that closes the loop on an unidentified tool."""
+    found: list[Mistake] = []
     for number, step in enumerate(file.steps):
         limits, (torque_nm, angle_rad) = file.limits_of(step), _reach(step)
         torque = torque_nm, limits.torque_nm, "N·m", "torque_nm"
         for value, limit, unit, key in (torque, (angle_rad, limits.angle_rad, "rad", "angle_rad")):
             if value >= limit:
-                asks = f"steps[{number}]: {step.do} asks for {value:g} {unit}, and its limit is {limit:g} {unit}"
-                found.append(f"{asks}; raise limits.{key}, or ask for less")
+                asks = f"{step.do} asks for {value:g} {unit}, and its limit is {limit:g} {unit}"
+                found.append((("steps", number), f"{asks}; raise limits.{key}, or ask for less"))
+    if (unidentified := _holds_unidentified(file)) is not None:
+        cure = "put an `identify` step before it, after the last `tare`, `grip`, `release` or `adapt`"
+        found.append((("steps", unidentified), f"hold_torque needs an identified tool; {cure}"))
     return found
+
+
+def _holds_unidentified(file: ExperimentFile) -> int | None:
+    """Return the index of the first step that closes the loop on an unidentified tool, or None.
+
+    A new grip, a new zero, or another gain of the driving torque invalidates an identification.
+    """
+    identified = False
+    for number, step in enumerate(file.steps):
+        match step:
+            case IdentifyStep():
+                identified = True
+            case TareStep() | GripStep() | ReleaseStep():
+                identified = False
+            case AdaptStep() if step.fingertip == file.torque_source:
+                identified = False
+            case HoldTorqueStep() if not identified:
+                return number
+    return None
 
 
 def _reach(step: Step) -> tuple[float, float]:

@@ -559,6 +559,7 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
         step=experiment.step_number if experiment is not None else 0,
         steps=len(experiment.file.steps) if experiment is not None else 0,
         step_name=experiment.step.do if experiment is not None else "",
+        slices=experiment.file.slices or "" if experiment is not None else "",
         hold=experiment.command.hold_number if experiment is not None else 0,
         activity=status.activity,
         progress=experiment.progress if experiment is not None else 0.0,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.daemon.errors import UserError
+from shearloop.daemon.errors import missing
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.reader import check_identity, open_recording, read_messages
 
@@ -58,7 +58,7 @@ class RecordedTopics(Mapping[str, dict[str, NDArray[Any]]]):
         try:
             import pandas as pd
         except ModuleNotFoundError as error:
-            raise UserError("A frame needs pandas: `pip install 'shearloop[notebook]'`") from error
+            raise missing("pandas", "notebook", "a frame") from error
         columns: dict[str, NDArray[Any]] = {}
         for key, values in self[topic].items():
             if values.ndim == 2:

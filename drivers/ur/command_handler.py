@@ -43,7 +43,7 @@ STOP_RETRIES_S = (1.0, 2.0, 5.0, 10.0, 10.0)
 STILL_PAUSED = "The paused program could not be stopped ({reason}): stop it at the teach pendant, do not resume it."
 
 NOT_ENABLED = "Motion has not been enabled since the robot's process was started: enable it when the arm may move."
-BEING_MADE_READY = "The robot is being made ready (safety, power, control program): ask again in a second."
+BEING_MADE_READY = "The robot is being made ready (safety, power, control program); this takes some seconds."
 LEAVING = "The daemon disconnects from the robot: start it again to go on."
 
 

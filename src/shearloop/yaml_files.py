@@ -6,7 +6,7 @@ allowed: …; did you mean …?`.
 
 import math
 import re
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar
@@ -121,6 +121,17 @@ def load_model(
     except ValidationError as error:
         root = _Loader(path.read_text(encoding="utf-8")).get_single_node()
         raise raises("\n".join(_mistakes(error, model, content, str(path), root))) from error
+
+
+def located(path: Path, mistakes: Iterable[tuple[tuple[int | str, ...], str]], raises: type[Exception]) -> list[str]:
+    """Return `file:line: key: sentence` for each mistake of a YAML file, given by its location in the content."""
+    content = read_yaml(path, raises)
+    root = _Loader(path.read_text(encoding="utf-8")).get_single_node()
+    found = []
+    for location, sentence in mistakes:
+        key, line = _place(ErrorDetails(type="missing", loc=location, msg="", input=None), content, root)
+        found.append((line, f"{path}:{line}: {key}: {sentence}"))
+    return [text for _, text in sorted(found)]
 
 
 def validated(content: object, model: type[Model], where: str, raises: type[Exception], *, cure: str = "") -> Model:

@@ -51,20 +51,20 @@ def test_a_torque_that_is_measured_may_drive(tmp_path):
 
 def test_a_torque_that_is_not_measured_may_not_drive(tmp_path):
     assert refusal(tmp_path, {"torque_source": "load_cell"}).endswith(
-        "experiment.yaml: `torque_source: load_cell` is not a measured torque: choose another, or configure its "
+        "experiment.yaml:6: torque_source: `load_cell` is not a measured torque: choose another, or configure its "
         "device; there are right, wrench"
     )
-    assert "`torque_source: left` is a fingertip without a calibration" in refusal(tmp_path, {"torque_source": "left"})
+    assert "torque_source: `left` is a fingertip without a calibration" in refusal(tmp_path, {"torque_source": "left"})
     tips = {name: {"device": {"path": name}, "calibration": f"{name}.cal"} for name in SOURCES}
     told = refusal(tmp_path, {"torque_source": "left"}, fingertips=tips)
-    assert "`torque_source: left` has a calibration without torques" in told
+    assert "torque_source: `left` has a calibration without torques" in told
     assert told.endswith("there are right, wrench")
 
 
 @pytest.mark.parametrize("step", [{"do": "grip"}, {"do": "release"}])
 def test_a_gripper_that_is_not_there_is_missed_before_the_start(tmp_path, step):
     told = refusal(tmp_path, {"steps": [*STEPS, step]})
-    assert f"step 3 is `{step['do']}`, and no gripper is configured; add a `gripper` section" in told
+    assert f"steps[2]: {step['do']} needs a gripper, and none is configured; add a `gripper` section" in told
 
 
 LIMITS = {"torque_nm": 0.2, "angle_rad": 1.0}
@@ -103,7 +103,7 @@ def test_a_tool_of_which_nothing_is_known_is_not_held(tmp_path, between):
     gripper = {"socket": {"host": "127.0.0.1"}}
     first = [identify] if between else []
     told = refusal(tmp_path, {"steps": [*first, *between, hold, identify, hold]}, gripper=gripper)
-    assert f"step {1 + len(first) + len(between)} is `hold_torque`, and the tool is not identified then; put an" in told
+    assert f"steps[{len(first) + len(between)}]: hold_torque needs an identified tool; put an `identify` step" in told
     steps = [*between, identify, {"do": "wait", "wait_s": 1}, hold, hold]
     assert check_experiment(config(tmp_path, {"steps": steps}, gripper=gripper), SOURCES) is not None
 
@@ -115,18 +115,18 @@ IDENTIFY = {"do": "identify"}
 @pytest.mark.parametrize(
     ("steps", "said"),
     [
-        ([IDENTIFY, ADAPT], "step 2 is `adapt`, and no load cell measures the torque; add a `load_cell` section"),
+        ([IDENTIFY, ADAPT], "steps[1]: adapt needs a load cell, and none is configured; add a `load_cell` section"),
         (
             [IDENTIFY, {**ADAPT, "fingertip": "left", "reference": "wrench"}],
-            "step 2 adapts `left`, which has no",
+            "steps[1]: adapt corrects `left`, which has no",
         ),
         (
             [IDENTIFY, {"do": "tare"}, {**ADAPT, "reference": "wrench"}],
-            "step 3 is `adapt`, and the tool is not",
+            "steps[2]: adapt needs a twisted tool",
         ),
         (
             [IDENTIFY, {**ADAPT, "reference": "wrench"}, {"do": "hold_torque", "torque_nm": 0.1}],
-            "step 3 is `hold_torque`, and the tool is not identified then",
+            "steps[2]: hold_torque needs an identified tool",
         ),
     ],
 )
@@ -142,9 +142,17 @@ def test_an_adaptation_that_nothing_is_known_for_is_refused(tmp_path, steps, sai
 def test_every_mistake_of_an_experiment_is_told_on_a_line_of_its_own(tmp_path):
     hold = {"do": "hold_torque", "torque_nm": 0.1}
     told = refusal(tmp_path, {"torque_source": "rigth", "steps": [{"do": "grip"}, hold, {"do": "release"}]})
-    first, *others = told.splitlines()
-    assert first.endswith("there are right, wrench; did you mean right?")
-    assert [f"step {number} is" in line for number, line in zip((1, 3, 2), others, strict=True)] == [True] * 3
+    *others, last = told.splitlines()
+    assert last.endswith(
+        "torque_source: `rigth` is not a measured torque: choose another, or configure its device; "
+        "there are right, wrench; did you mean right?"
+    )
+    assert [f"steps[{number}]: " in line for number, line in zip((0, 1, 2), others, strict=True)] == [True] * 3
+    schema, source = refusal(
+        tmp_path, {"torque_source": "rigth", "steps": [*STEPS, {"do": "turn_to", "angle_rad": 90}]}
+    ).splitlines()[::-1]
+    assert "steps[2].angle_rad: 90 is too large" in schema
+    assert source.endswith("did you mean right?")
     twist = {"do": "twist", "angles_rad": [2]}
     assert len(refusal(tmp_path, {"limits": LIMITS, "steps": [twist, twist]}).splitlines()) == 2
 

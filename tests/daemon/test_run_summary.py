@@ -52,7 +52,7 @@ def told(truth: TorqueSeries | None, happened: list[tuple[int, str]], *more: dic
     for t_s in np.arange(14.0, 44.0, 0.5):
         values = {"torque_nm": 0.098, "valid": True, "diameter_mm": 20}
         messages.append({"source": "right", "t_mono_ns": round(t_s * S), **values})
-    messages.append({"source": "right", "t_mono_ns": 44 * S, "torque_nm": None, "valid": False})
+    messages.append({"source": "right", "t_mono_ns": 44 * S, "torque_nm": None, "valid": False, "reason": "no grip"})
     return summary_of(*messages, loop_state(44, phase="done", hold=0), truth=truth, sent=happened)
 
 
@@ -74,7 +74,7 @@ def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturban
     assert "true       +0.0945 N·m on average, ± 0.0116, within ± 10% for 82% of the time" in text
     assert "within ± 10% 3.0 s after the set point changed, by true" in text
     assert "disturbed after 12.0 s (kick -0.03): 0.030 N·m off, back within ± 10% after 5.5 s" in text
-    assert "1 of 61 torques of right were not valid" in text
+    assert "1 of 61 torques of right were not valid and not used, most often: no grip" in text
     assert "the wrist was never held" in text
     assert "no command was refused" in text
 

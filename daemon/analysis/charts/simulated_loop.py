@@ -482,11 +482,9 @@ def chart(out: Path, seeds: int = 20) -> list[Path]:
         back_s = [back_after_s(after, _TARGET_NM) for _, after in rows]
         content[name] = {"time_in_band": share, "kick_back_s": back_s}
         for before, after in rows:
-            t_s, torque_nm = (
-                np.concatenate([before.t_s, after.t_s]),
-                np.concatenate([before.torque_nm, after.torque_nm]),
-            )
-            axes.plot(t_s - t_s[0], torque_nm, color=drawing.SHADES[1], lw=0.7, alpha=0.6)
+            t_s = np.concatenate([before.t_s, after.t_s]) - before.t_s[0]
+            torque_nm = np.concatenate([before.torque_nm, after.torque_nm])
+            axes.plot(t_s, torque_nm, color=drawing.SHADES[1], lw=0.7, alpha=0.6)
         axes.axhspan(_TARGET_NM * (1.0 - BAND), _TARGET_NM * (1.0 + BAND), color=drawing.SHADES[3], alpha=0.2, lw=0)
         axes.axvline(_KICK_AT_S, color="black", lw=1, ls=":")
         returns = f"back after {np.median(back_s):.1f} s, worst {max(back_s):.1f} s"

@@ -65,11 +65,14 @@ def splits(paths: Sequence[Path], share: float, scratch: Path) -> list[Split]:
         named = [("synthetic slices", synthetic_slices(scratch)), ("synthetic stream", synthetic_stream(scratch))]
     found = []
     for name, series in named:
-        if series.torque_t_s.size and not np.isfinite(series.diameter_mm).any():
+        # Slices of a known diameter are not of a known torque.
+        if series.torque_t_s.size and (series.kind == "raw" or not np.isfinite(series.diameter_mm).any()):
             kind, warm_up = ("stream", WARM_UP_FRAMES) if series.kind == "raw" else ("slices", 0)
             start = max(round(share * len(series.t_s)) - warm_up, 0)
             future = series.between(start, len(series.t_s))
             found.append(Split(f"{name}, {kind}, first {share:.0%}", part_of(series, 0, share), future, series))
+        elif not series.torque_t_s.size:
+            print(f"{name} is left out: it holds no torques of a load cell")
     return found
 
 

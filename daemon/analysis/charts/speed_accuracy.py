@@ -227,7 +227,10 @@ def compare_methods(split: Split, bank: Bank, mesh: Mesh, rounds: int) -> Method
     else:
         chosen = dict.fromkeys((sides[:1], sides))
         methods = [method for some in chosen for method in estimators(split, physics, some)]
-    return MethodComparison(split, measure(methods, loaded_truth(split.future), rounds))
+    measured = measure(methods, loaded_truth(split.future), rounds)
+    if not measured:
+        print(f"{split.title} is left out: no method has two valid estimates of the later loaded frames")
+    return MethodComparison(split, measured)
 
 
 def loaded_truth(series: FrameSeries) -> FloatArray:
@@ -314,7 +317,7 @@ def _draw_methods(axes: Axes, compared: MethodComparison) -> None:
     future = compared.split.future
     loaded = np.count_nonzero(np.isfinite(loaded_truth(future)))
     axes.set(
-        title=f"{compared.split.title}; judged on {loaded} loaded of {len(future.t_s)} later frames",
+        title=f"{compared.split.title}; {loaded} loaded of {len(future.t_s)} later frames",
         xlabel="latency of one frame, ms (one thread; bars: slowest and fastest round)",
         ylabel=f"torque error on loaded frames (≥ {LOADED_NM:g} N·m), RMS, N·m",
     )

@@ -14,8 +14,8 @@ from shearloop.bank.eit.design import (
     PAPER_ENVELOPE,
     EnvelopeSettings,
     centred_settings,
+    envelope_score,
     matching_scores,
-    mean_envelope_score,
     searched_settings,
     simulated_signals,
 )
@@ -303,7 +303,7 @@ def _envelope_scores(difference: FloatArray, signals: FloatArray) -> dict[Envelo
     for settings in ENVELOPES if len(signals) else ():
         # A signal without peaks has no score.
         with suppress(MatchingError):
-            found[settings] = mean_envelope_score(difference, signals, settings)
+            found[settings] = envelope_score(difference, signals, settings)
     return found
 
 

@@ -242,7 +242,8 @@ export function loopPanel(link) {
   const underWay = Boolean(current?.steps) && (ACTIVE.has(current.phase) || current.phase === "done");
   const share = underWay ? current.progress : 0;
   if (byId("progress").value !== share) byId("progress").value = share;
-  put(byId("progress-text"), underWay ? `${Math.round(100 * share)} %, about ${Math.round(current.remaining_s)} s left` : "");
+  const left = current?.phase === "done" ? "" : `, about ${Math.round(current?.remaining_s)} s left`;
+  put(byId("progress-text"), underWay ? `${Math.round(100 * share)} %${left}` : "");
   show(byId("holding"), reasons !== "");
   if (reasons === "") return;
   const stop = current.response.startsWith("stop");

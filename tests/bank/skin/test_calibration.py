@@ -21,8 +21,16 @@ from shearloop.bank.skin.calibration import (
     save_calibration,
     turned_rad,
 )
-from shearloop.bank.skin.characterisation import loading, loop
-from shearloop.bank.skin.membrane import PAPER_SECTION, UNSTRETCHED, Belt, BeltState, Direction
+from shearloop.bank.skin.characterisation import loading, loop, responses
+from shearloop.bank.skin.membrane import (
+    PAPER_SECTION,
+    THICK_SECTION,
+    UNSTRETCHED,
+    Belt,
+    BeltState,
+    Direction,
+    Membrane,
+)
 
 BELT = Belt(0.04, PAPER_SECTION.gauge_angle_rad)
 R1, R2 = 24.6, 25.3
@@ -180,6 +188,18 @@ def test_a_light_loading_needs_no_curve_and_drops_no_row_silently():
     assert len(found.tension_n) == 2
     assert found.rows_beyond == 7, "tension beyond 1.2 N: from 1.3 N of shear under 1 N, from 1.2 N under 2 N"
     assert found.friction == pytest.approx(0.04, abs=0.003)
+
+
+def test_loadings_under_several_normal_forces_make_one_curve():
+    """A load that turns with the skin pulls along it by a part of the normal force."""
+    membrane, rows = Membrane(THICK_SECTION), []
+    for normal_n in (0.5, 1.0, 2.0):
+        rows.append((R1, R2, 0.0, 0.0))
+        for shear_n, response in zip(loading(1.2), responses(membrane, loading(1.2).tolist(), normal_n), strict=True):
+            rows.append((R1 * (1 + response), R2, shear_n, normal_n))
+    found = fit_calibration(CalibrationTable(*np.array(rows).T))
+    assert found.friction == pytest.approx(membrane.belt.friction, abs=0.007)
+    assert found.prediction_half_width_n < 0.012
 
 
 def test_a_table_without_friction_in_it_is_refused_unless_friction_is_given():

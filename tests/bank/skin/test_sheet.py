@@ -51,6 +51,7 @@ def test_a_transverse_force_strains_neither_gauge_and_takes_friction_from_the_sh
     hold = 1 - alone / slipping
     assert both == pytest.approx(slipping * (1 - hold / np.sqrt(2)))
     assert sheet.response(1.0, 0.03) == 0, "within the deadband"
+    assert sheet.response(1.0, -0.5) == -alone
 
 
 @pytest.mark.parametrize("plate_mm", [7.0, 21.0])

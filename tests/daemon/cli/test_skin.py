@@ -22,6 +22,8 @@ def test_characterise_holds_the_models_against_the_paper_and_draws_its_figures(t
         assert row["two_d"] == pytest.approx(float(row["paper_computed"]), rel=0.13)
     assert rows["slope without friction"]["membrane"] == pytest.approx(0.088, rel=0.07)
     assert rows["deadband, Fn = 1 N"]["membrane"] == pytest.approx(0.04, abs=0.003)
+    upturn = rows["response at 1.6 N above the line, Fn = 1 N"]
+    assert 0 < upturn["two_d"] < upturn["membrane"] < 7
     assert rows["response to 2 N of normal force alone"]["two_d"] < 1e-6
     for name, tolerance in {
         "noise floor": 0.05,

@@ -47,9 +47,17 @@ def test_loop_state_has_the_filtered_torque_and_its_standard_deviation():
     assert 0.0 < state.filtered_torque_std_nm < 0.002
 
 
-def test_a_set_point_without_identification_is_refused_with_the_cure():
-    rig = started(Rig(new_loop()), GRIP, {"do": "hold_torque", "torque_nm": 0.1})
-    rig.run(20)
+@pytest.mark.parametrize(
+    ("adapted", "drive", "refused"),
+    [(None, "right", True), ("right", "right", True), ("right", "load_cell", False)],
+)
+def test_a_set_point_without_identification_at_its_gain_is_refused_with_the_cure(adapted, drive, refused):
+    first = [{"do": "identify"}, {"do": "adapt", "fingertip": adapted}] if adapted else []
+    rig = started(Rig(new_loop()), GRIP, *first, {"do": "hold_torque", "torque_nm": 0.1}, torque_source=drive)
+    rig.run(100)
+    if not refused:
+        assert phase(rig) is ExperimentPhase.DONE
+        return
     assert phase(rig) is ExperimentPhase.STOPPED
     assert "put an `identify` step before" in rig.control_loop.experiment.stop_reason
 

@@ -1,8 +1,6 @@
 """Exports topics of a recording as tables: CSV or Parquet, one file per topic, or one MATLAB file."""
 
 import csv
-import itertools
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -11,10 +9,9 @@ from scipy.io import savemat
 
 from shearloop.daemon.errors import UserError, require
 from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.reader import read_messages
+from shearloop.daemon.recording.reader import Progress, read_messages
 from shearloop.daemon.recording.tables import arrays, columns_of, read_rows, row_of
 
-Progress = Callable[[int], None]
 # Numbers of a Parquet table that are written at once.
 _BATCH = 200_000
 
@@ -27,9 +24,8 @@ def export(path: Path, form: str, out: Path, topics: list[str], progress: Progre
     """
     try:
         if form == "mat":
-            done = itertools.count(1)
-            found = {topic: arrays(read_rows(path, topic, lambda: progress(next(done)))) for topic in topics}
-            structs = {topic.replace(".", "_").replace("-", "_"): columns for topic, columns in found.items()}
+            rows = read_rows(path, topics, progress)
+            structs = {topic.replace(".", "_").replace("-", "_"): arrays(rows.pop(topic)) for topic in topics}
             # savemat changes names and hides the reason if it opens the file itself.
             with out.open("wb") as file:
                 # The stubs allow only names.

@@ -5,9 +5,10 @@
 index that is written when a file is closed.
 """
 
+import io
 import json
+import struct
 import zlib
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -16,6 +17,7 @@ from typing import IO, Any
 
 import numpy as np
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
@@ -34,6 +36,9 @@ from shearloop.files import replace_file
 
 Progress = Callable[[int], None]
 _LARGEST_RECORD_BYTES = 1 << 30
+_BLOCK_BYTES = 1 << 20
+# Opcode and length, then the places of index and its offsets, and the index's checksum; or the data's checksum.
+_FOOTER, _DATA_END = struct.Struct("<BQQQI"), struct.Struct("<BQI")
 # Metadata of every recording; the other keys are notes of this one.
 _IDENTITY_KEYS = ("format_version", "channel_table_hash", "electrodes", "injection", "software", "code_sha256")
 
@@ -229,15 +234,27 @@ def _side_frames(rows: list[tuple[int, int, list[float]]]) -> SideFrames:
 
 
 def _check_checksums(file: IO[bytes]) -> None:
-    """Raise an error for a file that was not closed or does not match its checksums; mcap does not check the index."""
-    (footer,) = deque(StreamReader(file, emit_chunks=True, validate_crcs=True).records, maxlen=1)
-    if not isinstance(footer, Footer) or not footer.summary_start:
+    """Raise an error for a file that was not closed or does not match its checksums.
+
+    The mcap library does not check the index, and takes seconds to find the end of the data.
+    """
+    footer_at = file.seek(0, io.SEEK_END) - _FOOTER.size - len(MCAP0_MAGIC)
+    file.seek(max(footer_at, 0))
+    tail = file.read()
+    opcode, _, index_at, _, index_crc = _FOOTER.unpack(tail[: _FOOTER.size])
+    if opcode != Opcode.FOOTER or not tail.endswith(MCAP0_MAGIC) or not index_at:
         raise McapError("it has no index at its end")
-    file.seek(footer.summary_start)
-    # The checksum covers the footer up to itself.
-    index = file.read()[: -4 - len(MCAP0_MAGIC)]
-    if footer.summary_crc and zlib.crc32(index) != footer.summary_crc:
-        raise ValueError("its index does not match its checksum")
+    data_end_at = file.seek(index_at - _DATA_END.size)
+    _, _, data_crc = _DATA_END.unpack(file.read(_DATA_END.size))
+    # The index's checksum covers the footer up to itself.
+    index_end = footer_at + _FOOTER.size - 4
+    for what, begin, end, expected in (("index", index_at, index_end, index_crc), ("data", 0, data_end_at, data_crc)):
+        file.seek(begin)
+        crc = 0
+        for at in range(begin, end, _BLOCK_BYTES):
+            crc = zlib.crc32(file.read(min(_BLOCK_BYTES, end - at)), crc)
+        if expected and crc != expected:
+            raise ValueError(f"its {what} does not match its checksum")
 
 
 def _unusable(path: Path, reason: str) -> UserError:

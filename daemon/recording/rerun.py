@@ -127,16 +127,16 @@ class _RerunFile:
 
 
 def _shares(text: bytes) -> NDArray[np.float32]:
-    """Return the numbers of a JSON array from 0 to 1, to four decimals; 0 for null and for negative numbers.
+    """Return the numbers of a JSON array from 0 to 1, to three decimals; 0 for null and for negative numbers.
 
     A whole JSON parser would take most of the export's time for these numbers.
     """
-    characters = np.frombuffer(text + b"," * 6, np.uint8)
-    ends = np.flatnonzero(characters == ord(","))[:-5]
+    characters = np.frombuffer(text + b"," * 5, np.uint8)
+    ends = np.flatnonzero(characters == ord(","))[:-4]
     starts = np.append(0, ends[:-1] + 1)
     found = np.zeros(len(ends), np.float32)
     # The first digit, and those after the point.
-    for place, weight in ((0, 1.0), (2, 0.1), (3, 0.01), (4, 0.001), (5, 0.0001)):
+    for place, weight in ((0, 1.0), (2, 0.1), (3, 0.01), (4, 0.001)):
         digits = characters[starts + place] - ord("0")
         found += np.where((digits <= 9) & (starts + place < ends), digits, 0) * np.float32(weight)
     # A number with an exponent, as 1e-6, is less than 0.00001.

@@ -1,7 +1,7 @@
 """The topics of a recording as arrays and as pandas frames."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from shearloop.daemon.errors import missing
 from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.reader import check_identity, open_recording, read_messages
+from shearloop.daemon.recording.reader import Progress, check_identity, open_recording, read_messages
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -39,7 +39,7 @@ class RecordedTopics(Mapping[str, dict[str, NDArray[Any]]]):
         if topic not in self._topics:
             if topic not in self.counts:
                 raise KeyError(f"{self.path} has no topic {topic!r}; it has {', '.join(self)}")
-            self._topics[topic] = arrays(read_rows(self.path, topic))
+            self._topics[topic] = arrays(read_rows(self.path, [topic])[topic])
         return self._topics[topic]
 
     def __iter__(self) -> Iterator[str]:
@@ -74,14 +74,14 @@ def read(path: str | Path) -> RecordedTopics:
     return RecordedTopics(path)
 
 
-def read_rows(path: Path, topic: str, on_row: Callable[[], None] = lambda: None) -> Rows:
-    """Return a topic's messages by time."""
-    rows = []
-    for _, content, message in read_messages(path, [topic]):
+def read_rows(path: Path, topics: Iterable[str], progress: Progress = lambda _: None) -> dict[str, Rows]:
+    """Return the messages of topics by time; `progress` receives the number of messages so far."""
+    rows: dict[str, Rows] = {topic: [] for topic in topics}
+    for number, (topic, content, message) in enumerate(read_messages(path, rows), start=1):
         # As arrays, heatmaps take a quarter of the memory.
         held = {key: np.array(value, float) if isinstance(value, list) else value for key, value in content.items()}
-        rows.append(row_of(held, message.log_time))
-        on_row()
+        rows[topic].append(row_of(held, message.log_time))
+        progress(number)
     return rows
 
 

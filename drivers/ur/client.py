@@ -52,7 +52,7 @@ def missing_library() -> str:
     return (
         f"the robot needs the package ur-rtde, which is not installed for Python {platform.python_version()} on "
         f"{platform.machine()}: use Python 3.11 or 3.12 on x86-64, or build it with `pip install "
-        "'shearloop[robot-source]'`, which needs cmake, g++ and Boost's headers"
+        "'shearloop[robot-source]'`, which needs cmake, g++, git and Boost's headers"
     )
 
 

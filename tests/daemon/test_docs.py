@@ -52,7 +52,7 @@ def blocks(page: Path) -> list[str]:
 
 
 BLOCKS = [pytest.param(block, id=f"{page.stem}-{n}") for page in PAGES for n, block in enumerate(blocks(page))]
-SYSTEM_PROGRAMS = {"sudo", "pip", "ssh", "dask", "systemctl", "journalctl"}
+SYSTEM_PROGRAMS = {"sudo", "apt", "pip", "ssh", "dask", "systemctl", "journalctl"}
 
 
 @pytest.mark.parametrize("block", BLOCKS)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -91,6 +92,17 @@ def test_marks_distinguish_the_noises_of_loops_at_one_window():
         for line in (mark.lines[0] for mark in axes.containers)
     ]
     assert len(looks) == len(set(looks)) == 9
+
+
+def test_a_recording_of_a_known_tool_is_judged_and_one_without_torques_is_named(scratch, monkeypatch, capsys):
+    stream = synthetic_stream(scratch)
+    known = replace(stream, diameter_mm=np.full(len(stream.t_s), 20.0))
+    empty = replace(stream, torque_t_s=np.zeros(0), torque_nm=np.zeros(0))
+    recorded = {"known.mcap": [known], "empty.mcap": [empty]}
+    monkeypatch.setattr("shearloop.daemon.analysis.charts.sources.read_series", lambda path: recorded[str(path)])
+    [split] = splits([Path(name) for name in recorded], 0.6, scratch)
+    assert split.title.startswith("known.mcap, stream")
+    assert capsys.readouterr().out == "empty.mcap is left out: it holds no torques of a load cell\n"
 
 
 def test_synthetic_frames_are_split_in_time_and_the_same_each_time(scratch):

@@ -4,8 +4,8 @@
 
 For each seed the gel has another stiffness. The loop identifies it with the torque that drives, then steps to
 0.10 N·m. A fingertip errs by 0.012 N·m a frame. Then a screw is tightened to 0.12 N·m on the load cell. With `--bank`
-the default estimator also closes the loop on the rig's own frames from both fingertips, for 20 grips. Simulated time,
-so the numbers are the same on every machine.
+the default estimator also closes the loop on the rig's own frames from both fingertips, for 20 grips. Then the torque
+is kicked by 0.03 N·m up and down, and the tool slips. Simulated time, so the numbers are the same on every machine.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,8 +23,10 @@ from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFram
 from shearloop.daemon.analysis.charts import simulated_loop as sim
 from shearloop.daemon.analysis.creep import Stretch, fit_creep
 from shearloop.daemon.cli.emulated_calibration import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
+from shearloop.daemon.control.controller import TwistController
 from shearloop.daemon.control.loop_inputs import Creep, LoopConfig
 from shearloop.daemon.control.margins import margin_refusal
+from shearloop.daemon.run_summary import BAND
 from shearloop.daemon.synthetic_frames import RigFrames
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.emulators.gripper import Gripper
@@ -34,7 +36,6 @@ from shearloop.drivers.emulators.scene import Joint, Scene, Twin, TwinSettings
 PlantOf = Callable[[sim.SimulatedSensor, np.random.Generator], sim.Plant]
 
 TARGET_NM = 0.10
-BAND = 0.10
 # The stiffness of possible gels; the emulated rig's is 0.8.
 GEL_NM_PER_RAD = (0.5, 1.1)
 # A stiff gel needs less travel for its identification.
@@ -44,6 +45,8 @@ TWIN_SCENARIOS = tuple(replace(one, excite=replace(one.excite, amplitude_rad=AMP
 GRIP_FORCE_N = 60.0
 # The recording for the creep's calibration: ten twists of 40 s and the rests between them.
 CREEP_S = 600.0
+# Kicks while the torque is held, the time that each gets, and the torque that is left after a slip.
+KICKS_NM, KICKED_S, SLIPS_TO_NM = (-0.03, 0.03), 10.0, 0.02
 # As config/experiments/tighten.yaml.
 TIGHTEN_NM, TIGHTEN_RAD_PER_S = 0.12, 0.05
 DIAMETER_MM = 25.0
@@ -130,24 +133,40 @@ class RigPlant(sim.Plant):
         self.outside_interval += not estimate.torque_low_nm <= true_nm <= estimate.torque_high_nm
         self._samples.append(sim.PlantSample(estimate.torque_nm, t_mid_s, self.t_s + self.sensor.transfer_s))
 
+    def disturb(self, controller: TwistController) -> tuple[list[float], float]:
+        """Kick the held torque, then let the tool slip; return how long each took to come back, and to be found, in s.
 
-def step(plant: sim.Plant, scenario: sim.LoopScenario) -> tuple[FloatArray, bool]:
-    """Identify the tool and step to TARGET_NM; return the true torques, and whether the margins were refused."""
+        Infinite where that did not happen. The kicks come at different times within a frame.
+        """
+        back_s = []
+        for kick_nm in KICKS_NM:
+            sim.run(self, controller, float(self.rng.uniform(0.0, FRAME_PERIOD_S)))
+            self.scene.kick(kick_nm)
+            back_s.append(sim.back_after_s(sim.run(self, controller, KICKED_S), TARGET_NM))
+        self.scene.slip(SLIPS_TO_NM)
+        slipped_s = self.t_s
+        while not controller.filter.lost and self.t_s < slipped_s + KICKED_S:
+            sim.run(self, controller, self.period_s)
+        return back_s, self.t_s - slipped_s if controller.filter.lost else np.inf
+
+
+def step(plant: sim.Plant, scenario: sim.LoopScenario) -> tuple[FloatArray, bool, TwistController]:
+    """Identify the tool and step to TARGET_NM; return the true torques, whether the margins refuse, the controller."""
     found = sim.identified(plant, scenario)
     settings = sim.settings_for(found, scenario)
     controller = sim.started_controller(plant, found, settings)
-    while controller.estimator.innovation_nm is None:
+    while controller.filter.fresh_ns is None:
         sim.run(plant, controller, plant.period_s)
     controller.set_point(TARGET_NM)
     refused = margin_refusal(settings, found, LoopConfig()) is not None
-    return sim.run(plant, controller, scenario.hold_s).torque_nm, refused
+    return sim.run(plant, controller, scenario.hold_s).torque_nm, refused, controller
 
 
 def steps(scenario: sim.LoopScenario, seeds: int, plant_of: PlantOf) -> dict[str, float]:
     """Return the figures of merit of the true torque after the step, over many seeds."""
     rows, refused = [], 0
     for seed in range(seeds):
-        torque_nm, is_refused = step(plant_of(scenario.sensor, np.random.default_rng((20, seed))), scenario)
+        torque_nm, is_refused, _ = step(plant_of(scenario.sensor, np.random.default_rng((20, seed))), scenario)
         rows.append(torque_nm)
         refused += is_refused
     return judge_steps(rows, scenario.settled_s) | {"refused_by_margins": refused}
@@ -238,18 +257,25 @@ def rig_calibration(bank: Path, seed: int) -> Calibration:
 def estimator_in_the_loop(bank: Path, calibration: Calibration, seeds: Sequence[int]) -> dict[str, float]:
     """Return the figures of merit of a step driven by the default estimator."""
     scenario = replace(TWIN_SCENARIOS[0], hold_s=30.0)
-    rows, plants = [], []
+    rows, plants, back_s, found_s = [], [], [], []
     for seed in seeds:
         plant = RigPlant(
             sim.SimulatedTool(), sim.EIT, np.random.default_rng((30, seed)),
             frames=RigFrames(bank, seed), tracker=EstimatorSession(calibration),
         )  # fmt: skip
-        rows.append(step(plant, scenario)[0])
+        torque_nm, _, controller = step(plant, scenario)
+        rows.append(torque_nm)
         plants.append(plant)
+        back, found = plant.disturb(controller)
+        back_s += back
+        found_s.append(found)
     estimated, not_valid = sum(one.estimated for one in plants), sum(one.not_valid for one in plants)
     return judge_steps(rows, scenario.settled_s) | {
         "not_valid_share": not_valid / (estimated + not_valid),
         "coverage_95": 1.0 - sum(one.outside_interval for one in plants) / estimated if estimated else np.nan,
+        "kick_back_s_median": float(np.median(back_s)),
+        "kick_back_s_worst": max(back_s),
+        "slip_found_s_worst": max(found_s),
     }
 
 

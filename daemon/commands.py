@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
+from shearloop.daemon.control.runner import loop_state
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
 from shearloop.daemon.rig import Rig
@@ -13,6 +14,8 @@ from shearloop.daemon.sensors import Sensors
 from shearloop.daemon.supervisor import HealthReporter
 
 STOP_DELAY_S = 0.05
+# What `status` shows of `loop.state`.
+LOOP_KEYS = ("phase", "experiment", "step", "steps", "step_name", "activity", "progress", "reasons")
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +93,11 @@ class Commands:
         return {"set": names, "heatmap": heatmap}
 
     async def _status(self, _request: Request) -> Reply:
-        return {"tasks": self.health.tasks()}
+        tasks = self.health.tasks()
+        if self.rig is None:
+            return {"tasks": tasks}
+        state = loop_state(self.rig.control_loop, 0.0, 0)
+        return {"tasks": tasks, "loop": {key: getattr(state, key) for key in LOOP_KEYS}}
 
     async def _stop(self, request: Request) -> Reply:
         stopped = self.rig.stop() if self.rig is not None else ""

@@ -9,6 +9,7 @@ from shearloop.daemon.errors import UserError, require
 NAMES = {
     "speed-accuracy": "latency against torque error of every estimator, forward methods, and the loop's window",
     "stability": "every estimator as faults grow (bias, spread, valid, false-valid), continuity, the loop on the skin",
+    "loop": "a torque that is held and kicked, with and without the torque filter; no recordings",
     "scene": "how much model, bank and board the recording's noise asks for",
 }
 
@@ -32,12 +33,15 @@ def run(args: argparse.Namespace) -> int:
     """Draw one chart and print its paths."""
     _check_arguments(args)
     require("matplotlib", "plot", "a chart")
-    from shearloop.daemon.analysis.charts import scene, speed_accuracy, stability
+    from shearloop.daemon.analysis.charts import scene, simulated_loop, speed_accuracy, stability
     from shearloop.daemon.analysis.charts.drawing import check_takes_pictures
     from shearloop.daemon.analysis.charts.sources import bank_of, mesh_of, splits
     from shearloop.daemon.executors import open_executor
 
     check_takes_pictures(args.out)
+    if args.name == "loop":
+        print(*simulated_loop.chart(args.out), sep="\n")
+        return 0
     scratch = args.out / "banks"
     parts = splits(args.recordings, args.split, scratch)
     with open_executor(args.cluster, args.jobs) as executor:
@@ -62,5 +66,7 @@ def _check_arguments(args: argparse.Namespace) -> None:
     checked_jobs(args.jobs)
     if args.name == "speed-accuracy" and (args.cluster is not None or args.jobs not in (None, 1)):
         raise UserError("speed-accuracy measures times, one thread on this machine: leave out --cluster and --jobs")
+    if args.name == "loop" and args.recordings:
+        raise UserError(f"loop is a simulation: leave out {args.recordings[0]}")
     if args.name == "scene" and (args.bank is not None or args.mesh is not None):
         raise UserError("scene chooses mesh and bank itself, on the paper's fingertip: leave out --bank and --mesh")

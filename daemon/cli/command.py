@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from shearloop.daemon.cli.options import add_connection, add_option, client_keys
-from shearloop.daemon.cli.terminal import table, task_row
+from shearloop.daemon.cli.terminal import loop_line, table, task_row
 from shearloop.daemon.messaging import addresses
 
 COMMANDS = {
     "tare": "set the zero of the torque sensors, with nothing gripped and no experiment running",
-    "status": "show the state of each task",
+    "status": "show the experiment and the state of each task",
     "start": "start an experiment",
     "pause": "hold the arm until `resume`; moving fingers finish their move",
     "resume": "continue after `pause`",
@@ -87,9 +87,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
-    """Return an accepted reply as text: the tasks of `status` as a table."""
+    """Return an accepted reply as text: of `status` the experiment, and the tasks as a table."""
     if name == "status":
         rows = [task_row(task, facts) for task, facts in reply["tasks"].items()]
-        return table(("task", "state", "rate", "notes"), rows)
+        loop = [loop_line("", reply["loop"]), ""] if "loop" in reply else []
+        return [*loop, *table(("task", "state", "rate", "notes"), rows)]
     values = {key: ", ".join(value) if isinstance(value, list) else value for key, value in reply.items()}
     return [f"{name}: {', '.join(f'{key} {value}' for key, value in values.items() if value) or 'done'}"]

@@ -79,7 +79,7 @@ class StatusLine:
     def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
         """Take one message; redraw after those that it shows."""
         if topic == "loop.state":
-            self._state = _loop(topic, content)
+            self._state = loop_line(topic, content)
             self._driving = content["torque_source"]
         elif topic in ("eit.estimate", "load.torque", "skin.shear") and content["source"] == self._driving:
             torque_nm = content["torque_nm"] if content["valid"] else None
@@ -185,15 +185,15 @@ def _shear(_: str, content: Mapping[str, Any]) -> str:
     return f"shear {content['shear_n']:+.3f} N {interval}{torque}   response {content['response']:+.5f}   {direction}"
 
 
-def _loop(_: str, content: Mapping[str, Any]) -> str:
+def loop_line(_: str, content: Mapping[str, Any]) -> str:
     """Return phase, step, activity, progress, and the reasons for holding."""
     if not content["experiment"]:
         return f"{content['phase']}: {content['reasons']}" if content["reasons"] else str(content["phase"])
     step = f"step {content['step']} of {content['steps']} {content['step_name']}"
-    percent = f"{100 * content['progress']:.0f} %"
+    percent = "" if content["phase"] == "stopped" else f" {100 * content['progress']:.0f} %"
     activity = content["activity"] or content["experiment"]
     reasons = f": {content['reasons']}" if content["reasons"] and content["reasons"] != activity else ""
-    return f"{content['phase']} {percent}  {step}  {activity}{reasons}"
+    return f"{content['phase']}{percent}  {step}  {activity}{reasons}"
 
 
 def _health(_: str, content: Mapping[str, Any]) -> str:
@@ -255,4 +255,4 @@ def _value(value: object) -> str:
     return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
-_BODIES = {"eit.estimate": _estimate, "skin.shear": _shear, "loop.state": _loop, "health": _health}
+_BODIES = {"eit.estimate": _estimate, "skin.shear": _shear, "loop.state": loop_line, "health": _health}

@@ -2,7 +2,7 @@
 
 The tool in the grip is a torsion spring on a wrist with a known angle: torque = K·(θ − θ₀) + d. The offset d takes in
 all that the spring does not explain (relaxation, hysteresis, slip, a wrong K). Only d is learnt from the torque sensor
-(`OffsetEstimator`); the rest is known without delay.
+(`TorqueFilter`); the rest is known without delay.
 
 - A measurement y belongs to a past time t_mid (an EIT frame: the middle of its acquisition). It is compared with the
   torque expected *at that time*: ν = y − K·(mean of θ over the acquisition − θ₀) − d. It is the delay compensator, the
@@ -11,6 +11,11 @@ all that the spring does not explain (relaxation, hysteresis, slip, a wrong K). 
   a dropped frame only postpones the next correction, and clipped commands or a slow wrist are no modelling error.
 - A PI controller in incremental form takes ν up into d: i ← i + ki·ν, d ← d + kp·ν + i. (An α-β filter, the steady
   Kalman filter of a drifting offset: Kalata 1984.) i is the drift of the torque at a fixed angle.
+- kp is the least gain. Where the noise σ and the error of K (σ_K) allow more, the gain is the Kalman filter's,
+  s²/(s² + σ²), with s² = p·σ² + σ_K²·(θ − θ_d)². So d is a weighted mean of measurements: θ_d is the same mean of their
+  angles, and p the sum of the squared weights. s² is the variance of the filtered torque at θ.
+- After a jump, which two CUSUM tests of ν detect, d restarts from the mean of the measurements since then. The jump
+  began where its likelihood is greatest (Willsky & Jones, IEEE Trans. Automatic Control 21, 1976).
 - The wrist is driven to the angle at which the expected torque equals the ramp r: speed = bandwidth·(r − torque)/K,
   with feed-forward of the ramp, ṙ/K.
 
@@ -24,6 +29,7 @@ from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
+from statistics import fmean
 from typing import Annotated
 
 from pydantic import ConfigDict, Field, model_validator
@@ -36,11 +42,13 @@ from shearloop.daemon.errors import UserError
 LONGEST_STEP_NS = 50_000_000
 # A rest ends at the deadband, a motion at this share of it: the hysteresis keeps noise from toggling the two.
 _SETTLED_SHARE = 0.1
-# CUSUM test for jumps (Page 1954), in standard deviations: the slack per innovation and the threshold of the sum. It
-# detects a lasting 2.5 sigma within four measurements; noise alone triggers it once in some 20 000.
-_JUMP_SLACK, _JUMP_SUM = 1.0, 4.5
-# After a jump the offset counts as known from this many measurements: the gain restarts at 1/4.
-_KNOWN_AFTER_JUMP = 3.0
+# CUSUM test for jumps, in standard deviations: the slack per innovation, the threshold of the sum, and the bound of an
+# innovation, which keeps one wild value below the threshold.
+_JUMP_SLACK, _JUMP_SUM, _JUMP_BOUND = 1.2, 5.0, 5.0
+# The offset restarts from at most this many measurements after a jump.
+_MOST_SINCE_JUMP = 5
+# Stands for no measurement at all.
+_UNKNOWN = 1e-6
 # A drift is extrapolated over at most this many dropped measurements.
 _MOST_MISSED = 4
 
@@ -51,6 +59,8 @@ class ControllerSettings:
 
     # Of the tool in the grip, as identified: torque over wrist angle.
     stiffness_nm_per_rad: Positive
+    # Its standard deviation.
+    stiffness_std_nm_per_rad: NotNegative = 0.0
     # Of the driving torque: how often it comes, and how long one measurement averages.
     sample_period_s: Positive
     window_s: Annotated[float, Field(ge=0, le=60)]
@@ -163,8 +173,30 @@ class AngleHistory:
         return angle if to_ns == from_ns else (integral - until_now) / (to_ns - from_ns)
 
 
-class OffsetEstimator:
-    """Learns the tool's offset from late torques: the torque at every wrist angle. Times are CLOCK_MONOTONIC ns."""
+class JumpDetector:
+    """Two CUSUM tests (Page 1954) for a lasting jump of the torque, one for each direction."""
+
+    def __init__(self) -> None:
+        self._sums = [0.0, 0.0]
+        # The latest offsets since each sum was 0, which is where a jump would have begun.
+        self._offsets_nm: list[list[float]] = [[], []]
+
+    def add(self, innovation_sigmas: float, offset_nm: float) -> list[float]:
+        """Take an innovation in standard deviations, and its offset; return the latest offsets of a jump, else []."""
+        bounded = max(-_JUMP_BOUND, min(_JUMP_BOUND, innovation_sigmas))
+        for number, deviation in enumerate((bounded, -bounded)):
+            self._sums[number] = max(self._sums[number] + deviation - _JUMP_SLACK, 0.0)
+            since_nm = [*self._offsets_nm[number], offset_nm] if self._sums[number] else []
+            self._offsets_nm[number] = since_nm[-_MOST_SINCE_JUMP:]
+        if max(self._sums) <= _JUMP_SUM:
+            return []
+        jumped = self._offsets_nm[self._sums.index(max(self._sums))]
+        self._sums, self._offsets_nm = [0.0, 0.0], [[], []]
+        return jumped
+
+
+class TorqueFilter:
+    """Fuses wrist angles, stiffness and late torques into one torque with its variance. Times: CLOCK_MONOTONIC ns."""
 
     def __init__(
         self, settings: ControllerSettings, t_ns: int, angle_rad: float, torque_nm: float, known_measurements: float
@@ -172,7 +204,6 @@ class OffsetEstimator:
         """Begin at a wrist angle and its torque, known as well as the mean of `known_measurements`."""
         self.offset_nm = torque_nm
         self.creep_nm = 0.0  # per measurement
-        self.innovation_nm: float | None = None
         # The arrival of the latest measurement.
         self.fresh_ns: int | None = None
         # The torque at a fixed angle has moved too far since the reference.
@@ -180,16 +211,23 @@ class OffsetEstimator:
         span_s = settings.age_limit_s + settings.window_s + settings.lag_s
         self.angles = AngleHistory(int(1e9 * (span_s + 1.0)))
         self.angles.add(t_ns, angle_rad)
+        self.origin_rad = angle_rad
         self._settings = settings
         self._reference_nm = torque_nm
-        self.origin_rad = angle_rad
-        self._known = known_measurements
-        self._sums = 0.0, 0.0
+        # The offset is a weighted mean of measurements: its variance in that of one, and the mean of their angles.
+        self._mean = 1.0 / max(known_measurements, _UNKNOWN), angle_rad
+        self._jumps = JumpDetector()
         self._t_mid_ns = t_ns
 
     def expected_nm(self, angle_rad: float) -> float:
         """Return the tool's torque at a wrist angle."""
         return self._settings.stiffness_nm_per_rad * (angle_rad - self.origin_rad) + self.offset_nm
+
+    def std_nm(self, angle_rad: float) -> float:
+        """Return the standard deviation of `expected_nm` that noise and the stiffness's error cause."""
+        variance, mean_rad = self._mean
+        from_noise_nm = math.sqrt(variance) * self._settings.noise_nm
+        return math.hypot(from_noise_nm, self._settings.stiffness_std_nm_per_rad * (angle_rad - mean_rad))
 
     def restart(self) -> None:
         """Take the present offset as the reference: a grip that slipped may slip as far again before the next hold."""
@@ -218,28 +256,39 @@ class OffsetEstimator:
         missed = min(round((t_mid_ns - self._t_mid_ns) * 1e-9 / own.sample_period_s) - 1, _MOST_MISSED)
         if self.fresh_ns is not None and missed > 0:
             self.offset_nm += self.creep_nm * missed
-        self.innovation_nm = torque_nm - self.expected_nm(angle)
-        bounded = max(-own.innovation_limit_nm, min(own.innovation_limit_nm, self.innovation_nm))
-        if own.noise_nm and self.has_jumped(bounded / own.noise_nm):
-            self._known = min(self._known, _KNOWN_AFTER_JUMP)
-        self._known += 1.0
-        gain = max(own.kp, 1.0 / self._known)
-        if gain == own.kp and integrates:
-            most = own.creep_limit_nm_per_s * own.sample_period_s
-            self.creep_nm = max(-most, min(most, self.creep_nm + own.ki * bounded))
-        self.offset_nm += gain * bounded + self.creep_nm
+        self._correct(torque_nm - self.expected_nm(angle), angle, integrates=integrates)
         self.lost |= abs(self.offset_nm - self._reference_nm) > own.offset_limit_nm
         self._t_mid_ns, self.fresh_ns = t_mid_ns, t_ns
         return None
 
-    def has_jumped(self, innovation_sigmas: float) -> bool:
-        """Update the two CUSUMs; return whether one exceeds the threshold, and reset both in that case."""
-        up, down = self._sums
-        up = max(up + innovation_sigmas - _JUMP_SLACK, 0.0)
-        down = max(down - innovation_sigmas - _JUMP_SLACK, 0.0)
-        jumped = max(up, down) > _JUMP_SUM
-        self._sums = (0.0, 0.0) if jumped else (up, down)
-        return jumped
+    def _correct(self, innovation_nm: float, angle_rad: float, *, integrates: bool) -> None:
+        """Correct the offset by an innovation at a mean angle: by its Kalman gain, or all of it after a jump."""
+        own = self._settings
+        variance, mean_rad = self._mean
+        if own.noise_nm:
+            uncertain = variance + (own.stiffness_std_nm_per_rad * (angle_rad - mean_rad) / own.noise_nm) ** 2
+            sigmas = innovation_nm / (own.noise_nm * math.sqrt(1.0 + uncertain))
+            if jumped := self._jumps.add(sigmas, self.offset_nm + innovation_nm):
+                self._jump(jumped, angle_rad)
+                return
+        else:
+            uncertain = variance
+        gain = max(own.kp, uncertain / (1.0 + uncertain))
+        bounded = max(-own.innovation_limit_nm, min(own.innovation_limit_nm, innovation_nm))
+        if gain == own.kp and integrates:
+            most = own.creep_limit_nm_per_s * own.sample_period_s
+            self.creep_nm = max(-most, min(most, self.creep_nm + own.ki * bounded))
+        self.offset_nm += gain * bounded + self.creep_nm
+        self._mean = (1.0 - gain) ** 2 * variance + gain**2, mean_rad + gain * (angle_rad - mean_rad)
+
+    def _jump(self, offsets_nm: list[float], angle_rad: float) -> None:
+        """Restart from the mean of the latest offsets, as many as most likely came after the jump."""
+
+        def sigmas(count: int) -> float:
+            return math.sqrt(count) * abs(fmean(offsets_nm[-count:]) - self.offset_nm)
+
+        count = max(range(1, len(offsets_nm) + 1), key=sigmas)
+        self.offset_nm, self._mean = fmean(offsets_nm[-count:]), (1.0 / count, angle_rad)
 
 
 class TwistController:
@@ -261,8 +310,8 @@ class TwistController:
         if not (math.isfinite(angle_rad) and math.isfinite(torque_nm) and known_measurements >= 0.0):
             raise UserError("controller: it cannot start without a wrist angle and a torque that are numbers")
         self.settings = settings
-        self.estimator = OffsetEstimator(settings, t_ns, angle_rad, torque_nm, known_measurements)
-        # The expected torque at the latest command.
+        self.filter = TorqueFilter(settings, t_ns, angle_rad, torque_nm, known_measurements)
+        # The filtered torque at the latest command.
         self.torque_nm = torque_nm
         self._held = self._moving = False
         # None before the first set point.
@@ -274,6 +323,11 @@ class TwistController:
         # Less was sent than was wanted; nothing is integrated then.
         self._clipped = False
 
+    @property
+    def torque_std_nm(self) -> float:
+        """The standard deviation of the filtered torque at the latest command."""
+        return self.filter.std_nm(self._angle_rad)
+
     def set_point(self, torque_nm: float) -> None:
         """Change the set point; the ramp continues, or begins at the present torque.
 
@@ -284,7 +338,7 @@ class TwistController:
             raise UserError(f"controller: a set point of {torque_nm:g} N·m is not within the limit of {limit:g} N·m")
         self.set_point_nm = torque_nm
         if self.ramp_nm is None:
-            self.ramp_nm = self.estimator.expected_nm(self._angle_rad)
+            self.ramp_nm = self.filter.expected_nm(self._angle_rad)
 
     def hold(self) -> None:
         """Hold the wrist until `resume`; measurements are still used."""
@@ -293,12 +347,12 @@ class TwistController:
     def resume(self) -> None:
         """Continue after a hold; the ramp restarts at the present torque."""
         self._held = False
-        self.estimator.restart()
+        self.filter.restart()
         self._rest()
 
     def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> ControllerRefusal | None:
         """Use a torque of the time t_mid_ns that arrived at t_ns; return why it was rejected, or None."""
-        return self.estimator.measure(torque_nm, t_mid_ns, t_ns, integrates=not self._clipped)
+        return self.filter.measure(torque_nm, t_mid_ns, t_ns, integrates=not self._clipped)
 
     def command(self, t_ns: int, wrist_angle_rad: float, torques: Iterable[TorqueSample] = ()) -> WristCommand:
         """Return the wrist speed for now, from the angle that the robot reports (NaN: unknown) and new torques.
@@ -306,7 +360,7 @@ class TwistController:
         The torques come after the angle, which their windows need, and before the decision. The speed is 0 while
         anything forbids motion, and never exceeds the limit. It counts as sent until `sent` corrects it.
         """
-        own, tool = self.settings, self.estimator
+        own, tool = self.settings, self.filter
         elapsed_s = min(max(t_ns - self._t_ns, 0), LONGEST_STEP_NS) / 1e9
         self._t_ns = max(t_ns, self._t_ns)
         reasons = []
@@ -365,7 +419,7 @@ class TwistController:
         turning = abs(self._sent) if speed * self._sent > 0.0 else 0.0
         fastest = turning + own.acceleration_limit_rad_per_s2 * elapsed_s
         # Slow down towards the limit of the travel, so that one period does not overshoot it.
-        travel = self._angle_rad - self.estimator.origin_rad
+        travel = self._angle_rad - self.filter.origin_rad
         room = max(own.travel_limit_rad - travel * math.copysign(1.0, speed), 0.0)
         brakeable = own.wrist_bandwidth_per_s * room
         if min(abs(speed), fastest) > brakeable:

@@ -10,6 +10,8 @@ the corrections (D₀ for the window that the compensator assumes, D₁ for the 
 
     compensated    (1 − x) + P·(x + ρ·D₁ − D₀) = 0        (exact model, ρ = 1 and D₁ = D₀: 1 − x + P·x = 0, no delay)
     uncompensated  (1 − x) + P·ρ·D₁ = 0
+
+kp and ki are the filter's steady gains. Its greater gains after a start, a turn or a jump last for some measurements.
 """
 
 import math

@@ -161,6 +161,7 @@ def controller_settings(
     kp = config.kp if config.kp is not None else gain_for_noise(found.noise_nm, config.allowed_noise_nm)
     return ControllerSettings(
         stiffness_nm_per_rad=found.stiffness_nm_per_rad,
+        stiffness_std_nm_per_rad=found.stiffness_std,
         sample_period_s=found.sample_period_s,
         window_s=source.window_s,
         lag_s=max(found.significant_lag_s, 0.0),

@@ -74,3 +74,5 @@ def test_the_default_estimator_holds_a_torque_on_both_fingertips(bank):
     assert figures["overshoot_worst_seed"] < 0.2
     assert figures["not_valid_share"] < 0.02
     assert figures["coverage_95"] > 0.9
+    assert figures["kick_back_s_worst"] <= 3.0
+    assert figures["slip_found_s_worst"] <= 3.0

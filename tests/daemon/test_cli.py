@@ -25,7 +25,7 @@ from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import COMMANDS, main
 from shearloop.daemon.cli.bank import MODEL_NAMES
 from shearloop.daemon.cli.completion import full_parser
-from shearloop.daemon.cli.terminal import StatusLine, message_json, message_line, table, task_row
+from shearloop.daemon.cli.terminal import StatusLine, loop_line, message_json, message_line, table, task_row
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.runner import WRENCH
 from shearloop.daemon.messaging.messages import EitEstimate, RobotStateMessage, decode, encode, wire_map
@@ -61,7 +61,15 @@ def test_a_calibration_without_torques_cannot_drive_the_loop(command, config, ti
     steps = {"name": "one", "torque_source": "right", "steps": [{"do": "wait", "wait_s": 1}]}
     (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(steps))
     said = mistake(capsys, command, str(config(fingertips=section, robot="ur.yaml", experiment="experiment.yaml")))
-    assert "`torque_source: right` has a calibration without torques" in said
+    assert "torque_source: `right` has a calibration without torques" in said
+
+
+def test_a_bank_that_is_not_built_hides_no_mistake_of_the_experiment(config, tmp_path, capsys):
+    (tmp_path / "experiment.yaml").write_text("name: one\nsteps: [{do: wiat}]\n")
+    section = {"right": {"device": {"path": "eit"}, "bank": "none.bank"}}
+    said = mistake(capsys, "check", str(config(fingertips=section, robot="ur.yaml", experiment="experiment.yaml")))
+    assert "none.bank: the bank cannot be read" in said
+    assert "steps[0].do: 'wiat' does not exist" in said
 
 
 @pytest.mark.parametrize("command", ["run", "check"])
@@ -307,6 +315,8 @@ def test_the_status_line_is_redrawn_in_place():
     _, starting, *shown, end = out.getvalue().split("\r\x1b[K")
     running = "running 50 %  step 2 of 3 grip  closing"
     assert (starting, shown, end) == ("starting", [running, f"{running}   right +0.100 N·m", running], "")
+    stopped = {**state, "phase": "stopped", "activity": "the operator stopped it"}
+    assert loop_line("loop.state", stopped) == "stopped  step 2 of 3 grip  the operator stopped it"
 
 
 def test_invalid_emulators_and_recordings_are_refused_before_the_start(config, tmp_path, capsys):

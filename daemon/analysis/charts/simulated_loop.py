@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -21,6 +22,7 @@ from shearloop.daemon.control.identification import ExciteSettings, StiffnessExc
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
 from shearloop.daemon.control.margins import integral_gain
 from shearloop.daemon.control.wrist_controller import controller_settings
+from shearloop.daemon.run_summary import BAND, STAYS_S
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 
 PERIOD_S = 0.008
@@ -225,6 +227,17 @@ class Trace:
     angle_rad: FloatArray
 
 
+def back_after_s(trace: Trace, target_nm: float) -> float:
+    """Return the time until the torque comes into its band for STAYS_S at least; infinite if it does not."""
+    outside = np.flatnonzero(np.abs(trace.torque_nm / target_nm - 1.0) > BAND)
+    came = np.concatenate([[0], outside + 1])
+    left_s = np.append(trace.t_s[outside], trace.t_s[-1])
+    stays = [
+        at for at, end_s in zip(came, left_s, strict=True) if at < len(trace.t_s) and end_s - trace.t_s[at] >= STAYS_S
+    ]
+    return float(trace.t_s[stays[0]] - trace.t_s[0]) if stays else np.inf
+
+
 def nanoseconds(time_s: float) -> int:
     """Return a simulated time in the controller's unit."""
     return round(time_s * 1e9)
@@ -403,13 +416,16 @@ def _averaged_loop(
             age_limit_s=settings.age_limit_s + frames * found.sample_period_s,
         )  # fmt: skip
     if name == LOOPS[1]:
-        late = UncompensatedController(
-            stiffness_nm_per_rad=settings.stiffness_nm_per_rad, kp=settings.kp, ki=settings.ki,
-            wrist_bandwidth_per_s=settings.wrist_bandwidth_per_s, ramp_nm_per_s=settings.ramp_nm_per_s,
-            speed_limit_rad_per_s=settings.speed_limit_rad_per_s,
-        )  # fmt: skip
-        return _AveragedLoop(late, latest)
+        return _AveragedLoop(_uncompensated(settings), latest)
     return _AveragedLoop(started_controller(plant, found, settings), latest)
+
+
+def _uncompensated(settings: ControllerSettings) -> UncompensatedController:
+    return UncompensatedController(
+        stiffness_nm_per_rad=settings.stiffness_nm_per_rad, kp=settings.kp, ki=settings.ki,
+        wrist_bandwidth_per_s=settings.wrist_bandwidth_per_s, ramp_nm_per_s=settings.ramp_nm_per_s,
+        speed_limit_rad_per_s=settings.speed_limit_rad_per_s,
+    )  # fmt: skip
 
 
 def _rms_error(plant: Plant, loop: _AveragedLoop) -> float:
@@ -424,3 +440,58 @@ def _rms_error(plant: Plant, loop: _AveragedLoop) -> float:
         if t_s >= _SETTLING_S:
             squares, n = squares + float(((torque - wanted) ** 2).sum()), n + len(torque)
     return float(np.sqrt(squares / n))
+
+
+# The loops of the chart of a kicked torque.
+HELD_LOOPS = ("torque filter", "constant gain", "latest estimates alone")
+# One frame's noise, as of the default estimator on both fingertips of the emulated rig.
+_FRAME_NOISE_NM = 0.005
+_KICK_NM, _KICK_AT_S, _KICKED_S = -0.03, 15.0, 15.0
+
+
+def held_loops(seeds: int) -> dict[str, list[tuple[Trace, Trace]]]:
+    """Return each loop's step to 0.10 N·m, and what follows a kick, for every seed."""
+    scenario = replace(SCENARIOS[0], sensor=replace(EIT, noise_nm=_FRAME_NOISE_NM))
+    held: dict[str, list[tuple[Trace, Trace]]] = {name: [] for name in HELD_LOOPS}
+    for seed in range(seeds):
+        gripped, found = _identified_plant(scenario, seed)
+        settings = settings_for(found, scenario)
+        # Without the noise, the filter has one gain and no test for jumps.
+        steady = replace(settings, noise_nm=0.0)
+        for name in HELD_LOOPS:
+            plant = copy.deepcopy(gripped)
+            loop: TwistController | UncompensatedController = _uncompensated(settings)
+            if name != HELD_LOOPS[2]:
+                loop = started_controller(plant, found, settings if name == HELD_LOOPS[0] else steady)
+            loop.set_point(_TARGET_NM)
+            before = run(plant, loop, _KICK_AT_S)
+            plant.disturbance_nm = _KICK_NM
+            held[name].append((before, run(plant, loop, _KICKED_S)))
+    return held
+
+
+def chart(out: Path, seeds: int = 20) -> list[Path]:
+    """Measure, draw and write `loop`: a torque that is held and kicked, with and without the torque filter."""
+    from shearloop.daemon.analysis.charts import drawing
+
+    made = drawing.figure(12.0, 4.4)
+    content = {}
+    for axes, (name, rows) in zip(made.subplots(1, 3, sharey=True), held_loops(seeds).items(), strict=True):
+        settled_nm = [one.torque_nm[one.t_s >= one.t_s[0] + SCENARIOS[0].settled_s] for one, _ in rows]
+        share = float(np.mean(np.abs(np.concatenate(settled_nm) / _TARGET_NM - 1.0) <= BAND))
+        back_s = [back_after_s(after, _TARGET_NM) for _, after in rows]
+        content[name] = {"time_in_band": share, "kick_back_s": back_s}
+        for before, after in rows:
+            t_s = np.concatenate([before.t_s, after.t_s]) - before.t_s[0]
+            torque_nm = np.concatenate([before.torque_nm, after.torque_nm])
+            axes.plot(t_s, torque_nm, color=drawing.SHADES[1], lw=0.7, alpha=0.6)
+        axes.axhspan(_TARGET_NM * (1.0 - BAND), _TARGET_NM * (1.0 + BAND), color=drawing.SHADES[3], alpha=0.2, lw=0)
+        axes.axvline(_KICK_AT_S, color="black", lw=1, ls=":")
+        returns = f"back after {np.median(back_s):.1f} s, worst {max(back_s):.1f} s"
+        axes.set_title(f"{name}\n{share:.1%} in the band; {returns}", fontsize=10)
+        axes.set_xlabel("time, s")
+        axes.grid(alpha=0.25)
+    made.axes[0].set_ylabel("true torque, N·m")
+    kicked = f"{_TARGET_NM:g} N·m held within ± {BAND:.0%}, kicked by {_KICK_NM:g} N·m at the dotted line"
+    made.suptitle(f"{kicked}; {seeds} seeds")
+    return drawing.save(made, content, out, "loop")

@@ -12,8 +12,12 @@ export function show(element, shown) {
   if (element.hidden === shown) element.hidden = !shown;
 }
 
+// What is normal between a tare and the first torque of a grip, not a fault.
+const WAITING = /^(no \w+: |not valid: )?(no grip|gripped too recently|taking the homogeneous frame|there is no earlier frame)/;
+
 export function warn(element, sentence) {
   put(element, sentence);
+  element.classList.toggle("waiting", WAITING.test(sentence));
   show(element, sentence !== "");
 }
 

@@ -1,16 +1,22 @@
 """The simulated plant, and the twist controller on it."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from shearloop.daemon.analysis.charts.simulated_loop import (
+    HELD_LOOPS,
     LOAD_CELL,
+    PERIOD_S,
     SCENARIOS,
     Plant,
     SimulatedSensor,
     SimulatedTool,
+    Trace,
+    back_after_s,
+    chart,
     identified,
     nanoseconds,
     run,
@@ -64,10 +70,30 @@ def test_a_slipping_grip_ends_in_a_held_wrist():
     found = identified(plant, scenario)
     plant.tool = replace(plant.tool, slip_nm=0.06)
     controller = started_controller(plant, found, settings_for(found, scenario))
-    while controller.estimator.innovation_nm is None:
+    while controller.filter.fresh_ns is None:
         run(plant, controller, plant.period_s)
     controller.set_point(0.10)
     trace = run(plant, controller, scenario.hold_s)
-    assert controller.estimator.lost
+    assert controller.filter.lost
     assert trace.angle_rad[-1] == trace.angle_rad[-100]
     assert np.ptp(trace.angle_rad) < (0.1 + 0.06 + 0.01) / 0.2
+
+
+@pytest.mark.parametrize(
+    ("away", "held", "away_again", "held_again", "steps"),
+    [(0, 130, 0, 0, 0), (10, 130, 0, 0, 10), (10, 120, 10, 130, 140), (0, 120, 10, 0, np.inf)],
+)
+def test_a_torque_is_back_when_it_stays_for_a_second(away, held, away_again, held_again, steps):
+    torque_nm = np.repeat([0.0, 0.1, 0.0, 0.1], [away, held, away_again, held_again])
+    trace = Trace(5.0 + PERIOD_S * np.arange(len(torque_nm)), torque_nm, torque_nm)
+    assert back_after_s(trace, 0.1) == pytest.approx(steps * PERIOD_S)
+
+
+def test_the_chart_shows_that_the_torque_filter_brings_a_kicked_torque_back_sooner(tmp_path):
+    paths = chart(tmp_path, seeds=3)
+    assert [path.name for path in paths] == ["loop.json", "loop.svg", "loop.png"]
+    found = json.loads(paths[0].read_text())
+    assert tuple(found) == HELD_LOOPS
+    with_filter, without, _ = (one["kick_back_s"] for one in found.values())
+    assert max(with_filter) <= 2.5
+    assert max(with_filter) < min(without)

@@ -49,7 +49,7 @@ class Bench:
 
     def seen_rad(self) -> float:
         """Return the mean angle of the half second that has ended 50 ms ago, NaN where it is not known."""
-        mean = self.controller.estimator.angles.mean(self.t_ns - 550_000_000, self.t_ns - 50_000_000)
+        mean = self.controller.filter.angles.mean(self.t_ns - 550_000_000, self.t_ns - 50_000_000)
         return math.nan if mean is None else mean
 
     def measured_for(self, seconds: float, stiffness: float = 0.25, origin_rad: float = 0.3) -> list[float]:

@@ -10,6 +10,7 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase, GripTo
 from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, TareStep
 from shearloop.daemon.control.loop_inputs import TorqueSample
+from shearloop.daemon.control.runner import loop_state
 from shearloop.daemon.control.safety import FaultCode, Response
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, TICK_S, Rig, new_loop, phase, started
 
@@ -32,6 +33,18 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive):
     held = np.array(rig.true_nm)[-round(15 / TICK_S) - 110 : -110]
     assert held.mean() == pytest.approx(0.1, abs=0.008)
     assert held.std() < 0.006
+
+
+def test_loop_state_has_the_filtered_torque_and_its_standard_deviation():
+    hold = {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 60}
+    rig = started(Rig(new_loop()), GRIP, {"do": "identify"}, hold, torque_source="load_cell")
+    while rig.control_loop.wrist.controller is None:
+        assert loop_state(rig.control_loop, 0.0, 0).filtered_torque_std_nm is None
+        rig.run(1)
+    rig.run(10)
+    state = loop_state(rig.control_loop, 0.0, 0)
+    assert state.filtered_torque_nm == pytest.approx(rig.true_nm[-1], abs=0.003)
+    assert 0.0 < state.filtered_torque_std_nm < 0.002
 
 
 @pytest.mark.parametrize(

@@ -213,6 +213,14 @@ def test_what_is_invalid_or_faulty_says_why_and_shows_no_number(said, shown, bro
     assert browsed.layout()["spilt"] == []
 
 
+@pytest.mark.parametrize(("reason", "waits"), [("gripped too recently: 4 more", True), ("another gel", False)])
+def test_what_is_normal_before_the_first_torque_is_no_warning(reason, waits, browsed):
+    browsed.open()
+    browsed.daemon.say(estimate={**NO_ESTIMATE, "valid": False, "reason": reason})
+    browsed.until("#torque-reason", reason)
+    assert browsed.page.evaluate("document.getElementById('torque-reason').classList.contains('waiting')") == waits
+
+
 def test_silent_sources_are_marked_old(browsed):
     browsed.open()
     browsed.daemon.say(robot=None, load=None)

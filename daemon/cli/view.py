@@ -67,7 +67,7 @@ def _serve_foxglove(args: argparse.Namespace) -> int:
     try:
         with FoxgloveServer(args.foxglove) as server:
             url = f"ws://127.0.0.1:{server.port}"
-            sentence = f"{url}: open this connection in Foxglove, with the layout config/foxglove.json"
+            sentence = f"{url}: open this connection in Foxglove, with the layout foxglove.json of `shearloop init`"
             print_result({"url": url}, [sentence], as_json=args.json)
             for topic, content in receive_messages(args.connect, (), keys=client_keys(args)):
                 server.publish(topic, content)

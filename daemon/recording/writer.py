@@ -164,7 +164,7 @@ class RecordingWriter:
     def add_frame(self, side: str, t_mid_unix_ns: int, arrival_unix_ns: int, line: NDArray[np.float64]) -> None:
         """Append one frame: the (v,) values of its line in volts."""
         # The board sends four decimals of a volt.
-        values = np.round(line, 6).tolist()
+        values = [round(value, 6) for value in line.tolist()]
         content = {"arrival_unix_ns": arrival_unix_ns, "line": values}
         self._add(schema.recorded_topic(schema.FRAME_TOPIC, side), t_mid_unix_ns, content)
 

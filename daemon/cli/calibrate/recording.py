@@ -1,6 +1,7 @@
 """`shearloop calibrate REC… --estimator NAME --out CAL`: fit an estimator to recordings."""
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -136,10 +137,13 @@ def _range_ends(regressor: "IntervalRegressor") -> str:
     span = regressor.range
     limits = (span.low, span.high, span.low_end, span.high_end, span.lowest, span.highest)
     low_nm, high_nm, below_nm, above_nm, lowest_nm, highest_nm = (round(limit, 3) + 0.0 for limit in limits)
-    where = (
-        f"intervals of estimates below {below_nm:g} N·m reach to {lowest_nm:g} at least, of estimates above "
-        f"{above_nm:g} to {highest_nm:g} N·m"
-    )
+    ends = (("below", below_nm, lowest_nm), ("above", above_nm, highest_nm))
+    reach = [
+        f"of estimates {side} {end_nm:g} N·m reach to {reached_nm:g} N·m at least"
+        for side, end_nm, reached_nm in ends
+        if math.isfinite(end_nm)
+    ]
+    where = f"intervals {', and '.join(reach)}"
     if below_nm >= high_nm and above_nm <= low_nm:
         where = f"all intervals reach from {lowest_nm:g} to {highest_nm:g} N·m at least, and the torque is useless"
     return (

@@ -71,7 +71,7 @@ def test_cylinders_give_a_diameter_and_no_torque(sliced):
     assert all(one.diameter_mm is None for one in follow(calibration, torque))
 
 
-FEW = "slices have too few different torques .*, 3; record more"
+FEW = "slices have too few different torques .*, {}; record more"
 
 
 @pytest.mark.parametrize(
@@ -84,9 +84,13 @@ FEW = "slices have too few different torques .*, 3; record more"
         (
             "motion_regression",
             {"torque_nm": np.tile([0.01, 0.05, 0.1], 17)[:50]},
-            f"50 of the 50 {FEW}",
+            f"50 of the 50 {FEW.format(3)}",
         ),
-        ("motion_regression", {"torque_nm": np.repeat([0.01, 0.03, 0.05, 0.07, 0.1], 10)}, f"30 of the 50 {FEW}"),
+        (
+            "motion_regression",
+            {"torque_nm": np.repeat([0.01, 0.03, 0.05, 0.07, 0.1], 10)},
+            f"40 of the 50 {FEW.format(4)}",
+        ),
     ],
 )
 def test_what_cannot_be_calibrated_says_why(sliced, name, change, message):
@@ -94,7 +98,7 @@ def test_what_cannot_be_calibrated_says_why(sliced, name, change, message):
         fit(name, [replace(sliced(), **change)], "x")
 
 
-@pytest.mark.parametrize(("name", "least"), [("motion_regression", 14), ("regression", 10)])
+@pytest.mark.parametrize(("name", "least"), [("motion_regression", 15), ("regression", 10)])
 def test_as_many_slices_as_an_estimator_asks_for_are_enough(sliced, name, least):
     whole = sliced()
     for n in (5, least - 1):
@@ -104,11 +108,11 @@ def test_as_many_slices_as_an_estimator_asks_for_are_enough(sliced, name, least)
 
 
 def test_where_few_torques_are_left_without_the_outermost_it_is_they_that_are_asked_for(sliced):
-    few = sliced().between(0, 14)
-    few = replace(few, torque_t_s=few.t_s, torque_nm=np.resize([0.01, 0.05, 0.1, 0.14], 14))
-    message = "10 frames at 3 distinct values .* at more values: 4 values and 11 frames must remain"
+    few = sliced().between(0, 15)
+    few = replace(few, torque_t_s=few.t_s, torque_nm=np.resize([0.01, 0.05, 0.08, 0.1, 0.14], 15))
+    message = "12 frames at 4 distinct values .* at more values: 5 values and 12 frames must remain"
     with pytest.raises(CalibrationError, match=message):
-        fit("motion_regression", [few], "four torques")
+        fit("motion_regression", [few], "five torques")
 
 
 def alike(frames):

@@ -14,14 +14,16 @@ import pytest
 import zmq
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.messaging.messages import TOPICS, Message
+from shearloop.daemon.messaging.messages import TOPICS, EitAdapted, Message
 from shearloop.daemon.messaging.publisher import Publisher
 from tests.daemon.conftest import DEADLINE_S
+from tests.daemon.sample_messages import sample
 from tests.daemon.web.fake_daemon import MESSAGES, made
 
 
 def messages() -> list[Message]:
-    return [made({"t_mono_ns": 1_000_000_000, **given}) for given in MESSAGES.values()]
+    """Return the messages of the page, and the one that it does not show."""
+    return [*(made({"t_mono_ns": 1_000_000_000, **given}) for given in MESSAGES.values()), sample(EitAdapted)]
 
 
 def parsed(frame: bytes) -> Any:

@@ -53,8 +53,11 @@ def imported(mat_folder, tmp_path) -> Path:
 
 
 @pytest.fixture
-def slices_folder(tmp_path) -> Path:
-    """49 torque slices and 16 of cylinders, made of smooth shapes, a drift and noise."""
+def slices_folder(request, tmp_path) -> Path:
+    """49 torque slices and 16 of cylinders, made of smooth shapes, a drift and noise.
+
+    The parameter is the share of the largest torque above which the frame no longer changes.
+    """
     rng = np.random.default_rng(3)
     base, slope, drift, cylinder = (np.abs(rng.normal(0, s, 896)) for s in (6e-3, 1.2e-3, 4e-4, 3e-3))
     folder = tmp_path / "slices"
@@ -62,7 +65,9 @@ def slices_folder(tmp_path) -> Path:
         (folder / name).mkdir(parents=True)
     for n in range(49):
         z = (n % 10) / 4.5 - 1
-        frame = np.abs(base + z * slope + n / 49 * drift + rng.normal(0, 5e-4, 896))
+        frame = np.abs(
+            base + min(z, getattr(request, "param", 1.0)) * slope + n / 49 * drift + rng.normal(0, 5e-4, 896)
+        )
         path = folder / "torque_slices" / f"Data_Slice_{n + 1}.mat"
         savemat(path, {"data_diff": frame[None], "torque_value": 0.075 + 0.065 * z})
     for n in range(16):

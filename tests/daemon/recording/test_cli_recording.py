@@ -105,7 +105,7 @@ def test_a_recording_is_read_into_arrays_and_frames(recording, monkeypatch):
         read["health"]
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "pandas", None)
-        with pytest.raises(UserError, match=r"needs pandas: `pip install 'shearloop\[notebook\]'`"):
+        with pytest.raises(UserError, match=r"needs pandas: `.* -m pip install 'shearloop\[notebook\]'`"):
             read.frame("load.torque")
     pandas = pytest.importorskip("pandas", reason="frames need the extra `notebook`")
     frame = read.frame("eit.frame.right")

@@ -7,6 +7,7 @@ import errno
 import itertools
 import os
 import resource
+import select
 import socket
 import stat
 import struct
@@ -111,8 +112,8 @@ class Connections:
     def disconnect(self, descriptor: int) -> bool:
         """Disconnect the client with this descriptor; return False if it has disconnected already."""
         with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as client:
-            # The number may belong to another file by now.
-            if _port(client) == _port(self._listener):
+            # The number may belong to another file by now; libzmq closes a disconnected client's some time later.
+            if _port(client) == _port(self._listener) and not _is_shut(client):
                 client.shutdown(socket.SHUT_RDWR)
                 return True
         return False
@@ -126,6 +127,13 @@ class Connections:
         # In this order: libzmq's thread waits forever for a queue that has no reader.
         self._bound.disable_monitor()
         self._events.close()
+
+
+def _is_shut(one: socket.socket) -> bool:
+    """Return whether a socket is shut down in both directions."""
+    poll = select.poll()
+    poll.register(one, 0)
+    return bool(poll.poll(0))
 
 
 def _port(one: socket.socket) -> Any:

@@ -362,9 +362,21 @@ def test_unlock_waits_and_a_missing_daemon_is_reported_at_once(monkeypatch, caps
     assert "unlock: done" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("command", ["check", "run", "demo"])
+def test_a_broken_robot_library_is_one_sentence(config, command, capsys, monkeypatch, tmp_path):
+    (tmp_path / "rtde_control.py").write_text("raise ImportError('librtde.so.1.6: cannot open shared object file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "rtde_control", raising=False)
+    robot = str(config(robot=str(Path("config/ur.yaml").resolve())))
+    arguments = ["--folder", str(tmp_path / "demo")] if command == "demo" else [robot]
+    said = mistake(capsys, command, *arguments)
+    assert "the package ur-rtde, which drives the robot, cannot be loaded: install it again with" in said
+    assert said.endswith("--no-deps ur-rtde` (librtde.so.1.6: cannot open shared object file)\n")
+
+
 @pytest.mark.parametrize("command", ["check", "run"])
 def test_a_missing_robot_library_is_one_sentence(config, command, capsys, monkeypatch):
     monkeypatch.setattr("shearloop.drivers.ur.client.find_spec", lambda _name: None)
     said = mistake(capsys, command, str(config(robot=str(Path("config/ur.yaml").resolve()))))
     assert "the robot needs the package ur-rtde, which is not installed for Python 3." in said
-    assert "pip install 'shearloop[robot-source]'" in said
+    assert "-m pip install 'shearloop[robot-source]'" in said

@@ -232,6 +232,12 @@ def test_a_pause_of_the_daemon_is_told_first_until_nothing_is_wrong_and_what_it_
     assert gate.judge([invalid], 11 * SECOND).reasons == (invalid.sentence,)
 
 
+@pytest.mark.parametrize("code", ["ROBOT_STARTING", "ROBOT_BLOCKED", "ROBOT_LOST", "DEVICE_LOST"])
+def test_a_reason_to_wait_with_the_start_does_not_ask_for_a_start(code):
+    """The configured experiment begins by itself once the reason is gone."""
+    assert "start the experiment again" not in trouble(FaultCode[code]).sentence
+
+
 @pytest.mark.parametrize("event", [FaultCode.RECORDING_FAILED, FaultCode.COMMAND_REFUSED])
 def test_what_neither_holds_the_wrist_nor_comes_of_a_pause_is_told_and_does_not_keep_the_pause(event):
     paused, other, limit = trouble(FaultCode.DAEMON_PAUSED), trouble(event), trouble(FaultCode.TORQUE_LIMIT)

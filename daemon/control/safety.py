@@ -113,9 +113,7 @@ class FaultCode(Enum):
         "a device that the experiment needs is not connected yet: {detail}.",
         "Switch it on and connect it; it is found automatically. `shearloop doctor CONFIG` examines it.",
     )
-    ROBOT_STARTING = Rule(
-        _KEEP, "the robot is not ready yet: {detail}.", "The experiment can begin in a few seconds."
-    )
+    ROBOT_STARTING = Rule(_KEEP, "the robot is not ready yet: {detail}.", "The experiment can begin in a few seconds.")
     DEVICE_LOST = Rule(
         _KEEP,
         "a device that the experiment needs is gone: {detail}.",
@@ -164,7 +162,7 @@ class FaultCode(Enum):
     COMMAND_REFUSED = Rule(
         Response.NOTE,
         "a command was refused: {detail}.",
-        "A running experiment continues once commands are accepted; if this recurs, end other programs on this computer.",
+        "A running experiment continues once commands are accepted. If this recurs, end other programs.",
     )
     COMMAND_UNANSWERED = Rule(
         Response.NOTE,

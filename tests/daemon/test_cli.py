@@ -64,12 +64,25 @@ def test_a_calibration_without_torques_cannot_drive_the_loop(command, config, ti
     assert "torque_source: `right` has a calibration without torques" in said
 
 
-def test_a_bank_that_is_not_built_hides_no_mistake_of_the_experiment(config, tmp_path, capsys):
-    (tmp_path / "experiment.yaml").write_text("name: one\nsteps: [{do: wiat}]\n")
-    section = {"right": {"device": {"path": "eit"}, "bank": "none.bank"}}
-    said = mistake(capsys, "check", str(config(fingertips=section, robot="ur.yaml", experiment="experiment.yaml")))
-    assert "none.bank: the bank cannot be read" in said
-    assert "steps[0].do: 'wiat' does not exist" in said
+def test_a_file_that_is_not_there_hides_no_other_mistake(config, tmp_path, capsys):
+    steps = "[{do: wiat}, {do: turn_to, angle_rad: 90}, {do: hold_torque, torque_nm: 9}]"
+    (tmp_path / "experiment.yaml").write_text(f"name: one\nsteps: {steps}\n")
+    tips = {name: {"device": {"path": name}, "bank": f"{name}.bank"} for name in ("right", "left")}
+    files = {"load_cell": {"device": {"path": "load"}, "calibration": "load.yaml"}, "robot": "ur.yaml"}
+    parts = {"fingertips": tips, "experiment": "experiment.yaml", **files}
+    said = mistake(capsys, "check", str(config(**parts)))
+    for part in ("right.bank: the bank", "left.bank: the bank", "load.yaml: the calibration", "ur.yaml: the robot"):
+        assert f"{tmp_path}/{part}" in said
+    assert "torque_source: `right` is a fingertip without a calibration" in said
+    of_steps = (
+        "steps[0].do: 'wiat' does not exist",
+        "steps[1].angle_rad: 90 is too large",
+        "steps[2].torque_nm: 9 is too large",
+        "steps[2]: hold_torque needs an identified tool",
+    )
+    assert [said.count(one) for one in of_steps] == [1] * 4
+    said = mistake(capsys, "check", str(config(**parts, fingertip={})))
+    assert [said.count(one) for one in ("fingertip: is not a known key", *of_steps)] == [1] * 5
 
 
 @pytest.mark.parametrize("command", ["run", "check"])

@@ -67,12 +67,12 @@ def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturban
     assert "'hold' was done, after 44 s" in text
     assert "  step 1 of 3  identify       10.0 s   stiffness" in text
     assert "  step 2 of 3  hold_torque    34.0 s\n" in text
-    assert "set point +0.100 N·m, held for 30 s; torque source: right" in text
+    assert "set point +0.100 N·m, held for 30 s; torque source: right; true torque: of the emulated tool" in text
     assert "stiffness 0.750 N·m/rad, delay 0.80 s" in text
-    assert "right      +0.0980 N·m on average" in text
+    assert "right       +0.0980 N·m on average" in text
     # 5.5 of 30 s were out of the band.
-    assert "true       +0.0945 N·m on average, ± 0.0116, within ± 10% for 82% of the time" in text
-    assert "within ± 10% 3.0 s after the set point changed, by true" in text
+    assert "true torque +0.0945 N·m on average, standard deviation 0.0116, within ± 10% for 82% of the time" in text
+    assert "within ± 10% 3.0 s after the set point changed, by true torque" in text
     assert "disturbed after 12.0 s (kick -0.03): 0.030 N·m off, back within ± 10% after 5.5 s" in text
     assert "1 of 61 torques of right were not valid and not used, most often: no grip" in text
     assert "the wrist was never held" in text
@@ -146,9 +146,9 @@ def test_where_a_screw_ended_and_what_it_took_is_told():
         messages.append({"source": "robot", "wrist_rad": wrist_rad})
         messages.append({"source": "load_cell", "t_mono_ns": round(t_s * S), "torque_nm": torque_nm})
     text = summary_of(*messages, loop_state(12.1, phase="done", **turning), truth=truth)
-    assert "    turned by -0.500 rad; torque source: load_cell" in text
-    assert "    true       -0.1190 N·m at the end, -0.1800 at most" in text
-    assert "    load_cell  -0.1210 N·m at the end, -0.1760 at most" in text
+    assert "    turned by -0.500 rad; torque source: load_cell; true torque: of the emulated tool" in text
+    assert "    true torque -0.1190 N·m at the end, -0.1800 at most" in text
+    assert "    load_cell   -0.1210 N·m at the end, -0.1760 at most" in text
 
 
 def test_the_times_of_a_stop_follow_the_summary():

@@ -49,8 +49,8 @@ def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_p
     assert (tmp_path / "named.svg").read_text().count(f"<!-- {slices_folder.name}, right") == 2
     assert main(["evaluate", str(first), str(slices_folder / "torque_slices")]) == 0
     text = capsys.readouterr().out
-    assert "rmse_nm" in text
-    assert re.search(r"^interval_nm +0\.\d+$", text, re.MULTILINE)
+    assert re.search(r"^figure +loaded +unloaded +all +meaning$", text, re.MULTILINE)
+    assert re.search(r"^interval_nm +0\.\d+ .* 0\.\d+ +median width of these intervals", text, re.MULTILINE)
     assert "diameter" not in text
 
 
@@ -326,16 +326,19 @@ def test_a_time_that_could_not_be_checked_is_told_as_probable(unsure_s):
 
 
 @pytest.mark.usefixtures("fonts")
-@pytest.mark.parametrize(("kind", "drawn"), [("raw", "torque in N·m"), ("difference", "diameter in mm")])
-def test_the_picture_of_a_stream_shows_torque_also_with_a_named_tool(kind, drawn, tmp_path):
+@pytest.mark.parametrize(
+    ("kind", "estimated_nm", "drawn"),
+    [("raw", 0.1, "torque in N·m"), ("raw", 0.0, "torque in N·m"), ("difference", 0.1, "diameter in mm")],
+)
+def test_the_picture_of_a_stream_shows_torque_also_with_a_named_tool(kind, estimated_nm, drawn, tmp_path):
     t, tool_mm = np.arange(4.0), np.full(4, 20.0)
     series = FrameSeries(kind, ("right",), t, np.zeros((4, 1, 896)), t, np.full(4, 0.1), tool_mm)
     estimates = tuple(
         Estimate(
             valid=True,
             reasons=(),
-            torque_nm=0.1,
-            torque_low_nm=0.05,
+            torque_nm=estimated_nm,
+            torque_low_nm=-0.2,
             torque_high_nm=0.15,
             diameter_mm=19.0,
             diameter_low_mm=15.0,
@@ -346,5 +349,8 @@ def test_the_picture_of_a_stream_shows_torque_also_with_a_named_tool(kind, drawn
     draw_tracks([EstimateTrack(series, estimates, np.ones(4))], ["one"], "title", tmp_path / "a.svg")
     picture = (tmp_path / "a.svg").read_text()
     assert f"<!-- {drawn} -->" in picture
-    judged = "one; 4 loaded frames: RMSE 0 N·m (always saying 0: 0.1)"
+    assert f"<!-- {'load cell' if kind == 'raw' else 'known diameter'} -->" in picture
+    # An interval that extends the other way is explained.
+    assert ("<!-- no load on the lever" in picture) == (estimated_nm == 0)
+    judged = f"one; 4 loaded frames: RMSE {0.1 - estimated_nm:g} N·m (always saying 0: 0.1)"
     assert (f"<!-- {judged} -->" in picture) == (kind == "raw")

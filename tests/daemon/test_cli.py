@@ -242,9 +242,9 @@ def test_every_command_explains_itself(name, capsys):
     with pytest.raises(SystemExit) as ended:
         main([name, "--help"])
     assert ended.value.code == 0
-    told = capsys.readouterr().out
-    assert f"usage: shearloop {name}" in told
-    assert "%%" not in told
+    printed = capsys.readouterr().out
+    assert f"usage: shearloop {name}" in printed
+    assert "%%" not in printed
 
 
 def test_an_unknown_command_lists_the_known_ones(capsys):
@@ -304,7 +304,7 @@ def test_messages_are_readable():
 
 def test_tasks_are_told_in_words_without_what_is_not_known():
     facts = {"alive": True, "done": False, "restarts": 0, "last_error": "", "rate_hz": None, "errors": {}}
-    for changes, told in (
+    for changes, row in (
         ({}, ("alive", "", "")),
         ({"rate_hz": 1.85, "expected_hz": 1.849}, ("alive", "1.85 of 1.85 Hz", "")),
         ({"connected": True, "errors": {"unreachable": 1}}, ("alive", "", "reconnected once")),
@@ -314,7 +314,7 @@ def test_tasks_are_told_in_words_without_what_is_not_known():
         ({"alive": False, "last_error": "ValueError"}, ("DEAD", "", "ValueError")),
         ({"alive": False, "done": True}, ("done", "", "")),
     ):
-        assert task_row("right", {**facts, **changes})[1:] == told
+        assert task_row("right", {**facts, **changes})[1:] == row
     assert table(("a", "b"), [("longer", "x")]) == ["a       b", "longer  x"]
 
 

@@ -90,9 +90,9 @@ def test_causes_that_take_turns_hold_the_wrist_no_longer_than_one_alone_may(coun
     stopped = taking_turns(*((event, each_s) for event in events))
     stopped_s, gate = stopped
     assert stopped_s == pytest.approx(HELD_AT_MOST_S, abs=2 * TICK_S)
-    told = gate.report([]).reasons[-1]
-    assert "held for too long" in told
-    assert all(f"{event.text} for " in told for event in events[:4])
+    reason = gate.report([]).reasons[-1]
+    assert "held for too long" in reason
+    assert all(f"{event.text} for " in reason for event in events[:4])
 
 
 def test_one_cause_alone_is_told_alone():
@@ -264,7 +264,7 @@ def test_what_explains_changes_what_is_told_and_never_what_is_done(moments):
         verdict = explaining.judge(map(trouble, events), t_ns)
         late = {FaultCode.LOOP_LATE if event is FaultCode.DAEMON_PAUSED else event for event in events}
         assert verdict.response >= plain.judge(map(trouble, late), t_ns).response
-        told = [one for one in verdict.faults if not one.is_consequence]
-        assert told or not events
+        reported = [one for one in verdict.faults if not one.is_consequence]
+        assert reported or not events
         for one in verdict.faults:
-            assert one in told or TABLE[one.code].response in (Response.NOTE, Response.HOLD)
+            assert one in reported or TABLE[one.code].response in (Response.NOTE, Response.HOLD)

@@ -102,7 +102,7 @@ def test_an_array_without_its_data_is_refused(tmp_path):
     hollow = tmp_path / "hollow.cal"
     with zipfile.ZipFile(hollow, "w") as archive:
         archive.writestr("a.npy", text.getvalue())
-    with pytest.raises(CalibrationError, match="truncated or damaged .*; calibrate again"):
+    with pytest.raises(CalibrationError, match=r"truncated or damaged .*; calibrate again"):
         Calibration.load(hollow)
 
 

@@ -245,8 +245,9 @@ def _draw_intervals(axes: "Axes", t_s: FloatArray, value: FloatArray, low: Float
     )  # fmt: skip
     if (value == 0).any():
         label = "no load on the lever, which is pushed from one side: the tool may be twisted this far the other way"
-        style = {"facecolor": "none", "edgecolor": "0.6", "hatch": "///", "linewidth": 0, "label": label}
-        axes.fill_between(t_s, low, high, where=value == 0, **style)
+        axes.fill_between(
+            t_s, low, high, where=value == 0, facecolor="none", edgecolor="0.6", hatch="///", linewidth=0, label=label
+        )
 
 
 def _loaded_text(track: EstimateTrack) -> str:

@@ -3,7 +3,7 @@
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ from shearloop.daemon.errors import UserError, missing
 
 if TYPE_CHECKING:
     from shearloop.bank.estimation import Calibration
-    from shearloop.daemon.analysis.evaluate import EstimateTrack
+    from shearloop.daemon.analysis.evaluate import EstimateTrack, Figures
 
 _FIGURES = (".png", ".svg", ".pdf")
 _MEANINGS = {
@@ -109,16 +109,20 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps({**by_load, **figures}))
         return 0
     print(f"Loaded frames have a known torque of {args.loaded_nm:g} N·m or more, unloaded frames less.")
-    columns = {**by_load, "all": figures}
+    print(*_lines({**by_load, "all": figures}), sep="\n")
+    for reason in invalid_reasons(tracks):
+        print(f"{reason.frames:>6} frames not valid{', e.g.' if reason.differ else ''}: {reason.sentence}")
+    return 0
+
+
+def _lines(columns: "Mapping[str, Figures]") -> list[str]:
+    """Return the figures of each group of frames as a table, with their meanings."""
     rows = [
         (name, *(_shown(group[name]) if name in group else "" for group in columns.values()), meaning)
         for name, meaning in _MEANINGS.items()
         if any(name in group for group in columns.values())
     ]
-    print(*table(("figure", *columns, "meaning"), rows), sep="\n")
-    for reason in invalid_reasons(tracks):
-        print(f"{reason.frames:>6} frames not valid{', e.g.' if reason.differ else ''}: {reason.sentence}")
-    return 0
+    return table(("figure", *columns, "meaning"), rows)
 
 
 def _draw(tracks: "Sequence[EstimateTrack]", paths: "Sequence[Path]", calibration: "Calibration", out: Path) -> None:

@@ -158,11 +158,11 @@ class Rig:
         return reason
 
     def stop(self) -> str:
-        """End the experiment on the operator's command, also during its start; return its name."""
+        """End the experiment, also during its start, or the unlocking; return its name, or an empty string."""
         self._stops += 1
         experiment = self.control_loop.experiment
         if experiment is None or not experiment.running:
-            return ""
+            return "unlock" if self.runner.stop_unlocking() else ""
         self.runner.stop("the operator stopped it")
         return experiment.file.name
 

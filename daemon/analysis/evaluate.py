@@ -8,7 +8,7 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from shearloop.bank.defaults import LOADED_NM
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, TactileFrame
 from shearloop.bank.estimation.values import winkler_scores
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Figures: TypeAlias = dict[str, float | int | None]
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
@@ -204,36 +207,47 @@ def draw_tracks(tracks: Sequence[EstimateTrack], names: Sequence[str], title: st
     rows = np.ravel(figure.subplots(len(tracks), 1, squeeze=False))
     for axes, track, row_name in zip(rows, tracks, names, strict=True):
         truth, quantity = track.series.torque_at_frames(), "torque_nm"
-        label, bounds = "torque in N·m", ("torque_low_nm", "torque_high_nm")
+        label, bounds, known = "torque in N·m", ("torque_low_nm", "torque_high_nm"), "load cell"
         slices = track.series.kind == "difference"
         # A stream has one tool, whose diameter would be a flat line.
         if slices and np.isfinite(track.series.diameter_mm).any():
             truth, quantity = track.series.diameter_mm, "diameter_mm"
-            label, bounds = "diameter in mm", ("diameter_low_mm", "diameter_high_mm")
+            label, bounds, known = "diameter in mm", ("diameter_low_mm", "diameter_high_mm"), "known diameter"
         t_s = track.series.t_s
         value, low, high = (
             np.array([getattr(one, key) if getattr(one, key) is not None else np.nan for one in track.estimates])
             for key in (quantity, *bounds)
         )
-        style, shown = "o" if slices else "-", "estimate with its 95 % interval"
-        axes.plot(t_s, truth, f"k{style}", linewidth=1.0, markersize=5, label="truth")
+        axes.plot(t_s, truth, "ko" if slices else "k-", linewidth=1.0, markersize=5, label=known)
         if slices:
+            shown = "estimate with its 95 % interval"
             axes.errorbar(t_s, value, [value - low, high - value], fmt="s", markersize=4, label=shown)
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         else:
-            axes.fill_between(t_s, low, high, alpha=0.25, linewidth=0)
-            axes.plot(t_s, value, linewidth=1.2, label=shown)
-            axes.fill_between(
-                t_s, 0, 1, where=np.isnan(value), transform=axes.get_xaxis_transform(), color="0.92", linewidth=0,
-                label="no valid estimate",
-            )  # fmt: skip
+            _draw_intervals(axes, t_s, value, low, high)
         judged = _loaded_text(track) if quantity == "torque_nm" else ""
         axes.set_title(row_name + judged, loc="left", fontsize="medium")
         axes.set_xlabel("slice" if slices else "time in s")
         axes.set_ylabel(label)
-        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0, ncols=3, frameon=False, fontsize="small")
+    labelled = {label: handle for axes in rows for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(labelled.values(), labelled, loc="outside lower left", ncols=3, frameon=False, fontsize="small")
     figure.suptitle(title)
     figure.savefig(path, dpi=110)
+
+
+def _draw_intervals(axes: "Axes", t_s: FloatArray, value: FloatArray, low: FloatArray, high: FloatArray) -> None:
+    """Draw the estimates of a stream with their intervals, hatched where a lever does not touch: there exactly 0."""
+    axes.plot(t_s, value, linewidth=1.2, label="estimate")
+    axes.fill_between(t_s, low, high, alpha=0.25, linewidth=0, label="95 % interval of the estimate")
+    axes.fill_between(
+        t_s, 0, 1, where=np.isnan(value), transform=axes.get_xaxis_transform(), color="0.92", linewidth=0,
+        label="no valid estimate",
+    )  # fmt: skip
+    if (value == 0).any():
+        label = "no load on the lever, which is pushed from one side: the tool may be twisted this far the other way"
+        axes.fill_between(
+            t_s, low, high, where=value == 0, facecolor="none", edgecolor="0.6", hatch="///", linewidth=0, label=label
+        )
 
 
 def _loaded_text(track: EstimateTrack) -> str:

@@ -424,7 +424,7 @@ class ActionExecutor:
     def _on_halted(self, error: str) -> None:
         if error:
             structlog.get_logger().error("the fingers did not stop", reason=error)
-            self._control_loop.on_command_refused(f"the fingers did not stop: {error}")
+            self._control_loop.on_command_refused(f"the fingers did not stop, keep clear of them: {error}")
 
     async def _run(self, action: Action) -> str:
         """Carry out an action; return an error, or an empty string."""

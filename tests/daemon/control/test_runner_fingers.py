@@ -100,4 +100,4 @@ async def test_fingers_that_could_not_be_stopped_are_told_of(monkeypatch):
         cell.control_loop.stop("the operator said stop")
         await cell.cycles(20)
         reasons = [one.reasons for one in cell.published.messages if one.topic == "loop.state"]
-        assert any("the fingers did not stop: the gripper does not answer" in one for one in reasons)
+        assert any("keep clear of them: the gripper does not answer" in one for one in reasons)

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from shearloop.bank.eit.build import build_bank
 from shearloop.bank.estimation import Calibration, FrameSeries, fit, measure_timing
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
+from shearloop.daemon.analysis.reproduce.banks import is_built
 from shearloop.daemon.analysis.series import series_of
 from shearloop.daemon.bank_config import load_bank_plan
-from shearloop.daemon.cli.bank import is_built
 from shearloop.daemon.cli.options import checked_jobs, writing
 from shearloop.daemon.cli.terminal import progress_bar
 from shearloop.daemon.recording.reader import read_recording
@@ -152,7 +152,7 @@ def emulate_recordings(
         folder.mkdir(parents=True, exist_ok=True)
     with resources.as_file(resources.files("shearloop") / "config") as config:
         plan = load_bank_plan(config / "banks" / "demo.yaml")
-    if not is_built(bank, plan):
+    if not is_built(bank, plan.definition):
         build_bank(*plan, bank, jobs=checked_jobs(None))
     return list(write_recordings(bank, folder, diameters_mm, seed))
 

@@ -86,14 +86,14 @@ class StatusLine:
             self._torque = "" if torque_nm is None else f"   {self._driving} {torque_nm:+.3f} N·m"
         else:
             return
-        self._draw(self._state + self._torque)
+        self._draw(self._state, self._torque)
 
-    def _draw(self, text: str) -> None:
+    def _draw(self, text: str, end: str = "") -> None:
         from shearloop.daemon.logs import CLEAR_LINE
 
         # A longer line would wrap, and could not be cleared.
-        width = shutil.get_terminal_size().columns - 1
-        self._out.write(f"{CLEAR_LINE}{text if len(text) <= width else text[: width - 1] + '…'}")
+        width = shutil.get_terminal_size().columns - 1 - len(end)
+        self._out.write(f"{CLEAR_LINE}{text if len(text) <= width else text[: width - 1] + '…'}{end}")
         self._out.flush()
 
 
@@ -158,7 +158,7 @@ def message_line(topic: str, content: Mapping[str, Any]) -> str:
     """Return one line of text: time, topic, source, and the values with their units."""
     clock = datetime.fromtimestamp(content["timestamp"]).astimezone().strftime("%H:%M:%S.%f")[:-3]
     body = _BODIES.get(topic, _columns)(topic, content)
-    return f"{clock}  {topic:<13} {content['source']:<7} {body}"
+    return f"{clock}  {topic:<13} {content['source']:<9} {body}"
 
 
 def message_json(topic: str, content: Mapping[str, Any]) -> str:

@@ -86,6 +86,13 @@ def test_the_demos_page_lasts_as_long_as_the_demo(tmp_path, monkeypatch, capsys)
         asyncio.run(status(url))
 
 
+def test_the_demo_refuses_a_recording_that_is_not_there_at_once(tmp_path, capsys):
+    assert main(["demo", "--folder", str(tmp_path), "--recording", str(tmp_path / "none.mat")]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "none.mat: the recording cannot be read: No such file" in err
+
+
 def test_the_demo_without_aiohttp_says_what_the_page_needs(monkeypatch, capsys):
     monkeypatch.setattr(demo, "find_spec", lambda _: None)
     with demo.page(DaemonConfig(fingertips={"right": {"device": {"path": "/dev/null"}}})):

@@ -65,7 +65,9 @@ class StatusLine:
 
     def __init__(self, out: "TextIO | NonBlockingWriter") -> None:
         self._out = out
-        self._state = self._driving = self._torque = ""
+        self._state = self._torque = ""
+        # None until a control loop reports; without a robot there is none.
+        self._driving: str | None = None
 
     def __enter__(self) -> Self:
         """Show that the daemon starts."""
@@ -84,6 +86,8 @@ class StatusLine:
         elif topic in ("eit.estimate", "load.torque", "skin.shear") and content["source"] == self._driving:
             torque_nm = content["torque_nm"] if content["valid"] else None
             self._torque = "" if torque_nm is None else f"   {self._driving} {torque_nm:+.3f} N·m"
+        elif topic in ("eit.estimate", "skin.shear") and self._driving is None:
+            self._state = message_line(topic, content)
         else:
             return
         self._draw(self._state, self._torque)

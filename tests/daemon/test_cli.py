@@ -335,6 +335,9 @@ def test_the_status_line_is_redrawn_in_place(monkeypatch):
     line("loop.state", {**state, "phase": "running", "activity": "closing on a tool", "torque_source": "right"})
     line("eit.estimate", {"source": "right", "valid": True, "torque_nm": 0.1})
     assert narrow.getvalue().split("\r\x1b[K")[-1] == "running 50 %  step 2 of 3 gri…   right +0.100 N·m"
+    line = StatusLine(narrow)
+    line("eit.estimate", {"source": "right", "timestamp": 0.0, "valid": False, "reason": "no grip"})
+    assert "eit.estimate  right     no estimat…" in narrow.getvalue(), "without a robot there is no state of the loop"
     stopped = {**state, "phase": "stopped", "activity": "the operator stopped it"}
     assert loop_line("loop.state", stopped) == "stopped  step 2 of 3 grip  the operator stopped it"
 

@@ -24,6 +24,15 @@ if TYPE_CHECKING:
 Figures: TypeAlias = dict[str, float | int | None]
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 _ENDS = ("", "_low", "_high")
+# A torque's errors, and their names in the report.
+_ERRORS = {
+    "rmse": "rmse_nm",
+    "zero_rmse": "zero_rmse_nm",
+    "bias": "bias_nm",
+    "coverage": "coverage_95",
+    "width": "interval_nm",
+    "winkler": "winkler_nm",
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,19 +81,19 @@ def figures_of(tracks: Sequence[EstimateTrack]) -> Figures:
     valid = [estimate.valid for track in tracks for estimate in track.estimates]
     latency = np.concatenate([track.latency_ms for track in tracks])
     figures: Figures = {
-        "r": torque.r,
-        **torque.errors_nm(),
+        "r": torque["r"],
+        **_torque_errors(torque),
         "valid_fraction": float(np.mean(valid)) if valid else None,
         "latency_ms_p50": float(np.quantile(latency, 0.5)) if len(latency) else None,
         "latency_ms_p99": float(np.quantile(latency, 0.99)) if len(latency) else None,
         "frames": len(valid),
     }
-    if not torque.estimated:
-        figures["coverage_95"] = diameter.coverage
+    if not torque["valid_fraction"]:
+        figures["coverage_95"] = diameter["coverage"]
     if any(np.isfinite(track.series.diameter_mm).any() for track in tracks):
-        figures["diameter_rmse_mm"] = diameter.rmse
-        figures["diameter_coverage_95"] = diameter.coverage
-        figures["diameter_interval_mm"] = diameter.width
+        figures["diameter_rmse_mm"] = diameter["rmse"]
+        figures["diameter_coverage_95"] = diameter["coverage"]
+        figures["diameter_interval_mm"] = diameter["width"]
     return figures
 
 
@@ -96,8 +105,13 @@ def figures_by_load(tracks: Sequence[EstimateTrack], loaded_nm: float = LOADED_N
     """
     frames = _frames(tracks, "torque", "nm")
     is_loaded = np.abs(frames[0]) >= loaded_nm
-    loaded, unloaded = _compare(frames[:, is_loaded]), _compare(frames[:, ~is_loaded])
-    return {"loaded": {**loaded.stratum_nm(), "gain": loaded.gain}, "unloaded": unloaded.stratum_nm()}
+    found = {"loaded": _compare(frames[:, is_loaded]), "unloaded": _compare(frames[:, ~is_loaded])}
+    by_load: dict[str, Figures] = {
+        name: {"n": one["n"], **_torque_errors(one), "valid_fraction": one["valid_fraction"]}
+        for name, one in found.items()
+    }
+    by_load["loaded"]["gain"] = found["loaded"]["gain"]
+    return by_load
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,37 +132,6 @@ def invalid_reasons(tracks: Sequence[EstimateTrack]) -> list[InvalidReason]:
     return sorted(found, key=lambda reason: -reason.frames)
 
 
-@dataclass(frozen=True, slots=True)
-class _Comparison:
-    """The errors of the `estimated` ones of n frames with a known truth."""
-
-    n: int
-    estimated: int
-    r: float | None = None
-    rmse: float | None = None
-    zero_rmse: float | None = None
-    bias: float | None = None
-    gain: float | None = None
-    coverage: float | None = None
-    width: float | None = None
-    winkler: float | None = None
-
-    def errors_nm(self) -> Figures:
-        """Return the errors of a torque by their names."""
-        return {
-            "rmse_nm": self.rmse,
-            "zero_rmse_nm": self.zero_rmse,
-            "bias_nm": self.bias,
-            "coverage_95": self.coverage,
-            "interval_nm": self.width,
-            "winkler_nm": self.winkler,
-        }
-
-    def stratum_nm(self) -> Figures:
-        """Return the errors with the number of frames and the share with a torque."""
-        return {"n": self.n, **self.errors_nm(), "valid_fraction": self.estimated / self.n if self.n else None}
-
-
 def _frames(tracks: Sequence[EstimateTrack], quantity: str, unit: str) -> FloatArray:
     """Return truth, estimate and interval's ends (4, n) of frames with a known truth; NaN for what is not estimated."""
     names = [f"{quantity}_{unit}", f"{quantity}_low_{unit}", f"{quantity}_high_{unit}"]
@@ -161,24 +144,29 @@ def _frames(tracks: Sequence[EstimateTrack], quantity: str, unit: str) -> FloatA
     return table[:, np.isfinite(table[0])]
 
 
-def _compare(frames: FloatArray) -> _Comparison:
+def _compare(frames: FloatArray) -> Figures:
+    """Return the figures of a quantity's frames (4, n), None where fewer than two of them are estimated."""
     truth, value, low, high = frames[:, np.isfinite(frames[1])]
+    n = frames.shape[1]
+    counts: Figures = {"n": n, "valid_fraction": len(truth) / n if n else None}
     if len(truth) < 2:
-        return _Comparison(frames.shape[1], len(truth))
+        return counts | dict.fromkeys(("r", "gain", *_ERRORS))
     error, size = value - truth, float(np.abs(truth).sum())
     changing = value.std() > 0 and truth.std() > 0
-    return _Comparison(
-        frames.shape[1],
-        len(truth),
-        r=float(np.corrcoef(value, truth)[0, 1]) if changing else None,
-        rmse=float(np.sqrt((error**2).mean())),
-        zero_rmse=float(np.sqrt((truth**2).mean())),
-        bias=float(error.mean()),
-        gain=float((value * np.sign(truth)).sum()) / size if size else None,
-        coverage=float(((low <= truth) & (truth <= high)).mean()),
-        width=float(np.median(high - low)),
-        winkler=float(winkler_scores(truth, low, high).mean()),
-    )
+    return counts | {
+        "r": float(np.corrcoef(value, truth)[0, 1]) if changing else None,
+        "gain": float((value * np.sign(truth)).sum()) / size if size else None,
+        "rmse": float(np.sqrt((error**2).mean())),
+        "zero_rmse": float(np.sqrt((truth**2).mean())),
+        "bias": float(error.mean()),
+        "coverage": float(((low <= truth) & (truth <= high)).mean()),
+        "width": float(np.median(high - low)),
+        "winkler": float(winkler_scores(truth, low, high).mean()),
+    }
+
+
+def _torque_errors(torque: Figures) -> Figures:
+    return {name: torque[key] for key, name in _ERRORS.items()}
 
 
 def write_estimates(tracks: Sequence[EstimateTrack], names: Sequence[str], path: Path) -> None:

@@ -83,8 +83,8 @@ def is_built(path: Path, definition: BankDefinition) -> bool:
         return False
     try:
         return Bank.open(path, verify=True).identity == definition.identity
-    except BankFileError:
-        print(f"{path}: it cannot be used, and is built again", file=sys.stderr)
+    except BankFileError as error:
+        print(f"{error} (it is built again)", file=sys.stderr)
         return False
 
 

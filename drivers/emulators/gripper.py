@@ -117,10 +117,6 @@ class Gripper:
         """Put something of a width between the fingers, or take it away."""
         self.object_mm = object_mm
 
-    def cut_power(self) -> None:
-        """Answer nothing more; the URCap then has no values."""
-        self.powered = False
-
     def fail(self, code: int) -> None:
         """Report a fault and stop; from 10 on only a rising edge of ACT ends it."""
         self.flt, self.current = code, 0

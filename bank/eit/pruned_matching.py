@@ -60,13 +60,10 @@ ROUNDING = 2e-5
 _SQUARE_ROUNDING = 4e-6
 # Rounding of float64 in the square of ρ.
 _SQUARE_ROUNDING_64 = 1e-12
-# Rounding of a sum of a thousand products in float64; where a tie hangs on less, the reference decides. In float32.
+# Rounding of a sum of a thousand products in float64; where a tie hangs on less, the reference decides.
 _ROUNDING_64 = 1e-14
-_ROUNDING_32 = 6e-5
 # With more lags than this, a transform costs less per cell than the products.
 _FEW_LAGS = 128
-# With fewer cells, a first look in float32 costs more than it saves.
-_FEW_CELLS = 48
 # With fewer cells, the whole heatmap at all lags is faster than pruning.
 MIN_PRUNED_CELLS = 300
 # The runner-up may be this much worse than the best cell at lag 0 before groups are bounded a second time.
@@ -301,15 +298,14 @@ class AllLagsBounds:
 
     def _bound_groups(self, score: float) -> None:
         """Bound the groups at all lags that let any cell reach the score."""
-        bank, spectra, n = self._matcher.compressed, self._matcher.spectra, self._matcher.n_channels
+        bank, n = self._matcher.compressed, self._matcher.n_channels
         self._bounded_down_to = score
         overlap = bank.overlaps * np.sqrt(self._energies) >= score - ROUNDING
         first, end = int(overlap.argmax()), 2 * n - int(overlap[::-1].argmax())
-        length = next(one for one in spectra if one >= max(2 * n - first, end))
         single = self._padded[n : 2 * n].astype(np.float32)
-        parts = fft.irfft(fft.rfft(single, length) * spectra[length], length)
+        parts = fft.irfft(fft.rfft(single, 2 * n) * self._matcher.spectra, 2 * n)
         self._lags = np.arange(first, end)
-        numbers = np.concatenate([parts[:, length + first - n :], parts[:, : end - n]], axis=1)
+        numbers = np.concatenate([parts[:, n + first :], parts[:, : end - n]], axis=1)
         self._columns = columns(numbers, self._energies[first:end])
         self._group_bounds = bank.groups @ self._columns
         self._highest = self._group_bounds.max(axis=0)
@@ -361,28 +357,21 @@ class _PruningMatcher(Matcher):
             reached = max(reached, self.score(likeliest, candidates.frames))
         cells = candidates.cells[candidates.bounds >= reached - ROUNDING]
         parts = [
-            self._contenders(frame, cells[i : i + CHUNK_CELLS], candidates.frames, reached)
+            self._highest_scores(frame, cells[i : i + CHUNK_CELLS], candidates.frames)
             for i in range(0, len(cells), CHUNK_CELLS)
         ]
-        cells, scores = parts[0] if len(parts) == 1 else (np.concatenate(each) for each in zip(*parts, strict=True))
+        scores = np.concatenate(parts)
         behind = scores.max() - scores
         if (np.abs(behind - TIE) < _ROUNDING_64).any():
             raise _UndecidedError
         winner = int(np.argmax(behind <= TIE))
         return int(cells[winner]), min(float(scores[winner]), 1.0)
 
-    def _contenders(
-        self, frame: FloatArray, cells: IntArray, frames: FloatArray, reached: float
-    ) -> tuple[IntArray, FloatArray]:
-        """Return the cells that may score `reached`, and their scores at the lags of (m, n) frames."""
+    def _highest_scores(self, frame: FloatArray, cells: IntArray, frames: FloatArray) -> FloatArray:
+        """Return the highest scores of cells at the lags of (m, n) frames."""
         if len(frames) > _FEW_LAGS:
-            return cells, self._scores(frame[None], self._unit_signals(self._cells[cells]))[0]
-        magnitudes = np.abs(self._signals.take(self._cells[cells], axis=0))
-        if len(cells) > _FEW_CELLS:
-            nearly = (frames.astype(np.float32) @ magnitudes.T).max(axis=0) / self._norms[cells]
-            close = np.flatnonzero(nearly >= reached - _ROUNDING_32)
-            cells, magnitudes = cells[close], magnitudes[close]
-        return cells, (frames @ magnitudes.astype(np.float64).T).max(axis=0) / self._norms[cells]
+            return np.asarray(self._scores(frame[None], self._unit_signals(self._cells[cells]))[0])
+        return np.asarray((frames @ self._magnitudes(self._cells[cells]).T).max(axis=0) / self._norms[cells])
 
     def score(self, cell: int, frames: FloatArray) -> float:
         """Return a cell's highest score at the lags of (m, n) frames."""
@@ -437,10 +426,8 @@ class PrunedMatcher(_PruningMatcher, ReferenceMatcher):
     def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Compress the bank; arguments and errors as `Matcher`."""
         super().__init__(signals, valid, k_grid, sigma_grid)
-        # The conjugate transforms of the basis's first directions, (r, l // 2 + 1), by length l. The shorter one serves
-        # where only small lags can matter.
-        lengths, directions = (10 * self.n_channels // 7, 2 * self.n_channels), self.compressed.basis[:COARSE_RANK]
-        self.spectra = {length: np.conj(fft.rfft(directions, length)) for length in lengths}
+        # The conjugate transforms (r, n + 1) of the basis's first directions.
+        self.spectra = np.conj(fft.rfft(self.compressed.basis[:COARSE_RANK], 2 * self.n_channels))
 
     def _search(self, frame: FloatArray, runner_up: bool) -> Match:
         bounds = AllLagsBounds(self, frame)

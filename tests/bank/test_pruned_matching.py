@@ -385,13 +385,13 @@ def test_no_bound_at_any_lag_is_below_its_score(cell, noise, seed):
 def test_few_cells_are_scored_exactly(slow, fast, monkeypatch):
     """What makes it fast: of a frame near to the bank's, most cells are never read."""
     read = []
-    contenders = type(fast)._contenders
+    highest_scores = type(fast)._highest_scores
 
-    def counted(self, frame, cells, frames, reached):
+    def counted(self, frame, cells, frames):
         read.append(len(cells))
-        return contenders(self, frame, cells, frames, reached)
+        return highest_scores(self, frame, cells, frames)
 
-    monkeypatch.setattr(type(fast), "_contenders", counted)
+    monkeypatch.setattr(type(fast), "_highest_scores", counted)
     frame = BANK[0][7, 12] * (1 + 0.05 * np.random.default_rng(6).normal(size=PAPER_TABLE.n_channels))
     assert_same(fast.match(frame), slow.match(frame))
     assert sum(read) < BANK[1].sum() / 4

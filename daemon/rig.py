@@ -158,11 +158,11 @@ class Rig:
         return reason
 
     def stop(self) -> str:
-        """End the experiment on the operator's command, also during its start; return its name."""
+        """End the experiment, also during its start, or the unlocking; return its name, or an empty string."""
         self._stops += 1
         experiment = self.control_loop.experiment
         if experiment is None or not experiment.running:
-            return ""
+            return "unlock" if self.runner.stop_unlocking() else ""
         self.runner.stop("the operator stopped it")
         return experiment.file.name
 
@@ -177,10 +177,7 @@ class Rig:
 
 def read_experiment(path: Path) -> experiment_schema.ExperimentFile:
     """Return the experiment of a file; raises UserError for an invalid one, or one that exceeds its own limits."""
-    file = load_yaml_model(path, experiment_schema.ExperimentFile)
-    if mistakes := experiment_schema.check_steps(file):
-        raise UserError("\n".join(located(path, mistakes, UserError)))
-    return file
+    return _without_mistakes(path, experiment_schema.check_steps(_outline(path)))
 
 
 def check_experiment(
@@ -194,14 +191,10 @@ def check_experiment(
     if path is None:
         return None
     driving = [*(name for name, source in sources.items() if source.measures_torque), WRENCH]
-    try:
-        file = load_yaml_model(path, experiment_schema.ExperimentFile)
-    except UserError as error:
-        content = read_yaml(path, UserError, experiment_schema.ExperimentFile.what)
-        source = content.get("torque_source") if isinstance(content, dict) else None
-        mistakes = _undriven(source, driving, config) if isinstance(source, str) else []
-        raise UserError("\n".join([*located(path, mistakes, UserError), str(error)])) from error
-    mistakes = _undriven(file.torque_source, driving, config) + experiment_schema.check_steps(file)
+    file = _outline(path)
+    mistakes = experiment_schema.check_steps(file)
+    if file.torque_source and file.steps:
+        mistakes += _undriven(file.torque_source, driving, config)
     if config.gripper is None:
         cure = "add a `gripper` section to the configuration, or take the step out"
         mistakes += [
@@ -209,7 +202,19 @@ def check_experiment(
             for number, step in enumerate(file.steps)
             if isinstance(step, experiment_schema.GripStep | experiment_schema.ReleaseStep)
         ]
-    mistakes += _unadaptable(file, sources)
+    return _without_mistakes(path, mistakes + _unadaptable(file, sources))
+
+
+def _outline(path: Path) -> experiment_schema.ExperimentFile:
+    return experiment_schema.outline(read_yaml(path, UserError, experiment_schema.ExperimentFile.what))
+
+
+def _without_mistakes(path: Path, mistakes: Sequence[experiment_schema.Mistake]) -> experiment_schema.ExperimentFile:
+    """Return the experiment of a file; raises UserError with these mistakes, and with those of its keys and values."""
+    try:
+        file = load_yaml_model(path, experiment_schema.ExperimentFile)
+    except UserError as error:
+        raise UserError("\n".join([*located(path, mistakes, UserError), str(error)])) from error
     if mistakes:
         raise UserError("\n".join(located(path, mistakes, UserError)))
     return file
@@ -233,7 +238,7 @@ def _unadaptable(
         if step.do in ("tare", "grip", "release"):
             twisted = False
         twisted = twisted or step.do in ("identify", "twist", "hold_torque", "tighten")
-        if not isinstance(step, experiment_schema.AdaptStep):
+        if not isinstance(step, experiment_schema.AdaptStep) or "fingertip" not in step.model_fields_set:
             continue
         named = [name for name, source in sources.items() if source.has_gain]
         if step.fingertip not in named:

@@ -82,7 +82,7 @@ def _run(
     if config.lock_memory:
         lock_memory()
     listeners: list[Listener] = []
-    reporters: dict[str, Reporter] = {"log": log, "shown": out}
+    reporters: dict[str, Reporter] = {"log_output": log, "printed_output": out}
     with ExitStack() as stack:
         slices = None
         if args.slices is not None:

@@ -245,9 +245,9 @@ async def test_a_stop_from_the_page_needs_no_token_and_the_wrist_stands_still(ri
         assert (await command("resume")).get("reason") == "no experiment is paused", "what was refused was not done"
         async with http.post(f"{page}/stop") as reply:
             assert await reply.json() == {"ok": True, "stopped": "test"}
-        told = watcher.seen["robot.state"][-1]["seq"]
+        last_seq = watcher.seen["robot.state"][-1]["seq"]
         still = await watcher.until(
-            "robot.state", lambda state: state["seq"] > told and abs(state["wrist_speed_rad_per_s"]) < 1e-3
+            "robot.state", lambda state: state["seq"] > last_seq and abs(state["wrist_speed_rad_per_s"]) < 1e-3
         )
         later = await watcher.until("robot.state", lambda state: state["seq"] > still["seq"] + 10)
         assert later["wrist_rad"] == pytest.approx(still["wrist_rad"], abs=1e-3)
@@ -289,8 +289,8 @@ async def test_a_straight_move_brakes_while_it_is_paused_and_ends_where_it_was_t
         await started(command, str(path))
         await watcher.until("robot.state", lambda state: np.linalg.norm(pose(state) - first) > 0.01)
         assert (await command("pause"))["ok"]
-        told = watcher.seen["robot.state"][-1]["seq"]
-        still = await watcher.until("robot.state", lambda state: state["seq"] > told + 12)
+        last_seq = watcher.seen["robot.state"][-1]["seq"]
+        still = await watcher.until("robot.state", lambda state: state["seq"] > last_seq + 12)
         later = await watcher.until("robot.state", lambda state: state["seq"] > still["seq"] + 12)
         assert np.linalg.norm(pose(later) - pose(still)) < 1e-4, "it stands"
         assert np.linalg.norm(pose(later) - first) < 0.045, "and is not there yet"

@@ -77,10 +77,10 @@ def test_messages_are_recorded_with_schema_and_time(tmp_path):
     with path.open("rb") as file:
         reader = make_reader(file)
         assert [one.name for one in reader.iter_attachments()] == ["configuration.json"]
-    told = summarise(path)
-    assert (told.closed, told.dropped, told.same_code) == (True, 0, True)
-    assert told.topics["input.right"].messages == 2
-    assert told.metadata["source"] == "a test"
+    summary = summarise(path)
+    assert (summary.closed, summary.dropped, summary.same_code) == (True, 0, True)
+    assert summary.topics["input.right"].messages == 2
+    assert summary.metadata["source"] == "a test"
 
 
 def test_a_live_recording_is_read_like_an_import(tmp_path):

@@ -274,9 +274,9 @@ async def test_view_prints_its_address_and_ends_on_a_signal(number, tmp_path):
     token = tmp_path / "token"
     addresses = ("--connect", f"ipc://{tmp_path}/p", "--commands", f"ipc://{tmp_path}/c")
     async with shearloop("view", "--port", "0", "--json", "--token-file", str(token), *addresses) as view:
-        told = json.loads(await view.stdout.readline())
-        assert told["url_with_token"] == f"{told['url']}#token={token.read_text().strip()}"
-        async with aiohttp.ClientSession() as http, http.ws_connect(f"{told['url']}stream") as stream:
+        printed = json.loads(await view.stdout.readline())
+        assert printed["url_with_token"] == f"{printed['url']}#token={token.read_text().strip()}"
+        async with aiohttp.ClientSession() as http, http.ws_connect(f"{printed['url']}stream") as stream:
             assert (await stream.receive_json())["first"]
             view.send_signal(number)
             while (message := await stream.receive()).type is aiohttp.WSMsgType.TEXT:

@@ -277,13 +277,13 @@ async def test_another_payload_than_the_configured_one_refuses_motion(controller
         assert (await robot.send(Enable())).accepted
 
 
-@pytest.mark.parametrize("told", [None, signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-async def test_leaving_stops_the_arm_and_ends_the_program(told, controller):
+@pytest.mark.parametrize("sent", [None, signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+async def test_leaving_stops_the_arm_and_ends_the_program(sent, controller):
     """Also when a terminal or service manager signals every process."""
     async with turning(controller) as robot:
         left_ns = time.monotonic_ns()
-        if told is not None:
-            os.kill(pid_of(robot), told)
+        if sent is not None:
+            os.kill(pid_of(robot), sent)
     stopped = await controller.event("motion-stopped", left_ns)
     ended = await controller.event("program-ended", left_ns)
     assert ended["t_mono_ns"] >= stopped["t_mono_ns"]

@@ -62,8 +62,6 @@ _SQUARE_ROUNDING = 4e-6
 _SQUARE_ROUNDING_64 = 1e-12
 # Rounding of a sum of a thousand products in float64; where a tie hangs on less, the reference decides.
 _ROUNDING_64 = 1e-14
-# With more lags than this, a transform costs less per cell than the products.
-_FEW_LAGS = 128
 # With fewer cells, the whole heatmap at all lags is faster than pruning.
 MIN_PRUNED_CELLS = 300
 # The runner-up may be this much worse than the best cell at lag 0 before groups are bounded a second time.
@@ -345,9 +343,7 @@ class _PruningMatcher(Matcher):
     @abstractmethod
     def _search(self, frame: FloatArray, runner_up: bool) -> Match: ...
 
-    def _best_candidate(
-        self, frame: FloatArray, candidates: Candidates, reached: float, seed: int = -1
-    ) -> tuple[int, float]:
+    def _best_candidate(self, candidates: Candidates, reached: float, seed: int = -1) -> tuple[int, float]:
         """Return the cell of the highest score, the lowest of those that tie, and the score.
 
         One of the candidates must reach the score `reached`: `seed`, where that is known.
@@ -357,7 +353,7 @@ class _PruningMatcher(Matcher):
             reached = max(reached, self.score(likeliest, candidates.frames))
         cells = candidates.cells[candidates.bounds >= reached - ROUNDING]
         parts = [
-            self._highest_scores(frame, cells[i : i + CHUNK_CELLS], candidates.frames)
+            self._highest_scores(cells[i : i + CHUNK_CELLS], candidates.frames)
             for i in range(0, len(cells), CHUNK_CELLS)
         ]
         scores = np.concatenate(parts)
@@ -367,10 +363,8 @@ class _PruningMatcher(Matcher):
         winner = int(np.argmax(behind <= TIE))
         return int(cells[winner]), min(float(scores[winner]), 1.0)
 
-    def _highest_scores(self, frame: FloatArray, cells: IntArray, frames: FloatArray) -> FloatArray:
+    def _highest_scores(self, cells: IntArray, frames: FloatArray) -> FloatArray:
         """Return the highest scores of cells at the lags of (m, n) frames."""
-        if len(frames) > _FEW_LAGS:
-            return np.asarray(self._scores(frame[None], self._unit_signals(self._cells[cells]))[0])
         return np.asarray((frames @ self._magnitudes(self._cells[cells]).T).max(axis=0) / self._norms[cells])
 
     def score(self, cell: int, frames: FloatArray) -> float:
@@ -404,18 +398,18 @@ class PrunedZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
 
     def _search(self, frame: FloatArray, runner_up: bool) -> Match:
         bounds = ZeroLagBounds(self.compressed, frame)
-        best = self._best(frame, bounds)
+        best = self._best(bounds)
         outside = self._outside(best[0], RUNNER_UP_RADIUS)
         if not (runner_up and outside.any()):
             return self._match(best, None)
         bounds.leave_out(~outside)
-        return self._match(best, self._best(frame, bounds))
+        return self._match(best, self._best(bounds))
 
-    def _best(self, frame: FloatArray, bounds: ZeroLagBounds) -> tuple[int, float]:
+    def _best(self, bounds: ZeroLagBounds) -> tuple[int, float]:
         """Return the cell of the highest score among those not left out, and the score."""
         seed = bounds.seed()
         reached = self.score(seed, bounds.frames)
-        return self._best_candidate(frame, bounds.candidates(reached), reached, seed)
+        return self._best_candidate(bounds.candidates(reached), reached, seed)
 
 
 class PrunedMatcher(_PruningMatcher, ReferenceMatcher):
@@ -433,15 +427,15 @@ class PrunedMatcher(_PruningMatcher, ReferenceMatcher):
         bounds = AllLagsBounds(self, frame)
         near, reached = bounds.reached
         if not runner_up:
-            return self._match(self._best_candidate(frame, bounds.candidates(reached), reached), None)
+            return self._match(self._best_candidate(bounds.candidates(reached), reached), None)
         # A cell outside at twice the radius is outside the peak of every cell in this peak.
         far, least = bounds.seed(self._outside(near, 2 * RUNNER_UP_RADIUS)) or (-1, 0.0)
         candidates = bounds.candidates(min(reached, least))
-        best = self._best_candidate(frame, candidates, reached)
+        best = self._best_candidate(candidates, reached)
         outside = self._outside(best[0], RUNNER_UP_RADIUS)
         if far >= 0 and not outside[far]:
             _, least = bounds.seed(outside) or (-1, 0.0)
             candidates = bounds.candidates(least)
         kept = outside[candidates.cells]
         rest = Candidates(candidates.cells[kept], candidates.bounds[kept], candidates.frames)
-        return self._match(best, self._best_candidate(frame, rest, least) if len(rest.cells) else None)
+        return self._match(best, self._best_candidate(rest, least) if len(rest.cells) else None)

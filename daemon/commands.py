@@ -66,7 +66,7 @@ class Commands:
         return {}
 
     async def _unlock(self, _request: Request) -> Reply:
-        _refuse_if(await required_rig(self.rig).runner.unlock())
+        _refuse_if(await required_rig(self.rig).unlock())
         return {}
 
     async def _tare(self, request: Request) -> Reply:

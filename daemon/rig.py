@@ -32,6 +32,8 @@ from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.yaml_files import located, read_yaml
 
+ENDING = "the daemon ends; start it again"
+
 
 def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
     """Return the load cell's calibration; raises DriverError if it cannot be used."""
@@ -137,8 +139,9 @@ class Rig:
         self.robot = UrRobot(robot_settings(config.robot), LinkMonitor(DeviceLink("robot", loop)))
         self.runner = ControlLoopRunner(loop, self.robot, gripper, sensors, publisher, clock, supervisor.dead)
         self._recorder = recorder
-        # Counts the operator's stops, also while an experiment starts.
+        # Counts the stops, also while an experiment starts.
         self._stops = 0
+        self._closed = False
 
     def tasks(self) -> dict[str, Task]:
         """Return the tasks to run, by their names in `health`."""
@@ -147,6 +150,8 @@ class Rig:
 
     async def start(self, path: Path) -> str | None:
         """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file."""
+        if self._closed:
+            return ENDING
         attached = AttachedFile.read(path) if self._recorder is not None else ()
         stops_before, file = self._stops, read_experiment(path)
         reason = await self.runner.start(file)
@@ -156,6 +161,10 @@ class Rig:
         if reason is None and self._recorder is not None:
             self._recorder.record_experiment(file.name, attached, experiment_notes(file))
         return reason
+
+    async def unlock(self) -> str | None:
+        """Enable robot and gripper after a stop; return None, or why not."""
+        return ENDING if self._closed else await self.runner.unlock()
 
     def stop(self) -> str:
         """End the experiment, also during its start, or the unlocking; return its name, or an empty string."""
@@ -167,7 +176,8 @@ class Rig:
         return experiment.file.name
 
     def close(self) -> None:
-        """Stop the running experiment at the daemon's end."""
+        """Stop the running experiment at the daemon's end, and start nothing more."""
+        self._stops, self._closed = self._stops + 1, True
         experiment = self.control_loop.experiment
         if experiment is not None and experiment.running:
             self.runner.stop("the daemon ended: the wrist is stopped, a gripped tool stays gripped")

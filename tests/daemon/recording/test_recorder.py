@@ -128,6 +128,18 @@ def test_each_experiment_has_a_file_with_its_name(tmp_path):
     assert topics(second)["input.clock"], "each can be replayed by itself"
 
 
+def test_a_clock_that_was_set_back_costs_no_recording(tmp_path, monkeypatch):
+    monkeypatch.setattr(Clock, "now_ns", lambda _: 0)
+    monkeypatch.setattr(Clock, "offset_ns", 10**18)
+    for number in range(3):
+        recorder = Recorder(tmp_path, IDENTITY, Clock())
+        recorder.record_experiment("hold")
+        recorder.record_message("load.torque", torque(number))
+        recorder.close()
+    kept = [topics(path)["load.torque"] for path in sorted(tmp_path.iterdir())]
+    assert sorted(one["seq"] for (one,) in kept) == [0, 1, 2]
+
+
 def test_a_new_file_begins_after_an_hour_without_experiment(tmp_path, monkeypatch):
     recorder = Recorder(tmp_path, IDENTITY, Clock())
     recorder.record_experiment("one")

@@ -343,14 +343,13 @@ class _PruningMatcher(Matcher):
     @abstractmethod
     def _search(self, frame: FloatArray, runner_up: bool) -> Match: ...
 
-    def _best_candidate(self, candidates: Candidates, reached: float, seed: int = -1) -> tuple[int, float]:
+    def _best_candidate(self, candidates: Candidates, reached: float) -> tuple[int, float]:
         """Return the cell of the highest score, the lowest of those that tie, and the score.
 
-        One of the candidates must reach the score `reached`: `seed`, where that is known.
+        One of the candidates must reach the score `reached`.
         """
         likeliest = int(candidates.cells[candidates.bounds.argmax()])
-        if likeliest != seed:
-            reached = max(reached, self.score(likeliest, candidates.frames))
+        reached = max(reached, self.score(likeliest, candidates.frames))
         cells = candidates.cells[candidates.bounds >= reached - ROUNDING]
         parts = [
             self._highest_scores(cells[i : i + CHUNK_CELLS], candidates.frames)
@@ -407,9 +406,8 @@ class PrunedZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
 
     def _best(self, bounds: ZeroLagBounds) -> tuple[int, float]:
         """Return the cell of the highest score among those not left out, and the score."""
-        seed = bounds.seed()
-        reached = self.score(seed, bounds.frames)
-        return self._best_candidate(bounds.candidates(reached), reached, seed)
+        reached = self.score(bounds.seed(), bounds.frames)
+        return self._best_candidate(bounds.candidates(reached), reached)
 
 
 class PrunedMatcher(_PruningMatcher, ReferenceMatcher):

@@ -197,7 +197,7 @@ class ExperimentFile(ConfigModel):
     tool_mm: float | None = Field(None, gt=0, lt=140, description="diameter of the tool, for recordings")
     slices: Literal["torque", "diameter"] | None = Field(
         None,
-        description="kind of samples that `shearloop run --slices DIR` stores for each held angle; none by default",
+        description="kind of sample that `recording export --format slices` makes of each held angle; none by default",
     )
     steps: tuple[Step, ...] = Field(min_length=1, description="the steps in order")
 

@@ -28,7 +28,7 @@ DEADLINE_S = 120
 ROBOT = str(Path(__file__).resolve().parents[3] / "config/ur.yaml")
 # What the daemon may keep of it all: caches, free lists, its sockets' buffers.
 MOST_GROWTH_MB = 16.0
-COMMANDS = ("tare", "start", "pause", "resume", "stop", "status", "unlock", "set")
+COMMANDS = ("tare", "start", "pause", "resume", "stop", "status", "unlock")
 
 
 def malformed_requests(count: int) -> Iterator[list[bytes]]:

@@ -62,7 +62,7 @@ async def served(tmp_path: Path, **other: Any) -> AsyncIterator[Served]:
         return handle
 
     publish, commands = f"ipc://{tmp_path}/publish", f"ipc://{tmp_path}/commands"
-    handlers = {name: handler(name) for name in (*NEEDS_TOKEN, "stop", "set")} | other
+    handlers = {name: handler(name) for name in (*NEEDS_TOKEN, "stop")} | other
     with zmq.asyncio.Context() as context:
         publisher = Publisher(context, publish, Clock())
         daemon = CommandServer(context, commands, handlers, Refusals())
@@ -108,7 +108,7 @@ async def test_motion_needs_the_token_and_stop_does_not(tmp_path):
             {"ok": False, "reason": "no experiment is running"},
         )
         # Other commands of the daemon are not the page's.
-        for name in ("stop", "set", "status"):
+        for name in ("stop", "status"):
             assert (await post(page, f"/commands/{name}", **BEARER))[0] == 404
         assert page.asked == ["stop", "start", "pause"]
 

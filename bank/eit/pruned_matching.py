@@ -19,7 +19,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import count
 from operator import itemgetter
 from typing import Any, NamedTuple
@@ -328,20 +328,19 @@ class _PruningMatcher(Matcher):
         self._norms = np.concatenate([np.linalg.norm(self._magnitudes(cells), axis=1) for cells in self._chunks()])
         self._row, self._column = np.divmod(self._cells, valid.shape[1])
 
-    def match(self, difference: ArrayLike, *, runner_up: bool = True) -> Match:
+    def match(self, difference: ArrayLike) -> Match:
         """Return what `best_match` finds in the heatmap of one (n,) difference, at a fraction of its cost.
 
-        Without `runner_up`, that is None. Raises MatchingError as `heatmap` does.
+        Raises MatchingError as `heatmap` does.
         """
         if len(self._cells) >= self._min_cells:
             (frame,) = unit_magnitudes(np.asarray(difference)[None], self.n_channels)
             with suppress(_UndecidedError):
-                return self._search(frame, runner_up)
-        match = super().match(difference)
-        return match if runner_up else replace(match, runner_up=None, runner_up_cell=None)
+                return self._search(frame)
+        return super().match(difference)
 
     @abstractmethod
-    def _search(self, frame: FloatArray, runner_up: bool) -> Match: ...
+    def _search(self, frame: FloatArray) -> Match: ...
 
     def _best_candidate(self, candidates: Candidates, reached: float) -> tuple[int, float]:
         """Return the cell of the highest score, the lowest of those that tie, and the score.
@@ -395,14 +394,12 @@ class _PruningMatcher(Matcher):
 class PrunedZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
     """Matches at lag 0 alone. All cells are bounded at once: one lag takes few operations per cell."""
 
-    def _search(self, frame: FloatArray, runner_up: bool) -> Match:
+    def _search(self, frame: FloatArray) -> Match:
         bounds = ZeroLagBounds(self.compressed, frame)
         best = self._best(bounds)
         outside = self._outside(best[0], RUNNER_UP_RADIUS)
-        if not (runner_up and outside.any()):
-            return self._match(best, None)
         bounds.leave_out(~outside)
-        return self._match(best, self._best(bounds))
+        return self._match(best, self._best(bounds) if outside.any() else None)
 
     def _best(self, bounds: ZeroLagBounds) -> tuple[int, float]:
         """Return the cell of the highest score among those not left out, and the score."""
@@ -421,11 +418,9 @@ class PrunedMatcher(_PruningMatcher, ReferenceMatcher):
         # The conjugate transforms (r, n + 1) of the basis's first directions.
         self.spectra = np.conj(fft.rfft(self.compressed.basis[:COARSE_RANK], 2 * self.n_channels))
 
-    def _search(self, frame: FloatArray, runner_up: bool) -> Match:
+    def _search(self, frame: FloatArray) -> Match:
         bounds = AllLagsBounds(self, frame)
         near, reached = bounds.reached
-        if not runner_up:
-            return self._match(self._best_candidate(bounds.candidates(reached), reached), None)
         # A cell outside at twice the radius is outside the peak of every cell in this peak.
         far, least = bounds.seed(self._outside(near, 2 * RUNNER_UP_RADIUS)) or (-1, 0.0)
         candidates = bounds.candidates(min(reached, least))

@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
@@ -34,8 +34,9 @@ from shearloop.bank.skin.membrane import (
     ShearInterval,
     direction_of,
 )
-from shearloop.yaml_files import load_model, save_yaml
+from shearloop.yaml_files import read_yaml, save_yaml, validated
 
+FORMAT = "shearloop skin calibration 3"
 COLUMNS = ("r1_ohm", "r2_ohm", "shear_n", "normal_n")
 # A load cell at rest may read slightly negative; a skin cannot be pulled off its core.
 MAX_PULL_N = 0.05
@@ -84,7 +85,6 @@ class SkinCalibration(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
-    format: Literal["shearloop skin calibration 3"]
     friction: float = Field(ge=0, le=1)
     gauge_angle_deg: float = Field(gt=0, lt=90)
     linear_to_n: float = Field(gt=0)
@@ -218,14 +218,17 @@ def _numbers(path: Path, line: int, row: dict[str | None, str]) -> list[float]:
 
 def save_calibration(calibration: SkinCalibration, path: Path) -> None:
     """Write a calibration as YAML, replacing the file at once."""
-    save_yaml(path, calibration.model_dump(), CalibrationError)
+    save_yaml(path, {"format": FORMAT, **calibration.model_dump()}, CalibrationError)
 
 
 def load_calibration(path: Path) -> SkinCalibration:
     """Return the calibration in a YAML file; raises CalibrationError naming the file and every wrong key."""
-    return load_model(
-        path, SkinCalibration, CalibrationError, "calibration", "; make it with `shearloop skin calibrate`."
-    )
+    document = read_yaml(path, CalibrationError, "calibration", "; make it with `shearloop skin calibrate`.")
+    if not (isinstance(document, dict) and document.pop("format", None) == FORMAT):
+        raise CalibrationError(
+            f"{path} is not a calibration as `shearloop skin calibrate` writes it: it has no `format: {FORMAT}`."
+        )
+    return validated(document, SkinCalibration, str(path), CalibrationError)
 
 
 def fit_calibration(table: CalibrationTable, *, friction: float | None = None) -> SkinCalibration:
@@ -259,7 +262,6 @@ def fit_calibration(table: CalibrationTable, *, friction: float | None = None) -
     knots, responses, half_width = curve.fit(friction)
     slack, slack_half_width = _fit_slack(changes[loaded][kept], responses)
     found = SkinCalibration(
-        format="shearloop skin calibration 3",
         friction=friction,
         gauge_angle_deg=math.degrees(PAPER_SECTION.gauge_angle_rad),
         linear_to_n=LINEAR_TO_N,

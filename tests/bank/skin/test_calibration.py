@@ -137,7 +137,6 @@ def exact_calibration() -> SkinCalibration:
     knots = (-5.0, -1.2, 1.2, 5.0)
     angle = float(np.degrees(BELT.gauge_angle_rad))
     return SkinCalibration(
-        format="shearloop skin calibration 3",
         friction=0.04,
         gauge_angle_deg=angle,
         linear_to_n=1.2,

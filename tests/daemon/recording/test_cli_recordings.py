@@ -353,6 +353,6 @@ def test_the_picture_of_a_stream_shows_torque_also_with_a_named_tool(kind, estim
     assert f"<!-- {drawn} -->" in picture
     assert f"<!-- {'load cell' if kind == 'raw' else 'known diameter'} -->" in picture
     # An interval that extends the other way is explained.
-    assert ("<!-- no load on the lever" in picture) == (estimated_nm == 0)
+    assert ("<!-- no load on a load cell" in picture) == (estimated_nm == 0)
     judged = f"one; 4 loaded frames: RMSE {0.1 - estimated_nm:g} N·m (always saying 0: 0.1)"
     assert (f"<!-- {judged} -->" in picture) == (kind == "raw")

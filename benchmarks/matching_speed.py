@@ -1,9 +1,9 @@
-"""Time per bank cell and per match against the peers, and agreement of the pruned matchers with the reference.
+"""Time per bank cell and per match against other methods, and agreement of the pruned matchers with the reference.
 
     python -m benchmarks.matching_speed --bank run/paper.bank --mesh MESH --recordings FOLDER --out FILE
 
-Methods take turns, so that a busy moment of the machine affects all alike. A ratio is of one turn; medians and
-quartiles are over the turns. `pip install -e '.[bench]'` installs pyEIT and FAISS; without them their rows are missing.
+Methods take turns, so that a busy moment of the machine affects all alike; medians and quartiles are over the turns.
+`pip install -e '.[bench]'` installs pyEIT; without it its row is missing.
 EIDORS needs MATLAB or Octave, so its time is cited. `--every N` also checks every N-th recorded frame against the
 reference matchers, with runner-up, which takes a tenth of a second a frame and more.
 """
@@ -41,12 +41,6 @@ CACHE_BYTES = 64 << 20
 MATCHERS: dict[str, tuple[type[Matcher], type[PrunedMatcher | PrunedZeroLagMatcher]]] = {
     "all lags": (ReferenceMatcher, PrunedMatcher),
     "zero lag": (ZeroLagMatcher, PrunedZeroLagMatcher),
-}
-# Peers and own methods by the row they are compared with.
-RATIOS = {
-    "batch, two threads": ("pyEIT", "direct", "batch, one thread"),
-    "all lags, pruned": ("all lags, numpy float32 FFT",),
-    "zero lag, pruned": ("zero lag, numpy float32", "zero lag, FAISS flat"),
 }
 
 
@@ -104,7 +98,7 @@ def match_methods(bank: Bank, frames: FloatArray) -> dict[str, tuple[Run, int]]:
             int(np.argmax(fft.irfft(fft.rfft(frame, length) * spectra, length).max(axis=1))) for frame in single[:4]
         ]
 
-    methods: dict[str, tuple[Run, int]] = {
+    return {
         "zero lag, pruned": (lambda: [zero.match(frame, runner_up=False) for frame in frames], n),
         "zero lag, pruned, with runner-up": (lambda: [zero.match(frame) for frame in frames], n),
         "zero lag, numpy float32": (lambda: [int(np.argmax(signals @ frame)) for frame in single], n),
@@ -112,15 +106,6 @@ def match_methods(bank: Bank, frames: FloatArray) -> dict[str, tuple[Run, int]]:
         "all lags, pruned, with runner-up": (lambda: [every.match(frame) for frame in frames], n),
         "all lags, numpy float32 FFT": (by_fft, 4),
     }
-    try:
-        import faiss
-    except ImportError:
-        return methods
-    faiss.omp_set_num_threads(1)
-    index = faiss.IndexFlatIP(PAPER_TABLE.n_channels)
-    index.add(signals)
-    methods["zero lag, FAISS flat"] = (lambda: [index.search(frame[None], 1) for frame in single], n)
-    return methods
 
 
 def recorded_slices(folder: Path) -> FloatArray:
@@ -185,16 +170,6 @@ def cold_seconds(bank: Bank, frames: FloatArray, turns: int) -> dict[str, list[f
     return found
 
 
-def ratios(seconds: Mapping[str, list[float]]) -> dict[str, Any]:
-    """Return how many times as long each peer takes, turn by turn."""
-    return {
-        f"{peer} / {own}": spread([slow / fast for slow, fast in zip(seconds[peer], seconds[own], strict=True)])
-        for own, peers in RATIOS.items()
-        for peer in peers
-        if peer in seconds
-    }
-
-
 def spread(values: list[float]) -> dict[str, float]:
     """Return the median and quartiles of some values."""
     low, middle, high = statistics.quantiles(values, n=4)
@@ -219,8 +194,7 @@ def main() -> None:
         "machine": {"cores": os.cpu_count(), "load_average": os.getloadavg()[0]},
         "cells": int(bank.valid.sum()),
         "seconds": {name: spread(each) for name, each in seconds.items()},
-        "ratios": ratios(seconds),
-        "eidors_cited_ratio": EIDORS_CELL_S / statistics.median(seconds["batch, two threads"]),
+        "eidors_cited_s": EIDORS_CELL_S,
         "batch_error_against_direct": error,
     }
     if args.every:

@@ -195,12 +195,13 @@ class RunningRig:
         path.write_text(yaml.safe_dump(content))
         end_s = time.monotonic() + DEADLINE_S
         while time.monotonic() < end_s:
-            if self.send("start", experiment=str(path))["ok"] and "wrist_rad" in self.wait_for(_turns_or_ended):
+            reply = self.send("start", experiment=str(path))
+            if reply["ok"] and "wrist_rad" in (reply := dict(self.wait_for(_turns_or_ended))):
                 return
             # Devices come back at their own time.
             time.sleep(0.2)
             self.send("unlock")
-        raise RuntimeError("the experiment does not start")
+        raise RuntimeError(f"the experiment does not start: {reply}")
 
     def cause(self, cause: Cause) -> int:
         """Bring a cause about; return its time in ns."""

@@ -191,7 +191,7 @@ def _info(args: argparse.Namespace) -> int:
     facts: dict[str, object] = {
         **_result(args.path, bank),
         "format_version": FORMAT_VERSION,
-        "variation": asdict(bank.definition.variation),
+        "variation": asdict(bank.variation),
         "geometry_hash": bank.geometry_hash,
         "channels": bank.table.n_channels,
         "channel_table_hash": bank.table.digest,

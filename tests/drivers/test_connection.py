@@ -1,6 +1,7 @@
 import asyncio
 import os
 import re
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -8,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers import connection
-from shearloop.drivers.connection import LinkMonitor, SerialLink, SerialPort, find_port
+from shearloop.drivers.connection import LinkMonitor, SerialLink, SerialPort, TcpPort, find_port
 from shearloop.drivers.emulators.ports import PtyPort
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceUnavailableError
 from tests.running import DEADLINE_S, LinkEvents
@@ -202,3 +203,13 @@ def test_waits_stay_within_their_bounds(steps):
             monitor.connected("up", now_ns)
         else:
             assert 0.2 <= monitor.failed(DeviceLostError("gone"), now_ns) <= 5.0
+
+
+async def test_bytes_at_the_deadline_count():
+    """After a pause of this process both the bytes and the timer are due."""
+    reader = asyncio.StreamReader()
+    receiving = asyncio.create_task(TcpPort("device", reader, SimpleNamespace()).read(0.01))
+    await asyncio.sleep(0)
+    time.sleep(0.05)  # noqa: ASYNC251 - the pause
+    reader.feed_data(b"ACT 1\n")
+    assert (await receiving).data == b"ACT 1\n"

@@ -245,7 +245,7 @@ async def test_a_scanner_that_breaks_off_in_mid_answer_is_named_counted_and_aske
         assert facts["errors"] == {"lost": 1, "unfinished": 1, **errors_of_start(bench)}
         told = str(facts["last_loss"])
         assert told.startswith("The scanner broke off in the middle of its answer to 'READ?': 127.0.0.1:")
-        assert told.endswith("has closed the connection; see whether the instrument is still on.")
+        assert told.endswith("has closed the connection; see whether the device is still on.")
         # Half an answer is no reading: every voltage is that of a gauge.
         good = [sample for sample in bench.samples if sample.trusted]
         assert all(0.1 < volts < 0.15 for sample in good for volts in (sample.v1_v, sample.v2_v))

@@ -50,6 +50,11 @@ def run(args: argparse.Namespace) -> int:
     if config.robot is not None and not args.prepare:
         # Without the robot's library nothing needs to be built.
         robot_settings(config.robot)
+    if args.recording is not None and not args.prepare:
+        from shearloop.daemon.recording.matlab import read_stream
+
+        # Before anything is built and served.
+        read_stream(args.recording)
     if args.prepare:
         _prepare(folder, args.folder / "run", calibrated=args.recording is None)
         return 0

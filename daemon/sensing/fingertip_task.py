@@ -273,10 +273,6 @@ class FingertipTask:
         if self._always_heatmap or self._publisher.has_subscriber(EitHeatmap.topic):
             await self._publish_heatmap(frame)
 
-    def show_heatmap(self, *, always: bool) -> None:
-        """Publish a heatmap with every frame, or only while somebody subscribes to it."""
-        self._always_heatmap = always
-
     def diagnostics(self) -> TaskFacts:
         """Return the values for the health message."""
         board = self._board.diagnostics()

@@ -237,7 +237,8 @@ class RobotiqGripper:
         self._last_move = None
         await self._write(messages.GripperHalt())
         readout, _ = await self._read()
-        if readout.sta is messages.ActivationStatus.ACTIVATING:
+        # The status may not show an activation yet that has just been requested.
+        if readout.sta is not messages.ActivationStatus.ACTIVE:
             await self._write(messages.Reset())
 
     async def states(self) -> AsyncGenerator[messages.GripperState]:

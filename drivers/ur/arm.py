@@ -1,4 +1,4 @@
-"""The arm through ur-rtde. Only this module imports ur-rtde, and only the worker process imports this module.
+"""The arm through ur-rtde. Only this module calls ur-rtde, and only the worker process imports this module.
 
 ur-rtde is not thread-safe. Its calls block for up to 301 s, its constructors hold the interpreter lock, and it crashes
 its process when RTDE is lost. So it has a process of its own, with an alarm before each call.

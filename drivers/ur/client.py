@@ -12,6 +12,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Coroutine
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, Literal, Protocol, cast
 
@@ -47,13 +48,19 @@ class LostError(DeviceLostError):
 
 def missing_library() -> str:
     """Return why the robot cannot be driven with this Python, or an empty string."""
-    if find_spec("rtde_control") is not None:
-        return ""
-    return (
-        f"the robot needs the package ur-rtde, which is not installed for Python {platform.python_version()} on "
-        f"{platform.machine()}: use Python 3.11 or 3.12 on x86-64, or build it with `pip install "
-        "'shearloop[robot-source]'`, which needs cmake, g++, git and Boost's headers"
-    )
+    pip = f"{sys.executable} -m pip install"
+    if find_spec("rtde_control") is None:
+        return (
+            f"the robot needs the package ur-rtde, which is not installed for Python {platform.python_version()} on "
+            f"{platform.machine()}: use Python 3.11 or 3.12 on x86-64, or build it with "
+            f"`{pip} 'shearloop[robot-source]'`, which needs cmake, g++, git and Boost's headers"
+        )
+    try:
+        import_module("rtde_control")
+    except ImportError as error:
+        again = f"`{pip} --force-reinstall --no-deps ur-rtde`"
+        return f"the package ur-rtde, which drives the robot, cannot be loaded: install it again with {again} ({error})"
+    return ""
 
 
 class UrRobot:

@@ -245,9 +245,9 @@ async def test_a_stop_from_the_page_needs_no_token_and_the_wrist_stands_still(ri
         assert (await command("resume")).get("reason") == "no experiment is paused", "what was refused was not done"
         async with http.post(f"{page}/stop") as reply:
             assert await reply.json() == {"ok": True, "stopped": "test"}
-        told = watcher.seen["robot.state"][-1]["seq"]
+        last_seq = watcher.seen["robot.state"][-1]["seq"]
         still = await watcher.until(
-            "robot.state", lambda state: state["seq"] > told and abs(state["wrist_speed_rad_per_s"]) < 1e-3
+            "robot.state", lambda state: state["seq"] > last_seq and abs(state["wrist_speed_rad_per_s"]) < 1e-3
         )
         later = await watcher.until("robot.state", lambda state: state["seq"] > still["seq"] + 10)
         assert later["wrist_rad"] == pytest.approx(still["wrist_rad"], abs=1e-3)

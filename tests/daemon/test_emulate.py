@@ -142,8 +142,8 @@ def test_help_names_every_fault(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["emulate", "eit-kit", "--help"])
     assert ended.value.code == 0
-    told = capsys.readouterr().out
-    assert [name for name in EitKitBoard.faults if name not in told] == []
+    printed = capsys.readouterr().out
+    assert [name for name in EitKitBoard.faults if name not in printed] == []
 
 
 async def test_the_command_runs_without_a_terminal(tmp_path):

@@ -84,9 +84,9 @@ def test_what_is_missing_is_told_before_what_came_later():
     outlet.write("20\n")
     terminal.may.release(2)
     outlet.close(10)
-    told = terminal.getvalue().splitlines()
-    assert told[-2:] == [f"… {lost} texts are missing here: the terminal did not read them", "20"]
-    assert told[:-2] == [str(number) for number in range(kept + 1)]
+    lines = terminal.getvalue().splitlines()
+    assert lines[-2:] == [f"… {lost} texts are missing here: the terminal did not read them", "20"]
+    assert lines[:-2] == [str(number) for number in range(kept + 1)]
 
 
 def test_what_nobody_reads_any_longer_kills_nobody():

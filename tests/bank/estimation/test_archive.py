@@ -43,13 +43,13 @@ def test_damage_is_refused_by_name_or_does_no_harm(saved, tmp_path_factory, wher
     try:
         loaded = Calibration.load(path)
     except BankError as error:
-        told = str(error)
+        message = str(error)
     else:
         # Bytes that nothing reads, such as a date in the directory of the zip.
         loaded.save(path)
         assert path.read_bytes() == content
         return
-    assert str(path) in told
+    assert str(path) in message
 
 
 def test_foreign_and_stale_files_are_refused(tmp_path, motion_calibration):

@@ -260,9 +260,9 @@ async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none()
         # Neither was the stop that comes next, of which there is nobody to hear.
         await asyncio.sleep(0)
         cell.runner.decide_now()
-        told = " ".join(cell.control_loop.status.decision.reasons)
-        assert "not connected" in told
-        assert "a command was refused" not in told
+        reasons = " ".join(cell.control_loop.status.decision.reasons)
+        assert "not connected" in reasons
+        assert "a command was refused" not in reasons
 
 
 def stops(cell: Cell) -> list[LoopStop]:

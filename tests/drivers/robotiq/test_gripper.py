@@ -81,6 +81,24 @@ async def test_halted_gripper_reports_no_object(way, tmp_path):
         assert 0 < state.width_mm < 140
 
 
+@pytest.mark.parametrize("requested", [[], [messages.Activate()]], ids=["reset", "about to activate"])
+@WAYS
+async def test_halting_a_gripper_that_is_not_active_moves_nothing(way, requested, tmp_path):
+    """A stop meets an activation before its beginning."""
+    async with a_rig(way, tmp_path, connected=True) as rig:
+        before_mm = rig.model.width_mm
+        # The status shows a command only after the next step.
+        rig.stopped = True
+        for request in requested:
+            await rig.driver._write(request)
+        await rig.driver.halt()
+        rig.stopped = False
+        for _ in range(10):
+            assert (await rig.driver.read()).activation is messages.ActivationStatus.RESET
+            rig.monotonic_ns()
+        assert rig.model.width_mm == before_mm
+
+
 @WAYS
 async def test_major_fault_needs_the_operators_confirmation(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig:

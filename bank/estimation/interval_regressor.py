@@ -317,7 +317,9 @@ class IntervalRegressor:
         parts = np.array([weighted[:, sides == side].sum(axis=1) + constant / m for side in range(m)]).T
         correction = self.gain.correct(parts, sign * torque_nm, twists, bounded=lever)
         factors, loaded = correction.factors, np.concatenate(twists)
-        total = float((parts[loaded] @ factors).sum() / parts[loaded].sum())
+        # Torques of both directions would cancel in a sum.
+        before = parts[loaded].sum(axis=1)
+        total = float(parts[loaded] @ factors @ before / (before @ before))
         weights, larger = point.weights * factors[sides], max(total, 1.0)
         offset = constant * float(factors.mean()) + float(point.mean @ weights) + correction.offset_nm
         adapted = replace(

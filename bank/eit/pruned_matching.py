@@ -50,10 +50,6 @@ FINE_RANK = 96
 # Number of groups, and the mean number of cells in a group at least.
 _N_GROUPS = 512
 _MIN_GROUP_CELLS = 4
-# Groups are split by their radius plus ρ times a usual t.
-_USUAL_T = 0.5
-# Frames fall where cells are dense, so groups of many cells are split slightly sooner.
-_CROWDING = 0.1
 # Rounding of float32 in a bound, and in the square of t. Sums of 98 products and a transform of 1792 values of norm 1
 # lose 5e-6 by the usual estimates; 3e-7 is observed.
 ROUNDING = 2e-5
@@ -178,16 +174,15 @@ def _group_row(cells: Float32Array) -> Float32Array:
 def _partition(cells: Float32Array, size: int) -> list[tuple[IntArray, Float32Array]]:
     """Split the cells into as many groups as `size`, or fewer where cells are alike.
 
-    Returns every group's cells and the row that bounds them. The group with the widest bound is split in two, between
+    Returns every group's cells and the row that bounds them. The group of the largest radius is split in two, between
     the cell farthest from its centre and the cell farthest from that one.
     """
     order = count()
 
     def entry(chosen: IntArray) -> tuple[float, int, IntArray, Float32Array]:
         row = _group_row(cells[chosen])
-        radius, left_out = row[-2:].tolist()
-        width = (radius + _USUAL_T * left_out) * len(chosen) ** _CROWDING if radius > ROUNDING else 0.0
-        return -width, next(order), chosen, row
+        radius = float(row[-2])
+        return -radius if radius > ROUNDING else 0.0, next(order), chosen, row
 
     heap = [entry(np.arange(len(cells)))]
     while len(heap) < size and heap[0][0] < 0:

@@ -224,17 +224,18 @@ def draw_tracks(tracks: Sequence[EstimateTrack], names: Sequence[str], title: st
 
 
 def _draw_intervals(axes: "Axes", t_s: FloatArray, value: FloatArray, low: FloatArray, high: FloatArray) -> None:
-    """Draw the estimates of a stream with their intervals, hatched where a lever does not touch: there exactly 0."""
+    """Draw a stream's estimates and intervals, hatched where a load cell is not pushed."""
     axes.plot(t_s, value, linewidth=1.2, label="estimate")
     axes.fill_between(t_s, low, high, alpha=0.25, linewidth=0, label="95 % interval of the estimate")
     axes.fill_between(
         t_s, 0, 1, where=np.isnan(value), transform=axes.get_xaxis_transform(), color="0.92", linewidth=0,
         label="no valid estimate",
     )  # fmt: skip
-    if (value == 0).any():
-        label = "no load on the lever, which is pushed from one side: the tool may be twisted this far the other way"
+    hanging = (value == 0) & ~np.isclose(low, -high)
+    if hanging.any():
+        label = "no load on a load cell that is pushed from one side: the tool may be twisted this far the other way"
         axes.fill_between(
-            t_s, low, high, where=value == 0, facecolor="none", edgecolor="0.6", hatch="///", linewidth=0, label=label
+            t_s, low, high, where=hanging, facecolor="none", edgecolor="0.6", hatch="///", linewidth=0, label=label
         )
 
 

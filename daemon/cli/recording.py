@@ -86,7 +86,8 @@ def _summary_text(found: "RecordingSummary") -> str:
         lines.append(f"  made by  shearloop {software}, {here}")
     for name, topic in found.topics.items():
         rate = "" if topic.rate_hz is None else f"{topic.rate_hz:8.2f} Hz"
-        lines.append(f"  {name:<20} {topic.messages:>8} messages {rate}")
+        plural = " " if topic.messages == 1 else "s"
+        lines.append(f"  {name:<22} {topic.messages:>8} message{plural} {rate}".rstrip())
     lines += [f"  attached {name}" for name in found.attachments]
     if not found.closed:
         lines.append(

@@ -151,10 +151,13 @@ class ControlLoopRunner:
         return self._control_loop.start(file, self._clock.now_ns())
 
     async def experiment_ended(self) -> Experiment:
-        """Return the present or the next experiment once it has ended."""
+        """Return the present or the next experiment once its end has been published, or another one has begun."""
         while (experiment := self._control_loop.experiment) is None:
             await self._states.changed.wait()
-        while experiment.running or self._stops.pending:
+        # An action's failure ends it between two decisions.
+        while experiment is self._control_loop.experiment and (
+            experiment is not self._states.ended or self._stops.pending
+        ):
             await self._states.changed.wait()
         return experiment
 
@@ -523,6 +526,8 @@ class StatePublisher:
 
     def __init__(self, publisher: Publisher, control_loop: ControlLoop) -> None:
         self.changed = asyncio.Event()
+        # The experiment whose end was published last.
+        self.ended: Experiment | None = None
         self._publisher = publisher
         self._control_loop = control_loop
         self._block = -1
@@ -577,6 +582,8 @@ class StatePublisher:
             )
         self._key, self._hold, self._published_ns = key, hold, now_ns
         self._publisher.publish(loop_state(self._control_loop, sent_rad_per_s, now_ns))
+        if experiment is not None and not experiment.running:
+            self.ended = experiment
         self._notify()
 
     def publish_stop(self, stop: LoopStop | None) -> None:

@@ -152,7 +152,7 @@ def test_every_mistake_of_an_experiment_is_told_on_a_line_of_its_own(tmp_path):
     assert [f"steps[{number}]: " in line for number, line in zip((0, 1, 2), others, strict=True)] == [True] * 3
     schema, source = refusal(
         tmp_path, {"torque_source": "rigth", "steps": [*STEPS, {"do": "turn_to", "angle_rad": 90}]}
-    ).splitlines()[::-1]
+    ).splitlines()
     assert "steps[2].angle_rad: 90 is too large" in schema
     assert source.endswith("did you mean right?")
     twist = {"do": "twist", "angles_rad": [2]}

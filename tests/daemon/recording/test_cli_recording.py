@@ -32,7 +32,7 @@ def test_info_shows_the_content(recording, capsys):
     assert main(["recording", "info", str(recording)]) == 0
     printed = capsys.readouterr().out
     assert "a bench" in printed
-    assert "eit.frame.right             4 messages     1.85 Hz" in printed
+    assert "eit.frame.right               4 messages     1.85 Hz" in printed
     assert "the same code as here" in printed
     assert main(["recording", "info", "--json", str(recording)]) == 0
     printed = json.loads(capsys.readouterr().out)

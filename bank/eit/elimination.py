@@ -16,7 +16,7 @@ from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.mesh import Terms
 
 # Matrices that are factorised together, each in its lane of a vector register.
-LANES: Final = 4
+LANES: Final = 8
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
@@ -120,10 +120,11 @@ def _factorise(plan: _Plan, work: FloatArray, kept: int) -> None:
             column[rows[p]] = work[p]
         for m in range(row_starts[k], row_starts[k + 1]):
             q = by_row[m]
-            a, b, c, d = work[q, 0], work[q, 1], work[q, 2], work[q, 3]
+            a, b, c, d, e, f, g, h = work[q]
             for p in range(q, ends[m]):
                 to, by = column[rows[p]], work[p]
                 to[0], to[1], to[2], to[3] = to[0] - a * by[0], to[1] - b * by[1], to[2] - c * by[2], to[3] - d * by[3]
+                to[4], to[5], to[6], to[7] = to[4] - e * by[4], to[5] - f * by[5], to[6] - g * by[6], to[7] - h * by[7]
         inverse_root = 1.0 / np.sqrt(column[k]) if k < n - kept else np.ones(LANES)
         for p in range(starts[k], starts[k + 1]):
             for lane in range(LANES):

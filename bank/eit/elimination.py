@@ -4,20 +4,17 @@ The pattern decides where the factor has entries (George and Liu 1981, chapter 5
 compiles the arithmetic, which treats a few matrices side by side.
 """
 
-from collections.abc import Callable
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from numba import config, njit
 from numpy.typing import NDArray
 
-from shearloop.bank.arrays import FloatArray, IntArray
+from shearloop.bank.arrays import FloatArray, IntArray, compiled
 from shearloop.bank.eit.mesh import Terms
 
 # Matrices that are factorised together, each in its lane of a vector register.
 LANES: Final = 8
-_F = TypeVar("_F", bound=Callable[..., Any])
 
 
 class _Plan(NamedTuple):
@@ -92,21 +89,7 @@ def _structures(lower: Terms, n: int, eliminated: int) -> list[IntArray]:
     return found + [np.arange(column, n) for column in range(eliminated, n)]
 
 
-def _compiled(function: _F) -> _F:
-    """Compile a function, which releases the interpreter's lock; cache the result on the disk where that is possible.
-
-    No products and sums are fused or reordered: every machine computes the same bits.
-    """
-    # Statements that differ in the lane alone become one vector instruction.
-    config.SLP_VECTORIZE = 1
-    try:
-        compiled: _F = njit(cache=True, nogil=True)(function)
-    except RuntimeError:  # no folder for the cache is writable
-        compiled = njit(nogil=True)(function)
-    return compiled
-
-
-@_compiled
+@compiled
 def _factorise(plan: _Plan, work: FloatArray, kept: int) -> None:
     """Replace the (entries, LANES) lower triangles in `work` by Cholesky factors, and the last columns by what is left.
 

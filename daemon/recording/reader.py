@@ -134,14 +134,12 @@ def open_recording(path: Path) -> Iterator[OpenRecording]:
             ) from error
 
 
-def read_messages(
-    path: Path, topics: Iterable[str], *, as_text: str = ""
-) -> Iterator[tuple[str, dict[str, Any], Message]]:
+def read_messages(path: Path, topics: Iterable[str]) -> Iterator[tuple[str, dict[str, Any], Message]]:
     """Yield topic, content and message by log time, None for keys without a value; raises UserError.
 
-    The elements of the array `as_text` stay JSON text.
+    The elements of the longest arrays, a heatmap's scores, stay JSON text: bytes, which `tables.numbers` reads.
     """
-    array = f'"{as_text}":['.encode()
+    array = b'"scores":['
     with open_recording(path) as recording:
         for channel, message in recording.messages(topics):
             live = schema.schema_name(channel.topic)
@@ -149,7 +147,7 @@ def read_messages(
             elements, _, after = rest.partition(b"]")
             content = from_json(data + found + b"]" + after if found else data)
             if found:
-                content[as_text] = elements
+                content["scores"] = elements
             yield channel.topic, schema.with_missing_keys(live, content), message
 
 

@@ -26,13 +26,13 @@ _LEAST_NOISE, _LEAST_ZERO, _ROUNDS = 1e-3, 1e-6, 200
 _REACH, _GAIN_ROUNDS = 1.5, 8
 # A frame is loaded above this share of the largest torque.
 LOADED_SHARE = 0.1
-# A twist that is missed, or read the other way round, counts as one of these.
+# Gains outside these mean a twist that was missed or has the wrong sign, and are clipped.
 _LEAST_GAIN, _LARGEST_GAIN = 0.2, 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class GainSpread:
-    """Standard deviations of the gain's logarithm, and of a loaded frame in N·m beside the gain.
+    """Standard deviations of the gain's logarithm, and of the rest of a loaded frame's error in N·m.
 
     `between` is of one recording to the next, and as certain as from this number of `recordings`; `within` is of one
     twist to the next. `zero` is of the torque without motion, as a share of the load: 0 for the calibration's tool.
@@ -80,7 +80,7 @@ class GainSpread:
         """
         m, loaded, total = parts.shape[1], np.concatenate(twists), parts.sum(axis=1)
         load_nm = float(np.sqrt((truth[loaded] ** 2).mean()))
-        # This recording shows how far gains go as well, less what its noise and its twists would show alone.
+        # This recording's gain counts for the spread too, less the part that noise and twists explain.
         excess = math.log(_gain(total[loaded], truth[loaded])) ** 2 - self.within**2 / len(twists)
         excess -= self.noise_nm**2 / max(float(total[loaded] @ total[loaded]), self.noise_nm**2)
         spread = self._with_recordings([max(excess, 0.0)])
@@ -89,7 +89,7 @@ class GainSpread:
         prior = np.append(np.full(m, m * spread.between**2), (max(self.zero, _LEAST_ZERO) * load_nm) ** 2)
         weighted, information = np.zeros((len(truth), m + 1)), np.diag(1.0 / prior)
         for rows in twists:
-            # One equation a twist, along its torque: its shape would tell of delays, not of the gain.
+            # One equation per twist, along its torque: errors of its shape come from delays, not from the gain.
             along, power = truth[rows], float(truth[rows] @ truth[rows])
             variance = power * (self.noise_nm**2 + self.within**2 * power)
             weighted[rows] = np.outer(along, along @ columns[rows]) / variance
@@ -101,9 +101,9 @@ class GainSpread:
             if bounded:
                 target[unloaded] = np.minimum(total + columns @ change, 0.0)[unloaded]
             change = covariance @ (weighted.T @ (target - total))
-        # A bound that does not bind tells nothing.
-        telling = np.union1d(loaded, np.flatnonzero((total + columns @ change > 0) | (not bounded)))
-        covariance = np.linalg.inv(information + weighted[telling].T @ columns[telling])
+        # Unloaded frames predicted below zero carry no information about a bound.
+        informative = np.union1d(loaded, np.flatnonzero((total + columns @ change > 0) | (not bounded)))
+        covariance = np.linalg.inv(information + weighted[informative].T @ columns[informative])
         factors = np.clip(1.0 + change[:m], _LEAST_GAIN, _LARGEST_GAIN)
         corrected = parts @ factors + change[m]
         spread_nm2 = np.einsum("ni,ij,nj->n", columns[loaded], covariance, columns[loaded]).mean()
@@ -114,7 +114,7 @@ class GainSpread:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GainCorrection:
-    """Factors (m,) on the torques of m fingertips with their standard errors, and what is added to their sum.
+    """Factors (m,) on the torques of m fingertips with their standard errors, and the offset of their sum.
 
     `spread` is the gain's spread that remains, `twists` their number. Where an estimator combines its fingertips
     otherwise, m is 1.
@@ -161,7 +161,7 @@ class ToolLaw:
 def gains_of_recordings(
     numbers: IntArray, torque_nm: FloatArray, predict: Callable[[IntArray, IntArray, FloatArray], FloatArray]
 ) -> FloatArray:
-    """Return the gain of each recording, whose number each of (n,) rows has, in one unit of motion.
+    """Return the gain of each recording in one unit of motion, from the recording's number of each of (n,) rows.
 
     predict(kept, out, values (n,)) fits values on some rows and predicts them on others. The gains are those that make
     each recording's torque predictable from the others'.

@@ -14,10 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 import zmq
-from numpy.typing import NDArray
 
 from shearloop.drivers.eit_kit import TRANSFER_NS
 
@@ -90,11 +88,6 @@ class PlayedBoard:
         """Close both ends."""
         os.close(self._master)
         os.close(self._slave)
-
-
-def line_text(values: NDArray[np.float64]) -> bytes:
-    """Return the bytes that a board sends for 1024 values in volts."""
-    return b"".join(b"%.4f, " % value for value in values.tolist()) + b"\n"
 
 
 def write_config(folder: Path, **content: Any) -> Path:

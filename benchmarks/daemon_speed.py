@@ -30,6 +30,7 @@ from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.drivers.defaults import FRAME_PERIOD_S
+from shearloop.drivers.emulators.boards import format_line
 
 MEASUREMENTS = ("commands", "latency", "flood", "rated")
 REPEATS = 5
@@ -53,7 +54,7 @@ def cpu_s(process: psutil.Process) -> float:
 def recorded_lines(rig: Path, side: str, n: int) -> list[bytes]:
     """Return n lines of one board from the emulated rig's recording: idle ones, then a gripped tool being twisted."""
     recorded = read_recording(rig / "rig-25mm.mcap").sides[side].lines[common.FIRST_FRAME :]
-    return list(islice(cycle([common.line_text(values) for values in recorded]), n))
+    return list(islice(cycle([format_line(values) for values in recorded]), n))
 
 
 def by_bank(args: argparse.Namespace, matching: str) -> dict[str, Any]:

@@ -3,14 +3,15 @@
     python -m benchmarks.estimator_accuracy RECORDINGS --bank run/demo.bank --mesh fingertip_mesh.npz --out DIR
 
 Three tables, led by the loaded frames (truth of 0.005 N·m or more): every estimator fitted to the earlier part of each
-of the paper's recordings and judged on the later part; the default estimator fitted to one day's stream and judged on
-the other day's; and with `--rig` the default estimator on the emulated rig, calibrated on three to seven cylinders and
-judged on other tools. RECORDINGS holds torque_slices, diameter_slices and streams. Writes estimators.json, and the
-default's truth against estimate as estimators.png.
+of the paper's recordings and judged on the later part; the default estimator fitted to one stream and judged on the
+others, of the same and of another day; and with `--rig` the default estimator on the emulated rig, calibrated on three
+to seven cylinders and judged on other tools. RECORDINGS holds torque_slices, diameter_slices and streams. Writes
+estimators.json, and the default's truth against estimate as estimators.png.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,11 @@ CYLINDER_SHARE = 0.62
 TWIST_SHARE = 0.457
 # Frames before the judged part that fill an estimator's memory.
 _WARM_UP = 0.015
-STREAMS = {"3 December": "2024-12-03_16-09", "2 December": "20241202_153632"}
+STREAMS = {
+    "3 December": "2024-12-03_16-09",
+    "2 December, 15:36": "20241202_153632",
+    "2 December, 17:17": "20241202_171704",
+}
 FINGERTIPS: tuple[tuple[str, ...], ...] = (("right",), ("left",), ("right", "left"))
 # Sets of cylinders to calibrate on, and the tools to judge.
 CYLINDERS_MM = [tuple(np.linspace(10.0, 40.0, n).tolist()) for n in (3, 4, 5, 7)]
@@ -105,32 +110,32 @@ def later_frames(
             yield split.title, name, estimate_series(calibration, split.future, physics.bank)
 
 
-def other_day(recordings: Path, scratch: Path) -> Iterator[tuple[str, dict[str, Figures] | str]]:
-    """Yield the default estimator's figures on the other day's stream, or the reason of a refused calibration.
+def other_recordings(recordings: Path, scratch: Path) -> Iterator[tuple[str, dict[str, Figures] | str]]:
+    """Yield the default estimator's figures on each other stream, or the reason of a refused calibration.
 
-    The fingertips changed sides between the days, so the other day's sides are exchanged.
+    The fingertips changed sides between the days, so sides of another day are exchanged.
     """
     streams = {name: series_of(read_recording(imported_stream(recordings, name, scratch))) for name in STREAMS}
-    for name, series in streams.items():
-        (other,) = (each for each in streams if each != name)
-        exchanged = replace(streams[other], channels=streams[other].channels[:, ::-1].copy())
-        for sides in FINGERTIPS:
-            title = f"{name}, {' and '.join(sides)}"
-            try:
-                chosen = [series.select_sides(sides)]
-                calibration = fit(DEFAULT, chosen, name, timing=measure_timing(chosen, [series]))
-            except BankError as error:
-                yield title, str(error)
-                continue
-            yield title, judged(estimate_series(calibration, exchanged.select_sides(sides)))
+    for name, sides in product(streams, FINGERTIPS):
+        title = f"{name}, {' and '.join(sides)}"
+        try:
+            chosen = [streams[name].select_sides(sides)]
+            calibration = fit(DEFAULT, chosen, name, timing=measure_timing(chosen, [streams[name]]))
+        except BankError as error:
+            yield title, str(error)
+            continue
+        for other in (each for each in streams if each != name):
+            order = 1 if other[0] == name[0] else -1
+            judge = replace(streams[other], channels=streams[other].channels[:, ::order].copy())
+            yield f"{title}: {other}", judged(estimate_series(calibration, judge.select_sides(sides)))
 
 
 def other_tools(bank: Path, seed: int, repeats: int) -> Iterator[tuple[int, tuple[str, ...], Figures]]:
     """Yield the number of cylinders, the fingertips, and the figures on the emulated rig's other tools."""
-    tools = [one.series(mm) for mm, one in record(bank, seed, TOOLS_MM)]
+    tools = list(record(bank, seed, TOOLS_MM))
     for number, cylinders_mm in enumerate(CYLINDERS_MM):
         seeds = [seed + 1000 * (1 + number) + 100 * i for i in range(repeats)]
-        known = [[one.series(mm) for mm, one in record(bank, each, cylinders_mm)] for each in seeds]
+        known = [list(record(bank, each, cylinders_mm)) for each in seeds]
         for sides in (tuple(SIDES), *((side,) for side in SIDES)):
             tracks = [estimate_series(calibrate(one, sides), tool) for one in known for tool in tools]
             yield len(cylinders_mm), sides, figures_of(tracks)
@@ -169,12 +174,12 @@ def main() -> None:
         if name == DEFAULT:
             tracks[title] = track
     print(table_head("fitted to", "estimator", *LOADED, *ALL))
-    for title, result in other_day(args.recordings, args.out):
+    for title, result in other_recordings(args.recordings, args.out):
         if isinstance(result, str):
-            print(table_row(f"{title}, other day", result, *[None] * len([*LOADED, *ALL])))
+            print(table_row(title, result, *[None] * len([*LOADED, *ALL])))
             continue
-        found[f"{title}, other day"] = {DEFAULT: result}
-        print(table_row(f"{title}, other day", DEFAULT, *row_of(result)))
+        found[title] = {DEFAULT: result}
+        print(table_row(title, DEFAULT, *row_of(result)))
     if args.rig:
         print(table_head("cylinders", "fingertips", "diameter RMSE, mm", "coverage"))
         for count, sides, figures in other_tools(args.bank, 5000, 4):

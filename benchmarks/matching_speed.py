@@ -1,11 +1,11 @@
-"""Time per bank cell and per match against the peers, and agreement of the pruned matchers with the reference.
+"""Time per bank cell and per match against other methods, and agreement of the pruned matchers with the reference.
 
     python -m benchmarks.matching_speed --bank run/paper.bank --mesh MESH --recordings FOLDER --out FILE
 
-Methods take turns, so that a busy moment of the machine affects all alike. A ratio is of one turn; medians and
-quartiles are over the turns. `pip install -e '.[bench]'` installs pyEIT and FAISS; without them their rows are missing.
+Methods take turns, so that a busy moment of the machine affects all alike; medians and quartiles are over the turns.
+`pip install -e '.[bench]'` installs pyEIT; without it its row is missing.
 EIDORS needs MATLAB or Octave, so its time is cited. `--every N` also checks every N-th recorded frame against the
-reference matchers, with runner-up, which takes a tenth of a second a frame and more.
+reference matchers, which takes a tenth of a second a frame and more.
 """
 
 import os
@@ -41,12 +41,6 @@ CACHE_BYTES = 64 << 20
 MATCHERS: dict[str, tuple[type[Matcher], type[PrunedMatcher | PrunedZeroLagMatcher]]] = {
     "all lags": (ReferenceMatcher, PrunedMatcher),
     "zero lag": (ZeroLagMatcher, PrunedZeroLagMatcher),
-}
-# Peers and own methods by the row they are compared with.
-RATIOS = {
-    "batch, two threads": ("pyEIT", "direct", "batch, one thread"),
-    "all lags, pruned": ("all lags, numpy float32 FFT",),
-    "zero lag, pruned": ("zero lag, numpy float32", "zero lag, FAISS flat"),
 }
 
 
@@ -104,23 +98,12 @@ def match_methods(bank: Bank, frames: FloatArray) -> dict[str, tuple[Run, int]]:
             int(np.argmax(fft.irfft(fft.rfft(frame, length) * spectra, length).max(axis=1))) for frame in single[:4]
         ]
 
-    methods: dict[str, tuple[Run, int]] = {
-        "zero lag, pruned": (lambda: [zero.match(frame, runner_up=False) for frame in frames], n),
-        "zero lag, pruned, with runner-up": (lambda: [zero.match(frame) for frame in frames], n),
+    return {
+        "zero lag, pruned": (lambda: [zero.match(frame) for frame in frames], n),
         "zero lag, numpy float32": (lambda: [int(np.argmax(signals @ frame)) for frame in single], n),
-        "all lags, pruned": (lambda: [every.match(frame, runner_up=False) for frame in frames], n),
-        "all lags, pruned, with runner-up": (lambda: [every.match(frame) for frame in frames], n),
+        "all lags, pruned": (lambda: [every.match(frame) for frame in frames], n),
         "all lags, numpy float32 FFT": (by_fft, 4),
     }
-    try:
-        import faiss
-    except ImportError:
-        return methods
-    faiss.omp_set_num_threads(1)
-    index = faiss.IndexFlatIP(PAPER_TABLE.n_channels)
-    index.add(signals)
-    methods["zero lag, FAISS flat"] = (lambda: [index.search(frame[None], 1) for frame in single], n)
-    return methods
 
 
 def recorded_slices(folder: Path) -> FloatArray:
@@ -171,28 +154,18 @@ def take_turns(methods: Mapping[str, tuple[Run, int]], turns: int) -> dict[str, 
 
 
 def cold_seconds(bank: Bank, frames: FloatArray, turns: int) -> dict[str, list[float]]:
-    """Return the median seconds of a match with runner-up in every turn, with cold caches as in a daemon."""
+    """Return the median seconds of a match in every turn, with cold caches as in a daemon."""
     matchers = {name: fast.from_bank(bank) for name, (_, fast) in MATCHERS.items()}
     memory = np.zeros(CACHE_BYTES // 8)
-    found: dict[str, list[float]] = {f"{name}, cold, with runner-up": [] for name in matchers}
+    found: dict[str, list[float]] = {f"{name}, cold": [] for name in matchers}
     for _ in range(turns):
         for name, matcher in matchers.items():
             taken = []
             for frame in frames:
                 memory += 1.0
                 taken.append(timeit(partial(matcher.match, frame), number=1))
-            found[f"{name}, cold, with runner-up"].append(statistics.median(taken))
+            found[f"{name}, cold"].append(statistics.median(taken))
     return found
-
-
-def ratios(seconds: Mapping[str, list[float]]) -> dict[str, Any]:
-    """Return how many times as long each peer takes, turn by turn."""
-    return {
-        f"{peer} / {own}": spread([slow / fast for slow, fast in zip(seconds[peer], seconds[own], strict=True)])
-        for own, peers in RATIOS.items()
-        for peer in peers
-        if peer in seconds
-    }
 
 
 def spread(values: list[float]) -> dict[str, float]:
@@ -219,8 +192,7 @@ def main() -> None:
         "machine": {"cores": os.cpu_count(), "load_average": os.getloadavg()[0]},
         "cells": int(bank.valid.sum()),
         "seconds": {name: spread(each) for name, each in seconds.items()},
-        "ratios": ratios(seconds),
-        "eidors_cited_ratio": EIDORS_CELL_S / statistics.median(seconds["batch, two threads"]),
+        "eidors_cited_s": EIDORS_CELL_S,
         "batch_error_against_direct": error,
     }
     if args.every:

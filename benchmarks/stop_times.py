@@ -63,11 +63,6 @@ class Cause:
         """The longest time to standstill that docs/safety.md allows."""
         return PROMISE_S + self.noticed_s
 
-    @property
-    def ends_daemon(self) -> bool:
-        """Whether the daemon has to be started again."""
-        return any(process == "daemon" for process, _ in self.signals)
-
 
 def _periods_s(topic: str, count: float) -> float:
     return count / (TOPICS[topic].rate_hz or 1.0)
@@ -195,12 +190,13 @@ class RunningRig:
         path.write_text(yaml.safe_dump(content))
         end_s = time.monotonic() + DEADLINE_S
         while time.monotonic() < end_s:
-            if self.send("start", experiment=str(path))["ok"] and "wrist_rad" in self.wait_for(_turns_or_ended):
+            reply = self.send("start", experiment=str(path))
+            if reply["ok"] and "wrist_rad" in (reply := dict(self.wait_for(_turns_or_ended))):
                 return
             # Devices come back at their own time.
             time.sleep(0.2)
             self.send("unlock")
-        raise RuntimeError("the experiment does not start")
+        raise RuntimeError(f"the experiment does not start: {reply}")
 
     def cause(self, cause: Cause) -> int:
         """Bring a cause about; return its time in ns."""
@@ -230,7 +226,7 @@ class RunningRig:
         """End the cause and the experiment."""
         self.order("normal")
         self.order("object 20")
-        if cause.ends_daemon:
+        if any(process == "daemon" for process, _ in cause.signals):
             self.daemon.kill()
             self._start_daemon()
         else:

@@ -33,7 +33,7 @@ class Commands:
 
     def handlers(self) -> Mapping[str, Handler]:
         """Return the handler of every command."""
-        named = {"tare": self._tare, STATUS: self._status, STOP: self._stop, "start": self._start, "set": self._set}
+        named = {"tare": self._tare, STATUS: self._status, STOP: self._stop, "start": self._start}
         return {**named, "pause": self._pause, "resume": self._resume, "unlock": self._unlock}
 
     def open_handlers(self) -> Mapping[str, Handler]:
@@ -66,12 +66,15 @@ class Commands:
         return {}
 
     async def _unlock(self, _request: Request) -> Reply:
-        _refuse_if(await required_rig(self.rig).runner.unlock())
+        _refuse_if(await required_rig(self.rig).unlock())
         return {}
 
     async def _tare(self, request: Request) -> Reply:
         sensors = self.sensors.tareable()
-        names = _requested(request, sensors, "sensor {source!r} to tare")
+        source = request.get("source")
+        if source is not None and not (isinstance(source, str) and source in sensors):
+            raise CommandRefusedError(f"there is no sensor {source!r} to tare; there are {', '.join(sensors)}")
+        names = list(sensors) if source is None else [source]
         experiment = self.rig.control_loop.experiment if self.rig is not None else None
         if experiment is not None and experiment.running:
             raise CommandRefusedError(
@@ -81,16 +84,6 @@ class Commands:
         for name in names:
             sensors[name].tare()
         return {"tared": names}
-
-    async def _set(self, request: Request) -> Reply:
-        """Change a setting of the running daemon; none of them moves the robot."""
-        heatmap = request.get("heatmap")
-        if heatmap not in ("always", "on_request"):
-            raise CommandRefusedError("only `heatmap` can be set while the daemon runs, to always or on_request")
-        names = _requested(request, self.sensors.fingertips, "fingertip {source!r}")
-        for name in names:
-            self.sensors.fingertips[name].show_heatmap(always=heatmap == "always")
-        return {"set": names, "heatmap": heatmap}
 
     async def _status(self, _request: Request) -> Reply:
         tasks = self.health.tasks()
@@ -117,16 +110,6 @@ def required_rig(rig: Rig | None) -> Rig:
     if rig is None:
         raise CommandRefusedError("the configuration has no robot; add `robot: ur.yaml` to it")
     return rig
-
-
-def _requested(request: Request, known: Mapping[str, object], kind: str) -> list[str]:
-    """Return the source that a request names, or all; raises CommandRefusedError for an unknown one."""
-    source = request.get("source")
-    if source is None:
-        return list(known)
-    if not (isinstance(source, str) and source in known):
-        raise CommandRefusedError(f"there is no {kind.format(source=source)}; there are {', '.join(known)}")
-    return [source]
 
 
 def _refuse_if(reason: str | None) -> None:

@@ -27,8 +27,8 @@ from shearloop.drivers.defaults import (
 
 # Names of other tasks, sources and recordings; a fingertip needs a different one.
 TAKEN_NAMES = {
-    *("load_cell", "wrench", "skin", "combined", "robot", "gripper", "loop", "experiment", "recording", "slices"),
-    *("commands", "stop", "publish", "keys", "health", "log", "shown", "daemon", "clock"),
+    *("load_cell", "wrench", "skin", "combined", "robot", "gripper", "loop", "experiment", "recording"),
+    *("commands", "stop", "publish", "keys", "health", "log_output", "printed_output", "daemon", "clock"),
 }
 
 

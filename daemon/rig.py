@@ -32,6 +32,8 @@ from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.yaml_files import located, read_yaml
 
+ENDING = "the daemon ends; start it again"
+
 
 def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
     """Return the load cell's calibration; raises DriverError if it cannot be used."""
@@ -137,8 +139,9 @@ class Rig:
         self.robot = UrRobot(robot_settings(config.robot), LinkMonitor(DeviceLink("robot", loop)))
         self.runner = ControlLoopRunner(loop, self.robot, gripper, sensors, publisher, clock, supervisor.dead)
         self._recorder = recorder
-        # Counts the operator's stops, also while an experiment starts.
+        # Counts the stops, also while an experiment starts.
         self._stops = 0
+        self._closed = False
 
     def tasks(self) -> dict[str, Task]:
         """Return the tasks to run, by their names in `health`."""
@@ -147,6 +150,8 @@ class Rig:
 
     async def start(self, path: Path) -> str | None:
         """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file."""
+        if self._closed:
+            return ENDING
         attached = AttachedFile.read(path) if self._recorder is not None else ()
         stops_before, file = self._stops, read_experiment(path)
         reason = await self.runner.start(file)
@@ -157,17 +162,22 @@ class Rig:
             self._recorder.record_experiment(file.name, attached, experiment_notes(file))
         return reason
 
+    async def unlock(self) -> str | None:
+        """Enable robot and gripper after a stop; return None, or why not."""
+        return ENDING if self._closed else await self.runner.unlock()
+
     def stop(self) -> str:
-        """End the experiment on the operator's command, also during its start; return its name."""
+        """End the experiment, also during its start, or the unlocking; return its name, or an empty string."""
         self._stops += 1
         experiment = self.control_loop.experiment
         if experiment is None or not experiment.running:
-            return ""
+            return "unlock" if self.runner.stop_unlocking() else ""
         self.runner.stop("the operator stopped it")
         return experiment.file.name
 
     def close(self) -> None:
-        """Stop the running experiment at the daemon's end."""
+        """Stop the running experiment at the daemon's end, and start nothing more."""
+        self._stops, self._closed = self._stops + 1, True
         experiment = self.control_loop.experiment
         if experiment is not None and experiment.running:
             self.runner.stop("the daemon ended: the wrist is stopped, a gripped tool stays gripped")
@@ -177,10 +187,7 @@ class Rig:
 
 def read_experiment(path: Path) -> experiment_schema.ExperimentFile:
     """Return the experiment of a file; raises UserError for an invalid one, or one that exceeds its own limits."""
-    file = load_yaml_model(path, experiment_schema.ExperimentFile)
-    if mistakes := experiment_schema.check_steps(file):
-        raise UserError("\n".join(located(path, mistakes, UserError)))
-    return file
+    return _without_mistakes(path, experiment_schema.check_steps(_outline(path)))
 
 
 def check_experiment(
@@ -194,14 +201,10 @@ def check_experiment(
     if path is None:
         return None
     driving = [*(name for name, source in sources.items() if source.measures_torque), WRENCH]
-    try:
-        file = load_yaml_model(path, experiment_schema.ExperimentFile)
-    except UserError as error:
-        content = read_yaml(path, UserError, experiment_schema.ExperimentFile.what)
-        source = content.get("torque_source") if isinstance(content, dict) else None
-        mistakes = _undriven(source, driving, config) if isinstance(source, str) else []
-        raise UserError("\n".join([*located(path, mistakes, UserError), str(error)])) from error
-    mistakes = _undriven(file.torque_source, driving, config) + experiment_schema.check_steps(file)
+    file = _outline(path)
+    mistakes = experiment_schema.check_steps(file)
+    if file.torque_source and file.steps:
+        mistakes += _undriven(file.torque_source, driving, config)
     if config.gripper is None:
         cure = "add a `gripper` section to the configuration, or take the step out"
         mistakes += [
@@ -209,9 +212,26 @@ def check_experiment(
             for number, step in enumerate(file.steps)
             if isinstance(step, experiment_schema.GripStep | experiment_schema.ReleaseStep)
         ]
-    mistakes += _unadaptable(file, sources)
-    if mistakes:
-        raise UserError("\n".join(located(path, mistakes, UserError)))
+    return _without_mistakes(path, mistakes + _unadaptable(file, sources))
+
+
+def _outline(path: Path) -> experiment_schema.ExperimentFile:
+    return experiment_schema.outline(read_yaml(path, UserError, experiment_schema.ExperimentFile.what))
+
+
+def _without_mistakes(path: Path, mistakes: Sequence[experiment_schema.Mistake]) -> experiment_schema.ExperimentFile:
+    """Return the experiment of a file; raises UserError with these mistakes, and with those of its keys and values."""
+    lines = located(path, mistakes, UserError)
+    try:
+        file = load_yaml_model(path, experiment_schema.ExperimentFile)
+    except UserError as error:
+        # Each line begins with the path and its line in the file.
+        number = len(str(path)) + 1
+        every = [*lines, *str(error).splitlines()]
+        in_order = sorted(every, key=lambda line: int(line[number:].partition(":")[0])) if lines else every
+        raise UserError("\n".join(in_order)) from error
+    if lines:
+        raise UserError("\n".join(lines))
     return file
 
 
@@ -233,7 +253,7 @@ def _unadaptable(
         if step.do in ("tare", "grip", "release"):
             twisted = False
         twisted = twisted or step.do in ("identify", "twist", "hold_torque", "tighten")
-        if not isinstance(step, experiment_schema.AdaptStep):
+        if not isinstance(step, experiment_schema.AdaptStep) or "fingertip" not in step.model_fields_set:
             continue
         named = [name for name, source in sources.items() if source.has_gain]
         if step.fingertip not in named:

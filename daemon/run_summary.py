@@ -24,6 +24,8 @@ BAND = 0.10
 STAYS_S = 1.0
 # Topics with a torque.
 TORQUES = ("eit.estimate", "load.torque", "skin.shear")
+# The name of the emulated tool's torque, which no sensor measures.
+TRUE = "true torque"
 _ENDS = ("done", "stopped")
 # The time of each disturbance in ns, and its description.
 _Events: TypeAlias = Sequence[tuple[int, str]]
@@ -196,32 +198,36 @@ def _elapsed_s(first: Mapping[str, Any], last: Mapping[str, Any]) -> float:
 def _turned(step: _StepSummary, run: _Run, truth: TorqueSeries | None) -> Iterator[str]:
     driving = run.first["torque_source"]
     if step.wrist_from_rad is not None and step.wrist_to_rad is not None:
-        yield f"    turned by {step.wrist_to_rad - step.wrist_from_rad:+.3f} rad; torque source: {driving}"
+        yield f"    turned by {step.wrist_to_rad - step.wrist_from_rad:+.3f} rad; {_named(driving, truth)}"
     for name, series in _all_torques(run, truth).items():
         turning = series.between(step.from_ns, step.to_ns).torque_nm
-        if turning.size and name in ("true", driving):
+        if turning.size and name in (TRUE, driving):
             largest_nm = turning[np.abs(turning).argmax()]
-            yield f"    {name:<10} {turning[-1]:+.4f} N·m at the end, {largest_nm:+.4f} at most"
+            yield f"    {name:<11} {turning[-1]:+.4f} N·m at the end, {largest_nm:+.4f} at most"
+
+
+def _named(driving: str, truth: TorqueSeries | None) -> str:
+    return f"torque source: {driving}{f'; {TRUE}: of the emulated tool' if truth is not None else ''}"
 
 
 def _all_torques(run: _Run, truth: TorqueSeries | None) -> dict[str, TorqueSeries]:
     sources = {name: TorqueSeries(*map(np.array, zip(*values, strict=True))) for name, values in run.torques.items()}
-    return sources if truth is None else {"true": truth, **sources}
+    return sources if truth is None else {TRUE: truth, **sources}
 
 
 def _held(
     step: _StepSummary, set_nm: float, from_ns: int, run: _Run, truth: TorqueSeries | None, events: _Events
 ) -> Iterator[str]:
     driving, held_s = run.first["torque_source"], (step.to_ns - from_ns) / 1e9
-    yield f"    set point {set_nm:+.3f} N·m, held for {held_s:.0f} s; torque source: {driving}"
     sources = _all_torques(run, truth)
+    yield f"    set point {set_nm:+.3f} N·m, held for {held_s:.0f} s; {_named(driving, truth)}"
     for name, series in sources.items():
         held = series.between(from_ns, step.to_ns).torque_nm
         if held.size:
-            mean = f"    {name:<10} {held.mean():+.4f} N·m on average, ± {held.std():.4f}"
+            mean = f"    {name:<11} {held.mean():+.4f} N·m on average, standard deviation {held.std():.4f}"
             yield f"{mean}, within ± {BAND:.0%} for {np.mean(_in_band(held, set_nm)):.0%} of the time"
     # Judge by the true torque, the load cell or another source, never by the one that drove the loop.
-    names = sorted(set(sources) - {driving}, key=lambda name: (name != "true", name != LOAD_CELL, name))
+    names = sorted(set(sources) - {driving}, key=lambda name: (name != TRUE, name != LOAD_CELL, name))
     for name in names[:1]:
         reached_s = _recovery_s(sources[name].between(step.from_ns, step.to_ns), step.from_ns, set_nm)
         if reached_s is not None:

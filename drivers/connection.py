@@ -176,24 +176,36 @@ def _open_error(path: str, error: serial.SerialException) -> DriverError:
 
 
 class TcpPort:
-    """A connection to an instrument; `TcpLink` makes it."""
+    """A TCP connection to a device."""
 
     def __init__(self, path: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.path = path
         self._reader = reader
         self._writer = writer
 
+    @classmethod
+    async def connect(cls, host: str, port: int) -> Self:
+        """Return a new connection; OSError, also for a timeout, where nothing answers."""
+        async with asyncio.timeout(CONNECT_TIMEOUT_S):
+            reader, writer = await asyncio.open_connection(host, port)
+        return cls(f"{host}:{port}", reader, writer)
+
     async def read(self, timeout_s: float) -> Received | None:
         """Return arrived bytes, or None after `timeout_s`; DeviceLostError if the other side is gone."""
-        try:
-            async with asyncio.timeout(timeout_s):
-                data = await self._reader.read(READ_BYTES)
-        except TimeoutError:
+        for left_s in (timeout_s, 0.0):
+            # Twice: when this process was paused, bytes may have arrived together with the deadline.
+            try:
+                async with asyncio.timeout(left_s):
+                    data = await self._reader.read(READ_BYTES)
+                    break
+            except TimeoutError:
+                continue
+            except OSError as error:
+                raise self._lost(error) from error
+        else:
             return None
-        except OSError as error:
-            raise self._lost(error) from error
         if not data:
-            raise DeviceLostError(f"{self.path} has closed the connection; see whether the instrument is still on.")
+            raise DeviceLostError(f"{self.path} has closed the connection; see whether the device is still on.")
         return Received(data, time.monotonic_ns())
 
     async def write(self, data: bytes) -> None:
@@ -203,7 +215,7 @@ class TcpPort:
                 self._writer.write(data)
                 await self._writer.drain()
         except TimeoutError as error:
-            raise DeviceLostError(f"{self.path} takes no bytes any more; switch the instrument off and on.") from error
+            raise DeviceLostError(f"{self.path} takes no bytes any more; switch the device off and on.") from error
         except OSError as error:
             raise self._lost(error) from error
 
@@ -372,12 +384,10 @@ class TcpLink(Link):
         self._port = port
 
     async def _connect(self) -> Port:
-        name = f"{self._host}:{self._port}"
         try:
-            async with asyncio.timeout(CONNECT_TIMEOUT_S):
-                reader, writer = await asyncio.open_connection(self._host, self._port)
+            return await TcpPort.connect(self._host, self._port)
         except OSError as error:  # includes a timeout
             raise DeviceNotFoundError(
-                f"Nothing answers at {name} ({error or 'no answer'}); see that it is on and its address is right."
+                f"Nothing answers at {self._host}:{self._port} ({error or 'no answer'}); see that it is on and its "
+                "address is right."
             ) from error
-        return TcpPort(name, reader, writer)

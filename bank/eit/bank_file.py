@@ -93,52 +93,21 @@ class BankDefinition:
         return hashlib.sha256(json.dumps(defining, sort_keys=True).encode()).hexdigest()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Bank:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Bank(BankDefinition):
     """A bank of difference signals v(k, σ) − v_homogeneous; its arrays are read-only.
 
-    signals (K, S, n) float32, zeros in cells that are not valid; homogeneous (n,); k_grid (K,) and sigma_grid (S,)
-    in the model's units; min_conductivity (K, S), the smallest of each cell's conductivities; valid (K, S), where
-    that is positive and the signal's norm at least MIN_SIGNAL_NORM.
+    signals (K, S, n) float32, zeros in cells that are not valid; homogeneous (n,); min_conductivity (K, S), the
+    smallest of each cell's conductivities; valid (K, S), where that is positive and the signal's norm at least
+    MIN_SIGNAL_NORM.
     """
 
     path: Path
-    definition: BankDefinition
     homogeneous: FloatArray
     min_conductivity: FloatArray
     valid: BoolArray
     signals: Float32Array
     signals_sha256: str
-
-    @property
-    def identity(self) -> str:
-        """The hash of everything that defines the bank."""
-        return self.definition.identity
-
-    @property
-    def model(self) -> str:
-        """The basis model's name."""
-        return self.definition.model
-
-    @property
-    def table(self) -> ChannelTable:
-        """The channel table."""
-        return self.definition.table
-
-    @property
-    def geometry_hash(self) -> str:
-        """The digest of the mesh that the bank was solved on."""
-        return self.definition.geometry_hash
-
-    @property
-    def k_grid(self) -> FloatArray:
-        """The (K,) values of k, ascending."""
-        return self.definition.k_grid
-
-    @property
-    def sigma_grid(self) -> FloatArray:
-        """The (S,) values of σ, ascending."""
-        return self.definition.sigma_grid
 
     @classmethod
     def open(cls, path: str | Path, verify: bool = False) -> "Bank":
@@ -156,13 +125,14 @@ class Bank:
                     arrays = {name: _read_array(path, file, name, header["arrays"][name]) for name in _TYPES}
                     checksums = {name: str(header["arrays"][name]["sha256"]) for name in _TYPES}
                     identity = str(header["identity"])
-                    definition = BankDefinition(
-                        header["geometry"],
-                        header["model"],
-                        arrays["k_grid"],
-                        arrays["sigma_grid"],
-                        Variation(**header.get("variation", {})),
-                        ChannelTable(**header.get("channels", {})),
+                    bank = cls(
+                        geometry_hash=header["geometry"],
+                        model=header["model"],
+                        variation=Variation(**header.get("variation", {})),
+                        table=ChannelTable(**header.get("channels", {})),
+                        path=path,
+                        signals_sha256=checksums["signals"],
+                        **arrays,
                     )
                 except (KeyError, TypeError, ValueError, ModelError, GeometryError) as error:
                     raise _unusable(path, f"its header does not describe a bank ({error!r})") from error
@@ -171,17 +141,16 @@ class Bank:
         for name, array in arrays.items():
             if (verify or name != "signals") and _sha256(array) != checksums[name]:
                 raise _unusable(path, f"the file is damaged: the checksum of {name} is not {checksums[name][:12]}…")
-        if header.get("channel_table") != definition.table.digest:
+        if header.get("channel_table") != bank.table.digest:
             raise _unusable(
                 path,
                 f"the bank was made under the channel table {str(header.get('channel_table'))[:12]}…, expected "
-                f"{definition.table.digest[:12]}…",
+                f"{bank.table.digest[:12]}…",
             )
-        if definition.identity != identity:
+        if bank.identity != identity:
             raise _unusable(path, f"its grids, model and geometry do not give its identity {identity[:12]}…")
-        _check_shapes(path, arrays, definition.table.n_channels)
-        del arrays["k_grid"], arrays["sigma_grid"]
-        return cls(path=path, definition=definition, signals_sha256=checksums["signals"], **arrays)
+        _check_shapes(path, arrays, bank.table.n_channels)
+        return bank
 
 
 def write_bank(

@@ -93,14 +93,9 @@ def measure_timing(recordings: Sequence[FrameSeries], others: Sequence[FrameSeri
     if not recordings or any(one.kind != "raw" for one in recordings):
         return TRUSTED
     check_finite(recordings)
-    timed = [(one, find_load_delay(one)) for one in recordings]
+    timed: Sequence[tuple[FrameSeries, LoadDelay | None]] = [(one, find_load_delay(one)) for one in recordings]
     if not any(_is_sure(delay) for _, delay in timed):
-        shown = []
-        for one in others:
-            with contextlib.suppress(CalibrationError):
-                if np.isfinite(one.channels).all() and _is_sure(delay := find_load_delay(one)):
-                    shown.append((one, delay))
-        timed = shown or timed
+        timed = _sure_delays(others) or timed
     sure = [delay if _is_sure(delay) else None for _, delay in timed]
     for (one, _), delay in zip(timed, sure, strict=True):
         if delay is not None and (unusual := _unusual(one, delay)):
@@ -128,26 +123,27 @@ def find_load_delay(series: FrameSeries) -> LoadDelay | None:
     return best if best is None or n >= _SURE_FRAMES else replace(best, few_frames=n)
 
 
-@dataclass(frozen=True, slots=True)
-class MeasuredDelay:
-    """A sure delay, and how far in s the torques are stamped later than a load cell stamps them, 0 if as usual."""
+def measured_delay(fingertips: Sequence[FrameSeries]) -> tuple[LoadDelay, float] | None:
+    """Return the delay in the series of the fingertip that shows it best, None where none is sure.
 
-    delay: LoadDelay
-    late_s: float
-
-
-def measured_delay(fingertips: Sequence[FrameSeries]) -> MeasuredDelay | None:
-    """Return the delay in the series of the fingertip that shows it best, None where none does."""
-    found: list[tuple[LoadDelay, FrameSeries]] = []
-    for one in fingertips:
-        with contextlib.suppress(CalibrationError):
-            if (delay := find_load_delay(one)) is not None and not delay.few_frames:
-                found.append((delay, one))
+    The second value is how far in s the torques are stamped later than a load cell stamps them, 0 if as usual.
+    """
+    found = _sure_delays(fingertips)
     if not found:
         return None
-    delay, series = max(found, key=lambda each: each[0].explained)
+    series, delay = max(found, key=lambda each: each[1].explained)
     unusual = _unusual(series, delay)
-    return MeasuredDelay(delay, delay.delay_s - unusual[1] if unusual else 0.0)
+    return delay, delay.delay_s - unusual[1] if unusual else 0.0
+
+
+def _sure_delays(recordings: Sequence[FrameSeries]) -> list[tuple[FrameSeries, LoadDelay]]:
+    """Return the recordings that show a sure delay; others, as of a dead board, are left out."""
+    found = []
+    for one in recordings:
+        with contextlib.suppress(CalibrationError):
+            if np.isfinite(one.channels).all() and (delay := find_load_delay(one)) is not None and not delay.few_frames:
+                found.append((one, delay))
+    return found
 
 
 def load_delay_warning(series: FrameSeries) -> str:

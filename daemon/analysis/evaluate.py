@@ -8,7 +8,7 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -18,9 +18,21 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, TactileFrame
 from shearloop.bank.estimation.values import winkler_scores
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 Figures: TypeAlias = dict[str, float | int | None]
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 _ENDS = ("", "_low", "_high")
+# A torque's errors, and their names in the report.
+_ERRORS = {
+    "rmse": "rmse_nm",
+    "zero_rmse": "zero_rmse_nm",
+    "bias": "bias_nm",
+    "coverage": "coverage_95",
+    "width": "interval_nm",
+    "winkler": "winkler_nm",
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,19 +81,19 @@ def figures_of(tracks: Sequence[EstimateTrack]) -> Figures:
     valid = [estimate.valid for track in tracks for estimate in track.estimates]
     latency = np.concatenate([track.latency_ms for track in tracks])
     figures: Figures = {
-        "r": torque.r,
-        **torque.errors_nm(),
+        "r": torque["r"],
+        **_torque_errors(torque),
         "valid_fraction": float(np.mean(valid)) if valid else None,
         "latency_ms_p50": float(np.quantile(latency, 0.5)) if len(latency) else None,
         "latency_ms_p99": float(np.quantile(latency, 0.99)) if len(latency) else None,
         "frames": len(valid),
     }
-    if not torque.estimated:
-        figures["coverage_95"] = diameter.coverage
+    if not torque["valid_fraction"]:
+        figures["coverage_95"] = diameter["coverage"]
     if any(np.isfinite(track.series.diameter_mm).any() for track in tracks):
-        figures["diameter_rmse_mm"] = diameter.rmse
-        figures["diameter_coverage_95"] = diameter.coverage
-        figures["diameter_interval_mm"] = diameter.width
+        figures["diameter_rmse_mm"] = diameter["rmse"]
+        figures["diameter_coverage_95"] = diameter["coverage"]
+        figures["diameter_interval_mm"] = diameter["width"]
     return figures
 
 
@@ -93,8 +105,13 @@ def figures_by_load(tracks: Sequence[EstimateTrack], loaded_nm: float = LOADED_N
     """
     frames = _frames(tracks, "torque", "nm")
     is_loaded = np.abs(frames[0]) >= loaded_nm
-    loaded, unloaded = _compare(frames[:, is_loaded]), _compare(frames[:, ~is_loaded])
-    return {"loaded": {**loaded.stratum_nm(), "gain": loaded.gain}, "unloaded": unloaded.stratum_nm()}
+    found = {"loaded": _compare(frames[:, is_loaded]), "unloaded": _compare(frames[:, ~is_loaded])}
+    by_load: dict[str, Figures] = {
+        name: {"n": one["n"], **_torque_errors(one), "valid_fraction": one["valid_fraction"]}
+        for name, one in found.items()
+    }
+    by_load["loaded"]["gain"] = found["loaded"]["gain"]
+    return by_load
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,37 +132,6 @@ def invalid_reasons(tracks: Sequence[EstimateTrack]) -> list[InvalidReason]:
     return sorted(found, key=lambda reason: -reason.frames)
 
 
-@dataclass(frozen=True, slots=True)
-class _Comparison:
-    """The errors of the `estimated` ones of n frames with a known truth."""
-
-    n: int
-    estimated: int
-    r: float | None = None
-    rmse: float | None = None
-    zero_rmse: float | None = None
-    bias: float | None = None
-    gain: float | None = None
-    coverage: float | None = None
-    width: float | None = None
-    winkler: float | None = None
-
-    def errors_nm(self) -> Figures:
-        """Return the errors of a torque by their names."""
-        return {
-            "rmse_nm": self.rmse,
-            "zero_rmse_nm": self.zero_rmse,
-            "bias_nm": self.bias,
-            "coverage_95": self.coverage,
-            "interval_nm": self.width,
-            "winkler_nm": self.winkler,
-        }
-
-    def stratum_nm(self) -> Figures:
-        """Return the errors with the number of frames and the share with a torque."""
-        return {"n": self.n, **self.errors_nm(), "valid_fraction": self.estimated / self.n if self.n else None}
-
-
 def _frames(tracks: Sequence[EstimateTrack], quantity: str, unit: str) -> FloatArray:
     """Return truth, estimate and interval's ends (4, n) of frames with a known truth; NaN for what is not estimated."""
     names = [f"{quantity}_{unit}", f"{quantity}_low_{unit}", f"{quantity}_high_{unit}"]
@@ -158,24 +144,29 @@ def _frames(tracks: Sequence[EstimateTrack], quantity: str, unit: str) -> FloatA
     return table[:, np.isfinite(table[0])]
 
 
-def _compare(frames: FloatArray) -> _Comparison:
+def _compare(frames: FloatArray) -> Figures:
+    """Return the figures of a quantity's frames (4, n), None where fewer than two of them are estimated."""
     truth, value, low, high = frames[:, np.isfinite(frames[1])]
+    n = frames.shape[1]
+    counts: Figures = {"n": n, "valid_fraction": len(truth) / n if n else None}
     if len(truth) < 2:
-        return _Comparison(frames.shape[1], len(truth))
+        return counts | dict.fromkeys(("r", "gain", *_ERRORS))
     error, size = value - truth, float(np.abs(truth).sum())
     changing = value.std() > 0 and truth.std() > 0
-    return _Comparison(
-        frames.shape[1],
-        len(truth),
-        r=float(np.corrcoef(value, truth)[0, 1]) if changing else None,
-        rmse=float(np.sqrt((error**2).mean())),
-        zero_rmse=float(np.sqrt((truth**2).mean())),
-        bias=float(error.mean()),
-        gain=float((value * np.sign(truth)).sum()) / size if size else None,
-        coverage=float(((low <= truth) & (truth <= high)).mean()),
-        width=float(np.median(high - low)),
-        winkler=float(winkler_scores(truth, low, high).mean()),
-    )
+    return counts | {
+        "r": float(np.corrcoef(value, truth)[0, 1]) if changing else None,
+        "gain": float((value * np.sign(truth)).sum()) / size if size else None,
+        "rmse": float(np.sqrt((error**2).mean())),
+        "zero_rmse": float(np.sqrt((truth**2).mean())),
+        "bias": float(error.mean()),
+        "coverage": float(((low <= truth) & (truth <= high)).mean()),
+        "width": float(np.median(high - low)),
+        "winkler": float(winkler_scores(truth, low, high).mean()),
+    }
+
+
+def _torque_errors(torque: Figures) -> Figures:
+    return {name: torque[key] for key, name in _ERRORS.items()}
 
 
 def write_estimates(tracks: Sequence[EstimateTrack], names: Sequence[str], path: Path) -> None:
@@ -204,36 +195,48 @@ def draw_tracks(tracks: Sequence[EstimateTrack], names: Sequence[str], title: st
     rows = np.ravel(figure.subplots(len(tracks), 1, squeeze=False))
     for axes, track, row_name in zip(rows, tracks, names, strict=True):
         truth, quantity = track.series.torque_at_frames(), "torque_nm"
-        label, bounds = "torque in N·m", ("torque_low_nm", "torque_high_nm")
+        label, bounds, known = "torque in N·m", ("torque_low_nm", "torque_high_nm"), "load cell"
         slices = track.series.kind == "difference"
         # A stream has one tool, whose diameter would be a flat line.
         if slices and np.isfinite(track.series.diameter_mm).any():
             truth, quantity = track.series.diameter_mm, "diameter_mm"
-            label, bounds = "diameter in mm", ("diameter_low_mm", "diameter_high_mm")
+            label, bounds, known = "diameter in mm", ("diameter_low_mm", "diameter_high_mm"), "known diameter"
         t_s = track.series.t_s
         value, low, high = (
             np.array([getattr(one, key) if getattr(one, key) is not None else np.nan for one in track.estimates])
             for key in (quantity, *bounds)
         )
-        style, shown = "o" if slices else "-", "estimate with its 95 % interval"
-        axes.plot(t_s, truth, f"k{style}", linewidth=1.0, markersize=5, label="truth")
+        axes.plot(t_s, truth, "ko" if slices else "k-", linewidth=1.0, markersize=5, label=known)
         if slices:
+            shown = "estimate with its 95 % interval"
             axes.errorbar(t_s, value, [value - low, high - value], fmt="s", markersize=4, label=shown)
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         else:
-            axes.fill_between(t_s, low, high, alpha=0.25, linewidth=0)
-            axes.plot(t_s, value, linewidth=1.2, label=shown)
-            axes.fill_between(
-                t_s, 0, 1, where=np.isnan(value), transform=axes.get_xaxis_transform(), color="0.92", linewidth=0,
-                label="no valid estimate",
-            )  # fmt: skip
+            _draw_intervals(axes, t_s, value, low, high)
         judged = _loaded_text(track) if quantity == "torque_nm" else ""
         axes.set_title(row_name + judged, loc="left", fontsize="medium")
         axes.set_xlabel("slice" if slices else "time in s")
         axes.set_ylabel(label)
-        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0, ncols=3, frameon=False, fontsize="small")
+    labelled = {label: handle for axes in rows for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(labelled.values(), labelled, loc="outside lower left", ncols=3, frameon=False, fontsize="small")
     figure.suptitle(title)
     figure.savefig(path, dpi=110)
+
+
+def _draw_intervals(axes: "Axes", t_s: FloatArray, value: FloatArray, low: FloatArray, high: FloatArray) -> None:
+    """Draw a stream's estimates and intervals, hatched where a load cell is not pushed."""
+    axes.plot(t_s, value, linewidth=1.2, label="estimate")
+    axes.fill_between(t_s, low, high, alpha=0.25, linewidth=0, label="95 % interval of the estimate")
+    axes.fill_between(
+        t_s, 0, 1, where=np.isnan(value), transform=axes.get_xaxis_transform(), color="0.92", linewidth=0,
+        label="no valid estimate",
+    )  # fmt: skip
+    hanging = (value == 0) & ~np.isclose(low, -high)
+    if hanging.any():
+        label = "no load on a load cell that is pushed from one side: the tool may be twisted this far the other way"
+        axes.fill_between(
+            t_s, low, high, where=hanging, facecolor="none", edgecolor="0.6", hatch="///", linewidth=0, label=label
+        )
 
 
 def _loaded_text(track: EstimateTrack) -> str:

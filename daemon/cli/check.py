@@ -3,6 +3,8 @@
 import argparse
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,22 +25,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Load everything that `run` loads, without opening a device."""
-    from shearloop.bank.errors import BankError
     from shearloop.daemon.config import load_daemon_config
-    from shearloop.daemon.rig import read_experiment
-    from shearloop.drivers.errors import DriverError
 
-    config = load_daemon_config(args.config)
-    try:
-        parts = _parts(config, args.config)
-    except (BankError, DriverError) as error:
-        # A bank that is not built yet does not hide the mistakes of the experiment.
-        try:
-            if config.experiment is not None:
-                read_experiment(config.experiment)
-        except UserError as mistakes:
-            raise UserError(f"{error}\n{mistakes}") from error
-        raise
+    mistakes: list[str] = []
+    config: DaemonConfig | None = None
+    with _collected(mistakes):
+        config = load_daemon_config(args.config)
+    if config is None:
+        with _collected(mistakes):
+            _check_experiment_alone(args.config)
+    parts = _parts(config, args.config, mistakes) if config is not None else {}
+    if mistakes:
+        raise UserError("\n".join(dict.fromkeys(mistakes)))
     if args.json:
         print(json.dumps({"config": str(args.config), "parts": parts}, ensure_ascii=False))
         return 0
@@ -48,35 +46,72 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _parts(config: "DaemonConfig", path: Path) -> dict[str, str]:
-    """Return a sentence on each part of the configuration in this file."""
-    from shearloop.daemon.cli.emulated_devices import check_emulators
-    from shearloop.daemon.rig import check_experiment
-    from shearloop.daemon.sensing.estimators import open_combined, open_estimator, torque_sources
+@contextmanager
+def _collected(mistakes: list[str]) -> Iterator[None]:
+    """Add the mistake that ends the context to a list, so that it hides no other."""
+    from shearloop.bank.errors import BankError
+    from shearloop.drivers.errors import DriverError
 
-    check_emulators(config.emulators, path)
-    parts = {}
+    try:
+        yield
+    except (BankError, DriverError, UserError) as error:
+        mistakes.append(str(error))
+
+
+def _check_experiment_alone(path: Path) -> None:
+    """Raise UserError for the mistakes of the experiment that an invalid configuration names."""
+    from shearloop.daemon.rig import read_experiment
+    from shearloop.yaml_files import read_yaml
+
+    content = read_yaml(path, UserError)
+    named = content.get("experiment") if isinstance(content, dict) else None
+    if named and isinstance(named, str):
+        read_experiment(path.parent / named)
+
+
+def _parts(config: "DaemonConfig", path: Path, mistakes: list[str]) -> dict[str, str]:
+    """Return a sentence on each part of the configuration in this file; collect the mistakes."""
+    from shearloop.daemon.cli.emulated_devices import check_emulators
+    from shearloop.daemon.control.loop_inputs import TorqueSource
+    from shearloop.daemon.rig import check_experiment
+    from shearloop.daemon.sensing.estimators import COMBINED, open_combined, open_estimator, torque_sources
+
+    parts, estimators, combined = {}, {}, None
+    with _collected(mistakes):
+        check_emulators(config.emulators, path)
     if config.curve is not None:
-        parts["keys"] = f"{_clients(config.curve)} may connect"
-    estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
+        with _collected(mistakes):
+            parts["keys"] = f"{_clients(config.curve)} may connect"
     for name, fingertip in config.fingertips.items():
-        grids = estimators[name].grids
-        torque = _torque(estimators[name], calibrated=fingertip.calibration is not None)
-        bank = "no bank" if grids is None else f"bank {fingertip.bank} of {grids[0].size} × {grids[1].size} cells"
-        parts[name] = f"{bank}, {torque}"
-    combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
-    if combined is not None:
-        parts["combined"] = f"{' and '.join(combined.calibration.sides)} together, {_torque(combined, calibrated=True)}"
+        with _collected(mistakes):
+            estimator = estimators[name] = open_estimator(fingertip, name)
+            grids, torque = estimator.grids, _torque(estimator, calibrated=fingertip.calibration is not None)
+            bank = "no bank" if grids is None else f"bank {fingertip.bank} of {grids[0].size} × {grids[1].size} cells"
+            parts[name] = f"{bank}, {torque}"
+    if config.combined is not None:
+        with _collected(mistakes):
+            combined = open_combined(config.combined, config.fingertips)
+            sides = " and ".join(combined.calibration.sides)
+            parts["combined"] = f"{sides} together, {_torque(combined, calibrated=True)}"
     if config.skin is not None:
-        parts["skin"] = _skin(config.skin)
-    parts |= _rig(config)
-    sources = torque_sources(config, estimators, combined)
-    experiment = check_experiment(config, sources)
-    if experiment is not None:
-        steps = f"{len(experiment.steps)} steps, driven by {experiment.torque_source}"
-        parts["experiment"] = f"{experiment.name!r}, {steps}"
-        if warm_up_s := max((one.warm_up_s for one in sources.values() if one.measures_torque), default=0.0):
-            parts["experiment"] += f"; after a grip it waits up to {warm_up_s:.0f} s for the first torques"
+        with _collected(mistakes):
+            parts["skin"] = _skin(config.skin)
+    parts |= _rig(config, mistakes)
+    # What cannot be opened yet counts as what it is configured to be.
+    files = {name: fingertip.calibration for name, fingertip in config.fingertips.items()}
+    files |= {COMBINED: config.combined.calibration} if config.combined is not None else {}
+    unopened = {
+        name: TorqueSource(name=name, period_s=1.0, measures_torque=file is not None, has_gain=True)
+        for name, file in files.items()
+    }
+    sources = unopened | torque_sources(config, estimators, combined)
+    with _collected(mistakes):
+        experiment = check_experiment(config, sources)
+        if experiment is not None:
+            steps = f"{len(experiment.steps)} steps, driven by {experiment.torque_source}"
+            parts["experiment"] = f"{experiment.name!r}, {steps}"
+            if warm_up_s := max((one.warm_up_s for one in sources.values() if one.measures_torque), default=0.0):
+                parts["experiment"] += f"; after a grip it waits up to {warm_up_s:.0f} s for the first torques"
     return parts
 
 
@@ -87,19 +122,23 @@ def _torque(estimator: "FrameEstimator", *, calibrated: bool) -> str:
     return f"without torque: {reason}"
 
 
-def _rig(config: "DaemonConfig") -> dict[str, str]:
+def _rig(config: "DaemonConfig", mistakes: list[str]) -> dict[str, str]:
     from shearloop.daemon.rig import gripper_calibration, load_cell_calibration, robot_settings
 
     parts = {}
     if (cell := config.load_cell) is not None:
-        load_cell_calibration(cell)
-        parts["load_cell"] = f"calibration {cell.calibration}" if cell.calibration else "torques in N·m from the board"
+        with _collected(mistakes):
+            load_cell_calibration(cell)
+            own = f"calibration {cell.calibration}" if cell.calibration else "torques in N·m from the board"
+            parts["load_cell"] = own
     if (hand := config.gripper) is not None:
-        gripper_calibration(hand)
-        own = f"calibration {hand.calibration}" if hand.calibration else "widths by the manufacturer's figures"
-        parts["gripper"] = own
+        with _collected(mistakes):
+            gripper_calibration(hand)
+            own = f"calibration {hand.calibration}" if hand.calibration else "widths by the manufacturer's figures"
+            parts["gripper"] = own
     if config.robot is not None:
-        parts["robot"] = f"{robot_settings(config.robot).host}, limits of {config.robot}"
+        with _collected(mistakes):
+            parts["robot"] = f"{robot_settings(config.robot).host}, limits of {config.robot}"
     return parts
 
 

@@ -19,7 +19,6 @@ COMMANDS = {
     "resume": "continue after `pause`",
     "stop": "stop the experiment and the arm; without an experiment, stop the daemon",
     "unlock": "allow motion again after a stop, when no person is within reach",
-    "set": "change a setting of the running daemon: --heatmap",
 }
 
 
@@ -41,9 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "commands:\n" + "".join(f"  {name:<{width}}  {what}\n" for name, what in COMMANDS.items()) + EPILOG
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("name", choices=COMMANDS, metavar="COMMAND", help="one of the commands below")
-    parser.add_argument("--source", metavar="NAME", help="for tare and set: name of the sensor (default: all)")
-    choices, text = ("always", "on_request"), "for set: compute heatmaps always, or only for subscribers"
-    parser.add_argument("--heatmap", choices=choices, help=text)
+    parser.add_argument("--source", metavar="NAME", help="for tare: name of the sensor (default: all)")
     add_option(parser, "--experiment", Path, "FILE", "for start (default: that of the configuration)")
     add_connection(parser, addresses.COMMAND_ADDRESS, "the daemon's command address")
     default = f"{addresses.COMMAND_TIMEOUT_S:g} s, for unlock {addresses.UNLOCK_TIMEOUT_S:g} s"
@@ -58,8 +55,6 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.messaging.stop_socket import send_to_stop_socket
 
     arguments = {} if args.source is None else {"source": args.source}
-    if args.heatmap is not None:
-        arguments["heatmap"] = args.heatmap
     if args.experiment is not None:
         # The daemon may run in another folder.
         arguments["experiment"] = str(args.experiment.resolve())

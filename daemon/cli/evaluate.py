@@ -1,21 +1,40 @@
-"""`shearloop evaluate CAL REC…`: compare estimates with the truth of recordings, in numbers and as a figure."""
+"""`shearloop evaluate CAL REC…`: compare estimates with the load cell of recordings, in numbers and as a figure."""
 
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.bank.defaults import LOADED_NM
 from shearloop.daemon.cli.options import add_cluster, add_json, add_option, writing
+from shearloop.daemon.cli.terminal import table
 from shearloop.daemon.errors import UserError, missing
 
 if TYPE_CHECKING:
     from shearloop.bank.estimation import Calibration
-    from shearloop.daemon.analysis.evaluate import EstimateTrack
+    from shearloop.daemon.analysis.evaluate import EstimateTrack, Figures
 
 _FIGURES = (".png", ".svg", ".pdf")
+_MEANINGS = {
+    "n": "frames with a known torque",
+    "rmse_nm": "root mean square error, N·m",
+    "zero_rmse_nm": "the same of an estimate that is always 0",
+    "bias_nm": "mean error, N·m",
+    "coverage_95": "share of the known values within their 95 % intervals",
+    "interval_nm": "median width of these intervals, N·m",
+    "winkler_nm": "mean width plus 40 times the distance of a known value outside; less is better",
+    "valid_fraction": "share of the frames with an estimate",
+    "gain": "mean estimate over mean known torque",
+    "r": "correlation of estimated and known torque",
+    "latency_ms_p50": "time of an estimate, ms, median",
+    "latency_ms_p99": "time of an estimate, ms, 99th percentile",
+    "frames": "frames in all",
+    "diameter_rmse_mm": "root mean square error of the diameter, mm",
+    "diameter_coverage_95": "share of the known diameters within their 95 % intervals",
+    "diameter_interval_mm": "median width of these intervals, mm",
+}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -25,20 +44,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--bank", Path, "FILE", "the bank of the calibration, if any")
     text = "share of each recording to use, e.g. 0.6:1 after calibrating on 0:0.6 (default: all)"
     add_option(parser, "--time-range", str, "FROM:TO", text, default="0:1")
-    text = "least true torque of a frame that counts as loaded (default: %(default)s N·m)"
+    text = "least known torque of a frame that counts as loaded (default: %(default)s N·m)"
     add_option(parser, "--loaded-nm", float, "NM", text, default=LOADED_NM)
-    add_option(parser, "--estimates", Path, "FILE.csv", "table to write with truth and estimate of every frame")
+    add_option(parser, "--estimates", Path, "FILE.csv", "table to write with known torque and estimate of every frame")
     add_cluster(parser)
     add_json(parser)
-    parser.add_argument("--plot", action="store_true", help="draw truth and estimate over time into --out")
+    parser.add_argument("--plot", action="store_true", help="draw load cell and estimate over time into --out")
     add_option(parser, "--out", Path, "FILE", "figure to draw (default with --plot: CAL.png)")
     parser.epilog = (
-        "Prints for valid estimates with a known truth, first of loaded frames, then of the others, then of all: root "
-        "mean square error, the same for an estimate that is always 0 (zero_rmse_nm), bias, the share of truths within "
-        "the 95 % intervals (coverage_95), the median width of the intervals (interval_nm, for diameters "
-        "diameter_interval_mm), and their mean score (winkler_nm: the width, and 40 times the distance of a truth "
-        "outside; less is better). gain is the mean estimate over the mean truth, r the correlation. Prints for all "
-        "frames: the share that is valid, why others are not, and the milliseconds of an estimate."
+        "Prints each figure with its meaning, for frames with a load, for the others and for all, and why frames have "
+        "no estimate. Errors and intervals are judged on frames with an estimate and a known torque or diameter."
     )
 
 
@@ -93,14 +108,21 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({**by_load, **figures}))
         return 0
-    groups = {**{f"{load} ": group for load, group in by_load.items()}, "": figures}
-    rows = [(load + name, _shown(value)) for load, group in groups.items() for name, value in group.items()]
-    width = max(len(name) for name, _ in rows)
-    for name, shown in rows:
-        print(f"{name:<{width}}  {shown}")
+    print(f"Loaded frames have a known torque of {args.loaded_nm:g} N·m or more, unloaded frames less.")
+    print(*_lines({**by_load, "all": figures}), sep="\n")
     for reason in invalid_reasons(tracks):
         print(f"{reason.frames:>6} frames not valid{', e.g.' if reason.differ else ''}: {reason.sentence}")
     return 0
+
+
+def _lines(columns: "Mapping[str, Figures]") -> list[str]:
+    """Return the figures of each group of frames as a table, with their meanings."""
+    rows = [
+        (name, *(_shown(group[name]) if name in group else "" for group in columns.values()), meaning)
+        for name, meaning in _MEANINGS.items()
+        if any(name in group for group in columns.values())
+    ]
+    return table(("figure", *columns, "meaning"), rows)
 
 
 def _draw(tracks: "Sequence[EstimateTrack]", paths: "Sequence[Path]", calibration: "Calibration", out: Path) -> None:

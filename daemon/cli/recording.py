@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import sys
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
@@ -48,9 +49,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(repair, "recording", Path, "REC", "e.g. NAME.mcap.partial; it is not changed")
     add_option(repair, "--out", Path, "FILE", "recording to write (default: NAME.mcap, or NAME.repaired.mcap)")
     add_json(repair)
-    export = add_action(parts, "export", "write a recording as tables, or for MATLAB, Rerun or LeRobot", _export)
+    export = add_action(
+        parts, "export", "write a recording as tables, or for MATLAB, Rerun, LeRobot, `reproduce`", _export
+    )
     add_option(export, "recording", Path, "REC", "a recording (.mcap or .mcap.partial)")
-    choices = ("csv", "parquet", "mat", "rrd", "lerobot")
+    choices = ("csv", "parquet", "mat", "rrd", "lerobot", "slices")
     export.add_argument("--format", choices=choices, default="csv", help="files to write (default: %(default)s)")
     add_option(export, "--out", Path, "PATH", "folder to write; for mat and rrd a file (default: next to REC)")
     export.add_argument("--topic", action="append", metavar="TOPIC", help="export only this topic; repeatable")
@@ -83,7 +86,8 @@ def _summary_text(found: "RecordingSummary") -> str:
         lines.append(f"  made by  shearloop {software}, {here}")
     for name, topic in found.topics.items():
         rate = "" if topic.rate_hz is None else f"{topic.rate_hz:8.2f} Hz"
-        lines.append(f"  {name:<20} {topic.messages:>8} messages {rate}")
+        plural = " " if topic.messages == 1 else "s"
+        lines.append(f"  {name:<22} {topic.messages:>8} message{plural} {rate}".rstrip())
     lines += [f"  attached {name}" for name in found.attachments]
     if not found.closed:
         lines.append(
@@ -124,7 +128,7 @@ def _export(args: argparse.Namespace) -> int:
     if unknown:
         raise UserError(f"{path} has no topic {unknown[0]!r}; it has {', '.join(counts)}")
     topics = args.topic or list(counts)
-    if form in ("rrd", "lerobot"):
+    if form in ("rrd", "lerobot", "slices"):
         topics = [topic for topic in topics if not topic.startswith(f"{INPUT}.")]
     with progress_bar(form, sum(counts[topic] for topic in topics), "message") as progress, writing(out, "the export"):
         if form == "rrd":
@@ -135,6 +139,12 @@ def _export(args: argparse.Namespace) -> int:
             from shearloop.daemon.recording.lerobot import export_lerobot
 
             written = export_lerobot(path, out, topics, progress)
+        elif form == "slices":
+            from shearloop.daemon.recording.matlab_slices import export_slices
+
+            written, missed = export_slices(path, out, topics, progress)
+            for reason, count in missed.items():
+                print(f"{path}: {count} holds without a slice: {reason}", file=sys.stderr)
         else:
             written = export(path, form, out, topics, progress)
     return print_result({"files": [str(path) for path in written]}, map(str, written), as_json=args.json)

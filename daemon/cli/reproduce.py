@@ -20,10 +20,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "recordings", Path, "RECORDINGS", "folder with torque_slices, diameter_slices")
     add_option(parser, "--out", Path, "DIR", "folder for banks, figures and numbers", required=True)
     add_json(parser)
-    geometry = parser.add_mutually_exclusive_group()
     default = "RECORDINGS/../reference/fingertip_mesh.npz, or a grid of our own if that file is missing"
-    add_option(geometry, "--mesh", Path, "FILE", f"mesh (.npz, EIDORS .mat) or fingertip (.yaml); by default {default}")
-    add_option(geometry, "--bank-config", Path, "FILE", "a bank's configuration, for its geometry")
+    add_option(parser, "--mesh", Path, "FILE", f"mesh (.npz, EIDORS .mat) or fingertip (.yaml); by default {default}")
     add_option(parser, "--jobs", int, "N", "processors to use (default: all)")
     parser.epilog = PAPERS_RECORDINGS
 
@@ -60,7 +58,7 @@ def _reproduce(args: argparse.Namespace, jobs: int) -> "tuple[Reproduction, dict
     from shearloop.daemon.analysis.reproduce.report import Reproduction
 
     inputs = analysis.read_inputs(args.recordings)
-    mesh, origin = choose_mesh(args.recordings, args.mesh, args.bank_config)
+    mesh, origin = choose_mesh(args.recordings, args.mesh)
     print(f"mesh: {origin}", file=sys.stderr)
     notes = list(inputs.notes)
 

@@ -26,8 +26,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="show the state (to a file: each estimate), and a summary",
     )
-    text = "write a slice of each held angle of a sweep, in torque_slices and diameter_slices for `reproduce`"
-    add_option(parser, "--slices", Path, "DIR", text)
     text = "log JSON lines (the default under systemd)"
     parser.add_argument("--json-log", action="store_true", default=None, help=text)
     add_option(parser, "--recording", Path, "FILE", "let the configuration's EIT emulators play this .mat recording")
@@ -82,18 +80,8 @@ def _run(
     if config.lock_memory:
         lock_memory()
     listeners: list[Listener] = []
-    reporters: dict[str, Reporter] = {"log": log, "shown": out}
+    reporters: dict[str, Reporter] = {"log_output": log, "printed_output": out}
     with ExitStack() as stack:
-        slices = None
-        if args.slices is not None:
-            # Imports scipy.io, which takes long.
-            from shearloop.daemon.recording.matlab_slices import SliceRecorder
-            from shearloop.daemon.sensing.estimators import channel_table
-
-            slices = SliceRecorder(args.slices, channel_table(config))
-            stack.callback(slices.close)
-            listeners.append(slices)
-            reporters["slices"] = slices
         # Without permission the loop still detects late commands and holds the wrist.
         stack.enter_context(high_priority() if config.robot is not None else nullcontext())
         emulated = stack.enter_context(EmulatedDevices(config.emulators, args.config.parent, args.recording))
@@ -103,8 +91,6 @@ def _run(
         shown = out if args.show or config.recording is not None else None
         summary = RunSummary(shown, emulated)
         finished = asyncio.run(run_daemon(config, tuple(listeners), reporters, on_ready, summary))
-    if slices is not None:
-        out.write(f"{args.slices}: {slices.summary}\n")
     return EXIT_OK if finished else EXIT_UNFINISHED
 
 

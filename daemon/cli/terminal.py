@@ -65,7 +65,9 @@ class StatusLine:
 
     def __init__(self, out: "TextIO | NonBlockingWriter") -> None:
         self._out = out
-        self._state = self._driving = self._torque = ""
+        self._state = self._torque = ""
+        # None until a control loop reports; without a robot there is none.
+        self._driving: str | None = None
 
     def __enter__(self) -> Self:
         """Show that the daemon starts."""
@@ -84,16 +86,18 @@ class StatusLine:
         elif topic in ("eit.estimate", "load.torque", "skin.shear") and content["source"] == self._driving:
             torque_nm = content["torque_nm"] if content["valid"] else None
             self._torque = "" if torque_nm is None else f"   {self._driving} {torque_nm:+.3f} N·m"
+        elif topic in ("eit.estimate", "skin.shear") and self._driving is None:
+            self._state = message_line(topic, content)
         else:
             return
-        self._draw(self._state + self._torque)
+        self._draw(self._state, self._torque)
 
-    def _draw(self, text: str) -> None:
+    def _draw(self, text: str, end: str = "") -> None:
         from shearloop.daemon.logs import CLEAR_LINE
 
         # A longer line would wrap, and could not be cleared.
-        width = shutil.get_terminal_size().columns - 1
-        self._out.write(f"{CLEAR_LINE}{text if len(text) <= width else text[: width - 1] + '…'}")
+        width = shutil.get_terminal_size().columns - 1 - len(end)
+        self._out.write(f"{CLEAR_LINE}{text if len(text) <= width else text[: width - 1] + '…'}{end}")
         self._out.flush()
 
 
@@ -158,7 +162,7 @@ def message_line(topic: str, content: Mapping[str, Any]) -> str:
     """Return one line of text: time, topic, source, and the values with their units."""
     clock = datetime.fromtimestamp(content["timestamp"]).astimezone().strftime("%H:%M:%S.%f")[:-3]
     body = _BODIES.get(topic, _columns)(topic, content)
-    return f"{clock}  {topic:<13} {content['source']:<7} {body}"
+    return f"{clock}  {topic:<13} {content['source']:<9} {body}"
 
 
 def message_json(topic: str, content: Mapping[str, Any]) -> str:

@@ -44,7 +44,7 @@ LONGEST_STEP_NS = 50_000_000
 _SETTLED_SHARE = 0.1
 # CUSUM test for jumps, in standard deviations: the slack per innovation, the threshold of the sum, and the bound of an
 # innovation, which keeps one wild value below the threshold.
-_JUMP_SLACK, _JUMP_SUM, _JUMP_BOUND = 1.2, 5.0, 5.0
+_JUMP_SLACK, _JUMP_SUM, _JUMP_BOUND = 1.2, 6.0, 6.0
 # The offset restarts from at most this many measurements after a jump.
 _MOST_SINCE_JUMP = 5
 # Stands for no measurement at all.
@@ -328,11 +328,13 @@ class TwistController:
         """The standard deviation of the filtered torque at the latest command."""
         return self.filter.std_nm(self._angle_rad)
 
-    def set_point(self, torque_nm: float) -> None:
+    def set_point(self, torque_nm: float, settings: ControllerSettings | None = None) -> None:
         """Change the set point; the ramp continues, or begins at the present torque.
 
-        Raises UserError for a torque beyond the limit.
+        `settings` are those of this set point on, where its ramp or its limit differ. Raises UserError for a torque
+        beyond the limit.
         """
+        self.settings = settings or self.settings
         limit = self.settings.torque_limit_nm
         if not abs(torque_nm) <= limit:
             raise UserError(f"controller: a set point of {torque_nm:g} N·m is not within the limit of {limit:g} N·m")

@@ -1,9 +1,10 @@
 """The experiment file: its limits and its steps, as pydantic models with bounds that the rig can keep."""
 
-from typing import Annotated, ClassVar, Literal
+import math
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
-from pydantic import BeforeValidator, Field, WithJsonSchema
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WithJsonSchema
 
 from shearloop.daemon.config_file import ConfigModel, either, not_of_kind
 
@@ -196,7 +197,7 @@ class ExperimentFile(ConfigModel):
     tool_mm: float | None = Field(None, gt=0, lt=140, description="diameter of the tool, for recordings")
     slices: Literal["torque", "diameter"] | None = Field(
         None,
-        description="kind of samples that `shearloop run --slices DIR` stores for each held angle; none by default",
+        description="kind of sample that `recording export --format slices` makes of each held angle; none by default",
     )
     steps: tuple[Step, ...] = Field(min_length=1, description="the steps in order")
 
@@ -220,6 +221,39 @@ def first_turn_before_grip(file: ExperimentFile) -> int | None:
 
 # A location in an experiment's file, and what is wrong there.
 Mistake = tuple[tuple[int | str, ...], str]
+_STEP: TypeAdapter[Step] = TypeAdapter(Step)
+_KINDS: dict[str, Any] = {
+    name: kind for kind in get_args(get_args(Step)[0]) for name in get_args(kind.model_fields["do"].annotation)
+}
+
+
+def outline(content: object) -> ExperimentFile:
+    """Return the content of a file as far as it can be read; a source of torque that is no name is empty.
+
+    A step with mistakes has only its kind and the names in it.
+    """
+    given = content if isinstance(content, dict) else {}
+    steps = given.get("steps")
+    try:
+        limits = ExperimentLimits.model_validate(given.get("limits", {}))
+    except ValidationError:
+        limits = ExperimentLimits.model_construct(torque_nm=math.inf, angle_rad=math.inf)
+    source = given.get("torque_source", ExperimentFile.model_fields["torque_source"].default)
+    return ExperimentFile.model_construct(
+        torque_source=source if isinstance(source, str) else "",
+        limits=limits,
+        steps=tuple(map(_outlined, steps)) if isinstance(steps, list) else (),
+    )
+
+
+def _outlined(content: object) -> Step:
+    try:
+        return _STEP.validate_python(content)
+    except ValidationError:
+        given = content if isinstance(content, dict) else {}
+        names = {key: given[key] for key in ("do", "fingertip", "reference") if isinstance(given.get(key), str)}
+        step: Step = _KINDS.get(names.get("do", ""), WaitStep).model_construct(**names)
+        return step
 
 
 def check_steps(file: ExperimentFile) -> list[Mistake]:
@@ -250,7 +284,7 @@ def _holds_unidentified(file: ExperimentFile) -> int | None:
                 identified = True
             case TareStep() | GripStep() | ReleaseStep():
                 identified = False
-            case AdaptStep() if step.fingertip == file.torque_source:
+            case AdaptStep(fingertip=fingertip) if fingertip == file.torque_source:
                 identified = False
             case HoldTorqueStep() if not identified:
                 return number
@@ -258,15 +292,15 @@ def _holds_unidentified(file: ExperimentFile) -> int | None:
 
 
 def _reach(step: Step) -> tuple[float, float]:
-    """Return the largest torque (N·m) and angle from the grip (rad) of a step; 0 if unknown."""
+    """Return the largest torque (N·m) and angle from the grip (rad) of a step; 0 if unknown, as in an outline."""
     match step:
-        case HoldTorqueStep():
-            return abs(step.torque_nm), 0.0
-        case TightenStep():
-            return step.until_torque_nm, step.until_angle_rad
-        case IdentifyStep():
-            return 0.0, step.amplitude_rad
-        case TwistStep(absolute=False):
-            return 0.0, max(map(abs, step.angles_rad))
+        case HoldTorqueStep(torque_nm=torque_nm):
+            return abs(torque_nm), 0.0
+        case TightenStep(until_torque_nm=torque_nm, until_angle_rad=angle_rad):
+            return torque_nm, angle_rad
+        case IdentifyStep(amplitude_rad=angle_rad):
+            return 0.0, angle_rad
+        case TwistStep(absolute=False, angles_rad=angles_rad):
+            return 0.0, max(map(abs, angles_rad))
         case _:
             return 0.0, 0.0

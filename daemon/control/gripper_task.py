@@ -18,6 +18,8 @@ from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperCommand, GripperState, ObjectStatus
 
 RELEASE_WIDTH_MM = 140.0
+# The fingers' own stop may lie this far before the widest target.
+OPEN_WITHIN_MM = 10.0
 # A release or halt is retried for longer than a reconnection takes.
 TRIED_FOR_S, TRIED_AGAIN_S = 5.0, 0.1
 
@@ -61,6 +63,8 @@ class GripperTask:
             return str(error)
         # The loop needs the state before the end of the action.
         self._control_loop.on_gripper(_status(state))
+        if state.object is ObjectStatus.CONTACT_OPENING and state.width_mm < target.width_mm - OPEN_WITHIN_MM:
+            return f"the fingers met something as they opened, and stopped at {state.width_mm:.1f} mm; clear their way"
         if target.expect_object and state.diameter_mm is None:
             return (
                 f"the fingers closed to {state.width_mm:.1f} mm and met nothing; "

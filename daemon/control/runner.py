@@ -146,18 +146,24 @@ class ControlLoopRunner:
                 while (state := await self._robot.next_state()).blocked:
                     pass
                 self._take_state(state)
+        if self._actions.unlocking:
+            return "robot and gripper are being unlocked; wait for the end"
         return self._control_loop.start(file, self._clock.now_ns())
 
     async def experiment_ended(self) -> Experiment:
-        """Return the present or the next experiment once it has ended."""
+        """Return the present or the next experiment once its end has been published, or another one has begun."""
         while (experiment := self._control_loop.experiment) is None:
             await self._states.changed.wait()
-        while experiment.running or self._stops.pending:
+        # An action's failure ends it between two decisions.
+        while experiment is self._control_loop.experiment and (
+            experiment is not self._states.ended or self._stops.pending
+        ):
             await self._states.changed.wait()
         return experiment
 
     async def halt_and_wait(self) -> None:
         """Halt moving fingers, and wait for the end of the last release or halt, and for the arm's standstill."""
+        self.stop_unlocking()
         if self._actions.fingers_move:
             self._actions.cancel()
         await self._actions.halt_and_wait()
@@ -168,13 +174,21 @@ class ControlLoopRunner:
 
     async def unlock(self) -> str | None:
         """Enable robot and gripper after a stop, on the operator's command; return None, or why not."""
-        reply = await self._robot.send(Unlock())
-        if not reply.accepted:
-            return reply.refusal
-        if self._actions.gripper is not None and (error := await self._actions.gripper.unlock()):
+        experiment = self._control_loop.experiment
+        if experiment is not None and experiment.running:
+            return f"the experiment {experiment.file.name!r} is running; stop it first"
+        if error := await self._actions.unlock():
             return error
         self._control_loop.acknowledge()
         return None
+
+    def stop_unlocking(self) -> bool:
+        """End an unlocking, and halt the fingers that it moves; return whether one was under way."""
+        stopped = self._actions.stop_unlocking()
+        if stopped:
+            # The robot's process ends its part.
+            self._robot.send(Stop(self._acceleration_rad_per_s2))
+        return stopped
 
     def _take_state(self, state: RobotState) -> None:
         # The controller's own time: a state that is repeated becomes stale.
@@ -308,6 +322,12 @@ class ActionExecutor:
         self._task: asyncio.Task[None] | None = None
         # The last action of a stop: to open the gripper, or to halt its fingers.
         self._final_task: asyncio.Task[None] | None = None
+        self._unlocking: asyncio.Task[str] | None = None
+
+    @property
+    def unlocking(self) -> bool:
+        """Whether robot and gripper are being unlocked."""
+        return self._unlocking is not None and not self._unlocking.done()
 
     def begin(self, action: Action) -> None:
         """Carry out an action, and report its end to the control loop."""
@@ -327,6 +347,36 @@ class ActionExecutor:
             self._final_task = self._task
         elif self._task is not None:
             self._task.cancel()
+
+    async def unlock(self) -> str:
+        """Enable robot and gripper while no experiment runs; return why not, or an empty string."""
+        if self.unlocking:
+            return "unlocking is under way"
+        task = self._unlocking = asyncio.create_task(self._unlock(), name="unlock")
+        await asyncio.wait([task])
+        return (
+            "unlocking was stopped; the arm stays blocked until the next `unlock`"
+            if task.cancelled()
+            else task.result()
+        )
+
+    async def _unlock(self) -> str:
+        reply = await self._robot.send(Unlock())
+        if not reply.accepted or self.gripper is None:
+            return reply.refusal
+        # An activation opens and closes the fingers.
+        self.fingers_move = True
+        error = await self.gripper.unlock()
+        self.fingers_move = bool(error)
+        return error
+
+    def stop_unlocking(self) -> bool:
+        """End an unlocking, and halt the fingers that it moves; return whether one was under way."""
+        if self._unlocking is None or not self._unlocking.cancel():
+            return False
+        if self.fingers_move:
+            self.cancel()
+        return True
 
     def abort(self) -> None:
         """Cancel the present action unless it is the last one of a stop.
@@ -377,7 +427,7 @@ class ActionExecutor:
     def _on_halted(self, error: str) -> None:
         if error:
             structlog.get_logger().error("the fingers did not stop", reason=error)
-            self._control_loop.on_command_refused(f"the fingers did not stop: {error}")
+            self._control_loop.on_command_refused(f"the fingers did not stop, keep clear of them: {error}")
 
     async def _run(self, action: Action) -> str:
         """Carry out an action; return an error, or an empty string."""
@@ -476,6 +526,8 @@ class StatePublisher:
 
     def __init__(self, publisher: Publisher, control_loop: ControlLoop) -> None:
         self.changed = asyncio.Event()
+        # The experiment whose end was published last.
+        self.ended: Experiment | None = None
         self._publisher = publisher
         self._control_loop = control_loop
         self._block = -1
@@ -530,6 +582,8 @@ class StatePublisher:
             )
         self._key, self._hold, self._published_ns = key, hold, now_ns
         self._publisher.publish(loop_state(self._control_loop, sent_rad_per_s, now_ns))
+        if experiment is not None and not experiment.running:
+            self.ended = experiment
         self._notify()
 
     def publish_stop(self, stop: LoopStop | None) -> None:

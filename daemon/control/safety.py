@@ -113,23 +113,21 @@ class FaultCode(Enum):
         "a device that the experiment needs is not connected yet: {detail}.",
         "Switch it on and connect it; it is found automatically. `shearloop doctor CONFIG` examines it.",
     )
-    ROBOT_STARTING = Rule(
-        _KEEP, "the robot is not ready yet: {detail}.", "Wait a few seconds, then start the experiment again."
-    )
+    ROBOT_STARTING = Rule(_KEEP, "the robot is not ready yet: {detail}.", "The experiment can begin in a few seconds.")
     DEVICE_LOST = Rule(
         _KEEP,
         "a device that the experiment needs is gone: {detail}.",
-        "Plug it in again; it is found automatically. Then start the experiment again.",
+        "Plug it in again; it is found automatically. Then the experiment can begin.",
     )
     ROBOT_LOST = Rule(
         _KEEP,
         "the robot, or the daemon's process that drives it, is gone: {detail}.",
-        "It reconnects automatically; then `shearloop command unlock`, and start the experiment again.",
+        "It reconnects automatically; then `shearloop command unlock`, and the experiment can begin.",
     )
     ROBOT_BLOCKED = Rule(
         _KEEP,
         "the robot does not move: {detail}.",
-        "Clear the cause and `shearloop command unlock`, then start the experiment again.",
+        "Clear the cause and `shearloop command unlock`, then the experiment can begin.",
     )
     TASK_DIED = Rule(
         _KEEP,
@@ -162,7 +160,9 @@ class FaultCode(Enum):
         "Make room on the disk or name another folder; the running experiment continues unrecorded.",
     )
     COMMAND_REFUSED = Rule(
-        Response.NOTE, "a command was refused: {detail}.", "Nothing was done; correct the command and send it again."
+        Response.NOTE,
+        "a command was refused: {detail}.",
+        "A running experiment continues once commands are accepted. If this recurs, end other programs.",
     )
     COMMAND_UNANSWERED = Rule(
         Response.NOTE,

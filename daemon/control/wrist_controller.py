@@ -95,7 +95,7 @@ class WristController:
         if self.controller is None:
             here_nm = tool.torque_nm + tool.stiffness_nm_per_rad * (wrist_rad - tool.angle_rad)
             self.controller = TwistController(settings, t_ns, wrist_rad, here_nm, tool.known_measurements)
-        self.controller.set_point(setpoint.torque_nm)
+        self.controller.set_point(setpoint.torque_nm, settings)
         self.tracked = setpoint
         return None
 

@@ -14,8 +14,6 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.errors import BankError
 from shearloop.bank.skin.calibration import load_calibration
 from shearloop.daemon.config import CombinedConfig, CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
-from shearloop.daemon.config_file import load_yaml_model
-from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.doctor.devices import (
     Finding,
     check_daemon,
@@ -29,6 +27,7 @@ from shearloop.daemon.doctor.devices import (
     trouble,
 )
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.rig import read_experiment
 from shearloop.daemon.sensing.estimators import open_combined, open_estimator
 from shearloop.daemon.serial_ports import list_serial_ports
 from shearloop.drivers.errors import DriverError
@@ -168,7 +167,7 @@ def check_files(config: DaemonConfig, geometry: Path | None) -> Iterator[Finding
             yield from_file("robot's settings", str(error), "the daemon does not start")
     if config.experiment is not None:
         try:
-            one = load_yaml_model(config.experiment, ExperimentFile)
+            one = read_experiment(config.experiment)
             steps = f"{one.name}, {len(one.steps)} steps, driven by {one.torque_source}"
             yield good("experiment", f"{config.experiment}: {steps}")
         except UserError as error:

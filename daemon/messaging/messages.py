@@ -205,7 +205,9 @@ class LoopState(Message):
     steps: int = column("", "number of steps")
     step_name: str = column("", "kind of the step, as the experiment names it")
     hold: int = column("", "number of the angle or torque of the step that is held now, from 1; 0 while none is")
-    slices: str = column("", "kind of slice that `shearloop run --slices` keeps of it: torque, diameter, or nothing")
+    slices: str = column(
+        "", "kind of slice that `recording export` makes of a held angle: torque, diameter, or nothing"
+    )
     activity: str = column("", "what the loop does or waits for")
     progress: float = column("", "share of the experiment that is done, 0 to 1")
     remaining_s: float = column("s", "estimated time to the end")

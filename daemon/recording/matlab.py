@@ -229,10 +229,11 @@ def import_mat(sources: Sequence[Path], out: Path) -> ImportResult:
     arrivals = {side: [round(float(unix_s) * 1e9) for unix_s in one.unix_s] for side, one in streams.items()}
     middles = {side: frame_middles(one) for side, one in arrivals.items()}
     found = measured_delay([_series_of_side(side, one, middles[side], load) for side, one in streams.items()])
-    if found is not None and found.late_s:
-        load = replace(load, unix_s=load.unix_s - found.late_s)
+    delay, late_s = found or (None, 0.0)
+    if delay is not None and late_s:
+        load = replace(load, unix_s=load.unix_s - late_s)
         remarks.append(
-            f"The load was stamped {found.late_s:.2f} ± {found.delay.error_s:.2f} s too late against the gel's motion, "
+            f"The load was stamped {late_s:.2f} ± {delay.error_s:.2f} s too late against the gel's motion, "
             "and its times were corrected."
         )
     if found is None and not sure:

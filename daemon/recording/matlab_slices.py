@@ -1,4 +1,4 @@
-"""Writes slices: the input of the paper's analysis, one MATLAB file for each held angle.
+"""Exports a recorded sweep as slices: the input of the paper's analysis, one MATLAB file for each held angle.
 
 A slice is the frame at the middle of a hold, smoothed over time like the paper's (Gaussian over nine frames), minus
 the homogeneous frame, as an absolute value. It comes with the load cell's torque over the same time. The homogeneous
@@ -9,20 +9,20 @@ import io
 import re
 from collections import Counter, deque
 from collections.abc import Collection, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import structlog
 from scipy.io import savemat
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.channels import ChannelTable
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.messages import Scalar
+from shearloop.daemon.messaging.messages import EitFrame, GripperStateMessage, LoadTorque, LoopState
+from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.matlab import DIAMETER_FOLDER, RAW_FRAME, RAW_HOMOGENEOUS, TORQUE_FOLDER
+from shearloop.daemon.recording.reader import Progress, open_recording, read_messages, recorded_table
 from shearloop.files import replace_file
 
 # The paper's smoothing: nine frames, with a standard deviation of a fifth of that.
@@ -31,21 +31,7 @@ MIN_FRAMES = 3
 CLIPPED_V = 0.45
 # More than a minute of frames and torques at 1.85 and 10.9 Hz.
 MAX_FRAMES, MAX_TORQUES = 256, 4096
-
-
-@dataclass(frozen=True, slots=True)
-class _SliceFrame:
-    t_ns: int
-    channels: FloatArray
-    line: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
-class _Hold:
-    from_ns: int
-    to_ns: int
-    kind: str
-    source: str
+_TOPICS = (EitFrame.topic, LoadTorque.topic, GripperStateMessage.topic, LoopState.topic)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,130 +45,110 @@ class _Slice:
     homogeneous_line: FloatArray
 
 
+def export_slices(
+    path: Path, out: Path, topics: list[str], progress: Progress = lambda _: None
+) -> tuple[list[Path], Counter[str]]:
+    """Write the slices of a recorded experiment with the key `slices` into folders of `out`.
+
+    Returns the files, and how many holds have no slice by the reason. Existing slices stay. Raises OSError for files
+    that cannot be written, and UserError for a recording that cannot be read or has no such hold.
+    """
+    with open_recording(path) as recording:
+        table = recorded_table(recording.metadata().get(schema.METADATA, {}))
+    sweep, folder, missed = _Sweep(table), _SliceFolder(out), Counter[str]()
+    used = [topic for topic in topics if schema.schema_name(topic) in _TOPICS]
+    for number, (topic, content, _) in enumerate(read_messages(path, used), start=1):
+        found = sweep.add(schema.schema_name(topic), content)
+        if isinstance(found, _Slice):
+            folder.save(found)
+        elif found is not None:
+            missed[found] += 1
+        progress(number)
+    if not folder.written and not missed:
+        raise UserError(
+            f"{path}: nothing to export; slices need an experiment with the key `slices` that holds angles, as "
+            "config/experiments/torque_sweep.yaml"
+        )
+    return folder.written, missed
+
+
 class _SliceFolder:
-    """Writes slices in a thread of its own, so that no frame waits for the disk, and counts them there."""
+    """Writes slices under the numbers after those that are there."""
 
     def __init__(self, folder: Path) -> None:
-        self.written: Counter[str] = Counter()
-        self.missed: Counter[str] = Counter()
-        self.thread = ThreadPoolExecutor(1, thread_name_prefix="slices")
+        self.written: list[Path] = []
         self._folder = folder
         self._largest_nm = 0.0
-        # The files of this run's raw frame and homogeneous frame.
-        self.raw: tuple[Path, Path] | None = None
+        # The files of this recording's raw frame and homogeneous frame.
+        self._raw: tuple[Path, Path] | None = None
 
     def save(self, one: _Slice) -> None:
-        """Write one slice, and count it or the reason of a failure."""
-        try:
-            if one.diameter_mm is None:
-                self._save(TORQUE_FOLDER, "Data_Slice_", data_diff=one.difference[None], torque_value=[[one.torque_nm]])
-                self._save_raw(one)
-            else:
-                prefix = f"{one.diameter_mm:.0f}mm_Data_"
-                self._save(DIAMETER_FOLDER, prefix, data_diff=one.difference[None], mean_torque=[[one.torque_nm]])
-        except OSError as error:
-            self.miss(f"{self._folder} cannot be written ({error.strerror})")
-        except Exception as error:  # noqa: BLE001 - the thread would hide it
-            structlog.get_logger().exception("a slice could not be written")
-            self.miss(f"writing it failed with {type(error).__name__}: {error}")
+        """Write one slice."""
+        if one.diameter_mm is None:
+            self._save(TORQUE_FOLDER, "Data_Slice_", data_diff=one.difference[None], torque_value=[[one.torque_nm]])
+            self._save_raw(one)
         else:
-            self.written["torque" if one.diameter_mm is None else "diameter"] += 1
-
-    def miss(self, reason: str) -> None:
-        """Count a hold without a slice, and log each reason once."""
-        self.missed[reason] += 1
-        if self.missed[reason] == 1:
-            structlog.get_logger().warning("a slice is missed", reason=reason)
+            prefix = f"{one.diameter_mm:.0f}mm_Data_"
+            self._save(DIAMETER_FOLDER, prefix, data_diff=one.difference[None], mean_torque=[[one.torque_nm]])
 
     def _save(self, folder_name: str, prefix: str, **arrays: Any) -> None:
         """Write a file with the number after the highest of the folder."""
         folder = self._folder / folder_name
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         found = (re.fullmatch(rf"{prefix}(\d+)\.mat", path.name) for path in folder.iterdir())
         number = 1 + max((int(match[1]) for match in found if match), default=0)
-        _save_mat(folder / f"{prefix}{number}.mat", **arrays)
+        self.written.append(folder / f"{prefix}{number}.mat")
+        _save_mat(self.written[-1], **arrays)
 
     def _save_raw(self, one: _Slice) -> None:
-        """Write the raw frame and homogeneous frame of the run's largest torque, clipped like the paper's."""
+        """Write the raw frame and homogeneous frame of the recording's largest torque, clipped like the paper's."""
         if abs(one.torque_nm) <= self._largest_nm:
             return
         number = 1
-        while self.raw is None:
+        while self._raw is None:
             end = ".mat" if number == 1 else f"_{number}.mat"
             names = (name.replace(".mat", end) for name in (RAW_FRAME, RAW_HOMOGENEOUS))
             frame, rest = (self._folder / TORQUE_FOLDER / name for name in names)
             if not frame.exists() and not rest.exists():
-                self.raw = frame, rest
+                self._raw = frame, rest
+                self.written += self._raw
             number += 1
-        _save_mat(self.raw[0], clipped_data=np.clip(one.line, 0.0, CLIPPED_V)[None])
-        _save_mat(self.raw[1], clipped_data_hom=np.clip(one.homogeneous_line, 0.0, CLIPPED_V)[None])
+        _save_mat(self._raw[0], clipped_data=np.clip(one.line, 0.0, CLIPPED_V)[None])
+        _save_mat(self._raw[1], clipped_data_hom=np.clip(one.homogeneous_line, 0.0, CLIPPED_V)[None])
         self._largest_nm = abs(one.torque_nm)
 
 
-class SliceRecorder:
-    """Listens to all messages of a daemon and writes a file for each hold of an experiment that asks for slices.
+class _Sweep:
+    """Finds the slices in the messages of one experiment, which come by the time of their measurement."""
 
-    `close` waits for the last file.
-    """
-
-    def __init__(self, folder: Path, table: ChannelTable) -> None:
-        """Create the folder for `torque_slices` and `diameter_slices`; raises UserError on failure."""
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UserError(f"{folder} cannot be made ({error.strerror}); choose another folder for slices") from None
-        self._folder, self._table = _SliceFolder(folder), table
-        self._frames: dict[str, deque[_SliceFrame]] = {}
+    def __init__(self, table: ChannelTable) -> None:
+        self._table = table
+        # By source, the time and the line of each frame.
+        self._frames: dict[str, deque[tuple[int, FloatArray]]] = {}
         self._torques: deque[tuple[int, float]] = deque(maxlen=MAX_TORQUES)
         # The start of the running `tare` step.
         self._tare_from_ns: int | None = None
         self._homogeneous: dict[str, FloatArray] = {}
         self._diameter_mm: float | None = None
-        # The number and the start of the current hold.
-        self._current: tuple[int, int] | None = None
-        # A finished hold that waits for its last frame.
-        self._pending: _Hold | None = None
+        # The number, the start and the kind of the current hold.
+        self._hold: tuple[int, int, str] | None = None
 
-    @property
-    def summary(self) -> str:
-        """The written and missed slices in a sentence."""
-        written, missed, raw = self._folder.written.copy(), self._folder.missed.copy(), self._folder.raw
-        text = ", ".join(f"{count} {kind} slices" for kind, count in written.items()) or "no slice was kept"
-        if raw is not None and raw[0].name != RAW_FRAME:
-            text += f", their raw frame in {raw[0].name} (that of an earlier run stays in {RAW_FRAME})"
-        return text + "".join(f"; {count} missed: {reason}" for reason, count in missed.items())
-
-    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
-        """Return the state for `health`."""
-        missed = self._folder.missed.copy()
-        return {"slices": self._folder.written.total(), "errors": missed, "error": next(reversed(missed), "")}
-
-    def close(self) -> None:
-        """Write the pending hold and wait for the writing thread."""
-        self._write_pending()
-        self._folder.thread.shutdown()
-
-    def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
-        """Process one message."""
+    def add(self, topic: str, content: Mapping[str, Any]) -> _Slice | str | None:
+        """Take one message; return the slice of a hold that it ends, or why there is none."""
+        t_ns = content["t_mono_ns"]
         match topic:
-            case "eit.frame" if not content["repeated"]:
-                self._add_frame(content)
-            case "load.torque" if content["valid"]:
-                self._torques.append((content["t_mono_ns"], content["torque_nm"]))
-            case "gripper.state":
+            case EitFrame.topic if not content["repeated"]:
+                frames = self._frames.setdefault(content["source"], deque(maxlen=MAX_FRAMES))
+                frames.append((t_ns, np.array(content["line"], dtype=np.float64)))
+            case LoadTorque.topic if content["valid"]:
+                self._torques.append((t_ns, content["torque_nm"]))
+            case GripperStateMessage.topic:
                 self._diameter_mm = content["diameter_mm"]
-            case "loop.state":
-                self._update_loop(content)
+            case LoopState.topic:
+                return self._on_loop_state(t_ns, content)
+        return None
 
-    def _add_frame(self, content: Mapping[str, Any]) -> None:
-        source, t_ns = content["source"], content["t_mono_ns"]
-        channels, line = (np.frombuffer(content[key], "<f4").astype(np.float64) for key in ("channels", "line"))
-        self._frames.setdefault(source, deque(maxlen=MAX_FRAMES)).append(_SliceFrame(t_ns, channels, line))
-        if self._pending is not None and source == self._pending.source and t_ns > self._pending.to_ns:
-            self._write_pending()
-
-    def _update_loop(self, content: Mapping[str, Any]) -> None:
-        now_ns, ended = content["t_mono_ns"], content["phase"] in ("done", "stopped")
+    def _on_loop_state(self, now_ns: int, content: Mapping[str, Any]) -> _Slice | str | None:
         tares = content["step_name"] == "tare" and content["phase"] == "running"
         if tares and self._tare_from_ns is None:
             self._tare_from_ns = now_ns
@@ -190,64 +156,53 @@ class SliceRecorder:
             self._end_tare(self._tare_from_ns)
             self._tare_from_ns = None
         # A safety hold or a pause keeps the angle, so the hold continues.
-        hold = content["hold"] if not ended and content["slices"] else 0
-        if self._current is not None and hold != self._current[0]:
-            self._write_pending()
+        number = 0 if content["phase"] in ("done", "stopped") or not content["slices"] else content["hold"]
+        found: _Slice | str | None = None
+        if self._hold is not None and number != self._hold[0]:
             # The fingertip of a slice: the torque source, else the right one, else the first.
             wanted = (content["torque_source"], "right", *sorted(self._frames))
             source = next((name for name in wanted if name in self._frames), wanted[0])
-            self._pending = _Hold(self._current[1], now_ns, content["slices"], source)
-            self._current = None
-        if hold and self._current is None:
-            self._current = (hold, now_ns)
-        if ended:
-            self._write_pending()
+            found = self._slice(source, self._hold[1], now_ns, self._hold[2])
+            self._hold = None
+        if number and self._hold is None:
+            self._hold = (number, now_ns, content["slices"])
+        return found
 
     def _end_tare(self, began_ns: int) -> None:
         for source, frames in self._frames.items():
             # The acquisition of the first frame began before the step, maybe with a tool in the fingers.
             from_ns = began_ns + _half_period_ns(frames)
-            lines = [frame.line for frame in frames if frame.t_ns >= from_ns]
+            lines = [line for t_ns, line in frames if t_ns >= from_ns]
             if lines:
                 self._homogeneous[source] = np.mean(lines, axis=0)
 
-    def _write_pending(self) -> None:
-        if self._pending is None:
-            return
-        found, self._pending = self._slice_of(self._pending), None
-        if isinstance(found, str):
-            self._folder.thread.submit(self._folder.miss, found)
-        else:
-            self._folder.thread.submit(self._folder.save, found)
-
-    def _slice_of(self, hold: _Hold) -> _Slice | str:
+    def _slice(self, source: str, from_ns: int, to_ns: int, kind: str) -> _Slice | str:
         """Return the slice of a hold, or the reason for its absence."""
-        known = self._frames.get(hold.source, ())
+        known = self._frames.get(source, ())
         # The whole acquisition of a frame must lie in the hold.
         half_ns = _half_period_ns(known)
-        frames = [frame for frame in known if hold.from_ns + half_ns <= frame.t_ns <= hold.to_ns - half_ns]
-        torques = np.array([row for row in self._torques if hold.from_ns < row[0] < hold.to_ns]).reshape(-1, 2)
-        if hold.source not in self._homogeneous:
+        frames = [frame for frame in known if from_ns + half_ns <= frame[0] <= to_ns - half_ns]
+        torques = np.array([row for row in self._torques if from_ns < row[0] < to_ns]).reshape(-1, 2)
+        if source not in self._homogeneous:
             return "no `tare` step came before the hold"
         if len(frames) < MIN_FRAMES or not len(torques):
             return f"the hold has fewer than {MIN_FRAMES} frames, or no torque"
-        if hold.kind == "diameter" and self._diameter_mm is None:
+        if kind == "diameter" and self._diameter_mm is None:
             return "the gripper measured no diameter"
-        times = np.array([frame.t_ns for frame in frames], float)
+        times, lines = np.array([t_ns for t_ns, _ in frames], float), [line for _, line in frames]
         period_ns = float(np.diff(times).mean())
         # Around the middle of the times, for at most nine frames.
         periods = (times - 0.5 * (times[0] + times[-1])) / period_ns
         weights = np.exp(-0.5 * (periods / STD_FRAMES) ** 2) * (np.abs(periods) <= WINDOW_FRAMES / 2)
         weights /= weights.sum()
-        smoothed = weights @ np.array([frame.channels for frame in frames])
         # The torque has the same middle and the same weights.
         near = np.exp(-0.5 * ((torques[:, 0] - float(weights @ times)) / (STD_FRAMES * period_ns)) ** 2)
-        rest = self._homogeneous[hold.source]
+        rest = self._homogeneous[source]
         return _Slice(
-            np.abs(smoothed - self._table.channels_of_line(rest)),
+            np.abs(self._table.channels_of_line(weights @ np.array(lines) - rest)),
             float(near @ torques[:, 1] / near.sum()),
-            self._diameter_mm if hold.kind == "diameter" else None,
-            frames[len(frames) // 2].line,
+            self._diameter_mm if kind == "diameter" else None,
+            lines[len(lines) // 2],
             rest,
         )
 
@@ -259,6 +214,6 @@ def _save_mat(path: Path, **arrays: Any) -> None:
         file.write(content.getbuffer())
 
 
-def _half_period_ns(frames: Collection[_SliceFrame]) -> float:
+def _half_period_ns(frames: Collection[tuple[int, FloatArray]]) -> float:
     """Return half the duration of an acquisition, 0 for fewer than two frames."""
-    return 0.5 * float(np.median(np.diff([frame.t_ns for frame in frames]))) if len(frames) > 1 else 0.0
+    return 0.5 * float(np.median(np.diff([t_ns for t_ns, _ in frames]))) if len(frames) > 1 else 0.0

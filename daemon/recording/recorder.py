@@ -308,12 +308,13 @@ class Recorder:
     def _new_file(self, lost_before: int) -> _CurrentFile:
         now_ns, offset_ns = self._clock.now_ns(), self._clock.offset_ns
         name = datetime.fromtimestamp((now_ns + offset_ns) / 1e9, UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
-        # Another file may have begun in the same second.
+        # Another file may have begun in the same second, or before the clock was set back.
         for number in count(1):
+            began = name if number == 1 else f"{name}-{number}"
             with suppress(FileExistsError):
-                suffix = "" if number == 1 else f"-{number}"
-                file = McapFile(FileIO(self._folder / f"{name}{suffix}.mcap{PARTIAL}", "xb"))
-                break
+                if not any(self._folder.glob(f"{began}*")):
+                    file = McapFile(FileIO(self._folder / f"{began}.mcap{PARTIAL}", "xb"))
+                    break
         try:
             file.add_metadata(schema.METADATA, self._identity.metadata)
             for one in self._identity.attached:

@@ -231,13 +231,13 @@ def torque_sources(
     sources = {
         name: TorqueSource(
             name=name,
-            period_s=own.frame_period_s,
+            period_s=(own := config.fingertips[name]).frame_period_s,
             window_s=own.frame_period_s * own.average_frames,
-            measures_torque=estimators[name].measures_torque,
-            warm_up_s=_WARM_UP_SHARE * estimators[name].warm_up_frames * own.frame_period_s,
-            has_gain=estimators[name].has_gain,
+            measures_torque=estimator.measures_torque,
+            warm_up_s=_WARM_UP_SHARE * estimator.warm_up_frames * own.frame_period_s,
+            has_gain=estimator.has_gain,
         )
-        for name, own in config.fingertips.items()
+        for name, estimator in estimators.items()
     }
     if combined is not None:
         period_s = max(own.frame_period_s for own in config.fingertips.values())

@@ -86,6 +86,10 @@ class _Tare:
         self._from_ns = None if due else self._from_ns
         return due
 
+    def give_up(self) -> None:
+        """Forget a tare that no frame has begun."""
+        self._from_ns = None
+
     def add(self, reason: str, *, taring: bool) -> None:
         """Take the reason of an estimate, and whether more frames are needed."""
         if self.done.is_set() or self._from_ns is not None:
@@ -176,6 +180,9 @@ class FingertipPipeline:
         except TimeoutError:
             what = f"the homogeneous frame of {self.name} could not be taken within {within_s:.3g} s"
             return f"{what}: {self._tare.reasons or 'no frame came'}"
+        finally:
+            # Frames that come later could be of any load.
+            self._tare.give_up()
         return ""
 
     async def adapt(self, reference: str) -> str:
@@ -272,10 +279,6 @@ class FingertipTask:
         self._publisher.publish(frame_message(self.name, frame))
         if self._always_heatmap or self._publisher.has_subscriber(EitHeatmap.topic):
             await self._publish_heatmap(frame)
-
-    def show_heatmap(self, *, always: bool) -> None:
-        """Publish a heatmap with every frame, or only while somebody subscribes to it."""
-        self._always_heatmap = always
 
     def diagnostics(self) -> TaskFacts:
         """Return the values for the health message."""

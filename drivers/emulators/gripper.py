@@ -69,7 +69,9 @@ class GripperRegisters:
 
 
 class Gripper:
-    """One gripper: `write` sets the command registers, `step` moves the fingers. Closing, they stop at `object_mm`.
+    """One gripper: `write` sets the command registers, `step` moves the fingers.
+
+    Closing, they stop at `object_mm`; opening, at `widest_mm`.
 
     The next step takes up commands: until then the status belongs to the motion before, as on the real gripper.
     """
@@ -78,11 +80,12 @@ class Gripper:
         """Start as after power-on: reset, half open."""
         self.mechanics = mechanics or GripperMechanics()
         self.object_mm = object_mm
+        self.widest_mm: float | None = None
         self.powered = True
         self.command = GripperRegisters()
         # The commands that the last step has taken up.
         self.taken = GripperRegisters()
-        # gOBJ: 0 moving, 2 contact closing, 3 at target; gFLT; gCU: motor current in 10 mA.
+        # gOBJ: 0 moving, 1 contact opening, 2 contact closing, 3 at target; gFLT; gCU: motor current in 10 mA.
         self.obj = self.flt = self.current = 0
         self._position = float(COUNTS_MAX // 2)
         # The positions that an activation has still to reach; None before it begins.
@@ -117,9 +120,9 @@ class Gripper:
         """Put something of a width between the fingers, or take it away."""
         self.object_mm = object_mm
 
-    def cut_power(self) -> None:
-        """Answer nothing more; the URCap then has no values."""
-        self.powered = False
+    def block_at(self, widest_mm: float | None) -> None:
+        """Keep the fingers from opening further than a width, or clear their way."""
+        self.widest_mm = widest_mm
 
     def fail(self, code: int) -> None:
         """Report a fault and stop; from 10 on only a rising edge of ACT ends it."""
@@ -174,11 +177,13 @@ class Gripper:
             # An object wider than the opening pushes the fingers apart.
             self._position = min(self._position + travel, stop)
         else:
+            if self.widest_mm is not None:
+                stop = max(target, self.mechanics.counts(self.widest_mm))
             self._position = max(self._position - travel, stop)
         if self._position != stop:
             self.obj, self.current = 0, 15
             return False
-        self.obj, self.current = (3, 0) if stop == target else (2, 5 + self.taken.force // 5)
+        self.obj, self.current = (3, 0) if stop == target else (1 + closing, 5 + self.taken.force // 5)
         return True
 
 

@@ -6,7 +6,7 @@ Poses are UR's: position and rotation vector of the flange.
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,23 +61,12 @@ def rotation_vector(turn: Matrix) -> Vector:
     return np.asarray(math.pi / np.linalg.norm(axis) * axis)
 
 
-class Advanced(NamedTuple):
-    """The arm after a cycle."""
-
-    q_rad: Vector
-    qd_rad_per_s: Vector
-    finished: bool
+# The arm after a cycle: joints (6,), speeds (6,), and whether the motion is over.
+Advanced: TypeAlias = tuple[Vector, Vector, bool]
 
 
 class PathError(Exception):
     """A path that the arm cannot follow; the controller answers with a protective stop."""
-
-
-class Motion(Protocol):
-    """A motion under way."""
-
-    def advance(self, q_rad: Vector, qd_rad_per_s: Vector, dt_s: float) -> Advanced:
-        """Return joints (6,), speeds (6,) and whether the motion is over, one cycle of `dt_s` later."""
 
 
 @dataclass
@@ -92,7 +81,7 @@ class Speed:
         """Return the arm one cycle later."""
         step = self.acceleration_rad_per_s2 * dt_s
         qd = qd_rad_per_s + np.clip(self.target_rad_per_s - qd_rad_per_s, -step, step)
-        return Advanced(q_rad + 0.5 * (qd + qd_rad_per_s) * dt_s, qd, self.halts and not qd.any())
+        return q_rad + 0.5 * (qd + qd_rad_per_s) * dt_s, qd, self.halts and not qd.any()
 
 
 @dataclass
@@ -131,7 +120,7 @@ class LinearMove:
         if np.abs(step).max() > JOINT_SPEED_LIMIT_RAD_PER_S * dt_s:
             raise PathError("the line asks a joint for more than its largest speed")
         finished = self._done >= self._end
-        return Advanced(q_rad + step, np.zeros(6) if finished else step / dt_s, finished)
+        return q_rad + step, np.zeros(6) if finished else step / dt_s, finished
 
     def _advance_trapezoid(self, dt_s: float) -> float:
         """Return the covered share of the length one cycle later."""
@@ -152,7 +141,7 @@ class Arm:
         # Elbow up, the tool pointing straight down.
         self.q_rad: Vector = np.array([0.0, -1.0, 1.0, -1.0, -1.0, 0.0]) * (math.pi / 2)
         self.qd_rad_per_s: Vector = np.zeros(6)
-        self.motion: Motion | None = None
+        self.motion: Speed | LinearMove | None = None
         self._framed_q_rad, self._last_frame = self.q_rad, link_frames(self.q_rad)[-1]
         self._wrench = np.zeros(6)
         self._wrench_zero = np.zeros(6)

@@ -12,7 +12,7 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from functools import lru_cache
+from functools import lru_cache, partial
 from types import CodeType
 from typing import Any
 
@@ -129,16 +129,33 @@ class Program:
         self._events: list[Event] = []
         self._watchdogs: dict[str, float] = {}
         code, main = translate(text)
-        # The public methods below are the program's functions; it has these names only.
-        names: dict[str, Any] = {name: getattr(self, name) for name in vars(Program) if not name.startswith("_")}
-        del names["cycle"]
-        names |= {"sqrt": math.sqrt, "__builtins__": {}}
+        names = self._functions()
         exec(code, names)  # noqa: S102
         # By number; the main one is number 1, and the program ends with it.
         self._threads: dict[int, Thread] = {1: names[main]()}
         # The numbers of the running thread, the one in a critical section, and the one that moves the arm; or 0.
         self._running = self._critical = self._mover = 0
         self._started, self._loops = 1, 0
+
+    def _functions(self) -> dict[str, Any]:
+        """Return the functions of URScript by name: the public methods, and what takes one line."""
+        registers, arm = self._registers, self._arm
+        methods = {name: getattr(self, name) for name in vars(Program) if not name.startswith("_") and name != "cycle"}
+        return methods | {
+            "read_input_float_register": lambda number: registers[f"input_double_register_{number}"],
+            "read_input_integer_register": lambda number: int(registers[f"input_int_register_{number}"]),
+            "write_output_float_register": partial(self._write_output, "double"),
+            "write_output_integer_register": partial(self._write_output, "int"),
+            "get_actual_joint_positions": lambda: [*map(float, arm.q_rad)],
+            "get_tcp_force": lambda: [*map(float, arm.wrench)],
+            "get_steptime": lambda: self._step_s,
+            "norm": lambda value: math.hypot(*value) if isinstance(value, list) else abs(value),
+            "put": lambda values, index, value: [*values[:index], value, *values[index + 1 :]],
+            "sqrt": math.sqrt,
+            # The pendant's log is not kept, and force mode is not played.
+            **dict.fromkeys(("textmsg", "force_mode_set_gain_scaling", "force_mode_set_damping"), lambda *_: None),
+            "__builtins__": {},
+        }
 
     def cycle(self, step_s: float, now_s: float) -> list[Event]:
         """Run each thread until it has used up this cycle; return what happened.
@@ -238,26 +255,13 @@ class Program:
             yield
         self._mover = 0
 
+    def _write_output(self, kind: str, number: int, value: float) -> None:
+        self._registers[f"output_{kind}_register_{number}"] = value
+
     def _claim_arm(self) -> None:
         if self._mover not in (0, self._running):
             raise ProgramEndedError("another thread is already controlling the robot")
         self._mover = self._running
-
-    def read_input_float_register(self, number: int) -> float:
-        """Return an input register."""
-        return self._registers[f"input_double_register_{number}"]
-
-    def read_input_integer_register(self, number: int) -> int:
-        """Return an input register."""
-        return int(self._registers[f"input_int_register_{number}"])
-
-    def write_output_float_register(self, number: int, value: float) -> None:
-        """Set an output register."""
-        self._registers[f"output_double_register_{number}"] = value
-
-    def write_output_integer_register(self, number: int, value: int) -> None:
-        """Set an output register."""
-        self._registers[f"output_int_register_{number}"] = value
 
     def rtde_set_watchdog(self, name: str, hz: float, action: str) -> None:
         """End the program from now on when this register is written less often."""
@@ -270,34 +274,3 @@ class Program:
         """Make the present wrench zero."""
         self._arm.zero_wrench()
         self._events.append(("wrench-zeroed", ""))
-
-    def get_actual_joint_positions(self) -> list[float]:
-        """Return the joint angles."""
-        return [*map(float, self._arm.q_rad)]
-
-    def get_tcp_force(self) -> list[float]:
-        """Return force and torque at the tool, in base coordinates."""
-        return [*map(float, self._arm.wrench)]
-
-    def get_steptime(self) -> float:
-        """Return the duration of a cycle in s."""
-        return self._step_s
-
-    @staticmethod
-    def norm(value: list[float] | float) -> float:
-        """Return the Euclidean norm of a list, or the absolute value of a number."""
-        return math.hypot(*value) if isinstance(value, list) else abs(value)
-
-    @staticmethod
-    def put(values: list[float], index: int, value: float) -> list[float]:
-        """Return the list with another entry."""
-        return [*values[:index], value, *values[index + 1 :]]
-
-    def textmsg(self, *_: object) -> None:
-        """Write to the pendant's log."""
-
-    def force_mode_set_gain_scaling(self, _: float) -> None:
-        """Force mode is not played."""
-
-    def force_mode_set_damping(self, _: float) -> None:
-        """Force mode is not played."""

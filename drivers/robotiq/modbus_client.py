@@ -26,13 +26,18 @@ FIRST_COMMAND_REGISTER, FIRST_STATUS_REGISTER, N_STATUS_REGISTERS = 0x03E8, 0x07
 _ACT, _GTO = 1 << 0, 1 << 3
 
 
-def command_registers(request: messages.Request, last: messages.GripperMove) -> list[int]:
-    """Return the three registers from 0x03E8 for a request; one without a target keeps the last target."""
+def command_registers(request: messages.Request, last: messages.GripperMove, *, act: bool) -> list[int]:
+    """Return the three registers from 0x03E8 for a request; one without a target keeps the last target.
+
+    `act` is the gripper's present ACT, which a halt keeps: a rising edge would begin an activation.
+    """
     match request:
         case messages.Reset():
             action = 0
-        case messages.Activate() | messages.GripperHalt():
+        case messages.Activate():
             action = _ACT
+        case messages.GripperHalt():
+            action = _ACT if act else 0
         case messages.GripperMove():
             action, last = _ACT | _GTO, request
     return [action << 8, last.position, last.speed << 8 | last.force]
@@ -75,6 +80,7 @@ class ModbusClient:
         self._deadline_s = reply_deadline_s
         self._client: AsyncModbusSerialClient | None = None
         self._last = messages.GripperMove(0, 0, 0)
+        self._act = False
 
     @property
     def name(self) -> str:
@@ -100,6 +106,7 @@ class ModbusClient:
             self._client = None
             raise
         self._last = messages.GripperMove(readout.pre, self._last.speed, self._last.force)
+        self._act = readout.act
 
     async def close(self) -> None:
         """Close the port; closing twice is allowed."""
@@ -114,7 +121,9 @@ class ModbusClient:
 
     async def write(self, request: messages.Request) -> None:
         """Write the command registers; DeviceLostError or ProtocolError."""
-        await self._exchange(command_registers(request, self._last))
+        command = command_registers(request, self._last, act=self._act)
+        await self._exchange(command)
+        self._act = bool(command[0] >> 8 & _ACT)
         if isinstance(request, messages.GripperMove):
             self._last = request
 

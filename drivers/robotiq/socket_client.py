@@ -5,13 +5,12 @@ or with `POS ?` when the controller has no value, for example because the grippe
 """
 
 import asyncio
-from contextlib import suppress
 
+from shearloop.drivers.connection import TcpPort
 from shearloop.drivers.defaults import URCAP_PORT
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, ProtocolError, system_reason
 from shearloop.drivers.robotiq import messages
 
-CONNECT_DEADLINE_S = 2.0
 # A reply takes some milliseconds; the controller serves the socket with a low priority.
 REPLY_DEADLINE_S = 0.5
 MAX_REPLY_BYTES = 32
@@ -42,7 +41,7 @@ def take_answer(line: str, received: bytes) -> tuple[str, bytes] | None:
     """
     text = received.lstrip()
     if len(text) > MAX_REPLY_BYTES:
-        raise ProtocolError(f"The gripper's socket answered with {text!r}; is this the URCap's port?")
+        raise ProtocolError(f"The gripper's socket answered {text[:MAX_REPLY_BYTES]!r}; is this the URCap's port?")
     if line.startswith("SET"):
         if not _ACK.startswith(text[: len(_ACK)]):
             raise ProtocolError(f"The gripper's socket answered a command with {text!r} instead of {_ACK!r}.")
@@ -96,7 +95,7 @@ class SocketClient:
         self._host = host
         self._port = port
         self._deadline_s = reply_deadline_s
-        self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
+        self._connection: TcpPort | None = None
         self._received = b""
 
     @property
@@ -109,8 +108,7 @@ class SocketClient:
         await self.close()
         self._received = b""
         try:
-            async with asyncio.timeout(CONNECT_DEADLINE_S):
-                self._streams = await asyncio.open_connection(self._host, self._port)
+            self._connection = await TcpPort.connect(self._host, self._port)
         except OSError as error:  # a timeout is one
             raise DeviceNotFoundError(
                 f"There is no gripper socket at {self.name} ({system_reason(error)}); check the robot's address and "
@@ -119,11 +117,9 @@ class SocketClient:
 
     async def close(self) -> None:
         """Close the connection; closing twice is allowed."""
-        streams, self._streams = self._streams, None
-        if streams is not None:
-            streams[1].transport.abort()
-            with suppress(OSError):
-                await streams[1].wait_closed()
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            connection.close()
 
     async def read(self) -> messages.Readout:
         """Return the status registers, requested one by one; DeviceLostError or ProtocolError."""
@@ -136,36 +132,25 @@ class SocketClient:
 
     async def _ask(self, line: str) -> str:
         """Send a line and return the value asked for, or `ack`."""
-        if self._streams is None:
+        connection = self._connection
+        if connection is None:
             raise DeviceLostError(f"There is no connection to the gripper at {self.name} at present.")
-        reader, writer = self._streams
+        loop = asyncio.get_running_loop()
         try:
             if self._received.strip():
                 raise ProtocolError(f"The gripper's socket sent {self._received!r} without a request.")
-            writer.write(f"{line}\n".encode())
-            until_s = asyncio.get_running_loop().time() + self._deadline_s
+            await connection.write(f"{line}\n".encode())
+            until_s = loop.time() + self._deadline_s
             while (taken := take_answer(line, self._received)) is None:
-                self._received += await self._receive(reader, line, until_s)
-        except BaseException as error:
+                received = await connection.read(until_s - loop.time())
+                if received is None:
+                    raise DeviceLostError(
+                        f"The gripper's socket at {self.name} gave no whole answer to {line!r} within "
+                        f"{self._deadline_s:g} s."
+                    )
+                self._received += received.data
+        except BaseException:
             await self.close()
-            if isinstance(error, OSError):
-                raise DeviceLostError(f"The connection to the gripper at {self.name} broke: {error}.") from error
             raise
         answer, self._received = taken
         return answer
-
-    async def _receive(self, reader: asyncio.StreamReader, line: str, until_s: float) -> bytes:
-        data = b""
-        for due_s in (until_s, 0.0):
-            # Twice: when this process was paused, the answer may have arrived together with the deadline.
-            with suppress(TimeoutError):
-                async with asyncio.timeout_at(due_s):
-                    data = await reader.read(MAX_REPLY_BYTES)
-                    break
-        else:
-            raise DeviceLostError(
-                f"The gripper's socket at {self.name} gave no whole answer to {line!r} within {self._deadline_s:g} s."
-            )
-        if not data:
-            raise DeviceLostError(f"The controller closed the gripper's socket at {self.name}.")
-        return data

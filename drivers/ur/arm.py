@@ -1,4 +1,4 @@
-"""The arm through ur-rtde. Only this module imports ur-rtde, and only the worker process imports this module.
+"""The arm through ur-rtde. Only this module calls ur-rtde, and only the worker process imports this module.
 
 ur-rtde is not thread-safe. Its calls block for up to 301 s, its constructors hold the interpreter lock, and it crashes
 its process when RTDE is lost. So it has a process of its own, with an alarm before each call.
@@ -25,7 +25,7 @@ from shearloop.drivers.ur.controller import (
     ScriptReadiness,
     ask_dashboard,
 )
-from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, WristSpeed
+from shearloop.drivers.ur.messages import MoveLinear, RtdeOutputs, RtdeSample, WristSpeed
 from shearloop.drivers.ur.script import guard_script
 from shearloop.drivers.ur.settings import UrSettings
 
@@ -73,7 +73,7 @@ class UrArm:
         sample = self._receiver.latest()
         now_ns = time.monotonic_ns()
         return RtdeSample(
-            *sample[:-2],
+            **{name: getattr(sample, name) for name in RtdeOutputs.__dataclass_fields__},
             t_mono_ns=now_ns,
             age_ns=self._age.age_ns(sample.timestamp_s, now_ns),
             connected=self._receiver.connected

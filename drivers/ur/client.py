@@ -12,8 +12,9 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Coroutine
+from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, Literal, Protocol, cast
+from typing import Any, Literal, cast
 
 from shearloop.drivers.connection import Diagnostics, LinkMonitor
 from shearloop.drivers.errors import DeviceLostError, ProtocolError
@@ -47,13 +48,19 @@ class LostError(DeviceLostError):
 
 def missing_library() -> str:
     """Return why the robot cannot be driven with this Python, or an empty string."""
-    if find_spec("rtde_control") is not None:
-        return ""
-    return (
-        f"the robot needs the package ur-rtde, which is not installed for Python {platform.python_version()} on "
-        f"{platform.machine()}: use Python 3.11 or 3.12 on x86-64, or build it with `pip install "
-        "'shearloop[robot-source]'`, which needs cmake, g++, git and Boost's headers"
-    )
+    pip = f"{sys.executable} -m pip install"
+    if find_spec("rtde_control") is None:
+        return (
+            f"the robot needs the package ur-rtde, which is not installed for Python {platform.python_version()} on "
+            f"{platform.machine()}: use Python 3.11 or 3.12 on x86-64, or build it with "
+            f"`{pip} 'shearloop[robot-source]'`, which needs cmake, g++, git and Boost's headers"
+        )
+    try:
+        import_module("rtde_control")
+    except ImportError as error:
+        again = f"`{pip} --force-reinstall --no-deps ur-rtde`"
+        return f"the package ur-rtde, which drives the robot, cannot be loaded: install it again with {again} ({error})"
+    return ""
 
 
 class UrRobot:
@@ -171,19 +178,12 @@ class UrRobot:
                 raise LostError(message.kind, message.sentence)
 
 
-class MessageHandler(Protocol):
-    """Receives the messages of a worker."""
-
-    def handle_message(self, number: int, message: messages.Message) -> None:
-        """Handle a message; an exception ends the connection."""
-
-
 class WorkerConnection(asyncio.SubprocessProtocol):
     """The pipes to one worker process, its end, and the reason for that."""
 
-    def __init__(self, settings: UrSettings, handler: MessageHandler) -> None:
+    def __init__(self, settings: UrSettings, robot: UrRobot) -> None:
         self._settings = settings
-        self._handler = handler
+        self._robot = robot
         self._decoder = messages.MessageDecoder()
         self._received_s = time.monotonic()
         # Done when the worker has ended and all of its output was read.
@@ -222,7 +222,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
                     self._activity = CONTROLLING
                     longest_s = messages.RECOVERY_HANG_S if message.recovering else self._settings.hang_timeout_s
                     self._timeout_s = longest_s + GRACE_S
-                self._handler.handle_message(number, message)
+                self._robot.handle_message(number, message)
         except ProtocolError as error:
             self._kill()
             self._closed.set_result(LostError("garbled", str(error)))

@@ -297,6 +297,9 @@ class CommandHandler:
         if command.deceleration_rad_per_s2 <= 0:
             return f"A deceleration of {command.deceleration_rad_per_s2:g} rad/s² is not above 0."
         if unfit := self._why_unfit(sample):
+            if not self.at_rest:
+                # The next sample may be fit again; a refused stop stops the arm all the same.
+                self._executor.leave_to_watchdog(unfit)
             return f"Nothing can be sent, and the arm stops by itself. {unfit}"
         return self._executor.stop_on_command(number, command, sample, now_ns)
 

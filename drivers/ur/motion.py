@@ -129,7 +129,7 @@ class MotionExecutor:
             case WristSpeed(_, acceleration), _ if acceleration <= 0:
                 return f"An acceleration of {acceleration:g} rad/s² is not above 0."
             case WristSpeed(), _Braking():
-                return "The arm is still stopping."
+                return f"The arm is still stopping ({self.end_reason})."
             case WristSpeed(), _Move():
                 return "A linear move is under way: stop it."
             case MoveLinear(_, speed, acceleration), _ if min(speed, acceleration) <= 0:

@@ -6,6 +6,7 @@ allowed: …; did you mean …?`.
 
 import math
 import re
+import stat
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -88,7 +89,11 @@ _Loader.add_implicit_resolver(
 def read_yaml(path: Path, raises: type[Exception], what: str = "configuration", cure: str = "") -> Any:
     """Return the content of a YAML file that is neither missing nor empty; `cure` ends the message of a missing one."""
     try:
-        if path.stat().st_size > _MOST_BYTES:
+        status = path.stat()
+        if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
+            # It may have no end.
+            raise raises(f"{path}: the {what} is a device or a pipe; name a file")
+        if status.st_size > _MOST_BYTES:
             raise raises(f"{path}: the {what} is larger than {_MOST_BYTES >> 10} kB; is it another file?")
         content = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # noqa: S506 - it is a SafeLoader
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The bench of matching_speed: what it compares agrees, and ratios are of one turn."""
+"""The bench of matching_speed: what it compares agrees, and methods take turns."""
 
 import numpy as np
 import pytest
@@ -11,12 +11,6 @@ from tests.bank.conftest import small_fingertip
 @pytest.fixture(scope="module")
 def bank(tiny_bank) -> Bank:
     return Bank.open(tiny_bank)
-
-
-def test_ratios_are_taken_turn_by_turn(monkeypatch):
-    monkeypatch.setattr(matching_speed, "RATIOS", {"own": ("peer", "absent")})
-    seconds = {"own": [1.0, 2.0, 4.0], "peer": [3.0, 6.0, 12.0], "other": [1.0, 1.0, 1.0]}
-    assert matching_speed.ratios(seconds) == {"peer / own": {"median": 3.0, "low": 3.0, "high": 3.0}}
 
 
 def test_methods_take_turns():

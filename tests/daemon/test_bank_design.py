@@ -80,9 +80,9 @@ def test_frames_that_no_model_explains_are_called_so_on_screen_and_in_the_config
         savemat(tmp_path / f"Data_Slice_{number}.mat", {"data_diff": frame[None], "torque_value": 0.01 * number})
     config = tmp_path / "design.yaml"
     assert main(["bank", "design", str(tmp_path), "--out", str(config)]) == 0
-    told, text = capsys.readouterr().err, config.read_text()
+    errors, text = capsys.readouterr().err, config.read_text()
     for words in ("even the best model leaves ", "the noise is "):
-        assert (f"shearloop bank: {words}" in told) == (f"# NOTE: {words}" in text) == mixed_up
+        assert (f"shearloop bank: {words}" in errors) == (f"# NOTE: {words}" in text) == mixed_up
     assert load_bank_plan(config).definition.model in text
 
 

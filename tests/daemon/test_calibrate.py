@@ -37,7 +37,7 @@ class Process:
         self._child.stdin.write(f"{line}\n")
         self._child.stdin.flush()
 
-    def told(self, line: str) -> None:
+    def carry_out(self, line: str) -> None:
         """Tell an emulator something, and wait until it has been done: commands are taken in order."""
         self.tell(line)
         self.tell("?")
@@ -72,11 +72,11 @@ def test_the_load_cell_is_calibrated_step_by_step_and_a_step_can_be_refused(tmp_
             calibrate.hear("Put 100 g on")
             calibrate.tell("")
             calibrate.hear("Put 100 g on")
-            board.told("mass 100")
+            board.carry_out("mass 100")
             calibrate.tell("")
             calibrate.hear("  100 g:")
             calibrate.hear("Put 200 g on")
-            board.told("mass 200")
+            board.carry_out("mass 200")
             calibrate.tell("")
             status, said, refused = calibrate.end()
         board.tell("nonsense")
@@ -99,14 +99,14 @@ def test_for_a_script_the_result_alone_is_on_stdout(tmp_path):
             script.hear("Take every load off", on_stderr=True)
             script.tell("")
             script.hear("Put 100 g on", on_stderr=True)
-            board.told("mass 100")
+            board.carry_out("mass 100")
             script.tell("")
             status, said, _ = script.end()
     assert status == 0
-    told = json.loads(said)
-    assert told["path"] == str(out)
-    assert [level["mass_g"] for level in told["levels"]] == [0, 100]
-    assert told["calibration"] == load_calibration(out, LoadCalibration).model_dump(mode="json")
+    result = json.loads(said)
+    assert result["path"] == str(out)
+    assert [level["mass_g"] for level in result["levels"]] == [0, 100]
+    assert result["calibration"] == load_calibration(out, LoadCalibration).model_dump(mode="json")
 
 
 @pytest.mark.parametrize("way", ["socket", "modbus"])
@@ -129,7 +129,7 @@ def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path, way):
                 calibrate.hear("Refused: the fingers closed without meeting anything", on_stderr=True)
             calibrate.hear("Hold the object of 10 mm", on_stderr=script)
             for diameter in (10, 40):
-                gripper.told(f"object {diameter}")
+                gripper.carry_out(f"object {diameter}")
                 calibrate.tell("")
                 calibrate.hear(f"  {diameter} mm:", on_stderr=script)
             status, said, refused = calibrate.end()

@@ -52,16 +52,16 @@ def test_it_prints_the_line_of_the_configuration(monkeypatch, capsys, tmp_path):
     played(monkeypatch, found)
     arguments = ["calibrate", "creep", str(tmp_path / "held.mcap"), "--calibration", "right.cal"]
     assert main([*arguments, "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["share"] == pytest.approx(0.08, abs=0.02)
-    assert (told["grips"], told["frames"]) == (1, 1109)
-    assert told["error_after_nm"] < told["error_before_nm"]
+    result = json.loads(capsys.readouterr().out)
+    assert result["share"] == pytest.approx(0.08, abs=0.02)
+    assert (result["grips"], result["frames"]) == (1, 1109)
+    assert result["error_after_nm"] < result["error_before_nm"]
     assert main(arguments) == 0
     line, followed, beside = capsys.readouterr().out.splitlines()
-    assert f"scaled by {told['scale']:.3f} and shifted by {1e3 * told['offset_nm']:+.1f} mN·m, follow" in followed
+    assert f"scaled by {result['scale']:.3f} and shifted by {1e3 * result['offset_nm']:+.1f} mN·m, follow" in followed
     assert "does not correct scale and zero" in beside
-    assert line == f"creep: {{share: {told['share']:g}, time_s: {told['time_s']:g}}}"
-    CreepConfig(share=told["share"], time_s=told["time_s"])
+    assert line == f"creep: {{share: {result['share']:g}, time_s: {result['time_s']:g}}}"
+    CreepConfig(share=result["share"], time_s=result["time_s"])
 
 
 def test_a_recording_without_held_twists_is_refused(monkeypatch, capsys):
@@ -73,7 +73,7 @@ def test_a_recording_without_held_twists_is_refused(monkeypatch, capsys):
 
 def test_twists_that_are_given_twice_are_refused(monkeypatch, capsys):
     played(monkeypatch, track())
-    told_of = {"held.mcap": "is given twice; name it once", "copy.mcap": "equals held.mcap"}
-    for copy, told in told_of.items():
+    refusals = {"held.mcap": "is given twice; name it once", "copy.mcap": "equals held.mcap"}
+    for copy, refusal in refusals.items():
         assert main(["calibrate", "creep", "held.mcap", copy, "--calibration", "right.cal"]) == 2
-        assert f"{copy} {told}" in capsys.readouterr().err
+        assert f"{copy} {refusal}" in capsys.readouterr().err

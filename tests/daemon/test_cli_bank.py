@@ -44,10 +44,10 @@ def test_build_writes_the_bank_and_tells_its_identity(folder, tmp_path, capsys):
     capsys.readouterr()
     build = ["bank", "build", "--config", f"{folder}/bank.yaml", "--out", f"{tmp_path}/b.bank", "--jobs", "1", "--json"]
     assert main(build) == 0
-    told = json.loads(capsys.readouterr().out)
+    result = json.loads(capsys.readouterr().out)
     bank = Bank.open(tmp_path / "b.bank", verify=True)
-    assert (told["identity"], told["shape"], told["model"]) == (bank.identity, [*bank.signals.shape], bank.model)
-    assert told["valid_cells"] == bank.valid.sum()
+    assert (result["identity"], result["shape"], result["model"]) == (bank.identity, [*bank.signals.shape], bank.model)
+    assert result["valid_cells"] == bank.valid.sum()
 
 
 @pytest.mark.usefixtures("default_signals")
@@ -65,9 +65,9 @@ def test_an_interrupted_build_says_so_and_the_same_command_goes_on(rows_done, fo
     with monkeypatch.context() as patched:
         patched.setattr(bank_command, "progress_bar", interrupted)
         assert main(build) == 130
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert f"shearloop bank: interrupted: finished rows are in {out}.part" in told.err
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert f"shearloop bank: interrupted: finished rows are in {out}.part" in printed.err
     assert [path.name for path in tmp_path.iterdir()] == ["c.bank.part"]
     assert main(build) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["c.bank"]
@@ -96,9 +96,9 @@ def test_banks_over_more_parameters_lie_in_a_folder_and_a_second_build_solves_on
     (folder / "over.yaml").write_text(f"{BANK}over: {{amplitude: {{low: 0.5, high: 1, count: 2}}}}\n")
     build = ["bank", "build", "--config", f"{folder}/over.yaml", "--out", f"{tmp_path}/banks", "--jobs", "1", "--json"]
     assert main(build) == 0
-    told = json.loads(capsys.readouterr().out)["banks"]
+    banks = json.loads(capsys.readouterr().out)["banks"]
     half, plain = tmp_path / "banks" / "amplitude=0.5.bank", tmp_path / "banks" / "amplitude=1.bank"
-    assert [one["path"] for one in told] == [str(half), str(plain)]
+    assert [one["path"] for one in banks] == [str(half), str(plain)]
     # With nothing varied it is the same bank as ever.
     assert plain.read_bytes() == (folder / "a.bank").read_bytes()
     bank, mesh = Bank.open(half), load_bank_plans(folder / "over.yaml")["amplitude=0.5"].mesh
@@ -119,7 +119,9 @@ def test_banks_over_more_parameters_lie_in_a_folder_and_a_second_build_solves_on
         plain.write_bytes(damaged)
         capsys.readouterr()
         assert main(build) == 0
-        assert f"{plain}: it cannot be used, and is built again" in capsys.readouterr().err
+        said = capsys.readouterr().err
+        assert str(plain) in said
+        assert "(it is built again)" in said
         assert plain.read_bytes() == (folder / "a.bank").read_bytes()
     assert main(["bank", "info", str(half)]) == 0
     assert "amplitude 0.5, offset 0, tilt_deg 0" in capsys.readouterr().out
@@ -130,9 +132,9 @@ def test_a_bank_without_a_valid_cell_is_left_out_and_a_folder_of_such_banks_is_r
     build = ["bank", "build", "--config", f"{folder}/weak.yaml", "--out", f"{tmp_path}", "--jobs", "1"]
     (folder / "weak.yaml").write_text(f"{BANK}over: {{amplitude: {{low: 0, high: 1, count: 2}}}}\n")
     assert main(build) == 0
-    told = capsys.readouterr()
-    assert "amplitude=0.bank: no cell of this bank is valid: no signal has a norm of 0.001 or more" in told.err
-    assert told.out.startswith(f"{tmp_path}/amplitude=1.bank: 6 of ")
+    printed = capsys.readouterr()
+    assert "amplitude=0.bank: no cell of this bank is valid: no signal has a norm of 0.001 or more" in printed.err
+    assert printed.out.startswith(f"{tmp_path}/amplitude=1.bank: 6 of ")
     assert [path.name for path in tmp_path.iterdir()] == ["amplitude=1.bank"]
     (folder / "weak.yaml").write_text(f"{BANK}over: {{amplitude: {{low: 0, high: 0, count: 1}}}}\n")
     assert "amplitude=0.bank: no cell of this bank is valid" in refused(capsys, *build[1:])
@@ -140,9 +142,9 @@ def test_a_bank_without_a_valid_cell_is_left_out_and_a_folder_of_such_banks_is_r
 
 def test_info_checks_the_bank_and_says_what_it_is_of(folder, capsys):
     assert main(["bank", "info", f"{folder}/a.bank", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["k"] == {"low": 0.5, "high": 3.0, "count": 3, "unit": "cm"}
-    assert told["valid_cells"] == 6
+    result = json.loads(capsys.readouterr().out)
+    assert result["k"] == {"low": 0.5, "high": 3.0, "count": 3, "unit": "cm"}
+    assert result["valid_cells"] == 6
     assert main(["bank", "info", f"{folder}/a.bank"]) == 0
     assert "3 values from 0.5 to 3 (cm)" in capsys.readouterr().out
 

@@ -2,6 +2,7 @@
 
 from contextlib import suppress
 from itertools import pairwise
+from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
@@ -153,6 +154,8 @@ def test_files_that_cannot_be_read_are_named(tmp_path):
         load_yaml_model(tmp_path / "none.yaml", Outer)
     with pytest.raises(UserError, match="cannot be read: Is a directory"):
         load_yaml_model(tmp_path, Outer)
+    with pytest.raises(UserError, match="null: the configuration is a device or a pipe"):
+        load_yaml_model(Path("/dev/null"), Outer)
     (tmp_path / "latin.yaml").write_bytes(b"mode: sl\xf6w\n")
     with pytest.raises(UserError, match=r"latin\.yaml: the configuration is not UTF-8 text \(byte 8\)"):
         load_yaml_model(tmp_path / "latin.yaml", Outer)

@@ -52,7 +52,7 @@ def blocks(page: Path) -> list[str]:
 
 
 BLOCKS = [pytest.param(block, id=f"{page.stem}-{n}") for page in PAGES for n, block in enumerate(blocks(page))]
-SYSTEM_PROGRAMS = {"sudo", "apt", "pip", "ssh", "dask", "systemctl", "journalctl"}
+SYSTEM_PROGRAMS = {"sudo", "apt", "pip", "uvx", "ssh", "dask", "systemctl", "journalctl"}
 
 
 @pytest.mark.parametrize("block", BLOCKS)
@@ -105,6 +105,11 @@ def check_command(line: str) -> None:
         assert importlib.util.find_spec(arguments[1])
     elif not re.fullmatch(r"\[\w+\]|\w+=.*", program):
         assert program.split("/")[-1] in {*SYSTEM_PROGRAMS, "python3", "usermod"}
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "docs/first-recording.ipynb"], ids=lambda page: page.name)
+def test_no_page_installs_from_an_index_where_shearloop_is_not(page):
+    assert re.findall(r"(?:install|--from) '?shearloop\b", page.read_text()) == []
 
 
 def test_the_readmes_recordings_are_ignored_by_git():
@@ -167,6 +172,8 @@ def test_the_readme_is_short_and_begins_with_what_for_whom_and_why():
     first_screen = "\n".join(lines[:25])
     for part in ("**What.**", "**For whom.**", "**Why.**", "](docs/images/overview.gif)", "shearloop demo"):
         assert part in first_screen
+    start = blocks(ROOT / "README.md")[0].splitlines()
+    assert [line.split(" #")[0].strip() for line in start] == ["make demo", "make test"]
 
 
 @pytest.fixture(scope="module")

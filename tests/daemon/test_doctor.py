@@ -141,6 +141,13 @@ def test_a_bank_of_another_geometry_is_reported(config):
     assert doctor.check_bank("right", fingertip, Path("no.yaml")).state == "trouble"
 
 
+def test_an_experiment_that_check_refuses_is_wrong(config, tmp_path):
+    (tmp_path / "one.yaml").write_text("name: one\nsteps: [{do: hold_torque, torque_nm: 0.1}]\n")
+    findings = doctor.check_files(load_daemon_config(config(robot="ur.yaml", experiment="one.yaml")), None)
+    (found,) = (one.found for one in findings if one.subject == "experiment")
+    assert "hold_torque needs an identified tool" in found
+
+
 def test_a_secret_key_that_others_can_read_is_reported(tmp_path):
     _, secret = make_key_pair(tmp_path, "server")
     (tmp_path / "clients").mkdir()

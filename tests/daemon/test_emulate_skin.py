@@ -21,7 +21,7 @@ async def line(process: asyncio.subprocess.Process) -> str:
     return (await process.stdout.readline()).decode().strip()
 
 
-async def told(process: asyncio.subprocess.Process, command: str) -> None:
+async def send(process: asyncio.subprocess.Process, command: str) -> None:
     process.stdin.write(f"{command}\n".encode())
     await process.stdin.drain()
 
@@ -55,14 +55,14 @@ async def test_both_instruments_tied_by_one_skin_are_read_and_obey(tmp_path):
         board = AdcBoard(SerialLink(path=places[3]), 10 * SPEED)
         async with read(SerialLink(path=places[1], baud=9600), board) as samples:
             assert (await until(samples)).r1_ohm == pytest.approx(24.6, rel=2e-3)
-            await told(process, "shear 0.54")
+            await send(process, "shear 0.54")
             membrane = Membrane(THICK_SECTION)
             response = membrane.response(membrane.step(UNSTRETCHED, 0.54, NORMAL_N))
             await until(samples, r1_ohm=24.6 * (1 + response / (1 - SLACK_RATIO)))
-            await told(process, "open 1")
+            await send(process, "open 1")
             await until(samples, SkinFault.COMPLIANCE, SkinFault.OPEN_1)
-            await told(process, "nonsense")
-            await told(process, "normal")
+            await send(process, "nonsense")
+            await send(process, "normal")
             await until(samples)
         process.stdin.close()
         assert await process.wait() == 0
@@ -76,8 +76,8 @@ async def test_source_and_scanner_are_played_on_sockets_too():
         scanner = ScpiScanner(tcp(places["daq"]), rate_hz=10 * SPEED)
         async with read(tcp(places["source"]), scanner) as samples:
             await until(samples, r1_ohm=24.6)
-            await told(process, "short 2")
+            await send(process, "short 2")
             await until(samples, SkinFault.SHORT_2)
-            await told(process, "mend")
-            await told(process, "leads 1000")
+            await send(process, "mend")
+            await send(process, "leads 1000")
             await until(samples, SkinFault.COMPLIANCE)

@@ -46,7 +46,7 @@ def summary_of(
     return out.getvalue()
 
 
-def told(truth: TorqueSeries | None, happened: list[tuple[int, str]], *more: dict[str, Any]) -> str:
+def summary_of_hold(truth: TorqueSeries | None, happened: list[tuple[int, str]], *more: dict[str, Any]) -> str:
     first = {"step": 1, "step_name": "identify", "set_point_nm": None}
     messages = [loop_state(0, **first), loop_state(10), loop_state(14, hold=1), *more]
     for t_s in np.arange(14.0, 44.0, 0.5):
@@ -63,16 +63,16 @@ def truth_that_falls_at(t_s: float, for_s: float) -> TorqueSeries:
 
 
 def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturbance():
-    text = told(truth_that_falls_at(26.0, 5.5), [(26 * S, "kick -0.03")])
+    text = summary_of_hold(truth_that_falls_at(26.0, 5.5), [(26 * S, "kick -0.03")])
     assert "'hold' was done, after 44 s" in text
     assert "  step 1 of 3  identify       10.0 s   stiffness" in text
     assert "  step 2 of 3  hold_torque    34.0 s\n" in text
-    assert "set point +0.100 N·m, held for 30 s; torque source: right" in text
+    assert "set point +0.100 N·m, held for 30 s; torque source: right; true torque: of the emulated tool" in text
     assert "stiffness 0.750 N·m/rad, delay 0.80 s" in text
-    assert "right      +0.0980 N·m on average" in text
+    assert "right       +0.0980 N·m on average" in text
     # 5.5 of 30 s were out of the band.
-    assert "true       +0.0945 N·m on average, ± 0.0116, within ± 10% for 82% of the time" in text
-    assert "within ± 10% 3.0 s after the set point changed, by true" in text
+    assert "true torque +0.0945 N·m on average, standard deviation 0.0116, within ± 10% for 82% of the time" in text
+    assert "within ± 10% 3.0 s after the set point changed, by true torque" in text
     assert "disturbed after 12.0 s (kick -0.03): 0.030 N·m off, back within ± 10% after 5.5 s" in text
     assert "1 of 61 torques of right were not valid and not used, most often: no grip" in text
     assert "the wrist was never held" in text
@@ -80,21 +80,21 @@ def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturban
 
 
 def test_without_a_truth_nothing_is_said_of_it():
-    assert "true" not in told(None, [])
+    assert "true" not in summary_of_hold(None, [])
 
 
 def test_a_tool_that_the_experiment_names_is_told():
     text = summary_of(*(loop_state(0, tool_mm=20.0, phase=phase) for phase in ("running", "done")))
     assert "  tool diameter 20 mm, from the experiment\n" in text
-    assert "tool diameter" not in told(None, [])
+    assert "tool diameter" not in summary_of_hold(None, [])
 
 
 def test_a_disturbance_that_is_not_overcome_is_said_to_be_none():
-    assert "not back by the end" in told(truth_that_falls_at(26.0, 100.0), [(26 * S, "kick")])
+    assert "not back by the end" in summary_of_hold(truth_that_falls_at(26.0, 100.0), [(26 * S, "kick")])
 
 
 def test_a_last_moment_in_the_band_is_no_way_back():
-    assert "not back by the end" in told(truth_that_falls_at(26.0, 17.5), [(26 * S, "kick")])
+    assert "not back by the end" in summary_of_hold(truth_that_falls_at(26.0, 17.5), [(26 * S, "kick")])
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_without_a_truth_who_judges_is_the_load_cell_and_is_named(others, judge)
 
 def test_holds_and_refusals_are_counted_by_their_kind():
     reason = "no new torque has arrived: the last came 1.5 s ago. Look at the cable."
-    text = told(
+    text = summary_of_hold(
         None,
         [],
         loop_state(20, phase="held", response="hold", reasons=reason),
@@ -146,9 +146,9 @@ def test_where_a_screw_ended_and_what_it_took_is_told():
         messages.append({"source": "robot", "wrist_rad": wrist_rad})
         messages.append({"source": "load_cell", "t_mono_ns": round(t_s * S), "torque_nm": torque_nm})
     text = summary_of(*messages, loop_state(12.1, phase="done", **turning), truth=truth)
-    assert "    turned by -0.500 rad; torque source: load_cell" in text
-    assert "    true       -0.1190 N·m at the end, -0.1800 at most" in text
-    assert "    load_cell  -0.1210 N·m at the end, -0.1760 at most" in text
+    assert "    turned by -0.500 rad; torque source: load_cell; true torque: of the emulated tool" in text
+    assert "    true torque -0.1190 N·m at the end, -0.1800 at most" in text
+    assert "    load_cell   -0.1210 N·m at the end, -0.1760 at most" in text
 
 
 def test_the_times_of_a_stop_follow_the_summary():

@@ -1,6 +1,7 @@
 import asyncio
 import os
 import re
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -8,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers import connection
-from shearloop.drivers.connection import LinkMonitor, SerialLink, SerialPort, find_port
+from shearloop.drivers.connection import LinkMonitor, SerialLink, SerialPort, TcpPort, find_port
 from shearloop.drivers.emulators.ports import PtyPort
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceUnavailableError
 from tests.running import DEADLINE_S, LinkEvents
@@ -147,13 +148,13 @@ async def test_a_write_that_nobody_takes_ends(monkeypatch):
 
 
 async def test_a_link_opens_a_device_that_comes_late_and_again_after_it_went(tmp_path):
-    told = LinkEvents()
+    links = LinkEvents()
     path = tmp_path / "port"
-    with PtyPort(path) as peer, SerialLink(path=str(path), monitor=LinkMonitor(told, 0.01, 0.02)) as link:
+    with PtyPort(path) as peer, SerialLink(path=str(path), monitor=LinkMonitor(links, 0.01, 0.02)) as link:
         peer.unplug()
         opening = asyncio.create_task(link.open())
         async with asyncio.timeout(DEADLINE_S):
-            await told.down()
+            await links.down()
             peer.plug()
             port = await opening
             peer.unplug()
@@ -167,7 +168,7 @@ async def test_a_link_opens_a_device_that_comes_late_and_again_after_it_went(tmp
             assert await sent_to(peer, 5) == b"again"
     assert link.diagnostics()["connections"] == 2
     assert re.search("has gone|no serial port", str(link.diagnostics()["last_loss"]))
-    assert told.events[-1].up
+    assert links.events[-1].up
     assert not path.is_symlink()
     assert link.port is None
 
@@ -180,17 +181,17 @@ async def test_a_link_that_leads_elsewhere_by_now_is_left_alone(tmp_path):
 
 
 def test_waits_grow_and_only_the_first_failure_is_news():
-    told = LinkEvents()
-    monitor = LinkMonitor(told)
+    links = LinkEvents()
+    monitor = LinkMonitor(links)
     loss = DeviceLostError("The device at port 1 has gone.")
     assert [monitor.failed(loss, 0) for _ in range(8)] == [0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0, 5.0]
-    assert [event.repeated for event in told.losses] == [False] + 7 * [True]
+    assert [event.repeated for event in links.losses] == [False] + 7 * [True]
     monitor.connected("up", 100 * SECOND_NS)
     assert monitor.failed(loss, 105 * SECOND_NS) == 0.2, "it held, so it is a new loss"
     monitor.connected("up", 106 * SECOND_NS)
     assert monitor.failed(loss, 107 * SECOND_NS) == 0.4, "it did not hold"
     monitor.failed(DeviceLostError("Another reason."), 108 * SECOND_NS)
-    assert not told.events[-1].repeated
+    assert not links.events[-1].repeated
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 20 * SECOND_NS)), max_size=200))
@@ -202,3 +203,13 @@ def test_waits_stay_within_their_bounds(steps):
             monitor.connected("up", now_ns)
         else:
             assert 0.2 <= monitor.failed(DeviceLostError("gone"), now_ns) <= 5.0
+
+
+async def test_bytes_at_the_deadline_count():
+    """After a pause of this process both the bytes and the timer are due."""
+    reader = asyncio.StreamReader()
+    receiving = asyncio.create_task(TcpPort("device", reader, SimpleNamespace()).read(0.01))
+    await asyncio.sleep(0)
+    time.sleep(0.05)  # noqa: ASYNC251 - the pause
+    reader.feed_data(b"ACT 1\n")
+    assert (await receiving).data == b"ACT 1\n"

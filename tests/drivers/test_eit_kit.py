@@ -27,12 +27,12 @@ async def play(
     lines: Iterable[NDArray[np.float64]], n_frames: int, tmp_path: Path, faults: dict[int, str] | None = None
 ) -> tuple[EitKit, list[Frame], list[LinkEvent]]:
     link = tmp_path / "eit"
-    told = LinkEvents()
+    links = LinkEvents()
     fault_at = {number: parse_fault(text, EitKitBoard.faults) for number, text in (faults or {}).items()}
     async with running(EitKitBoard(lines, period_s=PERIOD_S, link=link, fault_at=fault_at).run()):
-        kit = EitKit(zero_slots=PAPER_TABLE.zero_slots, path=link, frame_period_s=PERIOD_S, monitor=LinkMonitor(told))
+        kit = EitKit(zero_slots=PAPER_TABLE.zero_slots, path=link, frame_period_s=PERIOD_S, monitor=LinkMonitor(links))
         frames = await take(kit.readings(), n_frames)
-    return kit, frames, told.events
+    return kit, frames, links.events
 
 
 def assert_same(frames: list[Frame], lines: Iterable[NDArray[np.float64]]) -> None:
@@ -151,12 +151,12 @@ async def test_a_driver_that_begins_while_the_board_sends_takes_up_with_the_next
 
 
 async def test_a_board_that_is_not_there_is_awaited_and_told_of_once(tmp_path):
-    told = LinkEvents()
-    kit = EitKit(zero_slots=PAPER_TABLE.zero_slots, path=tmp_path / "eit", monitor=LinkMonitor(told))
+    links = LinkEvents()
+    kit = EitKit(zero_slots=PAPER_TABLE.zero_slots, path=tmp_path / "eit", monitor=LinkMonitor(links))
     taking = asyncio.create_task(take(kit.readings(), 1))
-    await told.down(2)
+    await links.down(2)
     async with running(EitKitBoard(some_lines(1), period_s=PERIOD_S, link=tmp_path / "eit").run()):
         (frame,) = await taking
     assert frame.seq == 0
-    assert [event.repeated for event in told.losses][:2] == [False, True]
-    assert "There is no serial port" in told.events[0].sentence
+    assert [event.repeated for event in links.losses][:2] == [False, True]
+    assert "There is no serial port" in links.events[0].sentence

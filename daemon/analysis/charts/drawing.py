@@ -78,7 +78,7 @@ _MARK_PX = 7.0
 _GAP_PX = 4.0
 
 
-def write_names(axes: Axes, points: Sequence[tuple[float, float, str]], fontsize: float = 7) -> None:
+def write_names(axes: Axes, points: Sequence[tuple[float, float, str]]) -> None:
     """Write a name next to each point (x, y, name), without covering other names, marks or the legend.
 
     Call it after `lay_out`, when limits, marks and legend are final.
@@ -92,7 +92,7 @@ def write_names(axes: Axes, points: Sequence[tuple[float, float, str]], fontsize
     for x, y, name in sorted(points):
         tried: list[tuple[float, int, Annotation, Bbox]] = []
         for dx, dy in _BESIDE:
-            note = _note(axes, (x, y, name), (dx, dy), fontsize)
+            note = _note(axes, (x, y, name), (dx, dy))
             box = note.get_window_extent()
             within = Bbox.intersection(box, inside)
             outside = _area(box) - (_area(within) if within is not None else 0.0)
@@ -108,19 +108,18 @@ def write_names(axes: Axes, points: Sequence[tuple[float, float, str]], fontsize
         if max(map(abs, chosen.get_position())) > _NEAR:
             # A name's extent is measured without its line, so add the line last.
             chosen.remove()
-            _note(axes, (x, y, name), chosen.get_position(), fontsize, _LEADER)
+            _note(axes, (x, y, name), chosen.get_position(), _LEADER)
 
 
 def _note(
     axes: Axes,
     point: tuple[float, float, str],
     offset: tuple[float, float],
-    fontsize: float,
     line: dict[str, Any] | None = None,
 ) -> Annotation:
     (x, y, name), (dx, dy) = point, offset
     note = axes.annotate(
-        name, (x, y), xytext=(dx, dy), textcoords="offset points", fontsize=fontsize,
+        name, (x, y), xytext=(dx, dy), textcoords="offset points", fontsize=7,
         ha="center" if dx == 0 else "left" if dx > 0 else "right",
         va="center" if dx else "bottom" if dy > 0 else "top", arrowprops=line,
     )  # fmt: skip

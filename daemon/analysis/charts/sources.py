@@ -102,10 +102,9 @@ def homogeneous_of(synthesiser: Synthesiser) -> FloatArray:
     return mean_frame(synthesiser, 3.2, 1.5, 0.0)
 
 
-def synthetic_slices(scratch: Path, seed: int = 0) -> FrameSeries:
+def synthetic_slices(scratch: Path) -> FrameSeries:
     """Return 49 differences like the paper's slices: five repeats of ten torques, means of nine frames."""
-    synthesiser, rng = Synthesiser(played_bank(scratch), seed=seed), np.random.default_rng((seed, 1))
-
+    synthesiser, rng = Synthesiser(played_bank(scratch)), np.random.default_rng((0, 1))
     homogeneous = homogeneous_of(synthesiser)
     levels = np.tile(np.linspace(0.01, _LARGEST_NM, 10), 5)[1:]
     torque = np.clip(levels + rng.normal(0.0, 0.003, len(levels)), 0.0, _LARGEST_NM)
@@ -119,17 +118,17 @@ def synthetic_slices(scratch: Path, seed: int = 0) -> FrameSeries:
     return FrameSeries("difference", ("right",), t_s, np.array(frames)[:, None], t_s, torque, np.full(49, np.nan))
 
 
-def synthetic_stream(scratch: Path, seed: int = 0, cycles: int = 8) -> FrameSeries:
+def synthetic_stream(scratch: Path) -> FrameSeries:
     """Return the frames of two fingertips, idle and then holding a tool through eight twists."""
-    programme = TwistProgramme(torque_nm=0.12, grip_s=1.0, cycles=cycles)
+    programme = TwistProgramme(grip_s=1.0)
     gripped_s = programme.idle_s + programme.grip_s
-    end_s = gripped_s + _REST_S + cycles * 2 * (programme.turn_s + programme.hold_s)
+    end_s = gripped_s + _REST_S + programme.cycles * 2 * (programme.turn_s + programme.hold_s)
     t_s = np.arange(0.5 * FRAME_PERIOD_S, end_s, FRAME_PERIOD_S)
     # A rest after the grip, before the first twist.
     moments = [programme.at(t if t < gripped_s else max(t - _REST_S, gripped_s)) for t in t_s.tolist()]
     channels = np.empty((len(t_s), 2, PAPER_TABLE.n_channels))
     for side, k in enumerate((3.2, 3.35)):
-        synthesiser = Synthesiser(played_bank(scratch), seed=seed + 100 * side)
+        synthesiser = Synthesiser(played_bank(scratch), seed=100 * side)
         for i, (grip, torque_nm) in enumerate(moments):
             channels[i, side] = PAPER_TABLE.channels_of_line(synthesiser.line(k, sigma_of(torque_nm), grip))
     torque = np.array([torque_nm for _, torque_nm in moments])

@@ -295,7 +295,7 @@ class ForeignMixture:
     auc: float
 
 
-def detect_mixtures(series: FrameSeries, origins: Sequence[float] = ORIGINS, seed: int = 7) -> list[ForeignMixture]:
+def detect_mixtures(series: FrameSeries, origins: Sequence[float] = ORIGINS) -> list[ForeignMixture]:
     """Return how each share of a foreign frame looks to a validity check fitted to the slices before each origin.
 
     The best limit is the lowest that refuses no good later slice; no rule on the misfit can refuse more mixtures.
@@ -309,7 +309,7 @@ def detect_mixtures(series: FrameSeries, origins: Sequence[float] = ORIGINS, see
         guard, later = NoveltyDetector.fit(frames[:n], PAPER_TABLE), frames[n:]
         mean = later.mean(axis=0)
         foreign = {
-            "another fingertip": mean[np.random.default_rng(seed).permutation(PAPER_TABLE.n_channels)],
+            "another fingertip": mean[np.random.default_rng(7).permutation(PAPER_TABLE.n_channels)],
             f"turned by {_TURNED_ELECTRODES} electrodes": mean[turned.model_channels(PAPER_TABLE)],
         }
         twins = ReciprocityCheck.fit(frames[:n], PAPER_TABLE)

@@ -13,7 +13,7 @@ from shearloop.bank.eit.bank_file import Bank, BankDefinition
 from shearloop.bank.eit.build import build_bank
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.errors import BankFileError
-from shearloop.daemon.bank_config import load_bank_plan, load_geometry
+from shearloop.daemon.bank_config import load_geometry
 from shearloop.daemon.errors import UserError
 
 MODEL = "gaussian_derivative"
@@ -64,19 +64,28 @@ def _around(found: FloatArray, paper: FloatArray, wide: FloatArray) -> FloatArra
     return np.linspace(max(middle - half, wide[0]), min(middle + half, wide[-1]), len(paper))
 
 
-def choose_mesh(recordings: Path, mesh: Path | None, bank_config: Path | None) -> tuple[Mesh, str]:
-    """Return the mesh of a file or of a bank's configuration, else the paper's next to the recordings, else our own.
+def choose_mesh(recordings: Path, mesh: Path | None) -> tuple[Mesh, str]:
+    """Return the mesh of a file, else the paper's next to the recordings, else our own.
 
     The second value is its origin, for the report. Raises UserError and GeometryError for unusable files.
     """
     if mesh is not None:
         return load_geometry(mesh).mesh, str(mesh)
-    if bank_config is not None:
-        return load_bank_plan(bank_config).mesh, f"the geometry of {bank_config}"
     beside = recordings.resolve().parent / PAPER_MESH
     if beside.is_file():
         return load_geometry(beside).mesh, f"{beside} (the paper's)"
     return load_geometry(OWN_FINGERTIP).mesh, f"our own grid for {OWN_FINGERTIP}"
+
+
+def is_built(path: Path, definition: BankDefinition) -> bool:
+    """Return whether an earlier build has finished this bank."""
+    if not path.exists():
+        return False
+    try:
+        return Bank.open(path, verify=True).identity == definition.identity
+    except BankFileError as error:
+        print(f"{error} (it is built again)", file=sys.stderr)
+        return False
 
 
 def cached_bank(
@@ -87,15 +96,9 @@ def cached_bank(
     `on_row(done, total)` is called during the build. Raises BankFileError where it cannot be written.
     """
     definition = BankDefinition(mesh.digest, MODEL, grid.k, grid.sigma)
-    identity = definition.identity
-    path = folder / f"{name}-{identity[:12]}.bank"
-    if path.exists():
-        try:
-            bank = Bank.open(path, verify=True)
-            if bank.identity == identity:
-                return bank
-        except BankFileError as error:
-            print(f"{error} (building it again)", file=sys.stderr)
+    path = folder / f"{name}-{definition.identity[:12]}.bank"
+    if is_built(path, definition):
+        return Bank.open(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -1,4 +1,3 @@
-import hashlib
 import io
 import tracemalloc
 import zipfile
@@ -44,20 +43,20 @@ def test_damage_is_refused_by_name_or_does_no_harm(saved, tmp_path_factory, wher
     try:
         loaded = Calibration.load(path)
     except BankError as error:
-        told = str(error)
+        message = str(error)
     else:
         # Bytes that nothing reads, such as a date in the directory of the zip.
         loaded.save(path)
         assert path.read_bytes() == content
         return
-    assert str(path) in told
+    assert str(path) in message
 
 
 def test_foreign_and_stale_files_are_refused(tmp_path, motion_calibration):
     foreign = tmp_path / "foreign.cal"
     with zipfile.ZipFile(foreign, "w") as archive:
         archive.writestr("notes.txt", "hello")
-    with pytest.raises(CalibrationError, match="no header"):
+    with pytest.raises(CalibrationError, match="not a calibration"):
         Calibration.load(foreign)
     (tmp_path / "text.cal").write_text("not a zip")
     with pytest.raises(CalibrationError, match="not a calibration, or it is truncated"):
@@ -81,7 +80,7 @@ def _with_header(calibration, path, content=None, **changes):
         header = yaml.safe_load(read.read("calibration.yaml")) | changes
         header["content"] |= content or {}
         written.writestr("calibration.yaml", yaml.safe_dump(header))
-        for member in header["sha256"]:
+        for member in read.namelist()[1:]:
             written.writestr(member, read.read(member))
 
 
@@ -100,13 +99,10 @@ def test_members_that_would_fill_the_memory_are_refused(tmp_path):
 def test_an_array_without_its_data_is_refused(tmp_path):
     text = io.BytesIO()
     np.lib.format.write_array_header_1_0(text, {"descr": "<f8", "fortran_order": False, "shape": (10**15,)})
-    array = text.getvalue()
-    header = {"kind": "shearloop estimator calibration", "sha256": {"a.npy": hashlib.sha256(array).hexdigest()}}
     hollow = tmp_path / "hollow.cal"
     with zipfile.ZipFile(hollow, "w") as archive:
-        archive.writestr("calibration.yaml", yaml.safe_dump(header))
-        archive.writestr("a.npy", array)
-    with pytest.raises(CalibrationError, match="holds a member that is no array; calibrate again"):
+        archive.writestr("a.npy", text.getvalue())
+    with pytest.raises(CalibrationError, match=r"truncated or damaged .*; calibrate again"):
         Calibration.load(hollow)
 
 

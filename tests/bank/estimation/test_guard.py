@@ -115,7 +115,7 @@ def test_too_little_is_said_to_be(recorded):
     with pytest.raises(CalibrationError, match="look like idle"):
         FingertipValidator.fit("right", (frames[:12], frames[6:34], frames[:0]))
     n = len(recorded.torque_nm)
-    for changed, told in (
+    for changed, reason in (
         ({"torque_nm": np.zeros(n)}, "is 0 at all of these frames; record twists"),
         (
             {"torque_t_s": recorded.torque_t_s + 1e4},
@@ -126,7 +126,7 @@ def test_too_little_is_said_to_be(recorded):
             "holds no frames of right and left together; record some frames",
         ),
     ):
-        with pytest.raises(CalibrationError, match=told):
+        with pytest.raises(CalibrationError, match=reason):
             segment_grip(replace(recorded, **changed))
 
 

@@ -23,15 +23,15 @@ def like(motion_calibration):
 
 def test_a_frame_from_before_a_zero_is_not_one_of_the_last_frames(motion_calibration, like):
     """A zero that is asked for while a tool is held, which is let go and gripped again before it is complete."""
-    tracker, told = EstimatorSession(motion_calibration), []
+    tracker, reasons = EstimatorSession(motion_calibration), []
     n_lags = motion_calibration.estimator.motion.n_lags
     before = [*np.zeros(12), *UP, *np.ones(n_lags)]
     for i, share in enumerate([*before, *DOWN, *UP, *np.ones(n_lags + 1)]):
         if i == len(before):
             tracker.tare(len(DOWN) + len(UP))
-        told.append(tracker.estimate(like(0.5 * i, share)).reasons)
-    assert not told[len(before) - 1]
-    after = told[-n_lags - 1 :]
+        reasons.append(tracker.estimate(like(0.5 * i, share)).reasons)
+    assert not reasons[len(before) - 1]
+    after = reasons[-n_lags - 1 :]
     assert after[:-1] == [(f"gripped too recently: {n} more frames are needed",) for n in range(n_lags, 0, -1)]
     assert not after[-1]
 
@@ -43,16 +43,16 @@ def test_a_grip_a_third_as_strong_as_the_one_before_the_zero_is_one(motion_calib
         tracker.estimate(like(0.5 * i, share))
     tracker.tare(10)
     shares = [*np.zeros(10), *np.full(18, 0.3)]
-    told = [tracker.estimate(like(100 + 0.5 * i, share)).reasons for i, share in enumerate(shares)]
-    assert not told[-1]
+    reasons = [tracker.estimate(like(100 + 0.5 * i, share)).reasons for i, share in enumerate(shares)]
+    assert not reasons[-1]
 
 
 def test_a_zero_during_which_a_tool_is_let_go_begins_anew(motion_calibration, like):
     memory = SessionState(motion_calibration.validators, motion_calibration.estimator.motion, idle_frames=8)
-    told = [memory.process(like(0.5 * i, share)).reasons for i, share in enumerate([1, 1, 1, 1, 1, *np.zeros(9)])]
-    assert [why[0] for why in told[2:5]] == [f"taking the homogeneous frame, {n} of 8" for n in (3, 4, 5)]
-    assert all("jumped" in why[0] for why in told[5:7])
-    assert told[7] == ("taking the homogeneous frame, 1 of 8",)
+    reasons = [memory.process(like(0.5 * i, share)).reasons for i, share in enumerate([1, 1, 1, 1, 1, *np.zeros(9)])]
+    assert [why[0] for why in reasons[2:5]] == [f"taking the homogeneous frame, {n} of 8" for n in (3, 4, 5)]
+    assert all("jumped" in why[0] for why in reasons[5:7])
+    assert reasons[7] == ("taking the homogeneous frame, 1 of 8",)
     assert memory.taring
     memory.process(like(7.0, 0.0))
     assert not memory.taring
@@ -65,9 +65,9 @@ def test_a_zero_in_whose_gap_a_tool_is_let_go_or_gripped_begins_anew(motion_cali
     memory = SessionState(motion_calibration.validators, motion_calibration.estimator.motion, idle_frames=8)
     for i in range(5):
         memory.process(like(0.5 * i, first))
-    told = [memory.process(like(2.0 + step_s + 0.5 * i, then)).reasons for i in range(9)]
-    assert all("jumped" in why[0] for why in told[:2])
-    assert [why[0] for why in told[2:]] == [f"taking the homogeneous frame, {n} of 8" for n in range(1, 8)]
+    reasons = [memory.process(like(2.0 + step_s + 0.5 * i, then)).reasons for i in range(9)]
+    assert all("jumped" in why[0] for why in reasons[:2])
+    assert [why[0] for why in reasons[2:]] == [f"taking the homogeneous frame, {n} of 8" for n in range(1, 8)]
     assert memory.taring
 
 
@@ -122,8 +122,8 @@ def test_a_board_that_turns_out_slower_than_its_first_frames_is_followed(motion_
     tracker = EstimatorSession(motion_calibration)
     times = [*0.1 * np.arange(12), *(2.0 + 0.5 * np.arange(60))]
     shares = [*np.zeros(20), *UP, *np.ones(31)]
-    told = [tracker.estimate(like(t_s, share)).reasons for t_s, share in zip(times, shares, strict=True)]
-    assert not told[-1]
+    reasons = [tracker.estimate(like(t_s, share)).reasons for t_s, share in zip(times, shares, strict=True)]
+    assert not reasons[-1]
 
 
 STEPS_S = {"garbled": 0.5, "saturated": 0.5, "lost": 1.0, "late": 1.2, "gap": 1.3, "back": -2.0}
@@ -132,12 +132,12 @@ STEPS_S = {"garbled": 0.5, "saturated": 0.5, "lost": 1.0, "late": 1.2, "gap": 1.
 @st.composite
 def sessions(draw):
     """Return how each frame comes, and whether a tool is gripped, or let go, just before it."""
-    told = []
+    frames = []
     for _ in range(draw(st.integers(3, 8))):
         some = draw(st.lists(st.sampled_from(sorted(STEPS_S)), max_size=4))
-        told += [(kind, draw(st.booleans())) for kind in some] + [("good", draw(st.booleans()))]
-        told += [("good", False)] * draw(st.sampled_from((0, 1, 2, 14)))
-    return told
+        frames += [(kind, draw(st.booleans())) for kind in some] + [("good", draw(st.booleans()))]
+        frames += [("good", False)] * draw(st.sampled_from((0, 1, 2, 14)))
+    return frames
 
 
 def test_what_is_valid_is_of_one_grip_and_hardly_made_up(motion_calibration):

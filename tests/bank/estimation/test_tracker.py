@@ -47,12 +47,12 @@ def test_another_session_takes_its_own_baseline(motion_calibration, twisting, gr
     assert coverage > 0.85
 
 
-@pytest.mark.parametrize("told", [False, True])
-def test_three_idle_frames_are_a_baseline_for_an_outright_grip(motion_calibration, twisting, told):
+@pytest.mark.parametrize("tared", [False, True])
+def test_three_idle_frames_are_a_baseline_for_an_outright_grip(motion_calibration, twisting, tared):
     other = twisting(seed=22)
     first = int(np.flatnonzero(other.t_s > 20)[0]) - 3
     tracker = EstimatorSession(motion_calibration)
-    if told:
+    if tared:
         tracker.tare(3)
     valid = [one.valid for one in follow(tracker, other.between(first, 230))]
     assert not any(valid[:3])
@@ -233,7 +233,7 @@ def test_another_tool_is_refused_for_as_long_as_it_is_held(motion_calibration, t
     # 15 % of 20 mm are 3 mm, and the half width of what is measured comes on top; where there is no grip that is said.
     assert set(refused) <= {*range(70, 80), *range(90, 100)}
     assert len(refused) > 15
-    assert all(same), "what it was told of tools changes nothing that it remembers"
+    assert all(same), "earlier tools change nothing that it remembers"
     unknown = EstimatorSession(motion_calibration)
     unknown.set_tool(Measured(14.0, 0.1))
     assert any(one.valid for one in follow(unknown, twisted))
@@ -293,9 +293,9 @@ def test_a_frame_that_a_board_sends_again_is_no_new_one(motion_calibration, twis
     frozen, expected = whole.channels.copy(), follow(motion_calibration, whole)
     hung = np.flatnonzero([one.valid for one in expected])[10]
     frozen[hung : hung + 30, sides] = frozen[hung, sides]
-    told = follow(motion_calibration, replace(whole, channels=frozen))
-    assert told[hung] == expected[hung]
-    assert all(one.reasons == ("the board sent the same frame again",) for one in told[hung + 1 : hung + 30])
+    estimates = follow(motion_calibration, replace(whole, channels=frozen))
+    assert estimates[hung] == expected[hung]
+    assert all(one.reasons == ("the board sent the same frame again",) for one in estimates[hung + 1 : hung + 30])
     number = np.arange(len(whole.t_s))
     without = kept(whole, (number <= hung) | (number >= hung + 30))
-    assert told[hung + 30 :] == follow(motion_calibration, without)[hung + 1 :]
+    assert estimates[hung + 30 :] == follow(motion_calibration, without)[hung + 1 :]

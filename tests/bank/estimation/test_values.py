@@ -32,8 +32,8 @@ def test_things_are_as_many_as_their_measurements_tell_apart(several, random):
 
 
 def test_a_gripper_tells_tools_apart_by_its_own_uncertainty():
-    told = [Measured(20.4, 1.2), Measured(10.1, 1.2), Measured(19.3, 1.2), Measured(20.0, 0.0)]
-    assert distinct(told) == [Measured(10.1, 1.2), Measured(20.0, 0.0)]
+    measured = [Measured(20.4, 1.2), Measured(10.1, 1.2), Measured(19.3, 1.2), Measured(20.0, 0.0)]
+    assert distinct(measured) == [Measured(10.1, 1.2), Measured(20.0, 0.0)]
 
 
 def test_two_that_contradict_each_other_are_not_a_sure_one_in_between():
@@ -72,8 +72,8 @@ def test_where_the_load_cell_was_silent_for_long_no_torque_is_made_up():
     series = FrameSeries("raw", ("right",), t_s, np.zeros((24, 1, 896)), torque_t_s, np.sin(torque_t_s), nothing)
     torque = series.torque_at_frames()
     np.testing.assert_array_equal(np.isfinite(torque), (t_s < 4.0) | (t_s >= 8.0))
-    told = (t_s < 3.0) | (t_s >= 9.0)
-    np.testing.assert_allclose(torque[told], np.sin(t_s[told]), atol=2e-3)
+    known = (t_s < 3.0) | (t_s >= 9.0)
+    np.testing.assert_allclose(torque[known], np.sin(t_s[known]), atol=2e-3)
 
 
 def test_torque_at_frames_is_interpolated_and_never_extrapolated():
@@ -99,12 +99,12 @@ def test_a_missing_side_is_named():
 
 
 def test_values_that_are_not_finite_are_not_usable():
-    channels, told = np.zeros((1, 896)), np.ones((1, 896), dtype=np.bool_)
+    channels, usable = np.zeros((1, 896)), np.ones((1, 896), dtype=np.bool_)
     channels[0, 5] = np.nan
     frame = TactileFrame.of(0.0, channels)
     assert list(np.flatnonzero(~frame.usable)) == [5]
     assert np.isfinite(frame.channels).all()
-    channels[0, 5], told[0, 7] = np.inf, False
-    frame = TactileFrame.of(0.0, channels, told)
+    channels[0, 5], usable[0, 7] = np.inf, False
+    frame = TactileFrame.of(0.0, channels, usable)
     assert list(np.flatnonzero(~frame.usable)) == [5, 7]
-    assert told[0, 5], "the caller's mask is left as it is"
+    assert usable[0, 5], "the caller's mask is left as it is"

@@ -45,14 +45,14 @@ def test_every_command_has_a_json_option_or_a_reason_for_none():
 
 
 def test_keys_as_json(tmp_path, capsys):
-    def told(*words: str) -> dict[str, object]:
+    def result_of(*words: str) -> dict[str, object]:
         assert main(["keys", *words, "--json"]) == 0
         return json.loads(capsys.readouterr().out)
 
-    server = told("server", "--dir", str(tmp_path / "server"))
-    client = told("client", "--dir", str(tmp_path / "client"))
+    server = result_of("server", "--dir", str(tmp_path / "server"))
+    client = result_of("client", "--dir", str(tmp_path / "client"))
     assert Path(str(server["secret_file"])).stat().st_mode & 0o777 == 0o600
     allow = ("allow", str(client["public_file"]), "--name", "ada", "--dir", str(tmp_path / "server"))
-    assert told(*allow) == {"allowed": "ada"}
-    assert list(told("list", "--dir", str(tmp_path / "server"))["clients"]) == ["ada"]
-    assert told("revoke", "ada", "--dir", str(tmp_path / "server")) == {"revoked": "ada"}
+    assert result_of(*allow) == {"allowed": "ada"}
+    assert list(result_of("list", "--dir", str(tmp_path / "server"))["clients"]) == ["ada"]
+    assert result_of("revoke", "ada", "--dir", str(tmp_path / "server")) == {"revoked": "ada"}

@@ -81,9 +81,9 @@ def test_calibrate_takes_a_table_to_a_file(tmp_path, capsys):
     assert main(["skin", "calibrate", str(table), "--out", str(out), "--friction", "0.04"]) == 0
     assert "(given)" in capsys.readouterr().out
     assert main(["skin", "calibrate", str(table), "--out", str(out), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["path"], told["friction"], told["friction_given"]) == (str(out), calibration.friction, False)
-    assert told["rows"] == calibration.rows
+    result = json.loads(capsys.readouterr().out)
+    assert (result["path"], result["friction"], result["friction_given"]) == (str(out), calibration.friction, False)
+    assert result["rows"] == calibration.rows
 
 
 def test_a_table_that_no_curve_fits_is_refused_by_its_name(tmp_path, capsys):

@@ -7,6 +7,8 @@ import pytest
 import yaml
 from jsonschema import Draft202012Validator
 
+from shearloop.bank.estimation import Calibration
+from shearloop.bank.skin.calibration import load_calibration
 from shearloop.daemon.cli import demo, main
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.config_file import load_yaml_model
@@ -39,6 +41,11 @@ def test_an_editor_accepts_angles_as_the_program_does(angles, accepted):
     step = {"do": "twist", "angles_rad": angles}
     schema = schema_for(CONFIG / "experiments" / "tighten.yaml")
     assert schema.is_valid({"name": "twists", "steps": [step]}) == accepted
+
+
+def test_the_calibrations_of_config_are_of_this_version():
+    assert Calibration.load(CONFIG / "calibrations" / "demo.cal").torque is not None
+    assert load_calibration(CONFIG / "calibrations" / "skin_demo.yaml").rows
 
 
 def test_schema_prints_every_kind(capsys):
@@ -84,6 +91,13 @@ def test_the_demos_page_lasts_as_long_as_the_demo(tmp_path, monkeypatch, capsys)
         assert asyncio.run(status(url)) == 200
     with pytest.raises(aiohttp.ClientConnectorError):
         asyncio.run(status(url))
+
+
+def test_the_demo_refuses_a_recording_that_is_not_there_at_once(tmp_path, capsys):
+    assert main(["demo", "--folder", str(tmp_path), "--recording", str(tmp_path / "none.mat")]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "none.mat: the recording cannot be read: No such file" in err
 
 
 def test_the_demo_without_aiohttp_says_what_the_page_needs(monkeypatch, capsys):

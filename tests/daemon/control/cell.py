@@ -148,6 +148,7 @@ class Gripper:
         return await self.grip(GripTo(140.0, 100.0, 10.0, expect_object=False))
 
     async def unlock(self) -> str:
+        await self.there.wait()
         return ""
 
 

@@ -122,6 +122,19 @@ async def test_cancelled_activation_stops_the_fingers(way, tmp_path):
 
 
 @WAYS
+async def test_fingers_that_meet_something_as_they_open_are_not_released(way, tmp_path, monkeypatch):
+    monkeypatch.setattr(gripper_task, "TRIED_FOR_S", 0.0)
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
+        rig.model.put_between(40.0)
+        task = task_of(rig)
+        assert await task.grip(GRIP) == ""
+        rig.model.block_at(40.0)
+        assert "met something as they opened, and stopped at 40.1 mm" in await task.release()
+        rig.model.block_at(139.0)
+        assert await task.release() == "", "their own stop"
+
+
+@WAYS
 async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way, tmp_path):
     async with a_rig(way, tmp_path, connected=True) as rig, asyncio.timeout(DEADLINE_S):
         rig.model.put_between(40.0)

@@ -96,6 +96,20 @@ async def test_who_waits_for_an_experiments_end_is_told_of_that_one():
         assert await waiting is first
 
 
+async def test_an_end_between_two_decisions_is_published_before_it_is_reported():
+    async with driven(MOVE, cycles=5) as cell:
+        waiting = asyncio.create_task(cell.runner.experiment_ended())
+        await asyncio.sleep(0)
+        cell.control_loop.on_action_ended("it met something")
+        cell.runner._states._notify()
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        assert not waiting.done()
+        await cell.cycles(20)
+        assert (await waiting).phase is ExperimentPhase.STOPPED
+        assert "stopped" in {one.phase for one in cell.published.messages if one.topic == "loop.state"}
+
+
 async def test_a_loop_that_dies_stops_the_arm_and_when_begun_again_the_experiment(monkeypatch):
     async with driven(MOVE, cycles=40) as cell:
         assert cell.state.motion == "linear"
@@ -260,9 +274,9 @@ async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none()
         # Neither was the stop that comes next, of which there is nobody to hear.
         await asyncio.sleep(0)
         cell.runner.decide_now()
-        told = " ".join(cell.control_loop.status.decision.reasons)
-        assert "not connected" in told
-        assert "a command was refused" not in told
+        reasons = " ".join(cell.control_loop.status.decision.reasons)
+        assert "not connected" in reasons
+        assert "a command was refused" not in reasons
 
 
 def stops(cell: Cell) -> list[LoopStop]:

@@ -123,7 +123,7 @@ HAPPENINGS: dict[str, Callable[[Story], Any]] = {
 }
 
 
-async def told(happenings: Sequence[str]) -> bool:
+async def stays_safe(happenings: Sequence[str]) -> bool:
     """Let things happen, one after the other; return whether anything has moved at all."""
     async with driven() as cell:
         story = Story(cell)
@@ -139,11 +139,11 @@ async def told(happenings: Sequence[str]) -> bool:
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.sampled_from([*HAPPENINGS]), max_size=25))
 def test_nothing_moves_that_no_experiment_moves(happenings):
-    asyncio.run(told(happenings))
+    asyncio.run(stays_safe(happenings))
 
 
 @pytest.mark.parametrize("begun", ["turn", "move", "twist"])
 def test_whatever_befalls_a_motion_and_then_again_it_stands(begun):
     others = [name for name in HAPPENINGS if name not in ("turn", "move", "twist", "mend", "wait long")]
     for first, second in itertools.permutations(others, 2):
-        assert asyncio.run(told(["mend", begun, first, second])), "it moved at first"
+        assert asyncio.run(stays_safe(["mend", begun, first, second])), "it moved at first"

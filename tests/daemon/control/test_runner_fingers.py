@@ -1,11 +1,14 @@
 """Fingers that are on their way when the loop stops are stopped too: they would go on by themselves."""
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 import pytest
 
-from tests.daemon.control.cell import GRIP, Cell, driven, no_tick
+from shearloop.daemon.control.loop_inputs import LoopConfig
+from shearloop.drivers.ur.messages import Stop
+from tests.daemon.control.cell import GRIP, Cell, driven, experiment, no_tick
 
 
 @asynccontextmanager
@@ -71,6 +74,22 @@ async def test_a_daemon_that_ends_in_the_middle_of_a_grip_stops_the_fingers_firs
         assert cell.gripper.asked == ["grip", "halt"]
 
 
+async def test_a_stop_ends_unlocking_and_stops_the_fingers():
+    async with driven() as cell:
+        cell.gripper.there.clear()
+        unlocking = asyncio.create_task(cell.runner.unlock())
+        await cell.cycles(5)
+        starting = asyncio.create_task(cell.runner.start(experiment(GRIP)))
+        await cell.cycles(5)
+        assert "being unlocked" in await starting
+        assert cell.runner.stop_unlocking()
+        await cell.cycles(5)
+        assert "unlocking was stopped" in await unlocking
+        assert cell.gripper.asked == ["halt"]
+        assert cell.robot.commands[-1] == Stop(LoopConfig().wrist_acceleration_rad_per_s2), "it ends the robot's part"
+        assert not cell.runner.stop_unlocking()
+
+
 async def test_fingers_that_could_not_be_stopped_are_told_of(monkeypatch):
     async with gripping() as cell:
 
@@ -81,4 +100,4 @@ async def test_fingers_that_could_not_be_stopped_are_told_of(monkeypatch):
         cell.control_loop.stop("the operator said stop")
         await cell.cycles(20)
         reasons = [one.reasons for one in cell.published.messages if one.topic == "loop.state"]
-        assert any("the fingers did not stop: the gripper does not answer" in one for one in reasons)
+        assert any("keep clear of them: the gripper does not answer" in one for one in reasons)

@@ -25,6 +25,17 @@ async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch):
         assert FaultCode.LOOP_LATE in [trouble.code for trouble in cell.control_loop.status.decision.faults]
 
 
+async def test_a_speed_that_comes_while_the_arm_still_brakes_after_a_late_one_says_why_and_the_turn_continues():
+    async with driven(TWIST, cycles=50) as cell:
+        while cell.state.motion != "stopping":
+            cell.robot.cycle(read=False)
+        await cell.cycles(3)
+        late = "The arm is still stopping (the wrist speed was not renewed within 0.3 s)"
+        assert Fault(FaultCode.COMMAND_REFUSED, late).sentence in cell.published.reasons
+        await cell.cycles(50)
+        assert (cell.phase, cell.state.motion) == (ExperimentPhase.RUNNING, "wrist")
+
+
 @pytest.mark.parametrize(("missed", "read"), [(24, 1), (18, 2), (12, 1)])
 async def test_a_loop_that_is_late_again_and_again_is_stopped(missed, read):
     """Though it then reads many states at once, or decides in time before it is late again."""

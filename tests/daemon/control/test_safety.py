@@ -90,9 +90,9 @@ def test_causes_that_take_turns_hold_the_wrist_no_longer_than_one_alone_may(coun
     stopped = taking_turns(*((event, each_s) for event in events))
     stopped_s, gate = stopped
     assert stopped_s == pytest.approx(HELD_AT_MOST_S, abs=2 * TICK_S)
-    told = gate.report([]).reasons[-1]
-    assert "held for too long" in told
-    assert all(f"{event.text} for " in told for event in events[:4])
+    reason = gate.report([]).reasons[-1]
+    assert "held for too long" in reason
+    assert all(f"{event.text} for " in reason for event in events[:4])
 
 
 def test_one_cause_alone_is_told_alone():
@@ -232,6 +232,12 @@ def test_a_pause_of_the_daemon_is_told_first_until_nothing_is_wrong_and_what_it_
     assert gate.judge([invalid], 11 * SECOND).reasons == (invalid.sentence,)
 
 
+@pytest.mark.parametrize("code", ["ROBOT_STARTING", "ROBOT_BLOCKED", "ROBOT_LOST", "DEVICE_LOST"])
+def test_a_reason_to_wait_with_the_start_does_not_ask_for_a_start(code):
+    """The configured experiment begins by itself once the reason is gone."""
+    assert "start the experiment again" not in trouble(FaultCode[code]).sentence
+
+
 @pytest.mark.parametrize("event", [FaultCode.RECORDING_FAILED, FaultCode.COMMAND_REFUSED])
 def test_what_neither_holds_the_wrist_nor_comes_of_a_pause_is_told_and_does_not_keep_the_pause(event):
     paused, other, limit = trouble(FaultCode.DAEMON_PAUSED), trouble(event), trouble(FaultCode.TORQUE_LIMIT)
@@ -258,7 +264,7 @@ def test_what_explains_changes_what_is_told_and_never_what_is_done(moments):
         verdict = explaining.judge(map(trouble, events), t_ns)
         late = {FaultCode.LOOP_LATE if event is FaultCode.DAEMON_PAUSED else event for event in events}
         assert verdict.response >= plain.judge(map(trouble, late), t_ns).response
-        told = [one for one in verdict.faults if not one.is_consequence]
-        assert told or not events
+        reported = [one for one in verdict.faults if not one.is_consequence]
+        assert reported or not events
         for one in verdict.faults:
-            assert one in told or TABLE[one.code].response in (Response.NOTE, Response.HOLD)
+            assert one in reported or TABLE[one.code].response in (Response.NOTE, Response.HOLD)

@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import pytest
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.control.experiment import MoveToAngle
-from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
+from shearloop.daemon.control.experiment import MoveToAngle, TrackTorque
+from shearloop.daemon.control.identification import ToolModel
+from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.runner import CommandSender
 from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.control.wrist_controller import WristController
@@ -100,3 +101,21 @@ async def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500
 @pytest.mark.parametrize("bandwidth_per_s", [5.0, FASTEST_PER_S])
 async def test_wrist_comes_to_rest_at_an_angle_however_fast_it_may_be_asked_to(angle_rad, bandwidth_per_s):
     assert max(map(abs, (await errors_rad(angle_rad, bandwidth_per_s))[-150:])) < 1e-4
+
+
+def test_each_torque_has_its_own_ramp_and_limit():
+    one = wrist()
+    one.tool = ToolModel(
+        stiffness_nm_per_rad=0.2, stiffness_std=0.002, lag_s=0.0, lag_std_s=0.01, age_s=0.05, actuation_s=0.02,
+        noise_nm=0.001, sample_period_s=0.1, angle_rad=0.0, torque_nm=0.0, torque_std_nm=0.0005,
+    )  # fmt: skip
+    assert one.close_loop(TrackTorque(0.1, 0.5), 10**9, 0.0, torque_limit_nm=0.15) is None
+    assert one.close_loop(TrackTorque(0.3, 0.01), 10**9, 0.0, torque_limit_nm=0.5) is None
+    angle_rad = 0.0
+    for cycle in range(1, 500):
+        t_ns = 10**9 + cycle * CYCLE_NS
+        one.on_torque(TorqueSample("load_cell", 0.2 * angle_rad, "", t_ns - CYCLE_NS // 2, t_ns))
+        speed = one.turn(TrackTorque(0.3, 0.01), t_ns, angle_rad, 0.0).speed_rad_per_s
+        one.on_speed_sent(speed)
+        angle_rad += speed * CYCLE_NS / 1e9
+    assert 0.2 * angle_rad == pytest.approx(0.01 * 500 * CYCLE_NS / 1e9, rel=0.15)

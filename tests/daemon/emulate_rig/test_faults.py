@@ -84,26 +84,26 @@ async def _read_on(gripper: RobotiqGripper) -> None:
 
 async def test_boards_fall_silent_vanish_and_come_back(rig):
     async with AsyncExitStack() as stack:
-        told, losses = LinkEvents(), LinkEvents()
-        kit, other = played.kit_at(rig, "right", told), played.kit_at(rig, "left")
+        of_right, losses = LinkEvents(), LinkEvents()
+        kit, other = played.kit_at(rig, "right", of_right), played.kit_at(rig, "left")
         cell = LoadCell(played.COUNTS, path=rig.run_dir / "load-cell", monitor=LinkMonitor(losses))
         right = await stack.enter_async_context(played.Reader(kit.readings()))
         left = await stack.enter_async_context(played.Reader(other.readings()))
         load = await stack.enter_async_context(played.Reader(cell.readings()))
         for each in (right, left, load):
             await each.take(1)
-        assert [event.up for event in (*told.events, *losses.events)] == [True, True]
+        assert [event.up for event in (*of_right.events, *losses.events)] == [True, True]
         for line in ("unplug right", "silence left", "silence load"):
             await rig.fault(line)
         async with asyncio.timeout(played.DEADLINE_S):
-            await told.down()
+            await of_right.down()
             assert "has sent nothing" in (await losses.down()).sentence
             # A silent board is started again by its driver, without being lost.
             while not other.diagnostics()["silences"]:
                 await left.take(1)
             await rig.fault("replug right")
             await rig.fault("normal")
-            for link in (told, losses):
+            for link in (of_right, losses):
                 await link.until(lambda link=link: link.events[-1].up)
             for each in (right, left, load):
                 await each.take(2)

@@ -35,11 +35,11 @@ def test_worker_processes_ignore_the_terminals_signals():
 @pytest.fixture
 def interrupted_once_it_works(tmp_path) -> Interrupted:
     """Interrupts this process as soon as a task `waits`, and returns the process that the task was in."""
-    os.mkfifo(tmp_path / "told")
+    os.mkfifo(tmp_path / "pids")
     running: list[int] = []
 
     def interrupt(number: signal.Signals) -> None:
-        running.append(int((tmp_path / "told").read_text()))
+        running.append(int((tmp_path / "pids").read_text()))
         os.kill(os.getpid(), number)
 
     def during(number: signal.Signals, work: Callable[[], object]) -> int:
@@ -57,7 +57,7 @@ def interrupted_once_it_works(tmp_path) -> Interrupted:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("more", ["", "x" * (1 << 20)], ids=["small", "large"])
 def test_worker_processes_end_on_an_interrupt(number, more, interrupted_once_it_works, tmp_path):
-    shared = str(tmp_path / "told"), more
+    shared = str(tmp_path / "pids"), more
     process = interrupted_once_it_works(number, lambda: list(ProcessExecutor(1).map(waits, shared, [0, 1, 2])))
     assert active_children() == []
     with pytest.raises(ProcessLookupError):

@@ -11,10 +11,8 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from shearloop.daemon.app import Daemon
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
-from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer, RequestExecutor
@@ -75,11 +73,6 @@ async def test_req_and_dealer_clients_are_answered():
         server.close()
 
 
-def test_a_missing_daemon_is_an_error():
-    with pytest.raises(UserError, match=r"no daemon answered at ipc:///nowhere-at-all within 0.01 s; start it with"):
-        send_command("ipc:///nowhere-at-all", {"command": "status"}, 0.01)
-
-
 def test_an_address_in_use_is_an_error():
     with zmq.Context() as context, context.socket(zmq.PUB) as taken:
         taken.bind("tcp://127.0.0.1:*")
@@ -130,26 +123,6 @@ def test_foreign_messages_are_an_error(tmp_path):
                 next(heard)
             sending.join()
             stranger.recv()
-
-
-async def test_only_heatmap_can_be_set(config):
-    with zmq.asyncio.Context() as context:
-        daemon = Daemon(load_daemon_config(config()), context)
-        change = daemon.commands.handlers()["set"]
-        assert not daemon.sensors.fingertips["right"]._always_heatmap
-        assert await change({"heatmap": "always"}) == {"set": ["right"], "heatmap": "always"}
-        assert daemon.sensors.fingertips["right"]._always_heatmap
-        await change({"heatmap": "on_request", "source": "right"})
-        assert not daemon.sensors.fingertips["right"]._always_heatmap
-        for wrong, why in (
-            ({}, "only `heatmap` can be set"),
-            ({"heatmap": ["always"]}, "only `heatmap` can be set"),
-            ({"torque_limit_nm": 9}, "only `heatmap` can be set"),
-            ({"heatmap": "always", "source": "left"}, "there is no fingertip 'left'; there are right"),
-        ):
-            with pytest.raises(CommandRefusedError, match=why):
-                await change(wrong)
-        daemon._close()
 
 
 async def test_tare_is_refused_during_an_experiment():

@@ -64,9 +64,9 @@ async def test_stop_is_fast_in_a_flood_of_idle_connections(key, config):
         for name in ("status", "stop"):
             assert await asyncio.to_thread(main, ["command", name, "--connect", addresses["commands"]]) == 0
         assert time.monotonic() - begun_s < 1.0
-        _, told = await daemon.communicate()
+        _, errors = await daemon.communicate()
     assert daemon.returncode == 0
-    assert f"clients are connected to `{key}`; others wait until one has disconnected" in told.decode()
+    assert f"clients are connected to `{key}`; others wait until one has disconnected" in errors.decode()
 
 
 async def test_the_stop_socket_answers_in_a_flood_of_datagrams():

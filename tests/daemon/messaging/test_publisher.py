@@ -97,13 +97,13 @@ def test_subscribers_come_and_go_while_messages_are_sent(publisher, connect):
 
 def test_a_subscriber_is_warned_once_and_receives_a_later_daemon(tmp_path, monkeypatch):
     monkeypatch.setattr("shearloop.daemon.messaging.client.QUIET_S", 0.02)
-    address, told = f"ipc://{tmp_path}/publish", []
+    address, warnings = f"ipc://{tmp_path}/publish", []
     content = {"timestamp": 1.0, "t_mono_ns": 2, "source": "daemon"}
     with zmq.Context() as context, context.socket(zmq.XPUB) as late:
         late.setsockopt(zmq.RCVTIMEO, 10_000)
 
         def comes() -> None:
-            told.append("quiet")
+            warnings.append("quiet")
             late.bind(address)
             assert late.recv() == b"\x01health"
             for seq in range(2):
@@ -111,7 +111,7 @@ def test_a_subscriber_is_warned_once_and_receives_a_later_daemon(tmp_path, monke
 
         with closing(receive_messages(address, ["health"], on_quiet=comes)) as heard:
             assert [next(heard)[1]["seq"] for _ in range(2)] == [0, 1]
-    assert told == ["quiet"]
+    assert warnings == ["quiet"]
 
 
 async def test_a_subscriber_is_iterated_with_and_without_asyncio(publisher, tmp_path):

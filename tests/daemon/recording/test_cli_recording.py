@@ -30,14 +30,14 @@ def recording(tmp_path) -> Path:
 
 def test_info_shows_the_content(recording, capsys):
     assert main(["recording", "info", str(recording)]) == 0
-    told = capsys.readouterr().out
-    assert "a bench" in told
-    assert "eit.frame.right             4 messages     1.85 Hz" in told
-    assert "the same code as here" in told
+    printed = capsys.readouterr().out
+    assert "a bench" in printed
+    assert "eit.frame.right               4 messages     1.85 Hz" in printed
+    assert "the same code as here" in printed
     assert main(["recording", "info", "--json", str(recording)]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["topics"]["load.torque"]["messages"] == 4
-    assert (told["closed"], told["same_code"], told["size_bytes"]) == (True, True, recording.stat().st_size)
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["topics"]["load.torque"]["messages"] == 4
+    assert (printed["closed"], printed["same_code"], printed["size_bytes"]) == (True, True, recording.stat().st_size)
 
 
 def test_a_torn_recording_is_refused_and_repaired(recording, tmp_path, capsys):
@@ -70,11 +70,11 @@ def test_a_damaged_chunk_is_left_out_and_counted(tmp_path, capsys, monkeypatch):
     content[at : at + 4] = bytes(255 - byte for byte in content[at : at + 4])
     path.write_bytes(content)
     assert main(["recording", "repair", str(path), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["path"], told["damaged_chunks"]) == (str(tmp_path / "a.repaired.mcap"), 1)
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["path"], printed["damaged_chunks"]) == (str(tmp_path / "a.repaired.mcap"), 1)
     kept = read_recording(tmp_path / "a.repaired.mcap").torque_nm
     assert set(np.round(kept, 2)) < set(np.round(0.01 * np.arange(100), 2))
-    assert len(kept) == told["messages"] >= 24
+    assert len(kept) == printed["messages"] >= 24
 
 
 def test_csv_parquet_and_matlab_exports_agree(recording, tmp_path, capsys):

@@ -55,7 +55,7 @@ def exported(path: Path) -> list[bytes]:
     return [one.read_bytes() for one in export(path, "csv", path.parent / "csv", list(RecordedTopics(path)))]
 
 
-def told(path: Path) -> list[tuple[str, int]]:
+def info(path: Path) -> list[tuple[str, int]]:
     found = summarise(path)
     # What is torn or damaged is said so here, and is no mistake.
     if found.closed and not found.damaged_chunks:
@@ -74,7 +74,7 @@ def calibrated(path: Path) -> list[float]:
     return [*found.torque_nm.tolist(), *found.sides["right"].lines.ravel().tolist()]
 
 
-READERS: list[Callable[[Path], Any]] = [happened, exported, calibrated, told, repaired]
+READERS: list[Callable[[Path], Any]] = [happened, exported, calibrated, info, repaired]
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_damage_is_an_error_with_the_files_name_or_harmless(
         said = str(error)
     else:
         assert found in (sound[reader.__name__], [])
-        assert not cut or reader in (told, repaired)
+        assert not cut or reader in (info, repaired)
         return
     assert str(path) in said
 

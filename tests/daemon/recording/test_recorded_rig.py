@@ -49,8 +49,8 @@ async def test_a_full_disk_refuses_only_the_next_experiment(recorded_rig, tiny_b
         await started(command, path)
         await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.005)
         filler = fill(small_disk)
-        told = await watcher.until("health", lambda health: bool(health["tasks"]["recording"]["error"]))
-        assert "No space left on device" in told["tasks"]["recording"]["error"]
+        health = await watcher.until("health", lambda health: bool(health["tasks"]["recording"]["error"]))
+        assert "No space left on device" in health["tasks"]["recording"]["error"]
         # What runs goes on. (A busy computer may hold the wrist for a moment meanwhile, as it must.)
         await watcher.until(
             "loop.state",

@@ -77,10 +77,10 @@ def test_messages_are_recorded_with_schema_and_time(tmp_path):
     with path.open("rb") as file:
         reader = make_reader(file)
         assert [one.name for one in reader.iter_attachments()] == ["configuration.json"]
-    told = summarise(path)
-    assert (told.closed, told.dropped, told.same_code) == (True, 0, True)
-    assert told.topics["input.right"].messages == 2
-    assert told.metadata["source"] == "a test"
+    summary = summarise(path)
+    assert (summary.closed, summary.dropped, summary.same_code) == (True, 0, True)
+    assert summary.topics["input.right"].messages == 2
+    assert summary.metadata["source"] == "a test"
 
 
 def test_a_live_recording_is_read_like_an_import(tmp_path):
@@ -126,6 +126,18 @@ def test_each_experiment_has_a_file_with_its_name(tmp_path):
     assert summarise(first).experiments == ["Hold 0.10 N·m"]
     assert summarise(first).attachments == ["configuration.json", "hold.yaml"]
     assert topics(second)["input.clock"], "each can be replayed by itself"
+
+
+def test_a_clock_that_was_set_back_costs_no_recording(tmp_path, monkeypatch):
+    monkeypatch.setattr(Clock, "now_ns", lambda _: 0)
+    monkeypatch.setattr(Clock, "offset_ns", 10**18)
+    for number in range(3):
+        recorder = Recorder(tmp_path, IDENTITY, Clock())
+        recorder.record_experiment("hold")
+        recorder.record_message("load.torque", torque(number))
+        recorder.close()
+    kept = [topics(path)["load.torque"] for path in sorted(tmp_path.iterdir())]
+    assert sorted(one["seq"] for (one,) in kept) == [0, 1, 2]
 
 
 def test_a_new_file_begins_after_an_hour_without_experiment(tmp_path, monkeypatch):

@@ -133,13 +133,13 @@ def test_a_loop_that_waits_for_its_load_gives_the_times_of_both(mat_folder, tmp_
     for ends in zip(frame_s[:-1], load_s[:-1], strict=True):
         stamps.append(max(stamps[-1], *ends))
     late = list(enumerate(np.array(stamps) - PERIOD_S * np.arange(1, 61)))
-    told = import_mat([mat_folder(one_loop=True, late=late)], tmp_path / "a.mcap")
+    imported = import_mat([mat_folder(one_loop=True, late=late)], tmp_path / "a.mcap")
     found = read_recording(tmp_path / "a.mcap")
     start_ns = found.torque_t_ns[0] - 2.6e9
     np.testing.assert_allclose((found.torque_t_ns - start_ns) / 1e9, load_s, atol=1e-3)
     middle_s = (found.sides["right"].t_mid_ns - start_ns) / 1e9
     assert np.abs(frame_s - PERIOD_S / 2 - middle_s).max() <= PERIOD_S / 2 + 0.01
-    assert "the load's times were moved by 2.33 ± 0.27 s against the frames" in told.remarks[1]
+    assert "the load's times were moved by 2.33 ± 0.27 s against the frames" in imported.remarks[1]
     assert LOAD_DOUBT_NOTE not in found.notes
     import_mat([mat_folder("regular", one_loop=True)], tmp_path / "b.mcap")
     assert "times may be seconds off" in read_series(tmp_path / "b.mcap")[0].load_doubt

@@ -140,8 +140,8 @@ def _same_at_any_speed(path: Path, live: list[Any], tmp_path: Path, capsys: pyte
     zeros = [c for t, c in fast if t == "eit.estimate" and c["reason"].startswith("taking the homogeneous frame, 1 of")]
     assert len(zeros) == 2, "the operator's tare is replayed"
     assert main(["replay", str(path), "--speed", "max", "--publish", address, "--check"]) == 0
-    told = capsys.readouterr().err
-    assert f"eit.estimate: {comparison.compared['eit.estimate']} of {comparison.compared['eit.estimate']}" in told
+    errors = capsys.readouterr().err
+    assert f"eit.estimate: {comparison.compared['eit.estimate']} of {comparison.compared['eit.estimate']}" in errors
 
 
 def test_a_real_recording_gives_the_stored_estimates(shared, config, tmp_path):
@@ -213,7 +213,7 @@ def recorded(content: dict[str, Any]) -> RecordedEvent:
 
 
 @pytest.mark.parametrize(
-    ("then", "now", "told"),
+    ("then", "now", "difference"),
     [
         ({}, {}, ""),
         ({"latency_s": 0.1, "timestamp": 1.0, "seq": 3}, {"latency_s": 0.7, "timestamp": 2.0, "seq": 4}, ""),
@@ -223,13 +223,13 @@ def recorded(content: dict[str, Any]) -> RecordedEvent:
         ({"reason": ""}, {"reason": "no grip"}, "reason was"),
     ],
 )
-def test_a_difference_is_described(then, now, told):
+def test_a_difference_is_described(then, now, difference):
     comparison = ReplayComparison(("eit.estimate.right",))
     comparison.add_computed(TOPIC, estimate(**now))
     comparison.compare(recorded(estimate(**then)))
     assert comparison.compared[TOPIC] == 1
-    assert comparison.different[TOPIC] == bool(told)
-    assert told in "".join(comparison.examples)
+    assert comparison.different[TOPIC] == bool(difference)
+    assert difference in "".join(comparison.examples)
     assert comparison.unrecorded == 0
 
 
@@ -278,7 +278,7 @@ def test_a_later_file_replays_frame_numbers_tares_and_tools(config, tmp_path, mo
     held: list[object] = []
     monkeypatch.setattr(FrameEstimator, "set_tool", lambda _self, tool: held.append(tool))
     again, _ = asyncio.run(replayed(later, math.inf))
-    assert held == [OTHER_TOOL], "which was told before the file began"
+    assert held == [OTHER_TOOL], "which came before the file began"
     estimates = {content["frame"]: content for topic, content in again if topic == "eit.estimate"}
     assert min(estimates) >= BEGUN
     said = ("reason", "valid", "k", "sigma", "score", "torque_nm")

@@ -321,18 +321,20 @@ def test_a_fingertip_that_the_lever_hardly_moves_has_its_times_from_the_other_on
 def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twists_file, tmp_path, capsys, monkeypatch):
     calibrate = ["calibrate", str(twists_file), "--time-range", f"0:{THIRD}", "--out", str(tmp_path / "a.cal")]
     assert main(calibrate) == 0
-    told = capsys.readouterr().out
-    assert "Could not verify the load cell's timestamps: the load changed too few times. They may be 0.75 s off" in told
-    assert re.search(r"intervals are wider, for loads \d\.\d times\. Record more changes of load", told)
+    printed = capsys.readouterr().out
+    assert (
+        "Could not verify the load cell's timestamps: the load changed too few times. They may be 0.75 s off" in printed
+    )
+    assert re.search(r"intervals are wider, for loads \d\.\d times\. Record more changes of load", printed)
     assert main([*calibrate, "--load-cell-delay-s", "0"]) == 0
     assert "Could not verify" not in capsys.readouterr().out
     looked, read, of_side = [], [], load_delay._delay_of_side
     monkeypatch.setattr(calibrate_module, "read_recording", lambda path: (read.append(path), read_recording(path))[1])
     monkeypatch.setattr(load_delay, "_delay_of_side", lambda *a: (looked.append(a[0]), of_side(*a))[1])
     assert main(["calibrate", str(twists_file), "--sides", "left", "--out", str(tmp_path / "a.cal"), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["timing_uncertainty_s"] == 0
-    assert told["load_cell_delay_s"] == [pytest.approx(0.25, abs=0.03)]
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["timing_uncertainty_s"] == 0
+    assert printed["load_cell_delay_s"] == [pytest.approx(0.25, abs=0.03)]
     assert len(looked) == len(set(looked)), "each recording once"
     assert read == [twists_file]
 
@@ -347,9 +349,9 @@ def test_a_load_that_one_loop_stamped_early_is_put_right(shared, twists, tmp_pat
     series = imported(tmp_path / "other.mcap", shared / "recordings/streams/20241202_153632")
     assert load_delay_warning(series) == ""
     early = replace(series, torque_t_s=series.torque_t_s - 2.36)
-    told = r"the frames move 2\.\d+ ± 0\.\d+ s after the load .*though 57 gripped frames are too few to be sure"
-    assert re.match(told, load_delay_warning(early))
-    assert re.match(told, measure_timing([early]).warnings[0])
+    warning = r"the frames move 2\.\d+ ± 0\.\d+ s after the load .*though 57 gripped frames are too few to be sure"
+    assert re.match(warning, load_delay_warning(early))
+    assert re.match(warning, measure_timing([early]).warnings[0])
     # The right fingertip of 2 December is the left one of 3 December.
     calibration = fit("motion_regression", [twists.select_sides(("left",))], "another day")
     other = imported(tmp_path / "third.mcap", shared / "recordings/streams/20241202_171704").select_sides(("right",))
@@ -367,8 +369,8 @@ def test_a_clock_that_is_surely_wrong_is_put_right_at_the_import(shared, twists,
     late = np.column_stack([(load.unix_s + 3.0) / 86400 + 719529, load.values])
     savemat(tmp_path / "load.mat", {"Load_Data": late})
     sources = [path for path in sorted(folder.glob("*.mat")) if "load" not in _streams_of(path)]
-    told = import_mat([*sources, tmp_path / "load.mat"], tmp_path / "late.mcap")
-    assert re.search(r"stamped 3\.0\d ± 0\.0\d s too late against the gel's motion", told.remarks[0])
+    imported = import_mat([*sources, tmp_path / "load.mat"], tmp_path / "late.mcap")
+    assert re.search(r"stamped 3\.0\d ± 0\.0\d s too late against the gel's motion", imported.remarks[0])
     (series,) = read_series(tmp_path / "late.mcap")
     np.testing.assert_allclose(series.torque_t_s, twists.torque_t_s, atol=0.1)
 

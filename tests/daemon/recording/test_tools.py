@@ -34,15 +34,15 @@ class Held(Clock):
 
 def recorded(folder: Path, *held: tuple[int, Measured | None], named_mm: float | None = None) -> Path:
     """Record 40 frames as a daemon does; from the frame with each number on the gripper holds another tool, or none."""
-    clock, told = Held(), dict(held)
+    clock, values = Held(), dict(held)
     file = ExperimentFile(name="twist", tool_mm=named_mm, steps=(WaitStep(do="wait", wait_s=1.0),))
     recorder = Recorder(folder, Identity(basic_identity("a test")), clock)
     recorder.record_experiment(file.name, notes=experiment_notes(file))
     for number in range(40):
         clock.t_ns += PERIOD_NS
         recorder.input_recorder("right").record(RawEvent(InputKind.DATA, clock.t_ns, b'"kind":"tool", said the board'))
-        if number in told:
-            tool = tool_as_bytes(number, told[number])
+        if number in values:
+            tool = tool_as_bytes(number, values[number])
             recorder.input_recorder("right").record(RawEvent(InputKind.TOOL, clock.t_ns - PERIOD_NS // 2, tool))
         line = np.random.default_rng(number).uniform(0.01, 0.5, 1024)
         t_ns = clock.t_ns - PERIOD_NS // 2

@@ -210,9 +210,9 @@ async def test_foxglove_gets_the_schema_and_each_message():
             aiohttp.ClientSession() as http,
             http.ws_connect(url, protocols=["foxglove.sdk.v1"]) as socket,
         ):
-            while (told := await socket.receive_json())["op"] != "advertise":
+            while (message := await socket.receive_json())["op"] != "advertise":
                 pass
-            (channel,) = told["channels"]
+            (channel,) = message["channels"]
             assert (channel["topic"], channel["encoding"]) == ("eit.heatmap.right", "json")
             assert json.loads(channel["schema"]) == schema.schemas()["eit.heatmap"]
             subscription = {"op": "subscribe", "subscriptions": [{"id": 1, "channelId": channel["id"]}]}

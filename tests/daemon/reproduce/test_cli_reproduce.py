@@ -102,19 +102,15 @@ def test_one_kind_of_slice_is_enough(make_recordings, coarse_fingertip, tmp_path
     assert drawn == (OF_ANY | {"figure_9_diameter"} if present == "diameter" else FIGURES - {"figure_9_diameter"})
 
 
-def test_the_papers_mesh_is_taken_where_it_is_beside_the_recordings(make_recordings, tmp_path, shared):
+def test_the_papers_mesh_is_taken_where_it_is_beside_the_recordings(make_recordings, shared):
     recordings = make_recordings(diameter=False)
-    assert banks.choose_mesh(recordings, None, None)[1] == f"our own grid for {banks.OWN_FINGERTIP}"
+    assert banks.choose_mesh(recordings, None)[1] == f"our own grid for {banks.OWN_FINGERTIP}"
     beside = recordings.parent / "reference" / "fingertip_mesh.npz"
     beside.parent.mkdir()
     shutil.copy(shared / "reference" / "fingertip_mesh.npz", beside)
-    mesh, origin = banks.choose_mesh(recordings, None, None)
+    mesh, origin = banks.choose_mesh(recordings, None)
     assert origin == f"{beside} (the paper's)"
     assert len(mesh.triangles) == 4882
-    config = tmp_path / "bank.yaml"
-    grid = "{low: 1, high: 2, count: 2}"
-    config.write_text(f"mesh: {{file: {beside}}}\nmodel: step\nk: {grid}\nsigma: {grid}\n")
-    assert banks.choose_mesh(recordings, None, config)[0].digest == mesh.digest
 
 
 def test_mistakes_end_in_one_sentence(make_recordings, tmp_path, capsys):

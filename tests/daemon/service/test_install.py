@@ -88,17 +88,17 @@ def test_dry_run_prints_the_steps_and_changes_nothing(command, tmp_path, capsys)
 
 def test_the_steps_as_json(tmp_path, capsys):
     assert place(tmp_path, "install", "--dry-run", "--json") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["dry_run"] is True
-    assert {"acts": True, "says": f"write {tmp_path / EXAMPLE}"} in told["steps"]
+    result = json.loads(capsys.readouterr().out)
+    assert result["dry_run"] is True
+    assert {"acts": True, "says": f"write {tmp_path / EXAMPLE}"} in result["steps"]
     assert place(tmp_path, "uninstall", "--dry-run", "--json") == 0
     assert {"acts": False, "says": f"not there: {tmp_path / EXAMPLE}"} in json.loads(capsys.readouterr().out)["steps"]
 
 
 def test_a_running_system_is_notified(tmp_path):
-    told = [step.sentence for step in install_steps(tmp_path, Path(PROGRAM), real_time=False, running=True)]
+    sentences = [step.sentence for step in install_steps(tmp_path, Path(PROGRAM), real_time=False, running=True)]
     for command in ("udevadm control --reload", "udevadm trigger --subsystem-match=tty", "systemctl daemon-reload"):
-        assert any(f"run `{command}`" in sentence for sentence in told)
+        assert any(f"run `{command}`" in sentence for sentence in sentences)
 
 
 def mistake(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:

@@ -206,7 +206,7 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "mistake"),
     [
         ({}, "nothing is measured: give `fingertips`, a `skin`, or both"),
         ({"skin": section({**ADC, **SCANNER})}, "skin.daq: give either scanner or adc, and not both"),
@@ -261,14 +261,14 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
         ({"skin": section(ADC, calibration=ROBOT)}, "is not a calibration as `shearloop skin calibrate` writes it: it"),
     ],
 )
-def test_a_mistake_in_the_skin_s_section_is_one_sentence_and_status_2(tmp_path, content, told, capsys, request):
+def test_a_mistake_in_the_skin_s_section_is_one_sentence_and_status_2(tmp_path, content, mistake, capsys, request):
     if "experiment" in content:
         request.getfixturevalue("ur_rtde")
     path = written(tmp_path, content)
     for command in ("check", "run"):
         assert main([command, str(path)]) == 2
         said = capsys.readouterr().err
-        assert told.replace("FOLDER", str(tmp_path)) in said
+        assert mistake.replace("FOLDER", str(tmp_path)) in said
         assert said.count("\n") == 1, "one line"
 
 

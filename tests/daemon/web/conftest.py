@@ -108,8 +108,8 @@ class Viewer(Killable):
             assert ready, f"the viewer has not said its address within {DEADLINE_S} s"
             line = said.readline()
         assert line, "the viewer has ended before it said its address"
-        told = json.loads(line)
-        self.url, self.url_with_token = told["url"], told["url_with_token"]
+        printed = json.loads(line)
+        self.url, self.url_with_token = printed["url"], printed["url_with_token"]
         self._port = int(self.url.rstrip("/").rpartition(":")[2])
 
 

@@ -26,10 +26,10 @@ def test_a_page_gets_the_latest_of_each_topic_and_source_with_its_age():
     latest.add("load.torque", message("load_cell", torque_nm=0.1), 1.0)
     latest.add("load.torque", message("load_cell", torque_nm=0.2), 2.0)
     latest.add("eit.estimate", message("left", torque_nm=None, valid=False), 3.0)
-    told = batch(latest)
-    assert told["first"]
-    assert told["quiet_s"] == 7.0
-    assert [(each["topic"], each["age_s"], each["content"]["torque_nm"]) for each in told["messages"]] == [
+    sent = batch(latest)
+    assert sent["first"]
+    assert sent["quiet_s"] == 7.0
+    assert [(each["topic"], each["age_s"], each["content"]["torque_nm"]) for each in sent["messages"]] == [
         ("load.torque", 8.0, 0.2),
         ("eit.estimate", 7.0, None),
     ]
@@ -42,9 +42,9 @@ def test_a_new_page_gets_the_last_minute():
     latest = MessageStore(3.6)
     for second in range(100):
         latest.add("load.torque", message("load_cell", torque_nm=0.01 * second, raw=1.0, valid=True), float(second))
-    told = latest.history(99.0)
-    assert [each["content"]["torque_nm"] for each in told] == pytest.approx(np.arange(34, 100) * 0.01)
-    assert told[0] == {
+    history = latest.history(99.0)
+    assert [each["content"]["torque_nm"] for each in history] == pytest.approx(np.arange(34, 100) * 0.01)
+    assert history[0] == {
         "topic": "load.torque",
         "content": {"source": "load_cell", "timestamp": 1.5, "torque_nm": 0.34, "valid": True},
     }
@@ -66,16 +66,16 @@ def test_invalid_messages_are_counted_by_kind_and_do_not_end_the_silence():
     for number in range(MAX_STREAMS):
         latest.add("health", message(f"daemon {number}"), 2.0)
     latest.add("health", message("one more"), 3.0)
-    told = batch(latest)
-    assert told["refused"] == {
+    sent = batch(latest)
+    assert sent["refused"] == {
         "unknown topic": 1,
         "incomplete message": 1,
         "message without a JSON form": 2,
         "malformed message": 1,
         "too many sources": 1,
     }
-    assert told["quiet_s"] == 8.0
-    assert len(told["messages"]) == MAX_STREAMS
+    assert sent["quiet_s"] == 8.0
+    assert len(sent["messages"]) == MAX_STREAMS
 
 
 VALUES: st.SearchStrategy[Any] = st.recursive(
@@ -89,18 +89,18 @@ VALUES: st.SearchStrategy[Any] = st.recursive(
 def test_any_message_becomes_json_or_is_counted(content):
     latest = MessageStore(3.6)
     latest.add("eit.estimate", message(**content) | {"source": "right"}, 1.0)
-    told = batch(latest)
-    assert len(told["messages"]) + sum(told["refused"].values()) == 1
+    sent = batch(latest)
+    assert len(sent["messages"]) + sum(sent["refused"].values()) == 1
 
 
 def test_arrays_become_float32_and_nan_becomes_null():
     scores = np.array([[0.25, np.nan], [0.5, 1.0]])
-    told = json_value(
+    value = json_value(
         decode(encode({"scores": scores.astype("<f4").tobytes(), "scores_shape": [2, 2], "k": float("inf")}))
     )
-    assert told["k"] is None
-    assert told["scores"]["shape"] == [2, 2]
-    unpacked = np.frombuffer(base64.b64decode(told["scores"]["float32"]), "<f4").reshape(2, 2)
+    assert value["k"] is None
+    assert value["scores"]["shape"] == [2, 2]
+    unpacked = np.frombuffer(base64.b64decode(value["scores"]["float32"]), "<f4").reshape(2, 2)
     np.testing.assert_array_equal(unpacked, scores)
 
 
@@ -121,16 +121,16 @@ def test_an_estimate_comes_with_its_conductivity_profile():
     assert batch(latest)["messages"][0]["conductivity"] is None, "the model is not known yet"
     latest.add("eit.heatmap", message(scores=np.ones((3, 3)), model="gaussian_derivative"), 1.0)
     latest.add("eit.estimate", message(k=1.8, sigma=0.9), 2.0)
-    told = batch(latest)["messages"][-1]["conductivity"]
-    assert told == pytest.approx(conductivity_profile("gaussian_derivative", 1.8, 0.9, 3.6))
+    profile = batch(latest)["messages"][-1]["conductivity"]
+    assert profile == pytest.approx(conductivity_profile("gaussian_derivative", 1.8, 0.9, 3.6))
 
 
 def test_the_profile_equals_the_banks_conductivity():
     mesh = small_fingertip()
     height_cm = float(mesh.nodes[:, 1].max())
-    told = conductivity_profile("gaussian_derivative", 0.6 * height_cm, 0.8 * height_cm, height_cm)
+    profile = conductivity_profile("gaussian_derivative", 0.6 * height_cm, 0.8 * height_cm, height_cm)
     middles_cm = mesh.nodes[:, 1][mesh.triangles].mean(axis=1)
-    at_middles = np.interp(middles_cm, np.linspace(0, height_cm, HEIGHTS), told)
+    at_middles = np.interp(middles_cm, np.linspace(0, height_cm, HEIGHTS), profile)
     built = conductivity_of_mesh(mesh, "gaussian_derivative", 0.6 * height_cm, 0.8 * height_cm)
     np.testing.assert_allclose(at_middles, built, atol=5e-3)
     assert conductivity_profile("no such model", 1.0, 1.0, 3.6) is None

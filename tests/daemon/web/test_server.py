@@ -62,7 +62,7 @@ async def served(tmp_path: Path, **other: Any) -> AsyncIterator[Served]:
         return handle
 
     publish, commands = f"ipc://{tmp_path}/publish", f"ipc://{tmp_path}/commands"
-    handlers = {name: handler(name) for name in (*NEEDS_TOKEN, "stop", "set")} | other
+    handlers = {name: handler(name) for name in (*NEEDS_TOKEN, "stop")} | other
     with zmq.asyncio.Context() as context:
         publisher = Publisher(context, publish, Clock())
         daemon = CommandServer(context, commands, handlers, Refusals())
@@ -108,7 +108,7 @@ async def test_motion_needs_the_token_and_stop_does_not(tmp_path):
             {"ok": False, "reason": "no experiment is running"},
         )
         # Other commands of the daemon are not the page's.
-        for name in ("stop", "set", "status"):
+        for name in ("stop", "status"):
             assert (await post(page, f"/commands/{name}", **BEARER))[0] == 404
         assert page.asked == ["stop", "start", "pause"]
 
@@ -269,16 +269,15 @@ async def test_a_used_port_and_an_invalid_address_are_one_sentence(tmp_path):
 
 
 @pytest.mark.usefixtures("default_signals")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-async def test_view_prints_its_address_and_ends_on_a_signal(number, tmp_path):
+async def test_view_prints_its_address_and_ends_on_a_signal(tmp_path):
     token = tmp_path / "token"
     addresses = ("--connect", f"ipc://{tmp_path}/p", "--commands", f"ipc://{tmp_path}/c")
     async with shearloop("view", "--port", "0", "--json", "--token-file", str(token), *addresses) as view:
-        told = json.loads(await view.stdout.readline())
-        assert told["url_with_token"] == f"{told['url']}#token={token.read_text().strip()}"
-        async with aiohttp.ClientSession() as http, http.ws_connect(f"{told['url']}stream") as stream:
+        printed = json.loads(await view.stdout.readline())
+        assert printed["url_with_token"] == f"{printed['url']}#token={token.read_text().strip()}"
+        async with aiohttp.ClientSession() as http, http.ws_connect(f"{printed['url']}stream") as stream:
             assert (await stream.receive_json())["first"]
-            view.send_signal(number)
+            view.send_signal(signal.SIGTERM)
             while (message := await stream.receive()).type is aiohttp.WSMsgType.TEXT:
                 continue
             assert message.type is aiohttp.WSMsgType.CLOSE

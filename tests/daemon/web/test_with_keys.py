@@ -66,8 +66,8 @@ async def page_of(places: dict[str, str], folder: Path, who: str | None) -> Asyn
     if who is not None:
         words += ["--key", str(folder / who / "client.key_secret"), "--server-key", str(folder / "keys" / "server.key")]
     async with shearloop(*words) as view, aiohttp.ClientSession() as http:
-        told = json.loads(await view.stdout.readline())
-        yield Page(http, told["url"], told["url_with_token"].partition("#token=")[2])
+        printed = json.loads(await view.stdout.readline())
+        yield Page(http, printed["url"], printed["url_with_token"].partition("#token=")[2])
 
 
 async def test_over_the_network_motion_needs_key_and_token_and_stop_neither(config, places, tmp_path):

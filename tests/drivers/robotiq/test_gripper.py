@@ -81,6 +81,24 @@ async def test_halted_gripper_reports_no_object(way, tmp_path):
         assert 0 < state.width_mm < 140
 
 
+@pytest.mark.parametrize("requested", [[], [messages.Activate()]], ids=["reset", "about to activate"])
+@WAYS
+async def test_halting_a_gripper_that_is_not_active_moves_nothing(way, requested, tmp_path):
+    """A stop meets an activation before its beginning."""
+    async with a_rig(way, tmp_path, connected=True) as rig:
+        before_mm = rig.model.width_mm
+        # The status shows a command only after the next step.
+        rig.stopped = True
+        for request in requested:
+            await rig.driver._write(request)
+        await rig.driver.halt()
+        rig.stopped = False
+        for _ in range(10):
+            assert (await rig.driver.read()).activation is messages.ActivationStatus.RESET
+            rig.monotonic_ns()
+        assert rig.model.width_mm == before_mm
+
+
 @WAYS
 async def test_major_fault_needs_the_operators_confirmation(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig:
@@ -97,6 +115,23 @@ async def test_major_fault_needs_the_operators_confirmation(way, tmp_path):
         state = await driver.activate(operator_confirmed=True)
         assert state.fault.code == 0
         assert state.activation is messages.ActivationStatus.ACTIVE
+
+
+@WAYS
+async def test_halt_after_a_failed_activation_keeps_the_fault(way, tmp_path):
+    """The operator has to confirm that the fingers are clear."""
+    async with a_rig(way, tmp_path, connected=True) as rig:
+        activation = asyncio.create_task(rig.driver.activate())
+        while rig.model.sta != 1:  # noqa: ASYNC110 - the model is looked at, as it moves
+            await asyncio.sleep(0)
+        rig.model.fail(13)
+        with pytest.raises(messages.GripperFaultError, match="activation failed"):
+            await activation
+        await rig.driver.halt()
+        rig.model.step(STEP_S)
+        assert (await rig.driver.read()).fault.code == 13
+        with pytest.raises(messages.GripperFaultError, match="operator has to confirm"):
+            await rig.driver.activate()
 
 
 @WAYS

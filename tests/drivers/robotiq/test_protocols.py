@@ -17,15 +17,13 @@ byte = st.integers(0, 255)
 
 def test_requests_are_the_manuals_registers():
     # Instruction manual, "Modbus RTU": reset 0000 0000 0000, close at full speed and force 0900 00FF FFFF.
-    last = messages.GripperMove(0, 0, 0)
-    assert modbus_client.command_registers(messages.Reset(), last) == [0, 0, 0]
-    assert modbus_client.command_registers(messages.Activate(), last) == [0x0100, 0, 0]
-    assert modbus_client.command_registers(messages.GripperMove(255, 255, 255), last) == [0x0900, 0x00FF, 0xFFFF]
-    assert modbus_client.command_registers(messages.GripperHalt(), messages.GripperMove(255, 255, 128)) == [
-        0x0100,
-        0x00FF,
-        0xFF80,
-    ]
+    last, closed = messages.GripperMove(0, 0, 0), messages.GripperMove(255, 255, 128)
+    registers = modbus_client.command_registers
+    assert registers(messages.Reset(), last, act=True) == [0, 0, 0]
+    assert registers(messages.Activate(), last, act=False) == [0x0100, 0, 0]
+    assert registers(messages.GripperMove(255, 255, 255), last, act=True) == [0x0900, 0x00FF, 0xFFFF]
+    assert registers(messages.GripperHalt(), closed, act=True) == [0x0100, 0x00FF, 0xFF80]
+    assert registers(messages.GripperHalt(), closed, act=False) == [0, 0x00FF, 0xFF80]
 
 
 def test_replies_are_read_as_the_manual_explains_them():

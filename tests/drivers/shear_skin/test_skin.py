@@ -229,10 +229,10 @@ async def test_a_source_that_breaks_off_in_mid_answer_is_named_counted_and_asked
         await bench.until(lambda: bench.skin.source_diagnostics()["connections"] == 2)
         await bench.next_says()
         # On a busy machine the converter board may be late too, which is no news here.
-        (told,) = (event.sentence for event in bench.events if event.sentence.startswith("The current source"))
-        assert told.startswith(f"The current source broke off in the middle of its answer to {query!r}: ")
+        (sentence,) = (event.sentence for event in bench.events if event.sentence.startswith("The current source"))
+        assert sentence.startswith(f"The current source broke off in the middle of its answer to {query!r}: ")
         assert bench.source_errors == {"lost": 1, "unfinished": 1}
-        assert bench.skin.source_diagnostics()["last_loss"] == told
+        assert bench.skin.source_diagnostics()["last_loss"] == sentence
         assert bench.circuit.output_on, "the current is not interrupted"
 
 
@@ -243,9 +243,9 @@ async def test_a_scanner_that_breaks_off_in_mid_answer_is_named_counted_and_aske
         await bench.next_says()
         facts = bench.skin.diagnostics()
         assert facts["errors"] == {"lost": 1, "unfinished": 1, **errors_of_start(bench)}
-        told = str(facts["last_loss"])
-        assert told.startswith("The scanner broke off in the middle of its answer to 'READ?': 127.0.0.1:")
-        assert told.endswith("has closed the connection; see whether the instrument is still on.")
+        sentence = str(facts["last_loss"])
+        assert sentence.startswith("The scanner broke off in the middle of its answer to 'READ?': 127.0.0.1:")
+        assert sentence.endswith("has closed the connection; see whether the device is still on.")
         # Half an answer is no reading: every voltage is that of a gauge.
         good = [sample for sample in bench.samples if sample.trusted]
         assert all(0.1 < volts < 0.15 for sample in good for volts in (sample.v1_v, sample.v2_v))
@@ -271,11 +271,11 @@ async def test_lines_of_the_board_that_are_missing_torn_or_garbage_are_counted(t
 
 async def test_an_instrument_that_is_no_source_is_refused_by_name():
     scanner = SocketServer(EmulatedScanner(Circuit(Unstrained())))
-    told = LinkEvents()
+    links = LinkEvents()
     async with asyncio.timeout(DEADLINE_S):
         await scanner.restore()
-        source = Keithley6430(TcpLink("127.0.0.1", scanner.port, monitor=LinkMonitor(told)))
+        source = Keithley6430(TcpLink("127.0.0.1", scanner.port, monitor=LinkMonitor(links)))
 
         async with running(pass_on(source.readings(), lambda _: None)):
-            assert "says it is 'Agilent Technologies,34972A" in (await told.down()).sentence
+            assert "says it is 'Agilent Technologies,34972A" in (await links.down()).sentence
         await scanner.disconnect()

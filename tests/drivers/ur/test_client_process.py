@@ -69,8 +69,8 @@ from tests.drivers.ur.flight import Flight
 decoder = MessageDecoder()
 while not (heard := decoder.feed(os.read(0, 1 << 16))):
     pass
-with open(sys.argv[1], "a") as told:
-    print(heard[0][1].takes_over, file=told)
+with open(sys.argv[1], "a") as log:
+    print(heard[0][1].takes_over, file=log)
 flight = Flight()
 flight.fly(CYCLES)
 os.write(1, encode(flight.state))
@@ -88,33 +88,33 @@ decoder, last = MessageDecoder(), None
 while heard := os.read(0, 1 << 16):
     for _, last in decoder.feed(heard):
         pass
-with open(sys.argv[1], "a") as told:
-    print(isinstance(last, Disconnect), file=told)
+with open(sys.argv[1], "a") as log:
+    print(isinstance(last, Disconnect), file=log)
 """
 
 
 async def test_disconnects_and_refuses_what_is_unanswered(play, tmp_path):
-    told = tmp_path / "told"
-    play(f"cd '{ROOT}' && exec '{sys.executable}' -c '{DISCONNECTS}' '{told}'")
+    log = tmp_path / "log"
+    play(f"cd '{ROOT}' && exec '{sys.executable}' -c '{DISCONNECTS}' '{log}'")
     async with asyncio.timeout(60):
         async with running(settings_for("127.0.0.254")) as robot:
             await robot.next_state()
             replied = robot.send(Stop(1.0))
         assert "ended before it answered" in (await replied).refusal
     assert robot.state is None
-    assert told.read_text() == "True\n", "it exits on Disconnect"
+    assert log.read_text() == "True\n", "it exits on Disconnect"
 
 
 # In the first cycle the register is cleared, in the second the program is sent.
 @pytest.mark.parametrize(("cycles", "may_stop"), [(0, "False"), (1, "False"), (2, "True"), (5, "True")])
 async def test_next_worker_may_stop_the_program_left_behind(play, tmp_path, cycles, may_stop):
-    told = tmp_path / "told"
+    log = tmp_path / "log"
     briefly = BRIEFLY.replace("CYCLES", str(cycles))
-    play(f"cd '{ROOT}' && exec '{sys.executable}' -c '{briefly}' '{told}'")
+    play(f"cd '{ROOT}' && exec '{sys.executable}' -c '{briefly}' '{log}'")
     link = LinkEvents()
     async with running(settings_for("127.0.0.254"), link):
         await link.down(2)
-    assert told.read_text().split()[:2] == ["False", may_stop]
+    assert log.read_text().split()[:2] == ["False", may_stop]
 
 
 STALE, PAUSED = {"age_ns": 400_000_000}, {"safety_mode": 3, "runtime_state": 4}

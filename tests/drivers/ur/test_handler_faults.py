@@ -218,6 +218,19 @@ def test_old_samples_block_motion():
     assert flight.wrist_speed == 0, "the program must not be kept going"
 
 
+@pytest.mark.parametrize("begin", [turning, lambda: moving(3)], ids=["wrist", "line"])
+def test_stop_that_meets_an_old_sample_stops(begin):
+    """The sample before it and the one after it are fit."""
+    flight = begin()
+    flight.arm.be(age_ns=260_000_000)
+    assert "stops by itself" in flight.ask(Stop(4.0)).refusal
+    flight.arm.be(age_ns=0)
+    flight.arm.calls.clear()
+    flight.fly(30)
+    assert flight.arm.calls == []
+    assert not flight.arm.reading.program_running
+
+
 def test_old_samples_at_rest_need_only_an_enable():
     flight = flying()
     flight.arm.be(age_ns=300_000_000)

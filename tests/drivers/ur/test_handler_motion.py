@@ -150,7 +150,7 @@ def test_stop_is_sent_at_once_and_ends_before_another_motion_begins():
     assert (flight.arm.calls, flight.arm.target) == (["wrist"], 0.0)
     flight.fly(1)
     assert flight.state.motion == "stopping"
-    assert "still stopping" in flight.ask(WristSpeed(0.5, 1.0)).refusal
+    assert flight.ask(WristSpeed(0.5, 1.0)).refusal == "The arm is still stopping (stopped on command)."
     assert "stop it before" in flight.ask(MoveLinear(POSE, 0.1, 0.1)).refusal
     state = flight.fly_until(lambda state: state.motion == "idle")
     assert state.end_reason == "stopped on command"

@@ -205,14 +205,14 @@ def test_network_error_is_a_lost_connection(play, number):
 
 
 @pytest.mark.parametrize(
-    ("answers", "told"),
+    ("answers", "refusal"),
     [
         (((TOOL_TYPES.replace(b"UINT32", b"NOT_FOUND"), TYPES.replace(b"UINT32", b"NOT_FOUND")),), "NOT_FOUND"),
         (((TOOL_TYPES,), b"\x00"), "does not send its state"),
         (((TOOL_TYPES,), b"\x01", b"\x00IN_USE"), "already in use by another RTDE client"),
     ],
 )
-def test_controller_without_the_needed_outputs_is_refused(play, answers, told):
+def test_controller_without_the_needed_outputs_is_refused(play, answers, refusal):
     play(*answers)
-    with pytest.raises(ProbeError, match=told):
+    with pytest.raises(ProbeError, match=refusal):
         RtdeReceiver("127.0.0.1", 125.0, 5.0)

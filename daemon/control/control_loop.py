@@ -264,6 +264,7 @@ class ControlLoop:
             )
         found = [*detect_faults(self.inputs, watched, self.config, t_ns), *self._reported]
         self._reported.clear()
+        self.inputs.unjudged.clear()
         if grip.release_error:
             found.append(Fault(FaultCode.NOT_RELEASED, grip.release_error))
         if experiment is None or not active:

@@ -161,8 +161,7 @@ async def test_a_tool_is_gripped_twisted_and_released(rig_config, tiny_bank, tmp
 
 def write_calibration(bank: Path, path: Path, gain: float) -> None:
     """Calibrate the right fingertip on torques that are too large by a factor."""
-    ((tool_mm, recorded),) = record(bank, 3, (20.0,))
-    series = recorded.series(tool_mm)
+    (series,) = record(bank, 3, (20.0,))
     calibrate([replace(series, torque_nm=gain * series.torque_nm)], ("right",)).save(path)
 
 

@@ -198,12 +198,10 @@ def test_the_readmes_path_from_the_demo_to_a_calibration_of_ones_own(tree):
     assert [topic for topic, *_ in same] == ["eit.estimate", "eit.frame", "load.torque"]
     assert all(made == recorded and int(made) > 100 for _, made, recorded in same)
     assert "Estimator motion_regression, torque from" in tree.shell(calibrate).stdout
-    figures = dict(
-        line.split(maxsplit=1) for line in tree.shell(evaluate).stdout.splitlines() if re.match(r"\w+ +\S+$", line)
-    )
-    assert float(figures["r"]) > 0.9
-    assert float(figures["rmse_nm"]) < 0.02
-    assert float(figures["valid_fraction"]) > 0.3
+    figures = json.loads(tree.shell(f"{evaluate} --json").stdout)
+    assert figures["r"] > 0.9
+    assert figures["rmse_nm"] < 0.02
+    assert figures["valid_fraction"] > 0.3
     assert (tree.root / "run" / "my.png").read_bytes().startswith(b"\x89PNG")
     (recording,) = (tree.root / "recordings/second").glob("*.mcap")
     example = readme_program().replace("fingertip.cal", "run/my.cal").replace("twists.mcap", str(recording))

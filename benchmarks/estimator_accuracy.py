@@ -132,10 +132,10 @@ def other_recordings(recordings: Path, scratch: Path) -> Iterator[tuple[str, dic
 
 def other_tools(bank: Path, seed: int, repeats: int) -> Iterator[tuple[int, tuple[str, ...], Figures]]:
     """Yield the number of cylinders, the fingertips, and the figures on the emulated rig's other tools."""
-    tools = [one.series(mm) for mm, one in record(bank, seed, TOOLS_MM)]
+    tools = list(record(bank, seed, TOOLS_MM))
     for number, cylinders_mm in enumerate(CYLINDERS_MM):
         seeds = [seed + 1000 * (1 + number) + 100 * i for i in range(repeats)]
-        known = [[one.series(mm) for mm, one in record(bank, each, cylinders_mm)] for each in seeds]
+        known = [list(record(bank, each, cylinders_mm)) for each in seeds]
         for sides in (tuple(SIDES), *((side,) for side in SIDES)):
             tracks = [estimate_series(calibrate(one, sides), tool) for one in known for tool in tools]
             yield len(cylinders_mm), sides, figures_of(tracks)

@@ -5,7 +5,7 @@
 Methods take turns, so that a busy moment of the machine affects all alike; medians and quartiles are over the turns.
 `pip install -e '.[bench]'` installs pyEIT; without it its row is missing.
 EIDORS needs MATLAB or Octave, so its time is cited. `--every N` also checks every N-th recorded frame against the
-reference matchers, with runner-up, which takes a tenth of a second a frame and more.
+reference matchers, which takes a tenth of a second a frame and more.
 """
 
 import os
@@ -99,11 +99,9 @@ def match_methods(bank: Bank, frames: FloatArray) -> dict[str, tuple[Run, int]]:
         ]
 
     return {
-        "zero lag, pruned": (lambda: [zero.match(frame, runner_up=False) for frame in frames], n),
-        "zero lag, pruned, with runner-up": (lambda: [zero.match(frame) for frame in frames], n),
+        "zero lag, pruned": (lambda: [zero.match(frame) for frame in frames], n),
         "zero lag, numpy float32": (lambda: [int(np.argmax(signals @ frame)) for frame in single], n),
-        "all lags, pruned": (lambda: [every.match(frame, runner_up=False) for frame in frames], n),
-        "all lags, pruned, with runner-up": (lambda: [every.match(frame) for frame in frames], n),
+        "all lags, pruned": (lambda: [every.match(frame) for frame in frames], n),
         "all lags, numpy float32 FFT": (by_fft, 4),
     }
 
@@ -156,17 +154,17 @@ def take_turns(methods: Mapping[str, tuple[Run, int]], turns: int) -> dict[str, 
 
 
 def cold_seconds(bank: Bank, frames: FloatArray, turns: int) -> dict[str, list[float]]:
-    """Return the median seconds of a match with runner-up in every turn, with cold caches as in a daemon."""
+    """Return the median seconds of a match in every turn, with cold caches as in a daemon."""
     matchers = {name: fast.from_bank(bank) for name, (_, fast) in MATCHERS.items()}
     memory = np.zeros(CACHE_BYTES // 8)
-    found: dict[str, list[float]] = {f"{name}, cold, with runner-up": [] for name in matchers}
+    found: dict[str, list[float]] = {f"{name}, cold": [] for name in matchers}
     for _ in range(turns):
         for name, matcher in matchers.items():
             taken = []
             for frame in frames:
                 memory += 1.0
                 taken.append(timeit(partial(matcher.match, frame), number=1))
-            found[f"{name}, cold, with runner-up"].append(statistics.median(taken))
+            found[f"{name}, cold"].append(statistics.median(taken))
     return found
 
 

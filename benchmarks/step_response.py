@@ -251,7 +251,7 @@ def measure(seeds: int) -> dict[str, Any]:
 
 def rig_calibration(bank: Path, seed: int) -> Calibration:
     """Return the default estimator's calibration of both fingertips on the rig's frames."""
-    return calibrate([recorded.series(mm) for mm, recorded in record(bank, seed, (DIAMETER_MM,))], tuple(SIDES))
+    return calibrate(list(record(bank, seed, (DIAMETER_MM,))), tuple(SIDES))
 
 
 def estimator_in_the_loop(bank: Path, calibration: Calibration, seeds: Sequence[int]) -> dict[str, float]:

@@ -63,11 +63,6 @@ class Cause:
         """The longest time to standstill that docs/safety.md allows."""
         return PROMISE_S + self.noticed_s
 
-    @property
-    def ends_daemon(self) -> bool:
-        """Whether the daemon has to be started again."""
-        return any(process == "daemon" for process, _ in self.signals)
-
 
 def _periods_s(topic: str, count: float) -> float:
     return count / (TOPICS[topic].rate_hz or 1.0)
@@ -231,7 +226,7 @@ class RunningRig:
         """End the cause and the experiment."""
         self.order("normal")
         self.order("object 20")
-        if cause.ends_daemon:
+        if any(process == "daemon" for process, _ in cause.signals):
             self.daemon.kill()
             self._start_daemon()
         else:

@@ -18,7 +18,7 @@ MOST_CALLABLES = 0.05
 # Models of configuration and messages are tables: they have as many columns as users need.
 TABLES = ("BaseModel", "ConfigModel", "Message", "NamedTuple")
 # Plain values that are made in one place, and whose parts are not used on their own.
-WIDE_VALUES = {"ControllerSettings", "Estimate", "RtdeSample"}
+WIDE_VALUES = {"ControllerSettings", "Estimate", "RtdeOutputs"}
 # Objects of libraries are set up by assignment.
 OF_LIBRARIES = ("parser", "action", "config", "tqdm", "sys")
 

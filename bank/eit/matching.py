@@ -158,28 +158,21 @@ def unit_magnitudes(differences: ArrayLike, n_channels: int) -> FloatArray:
     return np.asarray(magnitudes / np.linalg.norm(magnitudes, axis=1, keepdims=True))
 
 
-def signal_above_noise(difference: ArrayLike, noise_std: ArrayLike) -> str | None:
+def signal_above_noise(difference: FloatArray, noise_std: FloatArray) -> str | None:
     """Return why an (n,) difference is no signal and must not be matched, or None where it exceeds the noise.
 
-    noise_std is the difference's standard deviation from noise alone, (n,) or one number. For independent Gaussian
-    noise Σ (difference/noise_std)² is χ² distributed with n degrees of freedom; a signal exceeds its quantile at
-    1 − FALSE_ALARM. Raises MatchingError for values that are not finite and for a noise that is not above zero.
+    noise_std (n,) is the difference's standard deviation from noise alone. For independent Gaussian noise
+    Σ (difference/noise_std)² is χ² distributed with n degrees of freedom; a signal exceeds its quantile at
+    1 − FALSE_ALARM.
     """
-    values, noise = np.asarray(difference, dtype=np.float64), np.asarray(noise_std, dtype=np.float64)
-    if values.ndim != 1 or noise.shape not in ((), values.shape):
-        raise MatchingError(
-            f"a difference has a value for each channel; the arrays have shapes {values.shape}, {noise.shape}"
-        )
-    if not (np.isfinite(values).all() and np.isfinite(noise).all() and (noise > 0).all()):
-        raise MatchingError("the difference must be finite, and its noise finite and above zero, in all channels")
     with np.errstate(over="ignore"):  # infinite energy is still a signal
-        energy = float(np.sum((values / noise) ** 2))
-    least = float(chdtri(values.size, FALSE_ALARM))
+        energy = float(np.sum((difference / noise_std) ** 2))
+    least = float(chdtri(len(difference), FALSE_ALARM))
     if energy > least:
         return None
     return (
-        f"no signal above the noise: the difference is {np.sqrt(energy / values.size):.2f} times the noise, "
-        f"and a signal needs {np.sqrt(least / values.size):.2f} times"
+        f"no signal above the noise: the difference is {np.sqrt(energy / len(difference)):.2f} times the noise, "
+        f"and a signal needs {np.sqrt(least / len(difference)):.2f} times"
     )
 
 

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
 
 _SUBDIVISIONS = 5
-# Triangles computed at a time: small enough for the processor's caches.
-_AT_ONCE = 1300
 # Of a height, in shares of the fingertip's, in which two triangles are alike.
 _DIGITS = 12
 # An axis turned this far lies across the fingertip.
@@ -78,14 +76,8 @@ def _cut_linear(y: FloatArray, k: float, sigma: float, c: float) -> FloatArray:
 
 
 def _gaussian_derivative(y: FloatArray, k: float, sigma: float, c: float) -> FloatArray:  # noqa: ARG001 - as above
-    # In place: allocating memory takes longer than the arithmetic.
     d = y - k
-    f = d * d
-    f *= -0.5 / np.square(sigma)
-    np.exp(f, out=f)
-    f *= d
-    f *= -1 / np.square(sigma)
-    return f
+    return np.asarray(np.exp(d * d * (-0.5 / np.square(sigma))) * d * (-1 / np.square(sigma)))
 
 
 def _modulated_gaussian(y: FloatArray, k: float, sigma: float, c: float) -> FloatArray:
@@ -146,8 +138,7 @@ class ConductivityModel:
         rounded = np.round(corners / mesh.height_cm, _DIGITS)
         _, first, self._alike = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
         corners = corners[first]
-        points = corners @ averaging_points().T
-        self._heights = [np.ascontiguousarray(part.T) for part in np.array_split(points, -(-len(points) // _AT_ONCE))]
+        self._heights = np.ascontiguousarray((corners @ averaging_points().T).T)
 
     def conductivity(self, model: str, k: float, sigma: float) -> FloatArray:
         """Return the (T,) conductivity; errors as `conductivity`."""
@@ -156,7 +147,6 @@ class ConductivityModel:
             raise ModelError(f"k and sigma must be finite numbers, not k = {k} and sigma = {sigma}")
         if sigma <= 0 and basis.uses_sigma:
             raise ModelError(f"sigma must be above 0 for the model {model}, not {sigma}")
-        means = [basis.function(heights, k, sigma, self._centre).sum(axis=0) for heights in self._heights]
-        shape = np.concatenate(means) / len(self._heights[0])
+        shape = basis.function(self._heights, k, sigma, self._centre).sum(axis=0) / len(self._heights)
         values: FloatArray = (1.0 + self._variation.offset + self._variation.amplitude * shape)[self._alike]
         return values

@@ -19,7 +19,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import count
 from operator import itemgetter
 from typing import Any, NamedTuple
@@ -50,23 +50,14 @@ FINE_RANK = 96
 # Number of groups, and the mean number of cells in a group at least.
 _N_GROUPS = 512
 _MIN_GROUP_CELLS = 4
-# Groups are split by their radius plus ρ times a usual t.
-_USUAL_T = 0.5
-# Frames fall where cells are dense, so groups of many cells are split slightly sooner.
-_CROWDING = 0.1
 # Rounding of float32 in a bound, and in the square of t. Sums of 98 products and a transform of 1792 values of norm 1
 # lose 5e-6 by the usual estimates; 3e-7 is observed.
 ROUNDING = 2e-5
 _SQUARE_ROUNDING = 4e-6
 # Rounding of float64 in the square of ρ.
 _SQUARE_ROUNDING_64 = 1e-12
-# Rounding of a sum of a thousand products in float64; where a tie hangs on less, the reference decides. In float32.
+# Rounding of a sum of a thousand products in float64; where a tie hangs on less, the reference decides.
 _ROUNDING_64 = 1e-14
-_ROUNDING_32 = 6e-5
-# With more lags than this, a transform costs less per cell than the products.
-_FEW_LAGS = 128
-# With fewer cells, a first look in float32 costs more than it saves.
-_FEW_CELLS = 48
 # With fewer cells, the whole heatmap at all lags is faster than pruning.
 MIN_PRUNED_CELLS = 300
 # The runner-up may be this much worse than the best cell at lag 0 before groups are bounded a second time.
@@ -183,16 +174,15 @@ def _group_row(cells: Float32Array) -> Float32Array:
 def _partition(cells: Float32Array, size: int) -> list[tuple[IntArray, Float32Array]]:
     """Split the cells into as many groups as `size`, or fewer where cells are alike.
 
-    Returns every group's cells and the row that bounds them. The group with the widest bound is split in two, between
+    Returns every group's cells and the row that bounds them. The group of the largest radius is split in two, between
     the cell farthest from its centre and the cell farthest from that one.
     """
     order = count()
 
     def entry(chosen: IntArray) -> tuple[float, int, IntArray, Float32Array]:
         row = _group_row(cells[chosen])
-        radius, left_out = row[-2:].tolist()
-        width = (radius + _USUAL_T * left_out) * len(chosen) ** _CROWDING if radius > ROUNDING else 0.0
-        return -width, next(order), chosen, row
+        radius = float(row[-2])
+        return -radius if radius > ROUNDING else 0.0, next(order), chosen, row
 
     heap = [entry(np.arange(len(cells)))]
     while len(heap) < size and heap[0][0] < 0:
@@ -301,15 +291,14 @@ class AllLagsBounds:
 
     def _bound_groups(self, score: float) -> None:
         """Bound the groups at all lags that let any cell reach the score."""
-        bank, spectra, n = self._matcher.compressed, self._matcher.spectra, self._matcher.n_channels
+        bank, n = self._matcher.compressed, self._matcher.n_channels
         self._bounded_down_to = score
         overlap = bank.overlaps * np.sqrt(self._energies) >= score - ROUNDING
         first, end = int(overlap.argmax()), 2 * n - int(overlap[::-1].argmax())
-        length = next(one for one in spectra if one >= max(2 * n - first, end))
         single = self._padded[n : 2 * n].astype(np.float32)
-        parts = fft.irfft(fft.rfft(single, length) * spectra[length], length)
+        parts = fft.irfft(fft.rfft(single, 2 * n) * self._matcher.spectra, 2 * n)
         self._lags = np.arange(first, end)
-        numbers = np.concatenate([parts[:, length + first - n :], parts[:, : end - n]], axis=1)
+        numbers = np.concatenate([parts[:, n + first :], parts[:, : end - n]], axis=1)
         self._columns = columns(numbers, self._energies[first:end])
         self._group_bounds = bank.groups @ self._columns
         self._highest = self._group_bounds.max(axis=0)
@@ -334,55 +323,42 @@ class _PruningMatcher(Matcher):
         self._norms = np.concatenate([np.linalg.norm(self._magnitudes(cells), axis=1) for cells in self._chunks()])
         self._row, self._column = np.divmod(self._cells, valid.shape[1])
 
-    def match(self, difference: ArrayLike, *, runner_up: bool = True) -> Match:
+    def match(self, difference: ArrayLike) -> Match:
         """Return what `best_match` finds in the heatmap of one (n,) difference, at a fraction of its cost.
 
-        Without `runner_up`, that is None. Raises MatchingError as `heatmap` does.
+        Raises MatchingError as `heatmap` does.
         """
         if len(self._cells) >= self._min_cells:
             (frame,) = unit_magnitudes(np.asarray(difference)[None], self.n_channels)
             with suppress(_UndecidedError):
-                return self._search(frame, runner_up)
-        match = super().match(difference)
-        return match if runner_up else replace(match, runner_up=None, runner_up_cell=None)
+                return self._search(frame)
+        return super().match(difference)
 
     @abstractmethod
-    def _search(self, frame: FloatArray, runner_up: bool) -> Match: ...
+    def _search(self, frame: FloatArray) -> Match: ...
 
-    def _best_candidate(
-        self, frame: FloatArray, candidates: Candidates, reached: float, seed: int = -1
-    ) -> tuple[int, float]:
+    def _best_candidate(self, candidates: Candidates, reached: float) -> tuple[int, float]:
         """Return the cell of the highest score, the lowest of those that tie, and the score.
 
-        One of the candidates must reach the score `reached`: `seed`, where that is known.
+        One of the candidates must reach the score `reached`.
         """
         likeliest = int(candidates.cells[candidates.bounds.argmax()])
-        if likeliest != seed:
-            reached = max(reached, self.score(likeliest, candidates.frames))
+        reached = max(reached, self.score(likeliest, candidates.frames))
         cells = candidates.cells[candidates.bounds >= reached - ROUNDING]
         parts = [
-            self._contenders(frame, cells[i : i + CHUNK_CELLS], candidates.frames, reached)
+            self._highest_scores(cells[i : i + CHUNK_CELLS], candidates.frames)
             for i in range(0, len(cells), CHUNK_CELLS)
         ]
-        cells, scores = parts[0] if len(parts) == 1 else (np.concatenate(each) for each in zip(*parts, strict=True))
+        scores = np.concatenate(parts)
         behind = scores.max() - scores
         if (np.abs(behind - TIE) < _ROUNDING_64).any():
             raise _UndecidedError
         winner = int(np.argmax(behind <= TIE))
         return int(cells[winner]), min(float(scores[winner]), 1.0)
 
-    def _contenders(
-        self, frame: FloatArray, cells: IntArray, frames: FloatArray, reached: float
-    ) -> tuple[IntArray, FloatArray]:
-        """Return the cells that may score `reached`, and their scores at the lags of (m, n) frames."""
-        if len(frames) > _FEW_LAGS:
-            return cells, self._scores(frame[None], self._unit_signals(self._cells[cells]))[0]
-        magnitudes = np.abs(self._signals.take(self._cells[cells], axis=0))
-        if len(cells) > _FEW_CELLS:
-            nearly = (frames.astype(np.float32) @ magnitudes.T).max(axis=0) / self._norms[cells]
-            close = np.flatnonzero(nearly >= reached - _ROUNDING_32)
-            cells, magnitudes = cells[close], magnitudes[close]
-        return cells, (frames @ magnitudes.astype(np.float64).T).max(axis=0) / self._norms[cells]
+    def _highest_scores(self, cells: IntArray, frames: FloatArray) -> FloatArray:
+        """Return the highest scores of cells at the lags of (m, n) frames."""
+        return np.asarray((frames @ self._magnitudes(self._cells[cells]).T).max(axis=0) / self._norms[cells])
 
     def score(self, cell: int, frames: FloatArray) -> float:
         """Return a cell's highest score at the lags of (m, n) frames."""
@@ -413,20 +389,17 @@ class _PruningMatcher(Matcher):
 class PrunedZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
     """Matches at lag 0 alone. All cells are bounded at once: one lag takes few operations per cell."""
 
-    def _search(self, frame: FloatArray, runner_up: bool) -> Match:
+    def _search(self, frame: FloatArray) -> Match:
         bounds = ZeroLagBounds(self.compressed, frame)
-        best = self._best(frame, bounds)
+        best = self._best(bounds)
         outside = self._outside(best[0], RUNNER_UP_RADIUS)
-        if not (runner_up and outside.any()):
-            return self._match(best, None)
         bounds.leave_out(~outside)
-        return self._match(best, self._best(frame, bounds))
+        return self._match(best, self._best(bounds) if outside.any() else None)
 
-    def _best(self, frame: FloatArray, bounds: ZeroLagBounds) -> tuple[int, float]:
+    def _best(self, bounds: ZeroLagBounds) -> tuple[int, float]:
         """Return the cell of the highest score among those not left out, and the score."""
-        seed = bounds.seed()
-        reached = self.score(seed, bounds.frames)
-        return self._best_candidate(frame, bounds.candidates(reached), reached, seed)
+        reached = self.score(bounds.seed(), bounds.frames)
+        return self._best_candidate(bounds.candidates(reached), reached)
 
 
 class PrunedMatcher(_PruningMatcher, ReferenceMatcher):
@@ -437,24 +410,20 @@ class PrunedMatcher(_PruningMatcher, ReferenceMatcher):
     def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Compress the bank; arguments and errors as `Matcher`."""
         super().__init__(signals, valid, k_grid, sigma_grid)
-        # The conjugate transforms of the basis's first directions, (r, l // 2 + 1), by length l. The shorter one serves
-        # where only small lags can matter.
-        lengths, directions = (10 * self.n_channels // 7, 2 * self.n_channels), self.compressed.basis[:COARSE_RANK]
-        self.spectra = {length: np.conj(fft.rfft(directions, length)) for length in lengths}
+        # The conjugate transforms (r, n + 1) of the basis's first directions.
+        self.spectra = np.conj(fft.rfft(self.compressed.basis[:COARSE_RANK], 2 * self.n_channels))
 
-    def _search(self, frame: FloatArray, runner_up: bool) -> Match:
+    def _search(self, frame: FloatArray) -> Match:
         bounds = AllLagsBounds(self, frame)
         near, reached = bounds.reached
-        if not runner_up:
-            return self._match(self._best_candidate(frame, bounds.candidates(reached), reached), None)
         # A cell outside at twice the radius is outside the peak of every cell in this peak.
         far, least = bounds.seed(self._outside(near, 2 * RUNNER_UP_RADIUS)) or (-1, 0.0)
         candidates = bounds.candidates(min(reached, least))
-        best = self._best_candidate(frame, candidates, reached)
+        best = self._best_candidate(candidates, reached)
         outside = self._outside(best[0], RUNNER_UP_RADIUS)
         if far >= 0 and not outside[far]:
             _, least = bounds.seed(outside) or (-1, 0.0)
             candidates = bounds.candidates(least)
         kept = outside[candidates.cells]
         rest = Candidates(candidates.cells[kept], candidates.bounds[kept], candidates.frames)
-        return self._match(best, self._best_candidate(frame, rest, least) if len(rest.cells) else None)
+        return self._match(best, self._best_candidate(rest, least) if len(rest.cells) else None)

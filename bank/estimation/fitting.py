@@ -303,7 +303,7 @@ def _fit_slices(
             estimator.slices_fit(quantity, values[known]),
             strengths=estimator.strengths,
             left_out=later_origins(n) if quantity == "torque" else (),
-            test=test if quantity == "torque" else None,
+            mixtures=test.accepted if quantity == "torque" else None,
             fit_line=estimator.line_fit(),
             full_range=full_range,
         )
@@ -336,7 +336,6 @@ class ContaminationTest:
         ]
         self._foreign = [mean[channels] for channels in numberings]
         self._every = np.ones(table.n_channels, dtype=np.bool_)
-        self._detectors: dict[bytes, NoveltyDetector] = {}
         self._features: dict[tuple[int, int, float], FloatArray] = {}
 
     def features(self, difference: FloatArray, row: int) -> FloatArray:
@@ -346,7 +345,7 @@ class ContaminationTest:
 
     def accepted(self, past: IntArray, future: IntArray) -> Mixtures:
         """Return the mixtures of later slices that a detector fitted to the earlier ones accepts."""
-        detector = self._detector(past)
+        detector = NoveltyDetector.fit(self._differences[past], self._estimator.table)
         chosen = future[np.unique(np.linspace(0, len(future) - 1, min(len(future), _MOST_LATER)).astype(int))]
         rows, features, limit_shares = [], [], []
         for row in chosen.tolist():
@@ -363,12 +362,6 @@ class ContaminationTest:
                         self._features[key] = self.features(mixed, row)[self._estimator.columns["torque"]]
                     features.append(self._features[key])
         return Mixtures(np.array(rows, dtype=np.int64), np.array(features), np.array(limit_shares))
-
-    def _detector(self, past: IntArray) -> NoveltyDetector:
-        key = past.tobytes()
-        if key not in self._detectors:
-            self._detectors[key] = NoveltyDetector.fit(self._differences[past], self._estimator.table)
-        return self._detectors[key]
 
 
 def _consecutive(times: list[FloatArray]) -> FloatArray:

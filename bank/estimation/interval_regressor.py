@@ -12,7 +12,7 @@ ones. On torques of another recording the error of the gain is added, which grow
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Protocol, Self, TypeAlias
+from typing import ClassVar, Self, TypeAlias
 
 import numpy as np
 from scipy.special import stdtrit
@@ -140,13 +140,8 @@ class CensoredRidge(Ridge):
 Regressor: TypeAlias = Ridge | CensoredRidge | InverseCalibration
 RegressorFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Regressor]
 Refit: TypeAlias = Callable[[IntArray], Regressor]
-
-
-class SlicesTest(Protocol):
-    """A test of later slices by detectors fitted to earlier ones."""
-
-    def accepted(self, past: IntArray, future: IntArray) -> Mixtures:
-        """Return the accepted mixtures of later rows with foreign signals."""
+# Returns the mixtures of later rows with foreign signals that a detector fitted to earlier rows accepts.
+AcceptedMixtures: TypeAlias = Callable[[IntArray, IntArray], Mixtures]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -322,7 +317,9 @@ class IntervalRegressor:
         parts = np.array([weighted[:, sides == side].sum(axis=1) + constant / m for side in range(m)]).T
         correction = self.gain.correct(parts, sign * torque_nm, twists, bounded=lever)
         factors, loaded = correction.factors, np.concatenate(twists)
-        total = float((parts[loaded] @ factors).sum() / parts[loaded].sum())
+        # Torques of both directions would cancel in a sum.
+        before = parts[loaded].sum(axis=1)
+        total = float(parts[loaded] @ factors @ before / (before @ before))
         weights, larger = point.weights * factors[sides], max(total, 1.0)
         offset = constant * float(factors.mean()) + float(point.mean @ weights) + correction.offset_nm
         adapted = replace(
@@ -387,7 +384,7 @@ def fit_interval_regressor(
     strengths: tuple[float, ...] = STRENGTHS,
     limit_features: bool = False,
     left_out: Sequence[tuple[IntArray, IntArray]] = (),
-    test: SlicesTest | None = None,
+    mixtures: AcceptedMixtures | None = None,
     fit_line: RegressorFit | None = None,
     bounds: tuple[FloatArray, FloatArray] | None = None,
     full_range: bool = False,
@@ -396,8 +393,8 @@ def fit_interval_regressor(
 ) -> IntervalRegressor:
     """Fit to (n, d) features and (n,) values in time order.
 
-    `left_out` are pairs of rows to fit to and rows to validate on; by default blocks of time in turn. With a `test`
-    intervals cover the error of accepted mixtures and values keep their sign; unless they cover the `full_range` that
+    `left_out` are pairs of rows to fit to and rows to validate on; by default blocks of time in turn. With `mixtures`
+    intervals cover the error of accepted ones and values keep their sign; unless they cover the `full_range` that
     will ever occur, `fit_line` fits what reads values beyond it. `bounds` are the least and largest value (n,) that
     each frame may have: intervals extend to the further one. With the number of each row's recording, `recordings`
     (n,), intervals allow for the gain of another recording of as many `fingertips`. Raises CalibrationError where the
@@ -429,7 +426,7 @@ def fit_interval_regressor(
     intervals, widening = Intervals.fit(predicted, residuals, edges, inflation, least), 1.0
     # Before widening for unknown times: a load that is not seen is not seen at any time.
     half = np.array([intervals.half_width(one) for one in predicted])
-    misses_loads = test is None and _misses_loads(truth, np.abs(residuals) <= half)
+    misses_loads = mixtures is None and _misses_loads(truth, np.abs(residuals) <= half)
     if bounds is not None:
         if not left_out:
             # Unknown times mean few loads, in a block or two each.
@@ -439,8 +436,8 @@ def fit_interval_regressor(
         intervals = Intervals.fit(predicted, errors, edges, inflation, least)
         widening = float(intervals.half_widths[-1] / known)
     span, contamination, line = ValueRange(float(values.min()), float(values.max())), (0.0, 0.0), None
-    if test is not None:
-        tested = ((part, test.accepted(*block)) for part, block in zip(parts, blocks, strict=True))
+    if mixtures is not None:
+        tested = ((part, mixtures(*block)) for part, block in zip(parts, blocks, strict=True))
         contamination = _contamination(features, values, tested, inflation)
         span, line = _range_of_slices(point, features, values, refit, None if full_range else refit_line)
     gains = [] if recordings is None else _gains_of_recordings(features, values, recordings, refit)

@@ -7,7 +7,7 @@ limits come from stretches of time that were left out in turn (docs/charts.md).
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -128,12 +128,15 @@ class NoveltyDetector:
         whole = cls._model(differences)
         largest_t2 = max(*t2, *(whole.t2(one, every) for one in differences))
         least = 0.5 * float(np.linalg.norm(differences, axis=1).min() / np.sqrt(table.n_channels))
-        return cls(
-            whole.mean, whole.spread, whole.directions, whole.variances, least,
-            _Q_MARGIN * float(largest_q),
-            max(_Q_MARGIN * float(outlying), _LEAST_OUTLYING), _T2_MARGIN * largest_t2,
-            ReciprocityCheck.fit(differences, table), float(np.quantile(responses, LEVEL)),
-        )  # fmt: skip
+        return replace(
+            whole,
+            least_norm=least,
+            largest_q=_Q_MARGIN * float(largest_q),
+            largest_outlying=max(_Q_MARGIN * float(outlying), _LEAST_OUTLYING),
+            largest_t2=_T2_MARGIN * largest_t2,
+            reciprocity=ReciprocityCheck.fit(differences, table),
+            typical_response=float(np.quantile(responses, LEVEL)),
+        )
 
     @classmethod
     def _model(cls, differences: FloatArray) -> Self:

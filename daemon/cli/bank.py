@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from shearloop.bank.eit.bank_file import Bank, BankDefinition
     from shearloop.bank.eit.build import BankRow
     from shearloop.bank.eit.mesh import Mesh
-    from shearloop.daemon.bank_config import BankPlan
 
 run = run_action
 
@@ -77,6 +76,7 @@ def _build_all(args: argparse.Namespace) -> int:
     from shearloop.bank.eit.bank_file import BANK_MAGIC, Bank
     from shearloop.bank.eit.build import build_bank, solve_row
     from shearloop.bank.errors import EmptyBankError
+    from shearloop.daemon.analysis.reproduce.banks import is_built
     from shearloop.daemon.bank_config import load_bank_plans
     from shearloop.daemon.executors import open_executor
 
@@ -96,7 +96,7 @@ def _build_all(args: argparse.Namespace) -> int:
                 yield rows[number], cells
 
         for path, plan in zip(paths, plans.values(), strict=True):
-            if len(paths) > 1 and is_built(path, plan):
+            if len(paths) > 1 and is_built(path, plan.definition):
                 built.append(path)
                 continue
             try:
@@ -133,20 +133,6 @@ def _paths(out: Path, names: list[str]) -> list[Path]:
     except OSError as error:
         raise UserError(f"{out}: the banks need a folder there: {error.strerror}; choose another --out") from error
     return [out / f"{name}.bank" for name in names]
-
-
-def is_built(path: Path, plan: "BankPlan") -> bool:
-    """Return whether an earlier build has finished this bank."""
-    from shearloop.bank.eit.bank_file import Bank
-    from shearloop.bank.errors import BankFileError
-
-    if not path.exists():
-        return False
-    try:
-        return Bank.open(path, verify=True).identity == plan.definition.identity
-    except BankFileError:
-        print(f"{path}: it cannot be used, and is built again", file=sys.stderr)
-        return False
 
 
 def _result(path: Path, bank: "Bank") -> dict[str, Any]:

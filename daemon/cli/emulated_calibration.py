@@ -7,20 +7,20 @@ several cylinders. It runs on the emulated rig's physics in simulated time, so t
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.eit.build import build_bank
-from shearloop.bank.eit.channels import ChannelTable
 from shearloop.bank.estimation import Calibration, FrameSeries, fit, measure_timing
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
+from shearloop.daemon.analysis.reproduce.banks import is_built
 from shearloop.daemon.analysis.series import series_of
 from shearloop.daemon.bank_config import load_bank_plan
-from shearloop.daemon.cli.bank import is_built
 from shearloop.daemon.cli.options import checked_jobs, writing
 from shearloop.daemon.cli.terminal import progress_bar
 from shearloop.daemon.recording.reader import read_recording
@@ -57,41 +57,11 @@ def lines_of(scene: Scene, frames: RigFrames) -> list[NDArray[np.float64]]:
     return [frames.line(gel.grip, sign * gel.shear_torque_nm, gel.diameter_mm) for sign in SIDES.values()]
 
 
-@dataclass(slots=True)
-class RecordedTwists:
-    """Frames and torques with their simulated times."""
-
-    table: ChannelTable
-    frame_s: list[float] = field(default_factory=list)
-    lines: list[list[NDArray[np.float64]]] = field(default_factory=list)
-    torque_s: list[float] = field(default_factory=list)
-    torque_nm: list[float] = field(default_factory=list)
-
-    def series(self, diameter_mm: float) -> FrameSeries:
-        """Return the series that a reader makes of the recording."""
-        t_s = np.array(self.frame_s)
-        channels = np.array([[self.table.channels_of_line(line) for line in pair] for pair in self.lines])
-        torque = np.array(self.torque_s), np.array(self.torque_nm)
-        return FrameSeries(
-            "raw", tuple(SIDES), t_s, channels, *torque, np.full(len(t_s), diameter_mm), table=self.table
-        )
-
-    def write(self, path: Path, diameter_mm: float) -> None:
-        """Write a recording that begins at the Unix time 0."""
-        notes = {DIAMETER_NOTE: f"{diameter_mm:g}"}
-        with RecordingWriter(path, SOURCE, notes, self.table) as writer:
-            for t_s, pair in zip(self.frame_s, self.lines, strict=True):
-                for side, line in zip(SIDES, pair, strict=True):
-                    writer.add_frame(side, round(t_s * 1e9), round((t_s + FRAME_PERIOD_S / 2) * 1e9), line)
-            for t_s, torque_nm in zip(self.torque_s, self.torque_nm, strict=True):
-                writer.add_torque(round(t_s * 1e9), torque_nm)
-
-
 class TwistPlayer:
-    """One scene with a tool, and its recording."""
+    """One scene with a tool, which is recorded from the Unix time 0 on."""
 
-    def __init__(self, frames: RigFrames, diameter_mm: float, seed: int) -> None:
-        self.recorded = RecordedTwists(frames.table)
+    def __init__(self, frames: RigFrames, diameter_mm: float, seed: int, writer: RecordingWriter) -> None:
+        self._writer = writer
         self._random = np.random.default_rng(seed)
         self._frames = frames
         self._gripper = Gripper(object_mm=diameter_mm)
@@ -137,24 +107,13 @@ class TwistPlayer:
         now_s = self._scene.time_s
         if now_s >= self._due_frame_s:
             self._due_frame_s += FRAME_PERIOD_S
-            self.recorded.frame_s.append(now_s - FRAME_PERIOD_S / 2)
-            self.recorded.lines.append(lines_of(self._scene, self._frames))
+            middle_ns = round((now_s - FRAME_PERIOD_S / 2) * 1e9)
+            for side, line in zip(SIDES, lines_of(self._scene, self._frames), strict=True):
+                self._writer.add_frame(side, middle_ns, round(now_s * 1e9), line)
         if now_s >= self._due_torque_s:
             self._due_torque_s += LOAD_PERIOD_S
-            self.recorded.torque_s.append(now_s - LOAD_PERIOD_S / 2)
-            noise_nm = self._random.normal(0.0, NOISE_NM)
-            self.recorded.torque_nm.append(self._scene.conversion_nm(LOAD_PERIOD_S) + noise_nm)
-
-
-def record(
-    bank: Path, seed: int, diameters_mm: tuple[float, ...] = DIAMETERS_MM
-) -> Iterator[tuple[float, RecordedTwists]]:
-    """Yield each cylinder's diameter and recording."""
-    frames = RigFrames(bank, seed)
-    for number, diameter_mm in enumerate(diameters_mm):
-        play = TwistPlayer(frames, diameter_mm, seed + number)
-        play.run()
-        yield diameter_mm, play.recorded
+            torque_nm = self._scene.conversion_nm(LOAD_PERIOD_S) + self._random.normal(0.0, NOISE_NM)
+            self._writer.add_torque(round((now_s - LOAD_PERIOD_S / 2) * 1e9), torque_nm)
 
 
 def calibrate(recordings: list[FrameSeries], sides: Sides) -> Calibration:
@@ -165,10 +124,19 @@ def calibrate(recordings: list[FrameSeries], sides: Sides) -> Calibration:
 
 def write_recordings(bank: Path, folder: Path, diameters_mm: tuple[float, ...], seed: int) -> Iterator[Path]:
     """Write the recording of each cylinder, and yield its path."""
-    for diameter_mm, recorded in record(bank, seed, diameters_mm):
-        path = folder / f"rig-{diameter_mm:g}mm.mcap"
-        recorded.write(path, diameter_mm)
+    frames = RigFrames(bank, seed)
+    for number, diameter_mm in enumerate(diameters_mm):
+        path, notes = folder / f"rig-{diameter_mm:g}mm.mcap", {DIAMETER_NOTE: f"{diameter_mm:g}"}
+        with RecordingWriter(path, SOURCE, notes, frames.table) as writer:
+            TwistPlayer(frames, diameter_mm, seed + number, writer).run()
         yield path
+
+
+def record(bank: Path, seed: int, diameters_mm: tuple[float, ...] = DIAMETERS_MM) -> Iterator[FrameSeries]:
+    """Yield the recording of each cylinder, which is not kept."""
+    with TemporaryDirectory() as folder:
+        for path in write_recordings(bank, Path(folder), diameters_mm, seed):
+            yield series_of(read_recording(path))
 
 
 def emulate_recordings(
@@ -184,7 +152,7 @@ def emulate_recordings(
         folder.mkdir(parents=True, exist_ok=True)
     with resources.as_file(resources.files("shearloop") / "config") as config:
         plan = load_bank_plan(config / "banks" / "demo.yaml")
-    if not is_built(bank, plan):
+    if not is_built(bank, plan.definition):
         build_bank(*plan, bank, jobs=checked_jobs(None))
     return list(write_recordings(bank, folder, diameters_mm, seed))
 
@@ -196,7 +164,7 @@ def calibrate_rig(bank: Path, folder: Path) -> None:
         for number, path in enumerate(write_recordings(bank, folder, DIAMETERS_MM, SEED), 1):
             recordings.append(series_of(read_recording(path)))
             show(number)
-    apart = [recorded.series(mm) for mm, recorded in record(bank, SEED + 100, (20.0,))]
+    apart = list(record(bank, SEED + 100, (20.0,)))
     both: Sides = tuple(SIDES)
     for sides in itertools.chain([both], ((side,) for side in both)):
         calibration = calibrate(recordings, sides)

@@ -216,6 +216,8 @@ class ControlLoop:
             turning = f"step {number} ({file.steps[number - 1].do}), which turns the wrist"
             return f"{uncertain}; put a `grip` or a `release` before {turning}"
         self.experiment, self._watched, self.wrist = Experiment(file, t_ns), watched, self._wrists[file.torque_source]
+        # What the last experiment knew of the tool may be wrong by now.
+        self.wrist.reset()
         # Without a gripper of ours the tool is held by other means; with one, it may hold a tool already.
         gripper = self.inputs.gripper
         expected = "gripper" not in watched.required or (gripper is not None and gripper.holding)
@@ -262,6 +264,7 @@ class ControlLoop:
             )
         found = [*detect_faults(self.inputs, watched, self.config, t_ns), *self._reported]
         self._reported.clear()
+        self.inputs.unjudged.clear()
         if grip.release_error:
             found.append(Fault(FaultCode.NOT_RELEASED, grip.release_error))
         if experiment is None or not active:

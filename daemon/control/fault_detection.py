@@ -1,6 +1,7 @@
 """Fault detection: from the loop's inputs to the faults of the safety table, with their present numbers."""
 
 from bisect import bisect_left, bisect_right
+from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -20,6 +21,8 @@ LATEST_LOOP_S = ARM_STALE_S - LONGEST_TICK_S
 # A longer absence is a paused process rather than a slow loop. CLOCK_MONOTONIC stands while the computer is suspended;
 # the devices that were lost report that case.
 AWAY_S = 1.0
+# Torques between two ticks; more come only while the loop stands still.
+MOST_UNJUDGED = 256
 
 
 class Grip(Enum):
@@ -41,6 +44,8 @@ class LatestInputs:
     kept_s: float
     torques: dict[str, TorqueSample] = field(default_factory=dict)
     history: dict[str, tuple[list[int], list[float]]] = field(default_factory=dict)
+    # Valid torques since the latest tick, which may be several of one source.
+    unjudged: deque[TorqueSample] = field(default_factory=lambda: deque(maxlen=MOST_UNJUDGED))
     arm: ArmStatus | None = None
     gripper: GripperStatus | None = None
     lost: dict[str, str] = field(default_factory=dict)
@@ -54,6 +59,7 @@ class LatestInputs:
         self.torques[torque.source] = torque
         if torque.torque_nm is None:
             return
+        self.unjudged.append(torque)
         times_ns, torques_nm = self.history.setdefault(torque.source, ([], []))
         times_ns.append(torque.t_mid_ns)
         torques_nm.append(torque.torque_nm)
@@ -102,7 +108,7 @@ def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_
         found += _torque_faults(inputs, watched, config, t_ns)
     limit_nm, limit_rad = watched.limits.torque_nm, watched.limits.angle_rad
     for source in (watched.driving, *watched.supervising):
-        torque = inputs.torques.get(source.name)
+        torque = _largest(inputs, source)
         if torque is None or torque.torque_nm is None or abs(torque.torque_nm) <= limit_nm:
             continue
         if watched.grip is Grip.CHANGING and source.warm_up_s:
@@ -125,6 +131,12 @@ def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_
     if watched.overdue:
         found.append(Fault(FaultCode.STEP_OVERDUE, watched.overdue))
     return found
+
+
+def _largest(inputs: LatestInputs, source: TorqueSource) -> TorqueSample | None:
+    """Return the largest torque of a source since the latest tick, or its latest torque."""
+    found = [one for one in inputs.unjudged if one.source == source.name]
+    return max(found, key=lambda one: abs(one.torque_nm or 0.0), default=inputs.torques.get(source.name))
 
 
 def _torque_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_ns: int) -> list[Fault]:

@@ -86,6 +86,10 @@ class _Tare:
         self._from_ns = None if due else self._from_ns
         return due
 
+    def give_up(self) -> None:
+        """Forget a tare that no frame has begun."""
+        self._from_ns = None
+
     def add(self, reason: str, *, taring: bool) -> None:
         """Take the reason of an estimate, and whether more frames are needed."""
         if self.done.is_set() or self._from_ns is not None:
@@ -176,6 +180,9 @@ class FingertipPipeline:
         except TimeoutError:
             what = f"the homogeneous frame of {self.name} could not be taken within {within_s:.3g} s"
             return f"{what}: {self._tare.reasons or 'no frame came'}"
+        finally:
+            # Frames that come later could be of any load.
+            self._tare.give_up()
         return ""
 
     async def adapt(self, reference: str) -> str:

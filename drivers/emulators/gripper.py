@@ -124,10 +124,6 @@ class Gripper:
         """Keep the fingers from opening further than a width, or clear their way."""
         self.widest_mm = widest_mm
 
-    def cut_power(self) -> None:
-        """Answer nothing more; the URCap then has no values."""
-        self.powered = False
-
     def fail(self, code: int) -> None:
         """Report a fault and stop; from 10 on only a rising edge of ACT ends it."""
         self.flt, self.current = code, 0

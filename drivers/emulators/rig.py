@@ -8,7 +8,7 @@ import asyncio
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, Protocol, TypeAlias
 
 from shearloop.drivers.defaults import FRAME_PERIOD_S, URCAP_PORT
 from shearloop.drivers.emulators import number_between
@@ -37,11 +37,7 @@ class FrameSynthesiser(Protocol):
         """Return the board's line, (v,) in volts, for grip (0…1) and shear at each injection, (L,) each."""
 
 
-class Commanded(Protocol):
-    """A device that takes commands."""
-
-    def command(self, text: str) -> None:
-        """Execute a command; ValueError, with a sentence, for an unknown one."""
+Device: TypeAlias = EitKitBoard | Hx711Board | GripperPlayer | Controller
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,7 +96,7 @@ class EmulatedRig:
             seed=seed,
         )
         self._played: list[EitKitBoard | Hx711Board | Server] = [*boards.values(), player.server]
-        self._commanded: dict[str, Commanded] = {**boards, "gripper": player, "robot": self.controller}
+        self._commanded: dict[str, Device] = {**boards, "gripper": player, "robot": self.controller}
         self.ports = {name: board.port.appearances for name, board in boards.items()}
         self.ports["gripper"] = player.server.appearances
 
@@ -135,7 +131,7 @@ class EmulatedRig:
             case _:
                 raise ValueError(f"{text!r} is no command; there are {COMMANDS}")
 
-    def _device(self, name: str) -> Commanded:
+    def _device(self, name: str) -> Device:
         if name not in self._commanded:
             raise ValueError(f"there is no device {name!r}; there are {', '.join(self._commanded)}")
         return self._commanded[name]

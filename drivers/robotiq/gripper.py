@@ -237,8 +237,10 @@ class RobotiqGripper:
         self._last_move = None
         await self._write(messages.GripperHalt())
         readout, _ = await self._read()
-        # The status may not show an activation yet that has just been requested.
-        if readout.sta is not messages.ActivationStatus.ACTIVE:
+        # The status may not show an activation yet that has just been requested. A major fault stops the fingers, and
+        # a reset would clear it without the operator.
+        active = readout.sta is messages.ActivationStatus.ACTIVE
+        if not (active or messages.fault_of(readout.flt).needs_activation):
             await self._write(messages.Reset())
 
     async def states(self) -> AsyncGenerator[messages.GripperState]:

@@ -70,24 +70,17 @@ class ReplyLines(LineSplitter):
 
     def __init__(self) -> None:
         super().__init__(MAX_REPLY_BYTES)
-        self._not_ascii = 0
 
     @property
     def errors(self) -> Counter[str]:
         """The number of rejected replies, by kind."""
-        return +Counter({"too long": self.too_long, "unfinished": self.unfinished, "not ASCII": self._not_ascii})
+        return +Counter({"too long": self.too_long, "unfinished": self.unfinished})
 
     def replies(self, data: bytes) -> list[str]:
         """Return the replies that `data` completes, without line ends; empty lines are ignored."""
-        replies = []
-        for line in self.feed(data.replace(b"\r", b"\n")):
-            if line is None:
-                continue
-            if not line.isascii():
-                self._not_ascii += 1
-            elif text := line.decode().strip():
-                replies.append(text)
-        return replies
+        lines = self.feed(data.replace(b"\r", b"\n"))
+        texts = [line.decode("ascii", "replace").strip() for line in lines if line is not None]
+        return [text for text in texts if text]
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ from shearloop.drivers.ur.controller import (
     ScriptReadiness,
     ask_dashboard,
 )
-from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, WristSpeed
+from shearloop.drivers.ur.messages import MoveLinear, RtdeOutputs, RtdeSample, WristSpeed
 from shearloop.drivers.ur.script import guard_script
 from shearloop.drivers.ur.settings import UrSettings
 
@@ -73,7 +73,7 @@ class UrArm:
         sample = self._receiver.latest()
         now_ns = time.monotonic_ns()
         return RtdeSample(
-            *sample[:-2],
+            **{name: getattr(sample, name) for name in RtdeOutputs.__dataclass_fields__},
             t_mono_ns=now_ns,
             age_ns=self._age.age_ns(sample.timestamp_s, now_ns),
             connected=self._receiver.connected

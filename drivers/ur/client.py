@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Coroutine
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, Literal, Protocol, cast
+from typing import Any, Literal, cast
 
 from shearloop.drivers.connection import Diagnostics, LinkMonitor
 from shearloop.drivers.errors import DeviceLostError, ProtocolError
@@ -178,19 +178,12 @@ class UrRobot:
                 raise LostError(message.kind, message.sentence)
 
 
-class MessageHandler(Protocol):
-    """Receives the messages of a worker."""
-
-    def handle_message(self, number: int, message: messages.Message) -> None:
-        """Handle a message; an exception ends the connection."""
-
-
 class WorkerConnection(asyncio.SubprocessProtocol):
     """The pipes to one worker process, its end, and the reason for that."""
 
-    def __init__(self, settings: UrSettings, handler: MessageHandler) -> None:
+    def __init__(self, settings: UrSettings, robot: UrRobot) -> None:
         self._settings = settings
-        self._handler = handler
+        self._robot = robot
         self._decoder = messages.MessageDecoder()
         self._received_s = time.monotonic()
         # Done when the worker has ended and all of its output was read.
@@ -229,7 +222,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
                     self._activity = CONTROLLING
                     longest_s = messages.RECOVERY_HANG_S if message.recovering else self._settings.hang_timeout_s
                     self._timeout_s = longest_s + GRACE_S
-                self._handler.handle_message(number, message)
+                self._robot.handle_message(number, message)
         except ProtocolError as error:
             self._kill()
             self._closed.set_result(LostError("garbled", str(error)))

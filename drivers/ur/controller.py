@@ -12,12 +12,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 from shearloop.drivers.errors import DriverError, ProtocolError, system_reason
-from shearloop.drivers.ur.messages import RUNTIME_PLAYING, FailureKind
+from shearloop.drivers.ur.messages import RUNTIME_PLAYING, FailureKind, RtdeOutputs
 from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER
-from shearloop.drivers.ur.settings import Six, Three
 
 RTDE_PORT, DASHBOARD_PORT = 30004, 29999
 SCRIPT_READY: Final = 1
@@ -81,24 +80,11 @@ class ControllerInfo:
     registers_free: bool
 
 
-class ReceivedSample(NamedTuple):
-    """The outputs in one package, all but the last two as in `RtdeSample`."""
+@dataclass(frozen=True)
+class ReceivedSample(RtdeOutputs):
+    """The outputs in one package, with those of the control script."""
 
-    timestamp_s: float
-    q_rad: Six
-    qd_rad_per_s: Six
-    tcp_pose: Six
-    tcp_speed: Six
-    wrench: Six
-    robot_mode: int
-    safety_mode: int
-    runtime_state: int
-    speed_scaling: float
-    # NaN where the controller does not report them.
-    payload_kg: float
-    payload_cog_m: Three
-    tcp_offset: Six
-    # Of the control script: 1 when ready, 2 when done with a command; and its own clock.
+    # 1 when ready, 2 when done with a command; and the script's own clock.
     script_state: int
     script_s: float = 0.0
 

@@ -104,8 +104,8 @@ class CommandReply:
 
 
 @dataclass(frozen=True)
-class RtdeSample:
-    """The controller's latest sample (SI units, base frame, joints from base to wrist 3) and its connection's state."""
+class RtdeOutputs:
+    """The controller's outputs at one time (SI units, base frame, joints from base to wrist 3)."""
 
     # By the controller's clock.
     timestamp_s: float
@@ -122,6 +122,12 @@ class RtdeSample:
     payload_kg: float
     payload_cog_m: Three
     tcp_offset: Six
+
+
+@dataclass(frozen=True)
+class RtdeSample(RtdeOutputs):
+    """The controller's latest outputs and its connection's state."""
+
     t_mono_ns: int
     # Time since the controller made the sample, by its own clock.
     age_ns: int

@@ -68,6 +68,17 @@ def test_each_fingertip_has_its_own_gain():
     np.testing.assert_allclose(correction.factors, [1.3, 0.8], atol=0.1)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_intervals_grow_with_the_gain_where_twists_go_both_ways(seed):
+    rng = np.random.default_rng(seed)
+    torque_nm = np.concatenate([TWISTS[:16], -TWISTS[:16]])
+    share = rng.uniform(0.5, 1.5, len(torque_nm))
+    features = np.column_stack([share, 2 - share]) * torque_nm[:, None] / 1.5 + rng.normal(0, 0.001, (32, 2))
+    before = calibrated()
+    after, _ = before.adapt(features, torque_nm, np.array([0, 1]))
+    assert after.intervals.half_widths / before.intervals.half_widths == pytest.approx(1.5, rel=0.05)
+
+
 def test_twists_that_disagree_correct_little():
     """A correction is right on average only as far as the twists of one recording agree."""
     spread = GainSpread(between=0.3, within=0.05, noise_nm=0.001)

@@ -106,15 +106,6 @@ def test_a_saved_calibration_is_loaded_as_it_was_and_has_the_same_bytes_each_tim
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.cal", "b.cal"]
 
 
-def test_an_older_file_is_refused_with_the_cure(tmp_path):
-    path = tmp_path / "calibration.yaml"
-    path.write_text("kind: shearloop calibration\nformat_version: 1\n")
-    with pytest.raises(CalibrationError, match=r"calibration\.yaml.*calibrate again"):
-        Calibration.load(path)
-    with pytest.raises(CalibrationError, match="cannot be read: No such file"):
-        Calibration.load(tmp_path / "absent.cal")
-
-
 def test_a_calibration_that_cannot_be_written_leaves_what_was_there(tmp_path):
     path = tmp_path / "own.cal"
     CALIBRATION.save(path)

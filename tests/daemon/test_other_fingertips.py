@@ -13,8 +13,8 @@ from shearloop.bank.estimation import fit
 from shearloop.bank.estimation.estimator import Physics
 from shearloop.daemon.analysis.series import read_series
 from shearloop.daemon.bank_config import load_bank_plan
-from shearloop.daemon.cli.emulated_calibration import TwistPlayer
-from shearloop.daemon.synthetic_frames import RigFrames
+from shearloop.daemon.cli.emulated_calibration import write_recordings
+from shearloop.daemon.recording.reader import read_recording
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.emulators.boards import EitKitBoard
 from tests.daemon.conftest import collector, running_daemon
@@ -42,23 +42,20 @@ def bank(request, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def twists(bank) -> tuple[TwistPlayer, Path]:
+def twists(bank) -> Path:
     """Record twists of an emulated rig with this fingertip on both sides."""
-    player = TwistPlayer(RigFrames(bank, seed=3), 20.0, 3)
-    player.run()
-    player.recorded.write(bank.with_name("twists.mcap"), 20.0)
-    return player, bank.with_name("twists.mcap")
+    (path,) = write_recordings(bank, bank.parent, (20.0,), 3)
+    return path
 
 
 @pytest.mark.parametrize("estimator", ["motion_regression", "bank"])
 async def test_a_fingertip_of_another_kind_gives_its_torque(estimator, bank, twists, config, tmp_path):
-    player, recording = twists
     table = Bank.open(bank).table
     assert table.n_channels == {"round.bank": 208, "long.bank": 896}[bank.name]
-    (series,) = read_series(recording, ("right",))
+    (series,) = read_series(twists, ("right",))
     calibration = tmp_path / "right.cal"
     fit(estimator, [series], "emulated twists", Physics(bank=Bank.open(bank))).save(calibration)
-    lines = [pair[0] for pair in player.recorded.lines]
+    lines = list(read_recording(twists).sides["right"].lines)
     path = config(
         fingertips={
             "right": {

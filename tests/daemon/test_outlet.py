@@ -32,23 +32,25 @@ def test_what_is_written_comes_out_in_order_and_all_of_it_at_the_end():
 
 
 class Terminal(io.StringIO):
-    """A terminal that takes nothing while it is stopped."""
+    """A terminal that takes a text for each that it is let take."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.goes_on, self.waited_for = threading.Event(), threading.Event()
+        self.asked, self.may, self.took = (threading.Semaphore(0) for _ in range(3))
 
     def write(self, text: str) -> int:
-        self.waited_for.set()
-        assert self.goes_on.wait(10)
-        return super().write(text)
+        self.asked.release()
+        assert self.may.acquire(timeout=10)
+        written = super().write(text)
+        self.took.release()
+        return written
 
 
 def test_a_terminal_that_is_stopped_keeps_nobody_waiting_and_what_it_missed_is_told_in_its_place():
     terminal = Terminal()
     outlet = NonBlockingWriter(terminal, most_waiting=5)
     outlet.write("0\n")
-    assert terminal.waited_for.wait(10)
+    assert terminal.asked.acquire(timeout=10)
     for number in range(1, 9):
         outlet.write(f"{number}\n")
     assert outlet.lost == 3
@@ -56,7 +58,7 @@ def test_a_terminal_that_is_stopped_keeps_nobody_waiting_and_what_it_missed_is_t
     assert "Ctrl-Q" in str(outlet.diagnostics()["error"])
     outlet.close(timeout_s=0.0)
     assert outlet._thread.is_alive(), "the end waits no longer than it is told"
-    terminal.goes_on.set()
+    terminal.may.release(100)
     while not outlet._waiting.empty():
         outlet.close(timeout_s=0.01)
     outlet.close(10)
@@ -66,22 +68,8 @@ def test_a_terminal_that_is_stopped_keeps_nobody_waiting_and_what_it_missed_is_t
     ]  # fmt: skip
 
 
-class Slow(io.StringIO):
-    """A terminal that takes a text for each that it is let take."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.may, self.took = threading.Semaphore(0), threading.Semaphore(0)
-
-    def write(self, text: str) -> int:
-        assert self.may.acquire(timeout=10)
-        written = super().write(text)
-        self.took.release()
-        return written
-
-
 def test_what_is_missing_is_told_before_what_came_later():
-    terminal = Slow()
+    terminal = Terminal()
     outlet = NonBlockingWriter(terminal, most_waiting=4)
     outlet.write("0\n")
     terminal.may.release()

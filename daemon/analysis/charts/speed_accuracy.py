@@ -153,8 +153,6 @@ def matchers(split: Split, bank: Bank) -> Iterator[TorqueMethod]:
 
 
 def _best_sigma(matcher: Matcher, frame: FloatArray) -> float:
-    if isinstance(matcher, PrunedMatcher | PrunedZeroLagMatcher):
-        return matcher.match(frame, runner_up=False).sigma
     return matcher.match(frame).sigma
 
 

@@ -77,6 +77,17 @@ def choose_mesh(recordings: Path, mesh: Path | None) -> tuple[Mesh, str]:
     return load_geometry(OWN_FINGERTIP).mesh, f"our own grid for {OWN_FINGERTIP}"
 
 
+def is_built(path: Path, definition: BankDefinition) -> bool:
+    """Return whether an earlier build has finished this bank."""
+    if not path.exists():
+        return False
+    try:
+        return Bank.open(path, verify=True).identity == definition.identity
+    except BankFileError as error:
+        print(f"{error} (it is built again)", file=sys.stderr)
+        return False
+
+
 def cached_bank(
     name: str, grid: Grid, mesh: Mesh, folder: Path, jobs: int = 1, on_row: Callable[[int, int], None] = lambda *_: None
 ) -> Bank:
@@ -85,15 +96,9 @@ def cached_bank(
     `on_row(done, total)` is called during the build. Raises BankFileError where it cannot be written.
     """
     definition = BankDefinition(mesh.digest, MODEL, grid.k, grid.sigma)
-    identity = definition.identity
-    path = folder / f"{name}-{identity[:12]}.bank"
-    if path.exists():
-        try:
-            bank = Bank.open(path, verify=True)
-            if bank.identity == identity:
-                return bank
-        except BankFileError as error:
-            print(f"{error} (building it again)", file=sys.stderr)
+    path = folder / f"{name}-{definition.identity[:12]}.bank"
+    if is_built(path, definition):
+        return Bank.open(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -63,7 +63,7 @@ class Unmixed:
 
 
 def reader_of(features, values) -> IntervalRegressor:
-    return fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), test=Unmixed())
+    return fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), mixtures=Unmixed().accepted)
 
 
 def test_a_reading_at_the_end_of_what_is_told_apart_may_mean_anything_beyond_it():
@@ -93,7 +93,9 @@ def test_what_is_read_the_further_inside_the_further_it_lies_beyond_may_be_read_
     assert max(below, above) < 0.5
     value, _, above = reader.predict(np.array([0.6]))
     assert value + above == pytest.approx(values.max() + 2 * np.ptp(values)), "as far beyond as is known to pass"
-    vouched = fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), test=Unmixed(), full_range=True)
+    vouched = fit_interval_regressor(
+        features, values, Ridge.fit, strengths=(1e-9,), mixtures=Unmixed().accepted, full_range=True
+    )
     assert vouched.predict(np.array([0.6]))[2] < 0.5
     assert vouched.predict(np.array([0.6]))[0] == value
 

@@ -100,7 +100,7 @@ def test_the_interval_reaches_to_the_side_on_which_the_truth_is_hidden(sign):
         def accepted(self, _, later):
             return Mixtures(later, features[later] + sign * 0.3, np.full(len(later), 0.5))
 
-    reader = fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), test=Moved())
+    reader = fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), mixtures=Moved().accepted)
     _, *plain = reader.predict(np.array([0.8]))
     _, *at_limit = reader.predict(np.array([0.8]), limit_share=1.0)
     hidden, other = (0, 1) if sign > 0 else (1, 0)

@@ -308,8 +308,10 @@ def followed(path: list[float], seed: int = 0, noise: float = NOISE) -> list[tup
     follower = ForceFollower(CALIBRATION, finder.threshold)
     found = []
     for number, shear_n in enumerate(path):
-        state, response = loaded(state, shear_n, NORMAL_N, straight)
-        response += random.normal(0.0, noise)
+        # A force that stays changes nothing.
+        if number == 0 or shear_n != path[number - 1]:
+            state, exact = loaded(state, shear_n, NORMAL_N, straight)
+        response = exact + random.normal(0.0, noise)
         direction = finder.update(number / 10, response)
         found.append((direction, *follower.update(response, NORMAL_N, direction)))
     return found

@@ -35,6 +35,27 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive):
     assert held.std() < 0.006
 
 
+def test_tool_that_was_turned_after_an_experiment_is_identified_again():
+    rig = started(Rig(new_loop()), GRIP, {"do": "identify"}, {"do": "hold_torque", "torque_nm": 0.15, "hold_s": 60})
+    while not rig.control_loop.experiment.command.hold_number:
+        rig.step()
+    rig.control_loop.stop("the operator stopped it")
+    rig.wrist_rad -= 0.6
+    started(rig, {"do": "identify"}, {"do": "wait", "wait_s": 60})
+    while rig.control_loop.experiment.step_number == 1 and phase(rig) is ExperimentPhase.RUNNING:
+        rig.step()
+    assert rig.control_loop.experiment.step_number == 2, rig.control_loop.status.activity
+
+
+def test_every_torque_between_two_ticks_has_to_be_within_the_limit():
+    rig = started(Rig(new_loop()), GRIP, {"do": "wait", "wait_s": 60})
+    for later_ns, torque_nm in enumerate((0.0, 1.5, 0.0), 1):
+        t_ns = rig.t_ns + later_ns
+        rig.control_loop.on_torque(TorqueSample("load_cell", torque_nm, "", t_ns, t_ns))
+    rig.step()
+    assert "load_cell measured +1.500 N·m" in rig.control_loop.experiment.stop_reason
+
+
 def test_loop_state_has_the_filtered_torque_and_its_standard_deviation():
     hold = {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 60}
     rig = started(Rig(new_loop()), GRIP, {"do": "identify"}, hold, torque_source="load_cell")

@@ -280,12 +280,7 @@ def test_figures_are_what_their_names_say():
     t = np.arange(4.0)
     series = FrameSeries("difference", ("right",), t, np.zeros((4, 1, 896)), t, truth, np.full(4, np.nan))
     figures = figures_of([EstimateTrack(series, tuple(estimates), np.array([1.0, 2.0, 3.0, 4.0]))])
-    error = np.array([0.02, 0.0, 0.07])
-    assert figures["rmse_nm"] == pytest.approx(np.sqrt((error**2).mean()))
-    assert figures["bias_nm"] == pytest.approx(error.mean())
     assert figures["r"] == pytest.approx(np.corrcoef([0.02, 0.1, 0.27], truth[:3])[0, 1])
-    assert figures["coverage_95"] == pytest.approx(2 / 3)
-    assert figures["valid_fraction"] == 0.75
     assert (figures["latency_ms_p50"], figures["frames"]) == (2.5, 4)
     assert "diameter_rmse_mm" not in figures
 

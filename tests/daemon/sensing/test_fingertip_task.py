@@ -227,6 +227,8 @@ async def test_tare_that_times_out_says_why_its_frames_were_refused():
     assert error == f"{said}: 3 frames: 7 channels jumped, 1 frame: nothing"
     async with running(task.tare_and_wait(0.01)) as (waiting,):
         assert (await waiting).endswith("no frame came")
+    await task.process(frame(9, clock.t_ns + 9 * PERIOD_NS))
+    assert estimator.tared_before == [2], "a later frame may be of a gripped tool"
 
 
 def test_the_configured_frame_period_is_the_boards():

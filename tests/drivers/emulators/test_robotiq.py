@@ -168,7 +168,7 @@ def test_the_socket_answers_as_the_urcap_does():
     assert face.feed(b"RE\nGET FLT\nGET XYZ\n") == b"PRE 100\nFLT 00\nXYZ ?\n"
     gripper.fail(14)
     assert face.feed(b"GET FLT\n") == b"FLT 14\n"
-    gripper.cut_power()
+    gripper.powered = False
     assert face.feed(b"GET POS\n") == b"POS ?\n"
 
 

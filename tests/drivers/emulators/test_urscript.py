@@ -3,8 +3,7 @@
 import pytest
 
 from shearloop.drivers.emulators.ur_arm import Arm
-from shearloop.drivers.emulators.urscript import Program, ProgramEndedError, Registers, translate
-from tests.drivers.ur.robots import VERSIONS, control_script
+from shearloop.drivers.emulators.urscript import Program, ProgramEndedError, Registers
 
 COUNTING = "global n = 0\nthread t():\nwhile n < 7:\nn = n + 1\nsync()\nend\nend\n"
 
@@ -81,8 +80,3 @@ def test_text_with_mistakes_is_no_program(text):
 
 def test_program_has_nothing_of_python():
     assert "open" in run("x = open(1)")[1]
-
-
-@pytest.mark.parametrize("version", VERSIONS)
-def test_each_version_of_the_control_script_is_a_program(version):
-    assert translate(control_script(version=version))[1] == "rtde_control"

@@ -118,6 +118,23 @@ async def test_major_fault_needs_the_operators_confirmation(way, tmp_path):
 
 
 @WAYS
+async def test_halt_after_a_failed_activation_keeps_the_fault(way, tmp_path):
+    """The operator has to confirm that the fingers are clear."""
+    async with a_rig(way, tmp_path, connected=True) as rig:
+        activation = asyncio.create_task(rig.driver.activate())
+        while rig.model.sta != 1:  # noqa: ASYNC110 - the model is looked at, as it moves
+            await asyncio.sleep(0)
+        rig.model.fail(13)
+        with pytest.raises(messages.GripperFaultError, match="activation failed"):
+            await activation
+        await rig.driver.halt()
+        rig.model.step(STEP_S)
+        assert (await rig.driver.read()).fault.code == 13
+        with pytest.raises(messages.GripperFaultError, match="operator has to confirm"):
+            await rig.driver.activate()
+
+
+@WAYS
 async def test_overheating_passes_without_activation(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig:
         rig.model.fail(8)

@@ -143,7 +143,7 @@ async def test_absent_gripper_is_explained(way, tmp_path):
 
 async def test_gripper_without_power_is_not_read_as_zero(tmp_path):
     async with a_rig("socket", tmp_path, connected=True) as rig:
-        rig.model.cut_power()
+        rig.model.powered = False
         with pytest.raises(DeviceLostError, match="no data of the gripper"):
             await rig.driver.read()
 

@@ -35,7 +35,7 @@ hypothesis.settings.load_profile("shearloop")
 # Files of more than some five seconds, the longest first (`make test PYTEST_ARGS=--durations=60` shows them).
 LONGEST = (
     *("test_under_systemd.py", "test_shared_recordings.py", "test_page_controls.py", "test_run.py", "test_docs.py"),
-    *("test_speed_accuracy_chart.py", "test_cli_reproduce.py", "test_executors_commands.py", "test_page.py"),
+    *("test_speed_accuracy_chart.py", "test_cli_reproduce.py", "test_executors.py", "test_page.py"),
     *("test_finite_strain.py", "test_plane_strain.py", "test_copies.py"),
     *("test_skin.py", "test_cli_recordings.py", "test_other_fingertips.py", "test_skin_run.py", "test_design.py"),
     *("test_pruned_matching.py", "test_runner_any_order.py", "test_tracker.py", "test_flood.py", "test_filling.py"),

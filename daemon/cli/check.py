@@ -28,13 +28,13 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.config import load_daemon_config
 
     mistakes: list[str] = []
-    config: DaemonConfig | None = None
-    with _collected(mistakes):
-        config = load_daemon_config(args.config)
-    if config is None:
+    parts: dict[str, str] = {}
+    try:
+        parts = _parts(load_daemon_config(args.config), args.config, mistakes)
+    except UserError as error:
+        mistakes.append(str(error))
         with _collected(mistakes):
             _check_experiment_alone(args.config)
-    parts = _parts(config, args.config, mistakes) if config is not None else {}
     if mistakes:
         raise UserError("\n".join(dict.fromkeys(mistakes)))
     if args.json:
@@ -101,7 +101,7 @@ def _parts(config: "DaemonConfig", path: Path, mistakes: list[str]) -> dict[str,
     files = {name: fingertip.calibration for name, fingertip in config.fingertips.items()}
     files |= {COMBINED: config.combined.calibration} if config.combined is not None else {}
     unopened = {
-        name: TorqueSource(name=name, period_s=1.0, measures_torque=file is not None, has_gain=True)
+        name: TorqueSource(name=name, period_s=1.0, measures_torque=bool(file), has_gain=bool(file))
         for name, file in files.items()
     }
     sources = unopened | torque_sources(config, estimators, combined)

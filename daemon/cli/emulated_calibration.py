@@ -172,6 +172,7 @@ def calibrate_rig(bank: Path, folder: Path) -> None:
         calibration.save(path)
         figures = figures_of([estimate_series(calibration, one) for one in apart])
         print(
-            f"{path}: torque ± {figures['rmse_nm']:.4f} N·m, diameter ± {figures['diameter_rmse_mm']:.1f} mm, "
-            f"valid {figures['valid_fraction']:.2f} of the frames, intervals cover {figures['coverage_95']:.2f}"
+            f"{path}: root mean square errors {figures['rmse_nm']:.4f} N·m and {figures['diameter_rmse_mm']:.1f} mm; "
+            f"{figures['valid_fraction']:.0%} of frames have a torque, "
+            f"{figures['coverage_95']:.0%} of torques lie within their 95 % intervals"
         )

@@ -354,11 +354,7 @@ class ActionExecutor:
             return "unlocking is under way"
         task = self._unlocking = asyncio.create_task(self._unlock(), name="unlock")
         await asyncio.wait([task])
-        return (
-            "unlocking was stopped; the arm stays blocked until the next `unlock`"
-            if task.cancelled()
-            else task.result()
-        )
+        return "unlocking was stopped; send `unlock` again" if task.cancelled() else task.result()
 
     async def _unlock(self) -> str:
         reply = await self._robot.send(Unlock())

@@ -4,20 +4,17 @@ The pattern decides where the factor has entries (George and Liu 1981, chapter 5
 compiles the arithmetic, which treats a few matrices side by side.
 """
 
-from collections.abc import Callable
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from numba import config, njit
 from numpy.typing import NDArray
 
-from shearloop.bank.arrays import FloatArray, IntArray
+from shearloop.bank.arrays import FloatArray, IntArray, compiled
 from shearloop.bank.eit.mesh import Terms
 
 # Matrices that are factorised together, each in its lane of a vector register.
-LANES: Final = 4
-_F = TypeVar("_F", bound=Callable[..., Any])
+LANES: Final = 8
 
 
 class _Plan(NamedTuple):
@@ -92,21 +89,7 @@ def _structures(lower: Terms, n: int, eliminated: int) -> list[IntArray]:
     return found + [np.arange(column, n) for column in range(eliminated, n)]
 
 
-def _compiled(function: _F) -> _F:
-    """Compile a function, which releases the interpreter's lock; cache the result on the disk where that is possible.
-
-    No products and sums are fused or reordered: every machine computes the same bits.
-    """
-    # Statements that differ in the lane alone become one vector instruction.
-    config.SLP_VECTORIZE = 1
-    try:
-        compiled: _F = njit(cache=True, nogil=True)(function)
-    except RuntimeError:  # no folder for the cache is writable
-        compiled = njit(nogil=True)(function)
-    return compiled
-
-
-@_compiled
+@compiled
 def _factorise(plan: _Plan, work: FloatArray, kept: int) -> None:
     """Replace the (entries, LANES) lower triangles in `work` by Cholesky factors, and the last columns by what is left.
 
@@ -120,10 +103,11 @@ def _factorise(plan: _Plan, work: FloatArray, kept: int) -> None:
             column[rows[p]] = work[p]
         for m in range(row_starts[k], row_starts[k + 1]):
             q = by_row[m]
-            a, b, c, d = work[q, 0], work[q, 1], work[q, 2], work[q, 3]
+            a, b, c, d, e, f, g, h = work[q]
             for p in range(q, ends[m]):
                 to, by = column[rows[p]], work[p]
                 to[0], to[1], to[2], to[3] = to[0] - a * by[0], to[1] - b * by[1], to[2] - c * by[2], to[3] - d * by[3]
+                to[4], to[5], to[6], to[7] = to[4] - e * by[4], to[5] - f * by[5], to[6] - g * by[6], to[7] - h * by[7]
         inverse_root = 1.0 / np.sqrt(column[k]) if k < n - kept else np.ones(LANES)
         for p in range(starts[k], starts[k + 1]):
             for lane in range(LANES):

@@ -1,9 +1,9 @@
 """A fingertip described by its measures, and its mesh: a rectangle or a disc.
 
 A rectangle's mesh is a grid of lines parallel to the sides, each cell cut into two triangles; the diagonals alternate
-like a chessboard, so that no direction is preferred. A disc's mesh is of concentric rings. Nodes lie at both ends of
-every electrode, with at most `mesh_size_cm` between neighbours. The current is crowded at the boundary, so the
-outermost rows are halved twice.
+like a chessboard, so that no direction is preferred. A disc's mesh is a square grid within a few rings. Nodes lie at
+both ends of every electrode, with at most `mesh_size_cm` between neighbours along lines and rings. The current is
+crowded at the boundary, so the outermost rows are halved twice.
 """
 
 from collections.abc import Sequence
@@ -204,16 +204,19 @@ class RoundFingertip:
             for start, end in pairwise([*stops.tolist(), stops[0] + 2 * np.pi])
         ]
         around = np.concatenate(pieces)
-        n_rings = int(np.ceil(radius / size))
-        depths = radius / n_rings * np.array([0.0, 0.25, 0.5, *range(1, n_rings)])
-        points = []
-        for row, ring in enumerate(radius - depths):
-            # The outermost rows follow the electrodes' ends; every other ring inside is turned by half a spacing.
-            n = max(6, int(np.ceil(2 * np.pi * ring / size)))
-            angles = around if row <= _BOUNDARY_HALVINGS else 2 * np.pi * (np.arange(n) + 0.5 * (row % 2)) / n
-            points.append(radius + ring * np.column_stack([np.cos(angles), np.sin(angles)]))
-        nodes = np.vstack([*points, [[radius, radius]]])
-        following = np.append(np.arange(1, len(around)), 0)
+        n_around, n_rows = len(around), int(np.ceil(radius / size))
+        spacing = radius / n_rows
+        radii = radius - spacing * np.array([0.0, 0.25, 0.5, 1.0])[: n_rows + 2]
+        rings = np.multiply.outer(radii, np.column_stack([np.cos(around), np.sin(around)])).reshape(-1, 2)
+        line = spacing * np.arange(-n_rows, n_rows + 1)
+        grid = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+        # Half a spacing from the innermost ring on; the grid has few different heights and couplings.
+        grid = grid[np.hypot(*grid.T) <= radii[-1] - spacing / 2 + _SAME_CM]
+        nodes = radius + np.vstack([rings, grid])
+        ring, place = np.divmod(_chessboard(n_around + 1, len(radii)), n_around + 1)
+        innermost = n_around * (len(radii) - 1)
+        within = Delaunay(nodes[innermost:]).simplices + innermost
+        following = np.append(np.arange(1, n_around), 0)
         middles = around + np.diff(around, append=around[0] + 2 * np.pi) / 2
         edges, of_edge = [], []
         for electrode, (start, end) in enumerate(zip(starts, ends, strict=True)):
@@ -222,7 +225,7 @@ class RoundFingertip:
             of_edge += [electrode] * len(covered)
         return Mesh(
             nodes=nodes,
-            triangles=Delaunay(nodes).simplices.astype(np.int64),
+            triangles=np.vstack([ring * n_around + place % n_around, within]),
             electrode_edges=np.vstack(edges),
             electrode_of_edge=np.array(of_edge),
             contact_impedance=np.full(len(self.angles_deg), self.contact_impedance),

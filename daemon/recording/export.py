@@ -5,12 +5,14 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from scipy.io import savemat
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.errors import UserError, require
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.reader import Progress, read_messages
-from shearloop.daemon.recording.tables import arrays, columns_of, read_rows, row_of
+from shearloop.daemon.recording.tables import Rows, arrays, columns_of, numbers, read_rows, row_of
 
 # Numbers of a Parquet table that are written at once.
 _BATCH = 200_000
@@ -42,10 +44,8 @@ def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress
     out.mkdir(parents=True, exist_ok=True)
     files = {topic: out / f"{topic}.{form}" for topic in topics}
     tables: dict[str, _CsvTable | _ParquetTable] = {}
-    # CSV takes the text of the longest arrays as it is.
-    as_text = "scores" if form == "csv" else ""
     with ExitStack() as stack:
-        for number, (topic, content, message) in enumerate(read_messages(path, topics, as_text=as_text), start=1):
+        for number, (topic, content, message) in enumerate(read_messages(path, topics), start=1):
             row = row_of(content, message.log_time)
             if topic not in tables:
                 made = _CsvTable(files[topic], row) if form == "csv" else _ParquetTable(files[topic], topic, row)
@@ -113,15 +113,19 @@ class _ParquetTable:
 
         described = {"log_time_ns": {"type": "integer"}, **schema.schemas()[schema.schema_name(topic)]["properties"]}
         self._schema = pa.schema([(key, arrow_type(described[key])) for key in first])
-        # Measured values seldom repeat, so that a dictionary of them would only cost time.
-        self._writer = pq.ParquetWriter(path, self._schema, use_dictionary=False)
-        self._rows: list[dict[str, Any]] = []
+        scalars = [field.name for field in self._schema if not pa.types.is_list(field.type)]
+        # Measured values seldom repeat: a dictionary of them would only cost time, and so would limits of arrays.
+        self._writer = pq.ParquetWriter(path, self._schema, use_dictionary=False, write_statistics=scalars)
+        self._rows: Rows = []
         self._waiting = 0
 
     def add(self, row: dict[str, Any]) -> None:
         """Add one row."""
+        for key, value in row.items():
+            if isinstance(value, bytes):
+                row[key] = numbers(value)
+            self._waiting += len(row[key]) if isinstance(value, list | bytes) else 1
         self._rows.append(row)
-        self._waiting += sum(len(value) if isinstance(value, list) else 1 for value in row.values())
         if self._waiting > _BATCH:
             self._write()
 
@@ -134,6 +138,16 @@ class _ParquetTable:
     def _write(self) -> None:
         import pyarrow as pa
 
-        self._writer.write_table(pa.table(columns_of(self._rows), schema=self._schema))
+        columns = columns_of(self._rows).items()
+        held = {key: _lists(values) if isinstance(values[0], np.ndarray) else values for key, values in columns}
+        self._writer.write_table(pa.table(held, schema=self._schema))
         self._rows.clear()
         self._waiting = 0
+
+
+def _lists(values: list[FloatArray]) -> Any:
+    """Return arrays of numbers as one Arrow array of lists, with null for NaN."""
+    import pyarrow as pa
+
+    offsets = np.cumsum([0, *map(len, values)], dtype=np.int32)
+    return pa.ListArray.from_arrays(offsets, pa.array(np.concatenate(values), from_pandas=True))

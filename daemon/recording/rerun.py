@@ -12,6 +12,7 @@ from shearloop.daemon.errors import require
 from shearloop.daemon.messaging.messages import ENVELOPE, EitEstimate, EitHeatmap, RobotStateMessage
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.reader import Progress, read_messages
+from shearloop.daemon.recording.tables import numbers
 from shearloop.daemon.web.message_store import conductivity_profile
 
 TIMELINE = "time"
@@ -53,7 +54,7 @@ class _RerunFile:
             self._models[content["source"]] = content["model"]
             # Recordings of 0.1 have no shape.
             if shape := content.get(schema.SCORES_SHAPE):
-                self._add_image(f"{entity}/scores", _shares(content["scores"]).reshape(shape), t_ns)
+                self._add_image(f"{entity}/scores", numbers(content["scores"]).reshape(shape), t_ns)
         elif live == EitEstimate.topic and content["k"] is not None and content["sigma"] is not None:
             model = self._models.get(content["source"], "")
             profile = conductivity_profile(model, content["k"], content["sigma"], self._height_cm)
@@ -104,8 +105,8 @@ class _RerunFile:
         return rr.Scalars.columns(scalars=values)
 
     def _add_image(self, entity: str, share: NDArray[np.floating[Any]], t_ns: int) -> None:
-        """Add a grey image; 0 is black and 1 is white."""
-        pixels = np.round(255 * np.clip(share, 0, 1)).astype(np.uint8)
+        """Add a grey image; 0 and NaN are black, 1 is white."""
+        pixels = np.round(255 * np.fmin(np.fmax(share, 0), 1)).astype(np.uint8)
         self._images[entity] = None
         self._add(entity, pixels, t_ns)
 
@@ -126,24 +127,6 @@ class _RerunFile:
         return blueprint.Blueprint(blueprint.Horizontal(*columns))
 
 
-def _shares(text: bytes) -> NDArray[np.float32]:
-    """Return the numbers of a JSON array from 0 to 1, to three decimals; 0 for null and for negative numbers.
-
-    A whole JSON parser would take most of the export's time for these numbers.
-    """
-    characters = np.frombuffer(text + b"," * 5, np.uint8)
-    ends = np.flatnonzero(characters == ord(","))[:-4]
-    starts = np.append(0, ends[:-1] + 1)
-    found = np.zeros(len(ends), np.float32)
-    # The first digit, and those after the point.
-    for place, weight in ((0, 1.0), (2, 0.1), (3, 0.01), (4, 0.001)):
-        digits = characters[starts + place] - ord("0")
-        found += np.where((digits <= 9) & (starts + place < ends), digits, 0) * np.float32(weight)
-    # A number with an exponent, as 1e-6, is less than 0.00001.
-    found[(characters[starts] > ord("9")) | (characters[starts] < ord("0")) | (characters[ends - 3] == ord("e"))] = 0
-    return found
-
-
 def export_rerun(
     path: Path, out: Path, topics: list[str], fingertip: Fingertip, progress: Progress = lambda _: None
 ) -> Path:
@@ -155,7 +138,7 @@ def export_rerun(
     # The SDK's own error is a sentence of its internals.
     out.open("wb").close()
     file = _RerunFile(out, fingertip)
-    for number, (topic, content, message) in enumerate(read_messages(path, topics, as_text="scores"), start=1):
+    for number, (topic, content, message) in enumerate(read_messages(path, topics), start=1):
         file.add(topic, content, message.log_time)
         progress(number)
     file.close()

@@ -53,7 +53,7 @@ def missing_library() -> str:
         return (
             f"the robot needs the package ur-rtde, which is not installed for Python {platform.python_version()} on "
             f"{platform.machine()}: use Python 3.11 or 3.12 on x86-64, or build it with "
-            f"`{pip} 'shearloop[robot-source]'`, which needs cmake, g++, git and Boost's headers"
+            f"`{pip} ur-rtde`, which needs cmake, g++, git and Boost's headers"
         )
     try:
         import_module("rtde_control")

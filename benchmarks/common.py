@@ -136,8 +136,11 @@ def running_daemon(config: Path, module: str = "shearloop") -> Iterator[tuple["s
             stderr=log,
         )
         try:
-            while b"READY=1" not in ready.recv(4096):
-                continue
+            try:
+                while b"READY=1" not in ready.recv(4096):
+                    continue
+            except TimeoutError as error:
+                raise RuntimeError(f"the daemon is not ready: {(folder / 'daemon.log').read_text()}") from error
             yield process, time.monotonic() - begun
         finally:
             process.terminate()

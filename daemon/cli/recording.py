@@ -49,9 +49,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(repair, "recording", Path, "REC", "e.g. NAME.mcap.partial; it is not changed")
     add_option(repair, "--out", Path, "FILE", "recording to write (default: NAME.mcap, or NAME.repaired.mcap)")
     add_json(repair)
-    export = add_action(
-        parts, "export", "write a recording as tables, or for MATLAB, Rerun, LeRobot, `reproduce`", _export
-    )
+    summary = "write a recording as tables, or for MATLAB, Rerun, LeRobot or `reproduce`"
+    export = add_action(parts, "export", summary, _export)
     add_option(export, "recording", Path, "REC", "a recording (.mcap or .mcap.partial)")
     choices = ("csv", "parquet", "mat", "rrd", "lerobot", "slices")
     export.add_argument("--format", choices=choices, default="csv", help="files to write (default: %(default)s)")

@@ -44,7 +44,7 @@ LONGEST_STEP_NS = 50_000_000
 _SETTLED_SHARE = 0.1
 # CUSUM test for jumps, in standard deviations: the slack per innovation, the threshold of the sum, and the bound of an
 # innovation, which keeps one wild value below the threshold.
-_JUMP_SLACK, _JUMP_SUM, _JUMP_BOUND = 1.2, 6.0, 6.0
+_JUMP_SLACK, _JUMP_SUM, _JUMP_BOUND = 1.2, 5.0, 5.0
 # The offset restarts from at most this many measurements after a jump.
 _MOST_SINCE_JUMP = 5
 # Stands for no measurement at all.

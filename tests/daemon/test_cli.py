@@ -369,7 +369,7 @@ def test_missing_paths_and_shared_addresses_are_named(config, capsys):
     assert f"are both {both}" in mistake(capsys, "check", str(config(publish=both, commands=both)))
 
 
-def test_unlock_waits_and_a_missing_daemon_is_reported_at_once(monkeypatch, capsys):
+def test_unlock_waits_and_a_missing_daemon_is_reported_at_once(monkeypatch, capsys, tmp_path):
     asked: list[tuple[str, float]] = []
 
     def answers(_address: str, content: dict[str, Any], timeout_s: float, _keys: object) -> dict[str, Any]:
@@ -379,7 +379,7 @@ def test_unlock_waits_and_a_missing_daemon_is_reported_at_once(monkeypatch, caps
     monkeypatch.setattr("shearloop.daemon.messaging.client.send_command", answers)
     assert main(["command", "unlock"]) == 0
     assert main(["command", "unlock", "--timeout", "5"]) == 0
-    assert main(["command", "stop"]) == 0
+    assert main(["command", "stop", "--connect", f"ipc://{tmp_path}/commands"]) == 0
     assert asked == [("status", 2.0), ("unlock", 60.0), ("unlock", 5.0), ("stop", 2.0)]
     assert "unlock: done" in capsys.readouterr().out
 

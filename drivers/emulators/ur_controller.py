@@ -25,7 +25,7 @@ _ROBOT_MODES = {MODE_POWER_OFF: "POWER_OFF", MODE_IDLE: "IDLE", MODE_RUNNING: "R
 _SAFETY_MODES = {1: "NORMAL", 3: "PROTECTIVE_STOP", 7: "ROBOT_EMERGENCY_STOP"}
 
 FAULTS = (
-    *("protective-stop", "emergency-stop", "release", "drop-rtde", "silence", "stop-hangs"),
+    *("protective-stop", "emergency-stop", "release", "drop-rtde", "silence"),
     *("registers-in-use", "local-control", "refuse-protocol", "mute-dashboard", "version", "payload", "normal"),
 )
 
@@ -95,9 +95,6 @@ class Controller:
                     writer.close()
             case ["silence", seconds]:
                 self.silence(number_between(seconds, 0.0, 86400.0, "not a time in seconds from 0 to 86400"))
-            case ["stop-hangs", count]:
-                hangs = int(number_between(count, 0, 1000, "not a number of requests from 0 to 1000"))
-                self.faults = replace(self.faults, stop_hangs=hangs)
             case ["registers-in-use" | "local-control" | "refuse-protocol" | "mute-dashboard" as fault]:
                 self.faults = replace(self.faults, **{fault.replace("-", "_"): True})
             case ["version", numbers]:
@@ -164,10 +161,7 @@ class Controller:
             while line := await reader.readline():
                 if self.faults.mute_dashboard:
                     continue
-                request, hangs = line.decode("utf-8", "replace").strip(), self.faults.stop_hangs
-                if request == "stop" and hangs:
-                    self.faults = replace(self.faults, stop_hangs=hangs - 1)
-                    continue
+                request = line.decode("utf-8", "replace").strip()
                 self._send(writer, f"{self._answer_dashboard(request)}\n".encode())
 
     def _answer_dashboard(self, request: str) -> str:

@@ -95,8 +95,6 @@ class ConnectionFaults:
     registers_in_use: bool = False
     local_control: bool = False
     mute_dashboard: bool = False
-    # How many of the next requests to stop the dashboard ignores.
-    stop_hangs: int = 0
 
 
 class NotRtdeError(Exception):

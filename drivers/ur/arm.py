@@ -26,7 +26,7 @@ from shearloop.drivers.ur.controller import (
     ask_dashboard,
 )
 from shearloop.drivers.ur.messages import MoveLinear, RtdeOutputs, RtdeSample, WristSpeed
-from shearloop.drivers.ur.script import guard_script
+from shearloop.drivers.ur.script import NO_MOTION_S, guard_script
 from shearloop.drivers.ur.settings import UrSettings
 
 # A thread of ur-rtde polls its socket every 0.1 ms, which takes 5 % of a core. With this timer slack it wakes once per
@@ -153,6 +153,10 @@ class UrArm:
         """End the control script; one that is not ready is left to its watchdog."""
         if self._script_readiness.wait():
             self._control.stopScript()
+
+    def withdraw_deadline(self) -> None:
+        """Let no motion go on, also not when a program that is paused now is resumed."""
+        self._receiver.write_deadline(NO_MOTION_S)
 
     def _write_deadline(self, left_s: float) -> None:
         # The latest sample is older than now, so that the deadline is never late.

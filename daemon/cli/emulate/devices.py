@@ -28,7 +28,6 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
   release                 release the button; power comes back from the dashboard
   drop-rtde               close the RTDE connections, but not the dashboard's
   silence SECONDS         send nothing on any port
-  stop-hangs N            ignore the dashboard's next N stop commands, without an answer
   registers-in-use        refuse input registers as if a fieldbus had them
   local-control           leave remote control
   refuse-protocol         refuse the RTDE protocol version

@@ -13,6 +13,7 @@ import pytest
 
 from shearloop.drivers.ur.controller import ProbeError, ReceivedSample
 from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
+from shearloop.drivers.ur.script import NO_MOTION_S
 from tests.drivers.ur.flight import SETTINGS
 
 SIX = (0.0,) * 6
@@ -230,7 +231,8 @@ def test_deadline_counts_from_the_latest_sample(arm, monkeypatch):
     monkeypatch.setattr(arm, "RtdeReceiver", lambda *_: receiver)
     one = arm.UrArm(SETTINGS, VERSION)
     assert one.wrist(WristSpeed(0.1, 1.0), 0.07)
-    assert written == [pytest.approx(20.07)]
+    one.withdraw_deadline()
+    assert written == [pytest.approx(20.07), NO_MOTION_S]
 
 
 def test_connection_that_takes_no_script_is_lost(arm, monkeypatch, capsys):

@@ -9,7 +9,7 @@ import pytest
 from shearloop.drivers.ur import worker
 from shearloop.drivers.ur.messages import CommandReply, Disconnect, Enable, Unlock, WristSpeed
 from tests.drivers.ur.flight import Flight, flying
-from tests.drivers.ur.process import CyclingArm, Daemon, fly
+from tests.drivers.ur.process import CyclingArm, fly
 
 ROOT = Path(__file__).parents[3]
 

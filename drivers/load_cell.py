@@ -37,7 +37,6 @@ LINE_ERRORS = {
     "not_decimal": "The load cell's board sent a line that is not a decimal; check the baud rate and the sketch.",
     "too_long": f"The load cell's board sent more than {MAX_LINE_BYTES} bytes without a line end; check the baud rate.",
     "empty": "The load cell's board sent an empty line; bytes were lost, check the cable.",
-    "unfinished": "The load cell's board broke off in the middle of a line; check its plug and its power.",
 }
 
 # Of the paper's rig.
@@ -157,7 +156,7 @@ class LoadParser:
     @property
     def errors(self) -> Counter[str]:
         """The number of rejected lines, by kind."""
-        return self._errors + Counter(too_long=self._lines.too_long, unfinished=self._lines.unfinished)
+        return self._errors + Counter(too_long=self._lines.too_long)
 
     def feed(self, data: bytes, t_arrival_ns: int) -> list[LoadSample]:
         """Return the samples that `data` completes; of several lines each is a period older than the next."""

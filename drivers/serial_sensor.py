@@ -24,7 +24,7 @@ class InputKind(Enum):
     """What a parser is given; the value is the name in recordings."""
 
     OPENED = "opened"  # the port was opened, a half-received line is void
-    STARTED = "started"  # a silent board was started again
+    STARTED = "started"  # a silent board was started again; only in older recordings
     ASKED = "asked"  # an instrument was sent the query in `data`; its reply follows
     DATA = "data"  # bytes arrived
     TARE = "tare"  # a new zero was asked for, or found
@@ -51,9 +51,8 @@ class InputRecorder(Protocol):
 class LineSplitter:
     """Splits a byte stream into lines, however it is sliced. A line that is too long is counted once and dropped whole.
 
-    `too_long` and `unfinished` count since the beginning: lines of more than `max_bytes`, without the newline, and
-    lines cut off by a reopening.
-    `too_long_start` is the beginning of the last line that was too long.
+    `too_long` counts lines of more than `max_bytes`, without the newline, since the beginning; `too_long_start` is the
+    beginning of the last one.
     """
 
     def __init__(self, max_bytes: int) -> None:
@@ -62,16 +61,9 @@ class LineSplitter:
         self.partial = b""
         self.too_long = 0
         self.too_long_start = b""
-        self.unfinished = 0
-
-    @property
-    def in_line(self) -> bool:
-        """Whether a line has begun and not ended."""
-        return self._dropping or bool(self.partial.strip())
 
     def restart(self) -> None:
         """Drop a half-received line: the port was reopened."""
-        self.unfinished += self.in_line and not self._dropping
         self.partial = b""
         self._dropping = False
 
@@ -177,9 +169,7 @@ class SerialSensor(ABC, Generic[ValueT]):
         self._period_s = period_s
         self._longest_silence_s = SILENT_PERIODS * period_s
         self._inputs = inputs
-        # A silence of this time means that the board is lost, or needs another start.
         self._silence_s = BOOT_S
-        self._timeouts = 0
 
     async def readings(self) -> AsyncGenerator[ValueT]:
         """Yield the values of every line, in order and without end, as `batches` does."""
@@ -200,13 +190,13 @@ class SerialSensor(ABC, Generic[ValueT]):
                     port = self._link.port or await self._open()
                     received = await port.read(self._silence_s)
                     if received is None:
-                        self._timeouts += 1
-                        await self._on_timeout(port)
-                        continue
+                        raise DeviceLostError(
+                            f"{port.path} is open but has sent nothing for {self._silence_s:.1f} s; {self.silence_hint}"
+                        )
                 except DriverError as error:
                     await self._link.lost(error)
                     continue
-                self._timeouts, self._silence_s = 0, self._longest_silence_s
+                self._silence_s = self._longest_silence_s
                 yield self._dispatch(InputKind.DATA, received.t_arrival_ns, received.data)
 
     def diagnostics(self) -> Diagnostics:
@@ -222,7 +212,7 @@ class SerialSensor(ABC, Generic[ValueT]):
     async def _open(self) -> Port:
         port = await self._link.open()
         self._dispatch(InputKind.OPENED, time.monotonic_ns())
-        self._timeouts, self._silence_s = 0, BOOT_S
+        self._silence_s = max(BOOT_S, self._longest_silence_s)
         await self._on_open(port)
         return port
 
@@ -232,7 +222,3 @@ class SerialSensor(ABC, Generic[ValueT]):
 
     async def _on_open(self, port: Port) -> None:
         """Set up a board after its port was opened."""
-
-    async def _on_timeout(self, port: Port) -> None:
-        hint = self.silence_hint
-        raise DeviceLostError(f"{port.path} is open but has sent nothing for {self._silence_s:.1f} s; {hint}")

@@ -59,7 +59,6 @@ _PAIR_ERRORS = {
     "not two decimals": "The converter board sent a line that is not two decimals; check the baud rate and the sketch.",
     "too long": f"The converter board sent more than {MAX_PAIR_BYTES} bytes without a line end; check the baud rate.",
     "empty": "The converter board sent an empty line; bytes were lost, check the cable.",
-    "unfinished": "The converter board broke off in the middle of a line; check its plug and its power.",
 }
 
 ReadingT = TypeVar("ReadingT")
@@ -70,11 +69,6 @@ class ReplyLines(LineSplitter):
 
     def __init__(self) -> None:
         super().__init__(MAX_REPLY_BYTES)
-
-    @property
-    def errors(self) -> Counter[str]:
-        """The number of rejected replies, by kind."""
-        return +Counter({"too long": self.too_long, "unfinished": self.unfinished})
 
     def replies(self, data: bytes) -> list[str]:
         """Return the replies that `data` completes, without line ends; empty lines are ignored."""
@@ -171,7 +165,7 @@ class PolledInstrument(ABC, Generic[ReadingT]):
             **self._link.diagnostics(),
             "instrument": self._name,
             "readings": self._count,
-            "errors": dict(self._errors + self._lines.errors),
+            "errors": dict(self._errors + Counter({"too long": self._lines.too_long})),
         }
 
     async def _handle_error(self, error: DriverError) -> None:
@@ -239,14 +233,7 @@ class PolledInstrument(ABC, Generic[ReadingT]):
             deadline_ns = begin_ns + int(self._timeout_s * 1e9)
         while not self._waiting:
             left_s = (deadline_ns - monotonic_ns()) / 1e9
-            try:
-                received = await self._port.read(left_s) if left_s > 0 else None
-            except DeviceLostError as error:
-                if not self._lines.in_line:
-                    raise
-                raise DeviceLostError(
-                    f"{self.instrument} broke off in the middle of its answer to {query!r}: {error}"
-                ) from error
+            received = await self._port.read(left_s) if left_s > 0 else None
             if received is None:
                 waited_s = (deadline_ns - begin_ns) / 1e9
                 raise DeviceSilentError(
@@ -461,21 +448,17 @@ class ScpiScanner(PolledInstrument[Voltages]):
 
 
 class PairParser:
-    """Turns a converter board's bytes, however they are sliced, into voltages; counts rejected lines by kind. No I/O.
-
-    `partial_lines` may have been under way when the port was opened; they are not errors.
-    """
+    """Turns a converter board's bytes, in any slices, into voltages; counts rejected lines by kind. No I/O."""
 
     def __init__(self, rate_hz: float = DAQ_RATE_HZ, full_scale_v: float = ADC_FULL_SCALE_V) -> None:
         self._lines = TimedLines(MAX_PAIR_BYTES, ADC_BAUD, rate_hz)
         self._errors: Counter[str] = Counter()
-        self.partial_lines = 0
         self._end_v = _END_OF_RANGE * full_scale_v
 
     @property
     def errors(self) -> Counter[str]:
         """The number of rejected lines, by kind."""
-        return self._errors + Counter({"too long": self._lines.too_long, "unfinished": self._lines.unfinished})
+        return self._errors + Counter({"too long": self._lines.too_long})
 
     def handle(self, event: RawEvent) -> list[Voltages]:
         """Process a live or recorded event; return the voltages that it completes."""
@@ -493,8 +476,8 @@ class PairParser:
         found = []
         for line in self._lines.timed(data, t_arrival_ns):
             if line.partial:
-                self.partial_lines += 1
-            elif match := _PAIR.fullmatch(line.text):
+                continue
+            if match := _PAIR.fullmatch(line.text):
                 v1_v, v2_v = float(match[1]), float(match[2])
                 over_1, over_2 = abs(v1_v) >= self._end_v, abs(v2_v) >= self._end_v
                 found.append(Voltages(v1_v, v2_v, line.t_mid_ns, t_arrival_ns, over_1, over_2))
@@ -526,7 +509,6 @@ class AdcBoard(SerialSensor[Voltages]):
         return {
             **super().diagnostics(),
             "lines": self._count,
-            "partial_lines": self._parser.partial_lines,
             "errors": dict(errors),
             "error_details": describe_errors(errors, _PAIR_ERRORS),
         }

@@ -162,34 +162,20 @@ def test_the_rest_of_a_line_that_was_under_way_is_no_error(start):
     parser = FrameParser(PAPER_TABLE.zero_slots)
     assert len(parser.feed(GOOD[start:] + LINES[1], 0)) == 1
     assert not parser.errors
-    assert parser.partial_lines == 1
 
 
 def test_a_whole_line_that_is_broken_is_refused_even_as_the_first():
     parser = FrameParser(PAPER_TABLE.zero_slots)
     parser.feed(with_value(CHANNEL, b"nan"), 0)
     assert dict(parser.errors) == {FrameErrorKind.NAN: 1}
-    assert parser.partial_lines == 0
 
 
-def test_another_port_drops_the_line_that_was_cut_off_and_counts_it_apart():
+def test_another_port_drops_the_line_that_was_cut_off():
     parser = FrameParser(PAPER_TABLE.zero_slots)
     parser.feed(GOOD + LINES[1][:3000], 0)
     parser.handle(RawEvent(InputKind.OPENED, 0))
     frames = parser.feed(LINES[2], 0)
     assert [(frame.line + b"\n", frame.seq) for frame in frames] == [(LINES[2], 1)]
-    assert parser.unfinished == 1
-    assert not parser.errors
-
-
-@given(st.integers(0, 1024 * eit_kit.CELL_BYTES), st.booleans())
-def test_a_board_that_is_started_again_may_go_on_or_begin_anew(begun, anew):
-    parser = FrameParser(PAPER_TABLE.zero_slots)
-    parser.feed(GOOD + LINES[1][:begun], 0)
-    parser.handle(RawEvent(InputKind.STARTED, 0))
-    frames = parser.feed((LINES[2] if anew else LINES[1][begun:]) + LINES[3], 0)
-    assert [frame.line + b"\n" for frame in frames] == [LINES[2] if anew else LINES[1], LINES[3]]
-    assert parser.unfinished == (anew and begun > 0)
     assert not parser.errors
 
 

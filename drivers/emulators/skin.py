@@ -13,7 +13,7 @@ from random import Random
 from typing import Protocol, TypeAlias
 
 from shearloop.drivers.emulators import number_between
-from shearloop.drivers.emulators.boards import ConverterBoard
+from shearloop.drivers.emulators.boards import EmulatedBoard
 from shearloop.drivers.emulators.ports import PtyServer, SocketServer
 
 # The conductance of an open circuit's insulation.
@@ -306,7 +306,7 @@ class EmulatedScanner(ScpiInterpreter):
         return f"{volts:+.8E}"
 
 
-class EmulatedAdcBoard(ConverterBoard):
+class EmulatedAdcBoard(EmulatedBoard):
     """A converter board, an ADS1220: sends a line `v1,v2` in volts for each conversion."""
 
     faults = ("missing", "garbage", "torn", "silence", "stuck", "unplug")
@@ -319,7 +319,7 @@ class EmulatedAdcBoard(ConverterBoard):
         super().__init__(period_s, link, seed)
         self._circuit = circuit
 
-    def _convert(self) -> bytes:
+    def _line(self) -> bytes:
         v1_v, v2_v = self._circuit.voltages()
         return f"{self._quantise(v1_v):.6f},{self._quantise(v2_v):.6f}\r\n".encode()
 

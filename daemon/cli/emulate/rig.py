@@ -48,9 +48,8 @@ Commands, one a line on standard input:
   shear N                        push the skin (not while a robot turns it)
   open 1|2, short 1|2, reversed 1|2, swapped, drift 1|2 SHARE_PER_S, leads OHM, mend
                                  faults of the circuit
-  source silence [SECONDS] | unplug [SECONDS] | break-off | normal
-  daq silence [SECONDS] | unplug [SECONDS] | normal; of a scanner break-off (the next answer ends half-way), of a
-                                 converter board missing, garbage, torn, stuck [SECONDS]
+  source silence [SECONDS] | unplug [SECONDS] | normal
+  daq silence [SECONDS] | unplug [SECONDS] | normal; of a converter board missing, garbage, torn, stuck [SECONDS]
   robot FAULT                    any fault of `emulate ur`
   normal                         end all faults of circuit and instruments
 """

@@ -60,32 +60,6 @@ BROKEN = [
 ]
 
 
-def test_every_value_that_four_decimals_can_write_is_the_double_that_float_reads():
-    every = [b"%d.%04d" % divmod(value, 10_000) for value in range(22_001)]
-    for start in range(0, len(every), 1024):
-        texts = every[start : start + 1024]
-        texts += [b"0.0001"] * (1024 - len(texts))
-        values = eit_kit.read_line(b", ".join(texts) + b", ", np.array([text == b"0.0000" for text in texts]))
-        assert values.tolist() == [float(text) for text in texts]
-
-
-def test_a_cell_is_sound_with_digits_and_punctuation_in_their_places_alone():
-    for place in range(8):
-        sound = b"0123456789" if place in (0, 2, 3, 4, 5) else b"0.0000, "[place : place + 1]
-        for byte in range(256):
-            line = bytearray(GOOD.rstrip())
-            line += b" "
-            line[8 * CHANNEL + place] = byte
-            found = eit_kit.read_line(bytes(line), PAPER_TABLE.zero_slots)
-            if byte in sound:
-                # A first digit above 2 V, or digits that are all 0, are refused for what they say.
-                assert not isinstance(found, eit_kit.FrameError) or found.kind in (
-                    FrameErrorKind.OUT_OF_RANGE, FrameErrorKind.ZERO_CHANNEL,
-                )  # fmt: skip
-            else:
-                assert isinstance(found, eit_kit.FrameError)
-
-
 def test_a_line_is_read_to_the_last_digit():
     frame, other = FrameParser(PAPER_TABLE.zero_slots).feed(GOOD + LINES[1], 5_000_000_000)
     expected = [float(value) for value in GOOD.decode().split(", ")[:-1]]

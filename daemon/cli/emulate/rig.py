@@ -46,7 +46,7 @@ otherwise: a loop in real time then sees angles change that many times as fast, 
 SKIN_EPILOG = """Prints the addresses of source and DAQ, again each time they appear.
 Commands, one a line on standard input:
   shear N                        push the skin (not while a robot turns it)
-  open 1|2, short 1|2, reversed 1|2, swapped, drift 1|2 SHARE_PER_S, leads OHM, mend
+  open 1|2, short 1|2, reversed 1|2, swapped, leads OHM, mend
                                  faults of the circuit
   source silence [SECONDS] | unplug [SECONDS] | normal
   daq silence [SECONDS] | unplug [SECONDS] | normal; of a converter board missing, garbage, torn, stuck [SECONDS]

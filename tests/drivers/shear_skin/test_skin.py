@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -138,9 +137,9 @@ FAULTS = [
 async def test_each_fault_of_the_circuit_is_named_and_goes_away_with_its_cause(tmp_path, adc):
     async with a_bench(tmp_path, serial_source=False, adc=adc) as bench:
         for text, faults in FAULTS:
-            bench.circuit.command(text, time.monotonic())
+            bench.circuit.command(text)
             await bench.next_says(*faults)
-            bench.circuit.command("mend", time.monotonic())
+            bench.circuit.command("mend")
             await bench.next_says()
         errors = bench.skin.diagnostics()["errors"]
         assert {"compliance", "open_1", "open_2", "short_1", "reversed_2", "sum"} <= set(errors)
@@ -219,7 +218,7 @@ async def test_lines_of_the_board_that_are_missing_torn_or_garbage_are_counted(t
         count = len(bench.samples)
         await bench.until(lambda: len(bench.samples) > count + 10)
         facts = bench.skin.diagnostics()
-        assert facts["errors"]["not two decimals"] == 2
+        assert facts["errors"]["not a number"] == 2
         bench.reader("stuck")
         await bench.next_says(SkinFault.STUCK_1, SkinFault.STUCK_2)
 

@@ -1,8 +1,10 @@
 """Sensors on serial lines: raw events, lines, and the loop that reads a board and reconnects to it."""
 
 import contextlib
+import re
 import time
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -100,34 +102,60 @@ class TimedLine:
     partial: bool
 
 
-class TimedLines(LineSplitter):
-    """Splits and stamps the lines of a board that sends one per conversion. No I/O."""
+class LineParser(ABC, Generic[ValueT]):
+    """Turns the bytes of a board that sends a line for each conversion, in any slices, into values. No I/O."""
 
-    def __init__(self, max_bytes: int, baud: int, rate_hz: float) -> None:
-        super().__init__(max_bytes)
+    def __init__(self, pattern: re.Pattern[bytes], max_bytes: int, baud: int, rate_hz: float) -> None:
+        """Accept lines that match the pattern, of at most `max_bytes`; the board sends `rate_hz` lines a second."""
+        self._pattern = pattern
+        self._lines = LineSplitter(max_bytes)
         self._byte_ns = 10 * 10**9 // baud  # with start and stop bit
         self._period_ns = round(1e9 / rate_hz)
         self._last_mid_ns = -(2**63)
         self._first = True
+        self._rejected: Counter[str] = Counter()
+
+    @property
+    def errors(self) -> dict[str, int]:
+        """The number of rejected lines, by kind."""
+        return dict(self._rejected + Counter({"too long": self._lines.too_long}))
+
+    @abstractmethod
+    def _values(self, line: TimedLine) -> list[ValueT]:
+        """Return the values in a line that matches the pattern."""
+
+    def handle(self, event: RawEvent) -> list[ValueT]:
+        """Process a live or recorded event; return the values that it completes."""
+        match event.kind:
+            case InputKind.OPENED:
+                self.restart()
+            case InputKind.DATA:
+                return self.feed(event.data, event.t_ns)
+        return []
 
     def restart(self) -> None:
         """Drop a half-received line: the port was opened, perhaps in the middle of one."""
-        super().restart()
+        self._lines.restart()
         self._first = True
 
-    def timed(self, data: bytes, t_arrival_ns: int) -> list[TimedLine]:
-        """Return the lines that `data` completes; of several each is a period older than the next."""
-        lines = self.feed(data)
-        found = []
-        for age, line in zip(range(len(lines) - 1, -1, -1), lines, strict=True):
+    def feed(self, data: bytes, t_arrival_ns: int) -> list[ValueT]:
+        """Return the values that `data` completes; of several lines each is a period older than the next."""
+        values = []
+        lines = self._lines.feed(data)
+        for age, text in zip(range(len(lines) - 1, -1, -1), lines, strict=True):
             partial, self._first = self._first, False
-            if line is not None:
-                arrived_ns = t_arrival_ns - age * self._period_ns
-                t_mid_ns = arrived_ns - (len(line) + 1) * self._byte_ns - self._period_ns // 2
-                # Time stays in order when lines arrive in bursts.
-                self._last_mid_ns = max(t_mid_ns, self._last_mid_ns + 1)
-                found.append(TimedLine(line.strip(b"\r"), arrived_ns, self._last_mid_ns, partial))
-        return found
+            if text is None:
+                continue
+            arrived_ns = t_arrival_ns - age * self._period_ns
+            t_mid_ns = arrived_ns - (len(text) + 1) * self._byte_ns - self._period_ns // 2
+            # Time stays in order when lines arrive in bursts.
+            self._last_mid_ns = max(t_mid_ns, self._last_mid_ns + 1)
+            line = TimedLine(text.strip(b"\r"), arrived_ns, self._last_mid_ns, partial)
+            if self._pattern.fullmatch(line.text):
+                values += self._values(line)
+            elif not partial:
+                self._rejected["not a number" if line.text else "empty"] += 1
+        return values
 
 
 class StepFilter(Generic[ValueT]):

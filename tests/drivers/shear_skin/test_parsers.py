@@ -50,7 +50,7 @@ def test_no_bytes_break_the_board_s_parser_and_a_sound_line_comes_through_after_
 def test_refused_lines_are_counted_by_kind():
     parser = PairParser()
     parser.feed(b"cut\n0.1,0.2,0.3\n0.1\n0,1\nnan,0.1\n\r\n" + b"1" * 50 + b"\n0.100000,0.200000\n", 0)
-    assert parser.errors == {"not two decimals": 4, "empty": 1, "too long": 1}
+    assert parser.errors == {"not a number": 4, "empty": 1, "too long": 1}
 
 
 def test_lines_that_arrive_together_are_a_period_apart():
@@ -59,7 +59,7 @@ def test_lines_that_arrive_together_are_a_period_apart():
     first, second = parser.feed(b"0.125000,0.126000\r\n" * 2, 10**9)
     assert second.t_mid_ns == 10**9 - 19 * (10 * 10**9 // ADC_BAUD) - PERIOD_NS // 2
     assert second.t_mid_ns - first.t_mid_ns == PERIOD_NS
-    assert first.t_arrival_ns == second.t_arrival_ns == 10**9
+    assert (first.t_arrival_ns, second.t_arrival_ns) == (10**9 - PERIOD_NS, 10**9)
 
 
 @given(st.lists(st.from_regex(r"[ -~]{1,40}", fullmatch=True).filter(str.strip), max_size=6), CUTS)

@@ -31,7 +31,7 @@ Commands, one a line on standard input:
   truth                       print the true state: torque, angles, width, diameter
   kick NM                     turn the workpiece so that the torque jumps by NM
   slip [NM]                   let the tool slip in the grip until NM (0) remain
-  joint KIND                  put the tool on another joint: lever, tightening, seized, stripping
+  joint KIND                  put the tool on another joint: lever, tightening, seized
   object MM | object none     put something of that width between the fingers, or take it away
   silence DEVICE [SECONDS]    silence a device: right, left, load, gripper, robot
   unplug DEVICE [SECONDS]     disconnect a device, without a number until `replug DEVICE`

@@ -35,8 +35,6 @@ from shearloop.drivers.serial_sensor import (
 
 # A reading of five elements is 70 characters long.
 MAX_REPLY_BYTES = 512
-# Replies to earlier queries, skipped before the answer to *IDN?.
-MAX_STALE_REPLIES = 8
 REPLY_TIMEOUT_S = 2.0
 # Misunderstood replies in a row before the connection is reopened.
 MAX_STRIKES = 3
@@ -182,15 +180,9 @@ class PolledInstrument(ABC, Generic[ReadingT]):
         await self._link.lost(error)
 
     async def _identify(self, *models: str) -> str:
-        """Return the reply to *IDN?, skipping stale replies; ProtocolError unless it names one of the models."""
+        """Return the reply to *IDN?; ProtocolError unless it names one of the models."""
         self._lines.restart()
-        self._waiting.clear()
         name = (await self._ask("*IDN?")).text
-        for _ in range(MAX_STALE_REPLIES):
-            # A name has four fields; the first is not a number.
-            if name.count(",") >= 3 and not name.lstrip("+-")[:1].isdigit():
-                break
-            name = (await self._next(0, "*IDN?")).text
         if models and not any(model in name for model in models):
             raise ProtocolError(
                 f"{self.instrument} says it is {name!r}, and not {' or '.join(models)}; see which instrument is there."

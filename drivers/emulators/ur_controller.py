@@ -1,7 +1,6 @@
 """The controller's three ports and its clock around a `Robot`, its dashboard, and faults by lines of text."""
 
 import asyncio
-import logging
 import re
 import time
 from collections.abc import AsyncIterator, Iterator
@@ -10,13 +9,12 @@ from dataclasses import replace
 
 from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, Robot, RobotEvent
-from shearloop.drivers.emulators.ur_rtde import ConnectionFaults, NotRtdeError, RtdeSession
+from shearloop.drivers.emulators.ur_rtde import ConnectionFaults, RtdeSession
 from shearloop.drivers.emulators.urscript import translate
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 # A control script closes its outermost block in the first column.
 SCRIPT_END = b"\nend\n"
-LARGEST_SCRIPT = 1 << 20
 # A controller is never late. When this process was, the robot's time stands still, so that no watchdog expires on
 # heartbeats that wait in the socket. Its clock goes on: its samples are of now.
 MOST_CATCH_UP_S = 0.02
@@ -28,8 +26,6 @@ FAULTS = (
     *("protective-stop", "emergency-stop", "release", "drop-rtde", "silence"),
     *("registers-in-use", "local-control", "refuse-protocol", "mute-dashboard", "version", "payload", "normal"),
 )
-
-log = logging.getLogger(__name__)
 
 
 class Controller:
@@ -133,8 +129,6 @@ class Controller:
             try:
                 while data := await reader.read(4096):
                     self._send(writer, session.receive(data))
-            except NotRtdeError as error:
-                log.warning("an RTDE connection was closed: %s", error)
             finally:
                 del self._rtde[writer]
 
@@ -150,9 +144,6 @@ class Controller:
                         await asyncio.to_thread(translate, script)
                     self.robot.upload(script)
                     text.clear()
-                elif len(text) > LARGEST_SCRIPT:
-                    log.warning("a script without an end was dropped after %d bytes", len(text))
-                    return
 
     async def _serve_dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with self._connection(writer):

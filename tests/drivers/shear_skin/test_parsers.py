@@ -68,7 +68,6 @@ def test_replies_come_through_whatever_ends_their_lines(replies, cuts):
         lines = ReplyLines()
         data = b"".join(reply.encode() + end for reply in replies)
         assert [text for part in slices(data, cuts) for text in lines.replies(part)] == [r.strip() for r in replies]
-        assert not lines.errors
 
 
 @given(st.binary(max_size=2 * MAX_REPLY_BYTES), CUTS)
@@ -85,7 +84,7 @@ def test_a_flood_without_an_end_is_counted_once_and_forgotten():
     for _ in range(10):
         assert lines.replies(b"7" * 300) == []
     assert lines.replies(b"\n\xff\n0\n") == ["\N{REPLACEMENT CHARACTER}", "0"]
-    assert lines.errors == {"too long": 1}
+    assert lines.too_long == 1
 
 
 @given(st.text(max_size=80))

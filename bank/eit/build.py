@@ -49,7 +49,7 @@ class RowSolver:
     def __init__(self, mesh: Mesh, definition: BankDefinition) -> None:
         """Prepare the forward model and solve it for the homogeneous voltages."""
         self._forward = BatchForwardModel(mesh, definition.table)
-        self._conductivities = ConductivityModel(mesh, definition.variation)
+        self._conductivities = ConductivityModel(mesh)
         self._definition = definition
         self._n_triangles = len(mesh.triangles)
         (self.homogeneous,) = self._forward.voltages(np.ones((1, len(mesh.triangles))))
@@ -109,8 +109,7 @@ def build_bank(
             journal.remove()
             highest = max(float(cells.min_conductivity.max()) for cells in rows)
             raise EmptyBankError(
-                f"{path}: no cell of this bank is valid: {_why_empty(highest)}; choose other values of k and sigma, "
-                "and of what it is `over`"
+                f"{path}: no cell of this bank is valid: {_why_empty(highest)}; choose other values of k and sigma"
             )
         write_bank(
             path,

@@ -13,7 +13,6 @@ Layout, all numbers little-endian:
 Opening a bank checks the header and the small arrays; the signals are checked on request.
 """
 
-import errno
 import hashlib
 import json
 import math
@@ -173,17 +172,7 @@ def write_bank(
                 file.write(b"\0" * (offsets[key] - file.tell()))
                 file.write(array.data)
     except OSError as error:
-        raise unwritable(path, error) from error
-
-
-def unwritable(path: Path, error: OSError) -> BankFileError:
-    """Return the error for a bank, or its journal, that the disk refuses; on a full disk the solved rows stay."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return BankFileError(
-            f"{path}: the bank cannot be written: {error.strerror}, and the rows solved so far are kept; make room and "
-            "give the same command again"
-        )
-    return BankFileError(f"{path}: the bank cannot be written: {error.strerror}; choose another --out")
+        raise BankFileError(f"{path}: the bank cannot be written: {error.strerror}; choose another --out") from error
 
 
 def _layout(definition: BankDefinition, stored: dict[str, NDArray[Any]]) -> tuple[bytes, dict[str, int]]:

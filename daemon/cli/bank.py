@@ -17,14 +17,9 @@ from shearloop.daemon.cli.options import (
 )
 from shearloop.daemon.cli.terminal import print_result, progress_bar
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.process import report_interrupt
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from shearloop.bank.eit.bank_file import Bank, BankDefinition
-    from shearloop.bank.eit.build import BankRow
-    from shearloop.bank.eit.mesh import Mesh
+    from shearloop.bank.eit.bank_file import Bank
 
 run = run_action
 
@@ -35,7 +30,7 @@ MODEL_NAMES = "step, linear, cut_linear, gaussian_derivative or modulated_gaussi
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the actions and their arguments."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    build = add_action(actions, "build", "build a bank, or resume an interrupted build", _build)
+    build = add_action(actions, "build", "build a bank", _build)
     add_option(build, "--config", Path, "FILE", "the bank's configuration (YAML)", required=True)
     add_option(build, "--out", Path, "PATH", "the bank file to write", required=True)
     add_option(build, "--jobs", int, "N", "threads, or workers of a cluster of this machine (default: one per core)")
@@ -62,15 +57,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _build(args: argparse.Namespace) -> int:
-    try:
-        return _build_bank(args)
-    except KeyboardInterrupt as interrupt:
-        kept = f"{args.out}.part"
-        sentence = f"shearloop bank: interrupted: finished rows are in {kept}, and the same command resumes from there"
-        return report_interrupt(sentence, interrupt)
-
-
-def _build_bank(args: argparse.Namespace) -> int:
     from shearloop.bank.eit.bank_file import BANK_MAGIC, Bank
     from shearloop.bank.eit.build import build_bank, solve_row
     from shearloop.daemon.bank_config import load_bank_plan
@@ -79,24 +65,14 @@ def _build_bank(args: argparse.Namespace) -> int:
     jobs = checked_jobs(args.jobs)
     plan = load_bank_plan(args.config)
     check_overwrite(args.out, "a bank", BANK_MAGIC)
-    with (
-        open_executor(args.cluster, jobs) as pool,
-        progress_bar(args.out.name, len(plan.definition.k_grid), "row") as show,
-    ):
-
-        def on_cluster(
-            mesh: "Mesh", definition: "BankDefinition", rows: "Sequence[int]"
-        ) -> "Iterator[tuple[int, BankRow]]":
-            for number, cells in pool.map(solve_row, (mesh, definition), rows):
-                yield rows[number], cells
-
+    rows = len(plan.definition.k_grid)
+    with open_executor(args.cluster, jobs) as pool, progress_bar(args.out.name, rows, "row") as show:
         build_bank(
             *plan,
             args.out,
             jobs=jobs,
-            elsewhere=on_cluster if args.cluster is not None else None,
+            elsewhere=None if args.cluster is None else pool.map(solve_row, plan, range(rows)),
             on_row=lambda done, _: show(done),
-            on_notice=lambda sentence: print(sentence, file=sys.stderr),
         )
     result = _result(args.out, Bank.open(args.out))
     line = f"{args.out}: {result['valid_cells']} of {result['cells']} cells valid, identity {result['identity'][:12]}"

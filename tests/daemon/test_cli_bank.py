@@ -1,8 +1,6 @@
 """`shearloop bank`: files, output, and mistakes as one sentence with status 2."""
 
 import json
-import signal
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.eit.models import conductivity
 from shearloop.daemon.bank_config import load_geometry
-from shearloop.daemon.cli import bank as bank_command
 from shearloop.daemon.cli import main
 from tests.daemon.test_bank_config import BANK, FINGERTIP
 
@@ -48,30 +45,6 @@ def test_build_writes_the_bank_and_tells_its_identity(folder, tmp_path, capsys):
     bank = Bank.open(tmp_path / "b.bank", verify=True)
     assert (result["identity"], result["shape"], result["model"]) == (bank.identity, [*bank.signals.shape], bank.model)
     assert result["valid_cells"] == bank.valid.sum()
-
-
-@pytest.mark.usefixtures("default_signals")
-@pytest.mark.parametrize("rows_done", [0, 2])
-def test_an_interrupted_build_says_so_and_the_same_command_goes_on(rows_done, folder, tmp_path, capsys, monkeypatch):
-    """SIGINT, as Ctrl-C sends it, while rows are being solved: no bank, no half of one, and no work lost."""
-    capsys.readouterr()
-    out = tmp_path / "c.bank"
-    build = ["bank", "build", "--config", f"{folder}/bank.yaml", "--out", str(out), "--jobs", "1"]
-
-    @contextmanager
-    def interrupted(*_):
-        yield lambda done: signal.raise_signal(signal.SIGINT) if done == rows_done else None
-
-    with monkeypatch.context() as patched:
-        patched.setattr(bank_command, "progress_bar", interrupted)
-        assert main(build) == 130
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert f"shearloop bank: interrupted: finished rows are in {out}.part" in printed.err
-    assert [path.name for path in tmp_path.iterdir()] == ["c.bank.part"]
-    assert main(build) == 0
-    assert [path.name for path in tmp_path.iterdir()] == ["c.bank"]
-    assert out.read_bytes() == (folder / "a.bank").read_bytes()
 
 
 def test_info_checks_the_bank_and_says_what_it_is_of(folder, capsys):
@@ -152,8 +125,7 @@ def test_solve_refuses_a_conductivity_that_is_not_positive_and_writes_nothing(fo
         (["--jobs", "0"], "--jobs must be 1 or more, not 0"),
         (["--out", "{folder}"], "is a directory; give the name of a file"),
         (["--out", "/dev/null"], "/dev/null is no file, and cannot hold a bank; give the name of a file"),
-        (["--out", "{folder}/none/a.bank"], "the bank cannot be written: No such file or directory"),
-        (["--out", "{folder}/tip.yaml/a.bank"], "the bank cannot be written: Not a directory"),
+        (["--out", "{folder}/tip.yaml/a.bank"], "there is no folder"),
         (["--config", "{folder}/none.yaml"], "none.yaml: the bank's description cannot be read"),
         (["--config", "{folder}/tip.yaml"], "model: is missing; allowed: step, linear"),
     ],

@@ -233,6 +233,9 @@ class WorkerConnection(asyncio.SubprocessProtocol):
 
     async def end(self) -> None:
         """Disconnect the worker, and kill it after `EXIT_S`."""
+        # Its last states do not count as a connection.
+        if not self._closed.done():
+            self._closed.set_result(None)
         if self._process.get_returncode() is None:
             self.send(messages.Disconnect())
         # The end of its input disconnects the worker too.

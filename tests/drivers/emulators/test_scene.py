@@ -115,7 +115,7 @@ def test_a_slip_leaves_so_much_torque_and_the_grip_holds_again(sign):
 
 def test_a_tool_that_falls_takes_the_torque_with_it():
     hands, _ = twisted(0.1, 0.1)
-    hands.gripper.put_between(None)
+    hands.gripper.object_mm = None
     truth = hands.wait(1.0)
     assert (truth.gripped, truth.torque_nm, truth.diameter_mm) == (False, 0.0, None)
     assert truth.width_mm == pytest.approx(0.0)

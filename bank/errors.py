@@ -13,10 +13,6 @@ class ModelError(BankError):
     """A basis model or parameter that does not exist, or that no conductivity can be computed for."""
 
 
-class EmptyBankError(ModelError):
-    """A bank without a single valid cell: nothing can be matched with it."""
-
-
 class ConductivityError(ModelError):
     """A conductivity that is not positive everywhere: the equations have no physical solution."""
 

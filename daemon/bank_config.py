@@ -1,23 +1,20 @@
 """The configuration of banks and fingertips: `config/banks/*.yaml` and `config/fingertips/*.yaml`."""
 
-from dataclasses import fields
-from itertools import product
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import BankDefinition
 from shearloop.bank.eit.channels import INJECTION, ChannelTable, Injection
 from shearloop.bank.eit.fingertip import ElectrodePlace, Fingertip, RectangularFingertip, RoundFingertip, Side
 from shearloop.bank.eit.mesh import Mesh, load_mesh
-from shearloop.bank.eit.models import QUARTER_DEG, Variation
 from shearloop.bank.errors import GeometryError
 from shearloop.daemon.config_file import ConfigModel, load_yaml_model
 from shearloop.daemon.errors import UserError
-from shearloop.yaml_files import validated
 
 ModelName = Literal["step", "linear", "cut_linear", "gaussian_derivative", "modulated_gaussian"]
 MeshSize = Annotated[float, Field(ge=0.005, le=10)]
@@ -51,46 +48,8 @@ class MeshFileConfig(ConfigModel):
     injection: Injection = Field(INJECTION, description="the electrode that an injection's current comes from")
 
 
-class OverConfig(ConfigModel):
-    """Further parameters: a bank for each combination of their values.
-
-    amplitude, offset and tilt_deg vary the conductivity (1 + offset + amplitude · f along a turned axis); the others
-    replace the fingertip's.
-    """
-
-    amplitude: GridConfig | None = Field(None, description="factor of the basis model f")
-    offset: GridConfig | None = Field(None, description="change of the whole conductivity")
-    tilt_deg: GridConfig | None = Field(None, description="angle of the axis of f")
-    width_cm: GridConfig | None = Field(None, description="width of the fingertip")
-    height_cm: GridConfig | None = Field(None, description="height of the fingertip")
-    electrode_width_cm: GridConfig | None = Field(None, description="width of each electrode")
-    contact_impedance: GridConfig | None = Field(None, description="of each contact, in cm over the conductivity")
-
-    @field_validator("tilt_deg")
-    @classmethod
-    def _turns_less_than_a_quarter(cls, tilt_deg: GridConfig | None) -> GridConfig | None:
-        if tilt_deg is not None and not -QUARTER_DEG < tilt_deg.low <= tilt_deg.high < QUARTER_DEG:
-            limits = f"must be above -{QUARTER_DEG:g} and below {QUARTER_DEG:g} degrees"
-            raise ValueError(f"{limits}, not from {tilt_deg.low:g} to {tilt_deg.high:g}")
-        return tilt_deg
-
-    def values(self) -> list[dict[str, float]]:
-        """Return every combination by name, the last parameter changing first."""
-        grids = {name: grid for name in type(self).model_fields if (grid := getattr(self, name)) is not None}
-        combinations = product(*(grid.values().tolist() for grid in grids.values()))
-        return [dict(zip(grids, chosen, strict=True)) for chosen in combinations]
-
-
-# More banks than this fill a disk before anyone notices.
-_MOST_BANKS = 1000
-_VARIED = tuple(field.name for field in fields(Variation))
-
-
 class BankConfig(ConfigModel):
-    """A bank. Paths are relative to the file that names them; mesh_size_cm overrides the fingertip's.
-
-    With `over`, a folder of banks.
-    """
+    """A bank. Paths are relative to the file that names them; mesh_size_cm overrides the fingertip's."""
 
     what: ClassVar[str] = "bank's description"
 
@@ -100,7 +59,6 @@ class BankConfig(ConfigModel):
     model: ModelName = Field(description="basis model of the conductivity's change")
     k: GridConfig = Field(description="the model's first parameter, in cm")
     sigma: GridConfig = Field(description="the model's second parameter, in cm")
-    over: OverConfig | None = Field(None, description="further parameters: one bank for each combination")
 
     @model_validator(mode="after")
     def _is_of_one_geometry(self) -> Self:
@@ -110,17 +68,7 @@ class BankConfig(ConfigModel):
             raise ValueError("`mesh_size_cm` is for a `fingertip`; a `mesh` that is read from a file has its own")
         if self.sigma.low <= 0 and self.model != "step":
             raise ValueError(f"`sigma.low` must be above 0 for the model {self.model}, not {self.sigma.low:g}")
-        if self.over is not None:
-            self._has_what_it_is_over(self.over)
         return self
-
-    def _has_what_it_is_over(self, over: OverConfig) -> None:
-        banks = over.values()
-        if len(banks) > _MOST_BANKS:
-            raise ValueError(f"`over` makes {len(banks)} banks; take fewer values, {_MOST_BANKS} at most")
-        geometry = [name for name in banks[0] if name not in _VARIED]
-        if geometry and self.fingertip is None:
-            raise ValueError(f"`over` the {geometry[0]} needs a `fingertip`; a `mesh` that is read has its own")
 
 
 class ElectrodeRunConfig(ConfigModel):
@@ -191,46 +139,19 @@ class BankPlan(NamedTuple):
 
 
 def load_bank_plan(path: Path) -> BankPlan:
-    """Read a bank's configuration and its mesh.
-
-    Raises UserError and GeometryError with the file and the key to mend, also for a configuration of several banks.
-    """
-    plans = load_bank_plans(path)
-    if set(plans) != {""}:
-        raise UserError(f"{path}: `over` makes {len(plans)} banks, and here one is wanted; leave it out")
-    return plans[""]
-
-
-def load_bank_plans(path: Path) -> dict[str, BankPlan]:
-    """Read a configuration as `load_bank_plan` does, and return its banks by name.
-
-    With `over`, a name lists the parameters, `amplitude=0.5,tilt_deg=2`; a single bank has an empty name.
-    """
+    """Read a bank's configuration and its mesh; raises UserError and GeometryError with the file and key to mend."""
     config = load_yaml_model(path, BankConfig)
-    meshes: dict[tuple[tuple[str, float], ...], Geometry] = {}
-    plans = {}
-    for chosen in config.over.values() if config.over is not None else [{}]:
-        varied = {name: value for name, value in chosen.items() if name in _VARIED}
-        geometry = {name: value for name, value in chosen.items() if name not in _VARIED}
-        key = tuple(geometry.items())
-        if key not in meshes:
-            meshes[key] = _mesh_of(path, config, geometry)
-        if (name := _shown(chosen)) in plans:
-            raise UserError(f"{path}: two banks of `over` would be named {name}; take fewer values, or further apart")
-        mesh, table = meshes[key]
-        grids = config.k.values(), config.sigma.values()
-        plans[name] = BankPlan(mesh, BankDefinition(mesh.digest, config.model, *grids, Variation(**varied), table))
-    return plans
+    mesh, table = _mesh_of(path, config)
+    return BankPlan(mesh, BankDefinition(mesh.digest, config.model, config.k.values(), config.sigma.values(), table))
 
 
-def _mesh_of(path: Path, config: BankConfig, geometry: dict[str, float]) -> Geometry:
+def _mesh_of(path: Path, config: BankConfig) -> Geometry:
     if config.mesh is not None:
         mesh = load_mesh(path.parent / config.mesh.file)
         return Geometry(mesh, ChannelTable(mesh.n_electrodes, config.mesh.injection))
     if config.fingertip is None:
         raise UserError(f"{path}: give either `mesh` or `fingertip`")
-    size = {} if config.mesh_size_cm is None else {"mesh_size_cm": config.mesh_size_cm}
-    return _fingertip_mesh(path.parent / config.fingertip, **geometry, **size)
+    return _fingertip_mesh(path.parent / config.fingertip, config.mesh_size_cm)
 
 
 def load_geometry(path: Path) -> Geometry:
@@ -244,15 +165,12 @@ def load_geometry(path: Path) -> Geometry:
     return Geometry(mesh, ChannelTable(mesh.n_electrodes))
 
 
-def _fingertip_mesh(path: Path, **changed: float) -> Geometry:
-    content = load_yaml_model(path, FingertipGeometryConfig).model_dump() | changed
-    config = validated(content, FingertipGeometryConfig, f"{path}, with {_shown(changed)}", UserError)
+def _fingertip_mesh(path: Path, mesh_size_cm: float | None = None) -> Geometry:
+    config = load_yaml_model(path, FingertipGeometryConfig)
     try:
         fingertip = config.fingertip()
+        if mesh_size_cm is not None:
+            fingertip = replace(fingertip, mesh_size_cm=mesh_size_cm)
         return Geometry(fingertip.mesh(), fingertip.table)
     except GeometryError as error:
-        raise GeometryError(f"{path}{f', with {_shown(changed)}' if changed else ''}: {error}") from error
-
-
-def _shown(chosen: dict[str, float]) -> str:
-    return ",".join(f"{name}={value:.6g}" for name, value in chosen.items())
+        raise GeometryError(f"{path}: {error}") from error

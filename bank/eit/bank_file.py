@@ -13,7 +13,6 @@ Layout, all numbers little-endian:
 Opening a bank checks the header and the small arrays; the signals are checked on request.
 """
 
-import errno
 import hashlib
 import json
 import math
@@ -28,7 +27,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray
 from shearloop.bank.eit.channels import PAPER_TABLE, STIMULATION_CURRENT, ChannelTable
-from shearloop.bank.eit.models import MODELS, PLAIN, Variation, model_named
+from shearloop.bank.eit.models import MODELS, model_named
 from shearloop.bank.errors import BankFileError, GeometryError, ModelError
 from shearloop.files import replace_file
 
@@ -54,15 +53,13 @@ _TYPES = {
 class BankDefinition:
     """The definition of a bank: the geometry's digest, the basis model, the grids of k (K,) and σ (S,) in its units.
 
-    All cells share `variation`; a plain one is not part of the identity. Raises ModelError for an unknown model, and
-    for a grid that is empty, does not ascend or holds a σ ≤ 0.
+    Raises ModelError for an unknown model, and for a grid that is empty, does not ascend or holds a σ ≤ 0.
     """
 
     geometry_hash: str
     model: str
     k_grid: FloatArray
     sigma_grid: FloatArray
-    variation: Variation = PLAIN
     table: ChannelTable = PAPER_TABLE
 
     def __post_init__(self) -> None:
@@ -89,7 +86,7 @@ class BankDefinition:
             # Twelve digits: the last of a grid's sixteen may differ between machines.
             "k": [f"{k:.11e}" for k in self.k_grid.tolist()],
             "sigma": [f"{sigma:.11e}" for sigma in self.sigma_grid.tolist()],
-        } | _variation_entry(self.variation)
+        }
         return hashlib.sha256(json.dumps(defining, sort_keys=True).encode()).hexdigest()
 
 
@@ -128,7 +125,6 @@ class Bank(BankDefinition):
                     bank = cls(
                         geometry_hash=header["geometry"],
                         model=header["model"],
-                        variation=Variation(**header.get("variation", {})),
                         table=ChannelTable(**header.get("channels", {})),
                         path=path,
                         signals_sha256=checksums["signals"],
@@ -176,21 +172,7 @@ def write_bank(
                 file.write(b"\0" * (offsets[key] - file.tell()))
                 file.write(array.data)
     except OSError as error:
-        raise unwritable(path, error) from error
-
-
-def unwritable(path: Path, error: OSError) -> BankFileError:
-    """Return the error for a bank, or its journal, that the disk refuses; on a full disk the solved rows stay."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return BankFileError(
-            f"{path}: the bank cannot be written: {error.strerror}, and the rows solved so far are kept; make room and "
-            "give the same command again"
-        )
-    return BankFileError(f"{path}: the bank cannot be written: {error.strerror}; choose another --out")
-
-
-def _variation_entry(variation: Variation) -> dict[str, Any]:
-    return {} if variation == PLAIN else {"variation": asdict(variation)}
+        raise BankFileError(f"{path}: the bank cannot be written: {error.strerror}; choose another --out") from error
 
 
 def _layout(definition: BankDefinition, stored: dict[str, NDArray[Any]]) -> tuple[bytes, dict[str, int]]:
@@ -211,7 +193,7 @@ def _layout(definition: BankDefinition, stored: dict[str, NDArray[Any]]) -> tupl
             name: {"type": _TYPES[name], "shape": array.shape, "offset": offsets[name], "sha256": _sha256(array)}
             for name, array in stored.items()
         },
-    } | _variation_entry(definition.variation)
+    }
     # About 1.4 kB for every bank: nothing in it has a length that the user chooses.
     return json.dumps(header).encode().ljust(_PAGE - _PREAMBLE.size), offsets
 

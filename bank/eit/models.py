@@ -1,6 +1,6 @@
 """The five basis models of a sheared fingertip: conductivity 1 + f(y; k, σ), y along the fingertip's height.
 
-Trehan et al. 2025, equations (1) to (5). A `Variation` scales f, adds to it, or turns the axis.
+Trehan et al. 2025, equations (1) to (5).
 """
 
 from collections.abc import Callable
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 _SUBDIVISIONS = 5
 # Of a height, in shares of the fingertip's, in which two triangles are alike.
 _DIGITS = 12
-# An axis turned this far lies across the fingertip.
-QUARTER_DEG = 90.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,30 +35,6 @@ class BasisModel:
     def uses_sigma(self) -> bool:
         """Whether f depends on σ."""
         return self.sigma_unit != "not used"
-
-
-@dataclass(frozen=True, slots=True)
-class Variation:
-    """Further parameters of a conductivity: 1 + offset + amplitude · f(y′; k, σ).
-
-    y′ is the height along an axis turned by tilt_deg about the fingertip's centre, towards x. Raises ModelError for
-    values that are not finite, and for a tilt of a quarter turn or more.
-    """
-
-    amplitude: float = 1.0
-    offset: float = 0.0
-    tilt_deg: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if not np.isfinite([self.amplitude, self.offset, self.tilt_deg]).all() or abs(self.tilt_deg) >= QUARTER_DEG:
-            raise ModelError(
-                f"amplitude, offset and tilt must be finite, and the tilt less than ±{QUARTER_DEG:g}°, not "
-                f"{self.amplitude:g}, {self.offset:g} and {self.tilt_deg:g}°"
-            )
-
-
-PLAIN = Variation()
 
 
 def _step(y: FloatArray, k: float, sigma: float, c: float) -> FloatArray:  # noqa: ARG001 - all five have one signature
@@ -115,26 +89,23 @@ def averaging_points() -> FloatArray:
     return (3.0 * np.array(steps) + 1.0) / (3 * n)
 
 
-def conductivity(mesh: "Mesh", model: str, k: float, sigma: float, variation: Variation = PLAIN) -> FloatArray:
+def conductivity(mesh: "Mesh", model: str, k: float, sigma: float) -> FloatArray:
     """Return the (T,) conductivity of a mesh's triangles: 1 + the mean of f over the triangle's averaging points.
 
     It need not be positive. Raises ModelError for an unknown model, and for σ ≤ 0 where the model divides by it.
     """
-    return ConductivityModel(mesh, variation).conductivity(model, k, sigma)
+    return ConductivityModel(mesh).conductivity(model, k, sigma)
 
 
 class ConductivityModel:
     """The conductivity for many parameters on one mesh; triangles of equal heights are averaged once."""
 
-    def __init__(self, mesh: "Mesh", variation: Variation = PLAIN) -> None:
+    def __init__(self, mesh: "Mesh") -> None:
         """Find the triangles whose corners have the same heights."""
-        x, y = mesh.nodes.T
+        y = mesh.nodes[:, 1]
         self._centre = float((y.min() + y.max()) / 2)
-        self._variation = variation
-        turn, middle = np.deg2rad(variation.tilt_deg), (x.min() + x.max()) / 2
-        heights = self._centre + (y - self._centre) * np.cos(turn) + (x - middle) * np.sin(turn) if turn else y
         # A triangle's mean does not depend on the order of its corners, nor on rounding.
-        corners = np.sort(heights[mesh.triangles], axis=1)
+        corners = np.sort(y[mesh.triangles], axis=1)
         rounded = np.round(corners / mesh.height_cm, _DIGITS)
         _, first, self._alike = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
         corners = corners[first]
@@ -148,5 +119,5 @@ class ConductivityModel:
         if sigma <= 0 and basis.uses_sigma:
             raise ModelError(f"sigma must be above 0 for the model {model}, not {sigma}")
         shape = basis.function(self._heights, k, sigma, self._centre).sum(axis=0) / len(self._heights)
-        values: FloatArray = (1.0 + self._variation.offset + self._variation.amplitude * shape)[self._alike]
+        values: FloatArray = (1.0 + shape)[self._alike]
         return values

@@ -18,7 +18,6 @@ import heapq
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import count
 from operator import itemgetter
@@ -56,18 +55,12 @@ ROUNDING = 2e-5
 _SQUARE_ROUNDING = 4e-6
 # Rounding of float64 in the square of ρ.
 _SQUARE_ROUNDING_64 = 1e-12
-# Rounding of a sum of a thousand products in float64; where a tie hangs on less, the reference decides.
-_ROUNDING_64 = 1e-14
 # With fewer cells, the whole heatmap at all lags is faster than pruning.
 MIN_PRUNED_CELLS = 300
 # The runner-up may be this much worse than the best cell at lag 0 before groups are bounded a second time.
 _SLACK = 0.01
 # More bounds than this (16 MB) are not computed: all cells and lags remain.
 _MAX_BOUNDS = 1 << 22
-
-
-class _UndecidedError(Exception):
-    """Rounding of float64 decides which cells tie."""
 
 
 class Candidates(NamedTuple):
@@ -330,8 +323,7 @@ class _PruningMatcher(Matcher):
         """
         if len(self._cells) >= self._min_cells:
             (frame,) = unit_magnitudes(np.asarray(difference)[None], self.n_channels)
-            with suppress(_UndecidedError):
-                return self._search(frame)
+            return self._search(frame)
         return super().match(difference)
 
     @abstractmethod
@@ -350,10 +342,7 @@ class _PruningMatcher(Matcher):
             for i in range(0, len(cells), CHUNK_CELLS)
         ]
         scores = np.concatenate(parts)
-        behind = scores.max() - scores
-        if (np.abs(behind - TIE) < _ROUNDING_64).any():
-            raise _UndecidedError
-        winner = int(np.argmax(behind <= TIE))
+        winner = int(np.argmax(scores >= scores.max() - TIE))
         return int(cells[winner]), min(float(scores[winner]), 1.0)
 
     def _highest_scores(self, cells: IntArray, frames: FloatArray) -> FloatArray:

@@ -9,10 +9,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import ndtri, stdtrit
+from scipy.special import ndtri
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
+from shearloop.bank.polynomial import Polynomial
 from shearloop.bank.skin.finite_strain import FiniteStrainSkin
 from shearloop.bank.skin.membrane import (
     EXCITATION_A,
@@ -70,42 +71,30 @@ def noise_floor_n(time_s: FloatArray, response: FloatArray, sensitivity_per_n: f
     return math.sqrt(squares / float((counts[full] - 1).sum())) / sensitivity_per_n
 
 
-@dataclass(frozen=True, slots=True)
-class LineFit:
-    """A straight calibration line, response = offset + slope · force, and its scatter."""
+class LineFit(Polynomial):
+    """A straight calibration line: response (y) over shear force (x)."""
 
-    slope_per_n: float
-    offset: float
-    scatter: float
-    n: int
-    mean_n: float
-    spread_n2: float
+    __slots__ = ()
+
+    @property
+    def slope_per_n(self) -> float:
+        """The slope in 1/N."""
+        return self.coefficients[1]
 
     @property
     def kink_n(self) -> float:
         """The force where the line crosses zero."""
-        return -self.offset / self.slope_per_n
+        return self.centre - self.coefficients[0] / self.slope_per_n
 
     def prediction_half_width_n(self, shear_n: float) -> float:
-        """Return ± the 95 % interval (N) of a new single force read off the line near `shear_n`.
-
-        t(n−2) · s / slope · √(1 + 1/n + (x − x̄)² / Σ(x − x̄)²).
-        """
-        quantile = float(stdtrit(self.n - 2, 0.975))
-        widening = 1 + 1 / self.n + (shear_n - self.mean_n) ** 2 / self.spread_n2
-        return quantile * self.scatter / abs(self.slope_per_n) * math.sqrt(widening)
+        """Return ± the 95 % interval (N) of a new single force read off the line near `shear_n`."""
+        found = self.interval(shear_n)
+        return (found.high - found.value) / abs(self.slope_per_n)
 
 
 def fit_line(shear_n: FloatArray, response: FloatArray) -> LineFit:
     """Return the least-squares line of at least three responses; raises CalibrationError for fewer."""
-    n = len(shear_n)
-    spread = float(np.var(shear_n) * n)
-    if n < 3 or not spread > 0:
-        raise CalibrationError("A calibration line needs at least three responses, at more than one shear force.")
-    slope, offset = (float(value) for value in np.polyfit(shear_n, response, 1))
-    left = response - offset - slope * shear_n
-    scatter = math.sqrt(float(left @ left) / (n - 2))
-    return LineFit(slope, offset, scatter, n, float(shear_n.mean()), spread)
+    return LineFit.fit(shear_n, response, 1)
 
 
 def loading(up_to_n: float, step_n: float = 0.1) -> FloatArray:

@@ -1,9 +1,7 @@
 """`shearloop bank`: solve, design, build and inspect banks of simulated signals."""
 
 import argparse
-import json
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,14 +17,9 @@ from shearloop.daemon.cli.options import (
 )
 from shearloop.daemon.cli.terminal import print_result, progress_bar
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.process import report_interrupt
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from shearloop.bank.eit.bank_file import Bank, BankDefinition
-    from shearloop.bank.eit.build import BankRow
-    from shearloop.bank.eit.mesh import Mesh
+    from shearloop.bank.eit.bank_file import Bank
 
 run = run_action
 
@@ -37,9 +30,9 @@ MODEL_NAMES = "step, linear, cut_linear, gaussian_derivative or modulated_gaussi
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the actions and their arguments."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    build = add_action(actions, "build", "build a bank, or resume an interrupted build", _build)
+    build = add_action(actions, "build", "build a bank", _build)
     add_option(build, "--config", Path, "FILE", "the bank's configuration (YAML)", required=True)
-    add_option(build, "--out", Path, "PATH", "the bank file to write; with `over`, the folder", required=True)
+    add_option(build, "--out", Path, "PATH", "the bank file to write", required=True)
     add_option(build, "--jobs", int, "N", "threads, or workers of a cluster of this machine (default: one per core)")
     add_cluster(build)
     add_json(build)
@@ -64,75 +57,26 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _build(args: argparse.Namespace) -> int:
-    try:
-        return _build_all(args)
-    except KeyboardInterrupt as interrupt:
-        kept = args.out if args.out.is_dir() else f"{args.out}.part"
-        sentence = f"shearloop bank: interrupted: finished rows are in {kept}, and the same command resumes from there"
-        return report_interrupt(sentence, interrupt)
-
-
-def _build_all(args: argparse.Namespace) -> int:
     from shearloop.bank.eit.bank_file import BANK_MAGIC, Bank
     from shearloop.bank.eit.build import build_bank, solve_row
-    from shearloop.bank.errors import EmptyBankError
-    from shearloop.daemon.analysis.reproduce.banks import is_built
-    from shearloop.daemon.bank_config import load_bank_plans
+    from shearloop.daemon.bank_config import load_bank_plan
     from shearloop.daemon.executors import open_executor
 
     jobs = checked_jobs(args.jobs)
-    plans = load_bank_plans(args.config)
-    paths = _paths(args.out, list(plans))
-    # In a folder the names are the banks' own, and an unusable bank is built again.
-    if paths == [args.out]:
-        check_overwrite(args.out, "a bank", BANK_MAGIC)
-    built = []
-    with open_executor(args.cluster, jobs) as pool:
-
-        def on_cluster(
-            mesh: "Mesh", definition: "BankDefinition", rows: "Sequence[int]"
-        ) -> "Iterator[tuple[int, BankRow]]":
-            for number, cells in pool.map(solve_row, (mesh, definition), rows):
-                yield rows[number], cells
-
-        for path, plan in zip(paths, plans.values(), strict=True):
-            if len(paths) > 1 and is_built(path, plan.definition):
-                built.append(path)
-                continue
-            try:
-                with progress_bar(path.name, len(plan.definition.k_grid), "row") as show:
-                    build_bank(
-                        *plan,
-                        path,
-                        jobs=jobs,
-                        elsewhere=on_cluster if args.cluster is not None else None,
-                        on_row=lambda done, _: show(done),
-                        on_notice=lambda sentence: print(sentence, file=sys.stderr),
-                    )
-                built.append(path)
-            except EmptyBankError as error:
-                # The other banks of a folder are usable; where all are empty, the last one fails.
-                if path == paths[-1] and not built:
-                    raise
-                print(f"{error}. It is left out", file=sys.stderr)
-    results = [_result(path, Bank.open(path)) for path in built]
-    if args.json:
-        print(json.dumps(results[0] if args.out == paths[0] else {"banks": results}))
-    else:
-        for one in results:
-            print(f"{one['path']}: {one['valid_cells']} of {one['cells']} cells valid, identity {one['identity'][:12]}")
-    return 0
-
-
-def _paths(out: Path, names: list[str]) -> list[Path]:
-    """Return the banks' paths: `out` for a single one without a name, else files in the folder `out`."""
-    if names == [""]:
-        return [out]
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{out}: the banks need a folder there: {error.strerror}; choose another --out") from error
-    return [out / f"{name}.bank" for name in names]
+    plan = load_bank_plan(args.config)
+    check_overwrite(args.out, "a bank", BANK_MAGIC)
+    rows = len(plan.definition.k_grid)
+    with open_executor(args.cluster, jobs) as pool, progress_bar(args.out.name, rows, "row") as show:
+        build_bank(
+            *plan,
+            args.out,
+            jobs=jobs,
+            elsewhere=None if args.cluster is None else pool.map(solve_row, plan, range(rows)),
+            on_row=lambda done, _: show(done),
+        )
+    result = _result(args.out, Bank.open(args.out))
+    line = f"{args.out}: {result['valid_cells']} of {result['cells']} cells valid, identity {result['identity'][:12]}"
+    return print_result(result, [line], as_json=args.json)
 
 
 def _result(path: Path, bank: "Bank") -> dict[str, Any]:
@@ -177,7 +121,6 @@ def _info(args: argparse.Namespace) -> int:
     facts: dict[str, object] = {
         **_result(args.path, bank),
         "format_version": FORMAT_VERSION,
-        "variation": asdict(bank.variation),
         "geometry_hash": bank.geometry_hash,
         "channels": bank.table.n_channels,
         "channel_table_hash": bank.table.digest,
@@ -191,10 +134,8 @@ def _info(args: argparse.Namespace) -> int:
 
 
 def _text(value: object) -> str:
-    if isinstance(value, dict) and "count" in value:
-        return f"{value['count']} values from {value['low']:g} to {value['high']:g} ({value['unit']})"
     if isinstance(value, dict):
-        return ", ".join(f"{name} {one:g}" for name, one in value.items())
+        return f"{value['count']} values from {value['low']:g} to {value['high']:g} ({value['unit']})"
     if isinstance(value, list):
         return " × ".join(map(str, value))
     return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -69,12 +69,12 @@ def run(args: argparse.Namespace) -> int:
 def _prepare(config: Path, data: Path, *, calibrated: bool) -> None:
     """Make the bank and, if `calibrated`, the calibrations, where they are missing or outdated."""
     from shearloop.daemon.analysis.reproduce.banks import is_built
-    from shearloop.daemon.bank_config import load_bank_plans
+    from shearloop.daemon.bank_config import load_bank_plan
 
     with writing(data, "the folder"):
         data.mkdir(exist_ok=True)
     definition, signals = config / "banks" / "demo.yaml", data / "demo.bank"
-    if not is_built(signals, load_bank_plans(definition)[""].definition):
+    if not is_built(signals, load_bank_plan(definition).definition):
         print(f"The first time, a bank and calibrations are made in {data}, in about half a minute.", flush=True)
         _call(bank, "build", "--config", str(definition), "--out", str(signals))
     if calibrated and not _is_calibrated(data, signals):

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.bank.eit.models import MODELS, Variation, averaging_points, conductivity
+from shearloop.bank.eit.models import MODELS, averaging_points, conductivity
 from shearloop.bank.errors import ModelError
 
 
@@ -75,24 +75,3 @@ def test_the_conductivity_is_the_mean_over_the_averaging_points(name, fingertip,
         for k, sigma in [(0.7, 0.3), (2.0, 1.1)]:
             expected = 1 + MODELS[name].function(y, k, sigma, centre).mean(axis=1)
             np.testing.assert_allclose(conductivity(mesh, name, k, sigma), expected, rtol=0, atol=1e-12)
-
-
-@given(amplitude=st.floats(-2, 2), offset=st.floats(-0.5, 2), tilt_deg=st.floats(-80, 80))
-def test_a_variation_scales_adds_and_turns(fingertip, amplitude, offset, tilt_deg):
-    """The field along a turned axis is the plain one on a fingertip that is turned back, about the same centre."""
-    centre = (fingertip.nodes.min(axis=0) + fingertip.nodes.max(axis=0)) / 2
-    turn = np.deg2rad(tilt_deg)
-    turned = centre + (fingertip.nodes - centre) @ np.array(
-        [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
-    )
-    y = turned[fingertip.triangles, 1] @ averaging_points().T
-    expected = 1 + offset + amplitude * MODELS["gaussian_derivative"].function(y, 1.4, 0.8, centre[1]).mean(axis=1)
-    variation = Variation(amplitude, offset, tilt_deg)
-    found = conductivity(fingertip, "gaussian_derivative", 1.4, 0.8, variation)
-    np.testing.assert_allclose(found, expected, atol=1e-11)
-
-
-@pytest.mark.parametrize("wrong", [{"tilt_deg": 90.0}, {"tilt_deg": -120.0}, {"amplitude": np.nan}, {"offset": np.inf}])
-def test_a_variation_that_describes_nothing_is_refused(wrong):
-    with pytest.raises(ModelError, match=r"the tilt less than .*, not [^A-Z]*°$"):
-        Variation(**wrong)

@@ -387,16 +387,3 @@ def test_few_cells_are_scored_exactly(slow, fast, monkeypatch):
     frame = BANK[0][7, 12] * (1 + 0.05 * np.random.default_rng(6).normal(size=PAPER_TABLE.n_channels))
     assert_same(fast.match(frame), slow.match(frame))
     assert sum(read) < BANK[1].sum() / 4
-
-
-@both
-def test_a_tie_that_hangs_on_rounding_is_left_to_the_slow_matcher(slow, fast, monkeypatch):
-    frame = BANK[0][6, 6] + BANK[0][16, 5]
-    expected = slow.match(frame)
-    scored = []
-    monkeypatch.setattr(type(slow), "heatmap", lambda self, each: scored.append(each) or Matcher.heatmap(self, each))
-    assert_same(fast.match(frame), expected)
-    assert not scored
-    monkeypatch.setattr(pruned_matching, "_ROUNDING_64", 2.0)
-    assert_same(fast.match(frame), expected)
-    assert len(scored) == 1

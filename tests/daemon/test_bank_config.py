@@ -10,7 +10,7 @@ from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import GeometryError
-from shearloop.daemon.bank_config import ModelName, load_bank_plan, load_bank_plans, load_geometry
+from shearloop.daemon.bank_config import ModelName, load_bank_plan, load_geometry
 from shearloop.daemon.errors import UserError
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -113,54 +113,3 @@ def test_mistakes_in_a_bank_and_its_fingertip_are_named(config, before, after, s
     (config.parent / "tip.yaml").write_text(FINGERTIP.replace(before, after))
     with pytest.raises((UserError, GeometryError), match=sentence):
         load_bank_plan(config)
-
-
-OVER = """over:
-  amplitude: {low: 0.5, high: 1, count: 2}
-  electrode_width_cm: {low: 0.15, high: 0.2, count: 2}
-"""
-
-
-def test_a_configuration_over_more_parameters_is_a_bank_for_each_combination(config):
-    config.write_text(BANK + OVER)
-    plans = load_bank_plans(config)
-    assert list(plans) == [
-        f"amplitude={amplitude},electrode_width_cm={width}" for amplitude in ("0.5", "1") for width in ("0.15", "0.2")
-    ]
-    assert [plan.definition.variation.amplitude for plan in plans.values()] == [0.5, 0.5, 1.0, 1.0]
-    narrow, wide, *_ = (plan.mesh.digest for plan in plans.values())
-    assert narrow != wide
-    with pytest.raises(UserError, match="`over` makes 4 banks, and here one is wanted"):
-        load_bank_plan(config)
-    config.write_text(BANK)
-    assert list(load_bank_plans(config)) == [""]
-
-
-@pytest.mark.parametrize(
-    ("over", "sentence"),
-    [
-        ("over: {tilt: {low: 0, high: 1, count: 2}}", "over.tilt: is not a known key; did you mean tilt_deg"),
-        ("over: {amplitude: {low: 0, high: 1, count: 1001}}", "`over` makes 1001 banks; take fewer values, 1000"),
-        (
-            "over: {amplitude: {low: 0.5, high: 0.5000001, count: 3}}",
-            "two banks of `over` would be named amplitude=0.5",
-        ),
-        (
-            "over: {height_cm: {low: -1, high: 1, count: 2}}",
-            r"tip\.yaml, with height_cm=-1.*: height_cm: -1.* is too small",
-        ),
-        (
-            "over: {tilt_deg: {low: 0, high: 90, count: 2}}",
-            r"bank\.yaml:\d+: over.tilt_deg: must be above -90 and below 90 degrees, not from 0 to 90",
-        ),
-        (
-            "over: {electrode_width_cm: {low: 1.0e-9, high: 1.0e-9, count: 1}}",
-            r"tip\.yaml, with electrode_width_cm=1e-09: .* electrode_width_cm must be 0\.001 or more",
-        ),
-        ("over: {height_cm: {low: 1, high: 2, count: 2}}", r"tip\.yaml, with height_cm=1"),
-    ],
-)
-def test_mistakes_in_what_a_bank_is_over_are_named(config, over, sentence):
-    config.write_text(f"{BANK}{over}\n")
-    with pytest.raises((UserError, GeometryError), match=sentence):
-        load_bank_plans(config)

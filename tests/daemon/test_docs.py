@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from shearloop.daemon.bank_config import load_bank_plans
+from shearloop.daemon.bank_config import load_bank_plan
 from shearloop.daemon.cli import COMMANDS
 from shearloop.daemon.cli.completion import full_parser
 from shearloop.daemon.config import load_daemon_config
@@ -84,7 +84,7 @@ def check_yaml(block: str, folder: Path) -> None:
     elif "model" in content:
         (folder / "fingertips").symlink_to(ROOT / "config/fingertips")
         path.write_text(block)
-        assert load_bank_plans(path)
+        assert load_bank_plan(path)
     else:
         rest = {"fingertips": {"right": {"device": {"path": "port"}}}}
         path.write_text(yaml.safe_dump({**rest, **content}))

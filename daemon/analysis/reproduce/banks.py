@@ -103,7 +103,5 @@ def cached_bank(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{folder}: the folder for banks cannot be made: {error.strerror}") from error
-    build_bank(
-        mesh, definition, path, jobs=jobs, on_row=on_row, on_notice=lambda sentence: print(sentence, file=sys.stderr)
-    )
+    build_bank(mesh, definition, path, jobs=jobs, on_row=on_row)
     return Bank.open(path)

@@ -171,24 +171,6 @@ def bank(tmp_path_factory) -> Path:
     return folder / "here.bank"
 
 
-@pytest.fixture(scope="module")
-def varied(bank, scheduler) -> tuple[Path, Path]:
-    """Return folders of banks over tilt and amplitude, built here and on the cluster."""
-    folder = bank.parent
-    over = "over: {tilt_deg: {low: -5, high: 5, count: 2}, amplitude: {low: 0.5, high: 1, count: 2}}"
-    (folder / "over.yaml").write_text(f"{BANK}{over}\n")
-    for name, options in (("over-here", ["--jobs", "1"]), ("over-there", ["--cluster", scheduler])):
-        command = ["bank", "build", "--config", str(folder / "over.yaml"), "--out", str(folder / name), *options]
-        assert main(command) == 0
-    return folder / "over-here", folder / "over-there"
-
-
-def test_banks_over_more_parameters_have_the_same_bytes_from_a_cluster(varied):
-    here, there = ({path.name: path.read_bytes() for path in folder.iterdir()} for folder in varied)
-    assert len(set(here.values())) == 4
-    assert here == there
-
-
 @pytest.fixture
 def killed(scheduler, monkeypatch) -> Iterator[list[int]]:
     """Kill a worker as soon as the first result of anything is here, and give the numbers of those killed.

@@ -3,7 +3,6 @@
 No score lies above its bound, and few cells remain.
 """
 
-import copy
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -104,16 +103,6 @@ def assert_same(fast: Match, slow: Match) -> None:
 
 
 amplitudes = hnp.arrays(np.float64, PAPER_TABLE.n_channels, elements=st.floats(-10, 10, width=32)).filter(np.any)
-
-
-@both
-def test_a_matcher_that_was_copied_matches_the_same(slow, fast):
-    frame = np.random.default_rng(5).normal(size=PAPER_TABLE.n_channels)
-    for one in (slow, fast):
-        # As pickling does, which sends it to another process.
-        again = copy.deepcopy(one)
-        assert type(again) is type(one)
-        assert again.match(frame) == one.match(frame)
 
 
 @both

@@ -9,14 +9,18 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: install install-dev system-packages demo docs docs-site test test-fast lint format clean
 
-# `install` is for running and drawing; `install-dev` adds the tools of tests and checks.
-install: $(VENV)/.installed
+# The demo needs the least; `install` adds what the exports need, `install-dev` the tools of tests and checks.
+install: $(VENV)/.installed-exports
 install-dev: $(VENV)/.installed-dev
 
 $(VENV)/.installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version.split()[0]; sys.version_info >= (3, 11) or sys.exit(f"Python {v} is too old: shearloop needs 3.11 or later, e.g. `make demo PYTHON=python3.12`.")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[plot,view]'
+	touch $@
+
+$(VENV)/.installed-exports: pyproject.toml $(VENV)/.installed
+	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[export,rerun]'
 	touch $@
 
 $(VENV)/.installed-dev: pyproject.toml $(VENV)/.installed
@@ -31,7 +35,7 @@ system-packages:
 	[ -z "$$missing" ] || { apt-get update -qq -o Acquire::Retries=2 -o Acquire::http::Timeout=30 && apt-get install -y -qq --no-install-recommends $$missing; }
 
 # The whole emulated rig; with RECORDING=FILE one fingertip that plays a recorded stream (.mat).
-demo: install
+demo: $(VENV)/.installed
 	$(BIN)/shearloop demo --folder . $(if $(RECORDING),--recording '$(RECORDING)')
 
 # Test files run in parallel, the longest first (tests/conftest.py). Tests that drive a robot run afterwards with less
@@ -64,7 +68,7 @@ format: install-dev
 	$(BIN)/ruff format .
 
 # The generated pages.
-docs: install
+docs: $(VENV)/.installed
 	$(BIN)/python -m shearloop.daemon.docgen
 
 # The pages as a site in build/site; every warning is an error. The variable silences an advertisement.

@@ -221,7 +221,7 @@ class DaemonConfig(ConfigModel):
 
     _kind = not_of_kind(
         "an experiment",
-        "name it in a configuration as `experiment`, or `shearloop command start --experiment FILE`",
+        "name it in a configuration as `experiment`, or start it with `shearloop command start --experiment FILE`",
         "steps",
     )
 

@@ -9,7 +9,6 @@ where the measuring pair touches a driven electrode. Values are below 10 V, so a
 import math
 import os
 import re
-import time
 from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -22,7 +21,6 @@ from numpy.typing import NDArray
 
 from shearloop.drivers.connection import Diagnostics, LinkMonitor, Port, SerialLink
 from shearloop.drivers.defaults import FRAME_PERIOD_S
-from shearloop.drivers.errors import DeviceLostError
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, LineSplitter, RawEvent, SerialSensor
 
 CELL_BYTES = len(b"0.1234, ")
@@ -42,12 +40,10 @@ FULL_SCALE_SINE_RMS_V = ADC_REFERENCE_V / 2 / 2**0.5
 DEAD_AFTER_FRAMES = 200
 
 START = b"y"
-# A silence of this many periods restarts the board.
+# A board that is silent for this many periods is opened and started again.
 SILENT_PERIODS = 4
 # At fast frame rates a shorter silence may come from a busy computer.
 MIN_SILENCE_S = 0.5
-# Unanswered starts before the port is reopened.
-STARTS_BEFORE_REOPENING = 5
 
 # FrameClock.
 # Frames behind the period: 35 s at 0.54 s, while a crystal drifts by microseconds.
@@ -65,7 +61,7 @@ LONGEST_GAP = 2.5
 PLAUSIBLE = 0.05
 
 _SEPARATOR = b", "
-_DECIMAL = re.compile(rb"-?\d+\.\d{4}")
+_VALUE = re.compile(rb"\d\.\d{4}")
 _LINE = re.compile(rb"(?:\d\.\d{4}, )+")
 
 
@@ -74,9 +70,8 @@ class FrameErrorKind(Enum):
 
     TOO_LONG = f"a line of more than {MAX_LINE_BYTES} bytes: newlines are lost, or this is not an EIT-kit"
     WRONG_COUNT = "a line without all of its values, each followed by a comma and a space: bytes were lost"
-    NOT_A_NUMBER = "a value that is not a decimal with four places: bytes were lost or changed"
+    NOT_A_NUMBER = "a value that is not written as 0.1234: bytes were lost or changed"
     NAN = "a value that is NaN: the board divided by zero, restart it so that it calibrates again"
-    NEGATIVE = "a negative value, impossible for an amplitude: bytes were changed"
     OUT_OF_RANGE = f"a value above the ADC's {ADC_REFERENCE_V} V: bytes were changed"
     ZERO_CHANNEL = "a channel that reads exactly 0: an electrode is shorted, or values are out of place"
     NONZERO_SLOT = "a value where the pair touches a driven electrode and 0 belongs: a different injection pattern"
@@ -125,17 +120,10 @@ def _find_error(line: bytes, n_values: int) -> FrameError:
     if rest or len(values) != n_values:
         return FrameError(FrameErrorKind.WRONG_COUNT, line[:EXCERPT_BYTES])
     for position, value in enumerate(values):
-        if value.lower().lstrip(b"-") == b"nan":
-            kind = FrameErrorKind.NAN
-        elif not _DECIMAL.fullmatch(value):
-            kind = FrameErrorKind.NOT_A_NUMBER
-        elif value.startswith(b"-"):
-            kind = FrameErrorKind.NEGATIVE
-        elif len(value) + len(_SEPARATOR) != CELL_BYTES:
-            kind = FrameErrorKind.OUT_OF_RANGE
-        else:
-            continue
-        return FrameError(kind, value[:EXCERPT_BYTES], position)
+        if not _VALUE.fullmatch(value):
+            is_nan = value.lower().lstrip(b"-") == b"nan"
+            kind = FrameErrorKind.NAN if is_nan else FrameErrorKind.NOT_A_NUMBER
+            return FrameError(kind, value[:EXCERPT_BYTES], position)
     raise AssertionError("the line has no error")
 
 
@@ -253,21 +241,11 @@ def slope_below(points: Iterable[tuple[int, int]]) -> float:
     return (t1 - t0) / (n1 - n0)
 
 
-@dataclass(slots=True)
-class _Opening:
-    """What holds since the port was opened: the first line may lack its beginning."""
-
-    first: bool = True
-    rejected_since_frame: bool = False
-    # The length of the line that was under way when the board was started again.
-    restarted_at: int = 0
-
-
 class FrameParser:
     """Turns bytes, however they are sliced, into frames; counts rejected lines by kind. No I/O.
 
-    `zero_slots` (v,) is true where the injection pattern makes the value 0. Two counters are not errors:
-    `partial_lines` were under way when the port was opened, `unfinished` were cut off by a reopening or restart.
+    `zero_slots` (v,) is true where the injection pattern makes the value 0. A line that was under way when the port was
+    opened is no error.
     """
 
     def __init__(self, zero_slots: NDArray[np.bool_], *, nominal_period_ns: int = NOMINAL_PERIOD_NS) -> None:
@@ -275,30 +253,21 @@ class FrameParser:
         self.frames = 0
         self.errors: Counter[FrameErrorKind] = Counter()
         self.last_error: FrameError | None = None
-        self.partial_lines = 0
         self._zero_slots = zero_slots
         self._lines = LineSplitter(MAX_LINE_BYTES)
-        self._opening = _Opening()
-        self._restarted_lines = 0
+        self._first_line = True
+        self._rejected_since_frame = False
         self._last_mid_ns = -(2**63)
         self._last_channels = np.full(np.count_nonzero(~zero_slots), np.nan)
         self._equal_readings = np.zeros(len(self._last_channels), np.int64)
-
-    @property
-    def unfinished(self) -> int:
-        """Lines that were cut off."""
-        return self._lines.unfinished + self._restarted_lines
 
     def handle(self, event: RawEvent) -> list[Frame]:
         """Process a live or recorded event; return the frames that it completes."""
         match event.kind:
             case InputKind.OPENED:
                 self._lines.restart()
-                self._opening = _Opening()
+                self._first_line, self._rejected_since_frame = True, False
                 self.clock.restart()
-            case InputKind.STARTED:
-                # A restarted board continues its line or begins another.
-                self._opening.restarted_at = len(self._lines.partial)
             case InputKind.DATA:
                 return self.feed(event.data, event.t_ns)
         return []
@@ -308,10 +277,10 @@ class FrameParser:
         complete = []
         for line in self._lines.feed(data):
             found = self._read(line)
-            self._opening.first, self._opening.restarted_at = False, 0
+            self._first_line = False
             if found is not None:
-                complete.append((*found, self._opening.rejected_since_frame))
-                self._opening.rejected_since_frame = False
+                complete.append((*found, self._rejected_since_frame))
+                self._rejected_since_frame = False
         frames = []
         for number, (line, values, missed) in enumerate(complete, 1):
             # Frames that waited together were sent one period apart, the last one by now.
@@ -328,22 +297,15 @@ class FrameParser:
         values = read_line(line, self._zero_slots)
         if not isinstance(values, FrameError):
             return line, values
-        if self._opening.restarted_at:
-            rest = line[self._opening.restarted_at :]
-            rest_values = read_line(rest, self._zero_slots)
-            if not isinstance(rest_values, FrameError):
-                self._restarted_lines += 1
-                return rest, rest_values
-        if self._opening.first and values.kind in _PARTIAL_ERRORS and len(line) < self._zero_slots.size * CELL_BYTES:
-            self.partial_lines += 1
-        else:
+        whole = len(line) >= self._zero_slots.size * CELL_BYTES
+        if whole or not self._first_line or values.kind not in _PARTIAL_ERRORS:
             self._reject(values)
         return None
 
     def _reject(self, error: FrameError) -> None:
         self.errors[error.kind] += 1
         self.last_error = error
-        self._opening.rejected_since_frame = True
+        self._rejected_since_frame = True
 
     def _frame(self, line: bytes, values: NDArray[np.float64], sent_ns: int, t_arrival_ns: int) -> Frame:
         channels = values[~self._zero_slots]
@@ -380,6 +342,8 @@ class EitKit(SerialSensor[Frame]):
     is measured. `inputs` keeps every input of the parser.
     """
 
+    silence_hint = "see that it has power and that it is an EIT-kit."
+
     def __init__(
         self,
         *,
@@ -393,7 +357,6 @@ class EitKit(SerialSensor[Frame]):
         link = SerialLink(serial_number=serial_number, path=path, monitor=monitor)
         super().__init__(link, frame_period_s, inputs)
         self._parser = FrameParser(zero_slots, nominal_period_ns=round(frame_period_s * 1e9))
-        self._silences = 0
 
     @property
     def period_s(self) -> float:
@@ -408,9 +371,6 @@ class EitKit(SerialSensor[Frame]):
             "frames": parser.frames,
             "errors": {kind.name.lower(): count for kind, count in parser.errors.items()},
             "last_frame_error": "" if parser.last_error is None else str(parser.last_error),
-            "partial_lines": parser.partial_lines,
-            "unfinished": parser.unfinished,
-            "silences": self._silences,
             "expected_hz": 1.0 / self._period_s,
             "measured_hz": 1.0 / self.period_s if parser.clock.learned else None,
         }
@@ -421,15 +381,4 @@ class EitKit(SerialSensor[Frame]):
         return frames
 
     async def _on_open(self, port: Port) -> None:
-        self._silence_s = self._longest_silence_s
-        await port.write(START)
-
-    async def _on_timeout(self, port: Port) -> None:
-        if self._timeouts > STARTS_BEFORE_REOPENING:
-            raise DeviceLostError(
-                f"{port.path} is open but silent, though the board was started {STARTS_BEFORE_REOPENING} times more; "
-                "see that it has power and that it is an EIT-kit."
-            )
-        self._silences += 1
-        self._dispatch(InputKind.STARTED, time.monotonic_ns())
         await port.write(START)

@@ -8,7 +8,6 @@ With its RATE pin high an HX711 converts eight times as often; the configuration
 import os
 import re
 import time
-from collections import Counter
 from dataclasses import dataclass
 from typing import Literal, Self
 
@@ -16,7 +15,6 @@ from shearloop.drivers import serial_sensor
 from shearloop.drivers.calibration_files import CalibrationModel, Finite, Positive
 from shearloop.drivers.connection import Diagnostics, LinkMonitor, SerialLink
 from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ
-from shearloop.drivers.errors import times
 
 BAUD_RATE = 115200
 PERIOD_NS = round(1e9 / LOAD_CELL_RATE_HZ)
@@ -32,13 +30,6 @@ CAPACITY_NM = 1.75
 SLEW_NM_PER_S = 2.0
 
 _DECIMAL = re.compile(rb"[+-]?[0-9]{1,15}(\.[0-9]{1,15})?")
-
-LINE_ERRORS = {
-    "not_decimal": "The load cell's board sent a line that is not a decimal; check the baud rate and the sketch.",
-    "too_long": f"The load cell's board sent more than {MAX_LINE_BYTES} bytes without a line end; check the baud rate.",
-    "empty": "The load cell's board sent an empty line; bytes were lost, check the cable.",
-    "unfinished": "The load cell's board broke off in the middle of a line; check its plug and its power.",
-}
 
 # Of the paper's rig.
 LEVER_ARM_M = 0.035
@@ -123,53 +114,32 @@ class SpikeFilter:
         return abs(after[0] - before[0]) <= SLEW_NM_PER_S * elapsed_s
 
 
-class LoadParser:
-    """Turns the board's bytes, however they are sliced, into samples; counts rejected lines by kind. No I/O."""
+class LoadParser(serial_sensor.LineParser[LoadSample]):
+    """Turns the board's bytes into samples."""
 
     def __init__(self, calibration: LoadCalibration, rate_hz: float = LOAD_CELL_RATE_HZ) -> None:
-        self._period_ns = round(1e9 / rate_hz)
+        super().__init__(_DECIMAL, MAX_LINE_BYTES, BAUD_RATE, rate_hz)
         self._stuck_after = max(STUCK_AFTER, round(STUCK_AFTER * rate_hz / LOAD_CELL_RATE_HZ))
-        self._lines = serial_sensor.TimedLines(MAX_LINE_BYTES, BAUD_RATE, rate_hz)
-        self._errors: Counter[str] = Counter()
         self._seq = 0
         self.calibration = calibration
         self.restart()
 
     def handle(self, event: serial_sensor.RawEvent) -> list[LoadSample]:
         """Process a live or recorded event; return the samples that it completes."""
-        match event.kind:
-            case serial_sensor.InputKind.OPENED:
-                self.restart()
-            case serial_sensor.InputKind.TARE:
-                self.calibration = self.calibration.tared(float(event.data))
-                self._spikes = SpikeFilter(self._period_ns)
-            case serial_sensor.InputKind.DATA:
-                return self.feed(event.data, event.t_ns)
-        return []
+        if event.kind is serial_sensor.InputKind.TARE:
+            self.calibration = self.calibration.tared(float(event.data))
+            self._spikes = SpikeFilter(self._period_ns)
+        return super().handle(event)
 
     def restart(self) -> None:
         """Forget everything but counters and calibration: the port was (re)opened."""
-        self._lines.restart()
+        super().restart()
         self._last_raw: float | None = None
         self._repeats = 0
         self._spikes = SpikeFilter(self._period_ns)
 
-    @property
-    def errors(self) -> Counter[str]:
-        """The number of rejected lines, by kind."""
-        return self._errors + Counter(too_long=self._lines.too_long, unfinished=self._lines.unfinished)
-
-    def feed(self, data: bytes, t_arrival_ns: int) -> list[LoadSample]:
-        """Return the samples that `data` completes; of several lines each is a period older than the next."""
-        samples = []
-        for line in self._lines.timed(data, t_arrival_ns):
-            if _DECIMAL.fullmatch(line.text):
-                samples.append(self._sample(float(line.text), line))
-            else:
-                self._errors["not_decimal" if line.text else "empty"] += 1
-        return samples
-
-    def _sample(self, raw: float, line: serial_sensor.TimedLine) -> LoadSample:
+    def _values(self, line: serial_sensor.TimedLine) -> list[LoadSample]:
+        raw = float(line.text)
         torque_nm = self.calibration.torque_nm(raw)
         self._repeats = self._repeats + 1 if raw == self._last_raw else 1
         self._last_raw = raw
@@ -188,12 +158,7 @@ class LoadParser:
             partial=line.partial,
         )
         self._seq += 1
-        return sample
-
-
-def describe_errors(errors: Counter[str], sentences: dict[str, str] = LINE_ERRORS) -> str:
-    """Return one sentence, with its count, for every kind of rejected line."""
-    return " ".join(f"{sentences[kind]} ({times(count)})" for kind, count in sorted(errors.items()))
+        return [sample]
 
 
 class LoadCell(serial_sensor.SerialSensor[LoadSample]):
@@ -224,13 +189,11 @@ class LoadCell(serial_sensor.SerialSensor[LoadSample]):
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
-        errors = self._parser.errors
         return {
             **super().diagnostics(),
             "samples": self._samples,
             "flagged": self._flagged,
-            "errors": dict(errors),
-            "error_details": describe_errors(errors),
+            "errors": self._parser.errors,
         }
 
     def _parse(self, event: serial_sensor.RawEvent) -> list[LoadSample]:

@@ -1,8 +1,10 @@
 """Sensors on serial lines: raw events, lines, and the loop that reads a board and reconnects to it."""
 
 import contextlib
+import re
 import time
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -24,7 +26,7 @@ class InputKind(Enum):
     """What a parser is given; the value is the name in recordings."""
 
     OPENED = "opened"  # the port was opened, a half-received line is void
-    STARTED = "started"  # a silent board was started again
+    STARTED = "started"  # a silent board was started again; only in older recordings
     ASKED = "asked"  # an instrument was sent the query in `data`; its reply follows
     DATA = "data"  # bytes arrived
     TARE = "tare"  # a new zero was asked for, or found
@@ -51,9 +53,8 @@ class InputRecorder(Protocol):
 class LineSplitter:
     """Splits a byte stream into lines, however it is sliced. A line that is too long is counted once and dropped whole.
 
-    `too_long` and `unfinished` count since the beginning: lines of more than `max_bytes`, without the newline, and
-    lines cut off by a reopening.
-    `too_long_start` is the beginning of the last line that was too long.
+    `too_long` counts lines of more than `max_bytes`, without the newline, since the beginning; `too_long_start` is the
+    beginning of the last one.
     """
 
     def __init__(self, max_bytes: int) -> None:
@@ -62,16 +63,9 @@ class LineSplitter:
         self.partial = b""
         self.too_long = 0
         self.too_long_start = b""
-        self.unfinished = 0
-
-    @property
-    def in_line(self) -> bool:
-        """Whether a line has begun and not ended."""
-        return self._dropping or bool(self.partial.strip())
 
     def restart(self) -> None:
         """Drop a half-received line: the port was reopened."""
-        self.unfinished += self.in_line and not self._dropping
         self.partial = b""
         self._dropping = False
 
@@ -108,34 +102,60 @@ class TimedLine:
     partial: bool
 
 
-class TimedLines(LineSplitter):
-    """Splits and stamps the lines of a board that sends one per conversion. No I/O."""
+class LineParser(ABC, Generic[ValueT]):
+    """Turns the bytes of a board that sends a line for each conversion, in any slices, into values. No I/O."""
 
-    def __init__(self, max_bytes: int, baud: int, rate_hz: float) -> None:
-        super().__init__(max_bytes)
+    def __init__(self, pattern: re.Pattern[bytes], max_bytes: int, baud: int, rate_hz: float) -> None:
+        """Accept lines that match the pattern, of at most `max_bytes`; the board sends `rate_hz` lines a second."""
+        self._pattern = pattern
+        self._lines = LineSplitter(max_bytes)
         self._byte_ns = 10 * 10**9 // baud  # with start and stop bit
         self._period_ns = round(1e9 / rate_hz)
         self._last_mid_ns = -(2**63)
         self._first = True
+        self._rejected: Counter[str] = Counter()
+
+    @property
+    def errors(self) -> dict[str, int]:
+        """The number of rejected lines, by kind."""
+        return dict(self._rejected + Counter({"too long": self._lines.too_long}))
+
+    @abstractmethod
+    def _values(self, line: TimedLine) -> list[ValueT]:
+        """Return the values in a line that matches the pattern."""
+
+    def handle(self, event: RawEvent) -> list[ValueT]:
+        """Process a live or recorded event; return the values that it completes."""
+        match event.kind:
+            case InputKind.OPENED:
+                self.restart()
+            case InputKind.DATA:
+                return self.feed(event.data, event.t_ns)
+        return []
 
     def restart(self) -> None:
         """Drop a half-received line: the port was opened, perhaps in the middle of one."""
-        super().restart()
+        self._lines.restart()
         self._first = True
 
-    def timed(self, data: bytes, t_arrival_ns: int) -> list[TimedLine]:
-        """Return the lines that `data` completes; of several each is a period older than the next."""
-        lines = self.feed(data)
-        found = []
-        for age, line in zip(range(len(lines) - 1, -1, -1), lines, strict=True):
+    def feed(self, data: bytes, t_arrival_ns: int) -> list[ValueT]:
+        """Return the values that `data` completes; of several lines each is a period older than the next."""
+        values = []
+        lines = self._lines.feed(data)
+        for age, text in zip(range(len(lines) - 1, -1, -1), lines, strict=True):
             partial, self._first = self._first, False
-            if line is not None:
-                arrived_ns = t_arrival_ns - age * self._period_ns
-                t_mid_ns = arrived_ns - (len(line) + 1) * self._byte_ns - self._period_ns // 2
-                # Time stays in order when lines arrive in bursts.
-                self._last_mid_ns = max(t_mid_ns, self._last_mid_ns + 1)
-                found.append(TimedLine(line.strip(b"\r"), arrived_ns, self._last_mid_ns, partial))
-        return found
+            if text is None:
+                continue
+            arrived_ns = t_arrival_ns - age * self._period_ns
+            t_mid_ns = arrived_ns - (len(text) + 1) * self._byte_ns - self._period_ns // 2
+            # Time stays in order when lines arrive in bursts.
+            self._last_mid_ns = max(t_mid_ns, self._last_mid_ns + 1)
+            line = TimedLine(text.strip(b"\r"), arrived_ns, self._last_mid_ns, partial)
+            if self._pattern.fullmatch(line.text):
+                values += self._values(line)
+            elif not partial:
+                self._rejected["not a number" if line.text else "empty"] += 1
+        return values
 
 
 class StepFilter(Generic[ValueT]):
@@ -177,9 +197,7 @@ class SerialSensor(ABC, Generic[ValueT]):
         self._period_s = period_s
         self._longest_silence_s = SILENT_PERIODS * period_s
         self._inputs = inputs
-        # A silence of this time means that the board is lost, or needs another start.
         self._silence_s = BOOT_S
-        self._timeouts = 0
 
     async def readings(self) -> AsyncGenerator[ValueT]:
         """Yield the values of every line, in order and without end, as `batches` does."""
@@ -200,13 +218,13 @@ class SerialSensor(ABC, Generic[ValueT]):
                     port = self._link.port or await self._open()
                     received = await port.read(self._silence_s)
                     if received is None:
-                        self._timeouts += 1
-                        await self._on_timeout(port)
-                        continue
+                        raise DeviceLostError(
+                            f"{port.path} is open but has sent nothing for {self._silence_s:.1f} s; {self.silence_hint}"
+                        )
                 except DriverError as error:
                     await self._link.lost(error)
                     continue
-                self._timeouts, self._silence_s = 0, self._longest_silence_s
+                self._silence_s = self._longest_silence_s
                 yield self._dispatch(InputKind.DATA, received.t_arrival_ns, received.data)
 
     def diagnostics(self) -> Diagnostics:
@@ -222,7 +240,7 @@ class SerialSensor(ABC, Generic[ValueT]):
     async def _open(self) -> Port:
         port = await self._link.open()
         self._dispatch(InputKind.OPENED, time.monotonic_ns())
-        self._timeouts, self._silence_s = 0, BOOT_S
+        self._silence_s = max(BOOT_S, self._longest_silence_s)
         await self._on_open(port)
         return port
 
@@ -232,7 +250,3 @@ class SerialSensor(ABC, Generic[ValueT]):
 
     async def _on_open(self, port: Port) -> None:
         """Set up a board after its port was opened."""
-
-    async def _on_timeout(self, port: Port) -> None:
-        hint = self.silence_hint
-        raise DeviceLostError(f"{port.path} is open but has sent nothing for {self._silence_s:.1f} s; {hint}")

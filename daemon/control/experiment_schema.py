@@ -205,7 +205,8 @@ class ExperimentFile(ConfigModel):
         """Return the tighter of the experiment's limits and the step's."""
         own = step.limits or self.limits
         torque_nm, angle_rad = min(own.torque_nm, self.limits.torque_nm), min(own.angle_rad, self.limits.angle_rad)
-        return ExperimentLimits(torque_nm=torque_nm, angle_rad=angle_rad)
+        # The limits of an outline may be infinite.
+        return ExperimentLimits.model_construct(torque_nm=torque_nm, angle_rad=angle_rad)
 
 
 def first_turn_before_grip(file: ExperimentFile) -> int | None:

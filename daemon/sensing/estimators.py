@@ -1,6 +1,7 @@
 """Estimators of the daemon: opened from the configuration, and run on the boards' frames. No I/O but the files."""
 
 import asyncio
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -173,7 +174,7 @@ def fingertip_table(config: FingertipConfig) -> ChannelTable:
     """Return a fingertip's channels, by its bank or its calibration, else the paper's."""
     if config.bank is not None:
         return Bank.open(config.bank).table
-    if config.calibration is not None and config.calibration.exists():
+    if config.calibration is not None and os.path.exists(config.calibration):
         return Calibration.load(config.calibration).estimator.table
     return PAPER_TABLE
 
@@ -184,7 +185,7 @@ def open_estimator(config: FingertipConfig, name: str) -> FrameEstimator:
     Raises BankError for a file that is missing, damaged or does not fit, and UserError for a calibration of another
     estimator or side.
     """
-    if config.calibration is not None and config.calibration.exists():
+    if config.calibration is not None and os.path.exists(config.calibration):
         calibration = _load(config.calibration, config.estimator)
         if calibration.sides and calibration.sides != (name,):
             raise UserError(

@@ -2,11 +2,10 @@
 
 import asyncio
 import contextlib
-import itertools
 import math
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
@@ -51,9 +50,10 @@ def parse_fault(text: str, names: Collection[str]) -> BoardFault:
 
 
 class EmulatedBoard(ABC):
-    """An emulated board on a pseudo-terminal.
+    """A board on a pseudo-terminal that sends a line each period, whether or not anyone listens.
 
-    Without a reader the terminal fills up; then the board waits and `port.held_up` is set.
+    Without a reader the terminal fills up; then the board waits and `port.held_up` is set. Timed faults without a
+    duration last until the next one or `recover`.
     """
 
     faults: Collection[str]
@@ -63,14 +63,40 @@ class EmulatedBoard(ABC):
         self._period_s = period_s
         self._random = Random(seed)
         self._injected: deque[BoardFault] = deque()
+        self._lasting: str | None = None
+        self._lasts_until_s = math.inf
+        self._last_line = b""
 
     @abstractmethod
+    def _line(self) -> bytes:
+        """Return the next line; StopIteration at the end of the data."""
+
+    async def _wait_for_start(self) -> bool:
+        """Wait until the board is started; return whether that took time."""
+        return False
+
     async def run(self) -> None:
         """Play until cancelled; at the end of the data the board stays plugged in."""
-
-    @abstractmethod
-    def recover(self) -> None:
-        """End every fault and plug the port in."""
+        loop = asyncio.get_running_loop()
+        with self.port:
+            await self._wait_for_start()
+            due_s = loop.time()
+            while True:
+                # Held up by the reader, the next line takes a whole period from here.
+                due_s = max(due_s, loop.time() - CATCH_UP_S) + self._period_s
+                await asyncio.sleep(due_s - loop.time())
+                if loop.time() >= self._lasts_until_s:
+                    self._end_lasting()
+                if await self._wait_for_start():
+                    due_s = loop.time()
+                    continue
+                try:
+                    line = self._next_line(loop.time())
+                except StopIteration:
+                    break
+                with contextlib.suppress(ConnectionError):  # unplugged while the line waited for a reader
+                    await self.port.write(line)
+            await loop.create_future()
 
     def command(self, text: str) -> None:
         """Apply a fault to the next line, or recover on `normal`; ValueError, with a sentence, for other text.
@@ -81,6 +107,51 @@ class EmulatedBoard(ABC):
             self.recover()
         else:
             self._injected.append(parse_fault(text, self.faults))
+
+    def recover(self) -> None:
+        """End every fault and plug the port in."""
+        self._injected.clear()
+        self._end_lasting()
+
+    def _next_line(self, now_s: float) -> bytes:
+        """Return the next line with its faults, or nothing; StopIteration at the end of the data."""
+        fault = self._injected.popleft() if self._injected else None
+        if fault is not None and fault.name in TIMED_FAULTS:
+            self._begin_lasting(fault, now_s)
+        match self._lasting:
+            case "silence" | "unplug":
+                return b""
+            case "stuck" if self._last_line:
+                return self._last_line
+            case "saturation":
+                return b"%d\r\n" % COUNTS_MAX
+        self._last_line = self._line()
+        return self._last_line if fault is None else self._changed(fault.name, self._last_line)
+
+    def _changed(self, fault: str, line: bytes) -> bytes:
+        """Return a line with a fault of its own."""
+        match fault:
+            case "garbage":
+                return self._garbage(12) + b"\r\n"
+            case "spike":
+                return b"%d\r\n" % CORRUPTED
+            case "torn":
+                return line[len(line) // 2 :]
+            case "missing":
+                return b""
+        return line
+
+    def _begin_lasting(self, fault: BoardFault, now_s: float) -> None:
+        self._end_lasting()
+        self._lasting = fault.name
+        self._lasts_until_s = math.inf if fault.seconds is None else now_s + fault.seconds
+        if fault.name == "unplug":
+            self.port.unplug()
+
+    def _end_lasting(self) -> None:
+        if self._lasting == "unplug":
+            self.port.plug()
+        self._lasting, self._lasts_until_s = None, math.inf
 
     def _garbage(self, count: int) -> bytes:
         return bytes(self._random.choices(range(128, 256), k=count))
@@ -94,8 +165,8 @@ def format_line(values: NDArray[np.float64]) -> bytes:
 class EitKitBoard(EmulatedBoard):
     """An EIT-kit: waits for a `y`, then sends `frames` ((v,) values in volts each), and then is silent.
 
-    A frame is requested from the iterator at the end of its acquisition. `fault_at` maps frame numbers, from 0, to
-    faults. Only an unplugged board loses a frame; a silence without a duration lasts until the next `y`.
+    A frame is requested from the iterator at the end of its acquisition. A silent or unplugged board acquires none. A
+    `y` ends a silence.
     """
 
     faults = ("cut-line", "wrong-count", "nan", "garbage", "silence", "unplug")
@@ -106,155 +177,39 @@ class EitKitBoard(EmulatedBoard):
         *,
         period_s: float = FRAME_PERIOD_S,
         link: Path | None = None,
-        fault_at: Mapping[int, BoardFault] | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__(period_s, link, seed)
-        self._frames = frames
-        self._fault_at = dict(fault_at or {})
-        self._recovered = asyncio.Event()
-        self._silent = False
+        self._frames = iter(frames)
+        self._started = False
 
-    def recover(self) -> None:
-        """End every fault and plug the port in."""
-        self._injected.clear()
-        self._recovered.set()
-        if self._silent:
-            self.port.received.put_nowait(b"y")
+    def _line(self) -> bytes:
+        return format_line(next(self._frames))
 
-    async def run(self) -> None:
-        """Play until cancelled; at the end of the frames the board stays plugged in."""
-        loop = asyncio.get_running_loop()
-        with self.port:
-            await self._wait_for_start()
-            due_s = loop.time()
-            frames = iter(self._frames)
-            for number in itertools.count():
-                due_s += self._period_s
-                await asyncio.sleep(due_s - loop.time())
-                fault = self._fault_at.pop(number, None) or (self._injected.popleft() if self._injected else None)
-                if fault is not None and fault.name == "silence":
-                    self._silent = fault.seconds is None
-                    await (self._wait_for_start() if fault.seconds is None else self._pause(fault.seconds))
-                    self._silent, fault = False, None
-                values = next(frames, None)
-                if values is None:
-                    break
-                await self._send(format_line(values), fault)
-                if loop.time() - due_s > CATCH_UP_S:
-                    # Held up by the reader or a fault: the next frame takes a whole period from here.
-                    due_s = loop.time()
-            await loop.create_future()
-
-    async def _send(self, line: bytes, fault: BoardFault | None) -> None:
-        match None if fault is None else fault.name:
-            case "unplug":
-                await self.port.write(line[: len(line) // 2])
-                await self.port.break_off()
-                await self._pause(None if fault is None else fault.seconds)
-                self.port.plug()
-                # Without power the board has forgotten its start.
-                await self._wait_for_start()
-                return
-            case "garbage":
-                await self.port.write(self._garbage(700) + b"\n")
-            case "cut-line":
-                line = line[: self._random.randrange(len(line) // 10, len(line) - 10)] + b"\n"
-            case "wrong-count" | "nan" as kind:
-                values = line.split(b", ")
-                position = self._random.choice([n for n, value in enumerate(values[:-1]) if float(value)])
-                values[position : position + 1] = [b"nan"] if kind == "nan" else []
-                line = b", ".join(values)
-        await self.port.write(line)
-
-    async def _wait_for_start(self) -> None:
-        while not self.port.received.empty():
-            self.port.received.get_nowait()
-        while b"y" not in await self.port.received.get():
-            continue
-
-    async def _pause(self, seconds: float | None) -> None:
-        self._recovered.clear()
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(seconds):
-                await self._recovered.wait()
-
-
-class ConverterBoard(EmulatedBoard):
-    """A board that sends a line for each conversion, whether or not anyone listens.
-
-    Timed faults without a duration last until the next one or `recover`.
-    """
-
-    def __init__(self, period_s: float, link: Path | None = None, seed: int = 0) -> None:
-        super().__init__(period_s, link, seed)
-        self._lasting: str | None = None
-        self._lasts_until_s = 0.0
-        self._last_line = b""
-
-    @abstractmethod
-    def _convert(self) -> bytes:
-        """Return the line of one conversion; StopIteration at the end of the data."""
-
-    def recover(self) -> None:
-        """End every fault and plug the port in."""
-        self._injected.clear()
-        self._end_lasting()
-
-    async def run(self) -> None:
-        """Play until cancelled; at the end of the data the board stays plugged in."""
-        loop = asyncio.get_running_loop()
-        due_s = loop.time()
-        with self.port:
-            while True:
-                due_s = max(due_s + self._period_s, loop.time() - CATCH_UP_S)
-                await asyncio.sleep(due_s - loop.time())
-                try:
-                    line = self._convert()
-                except StopIteration:
-                    break
-                line = self._with_faults(line, loop.time())
-                with contextlib.suppress(ConnectionError):  # unplugged while the line waited for a reader
-                    await self.port.write(line)
-            await loop.create_future()
-
-    def _with_faults(self, line: bytes, now_s: float) -> bytes:
-        if self._injected:
-            line = self._apply(self._injected.popleft(), line, now_s)
-        elif self._lasting is not None and now_s >= self._lasts_until_s:
-            self._end_lasting()
-        match self._lasting:
-            case "silence" | "unplug":
-                return b""
-            case "stuck":
-                line = self._last_line or line
-            case "saturation":
-                line = b"%d\r\n" % COUNTS_MAX
-        self._last_line = line
-        return line
-
-    def _apply(self, fault: BoardFault, line: bytes, now_s: float) -> bytes:
-        match fault.name:
-            case "garbage":
-                return self._garbage(12) + b"\r\n"
-            case "spike":
-                return b"%d\r\n" % CORRUPTED
-            case "torn":
-                return line[len(line) // 2 :]
-            case "missing":
-                return b""
-            case kind:
-                self._end_lasting()
-                self._lasting = kind
-                self._lasts_until_s = math.inf if fault.seconds is None else now_s + fault.seconds
-                if kind == "unplug":
-                    self.port.unplug()
-        return line
+    async def _wait_for_start(self) -> bool:
+        """Wait for the first `y`; without power, when it was unplugged, the board has forgotten it."""
+        started_before = self._started
+        while not self._started or not self.port.received.empty():
+            if b"y" in await self.port.received.get():
+                self._started = True
+                if self._lasting == "silence":
+                    self._end_lasting()
+        return not started_before
 
     def _end_lasting(self) -> None:
-        if self._lasting == "unplug":
-            self.port.plug()
-        self._lasting = None
+        self._started = self._started and self._lasting != "unplug"
+        super()._end_lasting()
+
+    def _changed(self, fault: str, line: bytes) -> bytes:
+        match fault:
+            case "garbage":
+                return self._garbage(700) + b"\n" + line
+            case "cut-line":
+                return line[: self._random.randrange(len(line) // 10, len(line) - 10)] + b"\n"
+        values = line.split(b", ")
+        position = self._random.choice([n for n, value in enumerate(values[:-1]) if float(value)])
+        values[position : position + 1] = [b"nan"] if fault == "nan" else []
+        return b", ".join(values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,7 +229,7 @@ class Sketch:
 PAPER_SKETCH = Sketch(counts_per_nm=1.0, tare_counts=0.0, noise_counts=2e-5, decimals=12)
 
 
-class Hx711Board(ConverterBoard):
+class Hx711Board(EmulatedBoard):
     """The load cell's board: converts each of `torques_nm`, requested at the end of its conversion."""
 
     faults = ("garbage", "spike", "torn", "silence", "saturation", "stuck", "unplug")
@@ -292,7 +247,7 @@ class Hx711Board(ConverterBoard):
         self._torques_nm = iter(torques_nm)
         self._sketch = sketch or Sketch()
 
-    def _convert(self) -> bytes:
+    def _line(self) -> bytes:
         sketch = self._sketch
         counts = sketch.tare_counts + sketch.counts_per_nm * next(self._torques_nm)
         counts += self._random.gauss(0.0, sketch.noise_counts)

@@ -21,15 +21,11 @@ ACTIVATION_NOT_FINISHED, NOT_ACTIVATED, OVER_TEMPERATURE, NO_COMMUNICATION = 5, 
 SPEED_MM_S, FORCE_N = (30.0, 250.0), (10.0, 125.0)
 ACTIVATION_SPEED_MM_S = 150.0
 
-LONGEST_LINE = 256
 _COMMANDS = {"ACT": "act", "GTO": "gto", "ATR": "atr", "POS": "pos", "SPE": "spe", "FOR": "force"}
 
 DEVICE_ID = 9
 COMMAND_REGISTERS, STATUS_REGISTERS = struct.pack(">HH", 0x03E8, 3), struct.pack(">HH", 0x07D0, 3)
 READ, WRITE = 3, 16
-ILLEGAL_FUNCTION, ILLEGAL_ADDRESS = 1, 2
-# A frame is at most 256 bytes. A pause ends it: 1.75 ms on the wire, longer on a busy host.
-LONGEST_FRAME, PAUSE_S = 256, 0.1
 
 STEP_S = 0.008
 
@@ -189,7 +185,7 @@ class Gripper:
 
 @dataclass(slots=True)
 class UrcapSession:
-    """One connection to the URCap. An invalid line gets no reply."""
+    """One connection to the URCap."""
 
     gripper: Gripper
     _buffer: bytes = field(default=b"", init=False)
@@ -197,15 +193,15 @@ class UrcapSession:
     def feed(self, data: bytes) -> bytes:
         """Return the replies to the lines that `data` completes."""
         *lines, self._buffer = (self._buffer + data).split(b"\n")
-        self._buffer = self._buffer[-LONGEST_LINE:]
         return b"".join(self._reply(line.decode("ascii", "replace").split()) for line in lines)
 
     def _reply(self, words: list[str]) -> bytes:
         match words:
             case ["GET", variable]:
                 return f"{variable} {self._get(variable)}\n".encode()
-            case ["SET", *pairs] if pairs and len(pairs) % 2 == 0:
-                return self._set(dict(zip(pairs[::2], pairs[1::2], strict=True)))
+            case ["SET", *pairs]:
+                self._set(dict(zip(pairs[::2], pairs[1::2], strict=True)))
+                return b"ack"
         return b""
 
     def _get(self, variable: str) -> str:
@@ -227,16 +223,11 @@ class UrcapSession:
             return f"{values[variable]:02}"
         return str(values[variable])
 
-    def _set(self, pairs: dict[str, str]) -> bytes:
-        if not pairs.keys() <= _COMMANDS.keys():
-            return b""
-        if not all(text.isdigit() and int(text) <= 255 for text in pairs.values()):
-            return b""
+    def _set(self, pairs: dict[str, str]) -> None:
         flags = ("ACT", "GTO", "ATR")
         values = {name: bool(int(text)) if name in flags else int(text) for name, text in pairs.items()}
         changed: dict[str, Any] = {_COMMANDS[name]: value for name, value in values.items()}
         self.gripper.write(replace(self.gripper.command, **changed))
-        return b"ack"
 
 
 def crc16(data: bytes) -> bytes:
@@ -250,14 +241,9 @@ class ModbusSlave:
     def __init__(self, gripper: Gripper) -> None:
         self._gripper = gripper
         self._buffer = b""
-        self._last_s = 0.0
 
-    def feed(self, data: bytes, t_s: float | None = None) -> bytes:
-        """Return the reply frames to the bytes at `t_s`, now; damaged requests and those to other devices get none."""
-        t_s = time.monotonic() if t_s is None else t_s
-        if t_s - self._last_s > PAUSE_S:
-            self._buffer = b""
-        self._last_s = t_s
+    def feed(self, data: bytes) -> bytes:
+        """Return the reply frames to the requests that `data` completes; damaged ones get none."""
         self._buffer += data
         replies = b""
         while (length := _request_length(self._buffer)) is not None and len(self._buffer) >= length:
@@ -265,29 +251,24 @@ class ModbusSlave:
             if crc16(frame[:-2]) != frame[-2:]:
                 # The start of the next frame is unknown.
                 self._buffer = b""
-            elif frame[0] == DEVICE_ID and self._gripper.powered:
+            elif self._gripper.powered:
                 answer = bytes([DEVICE_ID]) + self._answer(frame[1:-2])
                 replies += answer + crc16(answer)
-        if len(self._buffer) > LONGEST_FRAME:
-            self._buffer = b""
         return replies
 
     def _answer(self, request: bytes) -> bytes:
-        function, registers = request[0], request[1:5]
-        if function not in (READ, WRITE):
-            return bytes([function | 0x80, ILLEGAL_FUNCTION])
         gripper = self._gripper
-        if function == READ and registers == STATUS_REGISTERS:
+        if request == bytes([READ]) + STATUS_REGISTERS:
             status = gripper.taken.act | gripper.taken.gto << 3 | gripper.sta << 4 | gripper.obj << 6
             answer = bytes([READ, 6, status, 0, gripper.flt, gripper.taken.pos, gripper.pos, gripper.current])
             gripper.status_was_read()
             return answer
-        if function == WRITE and registers == COMMAND_REGISTERS and len(request) == 12:
-            action, _, _, pos, spe, force = request[6:]
-            act, gto, atr = (bool(action & 1 << bit) for bit in (0, 3, 4))
-            gripper.write(GripperRegisters(act, gto, atr, pos, spe, force))
-            return request[:5]
-        return bytes([function | 0x80, ILLEGAL_ADDRESS])
+        if request[:5] != bytes([WRITE]) + COMMAND_REGISTERS:
+            raise ValueError(f"the gripper has no such registers: {request.hex()}")
+        action, _, _, pos, spe, force = request[6:]
+        act, gto, atr = (bool(action & 1 << bit) for bit in (0, 3, 4))
+        gripper.write(GripperRegisters(act, gto, atr, pos, spe, force))
+        return request[:5]
 
 
 def _request_length(buffer: bytes) -> int | None:

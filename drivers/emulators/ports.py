@@ -1,9 +1,8 @@
-"""Ports of emulated devices: pseudo-terminals and sockets that can be unplugged, fall silent, and break off."""
+"""Ports of emulated devices: pseudo-terminals and sockets that can be unplugged and fall silent."""
 
 import asyncio
 import contextlib
 import os
-import select
 import tty
 from abc import ABC, abstractmethod
 from copy import copy
@@ -13,11 +12,7 @@ from typing import Protocol, Self
 from shearloop.drivers.emulators import number_between
 
 READ_BYTES = 4096
-# A reader that empties a full buffer in parts shows it as empty for a moment: look several times.
-EMPTY_LOOKS = 3
-# How long a port that is about to hang up waits for its reader.
-UNREAD_S = 0.5
-OUTAGES = "silence [SECONDS], unplug [SECONDS], break-off (the next answer stops half-way, with the connection), normal"
+OUTAGES = "silence [SECONDS], unplug [SECONDS], normal"
 
 
 class PtyPort:
@@ -88,16 +83,6 @@ class PtyPort:
         with contextlib.suppress(BlockingIOError):
             self.received.put_nowait(os.read(master, READ_BYTES))
 
-    @property
-    def unread(self) -> bool:
-        """Whether written bytes wait for the other side."""
-        if self._master is None:
-            return False
-        # The kernel delivers late, on a busy machine by 0.1 s. poll waits for that (n_tty_poll), FIONREAD does not.
-        poll = select.poll()
-        poll.register(self._slave, select.POLLIN)
-        return bool(poll.poll(0))
-
     async def write(self, data: bytes) -> None:
         """Write all of `data`, waiting for the reader; ConnectionError if unplugged."""
         while data:
@@ -111,17 +96,6 @@ class PtyPort:
                 self.held_up.set()
                 await self._room.wait()
                 self.held_up.clear()
-
-    async def break_off(self) -> None:
-        """Hang up once the other side has read everything; a pseudo-terminal would take unread bytes back."""
-        loop = asyncio.get_running_loop()
-        end_s = loop.time() + UNREAD_S
-        empty_looks = 0
-        # The kernel has no event for a buffer that was read.
-        while empty_looks < EMPTY_LOOKS and loop.time() < end_s:
-            await asyncio.sleep(0.001)
-            empty_looks = 0 if self.unread else empty_looks + 1
-        self.unplug()
 
     def _on_room(self, master: int) -> None:
         asyncio.get_running_loop().remove_writer(master)
@@ -146,7 +120,6 @@ class Server(ABC):
     def __init__(self, answer_s: float) -> None:
         self._answer_s = answer_s
         self._silent = False
-        self._breaks_off = False
         self._connected = True
         self._changed = asyncio.Event()
         self._recovery: asyncio.TimerHandle | None = None
@@ -181,8 +154,6 @@ class Server(ABC):
                 self._connect(connected=kind == "silence")
                 for time_s in times_s:
                     self._recovery = asyncio.get_running_loop().call_later(time_s, self.recover)
-            case ["break-off"]:
-                self._breaks_off = True
             case ["normal"]:
                 self.recover()
             case _:
@@ -192,17 +163,12 @@ class Server(ABC):
         """End every outage."""
         if self._recovery is not None:
             self._recovery.cancel()
-        self._silent = self._breaks_off = False
+        self._silent = False
         self._connect(connected=True)
 
     def _connect(self, *, connected: bool) -> None:
         self._connected = connected
         self._changed.set()
-
-    def _ends_half_way(self) -> bool:
-        """Return whether this answer stops half-way; the next one does not."""
-        breaks_off, self._breaks_off = self._breaks_off, False
-        return breaks_off
 
 
 class PtyServer(Server):
@@ -226,12 +192,7 @@ class PtyServer(Server):
                 # The time of the measurement.
                 await asyncio.sleep(self._answer_s)
                 with contextlib.suppress(ConnectionError):  # unplugged in between
-                    if self._ends_half_way():
-                        await self._port.write(reply[: len(reply) // 2])
-                        await self._port.break_off()
-                        self._port.plug()
-                    else:
-                        await self._port.write(reply)
+                    await self._port.write(reply)
 
     async def restore(self) -> None:
         """Plug the port in."""
@@ -286,9 +247,6 @@ class SocketServer(Server):
                 if replies and not self._silent:
                     # The time of the measurement.
                     await asyncio.sleep(self._answer_s)
-                    if self._ends_half_way():
-                        writer.write(replies[: len(replies) // 2])
-                        break
                     writer.write(replies)
                     await writer.drain()
         except ConnectionError:

@@ -2,7 +2,7 @@
 
 The arm gives the wrist's angle, the fingers their force. Wrist and base hold two springs in series: the gel pads
 (they creep, and slip when the grip gives way) and the tool in its joint (a lever on the load cell, or a screw that
-tightens, breaks loose or strips). All motion is slow, so one torque follows from a balance at each step. The boards see
+tightens or breaks loose). All motion is slow, so one torque follows from a balance at each step. The boards see
 it as they measure: the load cell as a mean over each conversion, the EIT-kit injection by injection.
 """
 
@@ -33,7 +33,6 @@ class Joint(Enum):
     LEVER = "lever"  # rests on the load cell for ever: the paper's rig
     TIGHTENING = "tightening"  # friction grows with the angle turned
     SEIZED = "seized"  # holds up to a torque, then turns at a lower one
-    STRIPPING = "stripping"  # tightens, then gives way for good
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +52,6 @@ class TwinSettings:
     breakaway_torque_nm: float = 0.18
     running_torque_nm: float = 0.06
     tightening_nm_per_rad: float = 0.15
-    stripping_torque_nm: float = 0.22
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +77,6 @@ class Twin:
     _crept_rad: float = 0.0
     _turned_rad: float = 0.0  # plastic angle of the joint
     _broken_loose: bool = False
-    _stripped: bool = False
     _seen_rad: float = 0.0  # the hysteresis band's centre
 
     def step(self, dt_s: float, wrist_rad: float, grip_force_n: float) -> TwinState:
@@ -107,8 +104,6 @@ class Twin:
             else:
                 self._turned_rad += give_rad
                 self._broken_loose = True
-                if settings.joint is Joint.STRIPPING and abs(torque) >= settings.stripping_torque_nm:
-                    self._stripped = True
             torque, gel_rad = self._balance(wrist_rad)
         self._crept_rad += (gel_rad - self._crept_rad) * -math.expm1(-dt_s / settings.relaxation_s)
         band_rad = settings.hysteresis_rad / 2
@@ -146,9 +141,7 @@ class Twin:
                 return math.inf
             case Joint.SEIZED:
                 return settings.running_torque_nm if self._broken_loose else settings.breakaway_torque_nm
-            case Joint.TIGHTENING | Joint.STRIPPING:
-                if self._stripped:
-                    return settings.running_torque_nm / 2
+            case Joint.TIGHTENING:
                 # Clockwise, the negative direction, tightens; loosening takes a little less.
                 into_rad = max(0.0, -self._turned_rad)
                 limit_nm = settings.running_torque_nm + settings.tightening_nm_per_rad * into_rad

@@ -13,7 +13,7 @@ from random import Random
 from typing import Protocol, TypeAlias
 
 from shearloop.drivers.emulators import number_between
-from shearloop.drivers.emulators.boards import ConverterBoard
+from shearloop.drivers.emulators.boards import EmulatedBoard
 from shearloop.drivers.emulators.ports import PtyServer, SocketServer
 
 # The conductance of an open circuit's insulation.
@@ -76,15 +76,12 @@ class CircuitState:
     compliance: bool
 
 
-CIRCUIT_COMMANDS = (
-    "open 1|2, short 1|2, reversed 1|2, swapped, drift 1|2 SHARE_PER_S, leads OHM (the source goes into compliance), "
-    "mend"
-)
+CIRCUIT_COMMANDS = "open 1|2, short 1|2, reversed 1|2, swapped, leads OHM (the source goes into compliance), mend"
 
 
 @dataclass(slots=True)
 class Circuit:
-    """Two gauges in series with a current source: settings, wiring and faults. Times in s are passed in."""
+    """Two gauges in series with a current source: settings, wiring and faults."""
 
     gauges: Gauges
     level_a: float = 0.0
@@ -94,12 +91,10 @@ class Circuit:
     swapped: bool = False
     # Pairs of a fault, open, short or reversed, and its gauge.
     faults: set[tuple[str, str]] = field(default_factory=set)
-    # Relative change of a gauge's resistance at a time, and the change per second since then.
-    _drifts: dict[str, tuple[float, float, float]] = field(default_factory=dict)
 
-    def state(self, time_s: float) -> CircuitState:
+    def state(self) -> CircuitState:
         """Return current and voltages."""
-        ohm = [self._resistance(name, r, time_s) for name, r in zip(GAUGES, self.gauges.resistances_ohm(), strict=True)]
+        ohm = [self._resistance(name, r) for name, r in zip(GAUGES, self.gauges.resistances_ohm(), strict=True)]
         whole_ohm = sum(ohm) + self.lead_ohm
         compliance = self.output_on and abs(self.level_a * whole_ohm) > self.compliance_v
         current_a = 0.0
@@ -113,19 +108,16 @@ class Circuit:
 
     def voltages(self) -> tuple[float, float]:
         """Return the voltages of both gauges now."""
-        state = self.state(time.monotonic())
+        state = self.state()
         return state.v1_v, state.v2_v
 
-    def command(self, text: str, time_s: float) -> None:
+    def command(self, text: str) -> None:
         """Apply a fault; ValueError, with a sentence, for an unknown one."""
         match text.split():
             case ["open" | "short" | "reversed" as fault, "1" | "2" as gauge]:
                 self.faults.add((fault, gauge))
             case ["swapped"]:
                 self.swapped = True
-            case ["drift", "1" | "2" as gauge, share]:
-                per_s = number_between(share, -1.0, 1.0, "not a share per second from -1 to 1")
-                self._drifts[gauge] = (self._drift(gauge, time_s), time_s, per_s)
             case ["leads", ohm]:
                 self.lead_ohm = number_between(ohm, 0.0, OPEN_OHM, "not a resistance in Ω from 0 to 1e+09")
             case ["mend"]:
@@ -134,20 +126,15 @@ class Circuit:
                 raise ValueError(f"{text!r} is no fault of the circuit; there are {CIRCUIT_COMMANDS}")
 
     def mend(self) -> None:
-        """End every fault; a drifted gauge recovers."""
+        """End every fault."""
         self.swapped = False
         self.lead_ohm = LEAD_OHM
         self.faults.clear()
-        self._drifts.clear()
 
-    def _resistance(self, gauge: str, ohm: float, time_s: float) -> float:
+    def _resistance(self, gauge: str, ohm: float) -> float:
         if ("open", gauge) in self.faults:
             return OPEN_OHM
-        return 0.0 if ("short", gauge) in self.faults else ohm * (1.0 + self._drift(gauge, time_s))
-
-    def _drift(self, gauge: str, time_s: float) -> float:
-        drifted, since_s, per_s = self._drifts.get(gauge, (0.0, time_s, 0.0))
-        return drifted + per_s * (time_s - since_s)
+        return 0.0 if ("short", gauge) in self.faults else ohm
 
 
 class ScpiError(Exception):
@@ -250,14 +237,13 @@ class EmulatedKeithley6430(ScpiInterpreter):
     def _read(self, _: str) -> str:
         if not self.circuit.output_on:
             raise ScpiError(OUTPUT_IS_OFF)
-        now_s = time.monotonic()
-        state = self.circuit.state(now_s)
+        state = self.circuit.state()
         volts = state.source_v + self._random.gauss(0.0, SOURCE_NOISE_V)
         values = {
             "VOLT": volts if "VOLT" in self._measured else NOT_MEASURED,
             "CURR": state.current_a + self._random.gauss(0.0, SOURCE_NOISE_A),
             "RES": NOT_MEASURED,
-            "TIME": now_s % 1e5,
+            "TIME": time.monotonic() % 1e5,
             "STAT": float(_STATUS | (_COMPLIANCE if state.compliance else 0)),
         }
         return ",".join(f"{values[name]:+.6E}" for name in ELEMENTS if name in self._elements)
@@ -306,7 +292,7 @@ class EmulatedScanner(ScpiInterpreter):
         return f"{volts:+.8E}"
 
 
-class EmulatedAdcBoard(ConverterBoard):
+class EmulatedAdcBoard(EmulatedBoard):
     """A converter board, an ADS1220: sends a line `v1,v2` in volts for each conversion."""
 
     faults = ("missing", "garbage", "torn", "silence", "stuck", "unplug")
@@ -319,7 +305,7 @@ class EmulatedAdcBoard(ConverterBoard):
         super().__init__(period_s, link, seed)
         self._circuit = circuit
 
-    def _convert(self) -> bytes:
+    def _line(self) -> bytes:
         v1_v, v2_v = self._circuit.voltages()
         return f"{self._quantise(v1_v):.6f},{self._quantise(v2_v):.6f}\r\n".encode()
 
@@ -375,4 +361,4 @@ class SkinInstruments:
                 self._source.command("normal")
                 self._daq.command("normal")
             case _:
-                self.circuit.command(text, time.monotonic())
+                self.circuit.command(text)

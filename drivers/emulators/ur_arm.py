@@ -10,6 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -39,26 +40,6 @@ def jacobian(frames: list[Matrix]) -> Matrix:
     axes = np.array([frame[:3, 2] for frame in frames[:-1]])
     arms = frames[-1][:3, 3] - np.array([frame[:3, 3] for frame in frames[:-1]])
     return np.hstack([np.cross(axes, arms), axes]).T
-
-
-def rotation_matrix(turn_rad: Vector) -> Matrix:
-    """Return the matrix (3, 3) of a rotation vector (3,), by Rodrigues' formula."""
-    angle = float(np.linalg.norm(turn_rad))
-    x, y, z = turn_rad / (angle or 1.0)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross)
-
-
-def rotation_vector(turn: Matrix) -> Vector:
-    """Return the rotation vector (3,) in rad of a matrix (3, 3); scipy's takes 0.3 s to import."""
-    twice = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    sine, cosine = float(np.linalg.norm(twice)) / 2, (float(np.trace(turn)) - 1.0) / 2
-    if sine > 1e-6 or cosine > 0:
-        return np.asarray(twice / 2 * (math.atan2(sine, cosine) / sine if sine else 1.0))
-    # Half a turn: turn + 1 is twice the axis times itself.
-    outer = turn + np.eye(3)
-    axis = outer[:, np.diag(outer).argmax()]
-    return np.asarray(math.pi / np.linalg.norm(axis) * axis)
 
 
 # The arm after a cycle: joints (6,), speeds (6,), and whether the motion is over.
@@ -96,7 +77,7 @@ class LinearMove:
     def __post_init__(self) -> None:
         """Compute the length; a move that only turns is measured in radians."""
         way_m = float(np.linalg.norm(self.target[:3, 3] - self.start[:3, 3]))
-        self._turn = rotation_vector(self.start[:3, :3].T @ self.target[:3, :3])
+        self._turn = Rotation.from_matrix(self.start[:3, :3].T @ self.target[:3, :3]).as_rotvec()
         self._length = self._end = way_m if way_m > 1e-6 else float(np.linalg.norm(self._turn))
         self._done = self._rate = 0.0
 
@@ -111,8 +92,9 @@ class LinearMove:
         frames = link_frames(q_rad)
         here = frames[-1]
         where = self.start[:3, 3] + share * (self.target[:3, 3] - self.start[:3, 3])
-        turned = self.start[:3, :3] @ rotation_matrix(share * self._turn)
-        error = np.concatenate([where - here[:3, 3], rotation_vector(turned @ here[:3, :3].T)])
+        turned = self.start[:3, :3] @ Rotation.from_rotvec(share * self._turn).as_matrix()
+        turn = Rotation.from_matrix(turned @ here[:3, :3].T).as_rotvec()
+        error = np.concatenate([where - here[:3, 3], turn])
         try:
             step = np.linalg.solve(jacobian(frames), error)
         except np.linalg.LinAlgError as singular:
@@ -161,7 +143,7 @@ class Arm:
     @property
     def pose(self) -> Vector:
         """The tool's pose (6,)."""
-        return np.concatenate([self._frame[:3, 3], rotation_vector(self._frame[:3, :3])])
+        return np.concatenate([self._frame[:3, 3], Rotation.from_matrix(self._frame[:3, :3]).as_rotvec()])
 
     @property
     def speed(self) -> Vector:
@@ -180,7 +162,7 @@ class Arm:
     def move_to(self, pose: Vector, speed: float, acceleration: float) -> None:
         """Begin a linear move."""
         goal = np.eye(4)
-        goal[:3, :3], goal[:3, 3] = rotation_matrix(pose[3:]), pose[:3]
+        goal[:3, :3], goal[:3, 3] = Rotation.from_rotvec(pose[3:]).as_matrix(), pose[:3]
         self.motion = LinearMove(self._frame, goal, speed, acceleration)
 
     def halt(self, deceleration: float) -> None:

@@ -1,7 +1,6 @@
 """The controller's three ports and its clock around a `Robot`, its dashboard, and faults by lines of text."""
 
 import asyncio
-import logging
 import re
 import time
 from collections.abc import AsyncIterator, Iterator
@@ -10,13 +9,12 @@ from dataclasses import replace
 
 from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, Robot, RobotEvent
-from shearloop.drivers.emulators.ur_rtde import ConnectionFaults, NotRtdeError, RtdeSession
+from shearloop.drivers.emulators.ur_rtde import ConnectionFaults, RtdeSession
 from shearloop.drivers.emulators.urscript import translate
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 # A control script closes its outermost block in the first column.
 SCRIPT_END = b"\nend\n"
-LARGEST_SCRIPT = 1 << 20
 # A controller is never late. When this process was, the robot's time stands still, so that no watchdog expires on
 # heartbeats that wait in the socket. Its clock goes on: its samples are of now.
 MOST_CATCH_UP_S = 0.02
@@ -25,11 +23,9 @@ _ROBOT_MODES = {MODE_POWER_OFF: "POWER_OFF", MODE_IDLE: "IDLE", MODE_RUNNING: "R
 _SAFETY_MODES = {1: "NORMAL", 3: "PROTECTIVE_STOP", 7: "ROBOT_EMERGENCY_STOP"}
 
 FAULTS = (
-    *("protective-stop", "emergency-stop", "release", "drop-rtde", "silence", "stop-hangs"),
+    *("protective-stop", "emergency-stop", "release", "drop-rtde", "silence"),
     *("registers-in-use", "local-control", "refuse-protocol", "mute-dashboard", "version", "payload", "normal"),
 )
-
-log = logging.getLogger(__name__)
 
 
 class Controller:
@@ -95,9 +91,6 @@ class Controller:
                     writer.close()
             case ["silence", seconds]:
                 self.silence(number_between(seconds, 0.0, 86400.0, "not a time in seconds from 0 to 86400"))
-            case ["stop-hangs", count]:
-                hangs = int(number_between(count, 0, 1000, "not a number of requests from 0 to 1000"))
-                self.faults = replace(self.faults, stop_hangs=hangs)
             case ["registers-in-use" | "local-control" | "refuse-protocol" | "mute-dashboard" as fault]:
                 self.faults = replace(self.faults, **{fault.replace("-", "_"): True})
             case ["version", numbers]:
@@ -136,8 +129,6 @@ class Controller:
             try:
                 while data := await reader.read(4096):
                     self._send(writer, session.receive(data))
-            except NotRtdeError as error:
-                log.warning("an RTDE connection was closed: %s", error)
             finally:
                 del self._rtde[writer]
 
@@ -153,9 +144,6 @@ class Controller:
                         await asyncio.to_thread(translate, script)
                     self.robot.upload(script)
                     text.clear()
-                elif len(text) > LARGEST_SCRIPT:
-                    log.warning("a script without an end was dropped after %d bytes", len(text))
-                    return
 
     async def _serve_dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with self._connection(writer):
@@ -164,10 +152,7 @@ class Controller:
             while line := await reader.readline():
                 if self.faults.mute_dashboard:
                     continue
-                request, hangs = line.decode("utf-8", "replace").strip(), self.faults.stop_hangs
-                if request == "stop" and hangs:
-                    self.faults = replace(self.faults, stop_hangs=hangs - 1)
-                    continue
+                request = line.decode("utf-8", "replace").strip()
                 self._send(writer, f"{self._answer_dashboard(request)}\n".encode())
 
     def _answer_dashboard(self, request: str) -> str:

@@ -23,13 +23,18 @@ from shearloop.drivers.defaults import (
     SOURCE_CURRENT_MA,
 )
 from shearloop.drivers.errors import DeviceLostError, DeviceSilentError, DriverError, ProtocolError
-from shearloop.drivers.load_cell import describe_errors
-from shearloop.drivers.serial_sensor import InputKind, InputRecorder, LineSplitter, RawEvent, SerialSensor, TimedLines
+from shearloop.drivers.serial_sensor import (
+    InputKind,
+    InputRecorder,
+    LineParser,
+    LineSplitter,
+    RawEvent,
+    SerialSensor,
+    TimedLine,
+)
 
 # A reading of five elements is 70 characters long.
 MAX_REPLY_BYTES = 512
-# Replies to earlier queries, skipped before the answer to *IDN?.
-MAX_STALE_REPLIES = 8
 REPLY_TIMEOUT_S = 2.0
 # Misunderstood replies in a row before the connection is reopened.
 MAX_STRIKES = 3
@@ -54,13 +59,7 @@ ADC_BAUD = 115200
 MAX_PAIR_BYTES = 40
 # Values above this share of the range are at its end.
 _END_OF_RANGE = 0.9995
-_PAIR = re.compile(rb"([+-]?[0-9]{1,3}\.[0-9]{1,9}), ?([+-]?[0-9]{1,3}\.[0-9]{1,9})")
-_PAIR_ERRORS = {
-    "not two decimals": "The converter board sent a line that is not two decimals; check the baud rate and the sketch.",
-    "too long": f"The converter board sent more than {MAX_PAIR_BYTES} bytes without a line end; check the baud rate.",
-    "empty": "The converter board sent an empty line; bytes were lost, check the cable.",
-    "unfinished": "The converter board broke off in the middle of a line; check its plug and its power.",
-}
+_PAIR = re.compile(rb"[+-]?[0-9]{1,3}\.[0-9]{1,9}, ?[+-]?[0-9]{1,3}\.[0-9]{1,9}")
 
 ReadingT = TypeVar("ReadingT")
 
@@ -70,11 +69,6 @@ class ReplyLines(LineSplitter):
 
     def __init__(self) -> None:
         super().__init__(MAX_REPLY_BYTES)
-
-    @property
-    def errors(self) -> Counter[str]:
-        """The number of rejected replies, by kind."""
-        return +Counter({"too long": self.too_long, "unfinished": self.unfinished})
 
     def replies(self, data: bytes) -> list[str]:
         """Return the replies that `data` completes, without line ends; empty lines are ignored."""
@@ -171,7 +165,7 @@ class PolledInstrument(ABC, Generic[ReadingT]):
             **self._link.diagnostics(),
             "instrument": self._name,
             "readings": self._count,
-            "errors": dict(self._errors + self._lines.errors),
+            "errors": dict(self._errors + Counter({"too long": self._lines.too_long})),
         }
 
     async def _handle_error(self, error: DriverError) -> None:
@@ -186,15 +180,9 @@ class PolledInstrument(ABC, Generic[ReadingT]):
         await self._link.lost(error)
 
     async def _identify(self, *models: str) -> str:
-        """Return the reply to *IDN?, skipping stale replies; ProtocolError unless it names one of the models."""
+        """Return the reply to *IDN?; ProtocolError unless it names one of the models."""
         self._lines.restart()
-        self._waiting.clear()
         name = (await self._ask("*IDN?")).text
-        for _ in range(MAX_STALE_REPLIES):
-            # A name has four fields; the first is not a number.
-            if name.count(",") >= 3 and not name.lstrip("+-")[:1].isdigit():
-                break
-            name = (await self._next(0, "*IDN?")).text
         if models and not any(model in name for model in models):
             raise ProtocolError(
                 f"{self.instrument} says it is {name!r}, and not {' or '.join(models)}; see which instrument is there."
@@ -239,14 +227,7 @@ class PolledInstrument(ABC, Generic[ReadingT]):
             deadline_ns = begin_ns + int(self._timeout_s * 1e9)
         while not self._waiting:
             left_s = (deadline_ns - monotonic_ns()) / 1e9
-            try:
-                received = await self._port.read(left_s) if left_s > 0 else None
-            except DeviceLostError as error:
-                if not self._lines.in_line:
-                    raise
-                raise DeviceLostError(
-                    f"{self.instrument} broke off in the middle of its answer to {query!r}: {error}"
-                ) from error
+            received = await self._port.read(left_s) if left_s > 0 else None
             if received is None:
                 waited_s = (deadline_ns - begin_ns) / 1e9
                 raise DeviceSilentError(
@@ -460,47 +441,20 @@ class ScpiScanner(PolledInstrument[Voltages]):
         return read_scan(reply) if query == SCAN else None
 
 
-class PairParser:
-    """Turns a converter board's bytes, however they are sliced, into voltages; counts rejected lines by kind. No I/O.
-
-    `partial_lines` may have been under way when the port was opened; they are not errors.
-    """
+class PairParser(LineParser[Voltages]):
+    """Turns a converter board's bytes into voltages."""
 
     def __init__(self, rate_hz: float = DAQ_RATE_HZ, full_scale_v: float = ADC_FULL_SCALE_V) -> None:
-        self._lines = TimedLines(MAX_PAIR_BYTES, ADC_BAUD, rate_hz)
-        self._errors: Counter[str] = Counter()
-        self.partial_lines = 0
+        super().__init__(_PAIR, MAX_PAIR_BYTES, ADC_BAUD, rate_hz)
         self._end_v = _END_OF_RANGE * full_scale_v
 
-    @property
-    def errors(self) -> Counter[str]:
-        """The number of rejected lines, by kind."""
-        return self._errors + Counter({"too long": self._lines.too_long, "unfinished": self._lines.unfinished})
-
-    def handle(self, event: RawEvent) -> list[Voltages]:
-        """Process a live or recorded event; return the voltages that it completes."""
-        if event.kind is InputKind.OPENED:
-            self._lines.restart()
-        elif event.kind is InputKind.DATA:
-            return self.feed(event.data, event.t_ns)
-        return []
-
-    def feed(self, data: bytes, t_arrival_ns: int) -> list[Voltages]:
-        """Return the voltages that `data` completes; of several lines each is a period older than the next.
-
-        The first line after opening is dropped: the rest of a number may look like a number.
-        """
-        found = []
-        for line in self._lines.timed(data, t_arrival_ns):
-            if line.partial:
-                self.partial_lines += 1
-            elif match := _PAIR.fullmatch(line.text):
-                v1_v, v2_v = float(match[1]), float(match[2])
-                over_1, over_2 = abs(v1_v) >= self._end_v, abs(v2_v) >= self._end_v
-                found.append(Voltages(v1_v, v2_v, line.t_mid_ns, t_arrival_ns, over_1, over_2))
-            else:
-                self._errors["not two decimals" if line.text else "empty"] += 1
-        return found
+    def _values(self, line: TimedLine) -> list[Voltages]:
+        if line.partial:
+            # The rest of a number may look like a number.
+            return []
+        v1_v, v2_v = map(float, line.text.split(b","))
+        over_1, over_2 = abs(v1_v) >= self._end_v, abs(v2_v) >= self._end_v
+        return [Voltages(v1_v, v2_v, line.t_mid_ns, line.t_arrival_ns, over_1, over_2)]
 
 
 class AdcBoard(SerialSensor[Voltages]):
@@ -522,14 +476,7 @@ class AdcBoard(SerialSensor[Voltages]):
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
-        errors = self._parser.errors
-        return {
-            **super().diagnostics(),
-            "lines": self._count,
-            "partial_lines": self._parser.partial_lines,
-            "errors": dict(errors),
-            "error_details": describe_errors(errors, _PAIR_ERRORS),
-        }
+        return {**super().diagnostics(), "lines": self._count, "errors": self._parser.errors}
 
     def _parse(self, event: RawEvent) -> list[Voltages]:
         found = self._parser.handle(event)

@@ -1,14 +1,11 @@
 """The arm through ur-rtde. Only this module calls ur-rtde, and only the worker process imports this module.
 
 ur-rtde is not thread-safe. Its calls block for up to 301 s, its constructors hold the interpreter lock, and it crashes
-its process when RTDE is lost. So it has a process of its own, with an alarm before each call.
+its process when RTDE is lost or it has connected again. So it has a process of its own, with an alarm before each call.
 """
 
-import contextlib
 import ctypes
 import os
-import socket
-import stat
 import sys
 import time
 from collections.abc import Callable
@@ -18,7 +15,6 @@ import script_client
 
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.controller import (
-    RTDE_PORT,
     ProbeError,
     RtdeReceiver,
     SampleAge,
@@ -26,7 +22,7 @@ from shearloop.drivers.ur.controller import (
     ask_dashboard,
 )
 from shearloop.drivers.ur.messages import MoveLinear, RtdeOutputs, RtdeSample, WristSpeed
-from shearloop.drivers.ur.script import guard_script
+from shearloop.drivers.ur.script import NO_MOTION_S, guard_script
 from shearloop.drivers.ur.settings import UrSettings
 
 # A thread of ur-rtde polls its socket every 0.1 ms, which takes 5 % of a core. With this timer slack it wakes once per
@@ -55,13 +51,12 @@ class UrArm:
                 "ur-rtde 1.6.5.",
             )
         self._receiver = RtdeReceiver(settings.host, settings.rate_hz, settings.connect_timeout_s / 3)
-        kind, ours = rtde_control.RTDEControlInterface, connections_to(RTDE_PORT)
+        kind = rtde_control.RTDEControlInterface
         watchdog_ns = 1e9 / settings.watchdog_hz
         # The thread that ur-rtde starts here inherits the slack; 0 gives this one its default again.
         _set_timer_slack(min(_LONGEST_POLL_SLACK_NS, int(watchdog_ns / _SLACKS_PER_WATCHDOG)))
         self._control = kind(settings.host, settings.rate_hz, int(kind.FLAG_NO_WAIT))
         _set_timer_slack(0)
-        self._control_connections = connections_to(RTDE_PORT) - ours
         self._accepts_scripts = True
         # A linear move was begun, and the wrist has not turned since.
         self._may_move_linearly = False
@@ -76,10 +71,7 @@ class UrArm:
             **{name: getattr(sample, name) for name in RtdeOutputs.__dataclass_fields__},
             t_mono_ns=now_ns,
             age_ns=self._age.age_ns(sample.timestamp_s, now_ns),
-            connected=self._receiver.connected
-            and self._accepts_scripts
-            and self._control.isConnected()
-            and all(is_open(*one) for one in self._control_connections),
+            connected=self._receiver.connected and self._accepts_scripts and self._control.isConnected(),
             moving_linearly=self._may_move_linearly
             and self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
         )
@@ -154,6 +146,10 @@ class UrArm:
         if self._script_readiness.wait():
             self._control.stopScript()
 
+    def withdraw_deadline(self) -> None:
+        """Let no motion go on, also not when a program that is paused now is resumed."""
+        self._receiver.write_deadline(NO_MOTION_S)
+
     def _write_deadline(self, left_s: float) -> None:
         # The latest sample is older than now, so that the deadline is never late.
         self._receiver.write_deadline(self._receiver.latest().script_s + left_s)
@@ -171,32 +167,6 @@ class UrArm:
         answers = ask_dashboard(self._settings.host, 2.5, requests)
         if requests == ("unlock protective stop",) and answers != ["Protective stop releasing"]:
             raise DriverError(f"The controller refused: {answers[0]}")
-
-
-def connections_to(port: int) -> set[tuple[int, int]]:
-    """Return this process's TCP connections to a port: the descriptor and the inode of each."""
-    found = set()
-    for name in os.listdir("/proc/self/fd"):
-        # The descriptor may have been closed, or the socket may not be connected.
-        with contextlib.suppress(OSError):
-            status = os.fstat(int(name))
-            if stat.S_ISSOCK(status.st_mode):
-                with socket.socket(fileno=os.dup(int(name))) as one:
-                    if one.family == socket.AF_INET and one.getpeername()[1] == port:
-                        found.add((int(name), status.st_ino))
-    return found
-
-
-def is_open(descriptor: int, inode: int) -> bool:
-    """Return whether a connection is the one that had this inode, which a reused descriptor does not keep.
-
-    ur-rtde reconnects silently in a thread of its own. Commands on such a connection crash the process, so that a new
-    connection counts as a lost controller.
-    """
-    try:
-        return os.fstat(descriptor).st_ino == inode
-    except OSError:
-        return False
 
 
 def _set_timer_slack(slack_ns: int) -> None:

@@ -24,8 +24,6 @@ from shearloop.drivers.ur.settings import UrSettings
 
 LossKind = messages.FailureKind | Literal["crashed", "hung", "garbled"]
 
-# A program found this soon after a loss counts as left behind by the lost worker.
-TAKES_OVER_S = 10.0
 # A disconnecting worker stops the arm (1 s) and ends the program; after this time it is killed.
 EXIT_S = 3.0
 # The worker's own alarms end it at a known place; the daemon kills it this much later.
@@ -71,30 +69,20 @@ class UrRobot:
         self.state: messages.RobotState | None = None
         self.link = monitor or LinkMonitor()
         self.losses: Counter[str] = Counter()
-        # How many states have come, and how many times our program was paused and did not stop on request.
+        # How many states have come.
         self.states = 0
-        self.failed_program_stops = 0
         self._connection: WorkerConnection | None = None
         self._replies: dict[int, asyncio.Future[messages.CommandReply]] = {}
         self._number = 0
         self._version = ""
-        self._lost_s = -math.inf
         self._next: asyncio.Future[messages.RobotState] | None = None
-
-    @property
-    def takes_over(self) -> bool:
-        """Whether the connection was just lost, so that a program of ours may still be on the robot."""
-        return time.monotonic() - self._lost_s < TAKES_OVER_S
 
     def diagnostics(self) -> Diagnostics:
         """Return the robot's values for `health`; counts are since the process began."""
-        errors = dict(self.losses)
-        if self.failed_program_stops:
-            errors["paused program not stopped"] = self.failed_program_stops
         return {
             "connected": self.state is not None,
             "states": self.states,
-            "errors": errors,
+            "errors": dict(self.losses),
             "error": "" if self.link.latest.up else self.link.latest.sentence,
         }
 
@@ -131,7 +119,7 @@ class UrRobot:
         await asyncio.get_running_loop().subprocess_exec(
             lambda: connection, sys.executable, "-m", "shearloop.drivers.ur.worker"
         )
-        connection.send(messages.Configure(self.settings, self.takes_over))
+        connection.send(self.settings)
         self._connection = connection
         try:
             await connection.listen()
@@ -141,9 +129,6 @@ class UrRobot:
 
     def _disconnect(self) -> None:
         self._connection = None
-        if self.state is not None:
-            # A lost network does not make a foreign program ours.
-            self._lost_s = time.monotonic() if self.state.owns_program else -math.inf
         self.state = None
         unanswered = messages.CommandReply("The robot's process ended before it answered; nothing is sent again.")
         for number in list(self._replies):
@@ -155,9 +140,6 @@ class UrRobot:
             case messages.RobotState():
                 before, self.state = self.state, message
                 self.states += 1
-                # Each worker counts from zero.
-                counted = before.failed_program_stops if before is not None else 0
-                self.failed_program_stops += message.failed_program_stops - counted
                 if before is None:
                     untested = untested_sentence(self._version) if self._version else ""
                     said = (f"The robot at {self.settings.host} is connected.", untested, message.blocked)
@@ -251,6 +233,9 @@ class WorkerConnection(asyncio.SubprocessProtocol):
 
     async def end(self) -> None:
         """Disconnect the worker, and kill it after `EXIT_S`."""
+        # Its last states do not count as a connection.
+        if not self._closed.done():
+            self._closed.set_result(None)
         if self._process.get_returncode() is None:
             self.send(messages.Disconnect())
         # The end of its input disconnects the worker too.

@@ -37,10 +37,6 @@ if TYPE_CHECKING:
 _RETRY_S = 1.0
 # A program without heartbeats has ended by its watchdog after this time.
 ENDS_ITSELF_S = 2.0
-# The pauses between requests to stop a paused program; each may hang for another 2.5 s.
-STOP_RETRIES_S = (1.0, 2.0, 5.0, 10.0, 10.0)
-
-STILL_PAUSED = "The paused program could not be stopped ({reason}): stop it at the teach pendant, do not resume it."
 
 NOT_ENABLED = "Motion has not been enabled since the robot's process was started: enable it when the arm may move."
 BEING_MADE_READY = "The robot is being made ready (safety, power, control program); this takes some seconds."
@@ -54,18 +50,14 @@ class Recovery:
     unlocked only on the operator's request (UR's own rule). Without one, only the control program is started.
     """
 
-    def __init__(
-        self, arm: "UrArm", now_ns: int, timeout_s: float, *, operator_asked: bool, takes_over: bool = False
-    ) -> None:
-        """Begin. `operator_asked` allows unlocking, powering and stopping any program, `takes_over` a paused one."""
+    def __init__(self, arm: "UrArm", now_ns: int, timeout_s: float, *, operator_asked: bool) -> None:
+        """Begin. `operator_asked` allows unlocking, powering and stopping any program."""
         self._arm = arm
         self._deadline_ns = now_ns + int(timeout_s * 1e9)
         self._timeout_s = timeout_s
         self._operator_asked = operator_asked
-        self._takes_over = takes_over
         self._asked_ns: dict[str, int] = {}
-        # Whether the control program is being started, so that a program on the robot may be ours.
-        self.starts_program = self._uploaded = False
+        self._cleared = self._uploaded = False
         # Whether the attempt has succeeded, or why it has ended otherwise.
         self.ready = False
         self.refusal: str | None = None
@@ -98,14 +90,14 @@ class Recovery:
             # The control connection may see the program a sample later; then try again in the next cycle.
             self.ready = self._arm.arm_watchdog()
         elif sample.runtime_state != RUNTIME_STOPPED:
-            if self._operator_asked or (self._takes_over and sample.program_paused):
+            if self._operator_asked:
                 self._ask_dashboard(now_ns, "stop")
             elif now_ns > self._asked_ns.setdefault("end", now_ns) + int(ENDS_ITSELF_S * 1e9):
                 # Not ours to stop. After the death of its daemon its watchdog would have ended it.
                 self.refusal = ""
-        elif not self.starts_program:
+        elif not self._cleared:
             # Registers outlive the program: a new one would first execute the last command.
-            self.starts_program = self._arm.clear_command()
+            self._cleared = self._arm.clear_command()
         else:
             if self._uploaded:
                 # A heartbeat, for a script that arms its watchdog before its loop.
@@ -149,82 +141,15 @@ class Recovery:
         return due
 
 
-class ProgramOwner:
-    """Knows whether the program on the robot is ours, and stops ours while it is paused.
-
-    Resumed at the pendant, a paused program would go on with its last motion. Requests to stop it repeat less and less
-    often, a limited number of times; `failure` is the message for the operator. A program is another client's when it
-    plays on without our heartbeats: ours would end.
-    """
-
-    def __init__(self, arm: "UrArm", *, ours: bool) -> None:
-        self._arm = arm
-        self.ours = ours
-        # Whether the next cycle stops a paused program; the state before it announces that it may take long.
-        self.stop_announced = self._was_announced = False
-        self.failure = ""
-        self.failed_stops = 0
-        self._requests, self._next_ns = 0, 0
-        # When a program was being started last: an upload may take effect after its recovery was given up.
-        self._starting_ns: int | None = None
-        self._plays_without_us_ns: int | None = None
-
-    def may_be_ours(self, now_ns: int) -> bool:
-        """Return whether a program that plays is ours or may be, because one was just being started."""
-        return self.ours or (self._starting_ns is not None and now_ns - self._starting_ns <= ENDS_ITSELF_S * 1e9)
-
-    def update(self, sample: RtdeSample, now_ns: int, *, starting: bool, plays_without_us: bool) -> None:
-        """Take in a cycle's sample; `starting`: a program of ours is being started."""
-        self._was_announced, self.stop_announced = self.stop_announced, False
-        if not plays_without_us:
-            self._plays_without_us_ns = None
-        elif self._plays_without_us_ns is None:
-            self._plays_without_us_ns = now_ns
-        since_ns = self._plays_without_us_ns
-        foreign = since_ns is not None and now_ns - since_ns > ENDS_ITSELF_S * 1e9
-        if sample.runtime_state == RUNTIME_STOPPED or foreign:
-            # The next program may be anyone's, and ours may have ended between two samples.
-            self.ours = False
-            self._requests, self._next_ns, self.failure = 0, 0, ""
-        if starting:
-            self.ours, self._starting_ns = True, now_ns
-
-    def stop_paused(self, now_ns: int) -> None:
-        """Request a stop when it is due, in the cycle after the one that has announced it: it may take seconds."""
-        if now_ns < self._next_ns or self._requests > len(STOP_RETRIES_S):
-            return
-        if not self._was_announced:
-            self.stop_announced = True
-            return
-        if self._requests and not self.failure:
-            self._fail("the dashboard said that it is stopped, and it is not")
-        self._next_ns = now_ns + int(1e9 * STOP_RETRIES_S[min(self._requests, len(STOP_RETRIES_S) - 1)])
-        self._requests += 1
-        try:
-            self._arm.ask_dashboard("stop")
-        except DriverError as error:
-            self._fail(str(error))
-
-    def _fail(self, reason: str) -> None:
-        self.failed_stops += 1
-        self.failure = STILL_PAUSED.format(reason=reason.strip().removesuffix("."))
-
-
 class CommandHandler:
     """Applies the latest command within the limits."""
 
-    def __init__(self, settings: UrSettings, arm: "UrArm", now_ns: int, *, takes_over: bool = False) -> None:
-        """Begin with motion disabled, and start the control program where the robot allows it.
-
-        `takes_over`: a paused program on the robot was left behind by the worker before this one.
-        """
+    def __init__(self, settings: UrSettings, arm: "UrArm", now_ns: int) -> None:
+        """Begin with motion disabled, and start the control program where the robot allows it."""
         self._settings = settings
         self._arm = arm
         self._executor = MotionExecutor(settings, arm, now_ns)
-        self._program = ProgramOwner(arm, ours=takes_over)
-        self._recovery: Recovery | None = Recovery(
-            arm, now_ns, settings.recover_timeout_s, operator_asked=False, takes_over=takes_over
-        )
+        self._recovery: Recovery | None = Recovery(arm, now_ns, settings.recover_timeout_s, operator_asked=False)
         self._unlock_number: int | None = None
         self._held_reason = NOT_ENABLED
         self._daemon_alive_ns = now_ns
@@ -239,7 +164,7 @@ class CommandHandler:
     @property
     def recovering(self) -> bool:
         """Whether calls may take seconds: to the dashboard, or the first one to a new program."""
-        return self._recovery is not None or self._program.stop_announced
+        return self._recovery is not None
 
     def take_rejection(self) -> bool:
         """Return, once, whether the robot rejected a command.
@@ -315,16 +240,12 @@ class CommandHandler:
     def tick(self, sample: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
         """Run one cycle: check the sample and send what is due; return the reply to an `Unlock` that has ended."""
         self._executor.watch(sample, now_ns)
-        recent = is_recent(sample, self._settings)
+        if sample.program_paused:
+            # Resumed at the pendant, it would go on with its last motion until the deadline.
+            self._arm.withdraw_deadline()
         recovery = self._recovery
-        without_us = recovery is not None or bool(self._executor.disabled_reason)
-        self._program.update(
-            sample,
-            now_ns,
-            starting=recovery is not None and recovery.starts_program,
-            plays_without_us=without_us and sample.program_running and recent,
-        )
         if recovery is not None:
+            recent = is_recent(sample, self._settings)
             return self._end_recovery(recovery) if recovery.advance(sample, now_ns, recent=recent) else None
         unfit = self._why_unfit(sample)
         if unfit:
@@ -335,8 +256,6 @@ class CommandHandler:
                 self._executor.leave_to_watchdog(unfit)
             if not sample.program_running:
                 self._executor.disable(unfit)
-                if recent and self._program.ours and sample.program_paused and not self.leaving:
-                    self._program.stop_paused(now_ns)
             return None
         beyond = self._executor.violation(sample)
         if beyond:
@@ -361,8 +280,6 @@ class CommandHandler:
             sent=executor.sent,
             clipped=executor.clipped,
             cycle=cycle,
-            owns_program=self._program.ours,
-            failed_program_stops=self._program.failed_stops,
         )
 
     def _why_unfit(self, sample: RtdeSample) -> str:
@@ -373,8 +290,7 @@ class CommandHandler:
         """Return why motion is refused, or the empty string."""
         if self._recovery is not None:
             return BEING_MADE_READY
-        reason = self._why_unfit(sample) or self._executor.violation(sample) or self._held_reason
-        return f"{reason} {self._program.failure}" if self._program.failure else reason
+        return self._why_unfit(sample) or self._executor.violation(sample) or self._held_reason
 
     def _end_recovery(self, recovery: Recovery) -> tuple[int, CommandReply] | None:
         self._recovery = None
@@ -388,13 +304,7 @@ class CommandHandler:
             self._held_reason = ""
         return number, CommandReply(refusal=recovery.refusal or "")
 
-    def end_program(self, sample: RtdeSample, now_ns: int) -> None:
-        """End our program: also one that a late upload has started, and one that is paused. Leave other clients' alone.
-
-        Stopping a paused one may take seconds.
-        """
-        if sample.program_running:
-            if self._program.may_be_ours(now_ns):
-                self._arm.end_program()
-        elif self._program.ours and sample.program_paused:
-            self._arm.ask_dashboard("stop")
+    def end_program(self, sample: RtdeSample) -> None:
+        """End our program. One that has no heartbeats now ends by its watchdog, also when it starts or is resumed."""
+        if sample.program_running and not self._executor.disabled_reason:
+            self._arm.end_program()

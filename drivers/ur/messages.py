@@ -210,19 +210,6 @@ class RobotState(RtdeSample):
     clipped: tuple[str, ...]
     # Number of the worker's cycle.
     cycle: int
-    # Whether this worker, or the one before it, started the program on the robot.
-    owns_program: bool
-    # How many times our program was paused and did not stop on request.
-    failed_program_stops: int
-
-
-@dataclass(frozen=True, slots=True)
-class Configure:
-    """The first message to the worker."""
-
-    settings: UrSettings
-    # Whether a worker that has just ended may have left a program on the robot.
-    takes_over: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,14 +239,15 @@ class Failed:
     sentence: str
 
 
-Message = Command | CommandReply | RobotState | Configure | Heartbeat | WorkerPhase | ControllerVersion | Failed
+# The settings are the first message to the worker.
+Message = Command | CommandReply | RobotState | UrSettings | Heartbeat | WorkerPhase | ControllerVersion | Failed
 
 # The largest message, a state with every reason for clipping, has about 2 kB.
 LARGEST_MESSAGE: Final = 1 << 16
 
 _MOTIONS: Final = (WristSpeed, MoveLinear, Stop)
 _TYPES: Final[tuple[Any, ...]] = (
-    *_MOTIONS, ZeroForceTorque, Enable, Unlock, Disconnect, CommandReply, RobotState, Configure, Heartbeat, WorkerPhase,
+    *_MOTIONS, ZeroForceTorque, Enable, Unlock, Disconnect, CommandReply, RobotState, Heartbeat, WorkerPhase,
     ControllerVersion, Failed, UrSettings, UrLimits, Bound, InstalledTool, JointRange, Workspace,
 )  # fmt: skip
 _CODES: Final = {kind: code for code, kind in enumerate(_TYPES)}

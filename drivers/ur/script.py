@@ -11,6 +11,8 @@ from shearloop.drivers.ur.settings import UrSettings
 
 # RTDE guide: other clients may use the double registers from 24 on; ur-rtde uses lower ones.
 DEADLINE_REGISTER, CLOCK_REGISTER = "input_double_register_24", "output_double_register_24"
+# The clock starts at 0: with this deadline no motion begins or goes on.
+NO_MOTION_S = -1.0
 # A deadline lies this much further ahead at most: a cycle of the slowest controller, for rounding.
 _SLACK_S = 0.008
 # The client has this time to stop a linear move after its deadline.

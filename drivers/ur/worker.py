@@ -90,20 +90,20 @@ def main() -> NoReturn:
     os.dup2(2, 1)
     pipe = Pipe(0, stdout)
     try:
-        configured = _receive_configuration(pipe)
-        if configured is None:
+        settings = _receive_settings(pipe)
+        if settings is None:
             _exit(EXIT_DONE)
-        _control(pipe, configured, _connect(pipe, configured.settings))
+        _control(pipe, settings, _connect(pipe, settings))
     except Exception:  # noqa: BLE001 - printed, and the process exits all the same
         traceback.print_exc()
         _exit(EXIT_FAILED)
 
 
-def _receive_configuration(pipe: Pipe) -> messages.Configure | None:
+def _receive_settings(pipe: Pipe) -> UrSettings | None:
     while pipe.open:
         pipe.wait(60.0)
         for _, message in pipe.receive():
-            if isinstance(message, messages.Configure):
+            if isinstance(message, UrSettings):
                 return message
     return None
 
@@ -138,9 +138,8 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
         _fail(pipe, "unreachable", f"The connection to the robot at {host} failed: ur-rtde says “{text.strip()}”.")
 
 
-def _control(pipe: Pipe, configured: messages.Configure, arm: "UrArm") -> NoReturn:
-    settings = configured.settings
-    handler = CommandHandler(settings, arm, time.monotonic_ns(), takes_over=configured.takes_over)
+def _control(pipe: Pipe, settings: UrSettings, arm: "UrArm") -> NoReturn:
+    handler = CommandHandler(settings, arm, time.monotonic_ns())
     period_s, due_s, cycle = 1.0 / settings.rate_hz, time.monotonic(), 0
     leave_s = math.inf
     while True:
@@ -164,7 +163,7 @@ def _control(pipe: Pipe, configured: messages.Configure, arm: "UrArm") -> NoRetu
             pipe.send_latest(handler.state(sample, cycle))
         if (handler.leaving and handler.at_rest) or time.monotonic() > leave_s:
             _set_alarm(BRAKE_S + settings.hang_timeout_s)
-            handler.end_program(arm.read(), time.monotonic_ns())
+            handler.end_program(arm.read())
             _exit(EXIT_DONE)
         # A late cycle begins at once; missed ones are skipped.
         due_s, cycle = max(due_s + period_s, time.monotonic()), cycle + 1

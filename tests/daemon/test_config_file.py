@@ -117,6 +117,7 @@ ALIAS_BOMB = "a: &a [x]\n" + "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n"
     [
         ("", "the configuration is empty"),
         ("# nothing\n", "the configuration is empty"),
+        ("torque_limit_nm: 1\nmode\nlow: 2\n", "a key without its `:`"),
         ("- 1\n- 2\n", "expected keys and values such as `torque_limit_nm: …`, found [1, 2]"),
         ("torque_limit_nm: 1\nmode: [slow\n", ":3:1: a list is not closed"),
         ("torque_limit_nm: 1\n\tmode: slow\n", ":2:1: a tab indents this line; use spaces"),

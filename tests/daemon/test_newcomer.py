@@ -51,7 +51,7 @@ def readme_program() -> str:
 
 
 class Tree:
-    """A fresh tree as `git clone` and `make install` leave it, but for the copying of code and libraries."""
+    """A fresh tree as `git clone` and an installation leave it, but for the copying of code and libraries."""
 
     def __init__(self, root: Path) -> None:
         self.root, self.log = root, root / "log"

@@ -155,6 +155,10 @@ def test_every_mistake_of_an_experiment_is_told_on_a_line_of_its_own(tmp_path):
     ).splitlines()
     assert "steps[2].angle_rad: 90 is too large" in schema
     assert source.endswith("did you mean right?")
+    wide = {**LIMITS, "angle_rad": 90}
+    limit, source = refusal(tmp_path, {"torque_source": "rigth", "limits": wide, "steps": STEPS}).splitlines()
+    assert "limits.angle_rad: 90 is too large" in limit
+    assert source.endswith("did you mean right?")
     twist = {"do": "twist", "angles_rad": [2]}
     assert len(refusal(tmp_path, {"limits": LIMITS, "steps": [twist, twist]}).splitlines()) == 2
 

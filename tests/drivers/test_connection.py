@@ -78,17 +78,6 @@ async def test_bytes_pass_unchanged_in_both_directions():
             assert await sent_to(peer, 256) == bytes(range(256))
 
 
-async def test_what_was_written_is_unread_at_once_until_it_is_read():
-    with PtyPort() as peer, SerialPort(peer.path) as port:
-        assert not peer.unread
-        for _ in range(200):
-            await peer.write(b"half a line")
-            assert peer.unread
-            assert await read_exactly(port, 11) == b"half a line"
-            assert not peer.unread
-    assert not peer.unread, "nobody can read it any more"
-
-
 async def test_a_port_is_had_by_one_program_at_a_time():
     in_use = pytest.raises(DeviceUnavailableError, match="in use by another program")
     with PtyPort() as peer, SerialPort(peer.path), in_use:

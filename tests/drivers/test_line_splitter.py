@@ -19,7 +19,6 @@ def test_slices_change_nothing_and_every_line_is_given_or_counted(slices):
     *ended, rest = data.split(b"\n")
     assert expected == [line if len(line) <= LONGEST else None for line in ended] + [None] * (len(rest) > LONGEST)
     assert whole.too_long == sliced.too_long == sum(len(line) > LONGEST for line in [*ended, rest])
-    assert sliced.in_line == whole.in_line == (bool(rest.strip()) or len(rest) > LONGEST)
 
 
 def test_memory_stays_bounded_where_no_line_ever_ends():
@@ -30,21 +29,13 @@ def test_memory_stays_bounded_where_no_line_ever_ends():
     _, peak_bytes = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak_bytes < 10 * len(slice_)
-    assert (lines.too_long, lines.in_line) == (1, True)
+    assert lines.too_long == 1
 
 
-def test_what_had_begun_when_the_port_was_opened_again_is_counted_and_forgotten():
-    lines = LineSplitter(LONGEST)
-    lines.feed(b"1\n2")
-    lines.restart()
-    lines.restart()
-    assert (lines.unfinished, lines.in_line) == (1, False)
-    assert lines.feed(b"3\n") == [b"3"]
-
-
-def test_line_that_is_too_long_is_counted_once_where_the_port_is_opened_again_before_its_end():
-    lines = LineSplitter(LONGEST)
-    lines.feed(b"7" * 20)
-    lines.feed(b"7")
-    lines.restart()
-    assert (lines.too_long, lines.unfinished) == (1, 0)
+def test_what_had_begun_when_the_port_was_opened_again_is_forgotten():
+    for begun, too_long in ((b"1\n2", 0), (b"7" * 20, 1)):
+        lines = LineSplitter(LONGEST)
+        lines.feed(begun)
+        lines.restart()
+        assert lines.feed(b"3\n") == [b"3"]
+        assert lines.too_long == too_long

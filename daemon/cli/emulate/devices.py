@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from shearloop.drivers.emulators.boards import BoardFault
     from shearloop.drivers.emulators.ur_controller import Controller
     from shearloop.drivers.emulators.ur_robot import ControllerSpec, RobotEvent
 
@@ -28,7 +27,6 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
   release                 release the button; power comes back from the dashboard
   drop-rtde               close the RTDE connections, but not the dashboard's
   silence SECONDS         send nothing on any port
-  stop-hangs N            ignore the dashboard's next N stop commands, without an answer
   registers-in-use        refuse input registers as if a fieldbus had them
   local-control           leave remote control
   refuse-protocol         refuse the RTDE protocol version
@@ -42,8 +40,8 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
 def _configure_eit_kit(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Prints the port's path, again each time it is plugged in. A fault's name on standard input applies to the "
-        "next frame: cut-line, wrong-count, nan, garbage, silence [SECONDS], unplug [SECONDS]. A "
-        "silence without a number lasts until the board is started again; `normal` ends every fault."
+        "next frame: cut-line, wrong-count, nan, garbage; or to what follows: silence [SECONDS], unplug [SECONDS]. "
+        "Starting the board ends a silence; `normal` ends every fault."
     )
     frames = parser.add_argument_group("frames")
     add_option(frames, "--recording", Path, "FILE", "a recorded stream (.mat)")
@@ -53,8 +51,6 @@ def _configure_eit_kit(parser: argparse.ArgumentParser) -> None:
     frames.add_argument("--once", action="store_true", help="play the recording once, then be silent")
     console.add_seed_and_speed(parser, "the board's 1.85 frames per second")
     console.add_link(parser)
-    text = "a fault of one frame, counted from 0; may be given several times"
-    parser.add_argument("--fault", action="append", default=[], metavar="NAME[:SECONDS]@FRAME", help=text)
 
 
 def _run_eit_kit(args: argparse.Namespace) -> int:
@@ -62,22 +58,9 @@ def _run_eit_kit(args: argparse.Namespace) -> int:
     from shearloop.drivers.emulators.boards import EitKitBoard
 
     console.check_positive(args, "speed")
-    link, fault_at = console.checked_link(args.link), dict(_numbered_fault(text) for text in args.fault)
-    frames, period_s = _frames(args, FRAME_PERIOD_S), FRAME_PERIOD_S / args.speed
-    board = EitKitBoard(frames, period_s=period_s, link=link, fault_at=fault_at, seed=args.seed)
+    link = console.checked_link(args.link)
+    board = EitKitBoard(_frames(args, FRAME_PERIOD_S), period_s=FRAME_PERIOD_S / args.speed, link=link, seed=args.seed)
     return console.play(board.run(), board.command, {"": board.port.appearances})
-
-
-def _numbered_fault(argument: str) -> "tuple[int, BoardFault]":
-    from shearloop.drivers.emulators.boards import EitKitBoard, parse_fault
-
-    name, _, frame = argument.partition("@")
-    if not frame.isdecimal():
-        raise UserError(f"--fault {argument} names no frame; write NAME@FRAME, for instance cut-line@20")
-    try:
-        return int(frame), parse_fault(name, EitKitBoard.faults)
-    except ValueError as error:
-        raise UserError(f"--fault {argument}: {error}") from None
 
 
 def _frames(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.float64]"]:
@@ -209,8 +192,8 @@ def _configure_gripper(parser: argparse.ArgumentParser, printed: str) -> None:
     parser.epilog = (
         f"Prints {printed}, again each time it comes back. On standard input: `object MM` puts something of that width "
         "between the fingers, `object none` takes it away; `fault CODE` makes the gripper report a fault; `unplug "
-        "[SECONDS]` breaks the connection, `silence [SECONDS]` answers nothing, `break-off` ends the next answer "
-        "half-way; `normal` ends them, and a fault below 10."
+        "[SECONDS]` breaks the connection, `silence [SECONDS]` answers nothing; `normal` ends them, and a fault below "
+        "10."
     )
     add_option(parser, "--speed", float, "N", "times the gripper's own pace", default=1.0)
 

@@ -31,7 +31,7 @@ Commands, one a line on standard input:
   truth                       print the true state: torque, angles, width, diameter
   kick NM                     turn the workpiece so that the torque jumps by NM
   slip [NM]                   let the tool slip in the grip until NM (0) remain
-  joint KIND                  put the tool on another joint: lever, tightening, seized, stripping
+  joint KIND                  put the tool on another joint: lever, tightening, seized
   object MM | object none     put something of that width between the fingers, or take it away
   silence DEVICE [SECONDS]    silence a device: right, left, load, gripper, robot
   unplug DEVICE [SECONDS]     disconnect a device, without a number until `replug DEVICE`
@@ -46,11 +46,10 @@ otherwise: a loop in real time then sees angles change that many times as fast, 
 SKIN_EPILOG = """Prints the addresses of source and DAQ, again each time they appear.
 Commands, one a line on standard input:
   shear N                        push the skin (not while a robot turns it)
-  open 1|2, short 1|2, reversed 1|2, swapped, drift 1|2 SHARE_PER_S, leads OHM, mend
+  open 1|2, short 1|2, reversed 1|2, swapped, leads OHM, mend
                                  faults of the circuit
-  source silence [SECONDS] | unplug [SECONDS] | break-off | normal
-  daq silence [SECONDS] | unplug [SECONDS] | normal; of a scanner break-off (the next answer ends half-way), of a
-                                 converter board missing, garbage, torn, stuck [SECONDS]
+  source silence [SECONDS] | unplug [SECONDS] | normal
+  daq silence [SECONDS] | unplug [SECONDS] | normal; of a converter board missing, garbage, torn, stuck [SECONDS]
   robot FAULT                    any fault of `emulate ur`
   normal                         end all faults of circuit and instruments
 """

@@ -79,7 +79,7 @@ class Robot(UrRobot):
             self.gone_for -= 1
             self.flight.be_alone()
             if not self.gone_for:
-                self.flight.begin_anew(takes_over=self.takes_over)
+                self.flight.begin_anew()
             return
         # A real arm's move is under way until its end is told, though its joints rest.
         arm.stops_moves = not self.brakes_for

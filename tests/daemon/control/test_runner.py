@@ -236,16 +236,6 @@ async def test_a_straight_move_that_met_something_is_not_begun_again_after_a_pau
         assert sum(isinstance(command, MoveLinear) for command in cell.robot.commands) == 1
 
 
-async def test_a_paused_program_that_could_not_be_stopped_is_counted_in_health():
-    async with driven() as cell:
-        cell.robot.losses["hung"] = 2
-        assert cell.robot.diagnostics()["errors"] == {"hung": 2}
-        cell.robot.flight.arm.stoppable = False
-        cell.robot.flight.arm.protective_stop()
-        await cell.cycles(200)
-        assert cell.robot.diagnostics()["errors"] == {"hung": 2, "paused program not stopped": 2}
-
-
 TURN = WristSpeed(0.3, 4.0)
 
 

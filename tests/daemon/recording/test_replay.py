@@ -73,9 +73,9 @@ def measured(messages: Messages) -> Messages:
 
 @asynccontextmanager
 async def recording_daemon(
-    config: Path, *faults: str
-) -> AsyncIterator[tuple[Daemon, Messages, Callable[[int], Awaitable[None]]]]:
-    """Run a daemon on an emulated board of 60 frames; give it, what it published, and a wait for a frame."""
+    config: Path,
+) -> AsyncIterator[tuple[Daemon, asyncio.subprocess.Process, Messages, Callable[[int], Awaitable[None]]]]:
+    """Run a daemon on an emulated board of 60 frames; give both, what was published, and a wait for a frame."""
     published: Messages = []
     news = asyncio.Event()
 
@@ -90,14 +90,15 @@ async def recording_daemon(
 
     async with running_daemon(config) as daemon:
         daemon.publisher.add_listener(listen)
-        async with emulated_kit(config.parent, 60, "--once", *faults):
-            yield daemon, published, until
+        async with emulated_kit(config.parent, 60, "--once") as board:
+            yield daemon, board, published, until
 
 
 async def record(config: Path) -> Messages:
     """Record a board with faults and a tare on the way; return what the daemon published."""
-    faults = ["--fault", "wrong-count@5", "--fault", "unplug:0.3@12"]
-    async with recording_daemon(config, *faults) as (_, published, until):
+    async with recording_daemon(config) as (_, board, published, until):
+        await until(5)
+        board.stdin.write(b"wrong-count\nunplug 0.3\n")
         await until(25)
         address = f"ipc://{config.parent}/commands"
         assert (await asyncio.to_thread(send_command, address, {"command": "tare"}, DEADLINE_S))["ok"]
@@ -258,7 +259,7 @@ HELD, BEGUN, ZEROED, ENOUGH = 6, 12, 18, 40
 
 async def record_experiments(config: Path) -> list[dict[str, Any]]:
     """Run a daemon through two experiments; return what was published as estimates."""
-    async with recording_daemon(config) as (daemon, published, until):
+    async with recording_daemon(config) as (daemon, _, published, until):
         recorder, right = daemon.recorder, daemon.sensors.fingertips["right"].pipeline
         right._gripper = Gripper(right, OTHER_TOOL, range(HELD, 10 * ENOUGH))
         recorder.record_experiment("first")

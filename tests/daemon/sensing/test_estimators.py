@@ -143,6 +143,7 @@ def test_doctor_and_check_show_the_assumptions(calibration, files, tmp_path):
         (lambda f: open_estimator(fingertip(calibration=f["right"], estimator="bank"), "right"), f"estimator {NAME}"),
         (lambda _: open_estimator(fingertip(estimator=NAME), "right"), "none is configured"),
         (lambda _: open_estimator(fingertip(estimator=NAME, calibration="no.cal"), "right"), "no.cal does not"),
+        (lambda _: open_estimator(fingertip(estimator=NAME, calibration="c" * 300), "right"), "ccc does not exist"),
         (lambda _: open_estimator(fingertip(calibration=__file__), "right"), "calibrate again"),
         (lambda _: open_estimator(fingertip(), "right"), "needs a bank; add `bank:`"),
         (lambda f: open_combined(CombinedConfig(calibration=f["combined"]), {"right": fingertip()}), "of both, and"),

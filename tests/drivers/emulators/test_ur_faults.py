@@ -11,11 +11,11 @@ def test_faults_are_carried_out_and_ended():
     controller = Controller(Robot())
     robot = controller.robot
     for line in (
-        "registers-in-use", "local-control", "refuse-protocol", "mute-dashboard", "stop-hangs 2", "protective-stop",
+        "registers-in-use", "local-control", "refuse-protocol", "mute-dashboard", "protective-stop",
         "emergency-stop", "version 5.0.0.0", "payload 2.5",
     ):  # fmt: skip
         controller.command(line)
-    assert controller.faults == ConnectionFaults(True, True, True, True, 2)
+    assert controller.faults == ConnectionFaults(True, True, True, True)
     assert (robot.spec.payload_kg, robot.spec.version) == (2.5, (5, 0, 0, 0))
     assert robot.safety.safety_mode == 7
     controller.command("normal")

@@ -15,7 +15,7 @@ from shearloop.drivers.emulators.ur_robot import (
     ControllerSpec,
     Robot,
 )
-from tests.drivers.ur.robots import DELIVERED, control_script
+from tests.drivers.ur.robots import control_script
 
 DT_S = 0.002
 MOVE_J, MOVE_L, ZERO_FT, SPEED_J, SPEED_STOP, STOP_J, SET_WATCHDOG = 1, 3, 8, 9, 15, 34, 35
@@ -116,16 +116,6 @@ def test_watchdog_ends_with_its_program():
     robot.upload(control_script())
     wait(robot, 1.0)
     assert robot.program_running
-
-
-def test_script_may_arm_its_watchdog_by_itself():
-    robot = started()
-    robot.registers.write("input_int_register_0", 0, robot.time_s)
-    robot.upload(control_script(DELIVERED))
-    wait(robot, 0.06)
-    assert robot.program_running
-    wait(robot, 0.06)
-    assert not robot.program_running
 
 
 def test_watchdog_ends_the_program_under_a_blocking_move():

@@ -34,7 +34,6 @@ def test_every_line_of_the_board_comes_through_in_any_slices(pairs, cuts):
     found = [voltages for part in slices(data, cuts) for voltages in parser.feed(part, 10**9)]
     assert [(one.v1_v, one.v2_v) for one in found] == pairs
     assert [(one.over_1, one.over_2) for one in found] == [(abs(a) >= 0.51174, abs(b) >= 0.51174) for a, b in pairs]
-    assert parser.partial_lines == 1
     assert not parser.errors
 
 
@@ -51,7 +50,7 @@ def test_no_bytes_break_the_board_s_parser_and_a_sound_line_comes_through_after_
 def test_refused_lines_are_counted_by_kind():
     parser = PairParser()
     parser.feed(b"cut\n0.1,0.2,0.3\n0.1\n0,1\nnan,0.1\n\r\n" + b"1" * 50 + b"\n0.100000,0.200000\n", 0)
-    assert parser.errors == {"not two decimals": 4, "empty": 1, "too long": 1}
+    assert parser.errors == {"not a number": 4, "empty": 1, "too long": 1}
 
 
 def test_lines_that_arrive_together_are_a_period_apart():
@@ -60,7 +59,7 @@ def test_lines_that_arrive_together_are_a_period_apart():
     first, second = parser.feed(b"0.125000,0.126000\r\n" * 2, 10**9)
     assert second.t_mid_ns == 10**9 - 19 * (10 * 10**9 // ADC_BAUD) - PERIOD_NS // 2
     assert second.t_mid_ns - first.t_mid_ns == PERIOD_NS
-    assert first.t_arrival_ns == second.t_arrival_ns == 10**9
+    assert (first.t_arrival_ns, second.t_arrival_ns) == (10**9 - PERIOD_NS, 10**9)
 
 
 @given(st.lists(st.from_regex(r"[ -~]{1,40}", fullmatch=True).filter(str.strip), max_size=6), CUTS)
@@ -69,7 +68,6 @@ def test_replies_come_through_whatever_ends_their_lines(replies, cuts):
         lines = ReplyLines()
         data = b"".join(reply.encode() + end for reply in replies)
         assert [text for part in slices(data, cuts) for text in lines.replies(part)] == [r.strip() for r in replies]
-        assert not lines.errors
 
 
 @given(st.binary(max_size=2 * MAX_REPLY_BYTES), CUTS)
@@ -86,7 +84,7 @@ def test_a_flood_without_an_end_is_counted_once_and_forgotten():
     for _ in range(10):
         assert lines.replies(b"7" * 300) == []
     assert lines.replies(b"\n\xff\n0\n") == ["\N{REPLACEMENT CHARACTER}", "0"]
-    assert lines.errors == {"too long": 1}
+    assert lines.too_long == 1
 
 
 @given(st.text(max_size=80))

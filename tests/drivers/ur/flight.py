@@ -58,7 +58,6 @@ class FakeArm:
         self.accepts = True
         self.stops_moves = True
         self.unlockable = self.stoppable = True
-        self.stop_fails_silently = False
         self.stale_command = False
         self._resumed_target = 0.0
         self._watched = False
@@ -132,6 +131,9 @@ class FakeArm:
         self.note("send_heartbeat")
         return True
 
+    def withdraw_deadline(self) -> None:
+        self._resumed_target = 0.0
+
     def clear_command(self) -> bool:
         self.calls.append("clear_command")
         self.stale_command = False
@@ -152,8 +154,6 @@ class FakeArm:
                 self.be(robot_mode=5)
             case "brake release":
                 self.be(robot_mode=7)
-            case "stop" if self.stop_fails_silently:
-                pass
             case "stop":
                 if not self.stoppable:
                     raise DriverError("the dashboard does not answer")
@@ -176,20 +176,18 @@ class FakeArm:
 class Flight:
     """A handler, its arm and the time."""
 
-    def __init__(
-        self, settings: UrSettings = SETTINGS, *, arm: FakeArm | None = None, takes_over: bool = False
-    ) -> None:
+    def __init__(self, settings: UrSettings = SETTINGS, *, arm: FakeArm | None = None) -> None:
         self.arm = arm or FakeArm()
         self.now_ns = 10**12
         self.number = self.cycle = 0
         self.decided: dict[int, messages.CommandReply] = {}
         self._settings = settings
-        self.begin_anew(takes_over=takes_over)
+        self.begin_anew()
 
-    def begin_anew(self, *, takes_over: bool) -> None:
+    def begin_anew(self) -> None:
         """Replace the handler."""
         self.cycle = 0
-        self.handler = CommandHandler(self._settings, self.arm, self.now_ns, takes_over=takes_over)
+        self.handler = CommandHandler(self._settings, self.arm, self.now_ns)
 
     def be_alone(self) -> None:
         """Run a cycle of the program without a handler."""

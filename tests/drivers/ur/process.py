@@ -6,7 +6,7 @@ from typing import NoReturn
 import pytest
 
 from shearloop.drivers.ur import worker
-from shearloop.drivers.ur.messages import Configure, Message, MessageDecoder, RobotState, RtdeSample, encode
+from shearloop.drivers.ur.messages import Message, MessageDecoder, RobotState, RtdeSample, encode
 from tests.drivers.ur.flight import SETTINGS, FakeArm
 
 
@@ -56,7 +56,7 @@ class CyclingArm(FakeArm):
 
 def fly(daemon: Daemon, arm: CyclingArm) -> None:
     with pytest.raises(ExitedError):
-        worker._control(daemon.pipe, Configure(SETTINGS), arm)  # an arm in all that counts
+        worker._control(daemon.pipe, SETTINGS, arm)  # an arm in all that counts
 
 
 class Time:

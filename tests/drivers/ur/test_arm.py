@@ -3,7 +3,6 @@
 import ctypes
 import dataclasses
 import importlib
-import socket
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +12,7 @@ import pytest
 
 from shearloop.drivers.ur.controller import ProbeError, ReceivedSample
 from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
+from shearloop.drivers.ur.script import NO_MOTION_S
 from tests.drivers.ur.flight import SETTINGS
 
 SIX = (0.0,) * 6
@@ -173,35 +173,6 @@ def test_register_is_cleared_once_the_client_knows_that_no_program_runs(arm, mon
     assert one._control.calls == ["kickWatchdog"]
 
 
-def test_silently_reopened_connection_is_lost(arm, monkeypatch):
-    """ur-rtde reopens it silently, on the same descriptor."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        address = server.getsockname()
-        monkeypatch.setattr(arm, "RTDE_PORT", address[1])
-        with socket.create_connection(address):
-
-            class Reconnecting(Controlled):
-                """Has a connection to the controller, and a new one after `reconnect`."""
-
-                def __init__(self, *_: object) -> None:
-                    super().__init__()
-                    self.socket = socket.create_connection(address)
-
-                def reconnect(self) -> None:
-                    descriptor = self.socket.fileno()
-                    self.socket.close()
-                    self.socket = socket.create_connection(address)
-                    assert self.socket.fileno() == descriptor
-
-            monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Reconnecting)
-            one = arm.UrArm(SETTINGS, VERSION)
-            assert one.read().connected
-            one._control.reconnect()
-            assert not one.read().connected
-            one._control.socket.close()
-            assert not one.read().connected
-
-
 def test_sent_script_arms_its_watchdog(arm, monkeypatch):
     class Sending(Client):
         sent = ""
@@ -230,7 +201,8 @@ def test_deadline_counts_from_the_latest_sample(arm, monkeypatch):
     monkeypatch.setattr(arm, "RtdeReceiver", lambda *_: receiver)
     one = arm.UrArm(SETTINGS, VERSION)
     assert one.wrist(WristSpeed(0.1, 1.0), 0.07)
-    assert written == [pytest.approx(20.07)]
+    one.withdraw_deadline()
+    assert written == [pytest.approx(20.07), NO_MOTION_S]
 
 
 def test_connection_that_takes_no_script_is_lost(arm, monkeypatch, capsys):

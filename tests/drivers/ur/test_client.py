@@ -283,6 +283,7 @@ async def test_leaving_stops_the_arm_and_ends_the_program(controller):
         left_ns = time.monotonic_ns()
         for told in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             os.kill(pid_of(robot), told)
+    assert not robot.diagnostics()["connected"], "the worker's last states count as a connection"
     stopped = await controller.event("motion-stopped", left_ns)
     ended = await controller.event("program-ended", left_ns)
     assert ended["t_mono_ns"] >= stopped["t_mono_ns"]

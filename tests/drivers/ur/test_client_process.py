@@ -4,14 +4,13 @@ import asyncio
 import gc
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from shearloop.drivers.ur.client import LAST_WORDS_BYTES, LostError, UrRobot, WorkerConnection
 from shearloop.drivers.ur.messages import Failed, Stop, encode
-from tests.drivers.ur.flight import SETTINGS, Flight, flying
+from tests.drivers.ur.flight import SETTINGS
 from tests.drivers.ur.robots import ROOT, running, settings_for
 from tests.running import LinkEvents
 
@@ -61,22 +60,6 @@ async def test_error_output_of_a_worker_is_quoted_and_shortened(play, commands, 
     assert len(loss.sentence) < LAST_WORDS_BYTES + 400
 
 
-BRIEFLY = """
-import os, sys
-from shearloop.drivers.ur.messages import MessageDecoder, encode
-from tests.drivers.ur.flight import Flight
-
-decoder = MessageDecoder()
-while not (heard := decoder.feed(os.read(0, 1 << 16))):
-    pass
-with open(sys.argv[1], "a") as log:
-    print(heard[0][1].takes_over, file=log)
-flight = Flight()
-flight.fly(CYCLES)
-os.write(1, encode(flight.state))
-"""
-
-
 DISCONNECTS = """
 import os, sys
 from shearloop.drivers.ur.command_handler import CommandHandler
@@ -103,66 +86,6 @@ async def test_disconnects_and_refuses_what_is_unanswered(play, tmp_path):
         assert "ended before it answered" in (await replied).refusal
     assert robot.state is None
     assert log.read_text() == "True\n", "it exits on Disconnect"
-
-
-# In the first cycle the register is cleared, in the second the program is sent.
-@pytest.mark.parametrize(("cycles", "may_stop"), [(0, "False"), (1, "False"), (2, "True"), (5, "True")])
-async def test_next_worker_may_stop_the_program_left_behind(play, tmp_path, cycles, may_stop):
-    log = tmp_path / "log"
-    briefly = BRIEFLY.replace("CYCLES", str(cycles))
-    play(f"cd '{ROOT}' && exec '{sys.executable}' -c '{briefly}' '{log}'")
-    link = LinkEvents()
-    async with running(settings_for("127.0.0.254"), link):
-        await link.down(2)
-    assert log.read_text().split()[:2] == ["False", may_stop]
-
-
-STALE, PAUSED = {"age_ns": 400_000_000}, {"safety_mode": 3, "runtime_state": 4}
-
-
-def lost_after(*readings: dict[str, int], flight: Flight) -> UrRobot:
-    """Return a robot that was lost after these samples."""
-    robot = UrRobot(SETTINGS)
-    for reading in readings:
-        flight.arm.be(**reading)
-        flight.fly(1)
-        robot.handle_message(0, flight.state)
-    robot._disconnect()
-    return robot
-
-
-@pytest.mark.parametrize("cycles", [1, 500], ids=["just connected", "for long"])
-@pytest.mark.parametrize("last", [{}, STALE, PAUSED], ids=["playing", "silent", "paused"])
-@pytest.mark.parametrize("first", [{"runtime_state": 2}, PAUSED], ids=["played", "was paused"])
-async def test_earlier_program_does_not_count_as_left_behind(first, last, cycles):
-    assert not lost_after(*[first] * cycles, last, flight=Flight()).takes_over
-
-
-@pytest.mark.parametrize("last", [{}, STALE, PAUSED], ids=["playing", "silent", "paused"])
-async def test_our_program_counts_as_left_behind(last):
-    flight = flying()
-    flight.arm.stoppable = False
-    assert lost_after({}, *[last] * 5, flight=flight).takes_over
-    # And so on, from process to process, until it was seen to be gone.
-    after = Flight(takes_over=True)
-    after.arm.be(**{"runtime_state": 2, **last})
-    after.arm.stoppable = False
-    assert lost_after(*[{}] * 5, flight=after).takes_over
-
-
-async def test_program_started_after_ours_ended_is_foreign():
-    flight = flying()
-    flight.arm.end_program()
-    assert not lost_after({}, PAUSED, flight=flight).takes_over
-
-
-async def test_failed_stops_are_counted_across_workers():
-    robot = UrRobot(SETTINGS)
-    for counts in ((0, 1, 1, 2), (0, 3)):
-        for count in counts:
-            robot.handle_message(0, replace(Flight().state, failed_program_stops=count))
-        robot._disconnect()
-    assert robot.failed_program_stops == 5
 
 
 async def test_unretrieved_loss_causes_no_asyncio_complaint():

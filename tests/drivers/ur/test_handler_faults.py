@@ -51,12 +51,12 @@ def test_arm_that_moves_without_a_command_is_left_to_the_watchdog():
     assert "unlock" in flight.ask(WristSpeed(0.1, 1.0)).refusal.lower()
 
 
-def test_resumed_program_gets_no_heartbeats():
+def test_resumed_program_does_not_move_and_gets_no_heartbeats():
     flight = turning()
-    # Resumed before it could be stopped.
     flight.arm.protective_stop()
     flight.fly(1)
     flight.arm.be_resumed_at_the_pendant()
+    assert flight.arm.target == 0
     flight.arm.calls.clear()
     flight.fly(1)
     assert flight.state.blocked.startswith("A program runs on the robot that someone else started or resumed")
@@ -68,9 +68,8 @@ def test_resumed_program_gets_no_heartbeats():
     assert flight.ask(Unlock()).accepted
 
 
-@pytest.mark.parametrize("takes_over", [False, True], ids=["daemon", "process"])
-def test_program_left_behind_ends_before_ours_starts(takes_over):
-    flight = Flight(takes_over=takes_over)
+def test_program_left_behind_ends_before_ours_starts():
+    flight = Flight()
     flight.arm.be(runtime_state=2)
     flight.fly(60)
     flight.arm.end_program()
@@ -79,17 +78,15 @@ def test_program_left_behind_ends_before_ours_starts(takes_over):
     assert flight.ask(Enable()).accepted
 
 
-@pytest.mark.parametrize("takes_over", [False, True], ids=["daemon", "process"])
-def test_foreign_program_is_stopped_only_on_unlock(takes_over):
+def test_foreign_program_is_stopped_only_on_unlock():
     """A program of a lost worker would have ended by its watchdog."""
-    flight = Flight(takes_over=takes_over)
+    flight = Flight()
     flight.arm.be(runtime_state=2)
     flight.fly(500)
     assert "someone else" in flight.ask(WristSpeed(0.1, 1.0)).refusal
     flight.arm.be(runtime_state=4)
     flight.fly(50)
     assert flight.arm.calls == []
-    assert not flight.state.owns_program
     assert flight.ask(Unlock()).accepted
     assert "stop" in flight.arm.calls
 
@@ -106,21 +103,24 @@ def test_foreign_program_gets_no_commands():
     assert flight.arm.calls[:4] == ["close popup", "stop", "clear_command", "upload"]
 
 
-def test_program_after_an_abandoned_start_may_be_ours(monkeypatch):
-    """The upload may take effect after the recovery was given up."""
-    flight = Flight()
-    monkeypatch.setattr(flight.arm, "upload", lambda: True)
-    flight.fly(5)
-    recovery = flight.handler._recovery
-    recovery.give_up("The recovery is given up.")
-    flight.fly(5)
-    assert not flight.state.recovering
-    assert not flight.state.owns_program
-    for elapsed_cycles, program_running in ((0, False), (250, True)):
-        flight.fly(elapsed_cycles)
-        flight.arm.be(runtime_state=2)
-        flight.handler.end_program(flight.arm.reading, flight.now_ns)
-        assert flight.arm.reading.program_running == program_running
+@pytest.mark.parametrize("begin", [Flight, turning], ids=["found", "ours"])
+def test_paused_program_is_reported_and_stopped_only_on_unlock(begin):
+    flight = begin()
+    flight.arm.be(safety_mode=3, runtime_state=4)
+    flight.arm.target = 0.0
+    flight.fly(300)
+    assert "Protective stop" in flight.state.blocked
+    # Cleared at the pendant.
+    flight.arm.be(safety_mode=1)
+    flight.arm.calls.clear()
+    flight.fly(300)
+    assert "is paused" in flight.state.blocked
+    assert "unlock, which stops it" in flight.state.blocked
+    assert not flight.ask(Enable()).accepted
+    assert flight.arm.calls == []
+    assert flight.ask(Unlock()).accepted
+    assert "stop" in flight.arm.calls
+    assert not flight.state.blocked
 
 
 def test_hard_limit_stops_until_enabled_again():
@@ -145,7 +145,7 @@ def test_protective_stop_is_unlocked_only_by_the_operator():
     flight.fly(100)
     assert flight.state.protective_stop
     assert flight.state.blocked.startswith("Protective stop")
-    assert flight.arm.calls == ["stop"], "nothing is unlocked"
+    assert flight.arm.calls == [], "nothing is unlocked"
     assert "Protective stop" in flight.ask(Enable()).refusal
 
     flight.arm.unlockable = False
@@ -153,7 +153,9 @@ def test_protective_stop_is_unlocked_only_by_the_operator():
     flight.arm.unlockable = True
     flight.arm.calls.clear()
     assert flight.ask(Unlock()).accepted
-    assert flight.arm.calls == ["unlock protective stop", "close popup", "clear_command", "upload", "arm_watchdog"]
+    assert flight.arm.calls == [
+        "unlock protective stop", "close popup", "stop", "clear_command", "upload", "arm_watchdog",
+    ]  # fmt: skip
     flight.fly(100)
     assert flight.wrist_speed == 0, "the speed from before the stop is not taken up again"
     assert flight.ask(WristSpeed(0.1, 1.0)).accepted

@@ -3,7 +3,7 @@
 import pytest
 
 from shearloop.drivers.ur.messages import Disconnect, MoveLinear, Stop, WristSpeed
-from tests.drivers.ur.flight import CYCLE_NS, LIMITS, POSE, Flight, flying, moving, turning
+from tests.drivers.ur.flight import CYCLE_NS, LIMITS, POSE, Flight, flying, turning
 
 
 def cycles_with_calls(flight: Flight, cycles: int) -> list[int]:
@@ -54,54 +54,19 @@ def test_something_is_sent_in_each_cycle_of_a_motion():
     assert flight.arm.calls[-1] == "send_heartbeat"
 
 
-@pytest.mark.parametrize("repeated", [False, True])
-def test_speed_changed_by_a_limit_is_sent_in_the_same_cycle(repeated):
-    """In any cycle after the last command, repeated or not."""
-    for cycles in range(1, 7):
-        flight = flying()
-        assert flight.ask(WristSpeed(0.5, 4.0)).accepted
-        flight.fly(cycles)
-        flight.arm.be(wrench=(0.0, 0.0, 50.0, 0.0, 0.0, 0.0))
-        if repeated:
-            assert flight.ask(WristSpeed(0.5, 4.0)).accepted
-        flight.fly(1)
-        assert flight.arm.target == pytest.approx(0.4), "half of the fastest, half way to the hard limit"
-
-
-def test_same_speed_with_another_acceleration_is_sent_at_once():
-    flight = flying()
-    for acceleration in (4.0, 1.0, 2.0):
-        assert flight.ask(WristSpeed(0.1, acceleration)).accepted
-        assert flight.arm.acceleration == acceleration
-
-
-@pytest.mark.parametrize("cycles", [3, 4, 5])
-@pytest.mark.parametrize("stopped", [False, True])
-def test_last_cycle_of_a_linear_move_sends_a_heartbeat(cycles, stopped):
-    """Independent of the age of the last one."""
-    flight = moving(cycles)
-    if stopped:
-        assert flight.ask(Stop(4.0)).accepted
-    else:
-        flight.arm.be(moving_linearly=False)
-    flight.arm.calls.clear()
+def test_speed_changed_by_a_limit_is_sent_in_the_same_cycle():
+    flight = turning(0.5)
+    flight.arm.be(wrench=(0.0, 0.0, 50.0, 0.0, 0.0, 0.0))
     flight.fly(1)
-    assert flight.state.motion == "idle"
-    assert flight.arm.calls == ["send_heartbeat"]
+    assert flight.arm.target == pytest.approx(0.4), "half of the fastest, half way to the hard limit"
 
 
-def test_same_speed_after_another_motion_is_sent():
+def test_linear_move_ends_the_thread_for_speeds_first():
     flight = flying()
     assert flight.ask(WristSpeed(0.0, 4.0)).accepted
     flight.fly(2)
     assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
     assert flight.arm.calls[-2:] == ["end_speed", "move"]
-    flight.fly(10)
-    flight.arm.be(moving_linearly=False)
-    flight.fly_until(lambda state: state.motion == "idle")
-    assert flight.arm.calls[-1] == "send_heartbeat"
-    assert flight.ask(WristSpeed(0.0, 4.0)).accepted
-    assert flight.arm.calls[-1] == "wrist"
 
 
 def test_silent_daemon_ends_the_motion():

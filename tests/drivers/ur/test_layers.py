@@ -5,9 +5,9 @@ import itertools
 
 import pytest
 
-from shearloop.drivers.emulators.ur_robot import Robot
+from shearloop.drivers.emulators.ur_robot import PLAYING, Robot
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
-from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER
+from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER, NO_MOTION_S
 from tests.drivers.ur.flight import AT_REST, CYCLE_NS, FakeArm, Flight, flying
 from tests.drivers.ur.robots import DELIVERED, VERSIONS, control_script
 
@@ -50,6 +50,9 @@ class ScriptedArm(FakeArm):
     def _write_deadline(self, left_s: float) -> None:
         until_s = self.robot.registers[CLOCK_REGISTER] + left_s
         self.robot.registers.write(DEADLINE_REGISTER, until_s, self.robot.time_s)
+
+    def withdraw_deadline(self) -> None:
+        self.robot.registers.write(DEADLINE_REGISTER, NO_MOTION_S, self.robot.time_s)
 
     def wrist(self, command: WristSpeed, left_s: float) -> bool:
         self._write_deadline(left_s)
@@ -200,6 +203,28 @@ def test_killed_worker_stops_the_wrist_in_time():
         flight.arm.cycle()
     assert flight.arm.reading.rests
     assert not flight.arm.reading.program_running
+
+
+@pytest.mark.parametrize("worker_lives", [True, False])
+def test_resumed_program_does_not_turn_the_wrist(worker_lives):
+    """The worker has withdrawn the deadline. Without a worker the wrist turns until the deadline."""
+    flight, _ = at_full_speed(control_script(DELIVERED))
+    arm = flight.arm
+    arm.robot.protective_stop("a person")
+    for _ in range(10):
+        if worker_lives:
+            flight.fly(1)
+        else:
+            arm.cycle()
+    assert arm.reading.rests
+    arm.robot.safety.safety_mode, arm.robot.runtime_state = 1, PLAYING
+    speeds = []
+    for _ in range(round(PROMISED_S * 1e9 / CYCLE_NS)):
+        arm.cycle()
+        speeds.append(arm.reading.fastest_rad_per_s)
+    assert (max(speeds) == 0) == worker_lives
+    assert not arm.reading.program_running
+    assert arm.reading.rests
 
 
 def test_gentle_stop_of_the_worker_stays_gentle():

@@ -13,7 +13,6 @@ from shearloop.drivers.errors import ProtocolError
 from shearloop.drivers.ur import messages as wire
 from shearloop.drivers.ur.messages import (
     CommandReply,
-    Configure,
     ControllerVersion,
     Disconnect,
     Enable,
@@ -46,7 +45,6 @@ states = st.builds(
     RobotState,
     t_mono_ns=time_ns, age_ns=time_ns, robot_mode=mode, safety_mode=mode, runtime_state=mode,
     motion_id=st.integers(0, 2**32 - 1), cycle=st.integers(0, 2**64 - 1),
-    failed_program_stops=st.integers(0, 2**32 - 1),
     q_rad=six, qd_rad_per_s=six, tcp_pose=six, tcp_speed=six, wrench=six, tcp_offset=six, payload_kg=finite,
     payload_cog_m=st.tuples(*[finite] * 3), sent=sent, clipped=reasons,
     timestamp_s=finite, speed_scaling=finite,
@@ -57,7 +55,7 @@ messages = st.one_of(
     st.just(Heartbeat()),
     st.builds(CommandReply, st.text(), sent, reasons), st.builds(WorkerPhase, st.text()),
     st.builds(ControllerVersion, st.text()), st.builds(Failed, st.sampled_from(["lost", "silent"]), st.text()), states,
-    st.just(Configure(UrSettings(host="10.0.0.1", limits=LIMITS))),
+    st.just(UrSettings(host="10.0.0.1", limits=LIMITS)),
 )  # fmt: skip
 numbered = st.lists(st.tuples(st.integers(0, 2**32 - 1), messages), max_size=5)
 
@@ -101,7 +99,7 @@ def test_states_carry_values_that_are_not_finite():
     state = RobotState(
         0.0, (float("nan"),) * 6, (0.0,) * 6, (0.0,) * 6, (0.0,) * 6, (float("inf"),) * 6, 7, 1, 2, 1.0,
         float("nan"), (0.0,) * 3, (0.0,) * 6, 0, 0, True, False,
-        "", False, "idle", 0, "", None, (), 3, False, 0,
+        "", False, "idle", 0, "", None, (), 3,
     )  # fmt: skip
     ((_, got),) = MessageDecoder().feed(encode(state))
     assert got.wrench == state.wrench

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from shearloop.drivers.ur import worker
-from shearloop.drivers.ur.messages import CommandReply, Disconnect, Enable, Message, RtdeSample, Unlock, WristSpeed
+from shearloop.drivers.ur.messages import CommandReply, Disconnect, Enable, Unlock, WristSpeed
 from tests.drivers.ur.flight import Flight, flying
-from tests.drivers.ur.process import CyclingArm, Daemon, fly
+from tests.drivers.ur.process import CyclingArm, fly
 
 ROOT = Path(__file__).parents[3]
 
@@ -32,38 +32,6 @@ def test_commands_after_a_disconnection_are_refused(daemon):
     assert arm.calls == []
     replies = [message for _, message in daemon.receive() if isinstance(message, CommandReply)]
     assert [reply.accepted for reply in replies] == [True, False, False, False]
-
-
-class Uploading(CyclingArm):
-    """Its upload takes effect after `reads` more reads; at the upload the daemon sends messages."""
-
-    def __init__(self, daemon: Daemon, *said: Message, reads: int) -> None:
-        super().__init__()
-        self._daemon, self._said, self._reads = daemon, said, reads
-        self._left: int | None = None
-
-    def upload(self) -> bool:
-        if self._left is None:
-            self.calls.append("upload")
-            self._daemon.send(*self._said)
-            self._left = self._reads
-        return True
-
-    def read(self) -> RtdeSample:
-        if self._left is not None:
-            self._left -= 1
-            if self._left == 0:
-                self.be(runtime_state=2)
-        return super().read()
-
-
-def test_program_started_by_a_late_upload_is_ended(daemon):
-    """The state at the exit counts, not the one at the last cycle's start."""
-    # The next cycle's reading still shows none; that by which the process leaves shows it.
-    arm = Uploading(daemon, Disconnect(), reads=2)
-    fly(daemon, arm)
-    assert arm.calls == ["clear_command", "upload", "end_program"]
-    assert not arm.reading.program_running
 
 
 def test_our_program_is_ended_on_exit(daemon):
@@ -93,27 +61,9 @@ def test_foreign_program_is_left_alone_on_exit(daemon, runtime_state):
     assert arm.reading.runtime_state == runtime_state
 
 
-def test_our_paused_program_is_stopped_on_exit(daemon):
-    """If resumed later, it would turn the wrist on."""
-
-    class Stopped(CyclingArm):
-        """Has a protective stop as soon as its program is ready."""
-
-        def arm_watchdog(self) -> bool:
-            super().arm_watchdog()
-            self.protective_stop()
-            daemon.send(Disconnect())
-            return True
-
-    arm = Stopped()
-    fly(daemon, arm)
-    assert arm.calls[:4] == ["clear_command", "upload", "arm_watchdog", "stop"]
-
-
 CRASHING = """
 import threading
 from shearloop.drivers.ur import worker
-from shearloop.drivers.ur.messages import Configure
 from tests.drivers.ur.flight import SETTINGS, FakeArm
 
 class Arm(FakeArm):
@@ -122,7 +72,7 @@ class Arm(FakeArm):
 
 # As the client's threads may, this one keeps the interpreter from ending.
 threading.Thread(target=threading.Event().wait).start()
-worker._receive_configuration = lambda pipe: Configure(SETTINGS)
+worker._receive_settings = lambda pipe: SETTINGS
 worker._connect = lambda pipe, settings: Arm()
 worker.main()
 """

@@ -5,8 +5,7 @@ from itertools import pairwise
 import pytest
 
 from shearloop.drivers.ur import worker
-from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.messages import CommandReply, Disconnect, Enable, RtdeSample, Unlock, WristSpeed
+from shearloop.drivers.ur.messages import Disconnect, Enable, RtdeSample, WristSpeed
 from tests.drivers.ur.process import TimedArm
 
 
@@ -58,35 +57,3 @@ def test_protective_stop_seen_late_is_reported_as_such(timed, stopped_s):
     run = timed((0.1, Enable()), *speeds, (0.3, Disconnect()), arm=Late())
     assert {state.blocked[:15] for state in run.states if state.cycle > 15} == {"", "Protective stop"}
     assert {state.motion for state in run.states if state.blocked} == {"idle"}
-
-
-@pytest.mark.parametrize("cycle", [31, 32, 34])
-def test_protective_stop_is_reported_in_its_cycle(timed, cycle):
-    class Stopping(TimedArm):
-        def read(self) -> RtdeSample:
-            if worker.time.monotonic() > 1000.0 + 0.008 * cycle - 1e-6 and self.reading.safety_mode == 1:
-                self.protective_stop()
-            return super().read()
-
-    said = (0.1, Enable()), (0.2, WristSpeed(0.01, 4.0)), (0.3, Disconnect())
-    run = timed(*said, arm=Stopping())
-    assert next(state.cycle for state in run.states if state.protective_stop) == cycle
-
-
-def test_end_of_a_recovery_is_reported_at_once(timed, monkeypatch):
-    """The recovery is announced and given up in the same cycle."""
-    arm = TimedArm()
-    arm.be(robot_mode=3)
-    given_up = CommandHandler.tick
-
-    def tick(handler: CommandHandler, reading: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
-        if now_ns > 1000.1e9 and handler._recovery is not None:
-            handler._recovery.give_up("The recovery is given up.")
-        return given_up(handler, reading, now_ns)
-
-    monkeypatch.setattr("shearloop.drivers.ur.command_handler.CommandHandler.tick", tick)
-    run = timed((0.201, Unlock()), (0.4, Disconnect()), arm=arm)
-    ready = [state for state in run.states if 1000.195 < state.t_mono_ns / 1e9 < 1000.3]
-    announced = next(number for number, state in enumerate(ready) if state.recovering)
-    assert not ready[announced + 1].recovering
-    assert ready[announced + 1].cycle == ready[announced].cycle

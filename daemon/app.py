@@ -3,9 +3,8 @@
 import asyncio
 import contextlib
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import structlog
 import zmq
@@ -176,15 +175,14 @@ def _build_rig(
 async def run_daemon(
     config: DaemonConfig,
     listeners: tuple[Listener, ...] = (),
-    reporters: Mapping[str, Reporter] = MappingProxyType({}),
     on_ready: Callable[[], None] = lambda: None,
     summary: RunSummary | None = None,
 ) -> bool:
     """Run a daemon until SIGINT, SIGTERM, SIGHUP or the command `stop`; return whether it ended as planned.
 
     It ended as planned if its experiment is done, or by SIGTERM or SIGHUP. `listeners` receive every message;
-    `reporters` add their parts to `health`, by name; `on_ready` is called once all tasks run; `summary` collects
-    the daemon's messages. SIGTERM and SIGHUP are ignored afterwards.
+    `on_ready` is called once all tasks run; `summary` collects the daemon's messages. SIGTERM and SIGHUP are ignored
+    afterwards.
     """
     loop, terminated = asyncio.get_running_loop(), False
 
@@ -197,8 +195,6 @@ async def run_daemon(
         daemon = Daemon(config, context, summary)
         for listener in listeners:
             daemon.publisher.add_listener(listener)
-        for name, reporter in reporters.items():
-            daemon.health.add(name, reporter)
         ending = ending_signals()
         for number in ending:
             loop.add_signal_handler(number, daemon.stop if number == signal.SIGINT else terminate)

@@ -8,16 +8,15 @@ import queue
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from typing import TextIO, cast
 
 import structlog
 
-from shearloop.daemon.messaging.messages import Scalar
 from shearloop.drivers.connection import LinkEvent
 
-# Texts beyond this number are dropped and counted.
+# Texts beyond this number are dropped.
 MOST_WAITING = 10_000
 # Returns to the beginning of a terminal's line and empties it.
 CLEAR_LINE = "\r\x1b[K"
@@ -28,31 +27,23 @@ CLOSE_S = 1.0
 class NonBlockingWriter:
     """Writes text in a thread of its own, because a terminal stopped with Ctrl-S blocks its writers.
 
-    `lost` counts dropped texts; a line marks their place. After a broken pipe (`| head`) it stays silent.
+    After a broken pipe (`| head`) it stays silent.
     """
 
     def __init__(self, stream: TextIO, most_waiting: int = MOST_WAITING) -> None:
-        self.lost = 0
         if isinstance(stream, io.TextIOWrapper):
             # A terminal with another encoding may lack characters such as "…".
             stream.reconfigure(errors="backslashreplace")
         self._stream = stream
         self._waiting: queue.Queue[str | None] = queue.Queue(most_waiting)
-        self._reported = 0
-        # Several threads log.
-        self._lock = threading.Lock()
         # A daemon thread: a blocked write must not keep the process alive.
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
         self._thread.start()
 
     def write(self, text: str) -> int:
         """Queue a text; return its length, as a stream does."""
-        with self._lock:
-            try:
-                self._report_lost()
-                self._waiting.put_nowait(text)
-            except queue.Full:
-                self.lost += 1
+        with contextlib.suppress(queue.Full):
+            self._waiting.put_nowait(text)
         return len(text)
 
     def flush(self) -> None:
@@ -62,25 +53,8 @@ class NonBlockingWriter:
         """Write the rest, as far as the reader takes it in time."""
         until_s = time.monotonic() + timeout_s
         with contextlib.suppress(queue.Full):
-            with self._lock:
-                self._report_lost(timeout_s)
-            self._waiting.put(None, timeout=max(0.0, until_s - time.monotonic()))
+            self._waiting.put(None, timeout=timeout_s)
         self._thread.join(max(0.0, until_s - time.monotonic()))
-
-    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
-        """Return the writer's part of `health`."""
-        if not self.lost:
-            return {"errors": {}, "error": ""}
-        error = f"{self.lost} texts were dropped without a reader; Ctrl-Q resumes a terminal stopped with Ctrl-S"
-        return {"errors": {"unread": self.lost}, "error": error}
-
-    def _report_lost(self, timeout_s: float = 0.0) -> None:
-        """Mark the place of dropped texts; raises queue.Full without room in time."""
-        missing = self.lost - self._reported
-        if missing:
-            note = f"… {missing} texts are missing here: the terminal did not read them\n"
-            self._waiting.put(note, block=timeout_s > 0, timeout=timeout_s)
-            self._reported = self.lost
 
     def _run(self) -> None:
         while (text := self._waiting.get()) is not None:

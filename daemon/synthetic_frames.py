@@ -1,8 +1,7 @@
 """Synthetic frames of an EIT-kit on a twisted fingertip, from a bank's signals and the measured noise. No I/O."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -91,23 +90,6 @@ class Synthesiser:
                     raise UserError(f"the bank has no signal at {where}; choose others")
                 mixed += share * bank.signals[i, j, channels]
         return mixed
-
-
-def twist_frames(
-    synthesiser: Synthesiser,
-    programme: TwistProgramme,
-    *,
-    k: float,
-    sigma_of_torque: Callable[[float], float],
-    period_s: float,
-) -> Iterator[FloatArray]:
-    """Yield the lines (v,) of a programme without end, one every `period_s`.
-
-    `sigma_of_torque` is the inverse of a calibration: the σ of a torque in N·m. Raises UserError as `Synthesiser.line`.
-    """
-    for number in count():
-        grip, torque_nm = programme.at((number + 0.5) * period_s)
-        yield synthesiser.line(k, sigma_of_torque(torque_nm), grip)
 
 
 def _neighbours(grid: FloatArray, values: FloatArray, name: str) -> Iterator[tuple[NDArray[np.int64], FloatArray]]:

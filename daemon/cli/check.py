@@ -5,6 +5,7 @@ import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,35 +28,40 @@ def run(args: argparse.Namespace) -> int:
     """Load everything that `run` loads, without opening a device."""
     from shearloop.daemon.config import load_daemon_config
 
-    mistakes: list[str] = []
-    parts: dict[str, str] = {}
-    try:
-        parts = _parts(load_daemon_config(args.config), args.config, mistakes)
-    except UserError as error:
-        mistakes.append(str(error))
-        with _collected(mistakes):
+    parts = Parts()
+    with parts.of("configuration"):
+        parts = check_parts(load_daemon_config(args.config), args.config)
+    if "configuration" in parts.mistakes:
+        with parts.of("experiment"):
             _check_experiment_alone(args.config)
-    if mistakes:
-        raise UserError("\n".join(dict.fromkeys(mistakes)))
+    if parts.mistakes:
+        raise UserError("\n".join(dict.fromkeys(parts.mistakes.values())))
     if args.json:
-        print(json.dumps({"config": str(args.config), "parts": parts}, ensure_ascii=False))
+        print(json.dumps({"config": str(args.config), "parts": parts.texts}, ensure_ascii=False))
         return 0
-    for name, text in parts.items():
+    for name, text in parts.texts.items():
         print(f"{name}: {text}")
     print(f"{args.config} is in order")
     return 0
 
 
-@contextmanager
-def _collected(mistakes: list[str]) -> Iterator[None]:
-    """Add the mistake that ends the context to a list, so that it hides no other."""
-    from shearloop.bank.errors import BankError
-    from shearloop.drivers.errors import DriverError
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """A sentence on each part of a configuration, or its mistakes, so that one hides no other."""
 
-    try:
-        yield
-    except (BankError, DriverError, UserError) as error:
-        mistakes.append(str(error))
+    texts: dict[str, str] = field(default_factory=dict)
+    mistakes: dict[str, str] = field(default_factory=dict)
+
+    @contextmanager
+    def of(self, name: str) -> Iterator[None]:
+        """Keep the mistake that ends the context."""
+        from shearloop.bank.errors import BankError
+        from shearloop.drivers.errors import DriverError
+
+        try:
+            yield
+        except (BankError, DriverError, UserError) as error:
+            self.mistakes[name] = str(error)
 
 
 def _check_experiment_alone(path: Path) -> None:
@@ -69,34 +75,34 @@ def _check_experiment_alone(path: Path) -> None:
         read_experiment(path.parent / named)
 
 
-def _parts(config: "DaemonConfig", path: Path, mistakes: list[str]) -> dict[str, str]:
-    """Return a sentence on each part of the configuration in this file; collect the mistakes."""
+def check_parts(config: "DaemonConfig", path: Path) -> Parts:
+    """Return what each part of the configuration in this file is; opens every file that it names."""
     from shearloop.daemon.cli.emulated_devices import check_emulators
     from shearloop.daemon.control.loop_inputs import TorqueSource
     from shearloop.daemon.rig import check_experiment
     from shearloop.daemon.sensing.estimators import COMBINED, open_combined, open_estimator, torque_sources
 
-    parts, estimators, combined = {}, {}, None
-    with _collected(mistakes):
+    parts, estimators, combined = Parts(), {}, None
+    with parts.of("emulators"):
         check_emulators(config.emulators, path)
     if config.curve is not None:
-        with _collected(mistakes):
-            parts["keys"] = f"{_clients(config.curve)} may connect"
+        with parts.of("keys"):
+            parts.texts["keys"] = f"{_clients(config.curve)} may connect"
     for name, fingertip in config.fingertips.items():
-        with _collected(mistakes):
+        with parts.of(name):
             estimator = estimators[name] = open_estimator(fingertip, name)
             grids, torque = estimator.grids, _torque(estimator, calibrated=fingertip.calibration is not None)
             bank = "no bank" if grids is None else f"bank {fingertip.bank} of {grids[0].size} × {grids[1].size} cells"
-            parts[name] = f"{bank}, {torque}"
+            parts.texts[name] = f"{bank}, {torque}"
     if config.combined is not None:
-        with _collected(mistakes):
+        with parts.of(COMBINED):
             combined = open_combined(config.combined, config.fingertips)
             sides = " and ".join(combined.calibration.sides)
-            parts["combined"] = f"{sides} together, {_torque(combined, calibrated=True)}"
+            parts.texts[COMBINED] = f"{sides} together, {_torque(combined, calibrated=True)}"
     if config.skin is not None:
-        with _collected(mistakes):
-            parts["skin"] = _skin(config.skin)
-    parts |= _rig(config, mistakes)
+        with parts.of("skin"):
+            parts.texts["skin"] = _skin(config.skin)
+    _check_rig(config, parts)
     # What cannot be opened yet counts as what it is configured to be.
     files = {name: fingertip.calibration for name, fingertip in config.fingertips.items()}
     files |= {COMBINED: config.combined.calibration} if config.combined is not None else {}
@@ -105,13 +111,13 @@ def _parts(config: "DaemonConfig", path: Path, mistakes: list[str]) -> dict[str,
         for name, file in files.items()
     }
     sources = unopened | torque_sources(config, estimators, combined)
-    with _collected(mistakes):
+    with parts.of("experiment"):
         experiment = check_experiment(config, sources)
         if experiment is not None:
-            steps = f"{len(experiment.steps)} steps, driven by {experiment.torque_source}"
-            parts["experiment"] = f"{experiment.name!r}, {steps}"
+            text = f"{experiment.name!r}, {len(experiment.steps)} steps, driven by {experiment.torque_source}"
             if warm_up_s := max((one.warm_up_s for one in sources.values() if one.measures_torque), default=0.0):
-                parts["experiment"] += f"; after a grip it waits up to {warm_up_s:.0f} s for the first torques"
+                text += f"; after a grip it waits up to {warm_up_s:.0f} s for the first torques"
+            parts.texts["experiment"] = text
     return parts
 
 
@@ -122,24 +128,22 @@ def _torque(estimator: "FrameEstimator", *, calibrated: bool) -> str:
     return f"without torque: {reason}"
 
 
-def _rig(config: "DaemonConfig", mistakes: list[str]) -> dict[str, str]:
+def _check_rig(config: "DaemonConfig", parts: Parts) -> None:
     from shearloop.daemon.rig import gripper_calibration, load_cell_calibration, robot_settings
 
-    parts = {}
     if (cell := config.load_cell) is not None:
-        with _collected(mistakes):
+        with parts.of("load_cell"):
             load_cell_calibration(cell)
             own = f"calibration {cell.calibration}" if cell.calibration else "torques in N·m from the board"
-            parts["load_cell"] = own
+            parts.texts["load_cell"] = own
     if (hand := config.gripper) is not None:
-        with _collected(mistakes):
+        with parts.of("gripper"):
             gripper_calibration(hand)
             own = f"calibration {hand.calibration}" if hand.calibration else "widths by the manufacturer's figures"
-            parts["gripper"] = own
+            parts.texts["gripper"] = own
     if config.robot is not None:
-        with _collected(mistakes):
-            parts["robot"] = f"{robot_settings(config.robot).host}, limits of {config.robot}"
-    return parts
+        with parts.of("robot"):
+            parts.texts["robot"] = f"{robot_settings(config.robot).host}, limits of {config.robot}"
 
 
 def _clients(curve: "CurveConfig") -> str:

@@ -53,15 +53,14 @@ def run(args: argparse.Namespace) -> int:
     level, before = (logging.WARNING, CLEAR_LINE) if terminal else (logging.INFO, "")
     with (
         without_long_collections() as on_ready,
-        logging_to_stderr(json_lines=args.json_log, level=level, before=before) as log,
+        logging_to_stderr(json_lines=args.json_log, level=level, before=before),
         closing(NonBlockingWriter(sys.stdout)) as out,
     ):
-        return _run(args, log, out, on_ready, terminal=terminal)
+        return _run(args, out, on_ready, terminal=terminal)
 
 
 def _run(
     args: argparse.Namespace,
-    log: "NonBlockingWriter",
     out: "NonBlockingWriter",
     on_ready: Callable[[], None],
     *,
@@ -73,14 +72,12 @@ def _run(
     from shearloop.daemon.cli.terminal import EstimatePrinter, StatusLine
     from shearloop.daemon.process import high_priority, lock_memory, raise_descriptor_limit
     from shearloop.daemon.run_summary import RunSummary
-    from shearloop.daemon.supervisor import Reporter
 
     config = _config(args)
     raise_descriptor_limit()
     if config.lock_memory:
         lock_memory()
     listeners: list[Listener] = []
-    reporters: dict[str, Reporter] = {"log_output": log, "printed_output": out}
     with ExitStack() as stack:
         # Without permission the loop still detects late commands and holds the wrist.
         stack.enter_context(high_priority() if config.robot is not None else nullcontext())
@@ -90,7 +87,7 @@ def _run(
             listeners.append(stack.enter_context(StatusLine(out)) if terminal else EstimatePrinter(out))
         shown = out if args.show or config.recording is not None else None
         summary = RunSummary(shown, emulated)
-        finished = asyncio.run(run_daemon(config, tuple(listeners), reporters, on_ready, summary))
+        finished = asyncio.run(run_daemon(config, tuple(listeners), on_ready, summary))
     return EXIT_OK if finished else EXIT_UNFINISHED
 
 

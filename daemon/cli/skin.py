@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_action, add_json, add_option, check_overwrite, run_action, writing
-from shearloop.daemon.cli.terminal import print_result
+from shearloop.daemon.cli.terminal import print_result, table
 from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
@@ -60,10 +60,7 @@ def _characterise(args: argparse.Namespace) -> int:
 def _table(rows: "tuple[FigureOfMerit, ...]") -> str:
     cells = [["" if value is None else value for value in asdict(row).values()] for row in rows]
     shown = [[value if isinstance(value, str) else f"{value:#.3g}" if value else "0" for value in row] for row in cells]
-    widths = [max(map(len, column)) for column in zip(COLUMNS, *shown, strict=True)]
-    lines = [COLUMNS, ["-" * width for width in widths], *shown]
-    printed = ["  ".join(map(str.ljust, line, widths)).rstrip() for line in lines]
-    return "\n".join([*printed, "", EXPLANATION])
+    return "\n".join([*table(COLUMNS, shown), "", EXPLANATION])
 
 
 def _calibrate(args: argparse.Namespace) -> int:
@@ -73,9 +70,9 @@ def _calibrate(args: argparse.Namespace) -> int:
     if args.friction is not None and not 0 <= args.friction <= 1:
         raise UserError(f"--friction is {args.friction}; a coefficient of friction lies between 0 and 1.")
     check_overwrite(args.out, "a calibration file")
-    table = read_table(args.table)
+    recorded = read_table(args.table)
     try:
-        calibration = fit_calibration(table, friction=args.friction)
+        calibration = fit_calibration(recorded, friction=args.friction)
     except CalibrationError as error:
         raise UserError(f"{args.table}: {error}") from error
     save_calibration(calibration, args.out)

@@ -6,14 +6,13 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from pathlib import Path
 
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.errors import BankError
-from shearloop.bank.skin.calibration import load_calibration
-from shearloop.daemon.config import CombinedConfig, CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
+from shearloop.daemon.cli.check import check_parts
+from shearloop.daemon.config import CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
 from shearloop.daemon.doctor.devices import (
     Finding,
     check_daemon,
@@ -22,17 +21,13 @@ from shearloop.daemon.doctor.devices import (
     from_error,
     from_file,
     good,
-    listen,
+    listen_for_frames,
     note,
     trouble,
 )
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.rig import read_experiment
-from shearloop.daemon.sensing.estimators import open_combined, open_estimator
 from shearloop.daemon.serial_ports import list_serial_ports
-from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import missing_library
-from shearloop.drivers.ur.settings import read_settings
 
 __all__ = ["Finding", "examine"]
 
@@ -60,11 +55,11 @@ def examine(config_path: Path | None, seconds: float, geometry: Path | None = No
         return
     yield good("configuration", f"{config_path} is in order")
     yield check_disk(Path() if config.recording is None else config.recording.folder)
-    yield from check_files(config, geometry)
+    yield from check_files(config, config_path, geometry)
     tasks = daemon_tasks(config.commands)
     if tasks is not None:
         yield good("daemon", f"answers at {config.commands}; it holds the devices and reports on them")
-        received = {} if "publish" in config.network_addresses else listen(config.publish, seconds)
+        received = {} if "publish" in config.network_addresses else listen_for_frames(config.publish, seconds)
         yield from check_daemon(config, tasks, received)
     elif config.emulators:
         means = "they exist only while the daemon runs"
@@ -142,36 +137,17 @@ def check_ports() -> Finding:
     return good("USB serial ports", shown)
 
 
-def check_files(config: DaemonConfig, geometry: Path | None) -> Iterator[Finding]:
-    """Check every file; `geometry` is the fingertip (YAML or mesh) that its bank must match."""
+def check_files(config: DaemonConfig, path: Path, geometry: Path | None) -> Iterator[Finding]:
+    """Check every file of the configuration in `path`; `geometry` is the fingertip that its bank must match."""
     for name, fingertip in config.fingertips.items():
         yield check_bank(name, fingertip, geometry)
-        if fingertip.calibration is None:
-            means = "k and sigma are published, but no torque"
-            yield note(f"calibration of {name}", "not configured", means, "see docs/first-calibration.md")
-        else:
-            yield _opened(f"calibration of {name}", "there is no torque", partial(_calibration, name, fingertip))
-    if config.combined is not None:
-        yield _opened(
-            "combined calibration",
-            "there is no combined estimate",
-            partial(_combined, config.combined, config.fingertips),
-        )
-    if config.skin is not None:
-        yield _opened("calibration of the skin", "there is no shear force", partial(_skin, config.skin.calibration))
-    if config.robot is not None:
-        try:
-            host = read_settings(config.robot).host
-            yield good("robot's settings", f"{config.robot} is in order; the robot is {host}")
-        except DriverError as error:
-            yield from_file("robot's settings", str(error), "the daemon does not start")
-    if config.experiment is not None:
-        try:
-            one = read_experiment(config.experiment)
-            steps = f"{one.name}, {len(one.steps)} steps, driven by {one.torque_source}"
-            yield good("experiment", f"{config.experiment}: {steps}")
-        except UserError as error:
-            yield from_file("experiment", str(error), "it cannot start")
+    parts = check_parts(config, path)
+    for name, text in parts.texts.items():
+        if name != "keys":
+            yield good(f"files of {name}", text)
+    for name, mistake in parts.mistakes.items():
+        if name != "keys":
+            yield from_error(f"files of {name}", mistake, "the daemon does not start")
     yield check_keys(config.curve, config.network_addresses)
 
 
@@ -201,32 +177,6 @@ def check_bank(name: str, fingertip: FingertipConfig, geometry: Path | None = No
         cure = "build it again with `shearloop bank build`, or give the geometry it was built from"
         return trouble(subject, f"{found}; {geometry} is {digest[:12]}", means, cure)
     return good(subject, f"{found}, which is {geometry}")
-
-
-def _calibration(name: str, fingertip: FingertipConfig) -> str:
-    estimator = open_estimator(fingertip, name)
-    if not estimator.calibration.sides:
-        return f"{fingertip.calibration} belongs to this bank"
-    kind = estimator.calibration.estimator.name
-    return f"{fingertip.calibration} is for this fingertip, estimator {kind}{estimator.assumptions}"
-
-
-def _combined(combined: CombinedConfig, fingertips: dict[str, FingertipConfig]) -> str:
-    estimator = open_combined(combined, fingertips)
-    sides, kind = " and ".join(estimator.calibration.sides), estimator.calibration.estimator.name
-    return f"{combined.calibration} is for {sides}, estimator {kind}{estimator.assumptions}"
-
-
-def _skin(path: Path) -> str:
-    return f"{path}, ± {load_calibration(path).prediction_half_width_n:.3f} N"
-
-
-def _opened(subject: str, means: str, description: Callable[[], str]) -> Finding:
-    """Return the description of a file, or why it cannot be used."""
-    try:
-        return good(subject, description())
-    except (UserError, BankError) as error:
-        return from_error(subject, error, means)
 
 
 def check_keys(curve: CurveConfig | None, network: dict[str, str]) -> Finding:

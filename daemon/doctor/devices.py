@@ -17,7 +17,6 @@ import numpy as np
 from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.client import receive_messages, send_command
-from shearloop.daemon.messaging.messages import TOPICS
 from shearloop.daemon.messaging.stop_socket import send_to_stop_socket
 from shearloop.daemon.rig import make_gripper_client
 from shearloop.daemon.sensing.estimators import fingertip_table
@@ -254,40 +253,32 @@ def daemon_tasks(address: str) -> Mapping[str, Mapping[str, Any]] | None:
     return tasks if isinstance(tasks, dict) else {}
 
 
-def listen(address: str, seconds: float) -> dict[tuple[str, str], list[Mapping[str, Any]]]:
-    """Collect the messages of a local daemon for `seconds`, by topic and source."""
-    received: dict[tuple[str, str], list[Mapping[str, Any]]] = defaultdict(list)
+def listen_for_frames(address: str, seconds: float) -> dict[str, list[Mapping[str, Any]]]:
+    """Collect the frames of a local daemon's fingertips for `seconds`, by their names."""
+    received: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
     end_s = time.monotonic() + seconds
-    # `health` comes every second.
     with contextlib.suppress(UserError):
-        for topic, content in receive_messages(address, (), seconds):
-            received[topic, str(content["source"])].append(content)
+        # `health` comes every second.
+        for topic, content in receive_messages(address, ("eit.frame", "health"), seconds):
+            if topic == "eit.frame":
+                received[str(content["source"])].append(content)
             if time.monotonic() > end_s:
                 break
     return received
 
 
 def check_daemon(
-    config: DaemonConfig,
-    tasks: Mapping[str, Mapping[str, Any]],
-    received: Mapping[tuple[str, str], list[Mapping[str, Any]]],
+    config: DaemonConfig, tasks: Mapping[str, Mapping[str, Any]], received: Mapping[str, list[Mapping[str, Any]]]
 ) -> Iterator[Finding]:
-    """Judge a running daemon by its tasks and its messages."""
+    """Judge a running daemon by its tasks and by the frames of its fingertips."""
     for name, status in tasks.items():
         yield check_task(name, status)
-    for (topic, source), rate_hz in _expected_rates(config).items():
-        times_ns = [int(message["t_mono_ns"]) for message in received.get((topic, source), ())]
-        yield check_rate(f"rate of {topic} {source}", _rate_hz(times_ns), rate_hz)
-    for name in config.fingertips:
-        if frames := received.get(("eit.frame", name)):
+    for name, own in config.fingertips.items():
+        if frames := received.get(name):
+            measured_hz = _rate_hz([int(frame["t_mono_ns"]) for frame in frames])
+            yield check_rate(f"rate of {name}", measured_hz, 1.0 / own.frame_period_s)
             saturated, dead = (max(int(frame.get(key) or 0) for frame in frames) for key in ("saturated", "dead"))
             yield check_channels(name, saturated, dead, len(frames))
-        estimates = received.get(("eit.estimate", name))
-        if estimates and (reason := estimates[-1].get("reason")):
-            yield note(f"estimate of {name}", "not valid", str(reason), "see docs/troubleshooting.md")
-    states = received.get(("loop.state", "loop"))
-    if states and (reasons := states[-1].get("reasons")):
-        yield note("loop", str(states[-1].get("phase")), str(reasons), "see docs/faults.md")
 
 
 def check_task(name: str, status: Mapping[str, Any]) -> Finding:
@@ -307,17 +298,3 @@ def check_task(name: str, status: Mapping[str, Any]) -> Finding:
         means = reason or "refused data is not used"
         return note(subject, f"alive; refused: {counted}", means, "see docs/troubleshooting.md")
     return good(subject, "alive")
-
-
-def _expected_rates(config: DaemonConfig) -> dict[tuple[str, str], float]:
-    """Return each expected message's rate in Hz, by topic and source."""
-    cell, skin = config.load_cell, config.skin
-    rates = {
-        ("health", "daemon"): TOPICS["health"].rate_hz,
-        **{("eit.frame", name): 1.0 / one.frame_period_s for name, one in config.fingertips.items()},
-        ("load.torque", "load_cell"): cell.rate_hz if cell is not None else None,
-        ("skin.shear", "skin"): 1.0 / skin.daq.sample_period_s if skin is not None else None,
-        ("robot.state", "robot"): TOPICS["robot.state"].rate_hz if config.robot is not None else None,
-        ("gripper.state", "gripper"): TOPICS["gripper.state"].rate_hz if config.gripper is not None else None,
-    }
-    return {key: rate_hz for key, rate_hz in rates.items() if rate_hz is not None}

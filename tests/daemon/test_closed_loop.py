@@ -9,12 +9,9 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
-import aiohttp
 import numpy as np
 import pytest
 import yaml
-import zmq.asyncio
-from aiohttp import web
 
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.estimation import Calibration
@@ -22,8 +19,6 @@ from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli.emulated_calibration import calibrate, record
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.run_summary import RunSummary
-from shearloop.daemon.web.message_store import MessageStore
-from shearloop.daemon.web.server import Bridge, DaemonAddress, make_app
 from tests.daemon.conftest import DEADLINE_S, robot_at, running_daemon, shearloop
 from tests.daemon.emulate_rig.rig import write_rig_bank
 from tests.daemon.recording.test_replay import replayed
@@ -214,48 +209,6 @@ async def test_adapt_corrects_a_wrong_gain_until_the_next_grip_and_is_replayed(r
     assert comparison.compared["eit.adapted"] == 2
 
 
-@asynccontextmanager
-async def served_page(folder: Path) -> AsyncIterator[str]:
-    """Serve the live view's page before the daemon of this folder, and yield its address."""
-    place = DaemonAddress(f"ipc://{folder}/publish", f"ipc://{folder}/commands")
-    with zmq.asyncio.Context() as context:
-        bridge = Bridge(context, place, MessageStore(3.6))
-        runner = web.AppRunner(make_app(bridge, "secret", {}, place.publish), access_log=None)
-        await runner.setup()
-        await web.TCPSite(runner, "127.0.0.1", 0).start()
-        try:
-            yield f"http://127.0.0.1:{runner.addresses[0][1]}"
-        finally:
-            await runner.cleanup()
-            await bridge.close()
-
-
-async def test_a_stop_from_the_page_needs_no_token_and_the_wrist_stands_still(rig_config, tiny_bank, tmp_path):
-    async with (
-        running_rig(rig_config, tiny_bank) as (_, watcher, _fault, command),
-        served_page(tmp_path) as page,
-        aiohttp.ClientSession() as http,
-    ):
-        await started(command, experiment(tmp_path, SLOW_TWIST))
-        await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.01)
-        async with http.post(f"{page}/commands/pause") as refused:
-            assert refused.status == 403
-        # Not whether it runs: a busy computer may hold the wrist. Nor would a pause be seen that a stop comes after.
-        assert (await command("resume")).get("reason") == "no experiment is paused", "what was refused was not done"
-        async with http.post(f"{page}/stop") as reply:
-            assert await reply.json() == {"ok": True, "stopped": "test"}
-        last_seq = watcher.seen["robot.state"][-1]["seq"]
-        still = await watcher.until(
-            "robot.state", lambda state: state["seq"] > last_seq and abs(state["wrist_speed_rad_per_s"]) < 1e-3
-        )
-        later = await watcher.until("robot.state", lambda state: state["seq"] > still["seq"] + 10)
-        assert later["wrist_rad"] == pytest.approx(still["wrist_rad"], abs=1e-3)
-        assert (await watcher.until("loop.state", lambda state: state["phase"] == "stopped"))["activity"]
-        async with http.post(f"{page}/stop") as again:
-            assert await again.json() == {"ok": True, "stopped": ""}, "and the daemon goes on"
-        await watcher.until("robot.state", lambda state: state["seq"] > later["seq"])
-
-
 async def test_a_protective_stop_ends_the_experiment_and_the_operator_unlocks_it(rig_config, tiny_bank, tmp_path):
     async with running_rig(rig_config, tiny_bank) as (daemon, watcher, fault, command):
         path = experiment(tmp_path, SLOW_TWIST)
@@ -272,7 +225,21 @@ async def test_a_protective_stop_ends_the_experiment_and_the_operator_unlocks_it
             reply = await command("unlock")
         await started(command, path)
         assert (await command("pause"))["ok"]
-        assert (await command("stop")) == {"ok": True, "stopped": "test"}
+        assert (await command("resume"))["ok"]
+        turning = watcher.seen["robot.state"][-1]["seq"]
+        await watcher.until(
+            "robot.state", lambda state: state["seq"] > turning and state["wrist_speed_rad_per_s"] > 0.01
+        )
+        # As the page's stop: a second one leaves the daemon running.
+        assert (await command("stop", spare_daemon=True)) == {"ok": True, "stopped": "test"}
+        last = watcher.seen["robot.state"][-1]["seq"]
+        still = await watcher.until(
+            "robot.state", lambda state: state["seq"] > last and abs(state["wrist_speed_rad_per_s"]) < 1e-3
+        )
+        later = await watcher.until("robot.state", lambda state: state["seq"] > still["seq"] + 10)
+        assert later["wrist_rad"] == pytest.approx(still["wrist_rad"], abs=1e-3)
+        assert (await command("stop", spare_daemon=True)) == {"ok": True, "stopped": ""}
+        await watcher.until("robot.state", lambda state: state["seq"] > later["seq"])
         assert not daemon.supervisor.records["loop"].restarts
 
 

@@ -70,9 +70,7 @@ def test_collector_that_was_off_stays_off():
 def test_daemon_of_the_command_line_is_collected_from_when_it_is_ready(config, monkeypatch):
     collected = []
 
-    async def run_daemon(
-        _config: object, _listeners: object, _facts: object, on_ready: Callable[[], None], _summary: object
-    ) -> bool:
+    async def run_daemon(_config: object, _listeners: object, on_ready: Callable[[], None], _summary: object) -> bool:
         collected.append(gc.isenabled())
         on_ready()
         collected.append(gc.isenabled() and gc.get_freeze_count() > 0)

@@ -186,7 +186,6 @@ async def test_a_stopped_terminal_delays_no_estimate(config, tmp_path, subscribe
             # A line for each would be 30 kB, of which the terminal takes 4 unread.
             received = await asyncio.to_thread(lambda: [next_message(frames) for _ in range(300)])
         assert [message["frame"] for message in received] == list(range(300))
-        assert (await asyncio.to_thread(next_message, health))["tasks"]["printed_output"]["error"] == ""
         await stop_and_time(daemon, signal.SIGTERM)
     os.close(terminal)
     os.close(its_end)

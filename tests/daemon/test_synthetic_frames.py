@@ -1,4 +1,3 @@
-from itertools import islice
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +11,7 @@ from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.eit.models import conductivity
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.matlab import read_torque_slices
-from shearloop.daemon.synthetic_frames import Synthesiser, TwistProgramme, twist_frames
+from shearloop.daemon.synthetic_frames import Synthesiser, TwistProgramme
 from shearloop.drivers.eit_kit import FrameParser
 from shearloop.drivers.emulators.boards import format_line
 
@@ -110,22 +109,6 @@ def test_a_programme_idles_grips_twists_and_lets_go():
     assert at(38.0) == (1.0, 0.1), "the second cycle"
     assert at(53.0) == (0.5, 0.0)
     assert at(54.0 + 14.0) == at(14.0), "and again"
-
-
-def test_frames_follow_the_programme():
-    programme = TwistProgramme(torque_nm=0.1, idle_s=1, grip_s=1, turn_s=2, hold_s=2, cycles=1)
-    synthesiser = Synthesiser(small_bank(), noise_v=0.0, amplitude=1.0)
-
-    def sigma_of_torque(torque_nm: float) -> float:
-        return 1.5 - 5 * torque_nm
-
-    lines = list(
-        islice(twist_frames(synthesiser, programme, k=3.25, sigma_of_torque=sigma_of_torque, period_s=0.5), 22)
-    )
-    for number, line in enumerate(lines):
-        grip, torque_nm = programme.at(0.25 + 0.5 * number)
-        np.testing.assert_array_equal(line, synthesiser.line(3.25, sigma_of_torque(torque_nm), grip))
-    assert np.count_nonzero(PAPER_TABLE.channels_of_line(lines[0] != lines[9])) > PAPER_TABLE.n_channels / 2
 
 
 def test_the_same_seed_gives_the_same_frames():

@@ -3,7 +3,7 @@
 import argparse
 import math
 from collections.abc import Iterator
-from itertools import cycle, repeat
+from itertools import count, cycle, repeat
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from shearloop.drivers.emulators.ur_controller import Controller
     from shearloop.drivers.emulators.ur_robot import ControllerSpec, RobotEvent
 
-# The paper's screwdriver, and the largest torque of its peak samples.
-K_CM, LARGEST_TORQUE_NM = 3.25, 0.14
+# The tool of synthetic frames.
+DIAMETER_MM = 20.0
 UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standard input:
   protective-stop         stop for safety, pause the program
   emergency-stop          press the button: stop, end the program, power off
@@ -77,19 +77,14 @@ def _frames(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.f
 
 
 def _synthetic(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.float64]"]:
-    from shearloop.bank.eit.bank_file import Bank
-    from shearloop.daemon.synthetic_frames import Synthesiser, TwistProgramme, twist_frames
+    import numpy as np
 
-    rest, largest = args.sigma
+    from shearloop.daemon.synthetic_frames import RigFrames, TwistProgramme
 
-    def sigma_of_torque(torque_nm: float) -> float:
-        return float(rest + (largest - rest) * torque_nm / LARGEST_TORQUE_NM)
-
-    synthesiser = Synthesiser(Bank.open(args.bank), seed=args.seed)
-    # Report a wrong sigma before a port appears.
-    for torque_nm in (0.0, LARGEST_TORQUE_NM):
-        synthesiser.signal(K_CM, sigma_of_torque(torque_nm))
-    return twist_frames(synthesiser, TwistProgramme(), k=K_CM, sigma_of_torque=sigma_of_torque, period_s=period_s)
+    # Opened now: an error comes before a port appears.
+    frames, programme = RigFrames(args.bank, args.seed, args.sigma), TwistProgramme()
+    moments = (programme.at((number + 0.5) * period_s) for number in count())
+    return (frames.line(np.array([grip]), np.array([torque_nm]), DIAMETER_MM) for grip, torque_nm in moments)
 
 
 def _configure_hx711(parser: argparse.ArgumentParser) -> None:

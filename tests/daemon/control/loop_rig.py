@@ -38,8 +38,6 @@ class Rig:
         # Whether the fingers meet a tool, expected or not.
         self.meets = False
         self.silent: set[str] = set()
-        # What the load cell says too much, and whether it says nothing of use.
-        self.offset_nm, self.void = 0.0, False
         # When the fingertip's estimator has seen enough of the grip.
         self.warm_from_s, self.warm_up_s = 0.0, 0.0
         self.arm = ArmStatus(0.3, 0)
@@ -48,7 +46,7 @@ class Rig:
         self.begun: list[Action] = []
         self.orders = ControlOutput()
         self.true_nm: list[float] = []
-        self.late_s, self.died = 0.0, dict[str, str]()
+        self.died: dict[str, str] = {}
 
     @property
     def t_ns(self) -> int:
@@ -65,7 +63,7 @@ class Rig:
             if self.tick >= due:
                 self.pending.remove((due, action))
                 self._finish(action)
-        orders = self.orders = self.control_loop.tick(self.t_ns, self.late_s, self.died)
+        orders = self.orders = self.control_loop.tick(self.t_ns, 0.0, self.died)
         self.speed = 0.0 if orders.stop else orders.wrist_rad_per_s
         self.control_loop.on_speed_sent(self.speed)
         if orders.release:
@@ -88,10 +86,8 @@ class Rig:
             sample = None if cold else value
             self.control_loop.on_torque(TorqueSample("right", sample, "too recently" if cold else "", middle, now))
         if self.tick % 11 == 0 and "load_cell" not in self.silent:
-            value = torque_nm + self.offset_nm + float(self.random.normal(0.0, 0.0005))
-            self.control_loop.on_torque(
-                TorqueSample("load_cell", None if self.void else value, "", now - 1_000_000, now)
-            )
+            value = torque_nm + float(self.random.normal(0.0, 0.0005))
+            self.control_loop.on_torque(TorqueSample("load_cell", value, "", now - 1_000_000, now))
 
     def _finish(self, action: Action) -> None:
         if isinstance(action, GripTo):

@@ -123,7 +123,7 @@ class WholeRig:
         self.stopped = False
         if orders.action is not None:
             self._begin(orders.action)
-        assert math.isfinite(orders.wrist_rad_per_s)
+        assert abs(orders.wrist_rad_per_s) <= self.control_loop.config.wrist_speed_rad_per_s
         if self.control_loop.status.decision.response >= Response.HOLD:
             assert orders.wrist_rad_per_s == 0.0, "held, and yet it turns"
         if orders.wrist_rad_per_s or self.sent:

@@ -1,4 +1,3 @@
-import asyncio
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,18 +12,11 @@ def bank(tmp_path_factory) -> Path:
     return write_rig_bank(tmp_path_factory.mktemp("bank") / "rig.bank")
 
 
-@pytest.fixture(scope="module")
-def rig_process(bank, tmp_path_factory) -> Iterator[RigProcess]:
-    run_dir = tmp_path_factory.mktemp("run")
+@pytest.fixture
+def rig(bank, tmp_path) -> Iterator[RigProcess]:
+    run_dir = tmp_path / "run"
     process = RigProcess("rig", "--bank", str(bank), "--run-dir", str(run_dir), *PACE, module=2, ready="rig ready")
     process.run_dir = run_dir
     yield process
     assert process.close() == 0, "it ends when its input does"
     assert not list(run_dir.iterdir()), "and leaves no port behind"
-
-
-@pytest.fixture
-def rig(rig_process) -> Iterator[RigProcess]:
-    """The module's rig, without faults after the test."""
-    yield rig_process
-    asyncio.run(rig_process.fault("normal"))

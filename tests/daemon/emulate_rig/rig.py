@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.eit.bank_file import BankDefinition, write_bank
 from shearloop.bank.eit.channels import PAPER_TABLE
-from shearloop.drivers.connection import LinkMonitor, LinkObserver
+from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.load_cell import LoadCalibration, LoadSample
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
@@ -78,16 +78,16 @@ async def open_gripper_at(rig: RigProcess) -> AsyncIterator[RobotiqGripper]:
         await gripper.close()
 
 
-def kit_at(rig: RigProcess, side: str, observer: LinkObserver | None = None) -> EitKit:
-    path, monitor = rig.run_dir / f"eit-{side}", LinkMonitor(observer)
-    return EitKit(zero_slots=PAPER_TABLE.zero_slots, path=path, frame_period_s=0.5408 / SPEED, monitor=monitor)
+def kit_at(rig: RigProcess, side: str) -> EitKit:
+    path = rig.run_dir / f"eit-{side}"
+    return EitKit(zero_slots=PAPER_TABLE.zero_slots, path=path, frame_period_s=0.5408 / SPEED)
 
 
 @asynccontextmanager
-async def arm_at(rig: RigProcess, link: LinkObserver | None = None) -> AsyncIterator[UrRobot]:
+async def arm_at(rig: RigProcess) -> AsyncIterator[UrRobot]:
     pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
     settings = read_settings(Path(__file__).parents[3] / "config" / "ur.yaml")
-    arm = UrRobot(dataclasses.replace(settings, host=rig.host), LinkMonitor(link))
+    arm = UrRobot(dataclasses.replace(settings, host=rig.host), LinkMonitor())
     task = asyncio.create_task(arm.run())
     try:
         await until(arm, lambda state: state.program_running and not state.recovering)

@@ -276,9 +276,15 @@ def test_a_later_file_replays_frame_numbers_tares_and_tools(config, tmp_path, mo
     ((zeroed,),) = RecordedRun(later).replay_events().tares.values()
     assert zeroed >= ZEROED
     held: list[object] = []
-    monkeypatch.setattr(EstimatorSession, "set_tool", lambda _self, tool: held.append(tool))
+    set_tool = EstimatorSession.set_tool
+
+    def noted(self: EstimatorSession, tool: Measured | None) -> None:
+        held.append(tool)
+        set_tool(self, tool)
+
+    monkeypatch.setattr(EstimatorSession, "set_tool", noted)
     again, _ = asyncio.run(replayed(later, math.inf))
-    assert held == [OTHER_TOOL], "which came before the file began"
+    assert held == [None, OTHER_TOOL], "the second one came before the file began"
     estimates = {content["frame"]: content for topic, content in again if topic == "eit.estimate"}
     assert min(estimates) >= BEGUN
     said = ("reason", "valid", "k", "sigma", "score", "torque_nm")

@@ -145,7 +145,6 @@ class Bank(BankDefinition):
             )
         if bank.identity != identity:
             raise _unusable(path, f"its grids, model and geometry do not give its identity {identity[:12]}…")
-        _check_shapes(path, arrays, bank.table.n_channels)
         return bank
 
 
@@ -231,19 +230,6 @@ def _read_array(path: Path, file: BinaryIO, name: str, entry: dict[str, Any]) ->
     file.seek(offset)
     array: NDArray[Any] = np.frombuffer(file.read(expected - offset), dtype=kind).reshape(shape)
     return array
-
-
-def _check_shapes(path: Path, arrays: dict[str, NDArray[Any]], channels: int) -> None:
-    cells = (len(arrays["k_grid"]), len(arrays["sigma_grid"]))
-    expected = {
-        "homogeneous": (channels,),
-        "min_conductivity": cells,
-        "valid": cells,
-        "signals": (*cells, channels),
-    }
-    for name, shape in expected.items():
-        if arrays[name].shape != shape:
-            raise _unusable(path, f"{name} has shape {arrays[name].shape}, expected {shape}")
 
 
 def _sha256(array: NDArray[Any]) -> str:

@@ -55,8 +55,6 @@ ROUNDING = 2e-5
 _SQUARE_ROUNDING = 4e-6
 # Rounding of float64 in the square of ρ.
 _SQUARE_ROUNDING_64 = 1e-12
-# With fewer cells, the whole heatmap at all lags is faster than pruning.
-MIN_PRUNED_CELLS = 300
 # The runner-up may be this much worse than the best cell at lag 0 before groups are bounded a second time.
 _SLACK = 0.01
 # More bounds than this (16 MB) are not computed: all cells and lags remain.
@@ -303,9 +301,6 @@ class AllLagsBounds:
 class _PruningMatcher(Matcher):
     """The search, and the exact scores of the candidates that it leaves."""
 
-    # With fewer cells the whole heatmap is computed.
-    _min_cells = 0
-
     def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Compress the bank, in about half a second for 10⁴ cells; arguments and errors as `Matcher`.
 
@@ -321,10 +316,8 @@ class _PruningMatcher(Matcher):
 
         Raises MatchingError as `heatmap` does.
         """
-        if len(self._cells) >= self._min_cells:
-            (frame,) = unit_magnitudes(np.asarray(difference)[None], self.n_channels)
-            return self._search(frame)
-        return super().match(difference)
+        (frame,) = unit_magnitudes(np.asarray(difference)[None], self.n_channels)
+        return self._search(frame)
 
     @abstractmethod
     def _search(self, frame: FloatArray) -> Match: ...
@@ -393,8 +386,6 @@ class PrunedZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
 
 class PrunedMatcher(_PruningMatcher, ReferenceMatcher):
     """Matches at all lags."""
-
-    _min_cells = MIN_PRUNED_CELLS
 
     def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Compress the bank; arguments and errors as `Matcher`."""

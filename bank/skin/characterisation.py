@@ -1,15 +1,12 @@
-"""A skin's figures of merit by the paper's definitions: estimators, one table, and the curves of three figures.
+"""A skin's figures of merit by the paper's definitions: one table, and the curves of its figures.
 
-Responses follow equation (1), forces are in N. Noise, drift and temperature are properties of a made skin. For those
-the table shows estimates from synthetic recordings with the paper's figure as the true one.
+Responses follow equation (1), forces are in N. Noise and drift are properties of a made skin: no model gives them.
 """
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import ndtri
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
@@ -17,7 +14,6 @@ from shearloop.bank.polynomial import Polynomial
 from shearloop.bank.skin.finite_strain import FiniteStrainSkin
 from shearloop.bank.skin.membrane import (
     EXCITATION_A,
-    GAUGE_FACTOR,
     GAUGE_RESISTANCE_OHM,
     PAPER_SECTION,
     THICK_SECTION,
@@ -36,7 +32,6 @@ from shearloop.bank.skin.plane_strain import (
     unloaded,
 )
 
-FULL_RANGE_N = 5.0
 # The paper's response is straight up to here.
 PAPER_LINEAR_N = 1.2
 # From 25 °C to 40 °C.
@@ -55,20 +50,6 @@ def origin_slope(shear_n: FloatArray, response: FloatArray) -> float:
     if not squares > 0:
         raise CalibrationError("A sensitivity needs at least one response at a shear force other than zero.")
     return float(shear_n @ response) / squares
-
-
-def noise_floor_n(time_s: FloatArray, response: FloatArray, sensitivity_per_n: float) -> float:
-    """Return the standard deviation within windows of 1 s at constant load, in N; variances are pooled over windows.
-
-    A last window that is not full is left out. Raises CalibrationError where no window holds two values.
-    """
-    window = np.floor(time_s - time_s[0] + 1e-9).astype(np.int64)
-    counts = np.bincount(window)
-    full = np.flatnonzero((counts >= 2) & (counts >= 0.9 * np.median(counts)))
-    if not full.size:
-        raise CalibrationError("The noise floor needs at least two responses within 1 s; record faster.")
-    squares = sum(float(np.var(response[window == i]) * counts[i]) for i in full)
-    return math.sqrt(squares / float((counts[full] - 1).sum())) / sensitivity_per_n
 
 
 class LineFit(Polynomial):
@@ -118,53 +99,8 @@ def responses(membrane: Membrane, shear_n: Iterable[float], normal_n: float) -> 
 
 
 @dataclass(frozen=True, slots=True)
-class SkinFigures:
-    """The figures that a bench measures; the defaults are the paper's.
-
-    The noise floor and the 95 % prediction interval in N; the drift (std over an hour) and the largest response to 2 N
-    of normal force, as responses; the relative change of sensitivity per kelvin (less than 2 % over 15 K).
-    """
-
-    noise_floor_n: float = 0.0016
-    prediction_half_width_n: float = 0.0802
-    drift_std: float = 1.48e-4
-    crosstalk: float = 1.24e-4
-    sensitivity_per_k: float = 0.02 / 15
-
-
-def estimated_figures(sensitivity: float, true: SkinFigures, rng: np.random.Generator) -> SkinFigures:
-    """Return the estimates from synthetic recordings of a skin with this sensitivity in 1/N and these true figures.
-
-    The recordings: ten minutes at constant load (10 Hz), 20 loadings from −1 N to 1 N each read once at every 0.1 N,
-    one hour at 0.01 Hz, normal forces up to 2 N without shear (a minute each, averaged), and 20 loadings each at 25 °C
-    and 40 °C, averaged over 1 s as in the paper.
-    """
-    noise = true.noise_floor_n * sensitivity
-
-    time_s = np.arange(6000) / 10
-    still = rng.normal(0, noise, len(time_s))
-    shear_n = np.tile(np.concatenate([-loading(1.0)[::-1], [0.0], loading(1.0)]), 20)
-    scatter = true.prediction_half_width_n / float(ndtri(0.975)) * sensitivity
-    line = fit_line(shear_n, shear_n * sensitivity + rng.normal(0, scatter, len(shear_n)))
-    wandering = rng.normal(0, true.drift_std, 36)
-    normal_n = np.array([0.5, 1.0, 1.5, 2.0])
-    pressed = true.crosstalk * normal_n / 2 + rng.normal(0, noise / np.sqrt(600), len(normal_n))
-    cold, hot = (
-        fit_line(shear_n, shear_n * factor + rng.normal(0, noise / np.sqrt(10), len(shear_n))).slope_per_n
-        for factor in (sensitivity, sensitivity * (1 + true.sensitivity_per_k * WARM_K))
-    )
-    return SkinFigures(
-        noise_floor_n=noise_floor_n(time_s, still, sensitivity),
-        prediction_half_width_n=line.prediction_half_width_n(0.0),
-        drift_std=float(np.std(wandering, ddof=1)),
-        crosstalk=float(abs(pressed).max()),
-        sensitivity_per_k=(hot / cold - 1) / WARM_K,
-    )
-
-
-@dataclass(frozen=True, slots=True)
 class FigureOfMerit:
-    """One quantity: the paper's computed and measured values, as printed, and each model's or estimator's."""
+    """One quantity: the paper's computed and measured values, as printed, and each model's."""
 
     quantity: str
     unit: str
@@ -172,7 +108,6 @@ class FigureOfMerit:
     paper_measured: str = ""
     membrane: float | None = None
     two_d: float | None = None
-    synthetic: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,7 +138,7 @@ class Characterisation:
     wide_by_normal: dict[float, ResponseCurve]
 
 
-def characterise(rng: np.random.Generator) -> Characterisation:
+def characterise() -> Characterisation:
     """Return the contents of the paper's table 1 and figures 4 to 8, from the models; takes about ten seconds."""
     models = _Models()
     pressed = apply_load(models.skin, unloaded(models.skin), 1.0, 0.0)
@@ -211,7 +146,7 @@ def characterise(rng: np.random.Generator) -> Characterisation:
     finite = FiniteStrainSkin(PAPER_SECTION)
     steps = finite.states_along(1.0, loading(1.0))
     return Characterisation(
-        rows=(*_model_rows(models, profiles[-1]), *_estimator_rows(models, rng)),
+        rows=(*_model_rows(models, profiles[-1]), *_prediction_rows(models)),
         strain_maps={state.shear_n: finite.strain_map(state) for state in (steps[4], steps[-1])},
         line_deg=models.skin.line_deg,
         strain_profiles=np.array([line_strain(models.skin, state) for state in profiles]),
@@ -295,9 +230,7 @@ def _upturns(models: _Models) -> list[float]:
     return [100 * (each[-1] / (1.6 * origin_slope(shear_n[straight], each[straight])) - 1) for each in found]
 
 
-def _estimator_rows(models: _Models, rng: np.random.Generator) -> list[FigureOfMerit]:
-    found = estimated_figures(GAUGE_FACTOR * models.membrane.sheet_per_n, SkinFigures(), rng)
-    bits = math.log2(FULL_RANGE_N / found.noise_floor_n)
+def _prediction_rows(models: _Models) -> list[FigureOfMerit]:
     up, around = loading(1.0), loop(1.0)
 
     def half_width(shear_n: FloatArray, response: FloatArray) -> float:
@@ -307,12 +240,7 @@ def _estimator_rows(models: _Models, rng: np.random.Generator) -> list[FigureOfM
     loaded = [half_width(both_ways, np.concatenate([-y, y])) for y in (models.in_1d(up, 1.0), models.in_2d(up, 1.0))]
     cycled = [half_width(around, model(around, 1.0)) for model in (models.in_1d, models.in_2d)]
     return [
-        FigureOfMerit("noise floor", "N", "", "0.0016", synthetic=found.noise_floor_n),
-        FigureOfMerit("dynamic range to 5 N", "bit", "", "> 10", synthetic=bits),
-        FigureOfMerit("95 % prediction interval", "± N", "", "0.0802", synthetic=found.prediction_half_width_n),
+        FigureOfMerit("95 % prediction interval", "± N", "", "0.0802"),
         FigureOfMerit("  from friction alone, loading ± 1 N", "± N", "", "", *loaded),
         FigureOfMerit("  from friction alone, whole loop ± 1 N", "± N", "", "", *cycled),
-        FigureOfMerit("drift over an hour, std of the response", "", "", "1.48e-4", synthetic=found.drift_std),
-        FigureOfMerit("crosstalk, response to 2 N of normal force", "", "", "< 1.24e-4", synthetic=found.crosstalk),
-        FigureOfMerit("change of sensitivity over 15 K", "%", "", "< 2", synthetic=100 * 15 * found.sensitivity_per_k),
     ]

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
-from shearloop.bank.errors import CalibrationError, GeometryError
-
 EXCITATION_A = 5e-3
 # ρ N L / (w h): eutectic gallium indium at room temperature, in 70 strips of 3 mm without the turns between them (the
 # paper's section 2), 50 µm wide and high.
@@ -45,28 +43,6 @@ class Section:
     gauge_to_deg: float = 43.65
     gauge_depth_mm: float = 0.0
     load_arc_deg: float = 5.0
-
-    def __post_init__(self) -> None:
-        """Refuse a section that cannot exist, naming the value."""
-        for name in ("mid_radius_mm", "thickness_mm", "width_mm", "young_mpa", "load_arc_deg"):
-            if not getattr(self, name) > 0:
-                raise GeometryError(f"The skin's {name} is {getattr(self, name)!r}; give a positive number.")
-        if self.thickness_mm >= 2 * self.mid_radius_mm:
-            raise GeometryError(
-                f"The skin's thickness_mm {self.thickness_mm} leaves no core inside mid_radius_mm {self.mid_radius_mm}."
-            )
-        if not 0 <= self.poisson_ratio < 0.5:
-            raise GeometryError(f"The skin's poisson_ratio is {self.poisson_ratio!r}; it must lie in [0, 0.5).")
-        if not 0 <= self.friction <= 1:
-            raise GeometryError(f"The skin's friction is {self.friction!r}; it must lie in [0, 1].")
-        if not abs(self.gauge_depth_mm) <= self.thickness_mm / 2:
-            raise GeometryError(
-                f"The skin's gauge_depth_mm {self.gauge_depth_mm} lies outside its thickness_mm {self.thickness_mm}."
-            )
-        if not 0 < self.gauge_from_deg < self.gauge_to_deg < 90 - self.load_arc_deg / 2:
-            raise GeometryError(
-                f"The gauge from {self.gauge_from_deg}° to {self.gauge_to_deg}° must lie between bracket (0°) and load."
-            )
 
     @property
     def inner_radius_mm(self) -> float:
@@ -170,11 +146,6 @@ class Belt:
 
     friction: float
     gauge_angle_rad: float
-
-    def __post_init__(self) -> None:
-        """Refuse values that no belt has."""
-        if not (self.friction >= 0 and self.gauge_angle_rad >= 0):
-            raise CalibrationError(f"{self}: friction and angle must not be negative.")
 
     def step(self, state: BeltState, shear_n: float, normal_n: float, turned_rad: float) -> BeltState:
         """Return the state after the forces (N) have gone straight to these values and the load has turned."""

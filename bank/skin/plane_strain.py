@@ -27,7 +27,7 @@ from skfem.helpers import grad
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
-from shearloop.bank.errors import BankError, GeometryError
+from shearloop.bank.errors import BankError
 from shearloop.bank.skin.membrane import GAUGE_FACTOR, Section
 
 # More steps go in a circle.
@@ -51,11 +51,6 @@ class MeshSize:
     flank: int = 13
     load: int = 2
     layers: int = 2
-
-    def __post_init__(self) -> None:
-        """Refuse a mesh without elements."""
-        if min(astuple(self)) < 1:
-            raise GeometryError(f"{self} needs at least one element per stretch and one layer.")
 
     def refined(self, times: int) -> "MeshSize":
         """Return the size with every element cut into times × times."""

@@ -15,7 +15,6 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.errors import GeometryError
 from shearloop.bank.skin.membrane import GAUGE_FACTOR, SLACK_STIFFNESS, Section
 
 # The paper's loading plate and the width of its gauges.
@@ -48,12 +47,7 @@ class SheetSkin:
     def __init__(
         self, section: Section, plate_mm: float = PLATE_MM, size: SheetSize = SHEET_520, *, held_edges: bool = False
     ) -> None:
-        """Solve for both directions; raises GeometryError for a plate that the skin's gauges or edges do not allow."""
-        if not GAUGE_WIDTH_MM < plate_mm <= section.width_mm:
-            raise GeometryError(
-                f"The plate is {plate_mm} mm wide; it must be wider than the gauges ({GAUGE_WIDTH_MM} mm) and no wider "
-                f"than the skin ({section.width_mm} mm)."
-            )
+        """Solve for both directions, for a plate that is wider than the gauges and no wider than the skin."""
         self.section = section
         self._plate_mm = plate_mm
         self._basis = skfem.Basis(self._mesh(size), skfem.ElementVector(skfem.ElementQuad2()), intorder=4)

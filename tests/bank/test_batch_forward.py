@@ -51,13 +51,6 @@ def test_what_is_left_is_the_schur_complement(seed, n, kept, far):
         np.testing.assert_allclose(each, expected, rtol=1e-10, atol=1e-10)
 
 
-def test_factors_that_are_missing_are_refused():
-    elimination = Elimination(chained(np.random.default_rng(0), 9, 2, 4), 9, 2)
-    assert elimination.schur_complements(np.ones((1, 4))).shape == (1, 2, 2)
-    with pytest.raises(ValueError, match="mismatch"):
-        elimination.schur_complements(np.ones((1, 3)))
-
-
 @pytest.mark.parametrize("model", MODELS)
 def test_all_models_give_the_direct_solves_signals(batch, fingertip, model):
     rng = np.random.default_rng(3)

@@ -85,8 +85,6 @@ def test_voltages_and_signals_converge_at_the_rate_that_the_electrodes_ends_allo
 @pytest.mark.parametrize(
     ("changed", "sentence"),
     [
-        ({"width_cm": 0.0}, "width_cm must be above 0, not 0"),
-        ({"contact_impedance": float("nan")}, "contact_impedance must be above 0"),
         ({"electrodes": SQUARE.electrodes[1:]}, "8 to 32 electrodes, not 31"),
         ({"electrode_width_cm": 0.3}, "electrode 0 reaches from -0.05 to 0.25 cm on the left side"),
         (
@@ -142,17 +140,9 @@ def test_the_mesh_covers_the_disc_and_electrodes_have_their_place_and_width(size
         np.testing.assert_allclose([from_centre.min(), from_centre.max()], [-width / 4, width / 4], atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("changed", "sentence"),
-    [
-        ({"electrode_width_cm": 0.8}, "electrodes 0 and 1 touch or overlap"),
-        ({"diameter_cm": 0.0}, "the fingertip's diameter_cm must be above 0"),
-        ({"electrode_width_cm": 1e-4}, "electrode_width_cm must be 0.001 or more"),
-    ],
-)
-def test_a_disc_that_cannot_be_is_refused(changed, sentence):
-    with pytest.raises(GeometryError, match=sentence):
-        replace(disc(0.2), **changed)
+def test_a_disc_whose_electrodes_overlap_is_refused():
+    with pytest.raises(GeometryError, match="electrodes 0 and 1 touch or overlap"):
+        replace(disc(0.2), electrode_width_cm=0.8)
 
 
 @pytest.mark.parametrize("table", [ChannelTable(), ChannelTable(16, "adjacent"), ChannelTable(10, "opposite")])

@@ -88,6 +88,11 @@ def test_a_plan_has_the_grids_and_the_mesh(config):
         ("fingertip: tip.yaml", "mesh: {file: a.npz}\nmesh_size_cm: 0.1", "`mesh_size_cm` is for a `fingertip`"),
         ("fingertip: tip.yaml", "mesh: {file: none.npz}", r"none\.npz: the mesh cannot be read"),
         ("fingertip: tip.yaml", "fingertip: none.yaml", r"none\.yaml: the fingertip's description cannot be read"),
+        (
+            "electrode_width_cm: 0.2",
+            "electrode_width_cm: 1.0e-9",
+            r"tip\.yaml:\d+: electrode_width_cm: .* is too small",
+        ),
         ("count: 3", "count: 0", r"k\.count: 0 is too small; allowed: from 1 to 2000"),
         ("count: 3", "count: 1", r"k: a count of 1 needs low and high to be the same, not 0\.5 and 3"),
         ("high: 3", "high: 0.5", r"k: low must be below high, but low is 0\.5 and high is 0\.5"),

@@ -9,7 +9,7 @@ from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import FrameSeries
 from shearloop.bank.estimation.bank_match import BankMatch
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor, Mixtures, Ridge, fit_interval_regressor
-from shearloop.bank.estimation.novelty import NoveltyDetector, ReciprocityCheck
+from shearloop.bank.estimation.novelty import NoveltyDetector
 from tests.bank.estimation.conftest import follow, mixed
 
 ALL = np.ones(896, dtype=np.bool_)
@@ -173,15 +173,6 @@ def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
     seeing = np.column_stack([torque, rng.normal(0, 1, 600)]) + rng.normal(0, 1e-3, (600, 2))
     sighted = fit_interval_regressor(seeing, torque, Ridge.fit, bounds=(beside.min(axis=0), beside.max(axis=0)))
     assert not sighted.misses_loads, "one that sees loads pays no more than the times cost"
-
-
-def test_a_slice_is_measured_against_the_calibration_once(sliced, sliced_calibration, monkeypatch):
-    series, looked = sliced(), []
-    for kind, name in ((NoveltyDetector, "q_residual"), (ReciprocityCheck, "residual")):
-        found = getattr(kind, name)
-        monkeypatch.setattr(kind, name, lambda *args, found=found: (looked.append(type(args[0])), found(*args))[1])
-    assert all(one.valid for one in follow(sliced_calibration, series.between(20, 23)))
-    assert looked == [NoveltyDetector, ReciprocityCheck] * 3
 
 
 def test_a_judgement_holds_what_intervals_go_by(sliced):

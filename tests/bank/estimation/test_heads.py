@@ -107,18 +107,6 @@ def test_a_curve_works_on_with_the_channels_that_are_left():
     assert curve.predict(frame[None])[0] == pytest.approx(1.3, abs=0.05)
 
 
-def test_frames_together_are_read_as_each_alone():
-    rng = np.random.default_rng(9)
-    values = rng.uniform(-1, 2, 60)
-    curve = InverseCalibration.fit(frames_on_a_curve(values, rng, shrinking=0.08), values, 2, 1, trend=True)
-    frames = frames_on_a_curve(rng.uniform(-1, 2, 12), rng, begins_at=60.0, shrinking=0.08)
-    frames[1::3, -1] = 64.0
-    frames[:4, 10:60] = np.nan
-    frames[4:6, 100:130] = np.nan
-    alone = [curve.predict(frame[None])[0] for frame in frames]
-    np.testing.assert_array_equal(curve.predict(frames), alone)
-
-
 def test_a_response_that_shrinks_with_age_is_followed_beyond_what_was_fitted():
     rng = np.random.default_rng(8)
     values, later = rng.uniform(-1, 2, 60), rng.uniform(-1, 2, 60)

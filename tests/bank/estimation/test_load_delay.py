@@ -141,19 +141,6 @@ def test_a_board_beside_that_was_dead_garbled_or_away_spoils_no_times(recorded):
         assert measure_timing([still], [beside, recorded]).references == [recorded]
 
 
-def test_each_recording_is_looked_at_once(recorded, monkeypatch):
-    looked, of_side = [], load_delay._delay_of_side
-    monkeypatch.setattr(load_delay, "_delay_of_side", lambda *a: (looked.append((a[0], a[2])), of_side(*a))[1])
-    fit("regression", [recorded], "alone")
-    assert len(looked) == len(set(looked)) == len(recorded.sides)
-    looked.clear()
-    still = unmoved(recorded)
-    timing = measure_timing([still], [recorded])
-    assert (timing.references, timing.warnings, timing.uncertainty_s) == ([recorded], [""], 0.0)
-    fit("regression", [recorded], "with a timing", timing=timing)
-    assert len(looked) == len(set(looked)) == 2 * len(recorded.sides)
-
-
 def test_a_torque_within_some_time_is_any_from_the_least_to_the_largest(recorded):
     rising = replace(recorded, torque_t_s=np.array([0.0, 100.0]), torque_nm=np.array([0.0, 1.0]))
     least, largest = torque_bounds(rising, 0.5)

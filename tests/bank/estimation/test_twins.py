@@ -7,9 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from shearloop.bank.eit.channels import PAPER_TABLE
-from shearloop.bank.eit.forward import BatchForwardModel
 from shearloop.bank.estimation.novelty import NoveltyDetector, ReciprocityCheck, _coordinates
-from tests.bank.conftest import small_fingertip
 
 ALL = np.ones(896, dtype=np.bool_)
 
@@ -18,14 +16,6 @@ def slices(n: int, seed: int, noise: float = 1e-3) -> np.ndarray:
     rng = np.random.default_rng(seed)
     mean, ways = rng.uniform(0.02, 0.08, 896), 0.002 * rng.normal(size=(3, 896))
     return mean + rng.normal(size=(n, 3)) @ ways + rng.normal(0.0, noise, (n, 896))
-
-
-def test_opposite_injections_read_the_same_magnitudes():
-    forward = BatchForwardModel(small_fingertip())
-    cells = np.random.default_rng(1).uniform(0.5, 2.0, (1, len(forward.mesh.triangles)))
-    (voltages,) = np.abs(forward.voltages(cells))
-    np.testing.assert_allclose(voltages[PAPER_TABLE.twins[0]], voltages[PAPER_TABLE.twins[1]], rtol=1e-9)
-    assert sorted(PAPER_TABLE.twins.ravel()) == list(range(896))
 
 
 def test_the_misfit_of_noise_is_that_of_noise():

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from shearloop.bank.errors import CalibrationError, GeometryError
 from shearloop.bank.skin.characterisation import loading, origin_slope, responses
 from shearloop.bank.skin.membrane import (
     EXCITATION_A,
@@ -20,7 +19,6 @@ from shearloop.bank.skin.membrane import (
     BeltState,
     Direction,
     Membrane,
-    Section,
     direction_of,
     joule_heating_k,
     sensitivity_per_n,
@@ -192,26 +190,6 @@ def test_a_load_that_pulls_the_skin_off_its_core_has_no_friction():
     assert BELT.shear_range(pulled / UP, 0.1, 0.3, Direction.LOADING) == pytest.approx((1.0, 1.0))
 
 
-def test_a_belt_that_cannot_be_is_refused():
-    with pytest.raises(CalibrationError, match="must not be negative"):
-        Belt(-0.04, 1.0)
-
-
 def test_the_paper_s_gauge_has_25_ohm_and_stays_within_5_kelvin():
     assert pytest.approx(25.0, rel=0.02) == GAUGE_RESISTANCE_OHM
     assert 0 < joule_heating_k(EXCITATION_A**2 * GAUGE_RESISTANCE_OHM) < 5.0
-
-
-@pytest.mark.parametrize(
-    ("wrong", "named"),
-    [
-        ({"width_mm": 0.0}, "width_mm"),
-        ({"thickness_mm": 12.0}, "thickness_mm"),
-        ({"poisson_ratio": 0.5}, "poisson_ratio"),
-        ({"friction": 1.5}, "friction"),
-        ({"gauge_to_deg": 89.0}, "gauge"),
-    ],
-)
-def test_an_impossible_section_is_refused_by_name(wrong, named):
-    with pytest.raises(GeometryError, match=named):
-        Section(**wrong)

@@ -25,13 +25,6 @@ def test_characterise_holds_the_models_against_the_paper_and_draws_its_figures(t
     upturn = rows["response at 1.6 N above the line, Fn = 1 N"]
     assert 0 < upturn["two_d"] < upturn["membrane"] < 7
     assert rows["response to 2 N of normal force alone"]["two_d"] < 1e-6
-    for name, tolerance in {
-        "noise floor": 0.05,
-        "95 % prediction interval": 0.1,
-        "drift over an hour, std of the response": 0.4,
-    }.items():
-        assert rows[name]["synthetic"] == pytest.approx(float(rows[name]["paper_measured"]), rel=tolerance)
-    assert rows["dynamic range to 5 N"]["synthetic"] > 10
 
     drawn = sorted((tmp_path / "figures").iterdir())
     names = ["deadband", *(f"figure_{number}" for number in range(4, 9))]

@@ -48,8 +48,6 @@ MIN_SILENCE_S = 0.5
 # FrameClock.
 # Frames behind the period: 35 s at 0.54 s, while a crystal drifts by microseconds.
 PERIOD_WINDOW = 64
-# Frames between updates of the period, which hardly moves.
-LEARN_EVERY = 4
 # Frames behind the phase: a board that paused is followed within 6 s.
 PHASE_WINDOW = 12
 # Spacings needed to learn a period. Each spans several frames, so that a burst of late ones does no harm.
@@ -202,15 +200,14 @@ class FrameClock:
         if len(self._latest) > SPACING_FRAMES:
             (n, before_ns), (m, _) = self._latest[0], self._latest[-1]
             self._spacings.append((arrival_ns - before_ns) / (m - n))
-        if not self.learned or number % LEARN_EVERY == 0:
-            self._learn(number)
+        self._learn()
         straight_ns = math.inf
         for n, arrival in islice(reversed(self._seen), PHASE_WINDOW):
             straight_ns = min(straight_ns, arrival + (number - n) * self._period_ns)
         self._straight_ns = round(straight_ns)
         return self._straight_ns
 
-    def _learn(self, number: int) -> None:
+    def _learn(self) -> None:
         if len(self._spacings) < LEARN_FROM:
             return
         spacing = median(self._spacings)
@@ -218,7 +215,7 @@ class FrameClock:
             return
         if abs(self._period_ns - spacing) > PLAUSIBLE * spacing:
             self._period_ns, self.learned = spacing, True
-        if number % LEARN_EVERY == 0 and len(self._seen) >= LEARN_FROM:
+        if len(self._seen) >= LEARN_FROM:
             slope = slope_below(self._seen)
             if abs(slope - spacing) <= PLAUSIBLE * spacing:
                 self._period_ns, self.learned = slope, True

@@ -112,14 +112,6 @@ class Gripper:
         """Set the command registers."""
         self.command = registers
 
-    def put_between(self, object_mm: float | None) -> None:
-        """Put something of a width between the fingers, or take it away."""
-        self.object_mm = object_mm
-
-    def block_at(self, widest_mm: float | None) -> None:
-        """Keep the fingers from opening further than a width, or clear their way."""
-        self.widest_mm = widest_mm
-
     def fail(self, code: int) -> None:
         """Report a fault and stop; from 10 on only a rising edge of ACT ends it."""
         self.flt, self.current = code, 0
@@ -303,9 +295,9 @@ class GripperPlayer:
         """Carry out a line; ValueError, with a sentence, for an invalid one."""
         match text.split():
             case ["object", "none"] | ["drop"]:
-                self._gripper.put_between(None)
+                self._gripper.object_mm = None
             case ["object", width]:
-                self._gripper.put_between(number_between(width, 0.0, 140.0, "not a width in mm from 0 to 140"))
+                self._gripper.object_mm = number_between(width, 0.0, 140.0, "not a width in mm from 0 to 140")
             case ["fault", code]:
                 self._gripper.fail(int(number_between(code, 0, 15, "not a fault code from 0 to 15")))
             case _:

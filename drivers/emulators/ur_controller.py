@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, Robot, RobotEvent
-from shearloop.drivers.emulators.ur_rtde import ConnectionFaults, RtdeSession
+from shearloop.drivers.emulators.ur_rtde import RtdeSession
 from shearloop.drivers.emulators.urscript import translate
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
@@ -34,7 +34,8 @@ class Controller:
     def __init__(self, robot: Robot, *, host: str = "127.0.0.1", rate_hz: float = 500.0) -> None:
         """Take a robot; nothing is opened yet."""
         self.robot = robot
-        self.faults = ConnectionFaults()
+        # What the controller refuses or ignores.
+        self.faults: set[str] = set()
         self._host = host
         self._rate_hz = rate_hz
         self._silent_until_s = 0.0
@@ -92,7 +93,7 @@ class Controller:
             case ["silence", seconds]:
                 self.silence(number_between(seconds, 0.0, 86400.0, "not a time in seconds from 0 to 86400"))
             case ["registers-in-use" | "local-control" | "refuse-protocol" | "mute-dashboard" as fault]:
-                self.faults = replace(self.faults, **{fault.replace("-", "_"): True})
+                self.faults.add(fault)
             case ["version", numbers]:
                 if re.fullmatch(r"\d{1,4}(\.\d{1,4}){3}", numbers) is None:
                     raise ValueError(f"{numbers!r} is not a version such as 5.4.0.0")
@@ -103,7 +104,7 @@ class Controller:
                 self.robot.change(replace(self.robot.spec, payload_kg=payload_kg))
             case ["normal"]:
                 self.robot.clear_faults()
-                self.faults = ConnectionFaults()
+                self.faults.clear()
                 self.silence(0.0)
             case [name, *arguments] if name in FAULTS:
                 raise ValueError(f"{name} does not take {' '.join(arguments) or 'nothing'}")
@@ -147,10 +148,10 @@ class Controller:
 
     async def _serve_dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with self._connection(writer):
-            if not self.faults.mute_dashboard:
+            if "mute-dashboard" not in self.faults:
                 self._send(writer, BANNER.encode() + b"\n")
             while line := await reader.readline():
-                if self.faults.mute_dashboard:
+                if "mute-dashboard" in self.faults:
                     continue
                 request = line.decode("utf-8", "replace").strip()
                 self._send(writer, f"{self._answer_dashboard(request)}\n".encode())
@@ -164,7 +165,7 @@ class Controller:
             case "get serial number":
                 return "20235500001"
             case "is in remote control":
-                return "false" if self.faults.local_control else "true"
+                return "false" if "local-control" in self.faults else "true"
             case "robotmode":
                 return f"Robotmode: {_ROBOT_MODES[robot.safety.robot_mode]}"
             case "safetymode":

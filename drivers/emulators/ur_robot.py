@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from shearloop.drivers.emulators.ur_arm import Arm, PathError
-from shearloop.drivers.emulators.urscript import COMMAND, Program, ProgramEndedError, Registers
+from shearloop.drivers.emulators.urscript import Program, ProgramEndedError, Registers
 
 STOPPED, PLAYING, PAUSED = 1, 2, 4
 MODE_POWER_OFF, MODE_IDLE, MODE_RUNNING = 3, 5, 7
@@ -44,8 +44,6 @@ class RobotEvent:
     time_s: float
     name: str
     detail: str
-    since_command_s: float
-    q_rad: tuple[float, ...]
 
 
 class SafetyController:
@@ -213,6 +211,4 @@ class Robot:
         self._note("faults-cleared")
 
     def _note(self, name: str, detail: str = "") -> None:
-        q_rad = tuple(float(angle) for angle in self.arm.q_rad)
-        since_command_s = self.time_s - self.registers.written_s[COMMAND]
-        self._events.append(RobotEvent(self.time_s, name, detail, since_command_s, q_rad))
+        self._events.append(RobotEvent(self.time_s, name, detail))

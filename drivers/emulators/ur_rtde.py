@@ -84,23 +84,14 @@ def unpack(kinds: Iterable[str], data: bytes) -> list[float] | None:
     return list(struct.unpack(layout, data))
 
 
-@dataclass(frozen=True, slots=True)
-class ConnectionFaults:
-    """What a controller refuses or ignores."""
-
-    refuse_protocol: bool = False
-    registers_in_use: bool = False
-    local_control: bool = False
-    mute_dashboard: bool = False
-
-
 @dataclass
 class RtdeSession:
     """One client on port 30004."""
 
     robot: Robot
     rate_hz: float
-    faults: ConnectionFaults
+    # Names of faults, of which `refuse-protocol` and `registers-in-use` concern this connection.
+    faults: set[str]
     _buffer: bytearray = field(default_factory=bytearray)
     _inputs: list[list[str]] = field(default_factory=list)
     # Types by name.
@@ -135,7 +126,7 @@ class RtdeSession:
             self._write(payload)
             return b""
         if kind == VERSION:
-            return package(VERSION, bytes([payload == b"\x00\x02" and not self.faults.refuse_protocol]))
+            return package(VERSION, bytes([payload == b"\x00\x02" and "refuse-protocol" not in self.faults]))
         if kind == URCONTROL_VERSION:
             return package(URCONTROL_VERSION, struct.pack(">4I", *self.robot.spec.version))
         if kind == OUTPUTS:
@@ -159,7 +150,7 @@ class RtdeSession:
     def _set_inputs(self, payload: bytes) -> bytes:
         names = _names(payload)
         kinds = [type_of(name) for name in names]
-        if self.faults.registers_in_use:
+        if "registers-in-use" in self.faults:
             kinds = ["IN_USE" if "_register_" in name else kind for name, kind in zip(names, kinds, strict=True)]
         if {"IN_USE", "NOT_FOUND"} & set(kinds):
             return package(INPUTS, b"\x00" + ",".join(kinds).encode())

@@ -36,8 +36,6 @@ from shearloop.drivers.serial_sensor import (
 # A reading of five elements is 70 characters long.
 MAX_REPLY_BYTES = 512
 REPLY_TIMEOUT_S = 2.0
-# Misunderstood replies in a row before the connection is reopened.
-MAX_STRIKES = 3
 # The values of an overload and of an unmeasured quantity (SCPI-1999, 7.2.1.4 and 7.2.1.5).
 OVERLOAD, NOT_A_NUMBER = 9.9e37, 9.91e37
 _NUMBER = re.compile(r" *[+-]?[0-9]{1,12}(\.[0-9]{0,12})?([Ee][+-]?[0-9]{1,2})? *")
@@ -107,8 +105,6 @@ class PolledInstrument(ABC, Generic[ReadingT]):
         self._timeout_s = timeout_s
         self._inputs = inputs
         self._lines = ReplyLines()
-        self._waiting: list[tuple[str, int]] = []
-        self._strikes = 0
         self._count = 0
         self._errors: Counter[str] = Counter()
         self._name = ""
@@ -151,9 +147,10 @@ class PolledInstrument(ABC, Generic[ReadingT]):
                         due_s += self.period_s
                         reading = await self._read()
                     except DriverError as error:
-                        await self._handle_error(error)
+                        self._errors["not understood" if isinstance(error, ProtocolError) else "lost"] += 1
+                        self._name = ""
+                        await self._link.lost(error)
                         continue
-                    self._strikes = 0
                     self._count += 1
                     yield reading
             finally:
@@ -168,20 +165,8 @@ class PolledInstrument(ABC, Generic[ReadingT]):
             "errors": dict(self._errors + Counter({"too long": self._lines.too_long})),
         }
 
-    async def _handle_error(self, error: DriverError) -> None:
-        """Ignore a few misunderstood replies as line noise; otherwise reopen the connection."""
-        not_understood = isinstance(error, ProtocolError)
-        self._errors["not understood" if not_understood else "lost"] += 1
-        self._strikes += 1
-        if self._name and not_understood and self._strikes < MAX_STRIKES:
-            return
-        self._strikes, self._name = 0, ""
-        self._lines.restart()
-        await self._link.lost(error)
-
     async def _identify(self, *models: str) -> str:
         """Return the reply to *IDN?; ProtocolError unless it names one of the models."""
-        self._lines.restart()
         name = (await self._ask("*IDN?")).text
         if models and not any(model in name for model in models):
             raise ProtocolError(
@@ -196,12 +181,21 @@ class PolledInstrument(ABC, Generic[ReadingT]):
 
     async def _ask(self, query: str) -> Reply:
         """Return the answer to a query; DeviceSilentError if none comes, DeviceLostError if the port is gone."""
-        # An unasked reply must not pass for the answer.
-        self._errors["unasked"] += len(self._waiting)
-        self._waiting.clear()
-        asked_ns = monotonic_ns()
+        self._lines.restart()
+        asked_ns = arrival_ns = monotonic_ns()
+        until_ns = asked_ns + int(self._timeout_s * 1e9)
         await self._send(query)
-        reply = await self._next(asked_ns, query)
+        replies: list[str] = []
+        while not replies:
+            left_s = (until_ns - monotonic_ns()) / 1e9
+            received = await self._port.read(left_s) if left_s > 0 else None
+            if received is None:
+                raise DeviceSilentError(
+                    f"{self.instrument} at {self._port.path} has not answered {query!r} within {self._timeout_s:.2g} "
+                    "s; see that it is on, and that baud rate and line end are as configured."
+                )
+            replies, arrival_ns = self._lines.replies(received.data), received.t_arrival_ns
+        reply = Reply(replies[0], asked_ns, arrival_ns)
         if self._inputs is not None:
             self._inputs.record(RawEvent(InputKind.ASKED, asked_ns, query.encode()))
             self._inputs.record(RawEvent(InputKind.DATA, reply.t_arrival_ns, reply.text.encode()))
@@ -220,23 +214,6 @@ class PolledInstrument(ABC, Generic[ReadingT]):
         if self._link.port is None:
             raise DeviceLostError(f"There is no connection to {self.instrument} at present.")
         return self._link.port
-
-    async def _next(self, asked_ns: int, query: str, deadline_ns: int | None = None) -> Reply:
-        begin_ns = monotonic_ns()
-        if deadline_ns is None:
-            deadline_ns = begin_ns + int(self._timeout_s * 1e9)
-        while not self._waiting:
-            left_s = (deadline_ns - monotonic_ns()) / 1e9
-            received = await self._port.read(left_s) if left_s > 0 else None
-            if received is None:
-                waited_s = (deadline_ns - begin_ns) / 1e9
-                raise DeviceSilentError(
-                    f"{self.instrument} at {self._port.path} has not answered {query!r} within {waited_s:.2g} s; "
-                    "see that it is on, and that baud rate and line end are as configured."
-                )
-            self._waiting += [(text, received.t_arrival_ns) for text in self._lines.replies(received.data)]
-        text, arrival_ns = self._waiting.pop(0)
-        return Reply(text, asked_ns, arrival_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -359,17 +336,18 @@ class Keithley6430(PolledInstrument[SourceReading]):
             return
         try:
             # Twice: an interrupted command may have left its beginning on the line.
-            await self._send(":OUTP OFF", ":OUTP OFF", OUTPUT)
-            deadline_ns = monotonic_ns() + int(SWITCH_OFF_S * 1e9)
-            while (await self._next(0, OUTPUT, deadline_ns)).text != "0":
-                pass
+            await self._send(":OUTP OFF", ":OUTP OFF")
+            async with asyncio.timeout(SWITCH_OFF_S):
+                # The first answer may be that of a reading in progress.
+                while (await self._ask(OUTPUT)).text != "0":
+                    pass
             self._may_be_on = False
-        except DriverError as error:
+        except (DriverError, TimeoutError) as error:
             self._errors["not switched off"] += 1
             self._link.give_up(
                 DeviceLostError(
                     "The current source has not confirmed that its output is off; press its OUTPUT key, "
-                    f"or the current flows on through the gauges. {error}"
+                    f"or the current flows on through the gauges. {error}".rstrip()
                 )
             )
 

@@ -97,21 +97,6 @@ async def test_silence_is_no_loss_and_a_cancelled_read_loses_nothing():
         assert rest.data == b"kept"
 
 
-async def test_bytes_wait_in_the_kernel_while_there_is_no_read(monkeypatch):
-    calls = []
-    drain = SerialPort._drain
-    monkeypatch.setattr(SerialPort, "_drain", lambda port, done: (calls.append(port), drain(port, done)))
-    with PtyPort() as peer, SerialPort(peer.path) as port:
-        await peer.write(b"first")
-        assert await read_exactly(port, 5) == b"first"
-        calls.clear()
-        await peer.write(b"and the rest")
-        for _ in range(50):
-            await asyncio.sleep(0)
-        assert not calls
-        assert await read_exactly(port, 12) == b"and the rest"
-
-
 async def test_what_came_before_the_port_went_is_read_and_then_the_loss_is_told():
     with PtyPort() as peer, SerialPort(peer.path) as port:
         reading = asyncio.create_task(port.read(DEADLINE_S))

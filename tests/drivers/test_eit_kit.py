@@ -107,12 +107,6 @@ async def test_a_fault_costs_its_own_frame_at_most_and_is_counted(fault, kind, l
     assert kind.value in str(facts["last_frame_error"])
 
 
-async def test_a_repeated_line_is_handed_over_as_such(tmp_path):
-    first, second, third = some_lines(3)
-    _, frames, _ = await play([first, second, second, third], 4, tmp_path)
-    assert [frame.repeated for frame in frames] == [False, False, True, False]
-
-
 async def test_a_board_that_fell_silent_is_opened_and_started_again(tmp_path, monkeypatch):
     monkeypatch.setattr(eit_kit, "MIN_SILENCE_S", 0.3)
     lines = some_lines(8)

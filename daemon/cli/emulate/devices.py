@@ -150,8 +150,7 @@ def robot_make(args: argparse.Namespace) -> "ControllerSpec":
 
 def print_robot_event(event: "RobotEvent") -> None:
     """Print an event of the robot."""
-    times = {"time_s": round(event.time_s, 6), "since_command_s": round(event.since_command_s, 6)}
-    console.print_event(event.name, detail=event.detail, **times, q_rad=[round(angle, 9) for angle in event.q_rad])
+    console.print_event(event.name, detail=event.detail, time_s=round(event.time_s, 6))
 
 
 def _configure_ur(parser: argparse.ArgumentParser) -> None:

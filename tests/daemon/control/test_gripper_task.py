@@ -47,7 +47,7 @@ async def reading(way: str, folder: Path) -> AsyncIterator[tuple[Rig, GripperTas
 @WAYS
 async def test_cancelled_grip_can_be_released(way, tmp_path):
     async with reading(way, tmp_path) as (rig, task, _):
-        rig.model.put_between(40.0)
+        rig.model.object_mm = 40.0
         for turns in range(1, 30, 3):
             grip = asyncio.create_task(task.grip(GRIP))
             # A question is under way now and then: broken off, it takes the connection with it.
@@ -125,19 +125,19 @@ async def test_cancelled_activation_stops_the_fingers(way, tmp_path):
 async def test_fingers_that_meet_something_as_they_open_are_not_released(way, tmp_path, monkeypatch):
     monkeypatch.setattr(gripper_task, "TRIED_FOR_S", 0.0)
     async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
-        rig.model.put_between(40.0)
+        rig.model.object_mm = 40.0
         task = task_of(rig)
         assert await task.grip(GRIP) == ""
-        rig.model.block_at(40.0)
+        rig.model.widest_mm = 40.0
         assert "met something as they opened, and stopped at 40.1 mm" in await task.release()
-        rig.model.block_at(139.0)
+        rig.model.widest_mm = 139.0
         assert await task.release() == "", "their own stop"
 
 
 @WAYS
 async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way, tmp_path):
     async with a_rig(way, tmp_path, connected=True) as rig, asyncio.timeout(DEADLINE_S):
-        rig.model.put_between(40.0)
+        rig.model.object_mm = 40.0
         task = task_of(rig)
         assert await task.grip(GRIP) == ""
         held_mm = rig.model.width_mm
@@ -163,7 +163,7 @@ async def test_unlock_handles_a_fault_newer_than_the_state(way, tmp_path):
 
 async def test_held_tool_has_a_diameter_while_states_are_new(tmp_path):
     async with a_rig("socket", tmp_path) as rig, asyncio.timeout(DEADLINE_S):
-        rig.model.put_between(40.0)
+        rig.model.object_mm = 40.0
         task = task_of(rig)
         assert task.held_tool(0) is None, "nothing was read yet"
         await rig.driver.connect()

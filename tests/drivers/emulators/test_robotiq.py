@@ -67,7 +67,7 @@ def test_fingers_move_at_the_commanded_speed(speed, mm_s):
 @given(st.floats(1, 139), st.integers(0, 255), st.floats(0.001, 0.2))
 def test_fingers_never_pass_through_an_object(width, force, dt_s):
     gripper = active_gripper()
-    gripper.put_between(width)
+    gripper.object_mm = width
     go(gripper, 255, force=force)
     for _ in range(int(2.0 / dt_s) + 2):
         gripper.step(dt_s)
@@ -113,7 +113,7 @@ def test_frames_are_the_manuals_byte_for_byte():
     gripper = active_gripper()
     face = ModbusSlave(gripper)
     assert face.feed(bytes.fromhex("0910 03E8 0003 06 0900 00FF FFFF 4229")) == framed(bytes.fromhex("0910 03E8 0003"))
-    gripper.put_between(gripper.mechanics.width_mm(189))
+    gripper.object_mm = gripper.mechanics.width_mm(189)
     steps(gripper, 1.0)
     reply = face.feed(framed(READ_STATUS))
     assert reply[:7] == bytes.fromhex("0903 06 B900 00FF")

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from shearloop.drivers.emulators.gripper import Gripper, GripperRegisters
-from shearloop.drivers.emulators.scene import Joint, Scene, Truth, TwinSettings
+from shearloop.drivers.emulators.scene import Scene, Truth, TwinSettings
 
 DT_S = 0.002
 # A gel that does not creep, so that every torque can be said in advance.
@@ -115,17 +115,7 @@ def test_a_slip_leaves_so_much_torque_and_the_grip_holds_again(sign):
 
 def test_a_tool_that_falls_takes_the_torque_with_it():
     hands, _ = twisted(0.1, 0.1)
-    hands.gripper.put_between(None)
+    hands.gripper.object_mm = None
     truth = hands.wait(1.0)
     assert (truth.gripped, truth.torque_nm, truth.diameter_mm) == (False, 0.0, None)
     assert truth.width_mm == pytest.approx(0.0)
-
-
-def test_another_screw_is_one_that_nobody_has_turned():
-    hands, _ = twisted(0.1, 0.1)
-    hands.scene.put_on(Joint.SEIZED)
-    assert hands.wait(DT_S).torque_nm == pytest.approx(0.0, abs=1e-12)
-    truth = hands.twist(0.6, 1.0)
-    assert truth.joint == "seized"
-    assert truth.torque_nm == pytest.approx(0.06, abs=1e-3), "it broke loose at 0.18 N·m and turns at 0.06"
-    assert truth.tool_angle_rad > 0.3

@@ -4,7 +4,6 @@ import pytest
 
 from shearloop.drivers.emulators.ur_controller import Controller
 from shearloop.drivers.emulators.ur_robot import Robot
-from shearloop.drivers.emulators.ur_rtde import ConnectionFaults
 
 
 def test_faults_are_carried_out_and_ended():
@@ -15,11 +14,11 @@ def test_faults_are_carried_out_and_ended():
         "emergency-stop", "version 5.0.0.0", "payload 2.5",
     ):  # fmt: skip
         controller.command(line)
-    assert controller.faults == ConnectionFaults(True, True, True, True)
+    assert controller.faults == {"registers-in-use", "local-control", "refuse-protocol", "mute-dashboard"}
     assert (robot.spec.payload_kg, robot.spec.version) == (2.5, (5, 0, 0, 0))
     assert robot.safety.safety_mode == 7
     controller.command("normal")
-    assert (controller.faults, robot.safety.safety_mode) == (ConnectionFaults(), 1)
+    assert (controller.faults, robot.safety.safety_mode) == (set(), 1)
 
 
 @pytest.mark.parametrize(

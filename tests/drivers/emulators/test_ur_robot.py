@@ -177,14 +177,6 @@ def test_asynchronous_move_is_stopped_on_command():
     assert robot.arm.pose[2] > z_m - 0.1
 
 
-def test_two_threads_may_not_move_the_arm():
-    robot = turning(0.1)
-    send(robot, MOVE_L, *down(robot), asynchronous=True)
-    wait(robot, 0.1)
-    assert not robot.program_running
-    assert "another thread" in robot._events[-1].detail or "another thread" in robot._events[-2].detail
-
-
 def test_after_speed_stop_a_move_is_possible():
     robot = turning(0.3)
     assert do(robot, SPEED_STOP, 2.0) == pytest.approx(0.2, abs=0.01)
@@ -266,14 +258,6 @@ def test_fast_arm_motion_keeps_the_controllers_time():
     assert slow.arm.q_rad[5] == pytest.approx(0.1 * 0.5 - lost_rad, abs=0.1 * 2 * DT_S)
     assert fast.arm.q_rad[5] == pytest.approx(0.1 * 10.0 - lost_rad, abs=0.1 * 40 * DT_S)
     assert fast.program_running
-
-
-def test_command_with_an_unknown_function_ends_the_program():
-    robot = started()
-    send(robot, MOVE_J, *[0.0] * 8)
-    wait(robot, DT_S)
-    assert not robot.program_running
-    assert "movej" in robot._events[-1].detail
 
 
 def test_text_that_is_no_program_is_refused():

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from shearloop.drivers.emulators import ur_controller
 from shearloop.drivers.emulators.ur_robot import Robot
 from shearloop.drivers.emulators.ur_rtde import (
-    ConnectionFaults,
     RtdeSession,
     pack,
     package,
@@ -33,7 +32,7 @@ CONVERSATION = (
 
 
 def session() -> RtdeSession:
-    return RtdeSession(Robot(), 500.0, ConnectionFaults())
+    return RtdeSession(Robot(), 500.0, set())
 
 
 def replies(data: bytes) -> list[tuple[int, bytes]]:
@@ -89,7 +88,7 @@ def test_data_comes_at_the_rate_asked_for_and_not_before_the_start():
 
 
 def test_registers_in_use_and_unknown_variables_are_refused_by_name():
-    rtde = RtdeSession(Robot(), 500.0, ConnectionFaults(registers_in_use=True))
+    rtde = RtdeSession(Robot(), 500.0, {"registers-in-use"})
     ((_, answer),) = replies(rtde.receive(package(ord("I"), COMMAND)))
     assert answer == b"\x00IN_USE,IN_USE"
     ((_, answer),) = replies(rtde.receive(package(ord("O"), struct.pack(">d", 125.0) + b"timestamp,ft_raw_wrench")))

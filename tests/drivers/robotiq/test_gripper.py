@@ -32,7 +32,7 @@ async def test_gripper_activates_moves_and_measures_an_object(way, tmp_path):
         assert state.diameter_mm is None
         assert abs(state.width_mm - 60.0) <= abs(CALIBRATION.mm_per_count) / 2 + 1e-9
 
-        rig.model.put_between(31.7)
+        rig.model.object_mm = 31.7
         state = await driver.finish(await driver.move(messages.GripperCommand(0.0, force_n=40.0)))
         assert state.object is messages.ObjectStatus.CONTACT_CLOSING
         assert state.diameter_mm == pytest.approx(31.7, abs=abs(CALIBRATION.mm_per_count) / 2 + 1e-9)
@@ -40,7 +40,7 @@ async def test_gripper_activates_moves_and_measures_an_object(way, tmp_path):
         assert state.current_ma > 0
         assert rig.model.grip_force_n == pytest.approx(40.0, abs=0.5)
         # Without the object the fingers go on to their target: what they held is no longer claimed.
-        rig.model.put_between(None)
+        rig.model.object_mm = None
         closed = asyncio.Event()
         while not closed.is_set():
             state = await driver.read()
@@ -53,7 +53,7 @@ async def test_gripper_activates_moves_and_measures_an_object(way, tmp_path):
 @WAYS
 async def test_old_contact_is_ignored_until_the_command_is_taken_up(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig:
-        rig.model.put_between(20.0)
+        rig.model.object_mm = 20.0
         await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
         rig.stopped = True
         sent = await rig.driver.move(messages.GripperCommand(100.0))
@@ -147,7 +147,7 @@ async def test_overheating_passes_without_activation(way, tmp_path):
 @WAYS
 async def test_activating_an_active_gripper_moves_nothing(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig:
-        rig.model.put_between(25.0)
+        rig.model.object_mm = 25.0
         held = await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
         again = await rig.driver.activate()
         assert again.position_counts == held.position_counts
@@ -179,7 +179,7 @@ async def test_command_of_another_master_is_seen_at_the_next_poll(way, tmp_path,
     async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
         await anext(states)
         await rig.driver.activate()
-        rig.model.put_between(20.0)
+        rig.model.object_mm = 20.0
         await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
         rig.stopped = True
         while (await anext(states)).object is not messages.ObjectStatus.CONTACT_CLOSING:

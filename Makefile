@@ -38,13 +38,13 @@ system-packages:
 demo: $(VENV)/.installed
 	$(BIN)/shearloop demo --folder . $(if $(RECORDING),--recording '$(RECORDING)')
 
-# Test files run in parallel, the longest first (tests/conftest.py). Tests that drive a robot run afterwards with less
-# load, because a robot stops when its computer is busy; they may be repeated twice, and the summary names them. Status 5:
+# Test files run in parallel, the longest first (tests/conftest.py). Tests that drive a robot run afterwards, by themselves,
+# because a robot stops when its computer is busy; they may be repeated twice, and the summary names them. Status 5:
 # no test was selected.
 PYTEST := $(BIN)/pytest
 test: install-dev
 	$(PYTEST) -n 3 --dist loadfile --no-loadscope-reorder -m 'not real_time' $(PYTEST_ARGS) || [ $$? -eq 5 ]
-	$(PYTEST) -n 2 --dist loadfile --no-loadscope-reorder -m real_time --reruns 2 --reruns-delay 2 -rR $(PYTEST_ARGS) || [ $$? -eq 5 ]
+	$(PYTEST) -n 3 --dist loadfile --no-loadscope-reorder -m real_time --reruns 2 --reruns-delay 2 -rR $(PYTEST_ARGS) || [ $$? -eq 5 ]
 
 # What depends most on the versions of Python and of the libraries; nothing in real time.
 FAST := tests/test_package.py $(addprefix tests/bank/test_,bank_file.py forward.py matching.py models.py) \

@@ -27,7 +27,7 @@ CLOSE_S = 1.0
 class NonBlockingWriter:
     """Writes text in a thread of its own, because a terminal stopped with Ctrl-S blocks its writers.
 
-    After a broken pipe (`| head`) it stays silent.
+    A line says where texts were dropped. After a broken pipe (`| head`) it stays silent.
     """
 
     def __init__(self, stream: TextIO, most_waiting: int = MOST_WAITING) -> None:
@@ -36,14 +36,17 @@ class NonBlockingWriter:
             stream.reconfigure(errors="backslashreplace")
         self._stream = stream
         self._waiting: queue.Queue[str | None] = queue.Queue(most_waiting)
+        self._dropped = False
         # A daemon thread: a blocked write must not keep the process alive.
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
         self._thread.start()
 
     def write(self, text: str) -> int:
         """Queue a text; return its length, as a stream does."""
-        with contextlib.suppress(queue.Full):
+        try:
             self._waiting.put_nowait(text)
+        except queue.Full:
+            self._dropped = True
         return len(text)
 
     def flush(self) -> None:
@@ -57,10 +60,15 @@ class NonBlockingWriter:
         self._thread.join(max(0.0, until_s - time.monotonic()))
 
     def _run(self) -> None:
-        while (text := self._waiting.get()) is not None:
+        text: str | None = ""
+        while text is not None:
+            text = self._waiting.get()
             try:
-                self._stream.write(text)
+                self._stream.write(text or "")
                 if self._waiting.empty():
+                    if self._dropped:
+                        self._dropped = False
+                        self._stream.write("… texts are missing above: the terminal did not read them\n")
                     self._stream.flush()
             except OSError as error:
                 silence(self._stream)

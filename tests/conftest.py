@@ -34,14 +34,13 @@ hypothesis.settings.load_profile("shearloop")
 
 # Files of more than some five seconds, the longest first (`make test PYTEST_ARGS=--durations=60` shows them).
 LONGEST = (
-    *("test_under_systemd.py", "test_shared_recordings.py", "test_page_controls.py", "test_run.py", "test_docs.py"),
-    *("test_speed_accuracy_chart.py", "test_cli_reproduce.py", "test_executors.py", "test_page.py"),
-    *("test_finite_strain.py", "test_plane_strain.py", "test_copies.py"),
-    *("test_skin.py", "test_cli_recordings.py", "test_other_fingertips.py", "test_skin_run.py", "test_design.py"),
-    *("test_pruned_matching.py", "test_runner_any_order.py", "test_tracker.py", "test_flood.py", "test_filling.py"),
-    *("test_bank_design.py", "test_replay.py", "test_emulate.py", "test_adapt.py", "test_load_delay.py"),
-    *("test_cylinders.py", "test_calibrate.py", "test_with_keys.py", "test_fuzz.py", "test_stability_chart.py"),
-    *("test_closed_loop.py", "test_client.py", "test_soak.py", "test_gripper_link.py", "test_stop_times.py"),
+    *("test_page.py", "test_page_controls.py", "test_under_systemd.py", "test_run.py", "test_runner_any_order.py"),
+    *("test_replay.py", "test_other_fingertips.py", "test_finite_strain.py", "test_cli_reproduce.py", "test_flood.py"),
+    *("test_fingertip.py", "test_design.py", "test_shared_recordings.py", "test_docs.py", "test_executors.py"),
+    *("test_with_keys.py", "test_memory.py", "test_emulate.py", "test_bank_design.py"),
+    *("test_cylinders.py", "test_calibrate.py", "test_speed_accuracy_chart.py", "test_step_response.py"),
+    *("test_plane_strain.py", "test_recorder.py", "test_fuzz.py", "test_physics.py", "test_skin_loop_chart.py"),
+    *("test_newcomer.py", "test_closed_loop.py", "test_client.py", "test_soak.py", "test_stop_times.py"),
 )
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 

@@ -43,7 +43,7 @@ class Terminal(io.StringIO):
         return super().write(text)
 
 
-def test_a_stopped_terminal_blocks_nobody():
+def test_a_stopped_terminal_blocks_nobody_and_says_that_texts_are_missing():
     terminal = Terminal()
     outlet = NonBlockingWriter(terminal, most_waiting=5)
     outlet.write("0\n")
@@ -55,7 +55,9 @@ def test_a_stopped_terminal_blocks_nobody():
     terminal.may.release(100)
     outlet.close(10)
     assert not outlet._thread.is_alive()
-    assert terminal.getvalue().split() == list("012345")
+    *shown, note = terminal.getvalue().splitlines()
+    assert shown == list("012345")
+    assert note == "… texts are missing above: the terminal did not read them"
 
 
 def test_what_nobody_reads_any_longer_kills_nobody():

@@ -353,13 +353,6 @@ def test_within_the_band_the_force_stays_where_it_was_known_and_the_band_holds_t
     assert low_n == pytest.approx(0.8 - 2 * HOLD_N - 0.07, abs=0.02)
 
 
-def test_below_friction_nothing_is_told_from_nothing():
-    for direction, shear_n, low_n, high_n in followed([0.0] * 20 + ramp(0.0, 0.035, 0.05) + [0.035] * 20):
-        assert direction is Direction.UNKNOWN
-        assert abs(shear_n) < 0.01
-        assert low_n < 0.035 < high_n
-
-
 def test_after_a_gap_the_direction_is_found_anew():
     finder = DirectionFinder(NOISE)
     for number in range(20):

@@ -1,5 +1,6 @@
 """The shear skin's task: builds instruments and estimator, publishes the shear force, takes the zero, replays."""
 
+import asyncio
 import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,7 +17,6 @@ from shearloop.daemon.logs import LinkLog
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
-from shearloop.daemon.taring import Waiters
 from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.drivers.shear_skin.instruments import (
@@ -86,7 +86,7 @@ class SkinTask:
         self._inputs = inputs.get(SKIN)
         self._radius_m = _radius_m(config)
         self._zero_timeout_s = max(ZERO_TIMEOUT_S, 2.0 * config.zero_samples / config.daq.rate_hz)
-        self._zero_waiters = Waiters()
+        self._sampled = asyncio.Event()
         self._reason = ""
         self._valid = 0
 
@@ -96,10 +96,8 @@ class SkinTask:
             async for sample in samples:
                 reading = self._estimator.update(sample)
                 self._publish(sample, reading)
-                if self._estimator.refused:
-                    self._zero_waiters.notify(f"the skin's zero was refused: {self._estimator.refused}")
-                elif self._estimator.zero is not None:
-                    self._zero_waiters.notify("")
+                self._sampled.set()
+                self._sampled.clear()
 
     def tare(self) -> None:
         """Take a new zero from samples measured from now on."""
@@ -113,11 +111,13 @@ class SkinTask:
         self.tare()
         within_s = min(self._zero_timeout_s, within_s)
         try:
-            # Earlier waiters get this zero too.
-            return await self._zero_waiters.wait(within_s)
+            async with asyncio.timeout(within_s):
+                while self._estimator.zero is None and not self._estimator.refused:
+                    await self._sampled.wait()
         except TimeoutError:
             reason = self._reason or "nothing came"
             return f"the skin's zero could not be taken within {within_s:.3g} s: {reason}"
+        return f"the skin's zero was refused: {self._estimator.refused}" if self._estimator.refused else ""
 
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the values of voltages, zero and force for `health`."""

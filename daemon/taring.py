@@ -1,4 +1,4 @@
-"""Zeros of the torque sensors: what every sensor offers, and tasks that wait for the same zero."""
+"""Zeros of the torque sensors: what every sensor offers."""
 
 import asyncio
 from collections.abc import Iterable
@@ -29,30 +29,3 @@ class Adaptable(Protocol):
 async def tare_all(sensors: Iterable[Tareable], within_s: float = LONGEST_TARE_S) -> str:
     """Zero every sensor at the same time; return the reasons of failures, or an empty text."""
     return " ".join(filter(None, await asyncio.gather(*(sensor.tare_and_wait(within_s) for sensor in sensors))))
-
-
-class Waiters:
-    """Any number of waiting tasks; all receive the same text."""
-
-    def __init__(self) -> None:
-        self._futures: list[asyncio.Future[str]] = []
-
-    def __bool__(self) -> bool:
-        """Whether any task waits."""
-        return bool(self._futures)
-
-    async def wait(self, timeout_s: float | None) -> str:
-        """Return the text of the next `notify`; raises TimeoutError."""
-        future: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        self._futures.append(future)
-        try:
-            async with asyncio.timeout(timeout_s):
-                return await future
-        finally:
-            self._futures.remove(future)
-
-    def notify(self, text: str) -> None:
-        """Pass a text to all present waiters."""
-        for future in self._futures:
-            if not future.done():
-                future.set_result(text)

@@ -63,12 +63,12 @@ def build_bank(
     *,
     jobs: int = 1,
     elsewhere: Iterator[tuple[int, BankRow]] | None = None,
-    on_row: Callable[[int, int], None] = lambda *_: None,
+    on_row: Callable[[int], None] = lambda _: None,
 ) -> None:
     """Build a bank file on the mesh of its definition.
 
-    Rows are solved in `jobs` threads, or come from `elsewhere` in any order, with the same bytes. `on_row(done, total)`
-    is called after each. An existing bank is replaced only by a finished one. Raises GeometryError, ModelError where no
+    Rows are solved in `jobs` threads, or come from `elsewhere` in any order, with the same bytes. `on_row(done)` is
+    called after each. An existing bank is replaced only by a finished one. Raises GeometryError, ModelError where no
     cell is valid, and BankFileError where the bank cannot be written.
     """
     if path.is_dir():
@@ -79,9 +79,9 @@ def build_bank(
         raise BankFileError(f"{path}: there is no folder {path.parent}; make it or choose another --out")
     solver, total = RowSolver(mesh, definition), len(definition.k_grid)
     found: dict[int, BankRow] = {}
-    for row, cells in _solve(solver, total, jobs) if elsewhere is None else elsewhere:
+    for row, cells in elsewhere or _solve(solver, total, jobs):
         found[row] = cells
-        on_row(len(found), total)
+        on_row(len(found))
     rows = [found[row] for row in range(total)]
     if not any(cells.valid.any() for cells in rows):
         highest = max(float(cells.min_conductivity.max()) for cells in rows)

@@ -20,6 +20,8 @@ from shearloop.bank.eit.channels import PAPER_TABLE, STIMULATION_CURRENT, Channe
 from shearloop.bank.eit.mesh import Mesh, Terms, rows_of_edges
 from shearloop.bank.errors import ConductivityError, GeometryError
 
+# Symmetric positive definite matrices need no pivoting.
+_LITTLE_FILL: Any = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 # The node of zero potential; only differences of potentials leave this module.
 _GROUND = 0
 # The largest sum of a row as a share of its diagonal: rounding in differences of voltages is of that size, and the
@@ -32,19 +34,7 @@ class CompleteElectrodeModel:
 
     def __init__(self, mesh: Mesh) -> None:
         """Assemble the parts that do not depend on conductivity."""
-        self.mesh = mesh
-        terms, place = _terms(mesh)
-        n, n_triangles = len(mesh.nodes) + mesh.n_electrodes, len(mesh.triangles)
-        terms = terms.moved(place)
-        terms = terms.where((terms.rows >= 0) & (terms.columns >= 0))
-        keys, entry = np.unique(terms.columns * n + terms.rows, return_inverse=True)
-        # Entry p of the grounded matrix, in compressed columns, is Σ_t shares[p, t] · (s, 1)_t.
-        entries: Any = terms.values, (entry, terms.source)
-        self._shares = sp.csr_array(entries, shape=(len(keys), n_triangles + 1), dtype=np.float64)
-        column, row = np.divmod(keys, n)
-        self._indices = row.astype(np.int32)
-        self._indptr = np.searchsorted(column, np.arange(n)).astype(np.int32)
-        self._shape = (n - 1, n - 1)
+        self.mesh, self._terms = mesh, assemble(mesh)
 
     def electrode_potentials(self, conductivity: FloatArray, currents: FloatArray) -> FloatArray:
         """Return the (L, R) potentials of the electrodes for (T,) conductivities and (L, R) currents into them.
@@ -53,23 +43,14 @@ class CompleteElectrodeModel:
         the matrix would be indefinite, its solution finite and meaningless.
         """
         require_positive(conductivity, len(self.mesh.triangles))
-        matrix = sp.csc_array(
-            (self._shares @ np.append(conductivity, 1.0), self._indices, self._indptr), shape=self._shape
-        )
-        # Symmetric positive definite: no pivoting, so the order is kept and the electrodes come last. Narrow panels
-        # suit the few entries of a plane mesh.
-        factors = splu(
-            matrix,
-            permc_spec="NATURAL",
-            diag_pivot_thresh=0.0,
-            relax=1,
-            panel_size=1,
-            options={"SymmetricMode": True, "Equil": False},
-        )
-        # Currents enter at the electrodes only, so their own system, the Schur complement, is enough.
-        last = slice(-self.mesh.n_electrodes, None)
-        schur = factors.L[last, last] @ factors.U[last, last]
-        return np.asarray(np.linalg.solve(schur.toarray(), currents), dtype=np.float64)
+        terms, n_electrodes = self._terms, self.mesh.n_electrodes
+        n = len(self.mesh.nodes) + n_electrodes
+        entries: Any = terms.values * np.append(conductivity, 1.0)[terms.source], (terms.rows, terms.columns)
+        free = np.delete(np.arange(n), _GROUND)
+        right = np.zeros((n, currents.shape[1]))
+        right[-n_electrodes:] = currents
+        factors = splu(sp.csc_array(entries, shape=(n, n))[free][:, free], **_LITTLE_FILL)
+        return np.asarray(factors.solve(right[free])[-n_electrodes:])
 
 
 class ForwardModel:
@@ -131,7 +112,8 @@ class BatchForwardModel:
 
         self.mesh = mesh
         self.direct = ForwardModel(mesh, table)
-        terms, place = _terms(mesh)
+        terms = assemble(mesh)
+        place = elimination_order(mesh, terms)
         # The node that the direct solve grounds is the last one here.
         n_nodes = len(mesh.nodes)
         place[n_nodes:] += 1
@@ -193,8 +175,8 @@ def _load(v, w):  # type: ignore[no-untyped-def]  # as above
     return v / w.z
 
 
-def assemble(mesh: Mesh) -> tuple[Terms, Terms]:
-    """Return the terms ∫∇u·∇v of every triangle, and the contacts' terms, with the electrodes after the nodes."""
+def assemble(mesh: Mesh) -> Terms:
+    """Return the terms ∫∇u·∇v of every triangle, then the contacts' terms, with the electrodes after the nodes."""
     domain = MeshTri(mesh.nodes.T.copy(), mesh.triangles.T.copy())
     inside = _stiffness.coo_data(Basis(domain, ElementTriP1(), intorder=0))
     n_triangles = len(mesh.triangles)
@@ -216,31 +198,25 @@ def assemble(mesh: Mesh) -> tuple[Terms, Terms]:
         np.full(len(mass.data) + 3 * len(load.data), n_triangles),
     )
     # The third node of the triangle behind an edge has a function that vanishes on the edge.
-    return stiffness, contact.where(np.abs(contact.values) > 1e-12 * np.abs(contact.values).max())
+    contact = contact.where(np.abs(contact.values) > 1e-12 * np.abs(contact.values).max())
+    terms: Any = (np.concatenate(pair) for pair in zip(stiffness, contact, strict=True))
+    return Terms(*terms)
 
 
-def elimination_order(mesh: Mesh, stiffness: Terms) -> IntArray:
+def elimination_order(mesh: Mesh, terms: Terms) -> IntArray:
     """Return each unknown's place: −1 for the grounded node, then nodes in an order of little fill, then electrodes.
 
     Minimum degree breaks its ties by the order that it starts from: the one of three with the least fill is taken.
     """
-    n = len(mesh.nodes)
-    laplacian = sp.csc_array((stiffness.values, (stiffness.rows, stiffness.columns)), shape=(n, n))
+    n, inside = len(mesh.nodes), terms.where(terms.source < len(mesh.triangles))
+    laplacian = sp.csc_array((inside.values, (inside.rows, inside.columns)), shape=(n, n))
     free = np.delete(np.arange(n), _GROUND)
     grounded = sp.csc_array(laplacian[free][:, free])
     narrow = reverse_cuthill_mckee(grounded.tocsr(), symmetric_mode=True)
-    options: Any = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
     starts = np.arange(n - 1), narrow, narrow[::-1]
-    orderings = [splu(grounded[start][:, start], **options) for start in starts]
+    orderings = [splu(grounded[start][:, start], **_LITTLE_FILL) for start in starts]
     best = int(np.argmin([each.L.nnz for each in orderings]))
     place = np.full(n + mesh.n_electrodes, -1, dtype=np.int64)
     place[free[starts[best]]] = orderings[best].perm_c
     place[n:] = n - 1 + np.arange(mesh.n_electrodes)
     return place
-
-
-def _terms(mesh: Mesh) -> tuple[Terms, IntArray]:
-    """Return all terms of a mesh, and each unknown's place."""
-    stiffness, contact = assemble(mesh)
-    terms: Any = (np.concatenate(pair) for pair in zip(stiffness, contact, strict=True))
-    return Terms(*terms), elimination_order(mesh, stiffness)

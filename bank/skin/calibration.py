@@ -37,9 +37,6 @@ from shearloop.bank.skin.membrane import (
 from shearloop.yaml_files import read_yaml, save_yaml, validated
 
 FORMAT = "shearloop skin calibration 3"
-COLUMNS = ("r1_ohm", "r2_ohm", "shear_n", "normal_n")
-# A load cell at rest may read slightly negative; a skin cannot be pulled off its core.
-MAX_PULL_N = 0.05
 # The paper's response is straight up to here and rises faster beyond.
 LINEAR_TO_N = 1.2
 UNLOADED_BELOW_N = 0.02
@@ -180,40 +177,29 @@ class SkinCalibration(BaseModel):
         return Belt(self.friction, math.radians(self.gauge_angle_deg))
 
 
+class _Row(BaseModel):
+    """A row of a recorded table."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    r1_ohm: float = Field(gt=0)
+    r2_ohm: float = Field(gt=0)
+    shear_n: float
+    # A load cell at rest may read slightly negative; a skin cannot be pulled off its core.
+    normal_n: float = Field(ge=-0.05)
+
+
 def read_table(path: Path) -> CalibrationTable:
     """Return the rows of a CSV file with these columns; raises CalibrationError with the line and column at fault."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            if sorted(reader.fieldnames or ()) != sorted(COLUMNS):
-                raise CalibrationError(
-                    f"{path}: the first line is {','.join(reader.fieldnames or ())!r}; "
-                    f"the columns must be {', '.join(COLUMNS)}."
-                )
-            rows = [_numbers(path, reader.line_num, row) for row in reader]
+            reader = csv.DictReader(file, restkey="a value without a column")
+            rows = [validated(row, _Row, f"{path}, line {reader.line_num}", CalibrationError) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise CalibrationError(f"{path}: the table cannot be read: {error}.") from error
     if not rows:
-        raise CalibrationError(f"{path}: the table has no rows.")
-    return CalibrationTable(*np.array(rows).T)
-
-
-def _numbers(path: Path, line: int, row: dict[str | None, str]) -> list[float]:
-    if None in row:
-        raise CalibrationError(f"{path}, line {line}: there are more values than columns.")
-    numbers = []
-    for column in COLUMNS:
-        try:
-            numbers.append(float(row[column] or ""))
-        except ValueError:
-            numbers.append(math.nan)
-        if not math.isfinite(numbers[-1]) or (column.endswith("_ohm") and numbers[-1] <= 0):
-            raise CalibrationError(f"{path}, line {line}: {column} is {row[column]!r}, not a usable number.")
-    if numbers[-1] < -MAX_PULL_N:
-        raise CalibrationError(
-            f"{path}, line {line}: normal_n is {row['normal_n']}; a force that presses on the skin is positive."
-        )
-    return numbers
+        raise CalibrationError(f"{path}: the table has no rows; its columns are {', '.join(_Row.model_fields)}.")
+    return CalibrationTable(*np.array([list(row.model_dump().values()) for row in rows]).T)
 
 
 def save_calibration(calibration: SkinCalibration, path: Path) -> None:

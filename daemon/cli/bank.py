@@ -72,7 +72,7 @@ def _build(args: argparse.Namespace) -> int:
             args.out,
             jobs=jobs,
             elsewhere=None if args.cluster is None else pool.map(solve_row, plan, range(rows)),
-            on_row=lambda done, _: show(done),
+            on_row=show,
         )
     result = _result(args.out, Bank.open(args.out))
     line = f"{args.out}: {result['valid_cells']} of {result['cells']} cells valid, identity {result['identity'][:12]}"

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Self
 
 import numpy as np
-import structlog
 
 from shearloop.daemon.errors import UserError
 
@@ -46,7 +45,7 @@ def check_emulators(emulators: "tuple[EmulatorConfig, ...]", config: Path) -> li
 class EmulatedDevices:
     """Runs each device in a process, as a context that begins once all are ready, and takes the daemon's messages.
 
-    At each `loop.state` it sends the events that are due, and at each `health` it reports devices that have ended.
+    At each `loop.state` it sends the events that are due.
     """
 
     def __init__(self, emulators: "tuple[EmulatorConfig, ...]", folder: Path, recording: Path | None = None) -> None:
@@ -55,7 +54,6 @@ class EmulatedDevices:
         self._emulators = emulators
         self._folder = folder
         self._recording = recording
-        self._alive: list[tuple[str, subprocess.Popen[bytes]]] = []
         self._waiting: list[tuple[EventConfig, subprocess.Popen[bytes]]] = []
         self._since_ns: dict[int, int] = {}
         self._truth: Path | None = None
@@ -80,7 +78,6 @@ class EmulatedDevices:
                 ready.append(threading.Event())
                 readers.append(threading.Thread(target=_read_lines, args=(process.stdout, ready[-1]), daemon=True))
                 readers[-1].start()
-                self._alive.append((emulator.device, process))
                 self._waiting += [(event, process) for event in emulator.events]
             until_s = time.monotonic() + READY_S
             for one in ready:
@@ -94,9 +91,7 @@ class EmulatedDevices:
 
     def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
         """Take one of the daemon's messages."""
-        if topic == "health":
-            self._report_ended()
-        elif topic == "loop.state" and content["phase"] == "running" and content["hold"]:
+        if topic == "loop.state" and content["phase"] == "running" and content["hold"]:
             self._send_events(content["t_mono_ns"], content["step"])
 
     def torques(self) -> "TorqueSeries | None":
@@ -124,18 +119,12 @@ class EmulatedDevices:
         for entry in [entry for entry in self._waiting if entry[0].step == step and held_s >= entry[0].held_for_s]:
             self._waiting.remove(entry)
             event, process = entry
-            # A dead process is reported at the next `health`.
+            # A process that has died has said why.
             with contextlib.suppress(BrokenPipeError):
                 if process.stdin is not None and process.poll() is None:
                     process.stdin.write(f"{event.command}\n".encode())
                     process.stdin.flush()
                     self.sent.append((time.monotonic_ns(), event.command))
-
-    def _report_ended(self) -> None:
-        for entry in [entry for entry in self._alive if entry[1].poll() is not None]:
-            self._alive.remove(entry)
-            sentence = "an emulated device has ended: restart the daemon to emulate it again"
-            structlog.get_logger().error(sentence, device=entry[0], status=entry[1].returncode)
 
 
 def _read_lines(output: IO[bytes], ready: threading.Event) -> None:

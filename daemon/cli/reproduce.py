@@ -64,7 +64,7 @@ def _reproduce(args: argparse.Namespace, jobs: int) -> "tuple[Reproduction, dict
 
     def build(name: str, grid: "Grid") -> "Bank":
         with progress_bar(name, grid.k.size, "row") as show:
-            return cached_bank(name, grid, mesh, args.out / "banks", jobs, lambda done, _: show(done))
+            return cached_bank(name, grid, mesh, args.out / "banks", jobs, show)
 
     with fft.set_workers(jobs):
         banks = {"wide": build("wide", GRIDS["wide"])}

@@ -111,16 +111,6 @@ class ControllerReason(StrEnum):
     SPEED = "the wrist turns at its speed limit"
 
 
-class ControllerRefusal(StrEnum):
-    """Why a measurement was rejected."""
-
-    NOT_A_NUMBER = "not a number"
-    OUT_OF_ORDER = "not later than the one before it"
-    FROM_THE_FUTURE = "stamped in the future"
-    LATE = "too old when it arrived"
-    NO_ANGLE = "from a time at which the wrist angle is not known"
-
-
 @dataclass(frozen=True, slots=True)
 class WristCommand:
     """The wrist speed for now, and all reasons for a difference from the set point."""
@@ -233,33 +223,28 @@ class TorqueFilter:
         """Take the present offset as the reference: a grip that slipped may slip as far again before the next hold."""
         self._reference_nm, self.lost = self.offset_nm, False
 
-    def measure(
-        self, torque_nm: float | None, t_mid_ns: int, t_ns: int, *, integrates: bool = True
-    ) -> ControllerRefusal | None:
-        """Use a torque of the time t_mid_ns that arrived at t_ns; return why it was rejected, or None.
+    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int, *, integrates: bool = True) -> bool:
+        """Use a torque of the time t_mid_ns that arrived at t_ns; return whether it can be used.
 
-        The drift is learnt while the loop `integrates`.
+        It cannot if it is no number, not later than the one before, stamped in the future, too old, or from a time at
+        which the wrist angle is not known. The drift is learnt while the loop `integrates`.
         """
         own = self._settings
-        if torque_nm is None or not math.isfinite(torque_nm):
-            return ControllerRefusal.NOT_A_NUMBER
-        if t_mid_ns > t_ns:
-            return ControllerRefusal.FROM_THE_FUTURE
-        if t_mid_ns <= self._t_mid_ns:
-            return ControllerRefusal.OUT_OF_ORDER
+        if torque_nm is None or not math.isfinite(torque_nm) or not self._t_mid_ns < t_mid_ns <= t_ns:
+            return False
         if t_ns - t_mid_ns > own.age_limit_s * 1e9:
-            return ControllerRefusal.LATE
+            return False
         middle_ns, half_ns = t_mid_ns - int(own.lag_s * 1e9), int(own.window_s * 0.5e9)
         angle = self.angles.mean(middle_ns - half_ns, middle_ns + half_ns)
         if angle is None:
-            return ControllerRefusal.NO_ANGLE
+            return False
         missed = min(round((t_mid_ns - self._t_mid_ns) * 1e-9 / own.sample_period_s) - 1, _MOST_MISSED)
         if self.fresh_ns is not None and missed > 0:
             self.offset_nm += self.creep_nm * missed
         self._correct(torque_nm - self.expected_nm(angle), angle, integrates=integrates)
         self.lost |= abs(self.offset_nm - self._reference_nm) > own.offset_limit_nm
         self._t_mid_ns, self.fresh_ns = t_mid_ns, t_ns
-        return None
+        return True
 
     def _correct(self, innovation_nm: float, angle_rad: float, *, integrates: bool) -> None:
         """Correct the offset by an innovation at a mean angle: by its Kalman gain, or all of it after a jump."""
@@ -352,8 +337,8 @@ class TwistController:
         self.filter.restart()
         self._rest()
 
-    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> ControllerRefusal | None:
-        """Use a torque of the time t_mid_ns that arrived at t_ns; return why it was rejected, or None."""
+    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> bool:
+        """Use a torque of the time t_mid_ns that arrived at t_ns; return whether it can be used."""
         return self.filter.measure(torque_nm, t_mid_ns, t_ns, integrates=not self._clipped)
 
     def command(self, t_ns: int, wrist_angle_rad: float, torques: Iterable[TorqueSample] = ()) -> WristCommand:

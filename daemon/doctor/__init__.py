@@ -33,7 +33,6 @@ __all__ = ["Finding", "examine"]
 
 # An hour of recording takes some 80 MB.
 LOW_DISK_BYTES, NO_DISK_BYTES = 2e9, 2e8
-LOW_MEMORY_BYTES = 5e8
 # An earlier time means that the clock was never set.
 FIRST_SANE_UNIX_S = 1_704_067_200
 # adjtimex(2): the clock is not synchronised.
@@ -71,15 +70,8 @@ def examine(config_path: Path | None, seconds: float, geometry: Path | None = No
 
 
 def check_computer() -> Iterator[Finding]:
-    """Check clock, memory and the robot's library."""
+    """Check the clock and the robot's library."""
     yield check_clock(time.time(), clock_state())
-    meminfo = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
-    available = int(meminfo["MemAvailable"].split()[0]) * 1024
-    found = f"{available / 1e9:.1f} GB are available, {len(os.sched_getaffinity(0))} processors"
-    if available < LOW_MEMORY_BYTES:
-        yield note("memory", found, "the bank may be read from disk again and again", "close other programs")
-    else:
-        yield good("memory", found)
     version = ".".join(map(str, sys.version_info[:2]))
     if reason := missing_library():
         cause, _, cure = reason.partition(": ")

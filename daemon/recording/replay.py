@@ -207,11 +207,11 @@ class ReplayPipeline:
     async def _estimate(self, source: str, *frames: Frame) -> None:
         estimator, number = self._estimators[source], frames[0].seq
         if number in self._events.tares.get(source, ()):
-            estimator.tare()
+            estimator.session.tare()
         tools = self._events.tools.get(source, {})
         due = [first for first in tools if self._latest_frame.get(source, -1) < first <= number]
         if due:
-            estimator.set_tool(tools[max(due)])
+            estimator.session.set_tool(tools[max(due)])
         self._latest_frame[source] = number
         if known := self._events.adaptations.get(source, {}).get(number):
             self._adapt(source, frames, *known)
@@ -222,11 +222,11 @@ class ReplayPipeline:
 
     def _adapt(self, source: str, frames: tuple[Frame, ...], reference: str, torque_nm: FloatArray) -> None:
         estimator = self._estimators[source]
-        if len(estimator.grip_t_s) != len(torque_nm):
+        if len(estimator.session.grip_t_s) != len(torque_nm):
             reason = "the recording begins in the middle of the grip, so the correction of its gain is left out"
             structlog.get_logger().warning(reason, source=source, frame=frames[0].seq)
             return
-        self._publisher.publish(adapted_message(source, frames, reference, estimator.adapt(torque_nm)))
+        self._publisher.publish(adapted_message(source, frames, reference, estimator.session.adapt(torque_nm)))
 
 
 class ReplayClock(Clock):

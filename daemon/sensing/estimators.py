@@ -15,7 +15,7 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import Adaptation, Calibration, Estimate, EstimatorSession, Measured, TactileFrame
+from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, TactileFrame
 from shearloop.bank.estimation.bank_match import PaperMatcher
 from shearloop.bank.estimation.estimator import PaperEstimator
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor
@@ -43,7 +43,7 @@ _WARM_UP_SHARE = 2.0
 class FrameEstimator:
     """Estimates from the frames of one fingertip, or of several together, in order.
 
-    Around a session it adds the board's flags, and the bank match where a bank is configured.
+    Around its `session` it adds the board's flags, and the bank match where a bank is configured.
     """
 
     def __init__(self, calibration: Calibration, config: FingertipConfig) -> None:
@@ -56,7 +56,7 @@ class FrameEstimator:
         if not calibration.sides and self._matcher is not None:
             calibration.check_bank(bank)
             matcher = PaperMatcher(self._matcher)
-        self._session = EstimatorSession(
+        self.session = EstimatorSession(
             calibration,
             bank,
             matcher=matcher,
@@ -98,31 +98,6 @@ class FrameEstimator:
         """The k and the sigma of the bank's cells, None without a bank."""
         return (self._matcher.k_grid, self._matcher.sigma_grid) if self._matcher is not None else None
 
-    @property
-    def taring(self) -> bool:
-        """Whether frames are being averaged into the homogeneous frame."""
-        return self._session.taring
-
-    def tare(self) -> None:
-        """Average the next frames, of an untouched fingertip, into a new homogeneous frame."""
-        self._session.tare()
-
-    def set_tool(self, tool: Measured | None) -> None:
-        """Set the diameter of the held tool: on another one than the calibration's there is no torque."""
-        self._session.set_tool(tool)
-
-    @property
-    def grip_t_s(self) -> FloatArray:
-        """The times (n,) of this grip's frames with a torque, whose known torques `adapt` takes."""
-        return self._session.grip_t_s
-
-    def adapt(self, torque_nm: FloatArray) -> Adaptation:
-        """Correct the gain by torques (n,) at `grip_t_s`, NaN where unknown, until the next grip or tare.
-
-        Raises CalibrationError without a load that is large enough to show the gain.
-        """
-        return self._session.adapt(torque_nm)
-
     async def estimate(self, *frames: Frame) -> Estimate:
         """Return the estimate of frames of one time, one for each side.
 
@@ -137,11 +112,11 @@ class FrameEstimator:
             t_ns += frame.t_mid_ns
         tactile = TactileFrame(t_ns / len(frames) / 1e9, np.array(channels), np.array(usable))
         if self._matcher is None:
-            return self._session.estimate(tactile)
+            return self.session.estimate(tactile)
         return await asyncio.to_thread(self._estimate_with_bank, tactile)
 
     def _estimate_with_bank(self, frame: TactileFrame) -> Estimate:
-        estimate = self._session.estimate(frame)
+        estimate = self.session.estimate(frame)
         difference = self._first_difference()
         if not estimate.valid or estimate.k is not None or self._matcher is None or difference is None:
             return estimate
@@ -154,7 +129,7 @@ class FrameEstimator:
         return None if self._matcher is None or difference is None else self._matcher.heatmap(difference)
 
     def _first_difference(self) -> FloatArray | None:
-        difference = self._session.difference
+        difference = self.session.difference
         return difference[0] if difference is not None and difference[0].any() else None
 
 

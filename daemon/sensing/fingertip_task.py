@@ -144,12 +144,12 @@ class FingertipPipeline:
         number, now_ns = frames[0].seq, self._clock.now_ns()
         # A replay tares, takes the held tool, and corrects the gain before the same frame.
         if self._tare.is_due(min(frame.t_begin_ns for frame in frames)):
-            self.estimator.tare()
+            self.estimator.session.tare()
             self._record(InputKind.TARE, now_ns, str(number).encode())
         tool = self._gripper.held_tool(now_ns) if self._gripper is not None else None
         if tool != self._held:
             self._held = tool
-            self.estimator.set_tool(tool)
+            self.estimator.session.set_tool(tool)
             self._record(InputKind.TOOL, now_ns, tool_as_bytes(number, tool))
         if self._adapting is not None:
             reference, ended = self._adapting
@@ -165,7 +165,7 @@ class FingertipPipeline:
             self._diameters.update(self.name, estimate, now_ns)
         self._publisher.publish(message)
         self.count += 1
-        self._tare.add(message.reason, taring=self.estimator.taring)
+        self._tare.add(message.reason, taring=self.estimator.session.taring)
 
     def tare(self) -> None:
         """Take a new homogeneous frame from frames acquired entirely after now."""
@@ -199,9 +199,9 @@ class FingertipPipeline:
 
     def _adapt(self, reference: str, frames: tuple[Frame, ...], now_ns: int) -> str:
         times_ns, torques_nm = self._loop.inputs.history.get(reference, ([], [])) if self._loop else ([], [])
-        torque_nm = torque_at(self.estimator.grip_t_s, np.array(times_ns) / 1e9, np.array(torques_nm))
+        torque_nm = torque_at(self.estimator.session.grip_t_s, np.array(times_ns) / 1e9, np.array(torques_nm))
         try:
-            adaptation = self.estimator.adapt(torque_nm)
+            adaptation = self.estimator.session.adapt(torque_nm)
         except CalibrationError as error:
             return f"{self.name} against {reference}: {error}"
         self._record(InputKind.ADAPT, now_ns, torques_as_bytes(frames[0].seq, reference, torque_nm))

@@ -1,5 +1,6 @@
 """The load cell's task: reads it, publishes its torque, takes its zero."""
 
+import asyncio
 import contextlib
 from collections.abc import Mapping
 
@@ -10,7 +11,6 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.taring import Waiters
 from shearloop.drivers.load_cell import LoadCell, LoadSample
 
 LOAD_CELL = "load_cell"
@@ -43,7 +43,7 @@ class LoadCellTask:
         self._zeroing: list[float] | None = None
         self._zero_from_ns = self._zero_until_ns = 0
         self._zero_error = ""
-        self._zero_waiters = Waiters()
+        self._sampled = asyncio.Event()
         self._reason = ""
 
     async def run(self) -> None:
@@ -57,6 +57,8 @@ class LoadCellTask:
                 if self._loop is not None:
                     self._loop.on_torque(TorqueSample(LOAD_CELL, torque_nm, self._reason, sample.t_mid_ns, now_ns))
                 self._take_zero(sample)
+                self._sampled.set()
+                self._sampled.clear()
 
     def tare(self) -> None:
         """Make the mean of samples measured from now on the zero; samples under way belong to the load before."""
@@ -69,17 +71,19 @@ class LoadCellTask:
     async def tare_and_wait(self, within_s: float) -> str:
         """Take a new zero and wait until it is done; return the reason of a failure, else an empty text."""
         self.tare()
-        within_s = min(self._timeout_s, within_s)
+        own, within_s = self._zeroing, min(self._timeout_s, within_s)
         try:
-            # Earlier waiters get this zero too.
-            return await self._zero_waiters.wait(within_s)
+            async with asyncio.timeout(within_s):
+                # A later tare is awaited too.
+                while self._zeroing is not None:
+                    await self._sampled.wait()
         except TimeoutError:
-            reason = self._reason or "nothing came"
-            return f"the load cell's zero could not be taken within {within_s:.3g} s: {reason}"
+            return self._not_taken(within_s)
         finally:
-            if not self._zero_waiters:
+            if self._zeroing is own:
                 # A zero taken later could be of any load.
                 self._zeroing = None
+        return self._zero_error
 
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the board's values for `health`."""
@@ -87,15 +91,16 @@ class LoadCellTask:
         error = self._zero_error if found["connected"] else found["last_loss"]
         return {**found, "expected_hz": 1.0 / self._period_s, "error": error}
 
+    def _not_taken(self, within_s: float) -> str:
+        reason = self._reason or "no usable reading came"
+        return f"the load cell's zero could not be taken within {within_s:.3g} s: {reason}"
+
     def _take_zero(self, sample: LoadSample) -> None:
         if self._zeroing is None:
             return
         if sample.t_arrival_ns > self._zero_until_ns:
             self._zeroing = None
-            self._zero_error = (
-                f"the zero was not taken within {self._timeout_s:g} s and is given up; "
-                "see the reason of the load cell's readings, and tare again"
-            )
+            self._zero_error = self._not_taken(self._timeout_s)
             structlog.get_logger().warning(self._zero_error)
             return
         if sample.trusted and sample.t_mid_ns >= self._zero_from_ns:
@@ -103,7 +108,6 @@ class LoadCellTask:
         if len(self._zeroing) == ZERO_SAMPLES:
             self._board.tare(sum(self._zeroing) / ZERO_SAMPLES)
             self._zeroing = None
-            self._zero_waiters.notify("")
 
 
 def load_message(sample: LoadSample) -> LoadTorque:

@@ -1,5 +1,6 @@
 """The shear skin's task: builds instruments and estimator, publishes the shear force, takes the zero, replays."""
 
+import asyncio
 import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,7 +17,6 @@ from shearloop.daemon.logs import LinkLog
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
-from shearloop.daemon.taring import Waiters
 from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.drivers.shear_skin.instruments import (
@@ -30,7 +30,7 @@ from shearloop.drivers.shear_skin.instruments import (
     SourceReading,
     Voltages,
 )
-from shearloop.drivers.shear_skin.skin import SampleAverager, SampleValidator, ShearSkin, SkinSample
+from shearloop.drivers.shear_skin.skin import SampleValidator, ShearSkin, SkinSample
 
 SKIN = "skin"
 # The instruments' names in health and in recordings.
@@ -77,7 +77,6 @@ class SkinTask:
             _current_source(config, inputs.get(SKIN_SOURCE)),
             _daq(config, inputs.get(SKIN_DAQ)),
             _gauge_ohm(calibration),
-            config.daq.averaged,
         )
         self.source = SkinSourceTask(self._skin)
         self._estimator = _estimator(config, calibration)
@@ -86,8 +85,8 @@ class SkinTask:
         self._loop = loop
         self._inputs = inputs.get(SKIN)
         self._radius_m = _radius_m(config)
-        self._zero_timeout_s = max(ZERO_TIMEOUT_S, 2.0 * config.zero_samples * config.daq.sample_period_s)
-        self._zero_waiters = Waiters()
+        self._zero_timeout_s = max(ZERO_TIMEOUT_S, 2.0 * config.zero_samples / config.daq.rate_hz)
+        self._sampled = asyncio.Event()
         self._reason = ""
         self._valid = 0
 
@@ -97,10 +96,8 @@ class SkinTask:
             async for sample in samples:
                 reading = self._estimator.update(sample)
                 self._publish(sample, reading)
-                if self._estimator.refused:
-                    self._zero_waiters.notify(f"the skin's zero was refused: {self._estimator.refused}")
-                elif self._estimator.zero is not None:
-                    self._zero_waiters.notify("")
+                self._sampled.set()
+                self._sampled.clear()
 
     def tare(self) -> None:
         """Take a new zero from samples measured from now on."""
@@ -114,11 +111,13 @@ class SkinTask:
         self.tare()
         within_s = min(self._zero_timeout_s, within_s)
         try:
-            # Earlier waiters get this zero too.
-            return await self._zero_waiters.wait(within_s)
+            async with asyncio.timeout(within_s):
+                while self._estimator.zero is None and not self._estimator.refused:
+                    await self._sampled.wait()
         except TimeoutError:
             reason = self._reason or "nothing came"
             return f"the skin's zero could not be taken within {within_s:.3g} s: {reason}"
+        return f"the skin's zero was refused: {self._estimator.refused}" if self._estimator.refused else ""
 
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the values of voltages, zero and force for `health`."""
@@ -154,7 +153,6 @@ class RecordedSkin:
         current_a = config.source.current_ma * 1e-3
         daq_period_s = 1.0 / config.daq.rate_hz
         self._validator = SampleValidator(current_a, SOURCE_PERIOD_S, daq_period_s, _gauge_ohm(calibration))
-        self._averager = SampleAverager(config.daq.averaged)
         self._radius_m = _radius_m(config)
         self._source = RecordedInstrument(Keithley6430)
         adc = config.daq.adc
@@ -172,8 +170,7 @@ class RecordedSkin:
             samples = (self._validator.sample(voltages, self._latest) for voltages in self._daq.handle(event))
             return [
                 shear_message(sample, self._estimator.update(sample), self._radius_m, sample.t_arrival_ns)
-                for sample in map(self._averager.add, samples)
-                if sample is not None
+                for sample in samples
             ]
         elif event.kind is InputKind.TARE:
             self._estimator.tare(event.t_ns)
@@ -218,7 +215,7 @@ def skin_source(config: SkinConfig) -> TorqueSource | None:
     """Return the skin as a source of torque; None without a radius."""
     if config.tool_radius_mm is None:
         return None
-    return TorqueSource(name=SKIN, period_s=config.daq.sample_period_s, has_friction_band=True)
+    return TorqueSource(name=SKIN, period_s=1.0 / config.daq.rate_hz, has_friction_band=True)
 
 
 def check_circuit(config: SkinConfig, calibration: SkinCalibration) -> None:

@@ -166,7 +166,7 @@ class EitKitBoard(EmulatedBoard):
     """An EIT-kit: waits for a `y`, then sends `frames` ((v,) values in volts each), and then is silent.
 
     A frame is requested from the iterator at the end of its acquisition. A silent or unplugged board acquires none. A
-    `y` ends a silence.
+    `y` ends a silence without a duration.
     """
 
     faults = ("cut-line", "wrong-count", "nan", "garbage", "silence", "unplug")
@@ -192,7 +192,7 @@ class EitKitBoard(EmulatedBoard):
         while not self._started or not self.port.received.empty():
             if b"y" in await self.port.received.get():
                 self._started = True
-                if self._lasting == "silence":
+                if self._lasting == "silence" and self._lasts_until_s == math.inf:
                     self._end_lasting()
         return not started_before
 

@@ -140,7 +140,7 @@ class RobotiqGripper:
 
     async def connect(self) -> messages.GripperState:
         """Open the connection and return the first state; DeviceNotFoundError or DeviceLostError."""
-        await self._client.connect()
+        await _uninterrupted(self._exchange(self._client.connect))
         self.connected, self._loss = True, None
         # Another program may have commanded the gripper since.
         self._last_move = None
@@ -148,12 +148,13 @@ class RobotiqGripper:
 
     async def close(self) -> None:
         """Close the connection; the gripper keeps its grip."""
-        self.connected, self.latest = False, None
-        await self._client.close()
+        async with self._lock:
+            self.connected, self.latest = False, None
+            await self._client.close()
 
     async def read(self) -> messages.GripperState:
         """Return the gripper's present state."""
-        readout, t_ns = await self._exchange(self._client.read)
+        readout, t_ns = await self._read()
         self.latest = self._state(readout, t_ns)
         return self.latest
 

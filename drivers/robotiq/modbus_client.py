@@ -1,9 +1,7 @@
 """The gripper over its USB adapter: Modbus RTU with pymodbus (manual, "Gripper register mapping")."""
 
-import asyncio
 import logging
-from collections.abc import Awaitable, Sequence
-from typing import TypeVar
+from collections.abc import Sequence
 
 from pymodbus.client import AsyncModbusSerialClient
 from pymodbus.exceptions import ModbusException
@@ -12,8 +10,6 @@ from pymodbus.pdu import ModbusPDU
 from shearloop.drivers.connection import find_port
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, ProtocolError
 from shearloop.drivers.robotiq import messages
-
-T = TypeVar("T")
 
 # Errors carry what pymodbus would log.
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
@@ -96,7 +92,7 @@ class ModbusClient:
             path, baudrate=BAUD_RATE, timeout=self._deadline_s, retries=0, reconnect_delay=0
         )
         try:
-            if not await _cancellable(client.connect()):
+            if not await client.connect():
                 raise DeviceNotFoundError(f"{path} cannot be opened; is another program using the gripper?")
             self._client = client
             # The registers are written together, so that the first write has to repeat the gripper's present target.
@@ -140,7 +136,7 @@ class ModbusClient:
                 )
             else:
                 request = client.write_registers(FIRST_COMMAND_REGISTER, command, device_id=DEVICE_ID)
-            response = await _cancellable(request)
+            response = await request
             succeeded = not response.isError()
         except (ModbusException, OSError) as error:
             raise DeviceLostError(
@@ -153,16 +149,3 @@ class ModbusClient:
         if response.isError():
             raise ProtocolError(f"The gripper at {self.name} refused a Modbus request: {response}.")
         return response
-
-
-async def _cancellable(awaitable: Awaitable[T]) -> T:
-    """Await a call of pymodbus and honour a cancellation that arrives together with its result.
-
-    pymodbus uses asyncio.wait_for, which before Python 3.12 loses such a cancellation.
-    """
-    task = asyncio.current_task()
-    before = task.cancelling() if task is not None else 0
-    result = await awaitable
-    if task is not None and task.cancelling() > before:
-        raise asyncio.CancelledError
-    return result

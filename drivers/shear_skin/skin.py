@@ -4,10 +4,9 @@ import contextlib
 import math
 from collections import Counter
 from collections.abc import AsyncGenerator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
-from statistics import fmean
 
 from shearloop.drivers.connection import Diagnostics
 from shearloop.drivers.serial_sensor import StepFilter
@@ -194,48 +193,6 @@ class SampleValidator:
         return found
 
 
-class SampleAverager:
-    """Averages samples in blocks, as the paper's DAQ did over 1 s. No I/O.
-
-    A sample with faults passes at once, and a block without gaps begins after it.
-    """
-
-    def __init__(self, readings: int) -> None:
-        """Average this many samples into one; each passes unchanged if it is 1."""
-        self._readings = readings
-        self._block: list[SkinSample] = []
-        self._missed = self._seq = 0
-
-    def add(self, sample: SkinSample) -> SkinSample | None:
-        """Return the mean of the block that this sample completes, the sample itself if it has faults, else None."""
-        if sample.missed or sample.faults:
-            # Readings of a block that a gap or fault ends are missing too.
-            self._missed += sample.missed + len(self._block)
-            self._block.clear()
-        self._block.append(sample)
-        if not sample.faults and len(self._block) < self._readings:
-            return None
-        block = self._block
-        mean = replace(
-            sample,
-            r1_ohm=_mean([one.r1_ohm for one in block]),
-            r2_ohm=_mean([one.r2_ohm for one in block]),
-            v1_v=fmean(one.v1_v for one in block),
-            v2_v=fmean(one.v2_v for one in block),
-            current_a=_mean([one.current_a for one in block]),
-            t_mid_ns=sum(one.t_mid_ns for one in block) // len(block),
-            seq=self._seq,
-            missed=self._missed,
-        )
-        self._block, self._missed, self._seq = [], 0, self._seq + 1
-        return mean
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return fmean(known) if len(known) == len(values) else None
-
-
 def _is_reachable(before: tuple[float, float], after: tuple[float, float], missed: int) -> bool:
     most = (1 + missed) * math.log1p(MAX_CHANGE)
     return all(abs(math.log(now / then)) <= most for then, now in zip(before, after, strict=True))
@@ -244,11 +201,10 @@ def _is_reachable(before: tuple[float, float], after: tuple[float, float], misse
 class ShearSkin:
     """Source and DAQ of one skin. Run `watch_source` next to `samples`: without it every sample has a fault."""
 
-    def __init__(self, source: Keithley6430, daq: Daq, gauge_ohm: float = GAUGE_OHM, averaged: int = 1) -> None:
+    def __init__(self, source: Keithley6430, daq: Daq, gauge_ohm: float = GAUGE_OHM) -> None:
         self._source = source
         self._daq = daq
         self._validator = SampleValidator(source.current_a, source.period_s, daq.period_s, gauge_ohm)
-        self._averager = SampleAverager(averaged)
         self._latest: SourceReading | None = None
 
     async def watch_source(self) -> None:
@@ -258,12 +214,10 @@ class ShearSkin:
                 self._latest = reading
 
     async def samples(self) -> AsyncGenerator[SkinSample]:
-        """Yield a sample for every block of readings, without end; iterate within `contextlib.aclosing`."""
+        """Yield a sample for every reading, without end; iterate within `contextlib.aclosing`."""
         async with contextlib.aclosing(self._daq.readings()) as readings:
             async for voltages in readings:
-                sample = self._averager.add(self._validator.sample(voltages, self._latest))
-                if sample is not None:
-                    yield sample
+                yield self._validator.sample(voltages, self._latest)
 
     def diagnostics(self) -> Diagnostics:
         """Return the values of voltages and gauges for `health`; counts are since the process began."""

@@ -182,13 +182,6 @@ def test_a_model_without_a_sigma_gets_one_cell_along_it(fingertip, forward):
     assert design.k_count.chosen.setting > 1
 
 
-def test_all_injections_lose_nothing_and_half_of_them_are_twice_as_fast(quiet):
-    assert quiet.injections.steps[-1].added == 0.0
-    assert "1.86 frames/s" in quiet.injections.steps[-1].cost
-    assert "3.72 frames/s" in quiet.injections.steps[15].cost
-    assert len(quiet.injections.steps) == len(np.unique(PAPER_TABLE.electrodes[:, 0]))
-
-
 def test_a_choice_that_nothing_is_good_enough_for_says_so():
     choice = DesignChoice("mesh size", "cm", (DesignStep(0.5, 3.0, "few"), DesignStep(0.1, 1.0, "many")))
     assert not choice.enough

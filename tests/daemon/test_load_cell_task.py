@@ -115,7 +115,7 @@ async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_
         await board.send(8388607.0, saturated=True)
         await board.send(9.0, 2 * ZERO_SAMPLES, from_ns=Clock().now_ns() + round((ZERO_TIMEOUT_S + 1.0) * 1e9))
         assert board.tares == []
-        assert "was not taken within 15 s" in str(task.diagnostics()["error"])
+        assert "could not be taken within 15 s" in str(task.diagnostics()["error"])
         task._clock = SimpleNamespace(now_ns=lambda: Clock().now_ns() + 60 * 10**9)
         task.tare()
         assert task.diagnostics()["error"] == ""

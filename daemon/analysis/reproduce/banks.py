@@ -89,11 +89,11 @@ def is_built(path: Path, definition: BankDefinition) -> bool:
 
 
 def cached_bank(
-    name: str, grid: Grid, mesh: Mesh, folder: Path, jobs: int = 1, on_row: Callable[[int, int], None] = lambda *_: None
+    name: str, grid: Grid, mesh: Mesh, folder: Path, jobs: int = 1, on_row: Callable[[int], None] = lambda _: None
 ) -> Bank:
     """Return the bank of this grid and mesh from a folder; build it where it is missing or damaged.
 
-    `on_row(done, total)` is called during the build. Raises BankFileError where it cannot be written.
+    `on_row(done)` is called after each row. Raises BankFileError where it cannot be written.
     """
     definition = BankDefinition(mesh.digest, MODEL, grid.k, grid.sigma)
     path = folder / f"{name}-{definition.identity[:12]}.bank"

@@ -41,7 +41,7 @@ def _configure_eit_kit(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Prints the port's path, again each time it is plugged in. A fault's name on standard input applies to the "
         "next frame: cut-line, wrong-count, nan, garbage; or to what follows: silence [SECONDS], unplug [SECONDS]. "
-        "Starting the board ends a silence; `normal` ends every fault."
+        "Starting the board ends a silence without a number; `normal` ends every fault."
     )
     frames = parser.add_argument_group("frames")
     add_option(frames, "--recording", Path, "FILE", "a recorded stream (.mat)")

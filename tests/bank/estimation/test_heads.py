@@ -48,15 +48,6 @@ def test_what_a_free_lever_hides_is_not_taken_for_zero():
     assert Ridge.fit(x, y, 1e-9).weights[0] < 0.03
 
 
-def test_a_lever_may_be_pushed_either_way():
-    rng = np.random.default_rng(3)
-    x = rng.normal(size=(300, 1))
-    y = -np.maximum(0.05 * x[:, 0], 0.0)
-    pushed = CensoredRidge.fit(x, y, 1e-9)
-    assert pushed.sign == -1.0
-    assert pushed.sign * pushed.predict(np.array([[1.0]]))[0] == pytest.approx(-0.05, rel=0.1)
-
-
 def frames_on_a_curve(values, rng, noise=0.05, drift=1.0, begins_at=0.0, shrinking=0.0):
     """Return (n, 201) frames, one a second; the response to a value shrinks by a share with each e-folding of age."""
     shapes = np.random.default_rng(9).normal(size=(4, 200))

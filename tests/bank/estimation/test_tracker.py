@@ -120,11 +120,6 @@ def test_too_many_dead_channels_end_it(motion_calibration, twisting):
     assert "dead or saturated" in estimates[100].reasons[0]
 
 
-def test_the_future_changes_nothing(motion_calibration, twisting):
-    other = twisting(seed=12)
-    assert follow(motion_calibration, other.between(0, 150)) == follow(motion_calibration, other)[:150]
-
-
 def test_after_a_gap_the_memory_is_filled_anew(motion_calibration, twisting):
     other = twisting(seed=13)
     times = other.t_s + np.where(np.arange(len(other.t_s)) >= 150, 3.0, 0.0)

@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from shearloop.bank.eit.channels import PAPER_TABLE
-from shearloop.bank.estimation.novelty import NoveltyDetector, ReciprocityCheck, _coordinates
+from shearloop.bank.estimation.novelty import NoveltyDetector, ReciprocityCheck
 
 ALL = np.ones(896, dtype=np.bool_)
 
@@ -52,13 +50,3 @@ def test_what_one_of_the_two_does_not_say_is_left_out():
     wrong = np.where(usable, frames[45], 1e3)
     assert twins.residual(wrong, usable) == pytest.approx(twins.residual(frames[45], usable), rel=1e-12)
     assert twins.residual(wrong, usable) < twins.largest_residual < twins.residual(wrong, ALL)
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.floats(0, 0.6))
-def test_coordinates_are_those_of_least_squares_by_the_usable_values(seed, n_directions, unusable_share):
-    rng = np.random.default_rng(seed)
-    directions = np.linalg.qr(rng.normal(size=(60, n_directions)))[0].T
-    values, usable = rng.normal(size=60), rng.random(60) >= unusable_share
-    found = _coordinates(directions, np.where(usable, values, np.nan), usable)
-    part = directions[:, usable]
-    np.testing.assert_allclose(part @ part.T @ found, part @ values[usable], atol=1e-12)

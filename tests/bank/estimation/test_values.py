@@ -31,11 +31,6 @@ def test_things_are_as_many_as_their_measurements_tell_apart(several, random):
     assert distinct(several) == things
 
 
-def test_a_gripper_tells_tools_apart_by_its_own_uncertainty():
-    measured = [Measured(20.4, 1.2), Measured(10.1, 1.2), Measured(19.3, 1.2), Measured(20.0, 0.0)]
-    assert distinct(measured) == [Measured(10.1, 1.2), Measured(20.0, 0.0)]
-
-
 def test_two_that_contradict_each_other_are_not_a_sure_one_in_between():
     both = combine(Measured(10.0, 1.0), Measured(40.0, 1.0))
     assert both.value == pytest.approx(25.0)

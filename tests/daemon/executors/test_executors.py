@@ -209,6 +209,13 @@ def test_evaluate_gives_the_same_figures_on_a_cluster_with_a_killed_worker(sched
     assert figures[0] == figures[1]
 
 
+def test_a_bank_has_the_same_bytes_after_a_killed_worker(bank, scheduler, killed):
+    again, config = bank.with_name("killed.bank"), str(bank.with_name("bank.yaml"))
+    assert main(["bank", "build", "--config", config, "--out", str(again), "--cluster", scheduler]) == 0
+    assert killed
+    assert again.read_bytes() == bank.read_bytes()
+
+
 @pytest.mark.usefixtures("few_mixtures")
 def test_a_chart_has_the_same_numbers_after_a_killed_worker(scheduler, killed, tmp_path):
     from shearloop.bank.estimation import Physics

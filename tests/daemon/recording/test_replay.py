@@ -14,7 +14,7 @@ import pytest
 import yaml
 import zmq.asyncio
 
-from shearloop.bank.estimation import Measured
+from shearloop.bank.estimation import EstimatorSession, Measured
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import main
 from shearloop.daemon.clock import Clock
@@ -32,7 +32,6 @@ from shearloop.daemon.recording.replay import (
     restored_wire_map,
 )
 from shearloop.daemon.recording.schema import message_json, with_missing_keys
-from shearloop.daemon.sensing.estimators import FrameEstimator
 from shearloop.daemon.sensing.fingertip_task import FingertipPipeline
 from tests.daemon.conftest import DEADLINE_S, emulated_kit, running_daemon
 from tests.daemon.sample_messages import sample
@@ -277,9 +276,15 @@ def test_a_later_file_replays_frame_numbers_tares_and_tools(config, tmp_path, mo
     ((zeroed,),) = RecordedRun(later).replay_events().tares.values()
     assert zeroed >= ZEROED
     held: list[object] = []
-    monkeypatch.setattr(FrameEstimator, "set_tool", lambda _self, tool: held.append(tool))
+    set_tool = EstimatorSession.set_tool
+
+    def noted(self: EstimatorSession, tool: Measured | None) -> None:
+        held.append(tool)
+        set_tool(self, tool)
+
+    monkeypatch.setattr(EstimatorSession, "set_tool", noted)
     again, _ = asyncio.run(replayed(later, math.inf))
-    assert held == [OTHER_TOOL], "which came before the file began"
+    assert held == [None, OTHER_TOOL], "the second one came before the file began"
     estimates = {content["frame"]: content for topic, content in again if topic == "eit.estimate"}
     assert min(estimates) >= BEGUN
     said = ("reason", "valid", "k", "sigma", "score", "torque_nm")

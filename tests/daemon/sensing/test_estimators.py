@@ -83,12 +83,12 @@ def test_both_fingertips_together_follow_another_session(calibration):
 def test_a_tare_averages_the_frames_that_follow(calibration):
     played = series(seed=3)
     estimator = FrameEstimator(calibration, fingertip(baseline_frames=5))
-    estimator.tare()
+    estimator.session.tare()
     for number in range(5):
-        assert estimator.taring
+        assert estimator.session.taring
         estimate = estimated(estimator, *(frame(number, channels) for channels in played.channels[number]))
         assert estimate.reasons == (f"taking the homogeneous frame, {number + 1} of 5",)
-    assert not estimator.taring
+    assert not estimator.session.taring
     assert any(value is not None for value in torques(estimator, played.between(5, len(played.t_s))))
 
 

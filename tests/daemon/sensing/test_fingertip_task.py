@@ -61,6 +61,7 @@ class FakeEstimator:
         self.begun, self.go_on = asyncio.Event(), asyncio.Event()
         self.tared_before: list[int] = []
         self._tared = False
+        self.session = self
         self.calibration = SimpleNamespace(sides=("right", "left"))
 
     def tare(self) -> None:

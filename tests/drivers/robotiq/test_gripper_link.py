@@ -2,11 +2,8 @@
 
 import asyncio
 import contextlib
-from typing import Any
 
 import pytest
-from pymodbus.client import AsyncModbusSerialClient
-from pymodbus.pdu import ModbusPDU
 
 from shearloop.drivers.emulators.gripper import ModbusSlave
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DriverError
@@ -33,30 +30,6 @@ async def test_silence_is_a_loss_and_clears_the_state(way, tmp_path):
         with pytest.raises(DeviceLostError, match="no connection"):
             await rig.driver.move(GripperCommand(10.0))
         assert (await rig.driver.connect()).seq > 0
-
-
-async def test_cancellation_that_arrives_with_an_answer_is_kept(tmp_path, monkeypatch):
-    """Otherwise the reading task never ends, and the daemon waits for it on exit."""
-    answered = asyncio.Event()
-    read = AsyncModbusSerialClient.read_holding_registers
-
-    async def with_the_answer(*args: Any, **keys: Any) -> ModbusPDU:
-        response = await read(*args, **keys)
-        answered.set()
-        with contextlib.suppress(asyncio.CancelledError):
-            # As asyncio.wait_for does it before Python 3.12.
-            await asyncio.Event().wait()
-        return response
-
-    async with a_rig("modbus", tmp_path, connected=True) as rig, asyncio.timeout(20):
-        monkeypatch.setattr(AsyncModbusSerialClient, "read_holding_registers", with_the_answer)
-        reading = asyncio.create_task(rig.driver.read())
-        await answered.wait()
-        reading.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await reading
-        monkeypatch.undo()
-        assert (await rig.driver.connect()).seq == 1
 
 
 @WAYS

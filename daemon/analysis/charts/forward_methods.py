@@ -89,10 +89,12 @@ def forward_methods(
         found.append(SolvedForward(one.name, one.family, triangles, float(np.median(ms)), min(ms), max(ms), error))
     # EIDORS solves the same model: its error is known where the paper's mesh is given. pyEIT's electrodes are points.
     paper = next((one.error for one in found if one.triangles == PAPER_TRIANGLES), None)
-    for name, cell_s, error in (("EIDORS 3.10", EIDORS_CELL_S, paper), ("pyEIT", PYEIT_CELL_S, None)):
-        ms = [1e3 * cell_s] * 3
-        found.append(SolvedForward(f"{name} (cited)", name, PAPER_TRIANGLES, *ms, error, cited=True))
-    return found
+    return [*found, _cited("EIDORS 3.10", "EIDORS", EIDORS_CELL_S, paper), _cited("pyEIT", "pyEIT", PYEIT_CELL_S, None)]
+
+
+def _cited(name: str, family: str, cell_s: float, error: float | None) -> SolvedForward:
+    cell_ms = 1e3 * cell_s
+    return SolvedForward(f"{name} (cited)", family, PAPER_TRIANGLES, cell_ms, cell_ms, cell_ms, error, cited=True)
 
 
 def batch(mesh: Mesh) -> Callable[[], FloatArray]:

@@ -160,17 +160,14 @@ def without_long_collections() -> Iterator[Callable[[], None]]:
 
     Modules, banks and calibrations are some 100 000 objects. A collection through them stops the loop for 20 to 100 ms.
     """
-    was_enabled = gc.isenabled()
     gc.disable()
 
     def on_ready() -> None:
         gc.freeze()
-        if was_enabled:
-            gc.enable()
+        gc.enable()
 
     try:
         yield on_ready
     finally:
         gc.unfreeze()
-        if was_enabled:
-            gc.enable()
+        gc.enable()

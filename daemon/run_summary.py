@@ -76,11 +76,9 @@ class _Run:
     identified: str = ""
     held_s: float = 0.0
     hold_reasons: Counter[str] = field(default_factory=Counter)
-    refused: Counter[str] = field(default_factory=Counter)
     # By source, the reasons without their numbers.
     invalid: defaultdict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     torques: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
-    diameters: dict[str, list[float]] = field(default_factory=dict)
 
 
 class RunSummary:
@@ -140,9 +138,6 @@ def _on_sample(run: _Run, topic: str, content: Mapping[str, Any]) -> None:
         run.torques.setdefault(source, []).append((content["t_mono_ns"], content["torque_nm"]))
     elif topic in TORQUES and not content.get("valid", True):
         run.invalid[source][content["reason"].split(":")[0].split(",")[0]] += 1
-    gripped = topic in ("eit.estimate", "gripper.state") and step is not None and step.holds
-    if gripped and content.get("diameter_mm") is not None:
-        run.diameters.setdefault(source, []).append(content["diameter_mm"])
 
 
 def _update(run: _Run, content: Mapping[str, Any]) -> None:
@@ -152,8 +147,6 @@ def _update(run: _Run, content: Mapping[str, Any]) -> None:
     if content["response"] == "hold" and run.last["response"] != "hold":
         # The reason without its numbers.
         run.hold_reasons[content["reasons"].split(":")[0].rstrip(".")] += 1
-    if "a command was refused" in content["reasons"]:
-        run.refused[content["reasons"]] += 1
     run.last = content
     if run.steps:
         run.steps[-1].to_ns = now_ns
@@ -257,10 +250,6 @@ def _recovery_s(series: TorqueSeries, since_ns: float, set_nm: float) -> float |
 
 
 def _counted(run: _Run) -> Iterator[str]:
-    if run.first["tool_mm"] is not None:
-        yield f"  tool diameter {run.first['tool_mm']:g} mm, from the experiment"
-    for source, values in run.diameters.items():
-        yield f"  diameter by {source}: {np.mean(values):.1f} mm ± {np.std(values):.1f} of one reading"
     if run.hold_reasons:
         reasons = "; ".join(f"{times(count)} {reason}" for reason, count in run.hold_reasons.most_common())
         yield f"  the wrist was held for {run.held_s:.1f} s in all: {reasons}"
@@ -272,5 +261,3 @@ def _counted(run: _Run) -> Iterator[str]:
             count, ((most, _),) = reasons_of.total(), reasons_of.most_common(1)
             every = count + len(run.torques[source])
             yield f"  {count} of {every} torques of {source} were not valid and not used, most often: {most}"
-    refused = [f"  {times(count)} {reason}" for reason, count in run.refused.most_common()]
-    yield from refused or ["  no command was refused"]

@@ -59,7 +59,6 @@ MAX_BODY_BYTES = 4096
 # The largest message is a heatmap of 200 × 200 float32.
 MAX_MESSAGE_BYTES = 1 << 20
 HIGH_WATER_MARK = 1000
-MAX_PENDING_COMMANDS = 4
 # Health comes once a second. After a longer silence the page shows a dead daemon, within 2 s in all.
 DEAD_AFTER_S = 1.6
 # Allows for the delay through this process and the browser.
@@ -88,10 +87,6 @@ class DaemonAddress:
     keys: ClientKeys | None = None
 
 
-class BusyError(Exception):
-    """Too many commands are pending."""
-
-
 class Bridge:
     """Receives the messages of one daemon and sends commands to it."""
 
@@ -100,7 +95,6 @@ class Bridge:
         self.latest = latest
         self._context = context
         self._address = address
-        self._free = asyncio.Semaphore(MAX_PENDING_COMMANDS)
         self._stopping: asyncio.Future[dict[str, Any]] | None = None
         self._socket = context.socket(zmq.SUB)
         self._socket.setsockopt(zmq.LINGER, 0)
@@ -142,12 +136,8 @@ class Bridge:
             self._socket.unsubscribe(messages.EitHeatmap.topic)
 
     async def command(self, name: str) -> dict[str, Any]:
-        """Return the daemon's reply to a command; raise UserError without a reply, BusyError if too many wait."""
-        if self._free.locked():
-            raise BusyError
-        async with self._free:
-            timeout_s = UNLOCK_TIMEOUT_S if name == "unlock" else COMMAND_TIMEOUT_S
-            return await self._request({"command": name}, timeout_s)
+        """Return the daemon's reply to a command; raise UserError without a reply."""
+        return await self._request({"command": name}, UNLOCK_TIMEOUT_S if name == "unlock" else COMMAND_TIMEOUT_S)
 
     async def stop(self) -> dict[str, Any]:
         """Return the daemon's reply to a stop of all motion; simultaneous calls share one request.
@@ -331,8 +321,6 @@ class _Page:
     async def _reply(self, name: str, requested: Awaitable[dict[str, Any]]) -> web.Response:
         try:
             reply = await requested
-        except BusyError:
-            return self._refuse(429, "too many commands at once; wait for their answers")
         except UserError as error:
             return self._refuse(503, str(error))
         structlog.get_logger().info("command answered", command=name, ok=reply.get("ok"), reason=reply.get("reason"))

@@ -48,9 +48,7 @@ if TYPE_CHECKING:
     from shearloop.daemon.analysis.series import read_series
     from shearloop.daemon.cli.emulated_calibration import emulate_recordings
     from shearloop.daemon.messaging.client import Subscriber
-    from shearloop.daemon.messaging.client import receive_messages as subscribe
     from shearloop.daemon.messaging.keys import ClientKeys
-    from shearloop.daemon.recording.reader import read_recording
     from shearloop.daemon.recording.tables import read
 
 __all__ = [
@@ -69,9 +67,7 @@ __all__ = [
     "figures_by_load",
     "fit",
     "read",
-    "read_recording",
     "read_series",
-    "subscribe",
 ]
 
 # Imported on first use: the command line answers at once.
@@ -91,9 +87,7 @@ _HOMES = {
     "figures_by_load": "shearloop.daemon.analysis.evaluate:figures_by_load",
     "fit": "shearloop.bank.estimation:fit",
     "read": "shearloop.daemon.recording.tables:read",
-    "read_recording": "shearloop.daemon.recording.reader:read_recording",
     "read_series": "shearloop.daemon.analysis.series:read_series",
-    "subscribe": "shearloop.daemon.messaging.client:receive_messages",
 }
 
 

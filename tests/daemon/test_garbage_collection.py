@@ -59,14 +59,6 @@ def test_what_ends_before_it_is_ready_leaves_the_collector_as_it_was():
     assert gc.isenabled()
 
 
-def test_collector_that_was_off_stays_off():
-    gc.disable()
-    with without_long_collections() as collect_what_comes:
-        collect_what_comes()
-        assert not gc.isenabled()
-    assert not gc.isenabled()
-
-
 def test_daemon_of_the_command_line_is_collected_from_when_it_is_ready(config, monkeypatch):
     collected = []
 

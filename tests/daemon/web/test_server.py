@@ -217,15 +217,13 @@ async def test_many_stops_share_one_request_and_overtake_hanging_commands(tmp_pa
 
     async with served(tmp_path, tare=hang, stop=stop) as page:
         hanging = [asyncio.create_task(post(page, "/commands/tare", **BEARER)) for _ in range(6)]
-        done, _ = await asyncio.wait(hanging, return_when=asyncio.FIRST_COMPLETED)
-        assert (await done.pop())[0] == 429
         passed_on = page.bridge.stop
         monkeypatch.setattr(page.bridge, "stop", counted)
         replies = await asyncio.gather(*(post(page, "/stop") for _ in range(50)))
         assert {status for status, _ in replies} == {200}
         assert stops == 1
         released.set()
-        assert sorted(status for status, _ in await asyncio.gather(*hanging)) == [200] * 4 + [429] * 2
+        assert {status for status, _ in await asyncio.gather(*hanging)} == {200}
 
 
 async def test_a_stop_without_a_daemon_is_reported(tmp_path, monkeypatch):

@@ -3,7 +3,6 @@
 An estimator is a subclass of `Estimator` in a file of its own, and a line in `bank/estimators.py`.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeAlias
@@ -154,8 +153,6 @@ class Estimator:
     uses_amplitude: ClassVar[bool] = True
     ignores_nan: ClassVar[bool] = False
     least_slices: ClassVar[int] = 10
-    # Longer recordings are thinned out for the fit.
-    most_frames: ClassVar[float] = math.inf
 
     scale: FloatArray
     table: ChannelTable = PAPER_TABLE
@@ -345,8 +342,6 @@ class PaperEstimator(_OnBank):
     columns: ClassVar[Mapping[Quantity, slice]] = {"torque": slice(1, 3), "diameter": slice(0, 1)}
     strengths: ClassVar[tuple[float, ...]] = (1e-9,)
     uses_amplitude: ClassVar[bool] = False
-    # A heatmap over all lags takes most of a second.
-    most_frames: ClassVar[float] = 120
 
     def matcher(self, bank: Bank) -> BankMatcher:
         """Return the paper's match on the bank."""

@@ -139,7 +139,8 @@ def check_files(config: DaemonConfig, path: Path, geometry: Path | None) -> Iter
             yield good(f"files of {name}", text)
     for name, mistake in parts.mistakes.items():
         if name != "keys":
-            yield from_error(f"files of {name}", mistake, "the daemon does not start")
+            finding = from_file if "\n" in mistake else from_error
+            yield finding(f"files of {name}", mistake, "the daemon does not start")
     yield check_keys(config.curve, config.network_addresses)
 
 

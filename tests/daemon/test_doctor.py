@@ -140,11 +140,15 @@ def test_a_bank_of_another_geometry_is_reported(config):
 
 
 def test_an_experiment_that_check_refuses_is_wrong(config, tmp_path):
-    (tmp_path / "one.yaml").write_text("name: one\nsteps: [{do: hold_torque, torque_nm: 0.1}]\n")
+    steps = "[{do: hold_torque, torque_nm: 0.1}, {do: grip}]"
+    (tmp_path / "one.yaml").write_text(f"name: one\nsteps: {steps}\n")
     path = config(robot="ur.yaml", experiment="one.yaml")
     findings = doctor.check_files(load_daemon_config(path), path, None)
-    (found,) = (one.found for one in findings if one.subject == "files of experiment")
-    assert "hold_torque needs an identified tool" in found
+    (found,) = (one for one in findings if one.subject == "files of experiment")
+    first, second = found.found.splitlines()
+    assert "hold_torque needs an identified tool" in first
+    assert "grip needs a gripper" in second
+    assert found.next_step.startswith("correct the file")
 
 
 def test_a_secret_key_that_others_can_read_is_reported(tmp_path):

@@ -79,8 +79,8 @@ class _SliceFolder:
         self.written: list[Path] = []
         self._folder = folder
         self._largest_nm = 0.0
-        # The files of this recording's raw frame and homogeneous frame.
-        self._raw: tuple[Path, Path] | None = None
+        self._raw, self._raw_homogeneous = (folder / TORQUE_FOLDER / name for name in (RAW_FRAME, RAW_HOMOGENEOUS))
+        self._keeps_raw = self._raw.exists() or self._raw_homogeneous.exists()
 
     def save(self, one: _Slice) -> None:
         """Write one slice."""
@@ -101,20 +101,13 @@ class _SliceFolder:
         _save_mat(self.written[-1], **arrays)
 
     def _save_raw(self, one: _Slice) -> None:
-        """Write the raw frame and homogeneous frame of the recording's largest torque, clipped like the paper's."""
-        if abs(one.torque_nm) <= self._largest_nm:
+        """Write the frames of the recording's largest torque, clipped like the paper's; an earlier recording's stay."""
+        if self._keeps_raw or abs(one.torque_nm) <= self._largest_nm:
             return
-        number = 1
-        while self._raw is None:
-            end = ".mat" if number == 1 else f"_{number}.mat"
-            names = (name.replace(".mat", end) for name in (RAW_FRAME, RAW_HOMOGENEOUS))
-            frame, rest = (self._folder / TORQUE_FOLDER / name for name in names)
-            if not frame.exists() and not rest.exists():
-                self._raw = frame, rest
-                self.written += self._raw
-            number += 1
-        _save_mat(self._raw[0], clipped_data=np.clip(one.line, 0.0, CLIPPED_V)[None])
-        _save_mat(self._raw[1], clipped_data_hom=np.clip(one.homogeneous_line, 0.0, CLIPPED_V)[None])
+        if self._raw not in self.written:
+            self.written += self._raw, self._raw_homogeneous
+        _save_mat(self._raw, clipped_data=np.clip(one.line, 0.0, CLIPPED_V)[None])
+        _save_mat(self._raw_homogeneous, clipped_data_hom=np.clip(one.homogeneous_line, 0.0, CLIPPED_V)[None])
         self._largest_nm = abs(one.torque_nm)
 
 

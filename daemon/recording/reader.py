@@ -319,7 +319,6 @@ class TopicSummary:
 
     messages: int = 0
     rate_hz: float | None = None
-    json_bytes: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -366,7 +365,6 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
                 name, t_ns = channels[record.channel_id], record.log_time
                 topic = topics.setdefault(name, TopicSummary())
                 topic.messages += 1
-                topic.json_bytes += len(record.data)
                 first_ns, last_ns = spans.get(name, (t_ns, t_ns))
                 spans[name] = min(first_ns, t_ns), max(last_ns, t_ns)
             case Metadata():

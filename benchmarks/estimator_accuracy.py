@@ -6,7 +6,7 @@ Three tables, led by the loaded frames (truth of 0.005 N·m or more): every esti
 of the paper's recordings and judged on the later part; the default estimator fitted to one stream and judged on the
 others, of the same and of another day; and with `--rig` the default estimator on the emulated rig, calibrated on three
 to seven cylinders and judged on other tools. RECORDINGS holds torque_slices, diameter_slices and streams. Writes
-estimators.json, and the default's truth against estimate as estimators.png.
+estimators.json.
 """
 
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import FrameSeries, Physics, fit, measure_timing
 from shearloop.bank.estimators import DEFAULT, EstimatorName
-from shearloop.daemon.analysis.evaluate import EstimateTrack, draw_tracks, estimate_series, figures_by_load, figures_of
+from shearloop.daemon.analysis.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.cli.emulated_calibration import calibrate, record
 from shearloop.daemon.recording.matlab import import_mat
@@ -166,13 +166,10 @@ def main() -> None:
     physics = Physics(Bank.open(args.bank), load_mesh(args.mesh))
     names: list[EstimatorName] = ["paper", "bank", "regression", DEFAULT, "reconstruction"]
     found: dict[str, dict[str, dict[str, Figures]]] = {}
-    tracks: dict[str, EstimateTrack] = {}
     print(table_head("fitted to", "estimator", *LOADED, *ALL))
     for title, name, track in later_frames(args.recordings, args.out, names, physics):
         found.setdefault(title, {})[name] = judged(track)
         print(table_row(title, name, *row_of(judged(track))), flush=True)
-        if name == DEFAULT:
-            tracks[title] = track
     print(table_head("fitted to", "estimator", *LOADED, *ALL))
     for title, result in other_recordings(args.recordings, args.out):
         if isinstance(result, str):
@@ -187,8 +184,6 @@ def main() -> None:
             rmse_mm, coverage = figures["diameter_rmse_mm"], figures["diameter_coverage_95"]
             print(table_row(count, " and ".join(sides), rmse_mm, coverage), flush=True)
     write_figures(args.out / "estimators.json", found)
-    title = f"{DEFAULT}, on frames later than its fit"
-    draw_tracks(list(tracks.values()), [f"fitted to {name}" for name in tracks], title, args.out / "estimators.png")
 
 
 if __name__ == "__main__":

@@ -18,12 +18,11 @@ from scipy.io import savemat
 
 from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import Calibration, FrameSeries, fit, load_delay, measure_timing
+from shearloop.bank.estimation import Calibration, FrameSeries, fit, measure_timing
 from shearloop.bank.estimation.bank_match import ElectrodeNumbering
 from shearloop.bank.estimation.load_delay import find_load_delay, is_filtered, load_delay_warning
 from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.bank.estimators import EstimatorName
-from shearloop.daemon.analysis import calibrate as calibrate_module
 from shearloop.daemon.analysis.charts.fault_sweeps import balanced
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
@@ -318,7 +317,7 @@ def test_a_fingertip_that_the_lever_hardly_moves_has_its_times_from_the_other_on
         measure_timing([late.select_sides(("left",))], [late])
 
 
-def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twists_file, tmp_path, capsys, monkeypatch):
+def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twists_file, tmp_path, capsys):
     calibrate = ["calibrate", str(twists_file), "--time-range", f"0:{THIRD}", "--out", str(tmp_path / "a.cal")]
     assert main(calibrate) == 0
     printed = capsys.readouterr().out
@@ -328,15 +327,10 @@ def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twis
     assert re.search(r"intervals are wider, for loads \d\.\d times\. Record more changes of load", printed)
     assert main([*calibrate, "--load-cell-delay-s", "0"]) == 0
     assert "Could not verify" not in capsys.readouterr().out
-    looked, read, of_side = [], [], load_delay._delay_of_side
-    monkeypatch.setattr(calibrate_module, "read_recording", lambda path: (read.append(path), read_recording(path))[1])
-    monkeypatch.setattr(load_delay, "_delay_of_side", lambda *a: (looked.append(a[0]), of_side(*a))[1])
     assert main(["calibrate", str(twists_file), "--sides", "left", "--out", str(tmp_path / "a.cal"), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["timing_uncertainty_s"] == 0
     assert printed["load_cell_delay_s"] == [pytest.approx(0.25, abs=0.03)]
-    assert len(looked) == len(set(looked)), "each recording once"
-    assert read == [twists_file]
 
 
 @pytest.mark.parametrize("name", ["20241202_171704", "glitch_20241202_173837"])

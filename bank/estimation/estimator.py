@@ -3,7 +3,6 @@
 An estimator is a subclass of `Estimator` in a file of its own, and a line in `bank/estimators.py`.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeAlias
@@ -154,8 +153,6 @@ class Estimator:
     uses_amplitude: ClassVar[bool] = True
     ignores_nan: ClassVar[bool] = False
     least_slices: ClassVar[int] = 10
-    # Longer recordings are thinned out for the fit.
-    most_frames: ClassVar[float] = math.inf
 
     scale: FloatArray
     table: ChannelTable = PAPER_TABLE
@@ -165,11 +162,6 @@ class Estimator:
     def prepare(cls, material: Material) -> Self:
         """Return the estimator before its fit."""
         return cls(material.scale, material.table)
-
-    @property
-    def searches_bank(self) -> bool:
-        """Whether an estimate searches a bank, which takes many milliseconds; others take less than one."""
-        return self.needs == "bank"
 
     @property
     def motion(self) -> Motion:
@@ -213,7 +205,7 @@ class Estimator:
 
     def k_range(self, features: FloatArray) -> FloatArray:
         """Return the least and the largest k of (n, d) features, empty for an estimator without a bank."""
-        return np.array([features[:, 0].min(), features[:, 0].max()]) if self.searches_bank else np.zeros(0)
+        return np.array([features[:, 0].min(), features[:, 0].max()]) if self.needs == "bank" else np.zeros(0)
 
     def slices_fit(self, _quantity: Quantity, _values: FloatArray) -> RegressorFit:
         """Return the fit to slices of (n,) values; raises CalibrationError where they do not determine it."""
@@ -345,8 +337,6 @@ class PaperEstimator(_OnBank):
     columns: ClassVar[Mapping[Quantity, slice]] = {"torque": slice(1, 3), "diameter": slice(0, 1)}
     strengths: ClassVar[tuple[float, ...]] = (1e-9,)
     uses_amplitude: ClassVar[bool] = False
-    # A heatmap over all lags takes most of a second.
-    most_frames: ClassVar[float] = 120
 
     def matcher(self, bank: Bank) -> BankMatcher:
         """Return the paper's match on the bank."""

@@ -136,9 +136,8 @@ def _fit_raw(
     calibration: Calibration, recordings: list[FrameSeries], physics: Physics, timing_uncertainty_s: float
 ) -> Calibration:
     """Return the calibration with its outputs; the torques may be off by the uncertainty in time."""
-    matcher, n_frames = calibration.matcher(physics.bank), sum(len(one.t_s) for one in recordings)
-    every = max(1, int(n_frames // calibration.estimator.most_frames))
-    rows = [row for i, one in enumerate(recordings) for row in _replay(calibration, matcher, i, one, every)]
+    matcher = calibration.matcher(physics.bank)
+    rows = [row for i, one in enumerate(recordings) for row in _replay(calibration, matcher, i, one)]
     if not rows:
         raise CalibrationError("no frame of the recordings is gripped and undisturbed for long enough to calibrate on")
     bounds = None
@@ -219,7 +218,7 @@ def adapt(
     rows = [
         row
         for i, one in enumerate(recordings)
-        for row in _replay(calibration, matcher, i, one.select_sides(calibration.sides), 1)
+        for row in _replay(calibration, matcher, i, one.select_sides(calibration.sides))
         if not first_frames or row.frame >= first_frames[i]
     ]
     if not rows:
@@ -235,7 +234,7 @@ def adapt(
 
 
 def _replay(
-    calibration: Calibration, matcher: BankMatcher | None, recording: int, series: FrameSeries, every: int
+    calibration: Calibration, matcher: BankMatcher | None, recording: int, series: FrameSeries
 ) -> list[CalibrationRow]:
     """Return the frames that an estimate would be made of, processed as in a session."""
     estimator, rows = calibration.estimator, []
@@ -244,7 +243,7 @@ def _replay(
         zip(series.t_s.tolist(), series.channels, series.torque_at_frames(), series.diameter_mm, strict=True)
     ):
         processed = state.process(TactileFrame.of(t_s, channels))
-        if processed.reasons or not np.isfinite(torque) or i % every:
+        if processed.reasons or not np.isfinite(torque):
             continue
         features, _ = estimator.features(Reading(processed, t_s, matcher))
         position, mean_position = (

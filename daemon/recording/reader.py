@@ -9,22 +9,18 @@ import io
 import json
 import struct
 import zlib
-from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from itertools import zip_longest
-from operator import attrgetter
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Footer, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
+from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 from pydantic_core import from_json
@@ -43,8 +39,6 @@ _LARGEST_RECORD_BYTES = 1 << 30
 _BLOCK_BYTES = 1 << 20
 # Opcode and length, then the places of index and its offsets, and the index's checksum; or the data's checksum.
 _FOOTER, _DATA_END = struct.Struct("<BQQQI"), struct.Struct("<BQI")
-# Opcode and length of a record, and what a message begins with: channel, sequence, log time and publish time.
-_RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 # Metadata of every recording; the other keys are notes of this one.
 _IDENTITY_KEYS = ("format_version", "channel_table_hash", "electrodes", "injection", "software", "code_sha256")
 
@@ -90,7 +84,6 @@ class OpenRecording:
         counts = summary.statistics.channel_message_counts
         # The number of messages of each topic.
         self.counts = {channel.topic: counts.get(channel.id, 0) for channel in summary.channels.values()}
-        self._file, self._channels, self._chunks = file, summary.channels, summary.chunk_indexes
 
     def metadata(self) -> dict[str, dict[str, str]]:
         """Return the metadata records by name."""
@@ -103,36 +96,9 @@ class OpenRecording:
     def messages(
         self, topics: Iterable[str] | None = None, *, by_time: bool = True
     ) -> Iterator[tuple[Channel, Message]]:
-        """Yield the messages of some topics or of all, by log time or in the order of the file."""
-        chosen = self.counts.keys() if topics is None else set(topics)
-        wanted = {number: channel for number, channel in self._channels.items() if channel.topic in chosen}
-        chunks = [one for one in self._chunks if wanted.keys() & one.message_index_offsets.keys()]
-        if by_time:
-            chunks.sort(key=attrgetter("message_start_time"))
-        waiting: list[Message] = []
-        for chunk, following in zip_longest(chunks, chunks[1:]):
-            waiting += (one for one in self._messages_of(chunk) if one.channel_id in wanted)
-            n = len(waiting)
-            if by_time:
-                waiting.sort(key=attrgetter("log_time"))
-                # Later chunks may begin before this one ends.
-                n = bisect_left(waiting, following.message_start_time, key=attrgetter("log_time")) if following else n
-            for message in waiting[:n]:
-                yield wanted[message.channel_id], message
-            del waiting[:n]
-
-    def _messages_of(self, index: ChunkIndex) -> Iterator[Message]:
-        """Yield the messages of a chunk: the mcap library takes several times as long for small ones."""
-        self._file.seek(index.chunk_start_offset + _RECORD.size)
-        stream, size = get_chunk_data_stream(Chunk.read(ReadDataStream(self._file)), validate_crc=True)
-        data, at = stream.read(size), 0
-        while at < size:
-            opcode, length = _RECORD.unpack_from(data, at)
-            at += _RECORD.size
-            if opcode == Opcode.MESSAGE:
-                channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(data, at)
-                yield Message(channel, log_ns, data[at + _MESSAGE.size : at + length], publish_ns, sequence)
-            at += length
+        """Return the messages of some topics or of all, by log time or in the order of the file."""
+        found = self._reader.iter_messages(topics, log_time_order=by_time)
+        return ((channel, message) for _, channel, message in found)
 
 
 @contextmanager
@@ -169,20 +135,11 @@ def open_recording(path: Path) -> Iterator[OpenRecording]:
 
 
 def read_messages(path: Path, topics: Iterable[str]) -> Iterator[tuple[str, dict[str, Any], Message]]:
-    """Yield topic, content and message by log time, None for keys without a value; raises UserError.
-
-    The elements of the longest arrays, a heatmap's scores, stay JSON text: bytes, which `tables.numbers` reads.
-    """
-    array = b'"scores":['
+    """Yield topic, content and message by log time, None for keys without a value; raises UserError."""
     with open_recording(path) as recording:
         for channel, message in recording.messages(topics):
             live = schema.schema_name(channel.topic)
-            data, found, rest = message.data.partition(array)
-            elements, _, after = rest.partition(b"]")
-            content = from_json(data + found + b"]" + after if found else data)
-            if found:
-                content["scores"] = elements
-            yield channel.topic, schema.with_missing_keys(live, content), message
+            yield channel.topic, schema.with_missing_keys(live, from_json(message.data)), message
 
 
 def check_magic(path: Path, file: IO[bytes]) -> None:

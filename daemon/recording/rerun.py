@@ -12,7 +12,6 @@ from shearloop.daemon.errors import require
 from shearloop.daemon.messaging.messages import ENVELOPE, EitEstimate, EitHeatmap, RobotStateMessage
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.reader import Progress, read_messages
-from shearloop.daemon.recording.tables import numbers
 from shearloop.daemon.web.message_store import conductivity_profile
 
 TIMELINE = "time"
@@ -42,10 +41,14 @@ class _RerunFile:
         self._poses: dict[str, None] = {}
 
     def add(self, topic: str, content: Mapping[str, Any], t_ns: int) -> None:
-        """Add one message of a recorded topic; `scores` are JSON text."""
+        """Add one message of a recorded topic."""
         entity = topic.replace(".", "/")
         for key, value in content.items():
-            if (isinstance(value, list) and len(value) > _LONGEST_SCALARS) or key in (*ENVELOPE, schema.SCORES_SHAPE):
+            if (isinstance(value, list) and len(value) > _LONGEST_SCALARS) or key in (
+                *ENVELOPE,
+                "scores",
+                schema.SCORES_SHAPE,
+            ):
                 continue
             if isinstance(value, bool | int | float | list):
                 self._add(f"{entity}/{key}", value, t_ns)
@@ -54,7 +57,7 @@ class _RerunFile:
             self._models[content["source"]] = content["model"]
             # Recordings of 0.1 have no shape.
             if shape := content.get(schema.SCORES_SHAPE):
-                self._add_image(f"{entity}/scores", numbers(content["scores"]).reshape(shape), t_ns)
+                self._add_image(f"{entity}/scores", np.array(content["scores"], float).reshape(shape), t_ns)
         elif live == EitEstimate.topic and content["k"] is not None and content["sigma"] is not None:
             model = self._models.get(content["source"], "")
             profile = conductivity_profile(model, content["k"], content["sigma"], self._height_cm)

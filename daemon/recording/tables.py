@@ -2,15 +2,12 @@
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic_core import from_json
 
-from shearloop.bank.arrays import FloatArray, compiled
 from shearloop.daemon.errors import missing
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.reader import Progress, check_identity, open_recording, read_messages
@@ -19,12 +16,6 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 Rows = list[dict[str, Any]]
-
-# Integers of so many digits and these powers of ten are exact, so their product or quotient is rounded once
-# (Clinger 1990).
-_EXACT_DIGITS = 15
-_POWERS = np.array([float(10**n) for n in range(23)])
-_COMMA, _POINT, _MINUS, _PLUS, _ZERO, _NINE, _E, _CAPITAL_E = b",.-+09eE"
 
 
 class RecordedTopics(Mapping[str, dict[str, NDArray[Any]]]):
@@ -88,60 +79,10 @@ def read_rows(path: Path, topics: Iterable[str], progress: Progress = lambda _: 
     rows: dict[str, Rows] = {topic: [] for topic in topics}
     for number, (topic, content, message) in enumerate(read_messages(path, rows), start=1):
         # As arrays, heatmaps take a quarter of the memory.
-        held = {key: numbers(value) if isinstance(value, list | bytes) else value for key, value in content.items()}
+        held = {key: np.array(value, float) if isinstance(value, list) else value for key, value in content.items()}
         rows[topic].append(row_of(held, message.log_time))
         progress(number)
     return rows
-
-
-def numbers(array: list[float | None] | bytes) -> FloatArray:
-    """Return the numbers of a list, or of a JSON array without its brackets; NaN for a missing one."""
-    if isinstance(array, list):
-        return np.array(array, dtype=np.float64)
-    text = np.frombuffer(array + b",", np.uint8)
-    found = np.empty(np.count_nonzero(text == _COMMA) if array else 0)
-    if not _parser()(text, found):
-        found[:] = from_json(b"[" + array + b"]")
-    return found
-
-
-@cache
-def _parser() -> Any:
-    """Return `_parse`, compiled: a JSON parser makes an object of each number and takes several times as long."""
-    return compiled(_parse)
-
-
-def _parse(text: NDArray[np.uint8], found: FloatArray) -> bool:
-    """Write JSON numbers, each with a comma behind it, into `found`; return False where one may be rounded twice."""
-    i = 0
-    for n in range(len(found)):
-        sign = -1.0 if text[i] == _MINUS else 1.0
-        i += text[i] == _MINUS
-        mantissa = digits = power = 0
-        point = -1
-        while _POINT <= text[i] <= _NINE:
-            if text[i] == _POINT:
-                point = digits
-            else:
-                mantissa = 10 * mantissa + (text[i] - _ZERO)
-                digits += 1
-            i += 1
-        if text[i] in (_E, _CAPITAL_E):
-            downwards = text[i + 1] == _MINUS
-            i += 2 if text[i + 1] in (_MINUS, _PLUS) else 1
-            while text[i] != _COMMA:
-                power = 10 * power + (text[i] - _ZERO)
-                i += 1
-            power = -power if downwards else power
-        power -= digits - point if point >= 0 else 0
-        if digits > _EXACT_DIGITS or abs(power) >= len(_POWERS):
-            return False
-        scaled = mantissa / _POWERS[-power] if power < 0 else mantissa * _POWERS[power]
-        found[n] = sign * scaled if digits else np.nan
-        while text[i] != _COMMA:
-            i += 1
-        i += 1
-    return True
 
 
 def row_of(content: Mapping[str, Any], log_time_ns: int) -> dict[str, Any]:

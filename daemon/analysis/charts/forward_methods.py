@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.forward import BatchForwardModel, ForwardModel
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import ConductivityModel, conductivity
@@ -22,17 +21,15 @@ CONVERGED_SIZES_CM = (0.04, 0.025)
 BATCH, BATCHES = "batch of cells", 8
 # The mesh of the cited times. The direct solve agrees with EIDORS' voltages on it to 1e-9.
 PAPER_TRIANGLES = 4882
-# EIDORS 3.10 with warm caches on that mesh, in seconds; it needs MATLAB or Octave, so it is cited.
-EIDORS_CELL_S = 0.034
-# pyEIT with warm caches on that mesh, cited where it is not installed.
-PYEIT_CELL_S = 0.244
+# Seconds with warm caches on that mesh.
+EIDORS_CELL_S, PYEIT_CELL_S = 0.034, 0.244
 
 
 @dataclass(frozen=True, slots=True)
 class SolvedForward:
     """A forward method: ms per cell (median, fastest and slowest round), and the signals' relative L2 error.
 
-    `cited` times were not measured here. The error is None where it is unknown, or where the model is another one.
+    `cited` times were not measured here. The error is None where it is unknown.
     """
 
     name: str
@@ -50,9 +47,8 @@ class _Solver:
     name: str
     family: str
     mesh: Mesh
-    solve: Callable[[], object]
-    # None where another model is solved.
-    truth: FloatArray | None
+    solve: Callable[[], FloatArray]
+    truth: FloatArray
     # How often one call solves all cells.
     repeats: int = 1
 
@@ -63,10 +59,9 @@ def forward_methods(
     sizes_cm: Sequence[float] = DIRECT_SIZES_CM,
     converged_cm: tuple[float, float] = CONVERGED_SIZES_CM,
 ) -> list[SolvedForward]:
-    """Return all forward methods: direct and batched solves on ever finer meshes and on `mesh`, and the peers.
+    """Return all forward methods: direct and batched solves on ever finer meshes and on `mesh`, and two cited ones.
 
-    Methods take turns, so that a busy moment of the machine affects all alike. pyEIT solves on the mesh with the number
-    of triangles closest to the paper's, and is cited where it is not installed. EIDORS is always cited.
+    Methods take turns, so that a busy moment of the machine affects all alike.
     """
     coarse, fine = (own_fingertip(size).mesh() for size in converged_cm)
     truth = converged(coarse, fine, converged_cm[0] / converged_cm[1])
@@ -80,14 +75,8 @@ def forward_methods(
         given = converged(once, once.refined(), 2.0)
         solvers.append(_Solver("direct, --mesh", "direct, the given mesh", mesh, direct(mesh), given))
         solvers.append(_Solver("batch, --mesh", f"{BATCH}, the given mesh", mesh, batch(mesh), given, BATCHES))
-    alike = min((one.mesh for one in solvers), key=lambda mesh: abs(len(mesh.triangles) - PAPER_TRIANGLES))
-    solve = pyeit_solver(alike)
-    if solve is not None:
-        of = ConductivityModel(alike)
-        cells = [of.conductivity(MODEL, k, s) for k, s in CELLS]
-        solvers.append(_Solver("pyEIT", "pyEIT", alike, lambda: [solve(cell) for cell in cells], None))
     times: dict[str, list[float]] = {one.name: [] for one in solvers}
-    signals: dict[str, object] = {}
+    signals: dict[str, FloatArray] = {}
     for _ in range(rounds):
         for one in solvers:
             begun = time.perf_counter()
@@ -95,40 +84,17 @@ def forward_methods(
             times[one.name].append(1e3 * (time.perf_counter() - begun) / (len(CELLS) * one.repeats))
     found = []
     for one in solvers:
-        ms, error = times[one.name], None
-        if one.truth is not None:
-            error = error_of(np.asarray(signals[one.name]), one.truth)
-        triangles = len(one.mesh.triangles)
+        ms, triangles = times[one.name], len(one.mesh.triangles)
+        error = error_of(signals[one.name], one.truth)
         found.append(SolvedForward(one.name, one.family, triangles, float(np.median(ms)), min(ms), max(ms), error))
-    # EIDORS' error is known only where the paper's mesh was given.
-    error = next((one.error for one in found if one.triangles == PAPER_TRIANGLES), None)
-    found.append(_cited("EIDORS 3.10", "EIDORS", EIDORS_CELL_S, error))
-    return found if solve is not None else [*found, _cited("pyEIT", "pyEIT", PYEIT_CELL_S, None)]
+    # EIDORS solves the same model: its error is known where the paper's mesh is given. pyEIT's electrodes are points.
+    paper = next((one.error for one in found if one.triangles == PAPER_TRIANGLES), None)
+    return [*found, _cited("EIDORS 3.10", "EIDORS", EIDORS_CELL_S, paper), _cited("pyEIT", "pyEIT", PYEIT_CELL_S, None)]
 
 
 def _cited(name: str, family: str, cell_s: float, error: float | None) -> SolvedForward:
     cell_ms = 1e3 * cell_s
     return SolvedForward(f"{name} (cited)", family, PAPER_TRIANGLES, cell_ms, cell_ms, cell_ms, error, cited=True)
-
-
-def pyeit_solver(mesh: Mesh) -> Callable[[FloatArray], object] | None:
-    """Return pyEIT's forward solve of the same patterns on the same mesh, or None where it is not installed."""
-    try:
-        from pyeit.eit.fem import EITForward
-        from pyeit.eit.protocol import PyEITProtocol
-        from pyeit.mesh import PyEITMesh
-    except ImportError:
-        return None
-    nodes = np.column_stack([mesh.nodes, np.zeros(len(mesh.nodes))])
-    middles = [mesh.electrode_edges[mesh.electrode_of_edge == e][0, 0] for e in range(PAPER_TABLE.n_electrodes)]
-    free = int(np.setdiff1d(np.arange(len(mesh.nodes)), mesh.electrode_edges)[0])
-    body = PyEITMesh(node=nodes, element=np.asarray(mesh.triangles), el_pos=np.array(middles), ref_node=free)
-    injections = PAPER_TABLE.electrodes.reshape(PAPER_TABLE.n_electrodes, -1, 4)
-    protocol = PyEITProtocol(
-        injections[:, 0, [1, 0]].copy(), injections[:, :, 2:].copy(), np.ones(PAPER_TABLE.n_channels, dtype=bool)
-    )
-    solver = EITForward(body, protocol)
-    return lambda conductivity: solver.solve_eit(perm=conductivity)
 
 
 def batch(mesh: Mesh) -> Callable[[], FloatArray]:

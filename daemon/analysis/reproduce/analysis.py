@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
@@ -363,8 +364,8 @@ def place_in_series(values: FloatArray) -> tuple[IntArray, IntArray] | None:
     """Return the level and the repeat (n,) of values, in order of time, that repeat one rising series; else None.
 
     A series restarts where the value falls by more than half of the whole range. The longest series have all levels.
-    The values of a shorter one go, in their order, to the levels with the nearest means over the longest, in the sum of
-    squares. There must be two series, of three levels or more.
+    The values of a shorter one go, in their order, to the levels whose means over the longest are nearest to them, in
+    the sum of squares. There must be two series, of three levels or more.
     """
     falls = np.diff(values) < -_RESTART_SHARE * np.ptp(values)
     repeat = np.concatenate([[0], np.cumsum(falls)]).astype(np.int64)
@@ -377,26 +378,8 @@ def place_in_series(values: FloatArray) -> tuple[IntArray, IntArray] | None:
     level = np.empty(len(values), dtype=np.int64)
     for each in range(len(length)):
         members = np.flatnonzero(repeat == each)
-        level[members] = _rising_levels((values[members, None] - means) ** 2)
+        level[members] = np.sort(linear_sum_assignment((values[members, None] - means) ** 2)[1])
     return level, repeat
-
-
-def _rising_levels(cost: FloatArray) -> IntArray:
-    """Return the rising levels (n,) of n values with the least total of an (n, m) cost."""
-    n, m = cost.shape
-    # least[i, j] is the least cost of the first i values on the first j levels.
-    least = np.full((n + 1, m + 1), np.inf)
-    least[0] = 0.0
-    for i in range(1, n + 1):
-        for j in range(i, m + 1):
-            least[i, j] = min(least[i, j - 1], least[i - 1, j - 1] + cost[i - 1, j - 1])
-    levels, j = np.empty(n, dtype=np.int64), m
-    for i in range(n, 0, -1):
-        while least[i, j - 1] == least[i, j]:
-            j -= 1
-        j -= 1
-        levels[i - 1] = j
-    return levels
 
 
 def kmeans_groups(values: FloatArray, n_groups: int) -> IntArray:

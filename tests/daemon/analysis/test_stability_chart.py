@@ -186,13 +186,6 @@ def test_of_few_torques_each_limit_is_there_once_and_none_leaves_nothing_to_judg
     assert [part.limit_nm for part in found[stability.LARGER]] == [0.06, 0.1]
 
 
-def test_chosen_slices_keep_their_own_torques(slices):
-    rows = np.array([1, 7, 8, 30])
-    chosen = stability.select_rows(slices, rows)
-    np.testing.assert_array_equal(chosen.torque_at_frames(), slices.torque_at_frames()[rows])
-    np.testing.assert_array_equal(chosen.channels, slices.channels[rows])
-
-
 @pytest.mark.usefixtures("few_mixtures")
 def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(slices, bank, monkeypatch, capsys):
     # A twentieth is too few for an estimator.

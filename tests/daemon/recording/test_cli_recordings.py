@@ -262,12 +262,6 @@ def test_what_is_judged_twice_is_refused_as_what_is_fitted_twice_is(slices_folde
     assert f"{copy}: Data_Slice_30.mat equals {slices}: Data_Slice_30.mat, and 19 more are" in refusal
 
 
-def test_the_load_cell_is_still_calibrated_by_its_name(capsys):
-    with pytest.raises(SystemExit):
-        main(["calibrate", "load", "--help"])
-    assert "known masses" in capsys.readouterr().out
-
-
 def _torque(torque_nm: float, half_nm: float) -> Estimate:
     return Estimate(
         True, (), torque_nm=torque_nm, torque_low_nm=torque_nm - half_nm, torque_high_nm=torque_nm + half_nm

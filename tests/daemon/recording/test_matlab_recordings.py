@@ -182,24 +182,6 @@ def test_a_damaged_recording_is_refused_or_has_the_right_shape(tmp_path, recordi
         assert np.isfinite(slices.differences).all()
 
 
-def test_the_shared_recordings_are_read(shared):
-    folder = shared / "recordings"
-    torque, diameter = (
-        read_torque_slices(folder / "torque_slices"),
-        read_diameter_slices(folder / "diameter_slices"),
-    )
-    assert torque.numbers.tolist() == list(range(1, 50))
-    assert torque.torque_nm[9] == pytest.approx(0.0085, abs=5e-5)
-    assert diameter.diameter_mm.tolist() == [10.0] * 8 + [20.0] * 7 + [30.0] * 4 + [40.0] * 8
-    assert read_line(folder / "torque_slices" / "TorqueSlice.mat").max() == 0.45
-    streams = folder / "streams"
-    for name in ("2024-12-03_16-09/device1", "20241202_153632/left", "cylinders/10mm_1_right"):
-        stream = read_stream(streams / f"{name}.mat")
-        assert 0.4 < np.diff(stream.unix_s).mean() < 0.7
-        assert np.count_nonzero(stream.values[0]) == 896
-    assert read_load_stream(streams / "glitch_20241202_173837" / "load.mat").values.max() == 38399996.0
-
-
 NAMES = st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,30}", fullmatch=True)
 KINDS = ["f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"]
 MATRICES = st.sampled_from(KINDS).flatmap(

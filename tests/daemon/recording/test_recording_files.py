@@ -199,12 +199,3 @@ def test_unusable_files_are_refused_by_name(mat_folder, tmp_path):
             import_mat(sources, tmp_path / "a.mcap")
     with pytest.raises(UserError, match="without slices"):
         read_series(tmp_path / "empty")
-
-
-@pytest.mark.parametrize("decimals", [4, 6, 7, 17])
-def test_lines_are_rounded_number_by_number(tmp_path, decimals):
-    line = np.round(np.random.default_rng(decimals).uniform(-1, 1, PAPER_TABLE.n_line_values), decimals)
-    with RecordingWriter(tmp_path / "a.mcap", "a test") as writer:
-        writer.add_frame("right", 1, 2, line)
-    found = read_recording(tmp_path / "a.mcap").sides["right"].lines[0]
-    assert found.tolist() == [round(value, 6) for value in line.tolist()]

@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from shearloop.bank.eit.channels import PAPER_TABLE
@@ -22,7 +20,6 @@ from shearloop.daemon.cli import main
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import TOPICS, decode, encode, wire_map
 from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.tables import numbers
 from shearloop.daemon.recording.writer import McapFile
 from tests.daemon.sample_messages import sample
 
@@ -120,21 +117,6 @@ def test_tables_hold_every_score_of_a_heatmap(tmp_path, monkeypatch):
     assert [row["model"] for row in rows] == ["linear"] * 4
     table = parquet.read_table(tmp_path / "a_parquet/eit.heatmap.right.parquet").to_pydict()
     np.testing.assert_array_equal(np.array(table["scores"], dtype=float), found)
-
-
-@given(
-    st.lists(
-        st.none()
-        | st.floats(allow_nan=False, allow_infinity=False)
-        | st.integers(-(10**18), 10**18)
-        | st.floats(-1e5, 1e5).map(lambda x: round(x, 6))
-        | st.builds(lambda mantissa, exponent: mantissa * 10.0**exponent, st.integers(-999, 999), st.integers(-25, 25)),
-    )
-)
-def test_scores_are_read_as_a_json_parser_reads_them(values):
-    text = json.dumps(values, separators=(",", ":"))[1:-1].encode()
-    np.testing.assert_array_equal(numbers(text), np.array(values, dtype=np.float64))
-    assert numbers(text.replace(b"e", b"E")).tobytes() == numbers(text).tobytes()
 
 
 def test_a_dataset_holds_what_was_known_and_names_its_origin(tmp_path):

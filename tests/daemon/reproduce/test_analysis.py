@@ -186,7 +186,7 @@ def test_series_are_found_though_some_lack_a_level(repeats, lacking, seed):
 
 @given(drift=st.lists(st.floats(-0.02, 0.02), min_size=14, max_size=14), lacking=st.sampled_from([1, 2, 3, 4, 5, 6]))
 def test_beyond_half_a_spacing_the_nearest_rising_levels_are_taken(drift, lacking):
-    """By all ways there are: values that noise made change places stay in their order, and each has its own level."""
+    """By all ways there are: each value has its own level, in order of size."""
     lacks_two = [level for level in range(1, 8) if level != lacking]
     values = LEVELS[[*range(8), *lacks_two]] + drift
     series = place_in_series(values)
@@ -194,21 +194,13 @@ def test_beyond_half_a_spacing_the_nearest_rising_levels_are_taken(drift, lackin
     assume(series is not None and series[1].tolist() == 8 * [0] + 6 * [1])
     assert series[0][:8].tolist() == list(range(8))
     found = series[0][8:]
+    rising = np.sort(values[8:])
     cost = {
-        levels: float(((values[8:] - values[list(levels)]) ** 2).sum()) for levels in combinations(range(8), len(found))
+        levels: float(((rising - np.sort(values[list(levels)])) ** 2).sum())
+        for levels in combinations(range(8), len(found))
     }
     assert tuple(found) in cost
     assert cost[tuple(found)] == pytest.approx(min(cost.values()), abs=1e-15)
-
-
-def test_a_value_nearer_to_a_level_that_its_series_lacks_goes_there():
-    """Nothing tells them apart: 0.06 that reads 0.0549 is 0.05, where no other value is."""
-    whole, lacking = LEVELS.tolist(), np.delete(LEVELS, 2).tolist()
-    for reading, level in ((0.0551, 3), (0.0549, 2)):
-        lacking[2] = reading
-        series = place_in_series(np.array([*whole, *lacking, *whole]))
-        assert series is not None
-        assert series[0][8:15].tolist() == [0, 1, level, 4, 5, 6, 7]
 
 
 def test_in_a_whole_series_noise_moves_no_value_to_another_level():
@@ -232,15 +224,6 @@ def test_in_a_whole_series_noise_moves_no_value_to_another_level():
 )
 def test_what_is_no_repeated_series_is_told(values):
     assert place_in_series(values) is None
-
-
-def test_kmeans_finds_groups_that_are_there_and_the_same_ones_each_time():
-    generator = np.random.default_rng(3)
-    truth = generator.permutation(np.repeat(np.arange(4), 6))
-    values = truth * 10.0 + generator.normal(size=24) * 0.5
-    groups = kmeans_groups(values, 4)
-    assert groups.tolist() == kmeans_groups(values, 4).tolist() == truth.tolist()
-    np.testing.assert_allclose(group_means(values, groups), [0, 10, 20, 30], atol=1)
 
 
 @given(
@@ -269,8 +252,3 @@ def test_ten_groups_are_found_where_kmeans_loses_some():
     groups = kmeans_groups(values / 100, 10)
     assert np.unique(groups).tolist() == list(range(10))
     assert (np.diff(group_means(values / 100, groups)) > 0).all()
-
-
-def test_kmeans_takes_as_many_groups_as_there_are_values():
-    assert kmeans_groups(np.array([1.0, 1.0, 5.0]), 2).tolist() == [0, 0, 1]
-    assert kmeans_groups(np.ones(3), 1).tolist() == [0, 0, 0]

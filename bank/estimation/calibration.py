@@ -218,7 +218,7 @@ class Calibration:
 
     def matcher(self, bank: Bank | None) -> BankMatcher | None:
         """Return the matcher of an estimator that needs a bank, None for others; raises as `check_bank` does."""
-        return self.estimator.matcher(self.check_bank(bank)) if self.estimator.searches_bank else None
+        return self.estimator.matcher(self.check_bank(bank)) if self.estimator.needs == "bank" else None
 
 
 def _paper_estimator(table: ChannelTable) -> PaperEstimator:

@@ -164,11 +164,6 @@ class Estimator:
         return cls(material.scale, material.table)
 
     @property
-    def searches_bank(self) -> bool:
-        """Whether an estimate searches a bank, which takes many milliseconds; others take less than one."""
-        return self.needs == "bank"
-
-    @property
     def motion(self) -> Motion:
         """What a session remembers of the gel's motion."""
         return Motion()
@@ -210,7 +205,7 @@ class Estimator:
 
     def k_range(self, features: FloatArray) -> FloatArray:
         """Return the least and the largest k of (n, d) features, empty for an estimator without a bank."""
-        return np.array([features[:, 0].min(), features[:, 0].max()]) if self.searches_bank else np.zeros(0)
+        return np.array([features[:, 0].min(), features[:, 0].max()]) if self.needs == "bank" else np.zeros(0)
 
     def slices_fit(self, _quantity: Quantity, _values: FloatArray) -> RegressorFit:
         """Return the fit to slices of (n,) values; raises CalibrationError where they do not determine it."""

@@ -167,7 +167,7 @@ def open_estimator(config: FingertipConfig, name: str) -> FrameEstimator:
                 f"{config.calibration} is of the {' and '.join(calibration.sides)} fingertip, not of {name}; "
                 f"calibrate with `--sides {name}`, or name a calibration of both under `combined`"
             )
-        if calibration.estimator.searches_bank and config.bank is None:
+        if calibration.estimator.needs == "bank" and config.bank is None:
             raise _without_bank(calibration.estimator.name, name)
         return _live(config.calibration, calibration, config)
     if config.estimator not in (None, PaperEstimator.name):

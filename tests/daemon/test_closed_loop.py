@@ -272,19 +272,11 @@ async def test_a_daemon_that_ends_with_its_experiment_lets_the_tool_go_first(rig
     assert states[-1]["width_mm"] > held_mm + 5.0
 
 
-@pytest.mark.parametrize(
-    ("line", "sentence"),
-    [
-        ("unplug load", "no new torque has arrived"),
-        ("gripper fault 14", "the gripper reports a fault"),
-        ("gripper drop", "the gripper no longer holds an object"),
-    ],
-)
-async def test_each_fault_ends_in_the_tables_response(line, sentence, rig_config, tiny_bank, tmp_path):
+async def test_a_board_that_is_unplugged_holds_the_wrist(rig_config, tiny_bank, tmp_path):
     async with running_rig(rig_config, tiny_bank) as (_, watcher, fault, command):
         await started(command, experiment(tmp_path, SLOW_TWIST))
         await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.005)
-        fault(line)
-        state = await watcher.until("loop.state", lambda state: sentence in state["reasons"])
+        fault("unplug load")
+        state = await watcher.until("loop.state", lambda state: "no new torque has arrived" in state["reasons"])
         assert state["phase"] in ("held", "stopped")
         assert state["speed_command_rad_per_s"] == 0.0

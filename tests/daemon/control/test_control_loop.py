@@ -269,17 +269,18 @@ def test_a_protective_stop_ends_the_experiment_until_it_is_acknowledged():
 
 
 @pytest.mark.parametrize(
-    ("sense", "event"),
+    ("device", "sense", "event"),
     [
-        ({"protective_stop": True}, FaultCode.PROTECTIVE_STOP),
-        ({"emergency_stop": True}, FaultCode.EMERGENCY_STOP),
-        ({"blocked": "the robot's process was started again"}, FaultCode.ROBOT_BLOCKED),
+        ("arm", {"protective_stop": True}, FaultCode.PROTECTIVE_STOP),
+        ("arm", {"emergency_stop": True}, FaultCode.EMERGENCY_STOP),
+        ("arm", {"blocked": "the robot's process was started again"}, FaultCode.ROBOT_BLOCKED),
+        ("hand", {"fault": "the motor is overheated"}, FaultCode.GRIPPER_FAULT),
     ],
 )
-def test_what_the_robot_reports_ends_a_running_experiment_at_once(sense, event):
+def test_what_a_device_reports_ends_a_running_experiment_at_once(device, sense, event):
     rig = started(Rig(new_loop()), GRIP, {"do": "twist", "angles_rad": [0.3]})
     rig.run(2)
-    rig.arm = replace(rig.arm, **sense)
+    setattr(rig, device, replace(getattr(rig, device), **sense))
     rig.step()
     assert rig.orders.stop
     assert rig.speed == 0.0

@@ -147,7 +147,7 @@ async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way, tmp_pat
             await asyncio.sleep(0)
         assert rig.model.width_mm == held_mm
         rig.model.fail(12)
-        await rig.driver.read()
+        assert "internal fault" in gripper_task._status(await rig.driver.read()).fault
         assert await task.unlock() == ""
         assert not (await rig.driver.read()).fault.needs_activation
 

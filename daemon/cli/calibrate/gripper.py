@@ -29,7 +29,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--socket-port", int, "PORT", "the URCap's (default: %(default)s)", default=URCAP_PORT)
     text = "an object's diameter; give it once per object, of at least two"
     add_option(parser, "--diameter-mm", float, "MM", text, action="append", required=True)
-    add_option(parser, "--force-n", float, "N", "to grip with (default: %(default)s)", default=10.0)
     add_option(parser, "--out", Path, "FILE", "the calibration file to write", required=True)
     add_json(parser)
 
@@ -52,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
         client = ModbusClient(serial_number=args.serial_number, path=args.port)
     gripper = RobotiqGripper(client, WidthCalibration.nominal())
     operator = Operator(stdout_is_for_json=args.json)
-    gauges = asyncio.run(_grip(gripper, args.diameter_mm, args.force_n, operator))
+    gauges = asyncio.run(_grip(gripper, args.diameter_mm, operator))
     calibration = WidthCalibration.of_gauges(gauges)
     save_calibration(args.out, calibration)
     report = {
@@ -69,9 +68,7 @@ def run(args: argparse.Namespace) -> int:
     return print_result(report, sentences, as_json=args.json)
 
 
-async def _grip(
-    gripper: "RobotiqGripper", diameters_mm: list[float], force_n: float, operator: Operator
-) -> list[tuple[float, float]]:
+async def _grip(gripper: "RobotiqGripper", diameters_mm: list[float], operator: Operator) -> list[tuple[float, float]]:
     async with operator:
         try:
             await gripper.connect()
@@ -82,7 +79,7 @@ async def _grip(
             while len(gauges) < len(diameters_mm):
                 diameter_mm = diameters_mm[len(gauges)]
                 await operator.ask(f"Hold the object of {diameter_mm:g} mm between the fingertips, then press Enter.")
-                counts = await _contact(gripper, force_n)
+                counts = await _contact(gripper)
                 if counts is None:
                     print("Refused: the fingers closed without meeting anything.", file=sys.stderr, flush=True)
                 else:
@@ -93,12 +90,12 @@ async def _grip(
             await gripper.close()
 
 
-async def _contact(gripper: "RobotiqGripper", force_n: float) -> int | None:
+async def _contact(gripper: "RobotiqGripper") -> int | None:
     """Close and open; return the position of the contact, or None without one."""
     from shearloop.drivers.robotiq.gripper import STROKE_MM
     from shearloop.drivers.robotiq.messages import SPEED_MIN_MM_S, GripperCommand, ObjectStatus
 
     # Beyond the fingers' stop: reaching the target is never a contact.
-    closed = await gripper.finish(await gripper.move(GripperCommand(-STROKE_MM, SPEED_MIN_MM_S, force_n)))
+    closed = await gripper.finish(await gripper.move(GripperCommand(-STROKE_MM, SPEED_MIN_MM_S)))
     await gripper.finish(await gripper.move(GripperCommand(STROKE_MM)))
     return closed.position_counts if closed.object is ObjectStatus.CONTACT_CLOSING else None

@@ -283,7 +283,7 @@ class ForeignMixture:
     """Misfits of later slices, in units of their limit, for one origin, kind and share of a foreign frame.
 
     The misfit is from reciprocal channels. `passing` is the share that the validity check accepts, `passing_best`
-    the best limit's; `auc` is how often a mixed slice has a larger misfit than a good one.
+    the best limit's.
     """
 
     origin: float
@@ -292,7 +292,6 @@ class ForeignMixture:
     misfits: tuple[float, ...]
     passing: float
     passing_best: float
-    auc: float
 
 
 def detect_mixtures(series: FrameSeries, origins: Sequence[float] = ORIGINS) -> list[ForeignMixture]:
@@ -323,7 +322,6 @@ def detect_mixtures(series: FrameSeries, origins: Sequence[float] = ORIGINS) -> 
                         origin, kind, share, tuple(misfits),
                         float(np.mean([not guard.assess(frame, usable).reasons for frame in mixed])),
                         float((misfits <= good.max()).mean()),
-                        float((misfits[:, None] > good).mean() + 0.5 * (misfits[:, None] == good).mean()),
                     )
                 )  # fmt: skip
     return found

@@ -53,7 +53,7 @@ def test_the_frontier_is_what_nothing_beats_in_both():
 def test_a_method_with_few_valid_frames_is_not_on_the_frontier(scratch):
     split = splits([], 0.6, scratch)[0]
     methods = [
-        MeasuredMethod(name, name, cost, cost, cost, error, None, valid)
+        MeasuredMethod(name, name, cost, cost, cost, error, valid)
         for name, cost, error, valid in (
             ("rare", 1.0, 0.001, 0.32),
             ("often", 2.0, 0.01, 0.60),

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import mannwhitneyu
 
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import PAPER_TABLE
@@ -147,7 +146,6 @@ def test_the_passing_share_of_a_foreign_frame_follows_from_its_size():
     ]
     for one, misfits in zip(own, expected, strict=True):
         np.testing.assert_allclose(one.misfits, misfits, rtol=1e-6)
-        assert one.auc == pytest.approx(mannwhitneyu(misfits, expected[0]).statistic / len(later) ** 2)
         assert one.passing <= (misfits <= 1.0).mean()
     assert own[0].passing == 1.0
     assert {one.passing for one in own if one.share >= 0.2} == {0.0}

@@ -181,7 +181,7 @@ def _partition(cells: Float32Array, size: int) -> list[tuple[IntArray, Float32Ar
         points = cells[chosen, :-2]
         one = points[np.argmax(_squared_distances(points, points.mean(axis=0)))]
         other = points[np.argmax(_squared_distances(points, one))]
-        nearer = (points - (one + other) / 2) @ (one - other) > 0
+        nearer = np.einsum("ij,j->i", points - (one + other) / 2, one - other) > 0
         heapq.heappush(heap, entry(chosen[nearer]))
         heapq.heappush(heap, entry(chosen[~nearer]))
     return [(chosen, row) for _, _, chosen, row in heap]

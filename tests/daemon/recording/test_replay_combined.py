@@ -20,7 +20,7 @@ from tests.daemon.recording.test_replay import Gripper, Messages, measured, repl
 N_FRAMES = 120
 GRIPPED = slice(25, 110)
 PERIOD_S = 0.5408
-PLAYED = 25
+PLAYED = 10
 TOOL_MM = 10.0
 # The gripper says that another tool is held while so many frames have been estimated.
 OTHER_TOOL, OTHER_MM = range(70, 80), 14.0

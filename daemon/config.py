@@ -147,8 +147,19 @@ class SkinDaqConfig(ConfigModel):
     scanner: ScannerConfig | None = Field(None, description="a scanning multimeter; else `adc`")
     adc: AdcConfig | None = Field(None, description="a converter board; else `scanner`")
     rate_hz: float = Field(DAQ_RATE_HZ, ge=1, le=1000, description="readings of both gauges per second")
+    average_s: float = Field(0.0, ge=0, le=10, description="readings averaged into one sample; the paper's DAQ: 1")
 
     _one_way_in = either("scanner", "adc")
+
+    @property
+    def averaged(self) -> int:
+        """The readings of one sample."""
+        return max(round(self.average_s * self.rate_hz), 1)
+
+    @property
+    def sample_period_s(self) -> float:
+        """The time from sample to sample."""
+        return self.averaged / self.rate_hz
 
 
 class SkinConfig(ConfigModel):

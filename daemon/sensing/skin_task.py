@@ -30,7 +30,7 @@ from shearloop.drivers.shear_skin.instruments import (
     SourceReading,
     Voltages,
 )
-from shearloop.drivers.shear_skin.skin import SampleValidator, ShearSkin, SkinSample
+from shearloop.drivers.shear_skin.skin import SampleAverager, SampleValidator, ShearSkin, SkinSample
 
 SKIN = "skin"
 # The instruments' names in health and in recordings.
@@ -77,6 +77,7 @@ class SkinTask:
             _current_source(config, inputs.get(SKIN_SOURCE)),
             _daq(config, inputs.get(SKIN_DAQ)),
             _gauge_ohm(calibration),
+            config.daq.averaged,
         )
         self.source = SkinSourceTask(self._skin)
         self._estimator = _estimator(config, calibration)
@@ -85,7 +86,7 @@ class SkinTask:
         self._loop = loop
         self._inputs = inputs.get(SKIN)
         self._radius_m = _radius_m(config)
-        self._zero_timeout_s = max(ZERO_TIMEOUT_S, 2.0 * config.zero_samples / config.daq.rate_hz)
+        self._zero_timeout_s = max(ZERO_TIMEOUT_S, 2.0 * config.zero_samples * config.daq.sample_period_s)
         self._sampled = asyncio.Event()
         self._reason = ""
         self._valid = 0
@@ -104,6 +105,7 @@ class SkinTask:
         now_ns = self._clock.now_ns()
         if self._inputs is not None:
             self._inputs.record(RawEvent(InputKind.TARE, now_ns))
+        self._skin.restart_average()
         self._estimator.tare(now_ns)
 
     async def tare_and_wait(self, within_s: float) -> str:
@@ -153,6 +155,7 @@ class RecordedSkin:
         current_a = config.source.current_ma * 1e-3
         daq_period_s = 1.0 / config.daq.rate_hz
         self._validator = SampleValidator(current_a, SOURCE_PERIOD_S, daq_period_s, _gauge_ohm(calibration))
+        self._averager = SampleAverager(config.daq.averaged)
         self._radius_m = _radius_m(config)
         self._source = RecordedInstrument(Keithley6430)
         adc = config.daq.adc
@@ -170,9 +173,11 @@ class RecordedSkin:
             samples = (self._validator.sample(voltages, self._latest) for voltages in self._daq.handle(event))
             return [
                 shear_message(sample, self._estimator.update(sample), self._radius_m, sample.t_arrival_ns)
-                for sample in samples
+                for sample in map(self._averager.add, samples)
+                if sample is not None
             ]
         elif event.kind is InputKind.TARE:
+            self._averager.restart()
             self._estimator.tare(event.t_ns)
         return []
 
@@ -215,7 +220,7 @@ def skin_source(config: SkinConfig) -> TorqueSource | None:
     """Return the skin as a source of torque; None without a radius."""
     if config.tool_radius_mm is None:
         return None
-    return TorqueSource(name=SKIN, period_s=1.0 / config.daq.rate_hz, has_friction_band=True)
+    return TorqueSource(name=SKIN, period_s=config.daq.sample_period_s, has_friction_band=True)
 
 
 def check_circuit(config: SkinConfig, calibration: SkinCalibration) -> None:

@@ -4,9 +4,11 @@ import contextlib
 import math
 from collections import Counter
 from collections.abc import AsyncGenerator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
+from statistics import fmean
+from typing import Any
 
 from shearloop.drivers.connection import Diagnostics
 from shearloop.drivers.serial_sensor import StepFilter
@@ -193,6 +195,39 @@ class SampleValidator:
         return found
 
 
+class SampleAverager:
+    """Averages samples in blocks, as the paper's DAQ did over 1 s. No I/O.
+
+    A sample with faults passes at once. It and a gap end the block before them, whose readings count as missing.
+    """
+
+    def __init__(self, size: int) -> None:
+        """Average `size` samples into one; with 1 each passes unchanged."""
+        self._size = size
+        self._block: list[SkinSample] = []
+        self._missed = self._seq = 0
+
+    def restart(self) -> None:
+        """Begin a new block: samples from before a tare do not belong to its zero."""
+        self._block.clear()
+
+    def add(self, sample: SkinSample) -> SkinSample | None:
+        """Return the mean of the block that this sample completes, the sample itself if it has faults, else None."""
+        if sample.missed or sample.faults:
+            self._missed += sample.missed + len(self._block)
+            self._block.clear()
+        self._block.append(sample)
+        if len(self._block) < self._size and not sample.faults:
+            return None
+        whole = replace(sample, seq=self._seq, missed=self._missed)
+        if not sample.faults:
+            names = ("r1_ohm", "r2_ohm", "v1_v", "v2_v", "current_a")
+            means: dict[str, Any] = {name: fmean(getattr(one, name) for one in self._block) for name in names}
+            whole = replace(whole, **means, t_mid_ns=sum(one.t_mid_ns for one in self._block) // len(self._block))
+        self._block, self._missed, self._seq = [], 0, self._seq + 1
+        return whole
+
+
 def _is_reachable(before: tuple[float, float], after: tuple[float, float], missed: int) -> bool:
     most = (1 + missed) * math.log1p(MAX_CHANGE)
     return all(abs(math.log(now / then)) <= most for then, now in zip(before, after, strict=True))
@@ -201,10 +236,11 @@ def _is_reachable(before: tuple[float, float], after: tuple[float, float], misse
 class ShearSkin:
     """Source and DAQ of one skin. Run `watch_source` next to `samples`: without it every sample has a fault."""
 
-    def __init__(self, source: Keithley6430, daq: Daq, gauge_ohm: float = GAUGE_OHM) -> None:
+    def __init__(self, source: Keithley6430, daq: Daq, gauge_ohm: float = GAUGE_OHM, averaged: int = 1) -> None:
         self._source = source
         self._daq = daq
         self._validator = SampleValidator(source.current_a, source.period_s, daq.period_s, gauge_ohm)
+        self._averager = SampleAverager(averaged)
         self._latest: SourceReading | None = None
 
     async def watch_source(self) -> None:
@@ -214,10 +250,16 @@ class ShearSkin:
                 self._latest = reading
 
     async def samples(self) -> AsyncGenerator[SkinSample]:
-        """Yield a sample for every reading, without end; iterate within `contextlib.aclosing`."""
+        """Yield a sample for every block of readings, without end; iterate within `contextlib.aclosing`."""
         async with contextlib.aclosing(self._daq.readings()) as readings:
             async for voltages in readings:
-                yield self._validator.sample(voltages, self._latest)
+                sample = self._averager.add(self._validator.sample(voltages, self._latest))
+                if sample is not None:
+                    yield sample
+
+    def restart_average(self) -> None:
+        """Average only readings from now on, for a tare."""
+        self._averager.restart()
 
     def diagnostics(self) -> Diagnostics:
         """Return the values of voltages and gauges for `health`; counts are since the process began."""

@@ -14,16 +14,19 @@ from tests.daemon.recording.test_replay import measured, replayed
 from tests.daemon.skin.test_skin_run import played
 
 
-async def recorded(folder: Path, *, socket: bool) -> list[tuple[str, dict[str, Any]]]:
+async def recorded(folder: Path, *, socket: bool, average_s: float) -> list[tuple[str, dict[str, Any]]]:
     """Return what a daemon published while a skin was loaded, tared and ill-treated, all of it recorded."""
     published: list[tuple[str, dict[str, Any]]] = []
-    async with played(folder, socket=socket, daemon={"recording": {"folder": "recordings"}}) as bench:
+    recording = {"recording": {"folder": "recordings"}}
+    async with played(folder, socket=socket, average_s=average_s, daemon=recording) as bench:
         bench.daemon.publisher.add_listener(lambda topic, content: published.append((topic, content)))
         await bench.valid()
         for number in range(20):
             bench.skin.push(0.8 * number / 19)
             await bench.shear.get()
-        await bench.until(lambda content: content["valid"] and content["shear_n"] > 0.6)
+        content = await bench.until(lambda content: content["valid"] and content["shear_n"] > 0.6)
+        following = await bench.shear.get()
+        assert following["t_mono_ns"] - content["t_mono_ns"] == pytest.approx(1e9 * max(average_s, 0.005), rel=0.5)
         bench.instruments.command("open 1")
         await bench.says("gauge 1 is open")
         bench.instruments.command("normal")
@@ -41,9 +44,9 @@ async def recorded(folder: Path, *, socket: bool) -> list[tuple[str, dict[str, A
     return published
 
 
-@pytest.mark.parametrize("socket", [False, True])
-def test_a_skin_replay_gives_equal_forces(tmp_path, socket, capsys):
-    live = asyncio.run(recorded(tmp_path, socket=socket))
+@pytest.mark.parametrize(("socket", "average_s"), [(False, 0.02), (True, 0.0)])
+def test_a_skin_replay_gives_equal_forces(tmp_path, socket, average_s, capsys):
+    live = asyncio.run(recorded(tmp_path, socket=socket, average_s=average_s))
     (path,) = (tmp_path / "recordings").iterdir()
     assert {"skin.shear", "input.skin", "input.skin.source", "input.skin.daq"} <= set(RecordedTopics(path).counts)
     again, comparison = asyncio.run(replayed(path, math.inf))

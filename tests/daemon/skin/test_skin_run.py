@@ -85,7 +85,12 @@ ADC = {"adc": {"device": {"path": "skin-daq"}}}
 
 @contextlib.asynccontextmanager
 async def played(
-    folder: Path, *, socket: bool = False, daemon: dict[str, Any] | None = None, **changes: Any
+    folder: Path,
+    *,
+    socket: bool = False,
+    average_s: float = 0.0,
+    daemon: dict[str, Any] | None = None,
+    **changes: Any,
 ) -> AsyncIterator[Played]:
     skin = SyntheticSkin()
     instruments = SkinInstruments(
@@ -102,7 +107,8 @@ async def played(
         host, port = place.split(":")
         daq = {"scanner": {"socket": {"host": host, "port": int(port)}}}
     try:
-        async with running_daemon(written(folder, {**(daemon or {}), "skin": section(daq, **changes)})) as run:
+        skin_section = section({**daq, "average_s": average_s}, **changes)
+        async with running_daemon(written(folder, {**(daemon or {}), "skin": skin_section})) as run:
             yield Played(run, skin, instruments, f"ipc://{folder}/commands")
     finally:
         playing.cancel()

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.shear_skin.instruments import SourceReading, Voltages
-from shearloop.drivers.shear_skin.skin import SampleValidator, SkinFault, SkinSample
+from shearloop.drivers.shear_skin.skin import SampleAverager, SampleValidator, SkinFault, SkinSample
 
 CURRENT_A, SOURCE_S, DAQ_S = 5e-3, 0.5, 0.1
 GOOD = SourceReading(0, output_on=True, voltage_v=0.252, current_a=CURRENT_A)
@@ -63,6 +63,31 @@ def test_each_fault_has_its_name_and_leaves_no_resistance(v1_v, v2_v, source, fa
 def test_beyond_the_range_is_open_only_where_nothing_is_across_the_other_gauge():
     assert list(said(9.9e37, 0.126, over_1=True).faults) == [SkinFault.OVERRANGE_1]
     assert list(said(0.512, 0.0, STUCK_OPEN, over_1=True).faults) == [SkinFault.COMPLIANCE, SkinFault.OPEN_1]
+
+
+def test_readings_are_averaged_in_blocks_that_faults_gaps_and_tares_begin_anew():
+    validator, averager = judge(), SampleAverager(3)
+
+    def add(v1_v: float, number: int) -> SkinSample | None:
+        return averager.add(validator.sample(voltages(v1_v, 0.1265, number), GOOD))
+
+    assert [add(v1_v, number) for number, v1_v in enumerate((0.122, 0.123))] == [None, None]
+    mean = add(0.124, 2)
+    assert (mean.r1_ohm, mean.r2_ohm, mean.v1_v) == pytest.approx((24.6, 25.3, 0.123))
+    assert (mean.t_mid_ns, mean.t_arrival_ns, mean.seq, mean.missed) == (100_000_000, 200_000_000, 0, 0)
+    assert add(0.123, 3) is None
+    faulty = add(-0.123, 4)
+    assert (faulty.r1_ohm, faulty.v1_v, faulty.seq, faulty.missed) == (None, -0.123, 1, 1)
+    assert faulty.faults == (SkinFault.REVERSED_1,)
+    assert [add(0.123, number) for number in (5, 8, 9)] == [None] * 3, "two readings are missing before 8"
+    after = add(0.126, 10)
+    assert (after.seq, after.missed) == (2, 3)
+    assert after.r1_ohm == pytest.approx(24.8)
+    assert add(0.123, 11) is None
+    averager.restart()
+    assert [add(0.126, 12), add(0.126, 13)] == [None, None]
+    tared = add(0.126, 14)
+    assert (tared.r1_ohm, tared.missed) == (pytest.approx(25.2), 0)
 
 
 def test_a_source_that_falls_silent_is_lost_after_two_seconds():

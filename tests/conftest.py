@@ -85,14 +85,6 @@ def tiny_bank(tmp_path_factory) -> Path:
     return path
 
 
-@pytest.fixture
-def few_mixtures(monkeypatch) -> None:
-    """Have slices mixed with two foreign frames in place of fifteen: most of a fit, where no interval is judged."""
-    from shearloop.bank.estimation import fitting
-
-    monkeypatch.setattr(fitting, "_NUMBERINGS", fitting._NUMBERINGS[:2])
-
-
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """For `-m real_time` do not import the nine files of ten that have no such test, in each worker."""
     wanted = config.getoption("markexpr") == "real_time" and collection_path.match("test_*.py")

@@ -30,7 +30,7 @@ from shearloop.bank.gain import GainCorrection, ToolLaw
 from shearloop.bank.polynomial import Polynomial
 from shearloop.files import replace_file
 
-FORMAT_VERSION = 6
+FORMAT_VERSION = 7
 # First bytes of a zip that is not empty.
 ARCHIVE_MAGIC = b"PK\x03\x04"
 _FILE_KIND = "shearloop estimator calibration"

@@ -11,7 +11,7 @@ import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.bank_match import BankMatcher, ElectrodeNumbering
+from shearloop.bank.estimation.bank_match import BankMatcher
 from shearloop.bank.estimation.calibration import Assumption, Calibration
 from shearloop.bank.estimation.estimator import (
     LEAST_DIAMETERS,
@@ -27,7 +27,6 @@ from shearloop.bank.estimation.fingertip_validator import FingertipValidator, se
 from shearloop.bank.estimation.interval_regressor import (
     CensoredRidge,
     IntervalRegressor,
-    Mixtures,
     fit_interval_regressor,
 )
 from shearloop.bank.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
@@ -44,13 +43,6 @@ _TOOLS_MAY_LEAVE = 0.75
 _RELEASED, _TOOLS_STRENGTH = 0.05, 1e-5
 # Tools have a torque in common where their gains differ by less than this factor.
 _TOOLS_DIFFER = 2.0
-# Foreign frames: every eighth of a turn, plain and mirrored, except the own numbering. Of a few numberings alone the
-# result depends on the choice: single ones give half to twice the median.
-_NUMBERINGS = [(eighth, mirrored) for eighth in range(8) for mirrored in (False, True)][1:]
-# Hardly any mixture with a larger share is accepted.
-_SHARES = (0.1, 0.2, 0.3)
-# Later slices of each origin that are mixed; twice as many give the same result.
-_MOST_LATER = 10
 
 
 def fit(
@@ -294,16 +286,19 @@ def _fit_slices(
         differences = np.abs(frames[known, 0])
         # First, because it checks that a board sent the slices.
         novelty = NoveltyDetector.fit(differences, estimator.table)
-        test = ContaminationTest(differences, times[known], estimator, matcher)
-        features = np.array([test.features(one, row) for row, one in enumerate(differences)])
+        every = np.ones((1, differences.shape[1]), dtype=np.bool_)
+        readings = (
+            Reading(ProcessedFrame(one[None], (), every), t_s, matcher)
+            for one, t_s in zip(differences, times[known].tolist(), strict=True)
+        )
+        features = np.array([estimator.features(one)[0] for one in readings])
         regressor = fit_interval_regressor(
             features[:, estimator.columns[quantity]],
             values[known],
             estimator.slices_fit(quantity, values[known]),
             strengths=estimator.strengths,
             left_out=later_origins(n) if quantity == "torque" else (),
-            mixtures=test.accepted if quantity == "torque" else None,
-            fit_line=estimator.line_fit(),
+            fit_line=estimator.line_fit() if quantity == "torque" else None,
             full_range=full_range,
         )
         models[quantity] = OutputModel(regressor, novelty, estimator.k_range(features))
@@ -311,56 +306,6 @@ def _fit_slices(
         raise CalibrationError("the slices come with neither torque nor diameter")
     assumptions: tuple[Assumption, ...] = ("full range",) if full_range and "torque" in models else ()
     return replace(blank, torque=models.get("torque"), diameter=models.get("diameter"), assumptions=assumptions)
-
-
-class ContaminationTest:
-    """Slices mixed with foreign ones, as detectors of novelty fitted to earlier slices assess them.
-
-    A tenth of a foreign frame moves a slice no further than its own drift, so no detector can refuse it
-    (docs/charts.md), and the interval has to cover it. Stand-ins for foreign frames are the mean slice with the
-    electrodes renumbered.
-    """
-
-    def __init__(
-        self, differences: FloatArray, t_s: FloatArray, estimator: Estimator, matcher: BankMatcher | None
-    ) -> None:
-        """Take (n, c) differences at the times t_s (n,) in order, and their estimator."""
-        self._differences, self._t_s = differences, t_s
-        self._estimator, self._matcher = estimator, matcher
-        mean = differences.mean(axis=0)
-        table = estimator.table
-        numberings = [
-            ElectrodeNumbering(eighth * table.n_electrodes // 8, mirrored).model_channels(table)
-            for eighth, mirrored in _NUMBERINGS
-        ]
-        self._foreign = [mean[channels] for channels in numberings]
-        self._every = np.ones(table.n_channels, dtype=np.bool_)
-        self._features: dict[tuple[int, int, float], FloatArray] = {}
-
-    def features(self, difference: FloatArray, row: int) -> FloatArray:
-        """Return the (d,) features of a (c,) difference at the time of a row."""
-        frame = ProcessedFrame(difference[None], (), self._every[None])
-        return self._estimator.features(Reading(frame, float(self._t_s[row]), self._matcher))[0]
-
-    def accepted(self, past: IntArray, future: IntArray) -> Mixtures:
-        """Return the mixtures of later slices that a detector fitted to the earlier ones accepts."""
-        detector = NoveltyDetector.fit(self._differences[past], self._estimator.table)
-        chosen = future[np.unique(np.linspace(0, len(future) - 1, min(len(future), _MOST_LATER)).astype(int))]
-        rows, features, limit_shares = [], [], []
-        for row in chosen.tolist():
-            for number, foreign in enumerate(self._foreign):
-                for share in _SHARES:
-                    mixed = (1 - share) * self._differences[row] + share * foreign
-                    novelty = detector.assess(mixed, self._every)
-                    if novelty.reasons:
-                        break
-                    rows.append(row)
-                    limit_shares.append(novelty.limit_share)
-                    key = row, number, share
-                    if key not in self._features:
-                        self._features[key] = self.features(mixed, row)[self._estimator.columns["torque"]]
-                    features.append(self._features[key])
-        return Mixtures(np.array(rows, dtype=np.int64), np.array(features), np.array(limit_shares))
 
 
 def _consecutive(times: list[FloatArray]) -> FloatArray:

@@ -12,6 +12,7 @@ ones. On torques of another recording the error of the gain is added, which grow
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar, Self, TypeAlias
 
 import numpy as np
@@ -59,15 +60,6 @@ _UNSEEN = 2.0
 _LIKELY_UNSEEN = 0.5
 # This share of the loads must lie within their intervals.
 _LEAST_COVERED = 0.75
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Mixtures:
-    """Accepted mixtures of later frames with foreign ones: their rows, features (q, d) and shares of the limit (q,)."""
-
-    rows: IntArray
-    features: FloatArray
-    limit_shares: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,8 +132,6 @@ class CensoredRidge(Ridge):
 Regressor: TypeAlias = Ridge | CensoredRidge | InverseCalibration
 RegressorFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Regressor]
 Refit: TypeAlias = Callable[[IntArray], Regressor]
-# Returns the mixtures of later rows with foreign signals that a detector fitted to earlier rows accepts.
-AcceptedMixtures: TypeAlias = Callable[[IntArray, IntArray], Mixtures]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,10 +208,9 @@ class IntervalRegressor:
     """A point regressor with intervals, the range of values, and the range of features that it was calibrated on.
 
     Features are limited to largest_deviation from mean_feature unless that is empty. With misses_loads, too many
-    left-out loads lay outside their intervals, so every interval spans the calibrated range. contamination_below and
-    _above are how far the truth may lie below and above a prediction because of foreign signals, at the limit of
-    detection (0 where that was not tested). timing_widening is the factor on the loads' intervals for unknown load
-    timing. `gain` is how much a torque's gain changes between recordings. `line` reads values beyond the range.
+    left-out loads lay outside their intervals, so every interval spans the calibrated range. timing_widening is the
+    factor on the loads' intervals for unknown load timing. `gain` is how much a torque's gain changes between
+    recordings. `line` reads values beyond the range.
     """
 
     point: Regressor
@@ -230,25 +219,18 @@ class IntervalRegressor:
     mean_feature: FloatArray
     largest_deviation: FloatArray
     misses_loads: bool = False
-    contamination_below: float = 0.0
-    contamination_above: float = 0.0
     timing_widening: float = 1.0
     gain: GainSpread = field(default=GainSpread(), metadata=INLINE)
     line: Regressor | None = None
 
     def predict(
-        self,
-        features: FloatArray,
-        usable_share: float = 1.0,
-        limit_share: float = 0.0,
-        complete: FloatArray | None = None,
+        self, features: FloatArray, usable_share: float = 1.0, complete: FloatArray | None = None
     ) -> tuple[float, float, float]:
         """Return the value of (d,) features and how far its 95 % interval extends below and above it.
 
-        With a share of the channels unusable, the interval grows by the root of it. `limit_share` is how near the frame
-        is to refusal (1 at the limit): foreign signals may be the larger. `complete` (d,) are the features with a
-        response that may be missing: the interval extends to their value. Where the lever does not touch, the tool may
-        be twisted the other way as far as the frames allow.
+        With a share of the channels unusable, the interval grows by the root of it. `complete` (d,) are the features
+        with a response that may be missing: the interval extends to their value. Where the lever does not touch, the
+        tool may be twisted the other way as far as the frames allow.
         """
         rows = features[None] if complete is None else np.array([features, complete])
         raws = self.point.predict(rows)
@@ -260,8 +242,7 @@ class IntervalRegressor:
         half = widening * float(self.intervals.half_widths[self.intervals.edges.searchsorted(raw)])
         moved = others[0] - value if others else 0.0
         down, up = self.gain.reach(value)
-        below = max(math.hypot(half, down), limit_share * self.contamination_below) + max(-moved, 0.0)
-        above = max(math.hypot(half, up), limit_share * self.contamination_above) + max(moved, 0.0)
+        below, above = math.hypot(half, down) + max(-moved, 0.0), math.hypot(half, up) + max(moved, 0.0)
         if self.misses_loads:
             below, above = below + max(value - self.range.low, 0.0), above + max(self.range.high - value, 0.0)
         if lever is not None and raw < 0:
@@ -384,7 +365,6 @@ def fit_interval_regressor(
     strengths: tuple[float, ...] = STRENGTHS,
     limit_features: bool = False,
     left_out: Sequence[tuple[IntArray, IntArray]] = (),
-    mixtures: AcceptedMixtures | None = None,
     fit_line: RegressorFit | None = None,
     bounds: tuple[FloatArray, FloatArray] | None = None,
     full_range: bool = False,
@@ -393,22 +373,18 @@ def fit_interval_regressor(
 ) -> IntervalRegressor:
     """Fit to (n, d) features and (n,) values in time order.
 
-    `left_out` are pairs of rows to fit to and rows to validate on; by default blocks of time in turn. With `mixtures`
-    intervals cover the error of accepted ones and values keep their sign; unless they cover the `full_range` that
-    will ever occur, `fit_line` fits what reads values beyond it. `bounds` are the least and largest value (n,) that
-    each frame may have: intervals extend to the further one. With the number of each row's recording, `recordings`
-    (n,), intervals allow for the gain of another recording of as many `fingertips`. Raises CalibrationError where the
-    data does not determine the fit.
+    `left_out` are pairs of rows to fit to and rows to validate on; by default blocks of time in turn. Torques of slices
+    come with `fit_line`: they keep their sign, and unless they cover the `full_range` that will ever occur, it fits
+    what reads values beyond it. `bounds` are the least and largest value (n,) that each frame may have: intervals
+    extend to the further one. With the number of each row's recording, `recordings` (n,), intervals allow for the gain
+    of another recording of as many `fingertips`. Raises CalibrationError where the data does not determine the fit.
     """
     _check_values(values)
     strength = strengths[0] if len(strengths) == 1 else best_strength(features, values, fit, strengths)[0]
     blocks = list(left_out or left_out_blocks(len(values)))
 
-    def refit(rows: IntArray) -> Regressor:
-        return fit(features[rows], values[rows], strength)
-
-    def refit_line(rows: IntArray) -> Regressor:
-        return (fit_line or fit)(features[rows], values[rows], strength)
+    def refit(rows: IntArray, by: RegressorFit = fit) -> Regressor:
+        return by(features[rows], values[rows], strength)
 
     parts = [refit(past) for past, _ in blocks]
     raw = [part.predict(features[future]) for part, (_, future) in zip(parts, blocks, strict=True)]
@@ -426,7 +402,7 @@ def fit_interval_regressor(
     intervals, widening = Intervals.fit(predicted, residuals, edges, inflation, least), 1.0
     # Before widening for unknown times: a load that is not seen is not seen at any time.
     half = np.array([intervals.half_width(one) for one in predicted])
-    misses_loads = mixtures is None and _misses_loads(truth, np.abs(residuals) <= half)
+    misses_loads = fit_line is None and _misses_loads(truth, np.abs(residuals) <= half)
     if bounds is not None:
         if not left_out:
             # Unknown times mean few loads, in a block or two each.
@@ -435,16 +411,13 @@ def fit_interval_regressor(
         known = intervals.half_widths[-1]
         intervals = Intervals.fit(predicted, errors, edges, inflation, least)
         widening = float(intervals.half_widths[-1] / known)
-    span, contamination, line = ValueRange(float(values.min()), float(values.max())), (0.0, 0.0), None
-    if mixtures is not None:
-        tested = ((part, mixtures(*block)) for part, block in zip(parts, blocks, strict=True))
-        contamination = _contamination(features, values, tested, inflation)
-        span, line = _range_of_slices(point, features, values, refit, None if full_range else refit_line)
+    span, line = ValueRange(float(values.min()), float(values.max())), None
+    if fit_line is not None:
+        refit_line = None if full_range else partial(refit, by=fit_line)
+        span, line = _range_of_slices(point, features, values, refit, refit_line)
     gains = [] if recordings is None else _gains_of_recordings(features, values, recordings, refit)
     gain = GainSpread() if recordings is None else GainSpread.fit(reported, truth, gains, fingertips)
-    return IntervalRegressor(
-        point, intervals, span, centre, deviation, misses_loads, *contamination, widening, gain, line
-    )
+    return IntervalRegressor(point, intervals, span, centre, deviation, misses_loads, widening, gain, line)
 
 
 def _check_values(values: FloatArray) -> None:
@@ -464,29 +437,6 @@ def _gains_of_recordings(features: FloatArray, values: FloatArray, recordings: I
             part = refit(kept)
             gains.append(loaded_gain(_reported(part, part.predict(features[out])), values[out]))
     return gains
-
-
-def _contamination(
-    features: FloatArray, values: FloatArray, tested: Iterable[tuple[Regressor, Mixtures]], inflation: float
-) -> tuple[float, float]:
-    """Return how far the truth lies below and above predictions of mixtures, at 95 % on each side.
-
-    In units of the mixtures' share of the limit: in these, mixtures with a seventh or more of a foreign signal err
-    alike.
-    """
-    errors = [np.zeros(0)]
-    for point, mixed in tested:
-        if not len(mixed.rows):
-            continue
-        own, which = np.unique(mixed.rows, return_inverse=True)
-        pure, contaminated = (_reported(point, point.predict(rows)) for rows in (features[own], mixed.features))
-        pure = pure[which]
-        # More slices reduce the error of the slices, not the contamination.
-        errors.append((inflation * (pure - values[mixed.rows]) + contaminated - pure) / mixed.limit_shares)
-    found = np.concatenate(errors)
-    if not len(found):
-        return 0.0, 0.0
-    return max(float(np.quantile(found, LEVEL)), 0.0), max(float(-np.quantile(found, 1 - LEVEL)), 0.0)
 
 
 def _range_of_slices(

@@ -79,14 +79,12 @@ class ReciprocityCheck:
 
 @dataclass(frozen=True, slots=True)
 class Novelty:
-    """The reasons against a difference, none for a familiar one, and their effect on its interval.
+    """The reasons against a difference, none for a familiar one, and the share of the response that may be missing.
 
-    limit_share is the reciprocity residual over its limit: foreign signals raise it by the square of their share.
-    missing_share is the share of the fingertip's own response that foreign signals may have replaced.
+    Foreign signals may have replaced this share of the fingertip's own response.
     """
 
     reasons: tuple[str, ...]
-    limit_share: float = 0.0
     missing_share: float = 0.0
 
 
@@ -199,11 +197,9 @@ class NoveltyDetector:
                 f"outside the calibration: the Q residual is {q:.1f} (limit {self.largest_q:.1f}), with "
                 f"{100 * outlying:.0f} % of the channels far off (limit {100 * self.largest_outlying:.0f} %)"
             )
-        limit_share = 0.0
         if self.reciprocity is not None:
             residual = self.reciprocity.residual(difference, usable)
-            limit_share = residual / self.reciprocity.largest_residual
-            if limit_share > 1:
+            if residual > self.reciprocity.largest_residual:
                 return _refused(
                     f"outside the calibration: two measurements of the same voltages differ by {residual:.2f} (limit "
                     f"{self.reciprocity.largest_residual:.2f}); part of the frame may be another fingertip's"
@@ -214,7 +210,7 @@ class NoveltyDetector:
                 f"outside the calibration: the frame lies {np.sqrt(t2):.1f} standard deviations from the calibrated "
                 f"ones (limit {np.sqrt(self.largest_t2):.1f})"
             )
-        return Novelty((), limit_share, self._missing_share(difference, usable))
+        return Novelty((), self._missing_share(difference, usable))
 
     def _missing_share(self, difference: FloatArray, usable: BoolArray) -> float:
         if self.typical_response <= 0:

@@ -258,7 +258,7 @@ class EstimatorSession:
         if quantity == "torque" and novelty.missing_share and estimator.uses_amplitude:
             complete = self._regressor_inputs(quantity, reading, frame.difference / (1.0 - novelty.missing_share))
         usable_share = np.count_nonzero(frame.usable) / frame.usable.size
-        value = model.regressor.predict(features, usable_share, novelty.limit_share, complete)
+        value = model.regressor.predict(features, usable_share, complete)
         dead: tuple[str, ...] = ()
         if len(errors):
             changed = [self._regressor_inputs(quantity, reading, frame.difference + one) for one in errors]

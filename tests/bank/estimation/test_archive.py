@@ -68,7 +68,7 @@ def test_foreign_and_stale_files_are_refused(tmp_path, motion_calibration):
     with pytest.raises(CalibrationError, match="channel table 000000000000…, expected"):
         Calibration.load(stale)
     _with_header(motion_calibration, stale, format_version=5)
-    with pytest.raises(CalibrationError, match="format version 5, expected 6; calibrate again"):
+    with pytest.raises(CalibrationError, match="format version 5, expected 7; calibrate again"):
         Calibration.load(stale)
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from shearloop.bank.eit.channels import PAPER_TABLE
-from shearloop.bank.estimation import FrameSeries
+from shearloop.bank.estimation import FrameSeries, fit
 from shearloop.bank.estimation.bank_match import BankMatch
-from shearloop.bank.estimation.interval_regressor import IntervalRegressor, Mixtures, Ridge, fit_interval_regressor
+from shearloop.bank.estimation.interval_regressor import IntervalRegressor, Ridge, fit_interval_regressor
 from shearloop.bank.estimation.novelty import NoveltyDetector
-from tests.bank.estimation.conftest import follow, mixed
+from tests.bank.estimation.conftest import follow, judged, mixed
 
 ALL = np.ones(896, dtype=np.bool_)
 
@@ -55,15 +55,8 @@ def saturating(value):
     return np.column_stack([np.maximum(value, 0.3), np.maximum(value, 0.3) ** 2])
 
 
-class Unmixed:
-    """A test in which every slice is familiar and no mixture is accepted."""
-
-    def accepted(self, *_):
-        return Mixtures(np.zeros(0, int), np.zeros((0, 1)), np.zeros(0))
-
-
 def reader_of(features, values) -> IntervalRegressor:
-    return fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), mixtures=Unmixed().accepted)
+    return fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), fit_line=Ridge.fit)
 
 
 def test_a_reading_at_the_end_of_what_is_told_apart_may_mean_anything_beyond_it():
@@ -94,7 +87,7 @@ def test_what_is_read_the_further_inside_the_further_it_lies_beyond_may_be_read_
     value, _, above = reader.predict(np.array([0.6]))
     assert value + above == pytest.approx(values.max() + 2 * np.ptp(values)), "as far beyond as is known to pass"
     vouched = fit_interval_regressor(
-        features, values, Ridge.fit, strengths=(1e-9,), mixtures=Unmixed().accepted, full_range=True
+        features, values, Ridge.fit, strengths=(1e-9,), fit_line=Ridge.fit, full_range=True
     )
     assert vouched.predict(np.array([0.6]))[2] < 0.5
     assert vouched.predict(np.array([0.6]))[0] == value
@@ -175,15 +168,6 @@ def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
     assert not sighted.misses_loads, "one that sees loads pays no more than the times cost"
 
 
-def test_a_judgement_holds_what_intervals_go_by(sliced):
-    frames = sliced().channels[:, 0]
-    guard = NoveltyDetector.fit(frames[:30], PAPER_TABLE)
-    for frame in frames[30:]:
-        judged = guard.assess(frame, ALL)
-        assert judged.reasons == ()
-        assert judged.limit_share == guard.reciprocity.residual(frame, ALL) / guard.reciprocity.largest_residual <= 1.0
-
-
 def test_how_much_is_the_own_response_is_told_whatever_the_torque_does(sliced):
     frames = sliced().channels[:, 0]
     guard = NoveltyDetector.fit(frames, PAPER_TABLE)
@@ -233,3 +217,20 @@ def test_a_match_on_another_ridge_of_the_bank_is_refused(sliced_calibration):
     place = BankMatch(3.19, 1.5, 0.0, 0.99, None, ambiguous=False)
     assert task.match_reasons(place) == ()
     assert "another ridge" in task.match_reasons(replace(place, k=3.41))[0]
+
+
+@pytest.mark.parametrize("name", ["motion_regression", "regression"])
+def test_a_fifth_of_something_that_hardly_responds_lies_within_the_interval(name, sliced, sliced_calibration):
+    """It only makes the own response smaller, which is what another torque does: no misfit tells of it."""
+    calibration = sliced_calibration if name == "motion_regression" else fit(name, [sliced()], "all")
+    later = sliced(seed=3)
+    guard = calibration.torque.novelty
+    blind = replace(calibration, torque=replace(calibration.torque, novelty=replace(guard, typical_response=0.0)))
+    foreign = 0.2 * later.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(896)]
+    spoilt = replace(later, channels=0.8 * later.channels + 0.2 * foreign)
+    found = judged(follow(calibration, spoilt), later)
+    assert found.n > 45, "or nothing would be tested"
+    assert found.coverage >= 0.95
+    assert judged(follow(blind, spoilt), later).coverage < 0.8, "or there was nothing to hold"
+    widths = [judged(follow(one, later), later).width for one in (calibration, blind)]
+    assert widths[0] < 1.2 * widths[1]

@@ -107,7 +107,7 @@ def test_errors_fall_with_the_mesh_size_towards_the_extrapolated_signals():
     assert errors[0] > 1.5 * errors[1] > 2.0 * errors[2] > 0
 
 
-@pytest.mark.usefixtures("fonts", "few_mixtures")
+@pytest.mark.usefixtures("fonts")
 def test_the_speed_accuracy_chart_holds_every_method_with_its_ratio(scratch, tmp_path):
     mesh = own_fingertip(0.4).mesh()
     bank = bank_of(None, mesh, scratch, Grid(np.linspace(3.0, 3.6, 7), np.linspace(1.0, 2.1, 12)))

@@ -96,7 +96,7 @@ def test_unreported_lost_electrodes_never_pass_silently(parts, bank):
     assert found.levels[-1].valid == 0.0
 
 
-@pytest.mark.usefixtures("fonts", "few_mixtures")
+@pytest.mark.usefixtures("fonts")
 def test_the_mean_of_similar_cells_does_not_hop_and_the_rims_are_swept(parts, bank, scratch):
     slices = parts[0]
     calibrations = fault_sweeps.fitted(slices, ("bank", "motion_regression"), Physics(bank, None))
@@ -184,7 +184,6 @@ def test_of_few_torques_each_limit_is_there_once_and_none_leaves_nothing_to_judg
     assert [part.limit_nm for part in found[stability.LARGER]] == [0.06, 0.1]
 
 
-@pytest.mark.usefixtures("few_mixtures")
 def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(slices, bank, monkeypatch, capsys):
     # A twentieth is too few for an estimator.
     monkeypatch.setattr(stability, "CALIBRATED_SHARES", (0.5, 0.05))

@@ -216,7 +216,6 @@ def test_a_bank_has_the_same_bytes_after_a_killed_worker(bank, scheduler, killed
     assert again.read_bytes() == bank.read_bytes()
 
 
-@pytest.mark.usefixtures("few_mixtures")
 def test_a_chart_has_the_same_numbers_after_a_killed_worker(scheduler, killed, tmp_path):
     from shearloop.bank.estimation import Physics
     from shearloop.daemon.analysis.charts.fault_sweeps import FAULTS, sweeps

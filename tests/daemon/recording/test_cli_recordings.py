@@ -22,7 +22,7 @@ KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "interval_nm", "valid_fraction
 KEYS |= {"latency_ms_p50", "latency_ms_p99", "winkler_nm", "zero_rmse_nm", "loaded", "unloaded"}
 
 
-@pytest.mark.usefixtures("fonts", "few_mixtures")
+@pytest.mark.usefixtures("fonts")
 def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_path, capsys):
     first, second = tmp_path / "a.cal", tmp_path / "b.cal"
     for out, form in ((first, []), (second, ["--json"])):
@@ -54,7 +54,6 @@ def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_p
     assert "diameter" not in text
 
 
-@pytest.mark.usefixtures("few_mixtures")
 def test_a_part_of_the_slices_has_the_rows_of_the_whole(slices_folder, tmp_path, capsys):
     slices, whole, judged = str(slices_folder / "torque_slices"), tmp_path / "all.cal", []
     for out, part in ((whole, []), (tmp_path / "part.cal", ["--time-range", "0:1"])):
@@ -84,7 +83,6 @@ class BandMeans(Estimator):
         return reading.frame.difference.reshape(self.bands, -1).mean(axis=1), None
 
 
-@pytest.mark.usefixtures("few_mixtures")
 def test_an_estimator_is_one_class_and_one_line(slices_folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(ESTIMATORS, "bands", f"{__name__}:BandMeans")
     calibration, slices = str(tmp_path / "a.cal"), str(slices_folder / "torque_slices")
@@ -98,7 +96,6 @@ def test_an_estimator_is_one_class_and_one_line(slices_folder, tmp_path, capsys,
         Calibration.load(calibration)
 
 
-@pytest.mark.usefixtures("few_mixtures")
 @pytest.mark.parametrize("misses_loads", [True, False])
 def test_calibrate_says_where_loads_are_not_seen(misses_loads, slices_folder, tmp_path, capsys, monkeypatch):
     def blind(*arguments, **options):
@@ -120,7 +117,6 @@ def test_calibrate_says_where_loads_are_not_seen(misses_loads, slices_folder, tm
     assert json.loads(capsys.readouterr().out)["sees_loads"] is not misses_loads
 
 
-@pytest.mark.usefixtures("few_mixtures")
 @pytest.mark.parametrize("slices_folder", [0.5], indirect=True)
 def test_calibrate_says_which_torques_may_be_of_something_beyond(slices_folder, tmp_path, capsys, monkeypatch):
     fitted = []
@@ -146,7 +142,6 @@ def test_calibrate_says_which_torques_may_be_of_something_beyond(slices_folder, 
     assert json.loads(capsys.readouterr().out)["assumptions"] == ["full range"]
 
 
-@pytest.mark.usefixtures("few_mixtures")
 def test_a_stream_is_imported_and_cannot_be_judged_by_slices(mat_folder, slices_folder, tmp_path, capsys):
     recording, calibration = tmp_path / "a.mcap", tmp_path / "a.cal"
     assert main(["import", "mat", str(mat_folder()), "--out", str(recording)]) == 0
@@ -247,7 +242,6 @@ def test_what_is_given_twice_is_refused_by_its_name(slices_folder, mat_folder, t
     assert f"{second} equals {first}; leave copies out" in refused(first, second)
 
 
-@pytest.mark.usefixtures("few_mixtures")
 def test_what_is_judged_twice_is_refused_as_what_is_fitted_twice_is(slices_folder, tmp_path, capsys):
     slices, copy, calibration = slices_folder / "torque_slices", tmp_path / "copy", tmp_path / "a.cal"
     assert main(["calibrate", str(slices), "--estimator", "regression", "--out", str(calibration)]) == 0

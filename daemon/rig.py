@@ -210,7 +210,7 @@ def check_experiment(
         mistakes += [
             (("steps", number), f"{step.do} needs a gripper, and none is configured; {cure}")
             for number, step in enumerate(file.steps)
-            if isinstance(step, experiment_schema.GripStep | experiment_schema.ReleaseStep)
+            if isinstance(step, experiment_schema.GripperStep)
         ]
     return _without_mistakes(path, mistakes + _unadaptable(file, sources))
 
@@ -250,9 +250,9 @@ def _unadaptable(
     found: list[experiment_schema.Mistake] = []
     twisted = False
     for number, step in enumerate(file.steps):
-        if step.do in ("tare", "grip", "release"):
+        if isinstance(step, experiment_schema.TareStep | experiment_schema.GripperStep):
             twisted = False
-        twisted = twisted or step.do in ("identify", "twist", "hold_torque", "tighten")
+        twisted = twisted or isinstance(step, experiment_schema.TwistingStep)
         if not isinstance(step, experiment_schema.AdaptStep) or "fingertip" not in step.model_fields_set:
             continue
         named = [name for name, source in sources.items() if source.has_gain]

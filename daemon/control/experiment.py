@@ -260,7 +260,7 @@ def expected_s(step: Step) -> float:
             return 20.0
         case steps.TareStep():
             return 6.0
-        case _:
+        case steps.ApproachStep() | steps.GripStep() | steps.ReleaseStep() | steps.AdaptStep() | steps.TurnToStep():
             return 3.0
 
 

@@ -1,7 +1,7 @@
 """The experiment file: its limits and its steps, as pydantic models with bounds that the rig can keep."""
 
 import math
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias, get_args
 
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WithJsonSchema
@@ -165,21 +165,11 @@ class WaitStep(_Step):
     wait_s: Seconds = Field(description="time to stand still")
 
 
-Step = Annotated[
-    ApproachStep
-    | RetreatStep
-    | GripStep
-    | TareStep
-    | IdentifyStep
-    | AdaptStep
-    | TurnToStep
-    | TwistStep
-    | HoldTorqueStep
-    | TightenStep
-    | ReleaseStep
-    | WaitStep,
-    Field(discriminator="do"),
-]
+# Every step is in one of three groups: it may twist a gripped tool, it may grip another one, or neither.
+TwistingStep: TypeAlias = IdentifyStep | TwistStep | HoldTorqueStep | TightenStep
+GripperStep: TypeAlias = GripStep | ReleaseStep
+OtherStep: TypeAlias = ApproachStep | RetreatStep | TareStep | AdaptStep | TurnToStep | WaitStep
+Step = Annotated[OtherStep | GripperStep | TwistingStep, Field(discriminator="do")]
 
 
 class ExperimentFile(ConfigModel):
@@ -212,18 +202,17 @@ class ExperimentFile(ConfigModel):
 def first_turn_before_grip(file: ExperimentFile) -> int | None:
     """Return the number, from 1, of the first step that turns the wrist before any grip or release, or None."""
     for number, step in enumerate(file.steps, 1):
-        match step:
-            case GripStep() | ReleaseStep():
-                return None
-            case IdentifyStep() | TurnToStep() | TwistStep() | HoldTorqueStep() | TightenStep():
-                return number
+        if isinstance(step, GripperStep):
+            return None
+        if isinstance(step, TwistingStep | TurnToStep):
+            return number
     return None
 
 
 # A location in an experiment's file, and what is wrong there.
 Mistake = tuple[tuple[int | str, ...], str]
 _STEP: TypeAdapter[Step] = TypeAdapter(Step)
-_KINDS: dict[str, Any] = {
+STEP_KINDS: dict[str, Any] = {
     name: kind for kind in get_args(get_args(Step)[0]) for name in get_args(kind.model_fields["do"].annotation)
 }
 
@@ -253,7 +242,7 @@ def _outlined(content: object) -> Step:
     except ValidationError:
         given = content if isinstance(content, dict) else {}
         names = {key: given[key] for key in ("do", "fingertip", "reference") if isinstance(given.get(key), str)}
-        step: Step = _KINDS.get(names.get("do", ""), WaitStep).model_construct(**names)
+        step: Step = STEP_KINDS.get(names.get("do", ""), WaitStep).model_construct(**names)
         return step
 
 
@@ -294,6 +283,8 @@ def _holds_unidentified(file: ExperimentFile) -> int | None:
 
 def _reach(step: Step) -> tuple[float, float]:
     """Return the largest torque (N·m) and angle from the grip (rad) of a step; 0 if unknown, as in an outline."""
+    if not isinstance(step, TwistingStep):
+        return 0.0, 0.0
     match step:
         case HoldTorqueStep(torque_nm=torque_nm):
             return abs(torque_nm), 0.0
@@ -303,5 +294,5 @@ def _reach(step: Step) -> tuple[float, float]:
             return 0.0, angle_rad
         case TwistStep(absolute=False, angles_rad=angles_rad):
             return 0.0, max(map(abs, angles_rad))
-        case _:
+        case HoldTorqueStep() | TightenStep() | IdentifyStep() | TwistStep():
             return 0.0, 0.0

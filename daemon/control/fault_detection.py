@@ -102,7 +102,7 @@ def compared_for_s(sources: Iterable[TorqueSource], fresh_s: Mapping[str, float]
 
 
 def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_ns: int) -> list[Fault]:
-    """Return every fault at t_ns, in the order of the safety table."""
+    """Return every fault that the inputs show at t_ns; `ControlLoop.tick` adds those that were reported to it."""
     found: list[Fault] = []
     if watched.torque_needed:
         found += _torque_faults(inputs, watched, config, t_ns)

@@ -10,7 +10,7 @@ import structlog
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment import Action, Experiment, ExperimentPhase, GripTo
-from shearloop.daemon.control.experiment_schema import AdaptStep, ApproachStep, ExperimentFile, TareStep
+from shearloop.daemon.control.experiment_schema import AdaptStep, ApproachStep, ExperimentFile, IdentifyStep, TareStep
 from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
@@ -452,8 +452,8 @@ class ActionExecutor:
                 if not isinstance(sensor, Adaptable):
                     return f"{action.fingertip} is not a fingertip; name one that is calibrated on recordings"
                 return await sensor.adapt(action.reference)
-            case _:
-                raise TypeError(f"{action} is not an action of the devices")
+            case IdentifyStep():
+                raise TypeError("the control loop identifies by itself")
 
     async def _rest(self) -> str:
         """Wait until no motion is under way; return an error, or an empty string.

@@ -15,8 +15,15 @@ from shearloop.daemon.control.experiment import (
     MoveToAngle,
     StepCommand,
     TrackTorque,
+    expected_s,
 )
-from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.experiment_schema import (
+    STEP_KINDS,
+    ExperimentFile,
+    ExperimentLimits,
+    check_steps,
+    outline,
+)
 
 TICK_NS = 8_000_000
 STIFFNESS_NM_PER_RAD = 0.2
@@ -158,6 +165,30 @@ def test_a_steps_limits_only_tighten_the_experiments():
 def test_a_mistake_in_a_step_is_told_with_the_cure(step, part):
     with pytest.raises(ValidationError, match=part):
         experiment(step)
+
+
+SMALLEST: dict[str, dict[str, Any]] = {
+    "approach": {"along_tool_m": 0.1},
+    "retreat": {"along_tool_m": 0.1},
+    "adapt": {"fingertip": "right"},
+    "turn_to": {"angle_rad": 1.0},
+    "twist": {"angles_rad": [0.3]},
+    "hold_torque": {"torque_nm": 0.1},
+    "tighten": {"until_torque_nm": 0.1, "until_angle_rad": 0.3},
+    "wait": {"wait_s": 1},
+}
+
+
+@pytest.mark.parametrize("kind", STEP_KINDS)
+def test_every_kind_of_step_has_a_duration_a_program_and_limits(kind):
+    machine = experiment({"do": kind, **SMALLEST.get(kind, {})})
+    assert expected_s(machine.step) > 0
+    assert machine.command.activity
+    tight = ExperimentLimits(torque_nm=0.05, angle_rad=0.1)
+    over = check_steps(machine.file.model_copy(update={"limits": tight}))
+    limited = {"twist": 1, "identify": 1, "hold_torque": 2, "tighten": 2}
+    assert len(over) == limited.get(kind, 0), "of hold_torque also the missing identify"
+    assert [mistake for mistake in check_steps(outline({"steps": [{"do": kind}]})) if "its limit" in mistake[1]] == []
 
 
 STEPS = st.one_of(

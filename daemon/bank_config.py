@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -12,11 +12,15 @@ from shearloop.bank.eit.bank_file import BankDefinition
 from shearloop.bank.eit.channels import INJECTION, ChannelTable, Injection
 from shearloop.bank.eit.fingertip import ElectrodePlace, Fingertip, RectangularFingertip, RoundFingertip, Side
 from shearloop.bank.eit.mesh import Mesh, load_mesh
+from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import GeometryError
 from shearloop.daemon.config_file import ConfigModel, load_yaml_model
 from shearloop.daemon.errors import UserError
 
-ModelName = Literal["step", "linear", "cut_linear", "gaussian_derivative", "modulated_gaussian"]
+if TYPE_CHECKING:
+    ModelName: TypeAlias = str
+else:
+    ModelName = Literal[tuple(MODELS)]
 MeshSize = Annotated[float, Field(ge=0.005, le=10)]
 Measure = Annotated[float, Field(gt=0, le=100)]
 
@@ -57,8 +61,8 @@ class BankConfig(ConfigModel):
     fingertip: Path | None = Field(None, description="the fingertip's dimensions, a file; else `mesh`")
     mesh_size_cm: MeshSize | None = Field(None, description="largest distance of mesh lines (default: the fingertip's)")
     model: ModelName = Field(description="basis model of the conductivity's change")
-    k: GridConfig = Field(description="the model's first parameter, in cm")
-    sigma: GridConfig = Field(description="the model's second parameter, in cm")
+    k: GridConfig = Field(description="first parameter of the model, in cm (modulated_gaussian: rad/cm)")
+    sigma: GridConfig = Field(description="second parameter of the model, in cm (step: not used)")
 
     @model_validator(mode="after")
     def _is_of_one_geometry(self) -> Self:
@@ -66,7 +70,7 @@ class BankConfig(ConfigModel):
             raise ValueError("give either `mesh` (with a `file`) or `fingertip`, and not both")
         if self.mesh_size_cm is not None and self.fingertip is None:
             raise ValueError("`mesh_size_cm` is for a `fingertip`; a `mesh` that is read from a file has its own")
-        if self.sigma.low <= 0 and self.model != "step":
+        if self.sigma.low <= 0 and MODELS[self.model].uses_sigma:
             raise ValueError(f"`sigma.low` must be above 0 for the model {self.model}, not {self.sigma.low:g}")
         return self
 

@@ -1,8 +1,9 @@
 """What an estimator is: what it needs, its features of a frame, and its fit; and the estimators that read one frame.
 
-An estimator is a subclass of `Estimator` in a file of its own, and a line in `bank/estimators.py`.
+An estimator is a subclass of `Estimator`, and a line in `bank/estimators.py`. It must have a `name` and `features`.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeAlias
@@ -135,7 +136,7 @@ class CalibrationRow:
 
 
 @dataclass(frozen=True, eq=False)
-class Estimator:
+class Estimator(ABC):
     """An estimator of one calibration. The file keeps its fields, which are arrays, values, or dataclasses of these.
 
     scale (m, c) divides differences per channel and is infinite for dead ones. imputer serves raw frames.
@@ -176,9 +177,9 @@ class Estimator:
         """Return the matcher on the bank, None for an estimator without a bank."""
         return None
 
+    @abstractmethod
     def features(self, reading: Reading) -> tuple[FloatArray, BankMatch | None]:
         """Return the (d,) features of a reading, and the bank match if there is one."""
-        raise NotImplementedError
 
     def inputs(self, quantity: Quantity, features: FloatArray, _reading: Reading) -> FloatArray:
         """Return the (d,) inputs of a quantity's regressor."""

@@ -78,7 +78,7 @@ class FingertipConfig(ConfigModel):
     calibration: Path | None = Field(None, description="without one, k and sigma are published, but no torque")
     estimator: EstimatorName | None = Field(None, description="default: the calibration's")
     matching: Literal["all_lags", "zero_lag"] = Field("all_lags", description="shifts of a frame to search")
-    baseline_frames: int = Field(BASELINE_FRAMES, ge=2, le=1000, description="frames of the homogeneous frame")
+    baseline_frames: int = Field(BASELINE_FRAMES, ge=2, le=1000, description="frames in the idle frame of a tare")
     average_frames: int = Field(1, ge=1, le=100, description="latest frames averaged before matching")
     creep: CreepConfig | None = Field(None, description="of the gel; subtracted from the loop's torque")
     frame_period_s: float = Field(FRAME_PERIOD_S, gt=0, le=60, description="frame period before it is measured")

@@ -16,10 +16,10 @@ from shearloop.drivers.eit_kit import ADC_STEP_V
 # Mean and frame-to-frame standard deviation of the recorded frames.
 MEAN_V = 0.13
 NOISE_V = 0.002
-# With this share of the modelled conductivity change, difference frames have an RMS of 5 mV, as the 49 torque peak
-# samples (Gaussian derivative, k = 3.25 cm, σ from 1.25 to 1.85 cm).
+# With this share of the modelled conductivity change, difference frames have an RMS of 5 mV, as the 49 torque slices
+# (Gaussian derivative, k = 3.25 cm, σ from 1.25 to 1.85 cm).
 AMPLITUDE = 0.17
-# σ at rest and at the largest torque of the peak samples, in N·m; k of the thinnest and thickest recorded cylinder.
+# σ at rest and at the largest torque of the slices, in N·m; k of the thinnest and thickest recorded cylinder.
 SIGMA_CM, LARGEST_TORQUE_NM = (1.85, 1.25), 0.14
 K_CM, DIAMETER_MM = (3.78, 3.47), (10.0, 40.0)
 MAX_WIDTH_MM = 140.0

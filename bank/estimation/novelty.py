@@ -188,7 +188,7 @@ class NoveltyDetector:
         size = float(np.sqrt((difference[usable] ** 2).mean()))
         if size < self.least_norm:
             return _refused(
-                f"no grip: the difference to the homogeneous frame is {1e3 * size:.1f} mV a channel, and gripping "
+                f"no grip: the difference to the idle frame is {1e3 * size:.1f} mV a channel, and gripping "
                 f"makes at least {1e3 * self.least_norm:.1f} mV"
             )
         q, outlying = self.q_residual(difference, usable)

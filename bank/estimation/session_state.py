@@ -146,7 +146,7 @@ class IdleFrames:
             for layer, frames in enumerate(self._frames):
                 frames.extend(one[layer] for one in self._tare_frames)
             self._update()
-        return f"taking the homogeneous frame, {n} of {self._wanted}"
+        return f"taking the idle frame, {n} of {self._wanted}"
 
     def restart_tare(self) -> None:
         """Forget the frames of a tare that is not complete."""
@@ -386,9 +386,10 @@ class SessionState:
 
 
 class PaperState:
-    """State of one session of the paper's method: mean of the latest frames minus the homogeneous frame.
+    """State of one session of the paper's method: mean of the latest frames minus the idle frame.
 
-    Trehan et al. 2025, section 2. Without a validator nothing is known of the fingertip but its first frames.
+    Trehan et al. 2025, section 2, where the idle frame is the homogeneous frame. Without a validator nothing is known
+    of the fingertip but its first frames.
     """
 
     curves_only, refuses_repeats = True, False
@@ -402,7 +403,7 @@ class PaperState:
 
     @property
     def taring(self) -> bool:
-        """Whether frames are being averaged into the homogeneous frame."""
+        """Whether frames are being averaged into the idle frame."""
         return len(self._tare_frames) < self._baseline_frames
 
     def process(self, frame: TactileFrame) -> ProcessedFrame:
@@ -418,12 +419,12 @@ class PaperState:
         if self.taring:
             self._tare_frames.append(channels[0])
             n, wanted = len(self._tare_frames), self._baseline_frames
-            return ProcessedFrame.refused(frame.usable, f"taking the homogeneous frame, {n} of {wanted}")
+            return ProcessedFrame.refused(frame.usable, f"taking the idle frame, {n} of {wanted}")
         if self._latest and frame.t_s - self._latest[-1][0] > self._max_gap_s:
             self._latest.clear()
         self._latest.append((frame.t_s, channels[0]))
         mean = np.mean([one for _, one in self._latest], axis=0)
-        difference = mean - self._homogeneous
+        difference = mean - self._idle_frame
         n = len(self._latest)
         noise = self._noise * math.sqrt(1.0 / n + 1.0 / self._baseline_frames)
         if (reason := signal_above_noise(difference, noise)) is not None:
@@ -432,7 +433,7 @@ class PaperState:
         return ProcessedFrame(difference[None], (), frame.usable, lag_s=lag_s)
 
     @cached_property
-    def _homogeneous(self) -> FloatArray:
+    def _idle_frame(self) -> FloatArray:
         # Deviations from the first frame keep the microvolts that sums of volts would lose.
         first = self._tare_frames[0]
         return np.asarray(first + np.mean(np.array(self._tare_frames) - first, axis=0))
@@ -444,7 +445,7 @@ class PaperState:
         A few frames know the variance of one channel badly: each is drawn towards the mean of all (Smyth 2004).
         """
         freedom = self._baseline_frames - 1
-        own = (np.array(self._tare_frames) - self._homogeneous).var(axis=0, ddof=1)
+        own = (np.array(self._tare_frames) - self._idle_frame).var(axis=0, ddof=1)
         variance = (freedom * own + _POOLED_FREEDOM * own.mean()) / (freedom + _POOLED_FREEDOM)
         return np.asarray(np.sqrt(np.maximum(variance, LEAST_NOISE_V**2)))
 

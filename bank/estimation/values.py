@@ -12,7 +12,7 @@ from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.polynomial import TWO_SIDED_95
 
-# "raw": volts as the board sends them. "difference": |frame − homogeneous frame|, smoothed over time.
+# "raw": volts as the board sends them. "difference": slices, |frame − idle frame| smoothed over time.
 Kind = Literal["raw", "difference"]
 
 # Metadata of a dataclass's field: in the calibration's file its fields stand beside the others of the dataclass.

@@ -16,10 +16,10 @@ from shearloop.daemon.errors import UserError
 
 # The principal directions of one contact's frames; the rest is noise.
 _N_DIRECTIONS = 4
-# Beyond √½ less than half of a frame's square is explained. Unexplained are 61 % of the recorded peak samples, 70 % of
+# Beyond √½ less than half of a frame's square is explained. Unexplained are 61 % of the recorded slices, 70 % of
 # the right fingertip's twists, 78 % of the left one's, which the lever hardly moves, and 91 % without a grip.
 _MAX_UNEXPLAINED = 0.71
-# Twice the noise of the recorded peak samples (16 %; recorded twists 8 and 12 %); without a grip it is 47 %.
+# Twice the noise of the recorded slices (16 %; recorded twists 8 and 12 %); without a grip it is 47 %.
 _MAX_NOISE = 1.0 / 3.0
 
 
@@ -31,7 +31,7 @@ def designed_for(recording: Path, fingertip: Path | None, side: str | None) -> t
     series = [one for one in read_series(recording, sides) if one.torque_t_s.size]
     if not series:
         raise UserError(f"{recording} holds no torque; a design needs frames of a tool that is twisted")
-    # Peak samples have no side.
+    # Slices have no side.
     one = series[0] if sides is None else series[0].select_sides(sides)
     return path, design_bank(scene_of(one), load_yaml_model(path, FingertipGeometryConfig).fingertip())
 
@@ -92,7 +92,7 @@ def doubts(design: Design) -> list[str]:
     least = min(one.penalised for one in design.models)
     if least > _MAX_UNEXPLAINED:
         found.append(
-            f"even the best model leaves {least:.1%} of a frame unexplained, against 61% of the paper's peak samples: "
+            f"even the best model leaves {least:.1%} of a frame unexplained, against 61% of the paper's slices: "
             "a bank explains less than half of such a frame; record a tool that is gripped and twisted"
         )
     if design.relative_noise > _MAX_NOISE:

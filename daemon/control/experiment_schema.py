@@ -92,7 +92,7 @@ class GripStep(_Step):
 
 
 class TareStep(_Step):
-    """Take new homogeneous frames and a new zero of the load cell, with the wrist standing still."""
+    """Take the zero of every torque sensor, with the wrist standing still; of fingertips the idle frame."""
 
     do: Literal["tare"]
 
@@ -187,7 +187,7 @@ class ExperimentFile(ConfigModel):
     tool_mm: float | None = Field(None, gt=0, lt=140, description="diameter of the tool, for recordings")
     slices: Literal["torque", "diameter"] | None = Field(
         None,
-        description="kind of sample that `recording export --format slices` makes of each held angle; none by default",
+        description="kind of slice that `recording export --format slices` makes of each held angle; none by default",
     )
     steps: tuple[Step, ...] = Field(min_length=1, description="the steps in order")
 

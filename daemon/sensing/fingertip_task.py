@@ -168,17 +168,17 @@ class FingertipPipeline:
         self._tare.add(message.reason, taring=self.estimator.session.taring)
 
     def tare(self) -> None:
-        """Take a new homogeneous frame from frames acquired entirely after now."""
+        """Take a new idle frame from frames acquired entirely after now."""
         self._tare.begin(self._clock.now_ns())
 
     async def tare_and_wait(self, within_s: float) -> str:
-        """Take a new homogeneous frame and wait until it is complete; return why it is not, or an empty text."""
+        """Take a new idle frame and wait until it is complete; return why it is not, or an empty text."""
         self.tare()
         try:
             async with asyncio.timeout(within_s):
                 await self._tare.done.wait()
         except TimeoutError:
-            what = f"the homogeneous frame of {self.name} could not be taken within {within_s:.3g} s"
+            what = f"the idle frame of {self.name} could not be taken within {within_s:.3g} s"
             return f"{what}: {self._tare.reasons or 'no frame came'}"
         finally:
             # Frames that come later could be of any load.

@@ -5,7 +5,7 @@ Match a frame against a bank of simulated signals:
     import shearloop
 
     bank = shearloop.Bank.open("demo.bank")
-    match = shearloop.Matcher.from_bank(bank).match(difference)  # (896,) volts, frame - homogeneous frame
+    match = shearloop.Matcher.from_bank(bank).match(difference)  # (896,) volts, frame - idle frame
     print(match.k, match.sigma, match.score)
 
 Estimate the torque along a recording:

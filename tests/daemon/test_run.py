@@ -90,7 +90,7 @@ async def test_tare_status_and_stop_commands(config, tmp_path):
                 continue
             reply = await asyncio.to_thread(send_command, address, {"command": "tare"}, DEADLINE_S)
             assert reply == {"ok": True, "tared": ["right"]}
-            while "taking the homogeneous frame, 1 of 10" not in (await estimates.get())["reason"]:
+            while "taking the idle frame, 1 of 10" not in (await estimates.get())["reason"]:
                 continue
             reply = await asyncio.to_thread(send_command, address, {"command": "tare", "source": "left"}, DEADLINE_S)
             assert reply == {"ok": False, "reason": "there is no sensor 'left' to tare; there are right"}

@@ -369,7 +369,7 @@ def sweep_rims(calibrations: Sequence[Calibration], bank: Bank, scratch: Path) -
         (f"k at the rim of the grid ({k_end:g} cm) and beyond", "k, cm", ks, [(k, _SIGMA) for k in ks]),
         (f"σ at the rim of the grid ({sigma_end:g} cm) and beyond", "σ, cm", sigmas, [(_K, sigma) for sigma in sigmas]),
     )  # fmt: skip
-    # The same homogeneous frame as the slices': its noise is in every difference.
+    # The same idle frame as the slices': its noise is in every difference.
     synthesiser = _SolvedFrames(played_bank(scratch), 0)
     homogeneous = homogeneous_of(synthesiser)
     trackers = [EstimatorSession(calibration, bank) for calibration in calibrations]

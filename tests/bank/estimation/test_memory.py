@@ -50,9 +50,9 @@ def test_a_grip_a_third_as_strong_as_the_one_before_the_zero_is_one(motion_calib
 def test_a_zero_during_which_a_tool_is_let_go_begins_anew(motion_calibration, like):
     memory = SessionState(motion_calibration.validators, motion_calibration.estimator.motion, idle_frames=8)
     reasons = [memory.process(like(0.5 * i, share)).reasons for i, share in enumerate([1, 1, 1, 1, 1, *np.zeros(9)])]
-    assert [why[0] for why in reasons[2:5]] == [f"taking the homogeneous frame, {n} of 8" for n in (3, 4, 5)]
+    assert [why[0] for why in reasons[2:5]] == [f"taking the idle frame, {n} of 8" for n in (3, 4, 5)]
     assert all("jumped" in why[0] for why in reasons[5:7])
-    assert reasons[7] == ("taking the homogeneous frame, 1 of 8",)
+    assert reasons[7] == ("taking the idle frame, 1 of 8",)
     assert memory.taring
     memory.process(like(7.0, 0.0))
     assert not memory.taring
@@ -67,7 +67,7 @@ def test_a_zero_in_whose_gap_a_tool_is_let_go_or_gripped_begins_anew(motion_cali
         memory.process(like(0.5 * i, first))
     reasons = [memory.process(like(2.0 + step_s + 0.5 * i, then)).reasons for i in range(9)]
     assert all("jumped" in why[0] for why in reasons[:2])
-    assert [why[0] for why in reasons[2:]] == [f"taking the homogeneous frame, {n} of 8" for n in range(1, 8)]
+    assert [why[0] for why in reasons[2:]] == [f"taking the idle frame, {n} of 8" for n in range(1, 8)]
     assert memory.taring
 
 

@@ -1,4 +1,4 @@
-"""The paper's method in a session: homogeneous frame, average, match, curves."""
+"""The paper's method in a session: idle frame, average, match, curves."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def estimated(session: EstimatorSession, number: int, channels: NDArray[np.float
 
 
 def tared(matcher: OneCell, calibration: Calibration | None = None, average: int = 1) -> EstimatorSession:
-    """Return a session that has its homogeneous frame."""
+    """Return a session that has its idle frame."""
     session = EstimatorSession(
         calibration or Calibration.from_matches("bank", "synthetic", torque=TORQUE, diameter=DIAMETER),
         matcher=PaperMatcher(matcher),
@@ -49,7 +49,7 @@ def tared(matcher: OneCell, calibration: Calibration | None = None, average: int
     for number in range(10):
         assert session.taring
         reasons = estimated(session, number, noisy()).reasons
-        assert reasons == (f"taking the homogeneous frame, {number + 1} of 10",)
+        assert reasons == (f"taking the idle frame, {number + 1} of 10",)
     return session
 
 
@@ -58,7 +58,7 @@ def test_the_baseline_is_the_mean_of_its_frames_and_has_their_noise():
     for number in range(400):
         state.process(TactileFrame.of(float(number), noisy()[None]))
     assert not state.taring
-    np.testing.assert_allclose(state._homogeneous, HOMOGENEOUS, atol=6 * 0.002 / 20)
+    np.testing.assert_allclose(state._idle_frame, HOMOGENEOUS, atol=6 * 0.002 / 20)
     assert np.median(state._noise) == pytest.approx(0.002, rel=0.02)
 
 
@@ -124,7 +124,7 @@ def test_the_latest_frames_are_averaged_and_a_tare_forgets_them():
     np.testing.assert_allclose(matcher.asked[-1] - offset, 3.0 * PATTERN, atol=1e-12)
     assert estimate.lag_s == pytest.approx(0.541)
     session.tare()
-    assert estimated(session, 20, noisy(PATTERN)).reasons == ("taking the homogeneous frame, 1 of 10",)
+    assert estimated(session, 20, noisy(PATTERN)).reasons == ("taking the idle frame, 1 of 10",)
 
 
 def test_frames_before_a_gap_are_not_averaged_with_those_after_it():
@@ -133,5 +133,5 @@ def test_frames_before_a_gap_are_not_averaged_with_those_after_it():
     estimated(session, 10, noisy(PATTERN))
     after = noisy(-PATTERN)
     estimate = estimated(session, 5000, after)
-    np.testing.assert_allclose(matcher.asked[-1] + session._state._homogeneous, after, atol=1e-12)
+    np.testing.assert_allclose(matcher.asked[-1] + session._state._idle_frame, after, atol=1e-12)
     assert estimate.lag_s == 0

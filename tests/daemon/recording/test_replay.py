@@ -137,7 +137,7 @@ def _same_at_any_speed(path: Path, live: list[Any], tmp_path: Path, capsys: pyte
         then = measured([one for one in live if one[0] == topic])
         again = measured([one for one in fast if one[0] == topic])
         assert again[: len(then)] == then
-    zeros = [c for t, c in fast if t == "eit.estimate" and c["reason"].startswith("taking the homogeneous frame, 1 of")]
+    zeros = [c for t, c in fast if t == "eit.estimate" and c["reason"].startswith("taking the idle frame, 1 of")]
     assert len(zeros) == 2, "the operator's tare is replayed"
     assert main(["replay", str(path), "--speed", "max", "--publish", address, "--check"]) == 0
     errors = capsys.readouterr().err
@@ -292,4 +292,4 @@ def test_a_later_file_replays_frame_numbers_tares_and_tools(config, tmp_path, mo
     assert len(after) > ENOUGH - ZEROED - 10
     for one in after:
         assert [estimates[one["frame"]][key] for key in said] == [one[key] for key in said]
-    assert estimates[zeroed]["reason"].startswith("taking the homogeneous frame, 1 of")
+    assert estimates[zeroed]["reason"].startswith("taking the idle frame, 1 of")

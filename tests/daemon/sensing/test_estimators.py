@@ -87,7 +87,7 @@ def test_a_tare_averages_the_frames_that_follow(calibration):
     for number in range(5):
         assert estimator.session.taring
         estimate = estimated(estimator, *(frame(number, channels) for channels in played.channels[number]))
-        assert estimate.reasons == (f"taking the homogeneous frame, {number + 1} of 5",)
+        assert estimate.reasons == (f"taking the idle frame, {number + 1} of 5",)
     assert not estimator.session.taring
     assert any(value is not None for value in torques(estimator, played.between(5, len(played.t_s))))
 

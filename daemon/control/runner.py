@@ -543,7 +543,7 @@ class StatePublisher:
             tcp_speed_m_per_s=state.tcp_speed_m_per_s,
             wrench=state.wrench,
             wrist_rad=state.wrist_rad,
-            wrist_speed_rad_per_s=state.qd_rad_per_s[5],
+            wrist_speed_rad_per_s=state.wrist_speed_rad_per_s,
             wrist_torque_nm=state.wrist_torque_nm,
             robot_mode=state.robot_mode,
             safety_mode=state.safety_mode,

@@ -175,6 +175,11 @@ class RtdeSample(RtdeOutputs):
         return self.q_rad[5]
 
     @property
+    def wrist_speed_rad_per_s(self) -> float:
+        """The speed of wrist 3."""
+        return self.qd_rad_per_s[5]
+
+    @property
     def wrist_torque_nm(self) -> float:
         """The torque about the tool's own axis, from wrench and pose."""
         x, y, z = tool_axis(self.tcp_pose)

@@ -11,10 +11,13 @@ from pathlib import Path
 import pytest
 import yaml
 
+from shearloop.bank.eit.models import MODELS
+from shearloop.bank.estimators import ESTIMATORS
 from shearloop.daemon.bank_config import load_bank_plan
 from shearloop.daemon.cli import COMMANDS
 from shearloop.daemon.cli.completion import full_parser
 from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.control.experiment_schema import STEP_KINDS
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.rig import check_experiment
 
@@ -116,6 +119,17 @@ def test_the_readmes_recordings_are_ignored_by_git():
     folders = {Path(one).parts[0] for one in re.findall(r"--record (\S+)", (ROOT / "README.md").read_text())}
     assert folders
     assert {f"/{folder}/" for folder in folders} <= set((ROOT / ".gitignore").read_text().splitlines())
+
+
+def test_pages_list_every_command_step_estimator_and_basis_model():
+    for page, names in {
+        "README.md": COMMANDS,
+        "docs/writing-an-experiment.md": STEP_KINDS,
+        "docs/estimators.md": ESTIMATORS,
+        "docs/glossary.md": [*ESTIMATORS, *MODELS],
+    }.items():
+        text = (ROOT / page).read_text()
+        assert [name for name in names if f"`{name}`" not in text] == [], page
 
 
 def program_texts() -> list[str]:

@@ -11,11 +11,18 @@ import pytest
 import zmq
 import zmq.asyncio
 
+from shearloop.daemon.cli.command import COMMANDS
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.client import receive_messages, send_command
-from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer, RequestExecutor
+from shearloop.daemon.messaging.command_server import (
+    STATUS,
+    STOP,
+    CommandRefusedError,
+    CommandServer,
+    RequestExecutor,
+)
 from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
@@ -123,6 +130,12 @@ def test_foreign_messages_are_an_error(tmp_path):
                 next(heard)
             sending.join()
             stranger.recv()
+
+
+def test_every_command_has_a_handler_and_a_description_and_the_page_knows_it():
+    server = pytest.importorskip("shearloop.daemon.web.server", reason="the live page needs the extra `view`")
+    handled = Commands(rig=None, sensors=None, experiment=None, health=None, stop=None).handlers()
+    assert set(COMMANDS) == set(handled) == {*server.NEEDS_TOKEN, STATUS, STOP}
 
 
 async def test_tare_is_refused_during_an_experiment():

@@ -3,8 +3,8 @@
 `Ridge` is for features that contain the value linearly. `CensoredRidge` is for a load cell that a lever pushes from one
 side only: where it reads nothing the twist may be anything below, so these frames bound the value.
 
-Intervals come from residuals on frames later than those fitted to: split-conformal in strata of the prediction (Vovk
-2012), namely free of load, about to touch, loaded. In each stratum the half width is the 95 % quantile of the absolute
+Intervals come from residuals on frames left out of the fit: split-conformal in strata of the prediction (Vovk 2012),
+namely free of load, about to touch, loaded. In each stratum the half width is the 95 % quantile of the absolute
 residuals with the correction for a finite sample, so that many easy frames do not narrow the intervals of few hard
 ones. On torques of another recording the error of the gain is added, which grows with the torque.
 """

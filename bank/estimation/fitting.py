@@ -1,7 +1,7 @@
 """Fitting an estimator to recordings: one function for all estimators, on raw frames or on slices.
 
-Every choice is made on data left out of the fit: later data, blocks of time or recordings (docs/calibrations.md). Nothing
-looks at the recordings that the calibration will be evaluated on.
+Every choice is made on data left out of the fit: later data, blocks of time or recordings (docs/calibrations.md).
+Nothing looks at the recordings that the calibration will be evaluated on.
 """
 
 from collections.abc import Sequence

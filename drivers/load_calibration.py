@@ -1,11 +1,8 @@
-"""The guided calibration of the load cell: rest, then known masses, then a straight line or the reason for none.
-
-`LoadCalibrator` is a state machine without I/O: it receives samples and the operator's confirmations.
-"""
+"""The calibration of the load cell: levels of rest and known masses, then a straight line or the reason for none."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -38,26 +35,26 @@ class Level:
 
 @dataclass(frozen=True, slots=True)
 class LoadCalibrationResult:
-    """A calibration, its levels, the largest residual as a torque in N·m, and a report in sentences."""
+    """A calibration, the largest residual as a torque in N·m, and a report in sentences."""
 
     calibration: LoadCalibration
-    levels: tuple[Level, ...]
     residual_nm: float
     sentences: tuple[str, ...]
 
 
 def measure_level(samples: Sequence[LoadSample], mass_g: float) -> Level:
-    """Return the level of samples under a constant load.
+    """Return the level of SAMPLES_PER_STEP samples under a constant load; those before them are left out.
 
-    Up to a tenth may be corrupted. Raises DeviceCalibrationError if they are too few, saturated, flat or noisy.
+    Up to a tenth may be corrupted. Raises DeviceCalibrationError if they are saturated, flat or noisy.
     """
+    samples = samples[-SAMPLES_PER_STEP:]
     if any(sample.saturated for sample in samples):
         raise DeviceCalibrationError(
             "The load cell's converter is at the end of its range: take load off the cell, and check that none of "
             "its four wires is loose."
         )
     good = [sample.raw for sample in samples if not sample.spike and not sample.partial]
-    if len(samples) < SAMPLES_PER_STEP or len(good) < 0.9 * len(samples):
+    if len(good) < 0.9 * SAMPLES_PER_STEP:
         raise DeviceCalibrationError(
             f"Only {len(good)} of the {SAMPLES_PER_STEP} readings needed were good: check the cable, and that "
             "the board sends about 11 lines a second, then measure again."
@@ -76,7 +73,8 @@ def measure_level(samples: Sequence[LoadSample], mass_g: float) -> Level:
     return Level(mass_g, mean, std, len(good))
 
 
-def _check_levels(levels: Sequence[Level]) -> None:
+def check_levels(levels: Sequence[Level]) -> None:
+    """Raise DeviceCalibrationError unless the levels, rest first, change enough and in one direction with the mass."""
     empty, *loaded = levels
     for level in loaded:
         shift, noise = abs(level.mean - empty.mean), math.hypot(level.std, empty.std)
@@ -98,96 +96,42 @@ def _check_levels(levels: Sequence[Level]) -> None:
         )
 
 
-@dataclass(slots=True)
-class LoadCalibrator:
-    """The guided calibration as a state machine.
+def check_masses(masses_g: Sequence[float]) -> None:
+    """Raise DeviceCalibrationError for masses that do not define a line."""
+    if not masses_g or any(not (0 < mass < math.inf) for mass in masses_g):
+        raise DeviceCalibrationError("Give at least one mass in grams, each above zero.")
+    if len(set(masses_g)) < len(masses_g):
+        raise DeviceCalibrationError("Give every mass once; the same one twice says nothing about the line.")
 
-    `prompt` tells the operator what to do. Then call `start_step()` and `feed` samples until it returns True. A bad
-    signal raises DeviceCalibrationError from `feed`, and the step repeats. After the last step `finished` is True and
-    `result()` gives the calibration.
+
+def fit_levels(levels: Sequence[Level], lever_arm_m: float = LEVER_ARM_M, sign: int = 1) -> LoadCalibrationResult:
+    """Return the least-squares line through the levels of rest and masses, raw against force.
+
+    All levels have equal weight: how a mass hangs matters more than the converter's noise. Raises
+    DeviceCalibrationError if they do not lie on a line.
     """
-
-    masses_g: Sequence[float]
-    lever_arm_m: float = LEVER_ARM_M
-    sign: int = 1
-    levels: list[Level] = field(default_factory=list, init=False)
-    _samples: list[LoadSample] | None = field(default=None, init=False)
-    _to_skip: int = field(default=0, init=False)
-
-    def __post_init__(self) -> None:
-        """Refuse masses that do not define a line."""
-        if not self.masses_g or any(not (0 < mass < math.inf) for mass in self.masses_g):
-            raise DeviceCalibrationError("Give at least one mass in grams, each above zero.")
-        if len(set(self.masses_g)) < len(self.masses_g):
-            raise DeviceCalibrationError("Give every mass once; the same one twice says nothing about the line.")
-
-    @property
-    def finished(self) -> bool:
-        """Whether every step has been measured."""
-        return len(self.levels) == len(self.masses_g) + 1
-
-    @property
-    def prompt(self) -> str:
-        """The operator's instruction for the next step."""
-        if not self.levels:
-            return "Take every load off the lever arm and let it rest."
-        return f"Put {self._mass_g:g} g on the load cell, where the lever arm presses, and let it hang still."
-
-    @property
-    def _mass_g(self) -> float:
-        return self.masses_g[len(self.levels) - 1] if self.levels else 0.0
-
-    def start_step(self) -> None:
-        """Begin the step: the operator has followed the prompt."""
-        self._samples, self._to_skip = [], SKIP_SAMPLES
-
-    def feed(self, sample: LoadSample) -> bool:
-        """Add a sample; return True if it completes the step. Samples between steps are ignored."""
-        if self._samples is None:
-            return False
-        if self._to_skip:
-            self._to_skip -= 1
-            return False
-        self._samples.append(sample)
-        if len(self._samples) < SAMPLES_PER_STEP:
-            return False
-        samples, self._samples = self._samples, None
-        level = measure_level(samples, self._mass_g)
-        if self.levels:
-            _check_levels([*self.levels, level])
-        self.levels.append(level)
-        return True
-
-    def result(self) -> LoadCalibrationResult:
-        """Return the least-squares line through the levels, raw against force.
-
-        All levels have equal weight: how a mass hangs matters more than the converter's noise. Raises
-        DeviceCalibrationError if they do not lie on a line, or a step is missing.
-        """
-        if not self.finished:
-            raise DeviceCalibrationError(f"{len(self.masses_g) + 1 - len(self.levels)} steps are still to be measured.")
-        forces_n = np.array([level.mass_g for level in self.levels]) * 1e-3 * STANDARD_GRAVITY
-        means = np.array([level.mean for level in self.levels])
-        counts_per_n, tare_counts = (float(value) for value in np.polyfit(forces_n, means, 1))
-        calibration = LoadCalibration(
-            tare_counts=tare_counts,
-            scale_n_per_count=1 / counts_per_n,
-            lever_arm_m=self.lever_arm_m,
-            sign=-1 if self.sign < 0 else 1,
+    forces_n = np.array([level.mass_g for level in levels]) * 1e-3 * STANDARD_GRAVITY
+    means = np.array([level.mean for level in levels])
+    counts_per_n, tare_counts = (float(value) for value in np.polyfit(forces_n, means, 1))
+    calibration = LoadCalibration(
+        tare_counts=tare_counts,
+        scale_n_per_count=1 / counts_per_n,
+        lever_arm_m=lever_arm_m,
+        sign=-1 if sign < 0 else 1,
+    )
+    residuals = means - (tare_counts + counts_per_n * forces_n)
+    worst = int(np.argmax(np.abs(residuals)))
+    if abs(residuals[worst]) > MAX_RESIDUAL_FRACTION * float(np.ptp(means)):
+        raise DeviceCalibrationError(
+            f"The masses do not lie on a straight line: with {levels[worst].mass_g:g} g the reading is off by "
+            f"{abs(residuals[worst]) / abs(counts_per_n) / STANDARD_GRAVITY * 1e3:.1f} g. Check the masses that "
+            "were given and that each pressed on the cell alone, at the lever arm's place."
         )
-        residuals = means - (tare_counts + counts_per_n * forces_n)
-        worst = int(np.argmax(np.abs(residuals)))
-        if abs(residuals[worst]) > MAX_RESIDUAL_FRACTION * float(np.ptp(means)):
-            raise DeviceCalibrationError(
-                f"The masses do not lie on a straight line: with {self.levels[worst].mass_g:g} g the reading is off by "
-                f"{abs(residuals[worst]) / abs(counts_per_n) / STANDARD_GRAVITY * 1e3:.1f} g. Check the masses that "
-                "were given and that each pressed on the cell alone, at the lever arm's place."
-            )
-        residual_nm = float(abs(residuals[worst] * calibration.nm_per_count))
-        noise_nm = max(level.std for level in self.levels) * abs(calibration.nm_per_count)
-        sentences = (
-            f"One count is {calibration.nm_per_count:.3e} N·m at a lever arm of {self.lever_arm_m * 1e3:g} mm.",
-            f"The cell at rest reads {tare_counts:.6g}.",
-            f"The noise is {noise_nm:.1e} N·m, the worst distance from the straight line {residual_nm:.1e} N·m.",
-        )
-        return LoadCalibrationResult(calibration, tuple(self.levels), residual_nm, sentences)
+    residual_nm = float(abs(residuals[worst] * calibration.nm_per_count))
+    noise_nm = max(level.std for level in levels) * abs(calibration.nm_per_count)
+    sentences = (
+        f"One count is {calibration.nm_per_count:.3e} N·m at a lever arm of {lever_arm_m * 1e3:g} mm.",
+        f"The cell at rest reads {tare_counts:.6g}.",
+        f"The noise is {noise_nm:.1e} N·m, the worst distance from the straight line {residual_nm:.1e} N·m.",
+    )
+    return LoadCalibrationResult(calibration, residual_nm, sentences)

@@ -1,4 +1,4 @@
-"""The guided calibration: finds the truth it was fed with, and refuses every signal that is not fit."""
+"""The calibration: finds the truth it was fed with, and refuses every signal that is not fit."""
 
 from collections.abc import Callable, Iterable
 
@@ -9,8 +9,15 @@ from hypothesis import strategies as st
 
 from shearloop.drivers import load_calibration
 from shearloop.drivers.errors import DeviceCalibrationError
-from shearloop.drivers.load_calibration import STANDARD_GRAVITY, LoadCalibrator
-from shearloop.drivers.load_cell import COUNTS_MAX, LoadCalibration, LoadParser, LoadSample
+from shearloop.drivers.load_calibration import (
+    STANDARD_GRAVITY,
+    Level,
+    check_levels,
+    check_masses,
+    fit_levels,
+    measure_level,
+)
+from shearloop.drivers.load_cell import COUNTS_MAX, LoadParser, LoadSample
 
 STEP = load_calibration.SKIP_SAMPLES + load_calibration.SAMPLES_PER_STEP
 
@@ -25,10 +32,13 @@ def noisy(level: float, std: float = 200.0, seed: int = 0) -> list[LoadSample]:
     return samples(level + std * np.random.default_rng(seed).standard_normal(STEP))
 
 
-def calibrate(calibrator: LoadCalibrator, signal: Callable[[float], list[LoadSample]]) -> None:
-    for mass_g in (0.0, *calibrator.masses_g):
-        calibrator.start_step()
-        assert [calibrator.feed(sample) for sample in signal(mass_g)].index(True) == STEP - 1
+def measured(masses_g: list[float], signal: Callable[[float], list[LoadSample]]) -> list[Level]:
+    """Return the levels of rest and of the masses, checked as they are measured."""
+    levels: list[Level] = []
+    for mass_g in (0.0, *masses_g):
+        levels.append(measure_level(signal(mass_g), mass_g))
+        check_levels(levels)
+    return levels
 
 
 @given(
@@ -39,9 +49,8 @@ def calibrate(calibrator: LoadCalibrator, signal: Callable[[float], list[LoadSam
     masses_g=st.lists(st.sampled_from([50.0, 100.0, 200.0, 500.0, 1000.0]), min_size=1, unique=True),
 )
 def test_it_finds_the_tare_and_the_scale_of_the_signal(tare_counts, counts_per_g, wiring, sign, masses_g):
-    calibrator = LoadCalibrator(masses_g, sign=sign)
-    calibrate(calibrator, lambda mass_g: noisy(tare_counts + wiring * counts_per_g * mass_g, seed=int(mass_g)))
-    result = calibrator.result()
+    levels = measured(masses_g, lambda mass_g: noisy(tare_counts + wiring * counts_per_g * mass_g, seed=int(mass_g)))
+    result = fit_levels(levels, sign=sign)
     # The means of 30 readings scatter by 200 / √30 counts; five times that.
     tolerance = 5 * 200 / 30**0.5 / (counts_per_g * max(masses_g))
     for mass_g in masses_g:
@@ -53,90 +62,49 @@ def test_it_finds_the_tare_and_the_scale_of_the_signal(tare_counts, counts_per_g
 
 
 def test_a_board_that_sends_newton_metres_is_calibrated_the_same_way():
-    calibrator = LoadCalibrator([100.0])
-    calibrate(
-        calibrator,
-        lambda mass_g: samples(
-            1e-3 * mass_g * STANDARD_GRAVITY * 0.035 + 2e-5 * np.random.default_rng(1).standard_normal(STEP)
-        ),
-    )
-    assert calibrator.result().calibration.nm_per_count == pytest.approx(1.0, rel=1e-3)
-
-
-def step(calibrator: LoadCalibrator, signal: Iterable[LoadSample]) -> bool:
-    """Return whether these samples are enough for the next step."""
-    calibrator.start_step()
-    return any(calibrator.feed(sample) for sample in signal)
-
-
-def refused(calibrator: LoadCalibrator, signal: list[LoadSample]) -> str:
-    with pytest.raises(DeviceCalibrationError) as error:
-        step(calibrator, signal)
-    return str(error.value)
-
-
-def after_empty(masses_g: list[float]) -> LoadCalibrator:
-    calibrator = LoadCalibrator(masses_g)
-    assert step(calibrator, noisy(8000.0))
-    return calibrator
-
-
-def test_a_saturated_signal_is_refused_and_the_step_asked_for_again():
-    calibrator = after_empty([100.0])
-    asked = calibrator.prompt
-    assert "end of its range" in refused(calibrator, [*noisy(8000.0)[:-1], *samples([COUNTS_MAX])])
-    assert calibrator.prompt == asked
-    assert step(calibrator, noisy(50_000.0))
-    assert calibrator.finished
+    noise_nm = 2e-5 * np.random.default_rng(1).standard_normal(STEP)
+    levels = measured([100.0], lambda mass_g: samples(1e-3 * mass_g * STANDARD_GRAVITY * 0.035 + noise_nm))
+    assert fit_levels(levels).calibration.nm_per_count == pytest.approx(1.0, rel=1e-3)
 
 
 @pytest.mark.parametrize(
-    ("after_rest", "signal", "reason"),
+    ("rest", "signal", "reason"),
     [
-        (False, samples([1234.0] * STEP), "never that still"),
-        (False, noisy(8000.0, std=20_000.0), "more than 5000"),
-        (True, noisy(8100.0, seed=1), "did not change with 100 g"),
-        (True, noisy(12_000.0, seed=1), "use a larger one"),
+        ([*noisy(8000.0)[:-1], *samples([COUNTS_MAX])], [], "end of its range"),
+        (samples([1234.0] * STEP), [], "never that still"),
+        (noisy(8000.0, std=20_000.0), [], "more than 5000"),
+        (noisy(8000.0), noisy(8100.0, seed=1), "did not change with 100 g"),
+        (noisy(8000.0), noisy(12_000.0, seed=1), "use a larger one"),
     ],
 )
-def test_a_signal_that_is_not_fit_is_refused(after_rest, signal, reason):
-    assert reason in refused(after_empty([100.0]) if after_rest else LoadCalibrator([100.0]), signal)
+def test_a_signal_that_is_not_fit_is_refused(rest, signal, reason):
+    with pytest.raises(DeviceCalibrationError, match=reason):
+        measured([100.0], lambda mass_g: signal if mass_g else rest)
+
+
+def test_the_first_samples_of_a_step_do_not_count():
+    settling = samples([1e6] * load_calibration.SKIP_SAMPLES)
+    assert measure_level([*settling, *noisy(8000.0)[-30:]], 0.0) == measure_level(noisy(8000.0), 0.0)
 
 
 def test_masses_off_the_line_or_in_the_wrong_order_are_refused():
-    bent = LoadCalibrator([100.0, 200.0])
-    calibrate(bent, lambda mass_g: noisy(420 * mass_g * (0.8 if mass_g == 200 else 1.0)))
+    bent = measured([100.0, 200.0], lambda mass_g: noisy(420 * mass_g * (0.8 if mass_g == 200 else 1.0)))
     with pytest.raises(DeviceCalibrationError, match="straight line"):
-        bent.result()
-    swapped = LoadCalibrator([100.0, 200.0])
-    assert step(swapped, noisy(0.0))
-    assert step(swapped, noisy(84_000.0))
-    assert "order given" in refused(swapped, noisy(42_000.0))
+        fit_levels(bent)
+    with pytest.raises(DeviceCalibrationError, match="order given"):
+        measured([100.0, 200.0], lambda mass_g: noisy({0.0: 0.0, 100.0: 84_000.0, 200.0: 42_000.0}[mass_g]))
 
 
 def test_too_many_corrupted_values_are_refused_and_few_are_left_out():
     raws = 8000 + 100 * np.random.default_rng(2).standard_normal(STEP)
-    parser = LoadParser(LoadCalibration(tare_counts=0, scale_n_per_count=1e-5))
     raws[20] = 9e12
-    few = parser.feed(b"0\n" + b"".join(b"%.0f\n" % raw for raw in raws), 0)[1:]
-    calibrator = LoadCalibrator([100.0])
-    assert step(calibrator, few)
-    assert calibrator.levels[0].n == load_calibration.SAMPLES_PER_STEP - 1
+    assert measure_level(samples(raws), 0.0).n == load_calibration.SAMPLES_PER_STEP - 1
     raws[20:25] = 9e12
-    parser.restart()
-    many = parser.feed(b"0\n" + b"".join(b"%.0f\n" % raw for raw in raws), 0)[1:]
-    assert "Only 25 of the 30" in refused(LoadCalibrator([100.0]), many)
-
-
-def test_samples_between_the_steps_count_for_nothing():
-    calibrator = after_empty([100.0])
-    assert not any(calibrator.feed(sample) for sample in noisy(1e6))
-    assert len(calibrator.levels) == 1
-    with pytest.raises(DeviceCalibrationError, match="1 steps"):
-        calibrator.result()
+    with pytest.raises(DeviceCalibrationError, match="Only 25 of the 30"):
+        measure_level(samples(raws), 0.0)
 
 
 @pytest.mark.parametrize("masses_g", [[], [0.0], [-5.0], [float("nan")], [float("inf")], [100.0, 100.0]])
 def test_masses_that_no_line_goes_through_are_refused(masses_g):
     with pytest.raises(DeviceCalibrationError, match="mass"):
-        LoadCalibrator(masses_g)
+        check_masses(masses_g)

@@ -13,7 +13,7 @@ from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.drivers.connection import SerialPort
-    from shearloop.drivers.load_calibration import LoadCalibrator
+    from shearloop.drivers.load_calibration import Level
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -39,59 +39,67 @@ def run(args: argparse.Namespace) -> int:
     """Measure each load and write the calibration."""
     from shearloop.drivers.calibration_files import save_calibration
     from shearloop.drivers.connection import SerialPort, find_port
-    from shearloop.drivers.load_calibration import LoadCalibrator
+    from shearloop.drivers.load_calibration import check_masses, fit_levels
     from shearloop.drivers.load_cell import BAUD_RATE
 
     if not 0 < args.lever_arm_mm < 1000:
         raise UserError(f"--lever-arm-mm {args.lever_arm_mm:g} is no lever arm; give millimetres above 0")
     check_calibration_file(args.out)
-    calibrator = LoadCalibrator(args.mass_g, args.lever_arm_mm * 1e-3, -1 if args.reverse else 1)
+    check_masses(args.mass_g)
     with SerialPort(find_port(serial_number=args.serial_number, path=args.port), BAUD_RATE) as port:
-        asyncio.run(_measure(port, calibrator, Operator(stdout_is_for_json=args.json)))
-    result = calibrator.result()
+        levels = asyncio.run(_measure(port, args.mass_g, Operator(stdout_is_for_json=args.json)))
+    result = fit_levels(levels, args.lever_arm_mm * 1e-3, -1 if args.reverse else 1)
     save_calibration(args.out, result.calibration)
     report = {
         "path": str(args.out),
         "calibration": result.calibration.model_dump(mode="json"),
-        "levels": [asdict(level) for level in result.levels],
+        "levels": [asdict(level) for level in levels],
         "residual_nm": result.residual_nm,
         "remarks": list(result.sentences),
     }
     return print_result(report, [*result.sentences, f"Written to {args.out}."], as_json=args.json)
 
 
-async def _measure(port: "SerialPort", calibrator: "LoadCalibrator", operator: Operator) -> None:
+async def _measure(port: "SerialPort", masses_g: list[float], operator: Operator) -> list["Level"]:
     from shearloop.drivers.errors import DeviceCalibrationError, DeviceLostError
-    from shearloop.drivers.load_calibration import UNCALIBRATED
-    from shearloop.drivers.load_cell import LoadParser
+    from shearloop.drivers.load_calibration import (
+        SAMPLES_PER_STEP,
+        SKIP_SAMPLES,
+        UNCALIBRATED,
+        check_levels,
+        measure_level,
+    )
+    from shearloop.drivers.load_cell import LoadParser, LoadSample
     from shearloop.drivers.serial_sensor import BOOT_S
 
-    results: asyncio.Queue[DeviceCalibrationError | None] = asyncio.Queue()
+    samples: asyncio.Queue[LoadSample] = asyncio.Queue()
+    levels: list[Level] = []
 
     async def read_port() -> None:
         parser = LoadParser(UNCALIBRATED)
         while (received := await port.read(BOOT_S)) is not None:
             for sample in parser.feed(received.data, received.t_arrival_ns):
-                try:
-                    if calibrator.feed(sample):
-                        results.put_nowait(None)
-                except DeviceCalibrationError as error:
-                    results.put_nowait(error)
+                samples.put_nowait(sample)
         raise DeviceLostError(
             f"{port.path} has sent nothing for {BOOT_S:g} s; "
             "check that it is the load cell's board and that the HX711 has power and its DT and SCK wires"
         )
 
     async def guide_operator() -> None:
-        while not calibrator.finished:
-            await operator.ask(f"{calibrator.prompt} Then press Enter.")
-            calibrator.start_step()
-            if error := await results.get():
+        while len(levels) <= len(masses_g):
+            mass_g = masses_g[len(levels) - 1] if levels else 0.0
+            await operator.ask(f"{_instruction(mass_g)} Then press Enter.")
+            while not samples.empty():
+                samples.get_nowait()
+            try:
+                taken = [await samples.get() for _ in range(SKIP_SAMPLES + SAMPLES_PER_STEP)]
+                level = measure_level(taken, mass_g)
+                check_levels([*levels, level])
+            except DeviceCalibrationError as error:
                 print(f"Refused: {error}", file=sys.stderr, flush=True)
             else:
-                level = calibrator.levels[-1]
-                reading = f"{level.mean:.6g}, noise {level.std:.3g}, {level.n} readings"
-                operator.say(f"  {level.mass_g:g} g: {reading}.")
+                levels.append(level)
+                operator.say(f"  {mass_g:g} g: {level.mean:.6g}, noise {level.std:.3g}, {level.n} readings.")
 
     async with operator:
         # Reading never pauses: bytes in the port's buffer belong to an earlier load.
@@ -104,3 +112,10 @@ async def _measure(port: "SerialPort", calibrator: "LoadCalibrator", operator: O
             await asyncio.wait(tasks)
     for task in done:
         task.result()
+    return levels
+
+
+def _instruction(mass_g: float) -> str:
+    if not mass_g:
+        return "Take every load off the lever arm and let it rest."
+    return f"Put {mass_g:g} g on the load cell, where the lever arm presses, and let it hang still."

@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +29,8 @@ COUNTS_MIN, COUNTS_MAX = -(1 << 23), (1 << 23) - 1
 TIMED_FAULTS = ("silence", "saturation", "stuck", "unplug")
 
 
-@dataclass(frozen=True, slots=True)
-class BoardFault:
-    """One fault of the next line, or one that lasts for some seconds; None without an end."""
-
-    name: str
-    seconds: float | None = None
+# A fault of the next line, or one that lasts for some seconds, without an end if infinite.
+BoardFault: TypeAlias = tuple[str, float]
 
 
 def parse_fault(text: str, names: Collection[str]) -> BoardFault:
@@ -42,11 +39,11 @@ def parse_fault(text: str, names: Collection[str]) -> BoardFault:
     if name not in names:
         raise ValueError(f"there is no fault {name!r}; there are {', '.join(names)}")
     if not seconds:
-        return BoardFault(name)
+        return name, math.inf
     if name not in TIMED_FAULTS:
         raise ValueError(f"{name} has no duration; write {name} alone")
     no_duration = f"no duration in seconds; write for instance {name}:3"
-    return BoardFault(name, number_between(seconds, 0.0, 1e9, no_duration))
+    return name, number_between(seconds, 0.0, 1e9, no_duration)
 
 
 class EmulatedBoard(ABC):
@@ -115,9 +112,12 @@ class EmulatedBoard(ABC):
 
     def _next_line(self, now_s: float) -> bytes:
         """Return the next line with its faults, or nothing; StopIteration at the end of the data."""
-        fault = self._injected.popleft() if self._injected else None
-        if fault is not None and fault.name in TIMED_FAULTS:
-            self._begin_lasting(fault, now_s)
+        fault, seconds = self._injected.popleft() if self._injected else ("", 0.0)
+        if fault in TIMED_FAULTS:
+            self._end_lasting()
+            self._lasting, self._lasts_until_s = fault, now_s + seconds
+            if fault == "unplug":
+                self.port.unplug()
         match self._lasting:
             case "silence" | "unplug":
                 return b""
@@ -126,7 +126,7 @@ class EmulatedBoard(ABC):
             case "saturation":
                 return b"%d\r\n" % COUNTS_MAX
         self._last_line = self._line()
-        return self._last_line if fault is None else self._changed(fault.name, self._last_line)
+        return self._changed(fault, self._last_line) if fault else self._last_line
 
     def _changed(self, fault: str, line: bytes) -> bytes:
         """Return a line with a fault of its own."""
@@ -140,13 +140,6 @@ class EmulatedBoard(ABC):
             case "missing":
                 return b""
         return line
-
-    def _begin_lasting(self, fault: BoardFault, now_s: float) -> None:
-        self._end_lasting()
-        self._lasting = fault.name
-        self._lasts_until_s = math.inf if fault.seconds is None else now_s + fault.seconds
-        if fault.name == "unplug":
-            self.port.unplug()
 
     def _end_lasting(self) -> None:
         if self._lasting == "unplug":

@@ -119,8 +119,8 @@ class Server(ABC):
 
     def __init__(self, answer_s: float) -> None:
         self._answer_s = answer_s
-        self._silent = False
-        self._connected = True
+        # normal, silence or unplug.
+        self._state = "normal"
         self._changed = asyncio.Event()
         self._recovery: asyncio.TimerHandle | None = None
 
@@ -129,7 +129,7 @@ class Server(ABC):
         try:
             while True:
                 self._changed.clear()
-                await (self.restore() if self._connected else self.disconnect())
+                await (self.disconnect() if self._state == "unplug" else self.restore())
                 await self._changed.wait()
         finally:
             await self.disconnect()
@@ -149,25 +149,18 @@ class Server(ABC):
                 times_s = [
                     number_between(each, 0.0, 1e9, "no time in seconds; write for instance 2.5") for each in seconds
                 ]
-                self.recover()
-                self._silent = kind == "silence"
-                self._connect(connected=kind == "silence")
+                self._begin(kind)
                 for time_s in times_s:
-                    self._recovery = asyncio.get_running_loop().call_later(time_s, self.recover)
+                    self._recovery = asyncio.get_running_loop().call_later(time_s, self._begin, "normal")
             case ["normal"]:
-                self.recover()
+                self._begin("normal")
             case _:
                 raise ValueError(f"{text!r} is no command; there are {OUTAGES}")
 
-    def recover(self) -> None:
-        """End every outage."""
+    def _begin(self, state: str) -> None:
         if self._recovery is not None:
             self._recovery.cancel()
-        self._silent = False
-        self._connect(connected=True)
-
-    def _connect(self, *, connected: bool) -> None:
-        self._connected = connected
+        self._state = state
         self._changed.set()
 
 
@@ -187,7 +180,7 @@ class PtyServer(Server):
             while True:
                 data = await self._port.received.get()
                 reply = self._session.feed(data)
-                if not reply or self._silent:
+                if not reply or self._state == "silence":
                     continue
                 # The time of the measurement.
                 await asyncio.sleep(self._answer_s)
@@ -244,7 +237,7 @@ class SocketServer(Server):
         try:
             while data := await reader.read(READ_BYTES):
                 replies = session.feed(data)
-                if replies and not self._silent:
+                if replies and self._state != "silence":
                     # The time of the measurement.
                     await asyncio.sleep(self._answer_s)
                     writer.write(replies)

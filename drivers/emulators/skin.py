@@ -255,11 +255,10 @@ class EmulatedScanner(ScpiInterpreter):
     def __init__(self, circuit: Circuit, seed: int = 0) -> None:
         self._circuit = circuit
         self._random = Random(seed)
-        self._reset("")
+        self._range_v, self._channels = 300.0, 0
         super().__init__(
             SCANNER_IDENTITY,
             {
-                "*RST": self._reset,
                 "CONF:VOLT:DC": self._configure,
                 "VOLT:DC:NPLC": lambda _: None,
                 "ROUT:SCAN": self._set_scan,
@@ -267,10 +266,6 @@ class EmulatedScanner(ScpiInterpreter):
             },
             SCANNER_NO_ERROR,
         )
-
-    def _reset(self, _: str) -> None:
-        self._range_v = 300.0
-        self._channels = 0
 
     def _configure(self, text: str) -> None:
         self._range_v = parse_number(text.split(",", 1)[0], 0.0, 300.0)

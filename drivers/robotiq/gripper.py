@@ -174,7 +174,7 @@ class RobotiqGripper:
             if not blocking_fault(readout):
                 return self._state(readout, t_ns)
         self._last_move = None
-        await self._write(messages.Reset())
+        await self._write(messages.GripperAction.RESET)
         not_reset = "The gripper does not take the reset; check that nothing else commands it."
         await self._wait_until(
             lambda now: not now.act and now.sta is messages.ActivationStatus.RESET, RESET_DEADLINE_NS, not_reset
@@ -182,7 +182,7 @@ class RobotiqGripper:
         resume_ns = time.monotonic_ns() + PAUSE_NS
         await self._wait_until(lambda _: time.monotonic_ns() >= resume_ns, RESET_DEADLINE_NS, not_reset)
         # A rising edge of ACT, which also ends every fault.
-        await self._write(messages.Activate())
+        await self._write(messages.GripperAction.ACTIVATE)
         return await self._wait_until(
             _is_active,
             ACTIVATION_DEADLINE_NS,
@@ -236,13 +236,13 @@ class RobotiqGripper:
     async def halt(self) -> None:
         """Stop the fingers where they are; they keep their grip. An activation is ended by a reset."""
         self._last_move = None
-        await self._write(messages.GripperHalt())
+        await self._write(messages.GripperAction.HALT)
         readout, _ = await self._read()
         # The status may not show an activation yet that has just been requested. A major fault stops the fingers, and
         # a reset would clear it without the operator.
         active = readout.sta is messages.ActivationStatus.ACTIVE
         if not (active or messages.fault_of(readout.flt).needs_activation):
-            await self._write(messages.Reset())
+            await self._write(messages.GripperAction.RESET)
 
     async def states(self) -> AsyncGenerator[messages.GripperState]:
         """Yield a state every poll period and reconnect after losses, for ever.

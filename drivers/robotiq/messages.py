@@ -1,7 +1,7 @@
 """Requests to the gripper, its status registers, states and faults (instruction manual of the 2F-140)."""
 
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import Enum, IntEnum
 from typing import Protocol
 
 from shearloop.drivers.errors import DriverError
@@ -95,19 +95,12 @@ class Readout:
     current: int | None
 
 
-@dataclass(frozen=True, slots=True)
-class Reset:
-    """ACT and ATR to 0: motion stops, faults are cleared, the gripper is no longer active."""
+class GripperAction(Enum):
+    """A request without a target."""
 
-
-@dataclass(frozen=True, slots=True)
-class Activate:
-    """ACT to 1: after a reset the gripper opens and closes once, and is then active."""
-
-
-@dataclass(frozen=True, slots=True)
-class GripperHalt:
-    """GTO to 0: the fingers stop where they are."""
+    RESET = "ACT and ATR to 0: motion stops, faults are cleared, the gripper is no longer active"
+    ACTIVATE = "ACT to 1: after a reset the gripper opens and closes once, and is then active"
+    HALT = "GTO to 0: the fingers stop where they are"
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +115,7 @@ class GripperMove:
     force: int
 
 
-Request = Reset | Activate | GripperHalt | GripperMove
+Request = GripperAction | GripperMove
 
 
 class GripperClient(Protocol):

@@ -28,11 +28,11 @@ def command_registers(request: messages.Request, last: messages.GripperMove, *, 
     `act` is the gripper's present ACT, which a halt keeps: a rising edge would begin an activation.
     """
     match request:
-        case messages.Reset():
+        case messages.GripperAction.RESET:
             action = 0
-        case messages.Activate():
+        case messages.GripperAction.ACTIVATE:
             action = _ACT
-        case messages.GripperHalt():
+        case messages.GripperAction.HALT:
             action = _ACT if act else 0
         case messages.GripperMove():
             action, last = _ACT | _GTO, request

@@ -24,11 +24,11 @@ _OPTIONAL = ("COU",)
 def set_lines(request: messages.Request) -> list[str]:
     """Return the lines of a request; each is acknowledged before the next."""
     match request:
-        case messages.Reset():
+        case messages.GripperAction.RESET:
             return ["SET ACT 0", "SET ATR 0"]
-        case messages.Activate():
+        case messages.GripperAction.ACTIVATE:
             return ["SET ACT 1"]
-        case messages.GripperHalt():
+        case messages.GripperAction.HALT:
             return ["SET GTO 0"]
         case messages.GripperMove(position, speed, force):
             return [f"SET POS {position} SPE {speed} FOR {force} GTO 1"]

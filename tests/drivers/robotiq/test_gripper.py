@@ -81,7 +81,7 @@ async def test_halted_gripper_reports_no_object(way, tmp_path):
         assert 0 < state.width_mm < 140
 
 
-@pytest.mark.parametrize("requested", [[], [messages.Activate()]], ids=["reset", "about to activate"])
+@pytest.mark.parametrize("requested", [[], [messages.GripperAction.ACTIVATE]], ids=["reset", "about to activate"])
 @WAYS
 async def test_halting_a_gripper_that_is_not_active_moves_nothing(way, requested, tmp_path):
     """A stop meets an activation before its beginning."""

@@ -19,11 +19,11 @@ def test_requests_are_the_manuals_registers():
     # Instruction manual, "Modbus RTU": reset 0000 0000 0000, close at full speed and force 0900 00FF FFFF.
     last, closed = messages.GripperMove(0, 0, 0), messages.GripperMove(255, 255, 128)
     registers = modbus_client.command_registers
-    assert registers(messages.Reset(), last, act=True) == [0, 0, 0]
-    assert registers(messages.Activate(), last, act=False) == [0x0100, 0, 0]
+    assert registers(messages.GripperAction.RESET, last, act=True) == [0, 0, 0]
+    assert registers(messages.GripperAction.ACTIVATE, last, act=False) == [0x0100, 0, 0]
     assert registers(messages.GripperMove(255, 255, 255), last, act=True) == [0x0900, 0x00FF, 0xFFFF]
-    assert registers(messages.GripperHalt(), closed, act=True) == [0x0100, 0x00FF, 0xFF80]
-    assert registers(messages.GripperHalt(), closed, act=False) == [0, 0x00FF, 0xFF80]
+    assert registers(messages.GripperAction.HALT, closed, act=True) == [0x0100, 0x00FF, 0xFF80]
+    assert registers(messages.GripperAction.HALT, closed, act=False) == [0, 0x00FF, 0xFF80]
 
 
 def test_replies_are_read_as_the_manual_explains_them():
@@ -50,9 +50,9 @@ def test_every_status_is_either_read_whole_or_refused(content):
 
 def test_socket_lines_are_those_that_the_urcap_takes():
     assert set_lines(messages.GripperMove(100, 255, 50)) == ["SET POS 100 SPE 255 FOR 50 GTO 1"]
-    assert set_lines(messages.Reset()) == ["SET ACT 0", "SET ATR 0"]
-    assert set_lines(messages.Activate()) == ["SET ACT 1"]
-    assert set_lines(messages.GripperHalt()) == ["SET GTO 0"]
+    assert set_lines(messages.GripperAction.RESET) == ["SET ACT 0", "SET ATR 0"]
+    assert set_lines(messages.GripperAction.ACTIVATE) == ["SET ACT 1"]
+    assert set_lines(messages.GripperAction.HALT) == ["SET GTO 0"]
 
 
 @pytest.mark.parametrize("line", ["SET GTO 0", "GET POS"])

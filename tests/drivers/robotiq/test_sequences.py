@@ -64,7 +64,7 @@ async def test_activation_is_a_reset_a_pause_and_a_rising_edge(connect):
     state = await connect(client).activate(operator_confirmed=True)
     assert state.activation is messages.ActivationStatus.ACTIVE
     (reset, reset_ns), (activate, activate_ns) = client.requests
-    assert (reset, activate) == (messages.Reset(), messages.Activate())
+    assert (reset, activate) == (messages.GripperAction.RESET, messages.GripperAction.ACTIVATE)
     assert activate_ns - reset_ns >= PAUSE_NS
     assert client.readouts == [ACTIVE]
 

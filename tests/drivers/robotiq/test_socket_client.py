@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 import pytest
 
 from shearloop.drivers.errors import DeviceLostError, ProtocolError
-from shearloop.drivers.robotiq.messages import GripperMove, Reset
+from shearloop.drivers.robotiq.messages import GripperAction, GripperMove
 from shearloop.drivers.robotiq.socket_client import READ_ORDER, SocketClient
 
 VALUES = {"ACT": 1, "STA": 3, "GTO": 1, "PRE": 100, "OBJ": 3, "POS": 100, "FLT": 0, "COU": 7}
@@ -63,7 +63,7 @@ async def test_requests_are_answered_in_order():
     peer = Peer(usual)
     async with connected(peer) as client:
         assert (await client.read()).pos == 100
-        await client.write(Reset())
+        await client.write(GripperAction.RESET)
         await client.write(GripperMove(10, 20, 30))
         assert (await client.read()).current == 7
     asked = [f"GET {variable}" for variable in READ_ORDER]

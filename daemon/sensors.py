@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, SerialDevice
@@ -18,7 +17,7 @@ from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, RecordedSkin, 
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.supervisor import Task
 from shearloop.daemon.taring import Tareable
-from shearloop.drivers.connection import LinkMonitor
+from shearloop.drivers.connection import LinkMonitor, SerialLink
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.serial_sensor import InputRecorder
@@ -102,13 +101,14 @@ class SensorBuilder:
 
     def _eit_kit(self, name: str, estimator: FrameEstimator) -> EitKit:
         own, slots = self.config.fingertips[name], estimator.table.zero_slots
-        return EitKit(zero_slots=slots, frame_period_s=own.frame_period_s, **self._link(name, own.device))
+        return EitKit(self._link(name, own.device), slots, own.frame_period_s, self._inputs(name))
 
     def _load_cell(self) -> LoadCellTask | None:
         own = self.config.load_cell
         if own is None:
             return None
-        board = LoadCell(load_cell_calibration(own), rate_hz=own.rate_hz, **self._link(LOAD_CELL, own.device))
+        link, inputs = self._link(LOAD_CELL, own.device), self._inputs(LOAD_CELL)
+        board = LoadCell(link, load_cell_calibration(own), own.rate_hz, inputs)
         return LoadCellTask(board, self.publisher, self.clock, self.loop, own.rate_hz)
 
     def _skin(self) -> SkinTask | None:
@@ -117,10 +117,8 @@ class SensorBuilder:
         inputs = {name: self._inputs(name) for name in RecordedSkin.sources}
         return SkinTask(self.config.skin, self.publisher, self.clock, self.loop, inputs)
 
-    def _link(self, name: str, device: SerialDevice) -> dict[str, Any]:
-        """Return the name of a board's port, its monitor and its recorder."""
-        monitor = LinkMonitor(DeviceLink(name, self.loop))
-        return {**device.model_dump(), "monitor": monitor, "inputs": self._inputs(name)}
+    def _link(self, name: str, device: SerialDevice) -> SerialLink:
+        return SerialLink(**device.model_dump(), monitor=LinkMonitor(DeviceLink(name, self.loop)))
 
     def _inputs(self, source: str) -> InputRecorder | None:
         return self.recorder.input_recorder(source) if self.recorder is not None else None

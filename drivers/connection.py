@@ -364,8 +364,6 @@ class SerialLink(Link):
         baud: int = DEFAULT_BAUD,
         monitor: LinkMonitor | None = None,
     ) -> None:
-        if (serial_number is None) == (path is None):
-            raise ValueError("give either the USB serial number of a device or the path of its port")
         super().__init__(monitor)
         self._serial_number = serial_number
         self._path = None if path is None else os.fspath(path)

@@ -7,7 +7,6 @@ where the measuring pair touches a driven electrode. Values are below 10 V, so a
 """
 
 import math
-import os
 import re
 from collections import Counter, deque
 from collections.abc import Iterable
@@ -19,7 +18,7 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.drivers.connection import Diagnostics, LinkMonitor, Port, SerialLink
+from shearloop.drivers.connection import Diagnostics, Link, Port
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, LineSplitter, RawEvent, SerialSensor
 
@@ -132,8 +131,8 @@ class Frame:
     `channels` (c,) and `raw` (v,) are in volts and line order; `line` is the received line without its end.
     `t_mid_ns` is the middle of the acquisition, `t_arrival_ns` the arrival of the last byte (monotonic clock).
     `seq` counts frames from 0 across reconnections. `saturated` (c,): the signal exceeds the ADC's range; `dead`
-    (c,): unchanged for DEAD_AFTER_FRAMES, so nothing is connected; `unusable` counts channels with either flag;
-    `repeated`: the same line as the frame before, so no new measurement.
+    (c,): unchanged for DEAD_AFTER_FRAMES, so nothing is connected; `repeated`: the same line as
+    the frame before, so no new measurement.
     """
 
     channels: NDArray[np.float64]
@@ -145,7 +144,6 @@ class Frame:
     seq: int
     saturated: NDArray[np.bool_]
     dead: NDArray[np.bool_]
-    unusable: int
     repeated: bool
 
 
@@ -327,13 +325,12 @@ class FrameParser:
             seq=self.frames - 1,
             saturated=saturated,
             dead=dead,
-            unusable=int(np.count_nonzero(saturated | dead)),
             repeated=repeated,
         )
 
 
 class EitKit(SerialSensor[Frame]):
-    """One board, named by USB serial number or path.
+    """One board.
 
     `zero_slots` (v,) is true where its injection pattern makes a value 0. `frame_period_s` is used until the period
     is measured. `inputs` keeps every input of the parser.
@@ -343,15 +340,11 @@ class EitKit(SerialSensor[Frame]):
 
     def __init__(
         self,
-        *,
+        link: Link,
         zero_slots: NDArray[np.bool_],
-        serial_number: str | None = None,
-        path: str | os.PathLike[str] | None = None,
         frame_period_s: float = FRAME_PERIOD_S,
-        monitor: LinkMonitor | None = None,
         inputs: InputRecorder | None = None,
     ) -> None:
-        link = SerialLink(serial_number=serial_number, path=path, monitor=monitor)
         super().__init__(link, frame_period_s, inputs)
         self._parser = FrameParser(zero_slots, nominal_period_ns=round(frame_period_s * 1e9))
 

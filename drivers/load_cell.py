@@ -5,7 +5,6 @@ A lever arm on the tool's shaft presses on the cell; force times lever arm is th
 With its RATE pin high an HX711 converts eight times as often; the configuration gives the rate.
 """
 
-import os
 import re
 import time
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from typing import Literal, Self
 
 from shearloop.drivers import serial_sensor
 from shearloop.drivers.calibration_files import CalibrationModel, Finite, Positive
-from shearloop.drivers.connection import Diagnostics, LinkMonitor, SerialLink
+from shearloop.drivers.connection import Diagnostics, Link
 from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ
 
 BAUD_RATE = 115200
@@ -162,21 +161,17 @@ class LoadParser(serial_sensor.LineParser[LoadSample]):
 
 
 class LoadCell(serial_sensor.SerialSensor[LoadSample]):
-    """One board, by USB serial number or path; it only sends."""
+    """One board; it only sends."""
 
     silence_hint = "check that it is the load cell's board and that the HX711 has power and its DT and SCK wires."
 
     def __init__(
         self,
+        link: Link,
         calibration: LoadCalibration,
-        *,
-        serial_number: str | None = None,
-        path: str | os.PathLike[str] | None = None,
         rate_hz: float = LOAD_CELL_RATE_HZ,
-        monitor: LinkMonitor | None = None,
         inputs: serial_sensor.InputRecorder | None = None,
     ) -> None:
-        link = SerialLink(serial_number=serial_number, path=path, baud=BAUD_RATE, monitor=monitor)
         # A fast board may seem silent to a busy computer; reopening would reset it.
         super().__init__(link, 1.0 / min(rate_hz, LOAD_CELL_RATE_HZ), inputs)
         self._parser = LoadParser(calibration, rate_hz)

@@ -21,7 +21,7 @@ from shearloop.daemon.messaging.stop_socket import send_to_stop_socket
 from shearloop.daemon.rig import make_gripper_client
 from shearloop.daemon.sensing.estimators import fingertip_table
 from shearloop.daemon.serial_ports import access_error
-from shearloop.drivers.connection import find_port
+from shearloop.drivers.connection import SerialLink, find_port
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.errors import DriverError, times
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
@@ -145,11 +145,8 @@ async def _check_fingertip(name: str, config: FingertipConfig, seconds: float) -
     port = check_port(name, config.device)
     if port.state == "trouble":
         return [port]
-    board = EitKit(
-        zero_slots=fingertip_table(config).zero_slots,
-        frame_period_s=config.frame_period_s,
-        **config.device.model_dump(),
-    )
+    link = SerialLink(**config.device.model_dump())
+    board = EitKit(link, fingertip_table(config).zero_slots, config.frame_period_s)
     frames = await _received(board.readings(), seconds)
     facts = board.diagnostics()
     if not frames and facts["last_loss"]:
@@ -173,7 +170,7 @@ async def _check_load_cell(config: LoadCellConfig, seconds: float) -> list[Findi
     port = check_port("load_cell", config.device)
     if port.state == "trouble":
         return [port]
-    cell = LoadCell(LoadCalibration.of_torque_lines(), rate_hz=config.rate_hz, **config.device.model_dump())
+    cell = LoadCell(SerialLink(**config.device.model_dump()), LoadCalibration.of_torque_lines(), config.rate_hz)
     samples = await _received(cell.readings(), seconds)
     measured_hz = _rate_hz([sample.t_arrival_ns for sample in samples])
     findings = [port, check_rate("rate of load_cell", measured_hz, config.rate_hz)]

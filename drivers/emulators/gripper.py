@@ -21,7 +21,7 @@ ACTIVATION_NOT_FINISHED, NOT_ACTIVATED, OVER_TEMPERATURE, NO_COMMUNICATION = 5, 
 SPEED_MM_S, FORCE_N = (30.0, 250.0), (10.0, 125.0)
 ACTIVATION_SPEED_MM_S = 150.0
 
-_COMMANDS = {"ACT": "act", "GTO": "gto", "ATR": "atr", "POS": "pos", "SPE": "spe", "FOR": "force"}
+_COMMANDS = {"ACT": "act", "GTO": "gto", "POS": "pos", "SPE": "spe", "FOR": "force"}
 
 DEVICE_ID = 9
 COMMAND_REGISTERS, STATUS_REGISTERS = struct.pack(">HH", 0x03E8, 3), struct.pack(">HH", 0x07D0, 3)
@@ -58,7 +58,6 @@ class GripperRegisters:
 
     act: bool = False
     gto: bool = False
-    atr: bool = False
     pos: int = 0
     spe: int = 0
     force: int = 0
@@ -216,8 +215,8 @@ class UrcapSession:
         return str(values[variable])
 
     def _set(self, pairs: dict[str, str]) -> None:
-        flags = ("ACT", "GTO", "ATR")
-        values = {name: bool(int(text)) if name in flags else int(text) for name, text in pairs.items()}
+        # Automatic release, ATR, is not played.
+        values = {name: int(text) for name, text in pairs.items() if name != "ATR"}
         changed: dict[str, Any] = {_COMMANDS[name]: value for name, value in values.items()}
         self.gripper.write(replace(self.gripper.command, **changed))
 
@@ -258,8 +257,7 @@ class ModbusSlave:
         if request[:5] != bytes([WRITE]) + COMMAND_REGISTERS:
             raise ValueError(f"the gripper has no such registers: {request.hex()}")
         action, _, _, pos, spe, force = request[6:]
-        act, gto, atr = (bool(action & 1 << bit) for bit in (0, 3, 4))
-        gripper.write(GripperRegisters(act, gto, atr, pos, spe, force))
+        gripper.write(GripperRegisters(bool(action & 1), bool(action & 1 << 3), pos, spe, force))
         return request[:5]
 
 

@@ -69,8 +69,6 @@ class ModbusClient:
         reply_deadline_s: float = REPLY_DEADLINE_S,
     ) -> None:
         """Name the adapter by its USB serial number or by a path; nothing is opened yet."""
-        if (serial_number is None) == (path is None):
-            raise ValueError("the gripper's adapter is named either by its USB serial number or by its path")
         self._serial_number = serial_number
         self._path = path
         self._deadline_s = reply_deadline_s

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
 from statistics import fmean
-from typing import Any
 
 from shearloop.drivers.connection import Diagnostics
 from shearloop.drivers.serial_sensor import StepFilter
@@ -70,9 +69,6 @@ class SkinSample:
 
     r1_ohm: float | None
     r2_ohm: float | None
-    v1_v: float
-    v2_v: float
-    current_a: float | None
     t_mid_ns: int
     t_arrival_ns: int
     seq: int
@@ -121,9 +117,6 @@ class SampleValidator:
         sample = SkinSample(
             r1_ohm=r1_ohm,
             r2_ohm=r2_ohm,
-            v1_v=voltages.v1_v,
-            v2_v=voltages.v2_v,
-            current_a=source.current_a if source is not None and source.output_on else None,
             t_mid_ns=voltages.t_mid_ns,
             t_arrival_ns=voltages.t_arrival_ns,
             seq=self.samples,
@@ -221,11 +214,13 @@ class SampleAverager:
             return None
         whole = replace(sample, seq=self._seq, missed=self._missed)
         if not sample.faults:
-            names = ("r1_ohm", "r2_ohm", "v1_v", "v2_v", "current_a")
-            means: dict[str, Any] = {name: fmean(getattr(one, name) for one in self._block) for name in names}
-            whole = replace(whole, **means, t_mid_ns=sum(one.t_mid_ns for one in self._block) // len(self._block))
+            t_mid_ns = sum(one.t_mid_ns for one in self._block) // len(self._block)
+            whole = replace(whole, r1_ohm=self._mean("r1_ohm"), r2_ohm=self._mean("r2_ohm"), t_mid_ns=t_mid_ns)
         self._block, self._missed, self._seq = [], 0, self._seq + 1
         return whole
+
+    def _mean(self, name: str) -> float:
+        return fmean(getattr(one, name) for one in self._block)
 
 
 def _is_reachable(before: tuple[float, float], after: tuple[float, float], missed: int) -> bool:

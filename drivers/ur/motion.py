@@ -6,7 +6,7 @@ robot's watchdog: nothing more is sent to the program, and only a new program ma
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from shearloop.drivers.ur.messages import (
@@ -57,14 +57,6 @@ ASTRAY = "The arm moved without a command: check whether a person or another pro
 
 
 @dataclass(slots=True)
-class _Turn:
-    """The wrist turns at the speed last asked for."""
-
-    asked: WristSpeed
-    decided_ns: int
-
-
-@dataclass(slots=True)
 class _Move:
     """A linear move is under way."""
 
@@ -97,7 +89,8 @@ class MotionExecutor:
         self.sent: WristSpeed | MoveLinear | Stop | None = None
         self.clipped: tuple[str, ...] = ()
         self.disabled_reason = NOT_OURS
-        self._motion: _Turn | _Move | _Braking | None = None
+        # A wrist speed is the one last asked for, with the time of its decision.
+        self._motion: WristSpeed | _Move | _Braking | None = None
         self._rejected = False
         # The script's thread for speeds runs; it has to be ended before a linear move.
         self._speed_thread = False
@@ -108,7 +101,7 @@ class MotionExecutor:
     def motion(self) -> MotionKind:
         """What the arm does on command."""
         match self._motion:
-            case _Turn():
+            case WristSpeed():
                 return "wrist"
             case _Move():
                 return "linear"
@@ -138,7 +131,7 @@ class MotionExecutor:
                 return "The arm moves: stop it before a linear move."
         self.motion_id, self.end_reason = motion_id, ""
         if isinstance(asked, WristSpeed):
-            self._motion = _Turn(asked, asked.decided_ns or now_ns)
+            self._motion = replace(asked, decided_ns=asked.decided_ns or now_ns)
             self._keep_turning(self._motion, sample, now_ns)
         else:
             self._end_speed_thread()
@@ -173,7 +166,7 @@ class MotionExecutor:
                 return
             case _Braking(before) if before >= deceleration:
                 return
-            case _Turn() | _Move():
+            case WristSpeed() | _Move():
                 self.end_reason = reason
         nominal_s = sample.fastest_rad_per_s / deceleration
         self._motion = _Braking(deceleration, _deadline_ns(now_ns, nominal_s, STOP_SLACK_S, sample))
@@ -190,7 +183,7 @@ class MotionExecutor:
 
     def disable(self, end_reason: str, disabled_reason: str = NOT_OURS) -> None:
         """End the present motion on paper, and send nothing to the program on the robot."""
-        if isinstance(self._motion, _Turn | _Move):
+        if isinstance(self._motion, WristSpeed | _Move):
             self.end_reason = end_reason
         self._motion, self._speed_thread = None, False
         self.disabled_reason = disabled_reason
@@ -204,7 +197,7 @@ class MotionExecutor:
     def violation(self, sample: RtdeSample) -> str:
         """Return a sentence that names the limit that the sample or the present motion exceeds, or the empty string."""
         beyond = violation(sample, self._settings)
-        if not beyond and isinstance(self._motion, _Turn | _Move):
+        if not beyond and isinstance(self._motion, WristSpeed | _Move):
             beyond = self._accelerations.violation(self._settings.limits)
         return beyond
 
@@ -213,8 +206,8 @@ class MotionExecutor:
         if self.disabled_reason:
             return
         match self._motion:
-            case _Turn() as turn:
-                self._keep_turning(turn, sample, now_ns)
+            case WristSpeed() as asked:
+                self._keep_turning(asked, sample, now_ns)
             case _Move() as move:
                 self._keep_moving(move, sample, now_ns, daemon_alive_ns)
             case _Braking() as braking:
@@ -229,14 +222,14 @@ class MotionExecutor:
         """Return how long a wrist speed still holds."""
         return self._settings.command_timeout_s - (now_ns - decided_ns) / 1e9
 
-    def _keep_turning(self, turn: _Turn, sample: RtdeSample, now_ns: int) -> None:
-        left_s = self._left_s(turn.decided_ns, now_ns)
+    def _keep_turning(self, asked: WristSpeed, sample: RtdeSample, now_ns: int) -> None:
+        left_s = self._left_s(asked.decided_ns, now_ns)
         if left_s < 0:
             late = f"the wrist speed was not renewed within {self._settings.command_timeout_s:g} s"
             self.stop_now(sample, now_ns, late)
         else:
             # The one check of all speeds that turn the wrist.
-            self.sent, self.clipped = clip_wrist(turn.asked, sample, self._settings)
+            self.sent, self.clipped = clip_wrist(asked, sample, self._settings)
             self._send_speed(self.sent, left_s)
 
     def _keep_moving(self, move: _Move, sample: RtdeSample, now_ns: int, daemon_alive_ns: int) -> None:

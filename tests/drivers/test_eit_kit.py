@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.drivers import eit_kit
-from shearloop.drivers.connection import LinkEvent, LinkMonitor
+from shearloop.drivers.connection import LinkEvent, LinkMonitor, SerialLink
 from shearloop.drivers.eit_kit import ADC_STEP_V, EitKit, Frame, FrameErrorKind
 from shearloop.drivers.emulators.boards import EitKitBoard, format_line
 from tests.running import DEADLINE_S, LinkEvents, running, take
@@ -42,7 +42,7 @@ async def play(
 
     board = EitKitBoard(sent(), period_s=period_s, link=link)
     async with running(board.run()):
-        kit = EitKit(zero_slots=PAPER_TABLE.zero_slots, path=link, frame_period_s=period_s, monitor=LinkMonitor(links))
+        kit = EitKit(SerialLink(path=link, monitor=LinkMonitor(links)), PAPER_TABLE.zero_slots, period_s)
         frames = await take(kit.readings(), n_frames)
     return kit, frames, links.events
 
@@ -64,7 +64,7 @@ async def test_every_frame_arrives_once_and_in_order(tmp_path):
 
 async def test_the_rate_is_told_once_it_is_measured(tmp_path):
     async with running(EitKitBoard(cycle(some_lines(4)), period_s=PERIOD_S, link=tmp_path / "eit").run()):
-        kit = EitKit(zero_slots=PAPER_TABLE.zero_slots, path=tmp_path / "eit", frame_period_s=PERIOD_S)
+        kit = EitKit(SerialLink(path=tmp_path / "eit"), PAPER_TABLE.zero_slots, PERIOD_S)
         assert kit.diagnostics()["measured_hz"] is None
         async with asyncio.timeout(DEADLINE_S), aclosing(kit.readings()) as arriving:
             async for _ in arriving:
@@ -77,7 +77,7 @@ async def test_a_reader_that_stops_for_a_while_loses_nothing(tmp_path):
     lines = some_lines(40)
     board = EitKitBoard(lines, period_s=PERIOD_S, link=tmp_path / "eit")
     async with running(board.run()):
-        kit = EitKit(zero_slots=PAPER_TABLE.zero_slots, path=tmp_path / "eit", frame_period_s=PERIOD_S)
+        kit = EitKit(SerialLink(path=tmp_path / "eit"), PAPER_TABLE.zero_slots, PERIOD_S)
         frames = []
         async with asyncio.timeout(DEADLINE_S), aclosing(kit.readings()) as arriving:
             async for frame in arriving:
@@ -130,8 +130,8 @@ async def test_a_board_that_is_unplugged_is_found_again_and_started(tmp_path):
 async def test_a_driver_that_begins_while_the_board_sends_takes_up_with_the_next_line(tmp_path):
     lines = some_lines(30)
     async with running(EitKitBoard(lines, period_s=PERIOD_S, link=tmp_path / "eit").run()):
-        first = await take(EitKit(zero_slots=PAPER_TABLE.zero_slots, path=tmp_path / "eit").readings(), 10)
-        kit = EitKit(zero_slots=PAPER_TABLE.zero_slots, path=tmp_path / "eit")
+        first = await take(EitKit(SerialLink(path=tmp_path / "eit"), PAPER_TABLE.zero_slots).readings(), 10)
+        kit = EitKit(SerialLink(path=tmp_path / "eit"), PAPER_TABLE.zero_slots)
         second = await take(kit.readings(), 10)
     assert_same(first, lines[:10])
     sent = [line.tolist() for line in lines]
@@ -143,7 +143,7 @@ async def test_a_driver_that_begins_while_the_board_sends_takes_up_with_the_next
 
 async def test_a_board_that_is_not_there_is_awaited_and_told_of_once(tmp_path):
     links = LinkEvents()
-    kit = EitKit(zero_slots=PAPER_TABLE.zero_slots, path=tmp_path / "eit", monitor=LinkMonitor(links))
+    kit = EitKit(SerialLink(path=tmp_path / "eit", monitor=LinkMonitor(links)), PAPER_TABLE.zero_slots)
     taking = asyncio.create_task(take(kit.readings(), 1))
     await links.down(2)
     async with running(EitKitBoard(some_lines(1), period_s=PERIOD_S, link=tmp_path / "eit").run()):

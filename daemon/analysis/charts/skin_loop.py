@@ -152,7 +152,7 @@ class SkinLoop:
         noise = self._random.normal(0.0, RELATIVE_NOISE, 2)
         r1, r2 = (ohm * (1.0 + error) for ohm, error in zip(self.skin.resistances_ohm(), noise, strict=True))
         now_ns, known_ns = self.t_ns, self.t_ns + round(self._case.age_s * 1e9)
-        reading = self.estimator.update(SkinSample(r1, r2, 0.0, 0.0, 5e-3, now_ns, known_ns, self._samples))
+        reading = self.estimator.update(SkinSample(r1, r2, now_ns, known_ns, self._samples))
         torque = skin_torque(reading, RADIUS_MM * 1e-3, now_ns, known_ns)
         if not self._case.band:
             torque = replace(torque, low_nm=None, high_nm=None)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.eit.bank_file import BankDefinition, write_bank
 from shearloop.bank.eit.channels import PAPER_TABLE
-from shearloop.drivers.connection import LinkMonitor
+from shearloop.drivers.connection import LinkMonitor, SerialLink
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.load_cell import LoadCalibration, LoadSample
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
@@ -80,7 +80,7 @@ async def open_gripper_at(rig: RigProcess) -> AsyncIterator[RobotiqGripper]:
 
 def kit_at(rig: RigProcess, side: str) -> EitKit:
     path = rig.run_dir / f"eit-{side}"
-    return EitKit(zero_slots=PAPER_TABLE.zero_slots, path=path, frame_period_s=0.5408 / SPEED)
+    return EitKit(SerialLink(path=path), PAPER_TABLE.zero_slots, 0.5408 / SPEED)
 
 
 @asynccontextmanager

@@ -7,6 +7,7 @@ from contextlib import AsyncExitStack
 import numpy as np
 import pytest
 
+from shearloop.drivers.connection import SerialLink
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.messages import ObjectStatus
@@ -23,7 +24,7 @@ async def test_a_twist_is_felt_by_load_cell_wrench_and_both_fingertips_and_is_go
         right = await stack.enter_async_context(played.Reader(played.kit_at(rig, "right").readings()))
         left = await stack.enter_async_context(played.Reader(played.kit_at(rig, "left").readings()))
         load = await stack.enter_async_context(
-            played.Reader(LoadCell(played.COUNTS, path=rig.run_dir / "load-cell").readings())
+            played.Reader(LoadCell(SerialLink(path=rig.run_dir / "load-cell"), played.COUNTS).readings())
         )
         free = [await played.mean_of(right), await played.mean_of(left)]
         held = await played.grip(gripper)
@@ -74,7 +75,7 @@ async def test_the_modbus_gripper_the_papers_sketch_a_sigma_and_the_truth_in_a_f
                 ModbusClient(path=str(run_dir / "gripper")), WidthCalibration.nominal(), poll_s=0.02
             )
             stack.push_async_callback(gripper.close)
-            cell = LoadCell(LoadCalibration.of_torque_lines(), path=run_dir / "load-cell")
+            cell = LoadCell(SerialLink(path=run_dir / "load-cell"), LoadCalibration.of_torque_lines())
             load = await stack.enter_async_context(played.Reader(cell.readings()))
             right = await stack.enter_async_context(played.Reader(played.kit_at(rig, "right").readings()))
             await gripper.connect()

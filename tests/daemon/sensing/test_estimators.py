@@ -51,7 +51,7 @@ def frame(
     return Frame(
         channels=channels, raw=np.zeros(1024), line=b"", t_begin_ns=t_ns - 270_000_000, t_mid_ns=t_ns,
         t_arrival_ns=t_ns + 270_000_000,
-        seq=number, saturated=NO_CHANNEL, dead=dead, unusable=int(dead.sum()), repeated=repeated,
+        seq=number, saturated=NO_CHANNEL, dead=dead, repeated=repeated,
     )  # fmt: skip
 
 

@@ -65,8 +65,8 @@ class Bench:
         r1, r2 = self.spoil(*self.skin.resistances_ohm(), self.time_s)
         r1, r2 = (r * (1 + self._random.gauss(0, NOISE)) for r in (r1, r2))
         t_ns = self._number * PERIOD_NS
-        values = {"r1_ohm": r1, "r2_ohm": r2, "v1_v": 0.0, "v2_v": 0.0, "current_a": 5e-3}
-        return SkinSample(**{**values, "t_mid_ns": t_ns, "t_arrival_ns": t_ns, "seq": self._number, **changes})
+        values = {"r1_ohm": r1, "r2_ohm": r2, "t_mid_ns": t_ns, "t_arrival_ns": t_ns, "seq": self._number}
+        return SkinSample(**{**values, **changes})
 
     def at(self, shear_n: float, normal_n: float = 1.0) -> SkinReading:
         self.skin.normal_n = normal_n

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.drivers.connection import LinkMonitor
+from shearloop.drivers.connection import LinkMonitor, SerialLink
 from shearloop.drivers.emulators.boards import PAPER_SKETCH, Hx711Board, Sketch
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell, LoadSample
 from tests.running import LinkEvents, pass_on, running
@@ -44,7 +44,7 @@ async def a_rig(
     link = tmp_path / "load"
     board = Hx711Board(torques_nm, sketch, period_s=0.002, link=link)
     rig = Rig(board)
-    rig.cell = cell = LoadCell(calibration, path=link, monitor=LinkMonitor(rig, 0.001, 0.002))
+    rig.cell = cell = LoadCell(SerialLink(path=link, monitor=LinkMonitor(rig, 0.001, 0.002)), calibration)
 
     async with running(board.run()):
         await board.port.appearances.get()

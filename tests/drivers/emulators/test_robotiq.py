@@ -6,7 +6,6 @@ from hypothesis import strategies as st
 
 from shearloop.drivers.emulators.gripper import (
     Gripper,
-    GripperMechanics,
     GripperRegisters,
     ModbusSlave,
     UrcapSession,
@@ -144,9 +143,3 @@ def test_the_socket_answers_as_the_urcap_does():
     assert face.feed(b"GET FLT\n") == b"FLT 14\n"
     gripper.powered = False
     assert face.feed(b"GET POS\n") == b"POS ?\n"
-
-
-def test_positions_and_widths_are_each_others_inverse():
-    mechanics = GripperMechanics()
-    assert mechanics.width_mm(mechanics.counts(42.0)) == pytest.approx(42.0)
-    assert (mechanics.width_mm(3), mechanics.width_mm(230)) == (140.0, 0.0)

@@ -11,14 +11,13 @@ from shearloop.drivers.emulators.ur_robot import (
     MODE_POWER_OFF,
     MODE_RUNNING,
     PAUSED,
-    STOPPED,
     ControllerSpec,
     Robot,
 )
 from tests.drivers.ur.robots import control_script
 
 DT_S = 0.002
-MOVE_J, MOVE_L, ZERO_FT, SPEED_J, SPEED_STOP, STOP_J, SET_WATCHDOG = 1, 3, 8, 9, 15, 34, 35
+MOVE_L, ZERO_FT, SPEED_J, SPEED_STOP, SET_WATCHDOG = 3, 8, 9, 15, 35
 
 
 def wait(robot: Robot, seconds: float) -> None:
@@ -91,25 +90,6 @@ def test_speed_is_reached_with_the_acceleration_and_held():
     assert not robot.arm.qd_rad_per_s[:5].any()
 
 
-def test_without_a_watchdog_the_speed_outlives_its_client():
-    robot = turning(3.0)
-    assert robot.arm.qd_rad_per_s[5] == pytest.approx(0.4)
-
-
-def test_watchdog_ends_the_motion_of_a_dead_client():
-    robot = started()
-    do(robot, SET_WATCHDOG, 10.0)
-    turn(robot, 0.4)
-    wait(robot, 0.05)
-    turn(robot, 0.4)
-    died_s = robot.time_s
-    wait(robot, 0.5)
-    (stopped_s,) = happened(robot, "motion-stopped")
-    assert 0.1 < stopped_s - died_s < 0.15
-    assert robot.runtime_state == STOPPED
-    assert not robot.program_running
-
-
 def test_watchdog_ends_with_its_program():
     robot = started()
     do(robot, SET_WATCHDOG, 10.0)
@@ -162,19 +142,6 @@ def test_linear_move_out_of_reach_ends_in_a_protective_stop():
     wait(robot, 4.0)
     assert happened(robot, "protective-stop")
     assert not robot.arm.qd_rad_per_s.any()
-
-
-def test_asynchronous_move_is_stopped_on_command():
-    robot = started()
-    z_m = robot.arm.pose[2]
-    do(robot, MOVE_L, *down(robot), asynchronous=True)
-    wait(robot, 0.3)
-    do(robot, STOP_J, 2.0, asynchronous=True)
-    assert moving_asynchronously(robot)
-    wait(robot, 0.3)
-    assert not moving_asynchronously(robot)
-    assert not robot.arm.qd_rad_per_s.any()
-    assert robot.arm.pose[2] > z_m - 0.1
 
 
 def test_after_speed_stop_a_move_is_possible():

@@ -9,6 +9,7 @@ import pytest
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.command_handler import CommandHandler
+from shearloop.drivers.ur.controller import ReceivedSample
 from shearloop.drivers.ur.settings import Bound, JointRange, UrLimits, UrSettings, Workspace
 
 LIMITS = UrLimits(
@@ -43,6 +44,15 @@ AT_REST = messages.RtdeSample(
 )
 CYCLE_NS, WATCHDOG_NS = 8_000_000, 100_000_000
 POSE = (-0.5, -0.1, 0.45, 0.0, math.pi, 0.0)
+
+
+def received(
+    timestamp_s: float, runtime_state: int = 2, script_state: int = 1, script_s: float = 0.0
+) -> ReceivedSample:
+    """Return a sample as the controller sends it."""
+    outputs = {name: getattr(AT_REST, name) for name in messages.RtdeOutputs.__dataclass_fields__}
+    changes = {"timestamp_s": timestamp_s, "runtime_state": runtime_state}
+    return ReceivedSample(**{**outputs, **changes}, script_state=script_state, script_s=script_s)
 
 
 class FakeArm:

@@ -37,6 +37,12 @@ class Daemon:
     def receive(self) -> list[tuple[int, Message]]:
         return MessageDecoder().feed(os.read(self._stdout, 1 << 20))
 
+    def hang_up(self) -> None:
+        """Close the worker's input, as the end of the daemon does."""
+        if self._stdin in self._all:
+            self._all.remove(self._stdin)
+            os.close(self._stdin)
+
     def close(self) -> None:
         for descriptor in self._all:
             os.close(descriptor)

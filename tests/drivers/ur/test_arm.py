@@ -7,37 +7,51 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
+from typing import ClassVar
 
 import pytest
 
 from shearloop.drivers.ur.controller import ProbeError, ReceivedSample
 from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
 from shearloop.drivers.ur.script import NO_MOTION_S
-from tests.drivers.ur.flight import SETTINGS
+from tests.drivers.ur.flight import SETTINGS, received
 
 SIX = (0.0,) * 6
-FIVE = (SIX,) * 5
-TOOL = (1.0, (0.0, 0.0, 0.06), SIX)
 VERSION = "5.17.3.0"
+SCRIPT = "    thread speed_thread():\n    end\n        keep_running = True\n"
 
 
 class Client:
-    """Connects to nothing."""
+    """Connects to nothing, takes every call of ur-rtde's and answers True or from `answers`; `calls` names them."""
 
     FLAG_NO_WAIT = 0
+    answers: ClassVar[dict[str, object]] = {}
+
+    def __init__(self, *_: object) -> None:
+        self.calls: list[str] = []
+
+    def __getattr__(self, name: str) -> Callable[..., object]:
+        def call(*_: object, **__: object) -> object:
+            self.calls.append(name)
+            return self.answers.get(name, True)
+
+        return call
+
+
+class Receiver:
+    """Has the same sample for ever, and notes the deadlines."""
 
     def __init__(self, *_: object) -> None:
         self.connected = True
-
-    def getScript(self) -> str:  # noqa: N802 - ur-rtde's name
-        return "    thread speed_thread():\n    end\n        keep_running = True\n"
-
-    def write_deadline(self, script_s: float) -> None:
-        """Take it."""
+        self.deadlines: list[float] = []
+        # Of a program that ended during a command.
+        self.sample = received(1.0, runtime_state=1, script_state=2)
 
     def latest(self) -> ReceivedSample:
-        """Return a sample of a program that ended during a command."""
-        return ReceivedSample(1.0, *FIVE, 7, 1, 1, 1.0, *TOOL, 2)
+        return self.sample
+
+    def write_deadline(self, script_s: float) -> None:
+        self.deadlines.append(script_s)
 
 
 @pytest.fixture
@@ -47,10 +61,11 @@ def arm(monkeypatch) -> Iterator[ModuleType]:
         module = ModuleType(name)
         setattr(module, kind, Client)
         monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.setattr(Client, "answers", {"getScript": SCRIPT})
     # Another test may have imported it over the real clients.
     monkeypatch.delitem(sys.modules, "shearloop.drivers.ur.arm", raising=False)
     arm = importlib.import_module("shearloop.drivers.ur.arm")
-    monkeypatch.setattr(arm, "RtdeReceiver", Client)
+    monkeypatch.setattr(arm, "RtdeReceiver", Receiver)
     yield arm
     del sys.modules["shearloop.drivers.ur.arm"]
 
@@ -58,17 +73,15 @@ def arm(monkeypatch) -> Iterator[ModuleType]:
 def test_sample_that_waited_in_the_socket_is_old(arm, monkeypatch):
     reader, now_ns = arm.UrArm(SETTINGS, VERSION), 10**12
     monkeypatch.setattr(arm.time, "monotonic_ns", lambda: now_ns)
-    monkeypatch.setattr(reader, "_control", SimpleNamespace(isConnected=lambda: True))
     for number, waited_ns in enumerate([0, 0, 200_000_000]):
-        sample = ReceivedSample(50.0 + 0.008 * number, *FIVE, 7, 1, 2, 1.0, *TOOL, 1)
-        monkeypatch.setattr(reader, "_receiver", SimpleNamespace(latest=lambda it=sample: it, connected=True))
+        reader._receiver.sample = received(50.0 + 0.008 * number)
         now_ns = 10**12 + 8_000_000 * number + waited_ns
         assert reader.read().age_ns == pytest.approx(waited_ns, abs=3_000_000)
 
 
 def test_refused_timer_slack_does_not_prevent_connecting(arm, monkeypatch, capsys):
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: SimpleNamespace(prctl=lambda *_: -1))
-    assert arm.UrArm(SETTINGS, VERSION)._control.connected
+    assert arm.UrArm(SETTINGS, VERSION).read().connected
     assert "wake more often than needed" in capsys.readouterr().err
 
 
@@ -86,69 +99,20 @@ def test_timer_slack_is_a_fraction_of_the_watchdog_time(arm, monkeypatch, watchd
     assert asked == [slack_ms, 0]
 
 
-class Controlled(Client):
-    """Takes every command and reports a linear move; `asked` counts the queries."""
-
-    asked = 0
-
-    def isConnected(self) -> bool:  # noqa: N802 - ur-rtde's name
-        return True
-
-    def speedJ(self, *_: object) -> bool:  # noqa: N802
-        return True
-
-    def moveL(self, *_: object, **__: object) -> bool:  # noqa: N802
-        return True
-
-    def getAsyncOperationProgressEx(self) -> SimpleNamespace:  # noqa: N802
-        self.asked += 1
-        return SimpleNamespace(isAsyncOperationRunning=lambda: True)
-
-
-def test_progress_is_queried_only_for_a_linear_move(arm, monkeypatch):
-    monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Controlled)
-    times_s = iter(range(1, 100))
-    monkeypatch.setattr(
-        arm,
-        "RtdeReceiver",
-        lambda *_: SimpleNamespace(
-            connected=True,
-            latest=lambda: ReceivedSample(float(next(times_s)), *FIVE, 7, 1, 2, 1.0, *TOOL, 1),
-            write_deadline=lambda _: None,
-        ),
-    )
+def test_progress_is_queried_only_for_a_linear_move(arm):
+    Client.answers["getAsyncOperationProgressEx"] = SimpleNamespace(isAsyncOperationRunning=lambda: True)
     one = arm.UrArm(SETTINGS, VERSION)
     assert not one.read().moving_linearly
     one.move(MoveLinear(SIX, 0.1, 0.1))
     assert [one.read().moving_linearly for _ in range(3)] == [True] * 3
+    one._receiver.sample = received(2.0)
     one.wrist(WristSpeed(0.1, 1.0), 0.1)
     assert not one.read().moving_linearly
-    assert one._control.asked == 3
+    assert one._control.calls.count("getAsyncOperationProgressEx") == 3
 
 
-class Hanging(Client):
-    """Hangs in each call but the first; `calls` names them."""
-
-    def __init__(self, *_: object) -> None:
-        super().__init__()
-        self.calls: list[str] = []
-        self.knows_of_the_end = False
-
-    def __getattr__(self, name: str) -> Callable[..., bool]:
-        def call(*_: object, **__: object) -> bool:
-            assert not self.calls, f"{name} does not come back"
-            self.calls.append(name)
-            return True
-
-        return call
-
-    def isProgramRunning(self) -> bool:  # noqa: N802
-        return not self.knows_of_the_end
-
-
-def test_no_call_blocks_when_no_program_runs(arm, monkeypatch):
-    """The watchdog has ended the program before it was ready for the next command."""
-    monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Hanging)
+def test_no_call_blocks_when_no_program_runs(arm):
+    """The watchdog has ended the program before it was ready for the next command: a further call would hang."""
     one = arm.UrArm(SETTINGS, VERSION)
     assert one.zero_wrench()
     assert not one.send_heartbeat()
@@ -162,57 +126,47 @@ def test_no_call_blocks_when_no_program_runs(arm, monkeypatch):
     assert one._control.calls == ["zeroFtSensor"]
 
 
-def test_register_is_cleared_once_the_client_knows_that_no_program_runs(arm, monkeypatch):
+def test_register_is_cleared_once_the_client_knows_that_no_program_runs(arm):
     """Before that, the client would wait for the program."""
-    monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Hanging)
     one = arm.UrArm(SETTINGS, VERSION)
     assert not one.clear_command()
-    assert one._control.calls == []
-    one._control.knows_of_the_end = True
+    assert one._control.calls == ["isProgramRunning"]
+    Client.answers["isProgramRunning"] = False
     assert one.clear_command()
-    assert one._control.calls == ["kickWatchdog"]
+    assert one._control.calls[1:] == ["isProgramRunning", "kickWatchdog"]
 
 
 def test_sent_script_arms_its_watchdog(arm, monkeypatch):
-    class Sending(Client):
-        sent = ""
-
-        def setCustomScriptFile(self, path: str) -> None:  # noqa: N802 - ur-rtde's name
-            self.sent = Path(path).read_text()
-
-    monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Sending)
-    one = arm.UrArm(SETTINGS, VERSION)
-    assert one.upload()
-    assert 'rtde_set_watchdog("input_int_register_0", 10, "stop")' in one._control.sent
+    sent: list[str] = []
+    monkeypatch.setattr(
+        Client, "setCustomScriptFile", lambda _, path: sent.append(Path(path).read_text()), raising=False
+    )
+    assert arm.UrArm(SETTINGS, VERSION).upload()
+    assert 'rtde_set_watchdog("input_int_register_0", 10, "stop")' in sent[0]
 
 
-def test_unknown_script_is_refused(arm, monkeypatch):
+def test_unknown_script_is_refused(arm):
     """Without its deadline the wrist could turn on."""
-    monkeypatch.setattr(arm.script_client.ScriptClient, "getScript", lambda _: "of another form\n")
+    Client.answers["getScript"] = "of another form\n"
     with pytest.raises(ProbeError, match="unknown, so that its limits"):
         arm.UrArm(SETTINGS, VERSION)
 
 
-def test_deadline_counts_from_the_latest_sample(arm, monkeypatch):
-    written: list[float] = []
-    sample = ReceivedSample(1.0, *FIVE, 7, 1, 2, 1.0, *TOOL, 1, 20.0)
-    receiver = SimpleNamespace(latest=lambda: sample, write_deadline=written.append, connected=True)
-    monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Controlled)
-    monkeypatch.setattr(arm, "RtdeReceiver", lambda *_: receiver)
+def test_deadline_counts_from_the_latest_sample(arm):
     one = arm.UrArm(SETTINGS, VERSION)
+    one._receiver.sample = received(1.0, script_s=20.0)
     assert one.wrist(WristSpeed(0.1, 1.0), 0.07)
     one.withdraw_deadline()
-    assert written == [pytest.approx(20.07), NO_MOTION_S]
+    assert one._receiver.deadlines == [pytest.approx(20.07), NO_MOTION_S]
 
 
 def test_connection_that_takes_no_script_is_lost(arm, monkeypatch, capsys):
     """Only a new worker opens the connection again."""
 
-    class Closed(Controlled):
-        def setCustomScriptFile(self, _path: str) -> None:  # noqa: N802 - ur-rtde's name
-            raise RuntimeError("write: Broken pipe")
+    def refuse(_client: Client, _path: str) -> None:
+        raise RuntimeError("write: Broken pipe")
 
-    monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Closed)
+    monkeypatch.setattr(Client, "setCustomScriptFile", refuse, raising=False)
     one = arm.UrArm(SETTINGS, VERSION)
     assert one.read().connected
     assert not one.upload()

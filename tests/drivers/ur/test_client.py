@@ -311,41 +311,42 @@ asyncio.run(main())
 """
 
 
-@pytest.mark.parametrize("worker_hangs", [False, True])
-async def test_wrist_stops_when_the_daemon_hangs(controller, worker_hangs):
+@contextlib.asynccontextmanager
+async def turning_daemon(controller: ControllerProcess) -> AsyncIterator[tuple[asyncio.subprocess.Process, int]]:
+    """Yield a daemon's process, whose robot turns, and its worker's id; both are killed at the end."""
     daemon = await asyncio.create_subprocess_exec(
         sys.executable, "-c", DAEMON, controller.host, stdout=asyncio.subprocess.PIPE, cwd=ROOT
     )
     worker = int(await daemon.stdout.readline())
-    hung_ns = time.monotonic_ns()
-    daemon.send_signal(signal.SIGSTOP)
-    if worker_hangs:
-        os.kill(worker, signal.SIGSTOP)
     try:
-        stopped = await controller.event("motion-stopped", hung_ns)
-        assert stopped_after_s(stopped, hung_ns) <= STOPPED_WITHIN_S
+        yield daemon, worker
     finally:
         for pid in (daemon.pid, worker):
-            os.kill(pid, signal.SIGKILL)
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
         await daemon.communicate()
 
 
+@pytest.mark.parametrize("worker_hangs", [False, True])
+async def test_wrist_stops_when_the_daemon_hangs(controller, worker_hangs):
+    async with turning_daemon(controller) as (daemon, worker):
+        hung_ns = time.monotonic_ns()
+        daemon.send_signal(signal.SIGSTOP)
+        if worker_hangs:
+            os.kill(worker, signal.SIGSTOP)
+        stopped = await controller.event("motion-stopped", hung_ns)
+        assert stopped_after_s(stopped, hung_ns) <= STOPPED_WITHIN_S
+
+
 async def test_killed_daemon_leaves_a_resting_robot_and_no_process(controller):
-    daemon = await asyncio.create_subprocess_exec(
-        sys.executable, "-c", DAEMON, controller.host, stdout=asyncio.subprocess.PIPE, cwd=ROOT
-    )
-    worker = os.pidfd_open(int(await daemon.stdout.readline()))
-    killed_ns = time.monotonic_ns()
-    daemon.kill()
-    try:
+    async with turning_daemon(controller) as (daemon, pid):
+        worker, ended, killed_ns = os.pidfd_open(pid), asyncio.Event(), time.monotonic_ns()
+        daemon.kill()
         stopped = await controller.event("motion-stopped", killed_ns)
         assert stopped_after_s(stopped, killed_ns) <= STOPPED_WITHIN_S
-        ended = asyncio.Event()
         asyncio.get_running_loop().add_reader(worker, ended.set)
         async with asyncio.timeout(5):
             await ended.wait()
-    finally:
         asyncio.get_running_loop().remove_reader(worker)
         os.close(worker)
-    assert (await controller.event("program-ended", killed_ns))["detail"] == "it has run to its end"
-    await daemon.communicate()
+        assert (await controller.event("program-ended", killed_ns))["detail"] == "it has run to its end"

@@ -83,21 +83,10 @@ def test_foreign_program_is_stopped_only_on_unlock():
     flight = Flight()
     flight.arm.be(runtime_state=2)
     flight.fly(500)
-    assert "someone else" in flight.ask(WristSpeed(0.1, 1.0)).refusal
+    for command in (WristSpeed(0.1, 1.0), Enable()):
+        assert "someone else" in flight.ask(command).refusal
     flight.arm.be(runtime_state=4)
     flight.fly(50)
-    assert flight.arm.calls == []
-    assert flight.ask(Unlock()).accepted
-    assert "stop" in flight.arm.calls
-
-
-def test_foreign_program_gets_no_commands():
-    flight = Flight()
-    flight.arm.be(safety_mode=3)
-    flight.fly(5)
-    flight.arm.be(safety_mode=1, runtime_state=2)
-    flight.fly(5)
-    assert "someone else" in flight.ask(Enable()).refusal
     assert flight.arm.calls == []
     assert flight.ask(Unlock()).accepted
     assert flight.arm.calls[:4] == ["close popup", "stop", "clear_command", "upload"]

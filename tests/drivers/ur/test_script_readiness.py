@@ -6,10 +6,8 @@ import pytest
 
 from shearloop.drivers.ur import controller as ready_module
 from shearloop.drivers.ur.controller import ReceivedSample, ScriptReadiness
+from tests.drivers.ur.flight import received
 
-SIX = (0.0,) * 6
-FIVE = (SIX,) * 5
-TOOL = (1.0, (0.0, 0.0, 0.06), SIX)
 READY, DONE = 1, 2
 PLAYING, STOPPED, PAUSED = 2, 1, 4
 
@@ -25,7 +23,7 @@ class Samples:
 
     def latest(self) -> ReceivedSample:
         script_state, runtime_state = self._said[min(self.taken, len(self._said) - 1)]
-        return ReceivedSample(50.0 + 0.008 * self.taken, *FIVE, 7, 1, runtime_state, 1.0, *TOOL, script_state)
+        return received(50.0 + 0.008 * self.taken, runtime_state, script_state)
 
     def wait(self, seconds: float) -> bool:
         self.now_s += min(max(seconds, 0.0), 0.008)

@@ -41,6 +41,20 @@ def test_command_is_sent_on_arrival_and_in_each_cycle(timed):
     assert max(later - earlier for earlier, later in pairwise(sent_s)) < 0.0081
 
 
+def test_wrist_stands_soon_after_the_pipe_has_died(timed, daemon):
+    class Left(TimedArm):
+        def read(self) -> RtdeSample:
+            if worker.time.monotonic() > 1000.3:
+                daemon.hang_up()
+            return super().read()
+
+    run = timed((0.1, Enable()), (0.25, WristSpeed(0.5, 4.0)), (2.0, Disconnect()), arm=Left())
+    assert run.arm.calls.count("wrist") > 10
+    assert run.arm.reading.rests
+    assert run.arm.read_s[-1] < 0.3 + 0.2
+    assert run.arm.calls[-1] == "end_program"
+
+
 @pytest.mark.parametrize("stopped_s", [0.2001, 0.2005, 0.2079])
 def test_protective_stop_seen_late_is_reported_as_such(timed, stopped_s):
     class Late(TimedArm):

@@ -49,10 +49,8 @@ class RigSettings:
     gripper: Literal["socket", "modbus"] = "socket"
     twin: TwinSettings = field(default_factory=TwinSettings)
     diameter_mm: float | None = 20.0
-    # Relative to real time: of gel, fingers and boards, and of the arm. The answers of controller and gripper, their
-    # samples and the watchdog stay in real time, as their clients are.
+    # Of gel, fingers and boards relative to real time, in which arm, answers and watchdog stay, as their clients are.
     speed: float = 1.0
-    arm_speed: float = 1.0
     rate_hz: float = 500.0
     make: ControllerSpec = field(default_factory=ControllerSpec)
     sketch: Sketch = field(default_factory=lambda: Sketch(noise_counts=NOISE_NM * Sketch().counts_per_nm))
@@ -69,7 +67,7 @@ class EmulatedRig:
         run_dir, speed, seed = settings.run_dir, settings.speed, settings.seed
         gripper = Gripper()
         self.scene = Scene(gripper, settings.twin, speed)
-        robot = Robot(settings.make, self.scene, settings.arm_speed)
+        robot = Robot(settings.make, self.scene)
         self.controller = Controller(robot, host=settings.host, rate_hz=settings.rate_hz)
         player = GripperPlayer(
             gripper,

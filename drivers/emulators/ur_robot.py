@@ -14,8 +14,6 @@ STOPPED, PLAYING, PAUSED = 1, 2, 4
 MODE_POWER_OFF, MODE_IDLE, MODE_RUNNING = 3, 5, 7
 SAFETY_NORMAL, SAFETY_PROTECTIVE_STOP, SAFETY_EMERGENCY_STOP = 1, 3, 7
 PROGRAM_END_DECELERATION, SAFETY_DECELERATION = 10.0, 20.0
-# The longest step of the arm's motion in its own time.
-LONGEST_MOVE_S = 0.008
 
 
 class WristPlant(Protocol):
@@ -84,13 +82,9 @@ class SafetyController:
 
 
 class Robot:
-    """Arm, safety controller, program and registers.
+    """Arm, safety controller, program and registers."""
 
-    `pace` is the seconds of arm motion in one second of the controller: at 20 a wrist at 0.1 rad/s turns by 2 rad a
-    second. Samples, watchdog, unlocking and power stay in the controller's time.
-    """
-
-    def __init__(self, spec: ControllerSpec | None = None, plant: WristPlant | None = None, pace: float = 1.0) -> None:
+    def __init__(self, spec: ControllerSpec | None = None, plant: WristPlant | None = None) -> None:
         """Be switched on, at rest, without a program."""
         self.spec = self._first_spec = spec or ControllerSpec()
         self.arm = Arm()
@@ -101,7 +95,6 @@ class Robot:
         # The controller's clock, which never stands still.
         self.clock_s = 0.0
         self._events: list[RobotEvent] = []
-        self._pace = pace
         self._plant = plant
         self._program: Program | None = None
 
@@ -116,11 +109,9 @@ class Robot:
                     self._note(*event)
             except ProgramEndedError as ended:
                 self.end_program(str(ended))
-        parts = max(1, math.ceil(dt_s * self._pace / LONGEST_MOVE_S - 1e-9))
-        for _ in range(parts):
-            self._move(dt_s * self._pace / parts)
-            if self._plant is not None:
-                self.arm.load(self._plant.step(dt_s / parts, float(self.arm.q_rad[5])))
+        self._move(dt_s)
+        if self._plant is not None:
+            self.arm.load(self._plant.step(dt_s, float(self.arm.q_rad[5])))
 
     def stand_still(self, seconds: float) -> None:
         """Let only the clock go on."""

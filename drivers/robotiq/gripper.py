@@ -3,7 +3,7 @@
 import asyncio
 import math
 import time
-from collections.abc import AsyncGenerator, Awaitable, Callable, Coroutine, Sequence
+from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
 from functools import partial
 from typing import Self, TypeVar
 
@@ -140,7 +140,7 @@ class RobotiqGripper:
 
     async def connect(self) -> messages.GripperState:
         """Open the connection and return the first state; DeviceNotFoundError or DeviceLostError."""
-        await _uninterrupted(self._exchange(self._client.connect))
+        await self._exchange(self._client.connect)
         self.connected, self._loss = True, None
         # Another program may have commanded the gripper since.
         self._last_move = None
@@ -291,13 +291,23 @@ class RobotiqGripper:
         )
 
     async def _read(self) -> tuple[messages.Readout, int]:
-        return await _uninterrupted(self._exchange(self._client.read))
+        return await self._exchange(self._client.read)
 
     async def _write(self, request: messages.Request) -> None:
-        await _uninterrupted(self._exchange(partial(self._client.write, request)))
+        await self._exchange(partial(self._client.write, request))
 
     async def _exchange(self, exchange: Callable[[], Awaitable[T]]) -> tuple[T, int]:
-        """Return an exchange's result and its beginning; exclude others, and note a loss, which `states` reports."""
+        """Return an exchange's result and its beginning. It goes on when its caller is cancelled.
+
+        Breaking it off would cost the connection.
+        """
+        task = asyncio.ensure_future(self._locked(exchange))
+        # `states` reports a failure that comes after its caller was cancelled.
+        task.add_done_callback(lambda done: done.cancelled() or done.exception())
+        return await asyncio.shield(task)
+
+    async def _locked(self, exchange: Callable[[], Awaitable[T]]) -> tuple[T, int]:
+        """Exclude other exchanges, and note a loss, which `states` reports."""
         async with self._lock:
             t_ns = time.monotonic_ns()
             try:
@@ -353,11 +363,3 @@ def blocking_fault(readout: messages.Readout) -> str:
     if not readout.act or readout.sta is not messages.ActivationStatus.ACTIVE:
         return messages.fault_of(7).sentence
     return ""
-
-
-async def _uninterrupted(exchange: Coroutine[object, object, T]) -> T:
-    """Await an exchange that goes on when its caller is cancelled: breaking it off would cost the connection."""
-    task = asyncio.ensure_future(exchange)
-    # `states` reports a failure that comes after its caller was cancelled.
-    task.add_done_callback(lambda done: done.cancelled() or done.exception())
-    return await asyncio.shield(task)

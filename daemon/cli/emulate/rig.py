@@ -40,8 +40,7 @@ Commands, one a line on standard input:
   gripper drop|fault CODE|…   the tool falls; or any command of `emulate gripper-socket`
   protective-stop, …          any fault of `emulate ur`
   normal                      end all faults, the robot's included
-With --speed N gel, fingers and boards are N times as fast. The arm turns at its own pace unless --arm-speed says
-otherwise: a loop in real time then sees angles change that many times as fast, and needs a slower controller.
+With --speed N gel, fingers and boards are N times as fast; the arm stays in real time.
 """
 SKIN_EPILOG = """Prints the addresses of source and DAQ, again each time they appear.
 Commands, one a line on standard input:
@@ -91,7 +90,6 @@ def _configure_rig(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--diameter-mm", float, "MM", "of the tool (default: 20)", default=20.0)
     add_option(parser, "--gel-stiffness", float, "NM_PER_RAD", "of both pads (default: %(default)s)", default=0.8)
     console.add_seed_and_speed(parser, "the pace of gel, fingers and boards")
-    add_option(parser, "--arm-speed", float, "N", "of the arm (default: 1)", default=1.0)
     add_option(parser, "--truth", Path, "FILE", "append the true state, ten times a second, as JSON")
     text = "the load cell sends N·m, as the paper's, not counts"
     parser.add_argument("--paper-sketch", action="store_true", help=text)
@@ -144,7 +142,7 @@ def _rig_settings(args: argparse.Namespace) -> "RigSettings":
     from shearloop.drivers.emulators.rig import NOISE_NM, RigSettings
     from shearloop.drivers.emulators.scene import TwinSettings
 
-    console.check_positive(args, "speed", "arm_speed", "gel_stiffness")
+    console.check_positive(args, "speed", "gel_stiffness")
     make = robot_make(args)
     if not 0 < args.diameter_mm <= 140:
         raise UserError(f"--diameter-mm {args.diameter_mm:g} does not fit between the fingers; give up to 140")
@@ -155,7 +153,6 @@ def _rig_settings(args: argparse.Namespace) -> "RigSettings":
         twin=TwinSettings(gel_stiffness_nm_per_rad=args.gel_stiffness),
         diameter_mm=args.diameter_mm,
         speed=args.speed,
-        arm_speed=args.arm_speed,
         rate_hz=args.rate_hz,
         make=make,
         seed=args.seed,

@@ -26,9 +26,9 @@ from shearloop.drivers.ur.messages import Enable, RobotState, Stop, WristSpeed
 from shearloop.drivers.ur.settings import read_settings
 from tests.emulator_process import EmulatorProcess, Event
 
-# Gel, fingers and boards; the arm moves as fast as its loop bears.
+# Of gel, fingers and boards.
 SPEED = 10
-PACE = ("--speed", str(SPEED), "--arm-speed", "3", "--rate-hz", "250", "--unlock-wait-s", "0.2", "--power-on-s", "0.1")
+PACE = ("--speed", str(SPEED), "--rate-hz", "250", "--unlock-wait-s", "0.2", "--power-on-s", "0.1")
 DEADLINE_S = 30
 N_FRAMES, N_SAMPLES = 6, 20
 PERIOD_NS = round(0.5408e9 / SPEED)

@@ -13,7 +13,7 @@ from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings
     [
         (["--bank", "absent.bank"], "absent.bank"),
         (["--speed", "0"], "--speed 0 is not above 0"),
-        (["--arm-speed", "nan"], "--arm-speed nan is not above 0"),
+        (["--speed", "nan"], "--speed nan is not above 0"),
         (["--gel-stiffness", "-1"], "--gel-stiffness -1 is not above 0"),
         (["--rate-hz", "5"], "--rate-hz 5 is outside 50 to 1000"),
         (["--diameter-mm", "150"], "--diameter-mm 150 does not fit"),

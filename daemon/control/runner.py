@@ -20,7 +20,6 @@ from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH
 from shearloop.daemon.taring import LONGEST_TARE_S, Adaptable, Tareable, tare_all
 from shearloop.drivers.ur.client import UrRobot
-from shearloop.drivers.ur.command_handler import NOT_ENABLED
 from shearloop.drivers.ur.messages import (
     ARRIVED,
     STOPPED_ON_COMMAND,
@@ -201,7 +200,7 @@ class ControlLoopRunner:
                 emergency_stop=state.emergency_stop,
                 blocked=state.blocked,
                 starting=state.recovering,
-                enabled_by_start=state.blocked == NOT_ENABLED,
+                enabled_by_start=state.awaits_enable,
             )
         )
         if self._states.publish_robot(state):

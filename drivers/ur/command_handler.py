@@ -269,10 +269,11 @@ class CommandHandler:
 
     def state(self, sample: RtdeSample, cycle: int) -> RobotState:
         """Return the sample with the state of the driver."""
-        executor = self._executor
+        executor, blocked = self._executor, self._why_blocked(sample)
         return RobotState(
             **sample.__dict__,
-            blocked=self._why_blocked(sample),
+            blocked=blocked,
+            awaits_enable=blocked == NOT_ENABLED,
             recovering=self.recovering,
             motion=executor.motion,
             motion_id=executor.motion_id,

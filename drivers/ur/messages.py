@@ -204,6 +204,8 @@ class RobotState(RtdeSample):
 
     # Why motion is refused at present; empty when it is enabled.
     blocked: str
+    # Whether motion is refused for want of `Enable` alone.
+    awaits_enable: bool
     # Whether the robot is being unlocked, powered or started.
     recovering: bool
     motion: MotionKind

@@ -21,9 +21,11 @@ def test_nothing_moves_before_it_is_enabled():
     assert "not been enabled" in flight.ask(WristSpeed(0.1, 1.0)).refusal
     assert "not been enabled" in flight.ask(MoveLinear(POSE, 0.1, 0.1)).refusal
     assert flight.state.blocked
+    assert flight.state.awaits_enable
     assert {"wrist", "move"}.isdisjoint(flight.arm.calls)
     assert flight.ask(Enable()).accepted
     assert not flight.state.blocked
+    assert not flight.state.awaits_enable
     flight.fly(100)
     assert {"wrist", "move"}.isdisjoint(flight.arm.calls)
 

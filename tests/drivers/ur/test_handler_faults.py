@@ -99,6 +99,7 @@ def test_paused_program_is_reported_and_stopped_only_on_unlock(begin):
     flight.arm.target = 0.0
     flight.fly(300)
     assert "Protective stop" in flight.state.blocked
+    assert not flight.state.awaits_enable
     # Cleared at the pendant.
     flight.arm.be(safety_mode=1)
     flight.arm.calls.clear()

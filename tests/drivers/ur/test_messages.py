@@ -99,7 +99,7 @@ def test_states_carry_values_that_are_not_finite():
     state = RobotState(
         0.0, (float("nan"),) * 6, (0.0,) * 6, (0.0,) * 6, (0.0,) * 6, (float("inf"),) * 6, 7, 1, 2, 1.0,
         float("nan"), (0.0,) * 3, (0.0,) * 6, 0, 0, True, False,
-        "", False, "idle", 0, "", None, (), 3,
+        "", False, False, "idle", 0, "", None, (), 3,
     )  # fmt: skip
     ((_, got),) = MessageDecoder().feed(encode(state))
     assert got.wrench == state.wrench

@@ -272,7 +272,7 @@ def _holds_unidentified(file: ExperimentFile) -> int | None:
         match step:
             case IdentifyStep():
                 identified = True
-            case TareStep() | GripStep() | ReleaseStep():
+            case _ if isinstance(step, TareStep | GripperStep):
                 identified = False
             case AdaptStep(fingertip=fingertip) if fingertip == file.torque_source:
                 identified = False

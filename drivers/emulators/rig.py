@@ -6,7 +6,6 @@ controller's cycle makes time pass, so that all devices see the same moment.
 
 import asyncio
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol, TypeAlias
 
@@ -40,43 +39,37 @@ class FrameSynthesiser(Protocol):
 Device: TypeAlias = EitKitBoard | Hx711Board | GripperPlayer | Controller
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RigSettings:
-    """The rig's devices and addresses."""
-
-    run_dir: Path
-    host: str = "127.0.0.1"
-    gripper: Literal["socket", "modbus"] = "socket"
-    twin: TwinSettings = field(default_factory=TwinSettings)
-    diameter_mm: float | None = 20.0
-    # Of gel, fingers and boards relative to real time, in which arm, answers and watchdog stay, as their clients are.
-    speed: float = 1.0
-    rate_hz: float = 500.0
-    make: ControllerSpec = field(default_factory=ControllerSpec)
-    sketch: Sketch = field(default_factory=lambda: Sketch(noise_counts=NOISE_NM * Sketch().counts_per_nm))
-    seed: int = 0
-
-
 class EmulatedRig:
     """All devices: `run` plays all but the robot, and the `controller`, iterated over, makes time pass.
 
     `command` applies faults, `scene` is the true state. `ports` get the path or address of each port when it appears.
     """
 
-    def __init__(self, settings: RigSettings, synthesiser: FrameSynthesiser) -> None:
-        run_dir, speed, seed = settings.run_dir, settings.speed, settings.seed
-        gripper = Gripper()
-        self.scene = Scene(gripper, settings.twin, speed)
-        robot = Robot(settings.make, self.scene)
-        self.controller = Controller(robot, host=settings.host, rate_hz=settings.rate_hz)
+    def __init__(
+        self,
+        synthesiser: FrameSynthesiser,
+        run_dir: Path,
+        *,
+        host: str = "127.0.0.1",
+        gripper_on: Literal["socket", "modbus"] = "socket",
+        twin: TwinSettings | None = None,
+        diameter_mm: float = 20.0,
+        speed: float = 1.0,
+        rate_hz: float = 500.0,
+        make: ControllerSpec | None = None,
+        sketch: Sketch | None = None,
+        seed: int = 0,
+    ) -> None:
+        """Gel, fingers and boards are `speed` times as fast as arm, answers and watchdog, which stay in real time."""
+        gripper = Gripper(object_mm=diameter_mm)
+        self.scene = Scene(gripper, twin, speed)
+        self.controller = Controller(Robot(make, self.scene), host=host, rate_hz=rate_hz)
         player = GripperPlayer(
             gripper,
             PtyServer(ModbusSlave(gripper), run_dir / "gripper")
-            if settings.gripper == "modbus"
-            else SocketServer(UrcapSession(gripper), settings.host, URCAP_PORT),
+            if gripper_on == "modbus"
+            else SocketServer(UrcapSession(gripper), host, URCAP_PORT),
         )
-        if settings.diameter_mm is not None:
-            player.command(f"object {settings.diameter_mm}")
         boards: dict[str, EitKitBoard | Hx711Board] = {
             side: EitKitBoard(
                 self._frames(synthesiser, sign),
@@ -88,7 +81,7 @@ class EmulatedRig:
         }
         boards["load"] = Hx711Board(
             self._torques_nm(),
-            settings.sketch,
+            sketch or Sketch(noise_counts=NOISE_NM * Sketch().counts_per_nm),
             period_s=LOAD_PERIOD_S / speed,
             link=run_dir / "load-cell",
             seed=seed,

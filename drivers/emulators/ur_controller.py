@@ -167,9 +167,9 @@ class Controller:
             case "is in remote control":
                 return "false" if "local-control" in self.faults else "true"
             case "robotmode":
-                return f"Robotmode: {_ROBOT_MODES[robot.safety.robot_mode]}"
+                return f"Robotmode: {_ROBOT_MODES[robot.robot_mode]}"
             case "safetymode":
-                return f"Safetymode: {_SAFETY_MODES[robot.safety.safety_mode]}"
+                return f"Safetymode: {_SAFETY_MODES[robot.safety_mode]}"
             case "stop":
                 robot.end_program("stopped from the dashboard")
                 return "Stopped"
@@ -178,10 +178,10 @@ class Controller:
                 refusal = f"Cannot unlock protective stop until 5s after occurrence. {cause}"
                 return "Protective stop releasing" if robot.unlock() else refusal
             case "power on":
-                robot.safety.begin_power_step(MODE_POWER_OFF, robot.time_s)
+                robot.begin_power_step(MODE_POWER_OFF)
                 return "Powering on"
             case "brake release":
-                robot.safety.begin_power_step(MODE_IDLE, robot.time_s)
+                robot.begin_power_step(MODE_IDLE)
                 return "Brake releasing"
             case "close popup" | "close safety popup":
                 return request.replace("close", "closing")

@@ -44,51 +44,15 @@ class RobotEvent:
     detail: str
 
 
-class SafetyController:
-    """Safety mode, emergency stop button, power and brakes."""
-
-    def __init__(self, spec: ControllerSpec) -> None:
-        """Be switched on and safe."""
-        self._spec = spec
-        self.robot_mode, self.safety_mode = MODE_RUNNING, SAFETY_NORMAL
-        self._stopped_s = 0.0
-        self._power_step_s = math.inf
-
-    def pass_time(self, now_s: float) -> None:
-        """End a step of powering that has taken its time."""
-        if now_s >= self._power_step_s:
-            self._power_step_s = math.inf
-            self.robot_mode = MODE_IDLE if self.robot_mode == MODE_POWER_OFF else MODE_RUNNING
-
-    def stop(self, clock_s: float, mode: int = SAFETY_PROTECTIVE_STOP) -> None:
-        """Begin a protective stop, or an emergency stop, which switches the power off."""
-        self.safety_mode, self._stopped_s = mode, clock_s
-        if mode == SAFETY_EMERGENCY_STOP:
-            self.robot_mode = MODE_POWER_OFF
-
-    def end_stop(self, mode: int, clock_s: float) -> bool:
-        """End a stop of this mode; False within `unlock_wait_s` of the beginning of a protective stop."""
-        if self.safety_mode != mode:
-            return True
-        if mode == SAFETY_PROTECTIVE_STOP and clock_s - self._stopped_s < self._spec.unlock_wait_s:
-            return False
-        self.safety_mode = SAFETY_NORMAL
-        return True
-
-    def begin_power_step(self, from_mode: int, now_s: float) -> None:
-        """Begin to power the arm, or to release its brakes, if it is in this mode."""
-        if self.robot_mode == from_mode and self.safety_mode != SAFETY_EMERGENCY_STOP:
-            self._power_step_s = min(self._power_step_s, now_s + self._spec.power_on_s)
-
-
 class Robot:
-    """Arm, safety controller, program and registers."""
+    """Arm, safety mode, power, program and registers."""
 
     def __init__(self, spec: ControllerSpec | None = None, plant: WristPlant | None = None) -> None:
-        """Be switched on, at rest, without a program."""
+        """Be switched on, safe, at rest, without a program."""
         self.spec = self._first_spec = spec or ControllerSpec()
         self.arm = Arm()
-        self.safety = SafetyController(self.spec)
+        self.robot_mode, self.safety_mode = MODE_RUNNING, SAFETY_NORMAL
+        self._stopped_s, self._power_step_s = 0.0, math.inf
         self.registers = Registers()
         self.runtime_state = STOPPED
         self.time_s = 0.0
@@ -102,7 +66,9 @@ class Robot:
         """Run one control cycle."""
         self.time_s += dt_s
         self.clock_s += dt_s
-        self.safety.pass_time(self.time_s)
+        if self.time_s >= self._power_step_s:
+            self._power_step_s = math.inf
+            self.robot_mode = MODE_IDLE if self.robot_mode == MODE_POWER_OFF else MODE_RUNNING
         if self._program is not None and self.runtime_state == PLAYING:
             try:
                 for event in self._program.cycle(dt_s, self.time_s):
@@ -138,8 +104,8 @@ class Robot:
 
     def upload(self, text: str) -> None:
         """Run a program in URScript."""
-        if (self.safety.safety_mode, self.safety.robot_mode) != (SAFETY_NORMAL, MODE_RUNNING):
-            modes = f"robot mode {self.safety.robot_mode}, safety mode {self.safety.safety_mode}"
+        if (self.safety_mode, self.robot_mode) != (SAFETY_NORMAL, MODE_RUNNING):
+            modes = f"robot mode {self.robot_mode}, safety mode {self.safety_mode}"
             self._note("script-refused", modes)
             return
         self.end_program("a new script arrived")
@@ -161,8 +127,8 @@ class Robot:
 
     def protective_stop(self, cause: str) -> None:
         """Stop for safety and pause the program."""
-        if self.safety.safety_mode == SAFETY_NORMAL:
-            self.safety.stop(self.clock_s)
+        if self.safety_mode == SAFETY_NORMAL:
+            self.safety_mode, self._stopped_s = SAFETY_PROTECTIVE_STOP, self.clock_s
             self.arm.halt(SAFETY_DECELERATION)
             self._note("protective-stop", cause)
             if self._program is not None:
@@ -170,25 +136,31 @@ class Robot:
 
     def emergency_stop(self) -> None:
         """Press the emergency stop button: the program ends and the power goes off."""
-        if self.safety.safety_mode != SAFETY_EMERGENCY_STOP:
+        if self.safety_mode != SAFETY_EMERGENCY_STOP:
             self.arm.halt(SAFETY_DECELERATION)
             self._note("emergency-stop", "the button is pressed")
             self.end_program("emergency stop")
-            self.safety.stop(self.clock_s, SAFETY_EMERGENCY_STOP)
+            self.safety_mode, self.robot_mode = SAFETY_EMERGENCY_STOP, MODE_POWER_OFF
 
     def release(self) -> None:
         """Release the emergency stop button."""
-        if self.safety.safety_mode == SAFETY_EMERGENCY_STOP:
+        if self.safety_mode == SAFETY_EMERGENCY_STOP:
+            self.safety_mode = SAFETY_NORMAL
             self._note("emergency-stop-released")
-        self.safety.end_stop(SAFETY_EMERGENCY_STOP, self.clock_s)
 
     def unlock(self) -> bool:
         """End a protective stop; False within `unlock_wait_s` of its beginning."""
-        stopped = self.safety.safety_mode == SAFETY_PROTECTIVE_STOP
-        unlocked = self.safety.end_stop(SAFETY_PROTECTIVE_STOP, self.clock_s)
-        if stopped and unlocked:
+        if self.safety_mode == SAFETY_PROTECTIVE_STOP:
+            if self.clock_s - self._stopped_s < self.spec.unlock_wait_s:
+                return False
+            self.safety_mode = SAFETY_NORMAL
             self._note("protective-stop-unlocked")
-        return unlocked
+        return True
+
+    def begin_power_step(self, from_mode: int) -> None:
+        """Begin to power the arm, or to release its brakes, if it is in this mode."""
+        if self.robot_mode == from_mode and self.safety_mode != SAFETY_EMERGENCY_STOP:
+            self._power_step_s = min(self._power_step_s, self.time_s + self.spec.power_on_s)
 
     def change(self, spec: ControllerSpec) -> None:
         """Have another version or payload from now on."""
@@ -198,7 +170,7 @@ class Robot:
         """Be safe and powered, without a program, as it was at first."""
         self.end_program("the faults are cleared")
         self.spec = self._first_spec
-        self.safety = SafetyController(self.spec)
+        self.robot_mode, self.safety_mode, self._power_step_s = MODE_RUNNING, SAFETY_NORMAL, math.inf
         self._note("faults-cleared")
 
     def _note(self, name: str, detail: str = "") -> None:

@@ -62,17 +62,11 @@ _PAIR = re.compile(rb"[+-]?[0-9]{1,3}\.[0-9]{1,9}, ?[+-]?[0-9]{1,3}\.[0-9]{1,9}"
 ReadingT = TypeVar("ReadingT")
 
 
-class ReplyLines(LineSplitter):
-    """Splits bytes into replies, however they are sliced; instruments end them with CR, LF or both. No I/O."""
-
-    def __init__(self) -> None:
-        super().__init__(MAX_REPLY_BYTES)
-
-    def replies(self, data: bytes) -> list[str]:
-        """Return the replies that `data` completes, without line ends; empty lines are ignored."""
-        lines = self.feed(data.replace(b"\r", b"\n"))
-        texts = [line.decode("ascii", "replace").strip() for line in lines if line is not None]
-        return [text for text in texts if text]
+def split_replies(lines: LineSplitter, data: bytes) -> list[str]:
+    """Return the replies that `data` completes; they end with CR, LF or both, and empty lines are ignored."""
+    ended = lines.feed(data.replace(b"\r", b"\n"))
+    texts = [line.decode("ascii", "replace").strip() for line in ended if line is not None]
+    return [text for text in texts if text]
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +98,7 @@ class PolledInstrument(ABC, Generic[ReadingT]):
         self._link = link
         self._timeout_s = timeout_s
         self._inputs = inputs
-        self._lines = ReplyLines()
+        self._lines = LineSplitter(MAX_REPLY_BYTES)
         self._count = 0
         self._errors: Counter[str] = Counter()
         self._name = ""
@@ -194,7 +188,7 @@ class PolledInstrument(ABC, Generic[ReadingT]):
                     f"{self.instrument} at {self._port.path} has not answered {query!r} within {self._timeout_s:.2g} "
                     "s; see that it is on, and that baud rate and line end are as configured."
                 )
-            replies, arrival_ns = self._lines.replies(received.data), received.t_arrival_ns
+            replies, arrival_ns = split_replies(self._lines, received.data), received.t_arrival_ns
         reply = Reply(replies[0], asked_ns, arrival_ns)
         if self._inputs is not None:
             self._inputs.record(RawEvent(InputKind.ASKED, asked_ns, query.encode()))

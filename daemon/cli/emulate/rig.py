@@ -18,7 +18,7 @@ from shearloop.drivers.emulators import number_between
 
 if TYPE_CHECKING:
     from shearloop.daemon.synthetic_skin import SyntheticSkin
-    from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings
+    from shearloop.drivers.emulators.rig import EmulatedRig
     from shearloop.drivers.emulators.scene import Truth
     from shearloop.drivers.emulators.skin import Address, SkinInstruments
     from shearloop.drivers.emulators.ur_controller import Controller
@@ -99,11 +99,31 @@ def _configure_rig(parser: argparse.ArgumentParser) -> None:
 
 def _run_rig(args: argparse.Namespace) -> int:
     from shearloop.daemon.synthetic_frames import RigFrames
-    from shearloop.drivers.emulators.rig import EmulatedRig
+    from shearloop.drivers.emulators.boards import PAPER_SKETCH
+    from shearloop.drivers.emulators.rig import NOISE_NM, EmulatedRig
+    from shearloop.drivers.emulators.scene import TwinSettings
 
-    settings = _rig_settings(args)
-    frames = RigFrames(args.bank, args.seed, args.sigma)
-    rig = EmulatedRig(settings, frames)
+    console.check_positive(args, "speed", "gel_stiffness")
+    make = robot_make(args)
+    if not 0 < args.diameter_mm <= 140:
+        raise UserError(f"--diameter-mm {args.diameter_mm:g} does not fit between the fingers; give up to 140")
+    try:
+        args.run_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"--run-dir {args.run_dir} cannot be made ({error.strerror}); choose another") from None
+    rig = EmulatedRig(
+        RigFrames(args.bank, args.seed, args.sigma),
+        args.run_dir,
+        host=args.host,
+        gripper_on=args.gripper,
+        twin=TwinSettings(gel_stiffness_nm_per_rad=args.gel_stiffness),
+        diameter_mm=args.diameter_mm,
+        speed=args.speed,
+        rate_hz=args.rate_hz,
+        make=make,
+        sketch=replace(PAPER_SKETCH, noise_counts=NOISE_NM) if args.paper_sketch else None,
+        seed=args.seed,
+    )
     with (
         nullcontext() if args.truth is None else _open_truth(args.truth) as file,
         console.report_busy_address(
@@ -135,35 +155,6 @@ async def _write_truths(rig: "EmulatedRig", file: TextIO, period_s: float) -> No
         file.write(json.dumps({"t_mono_ns": time.monotonic_ns(), **_fields(rig.scene.truth())}) + "\n")
         due_s = max(due_s + period_s, time.monotonic())
         await asyncio.sleep(due_s - time.monotonic())
-
-
-def _rig_settings(args: argparse.Namespace) -> "RigSettings":
-    from shearloop.drivers.emulators.boards import PAPER_SKETCH
-    from shearloop.drivers.emulators.rig import NOISE_NM, RigSettings
-    from shearloop.drivers.emulators.scene import TwinSettings
-
-    console.check_positive(args, "speed", "gel_stiffness")
-    make = robot_make(args)
-    if not 0 < args.diameter_mm <= 140:
-        raise UserError(f"--diameter-mm {args.diameter_mm:g} does not fit between the fingers; give up to 140")
-    settings = RigSettings(
-        run_dir=args.run_dir,
-        host=args.host,
-        gripper=args.gripper,
-        twin=TwinSettings(gel_stiffness_nm_per_rad=args.gel_stiffness),
-        diameter_mm=args.diameter_mm,
-        speed=args.speed,
-        rate_hz=args.rate_hz,
-        make=make,
-        seed=args.seed,
-    )
-    if args.paper_sketch:
-        settings = replace(settings, sketch=replace(PAPER_SKETCH, noise_counts=NOISE_NM))
-    try:
-        args.run_dir.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"--run-dir {args.run_dir} cannot be made ({error.strerror}); choose another") from None
-    return settings
 
 
 def _obey(rig: "EmulatedRig", line: str) -> None:

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from shearloop.daemon.cli import main
-from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings
+from shearloop.drivers.emulators.rig import EmulatedRig
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ class Blank:
     ],
 )
 def test_what_is_no_command_is_said_to_be_none(line, sentence, tmp_path):
-    rig = EmulatedRig(RigSettings(run_dir=tmp_path), Blank())
+    rig = EmulatedRig(Blank(), tmp_path)
     with pytest.raises(ValueError, match=sentence):
         rig.command(line)
 
@@ -80,7 +80,7 @@ class Commanded:
     ],
 )
 def test_a_command_reaches_its_device_and_normal_all(line, device, passed, tmp_path):
-    rig = EmulatedRig(RigSettings(run_dir=tmp_path), Blank())
+    rig = EmulatedRig(Blank(), tmp_path)
     devices = rig._commanded = {name: Commanded() for name in rig._commanded}
     rig.command(line)
     assert {name: one.lines for name, one in devices.items() if one.lines} == {device: [passed]}
@@ -89,7 +89,7 @@ def test_a_command_reaches_its_device_and_normal_all(line, device, passed, tmp_p
 
 
 def test_the_tool_and_the_robot_obey_the_rig(tmp_path):
-    rig = EmulatedRig(RigSettings(run_dir=tmp_path), Blank())
+    rig = EmulatedRig(Blank(), tmp_path)
     rig.command("joint seized")
     rig.command("protective-stop")
-    assert (rig.scene.truth().joint, rig.controller.robot.safety.safety_mode) == ("seized", 3)
+    assert (rig.scene.truth().joint, rig.controller.robot.safety_mode) == ("seized", 3)

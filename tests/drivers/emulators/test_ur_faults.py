@@ -16,9 +16,9 @@ def test_faults_are_carried_out_and_ended():
         controller.command(line)
     assert controller.faults == {"registers-in-use", "local-control", "refuse-protocol", "mute-dashboard"}
     assert (robot.spec.payload_kg, robot.spec.version) == (2.5, (5, 0, 0, 0))
-    assert robot.safety.safety_mode == 7
+    assert robot.safety_mode == 7
     controller.command("normal")
-    assert (controller.faults, robot.safety.safety_mode) == (set(), 1)
+    assert (controller.faults, robot.safety_mode) == (set(), 1)
 
 
 @pytest.mark.parametrize(

@@ -157,7 +157,7 @@ def test_protective_stop_pauses_and_is_not_unlocked_at_once():
     robot.protective_stop("test")
     wait(robot, 0.1)
     assert robot.runtime_state == PAUSED
-    assert robot.safety.safety_mode == 3
+    assert robot.safety_mode == 3
     assert not robot.arm.qd_rad_per_s.any()
     wait(robot, 4.8)
     assert not robot.unlock()
@@ -170,17 +170,17 @@ def test_protective_stop_pauses_and_is_not_unlocked_at_once():
 def test_emergency_stop_cuts_power_that_returns_in_two_steps():
     robot = started(power_on_s=0.5)
     robot.emergency_stop()
-    robot.safety.begin_power_step(MODE_POWER_OFF, robot.time_s)
+    robot.begin_power_step(MODE_POWER_OFF)
     wait(robot, 1.0)
-    assert robot.safety.robot_mode == MODE_POWER_OFF, "the button is still pressed"
+    assert robot.robot_mode == MODE_POWER_OFF, "the button is still pressed"
     robot.release()
-    robot.safety.begin_power_step(MODE_POWER_OFF, robot.time_s)
+    robot.begin_power_step(MODE_POWER_OFF)
     wait(robot, 0.6)
     robot.upload(control_script())
     assert not robot.program_running, "the brakes are on"
-    robot.safety.begin_power_step(MODE_IDLE, robot.time_s)
+    robot.begin_power_step(MODE_IDLE)
     wait(robot, 0.6)
-    assert robot.safety.robot_mode == MODE_RUNNING
+    assert robot.robot_mode == MODE_RUNNING
     robot.upload(control_script())
     assert robot.program_running
 

@@ -8,13 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.errors import ProtocolError
+from shearloop.drivers.serial_sensor import LineSplitter
 from shearloop.drivers.shear_skin.instruments import (
+    MAX_REPLY_BYTES,
     PairParser,
     Reply,
-    ReplyLines,
     parse_numbers,
     read_elements,
     read_scan,
+    split_replies,
 )
 from tests.slices import slices
 
@@ -43,16 +45,18 @@ def test_refused_lines_are_counted_by_kind():
 @given(st.lists(st.from_regex(r"[ -~]{1,40}", fullmatch=True).filter(str.strip), max_size=6), CUTS)
 def test_replies_come_through_whatever_ends_their_lines(replies, cuts):
     for end in (b"\n", b"\r", b"\r\n", b"\n\r"):
-        lines = ReplyLines()
+        lines = LineSplitter(MAX_REPLY_BYTES)
         data = b"".join(reply.encode() + end for reply in replies)
-        assert [text for part in slices(data, cuts) for text in lines.replies(part)] == [r.strip() for r in replies]
+        assert [text for part in slices(data, cuts) for text in split_replies(lines, part)] == [
+            r.strip() for r in replies
+        ]
 
 
 def test_a_flood_without_an_end_is_counted_once_and_forgotten():
-    lines = ReplyLines()
+    lines = LineSplitter(MAX_REPLY_BYTES)
     for _ in range(10):
-        assert lines.replies(b"7" * 300) == []
-    assert lines.replies(b"\n\xff\n0\n") == ["\N{REPLACEMENT CHARACTER}", "0"]
+        assert split_replies(lines, b"7" * 300) == []
+    assert split_replies(lines, b"\n\xff\n0\n") == ["\N{REPLACEMENT CHARACTER}", "0"]
     assert lines.too_long == 1
 
 

@@ -217,7 +217,7 @@ def test_resumed_program_does_not_turn_the_wrist(worker_lives):
         else:
             arm.cycle()
     assert arm.reading.rests
-    arm.robot.safety.safety_mode, arm.robot.runtime_state = 1, PLAYING
+    arm.robot.safety_mode, arm.robot.runtime_state = 1, PLAYING
     speeds = []
     for _ in range(round(PROMISED_S * 1e9 / CYCLE_NS)):
         arm.cycle()

@@ -17,7 +17,7 @@ from shearloop.drivers.emulators.ports import Server
 
 COUNTS_MAX = 255
 FIRST_MAJOR_FAULT = 10
-ACTIVATION_NOT_FINISHED, NOT_ACTIVATED, OVER_TEMPERATURE, NO_COMMUNICATION = 5, 7, 8, 9
+ACTIVATION_NOT_FINISHED, NOT_ACTIVATED, OVER_TEMPERATURE = 5, 7, 8
 SPEED_MM_S, FORCE_N = (30.0, 250.0), (10.0, 125.0)
 ACTIVATION_SPEED_MM_S = 150.0
 
@@ -66,9 +66,8 @@ class GripperRegisters:
 class Gripper:
     """One gripper: `write` sets the command registers, `step` moves the fingers.
 
-    Closing, they stop at `object_mm`; opening, at `widest_mm`.
-
-    The next step takes up commands: until then the status belongs to the motion before, as on the real gripper.
+    Closing, they stop at `object_mm`; opening, at `widest_mm`. The next step takes up commands: until then the status
+    belongs to the motion before, as on the real gripper.
     """
 
     def __init__(self, mechanics: GripperMechanics | None = None, object_mm: float | None = None) -> None:
@@ -118,11 +117,6 @@ class Gripper:
     def clear_minor(self) -> None:
         """End a fault below 10, as cooling down does."""
         if self.flt < FIRST_MAJOR_FAULT:
-            self.flt = 0
-
-    def status_was_read(self) -> None:
-        """Note that the status was read, which clears the report of a silence."""
-        if self.flt == NO_COMMUNICATION:
             self.flt = 0
 
     def step(self, dt_s: float) -> None:
@@ -210,7 +204,6 @@ class UrcapSession:
         if not gripper.powered or variable not in values:
             return "?"
         if variable == "FLT":
-            gripper.status_was_read()
             return f"{values[variable]:02}"
         return str(values[variable])
 
@@ -251,9 +244,7 @@ class ModbusSlave:
         gripper = self._gripper
         if request == bytes([READ]) + STATUS_REGISTERS:
             status = gripper.taken.act | gripper.taken.gto << 3 | gripper.sta << 4 | gripper.obj << 6
-            answer = bytes([READ, 6, status, 0, gripper.flt, gripper.taken.pos, gripper.pos, gripper.current])
-            gripper.status_was_read()
-            return answer
+            return bytes([READ, 6, status, 0, gripper.flt, gripper.taken.pos, gripper.pos, gripper.current])
         if request[:5] != bytes([WRITE]) + COMMAND_REGISTERS:
             raise ValueError(f"the gripper has no such registers: {request.hex()}")
         action, _, _, pos, spe, force = request[6:]

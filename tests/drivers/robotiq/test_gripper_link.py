@@ -134,11 +134,3 @@ async def test_damaged_modbus_reply_is_rejected(tmp_path, monkeypatch):
             with pytest.raises(DeviceLostError):
                 await rig.driver.read()
         await rig.driver.connect()
-
-
-async def test_gripper_reports_a_silent_master(tmp_path):
-    async with a_rig("modbus", tmp_path, connected=True) as rig:
-        rig.stopped = True
-        rig.model.fail(9)
-        assert (await rig.driver.read()).fault.code == 9
-        assert (await rig.driver.read()).fault.code == 0

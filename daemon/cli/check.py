@@ -143,7 +143,9 @@ def _check_rig(config: "DaemonConfig", parts: Parts) -> None:
             parts.texts["gripper"] = own
     if config.robot is not None:
         with parts.of("robot"):
-            parts.texts["robot"] = f"{robot_settings(config.robot).host}, limits of {config.robot}"
+            settings = robot_settings(config.robot)
+            text = f"{settings.host}, limits of {config.robot}"
+            parts.texts["robot"] = f"{text}. {settings.warning}" if settings.warning else text
 
 
 def _clients(curve: "CurveConfig") -> str:

@@ -142,7 +142,8 @@ class UrRobot:
                 self.states += 1
                 if before is None:
                     untested = untested_sentence(self._version) if self._version else ""
-                    said = (f"The robot at {self.settings.host} is connected.", untested, message.blocked)
+                    connected = f"The robot at {self.settings.host} is connected."
+                    said = (connected, untested, self.settings.warning, message.blocked)
                     self.link.connected(" ".join(filter(None, said)), time.monotonic_ns())
                 if message.motion == "linear" and self._connection is not None:
                     # A straight move stops when the daemon falls silent; other commands are renewed by the loop.

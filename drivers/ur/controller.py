@@ -103,11 +103,17 @@ def probe_controller(host: str, timeout_s: float) -> str:
         numbers = struct.unpack(">4I", answer[:16])
         accepted = _agree_on_protocol(connection)
     version = ".".join(map(str, numbers))
-    if not accepted or numbers[0] not in OLDEST or numbers < OLDEST[numbers[0]]:
+    if numbers[0] not in OLDEST or numbers < OLDEST[numbers[0]]:
         raise ProbeError(
             "version",
             f"The UR controller at {host} has PolyScope {version}, which cannot be driven; install PolyScope 3.10 "
             "(CB3) or 5.4 (e-Series), or a newer 3.x or 5.x, and restart the daemon.",
+        )
+    if not accepted:
+        raise ProbeError(
+            "protocol",
+            f"The UR controller at {host} refuses version 2 of the RTDE protocol. Restart the controller; the daemon "
+            "tries again.",
         )
     return version
 
@@ -353,16 +359,19 @@ class SampleAge:
         self._offset_ns = self._seen_ns = 0
 
     def age_ns(self, timestamp_s: float, now_ns: int) -> int:
-        """Return the time in ns since the sample was made; 0 for the first, and unchanged for a NaN timestamp."""
-        if timestamp_s != self._timestamp_s and math.isfinite(timestamp_s):
+        """Return the time in ns since the newest sample was made; 0 for the first.
+
+        A sample without a timestamp, or with an earlier one, is not new. A restarted controller has a new clock, so it
+        gets too old, is lost, and is connected again.
+        """
+        if math.isfinite(timestamp_s) and not timestamp_s <= self._timestamp_s:
             self._update(timestamp_s, now_ns)
         return max(0, now_ns - self._made_ns)
 
     def _update(self, timestamp_s: float, now_ns: int) -> None:
         stamped_ns = round(timestamp_s * 1e9)
         offset_ns = now_ns - stamped_ns
-        # A timestamp that runs backwards is a restarted controller, with a new clock.
-        if timestamp_s > self._timestamp_s:
+        if math.isfinite(self._timestamp_s):
             risen_ns = self._offset_ns + round(_OFFSET_RISE * (now_ns - self._seen_ns))
             offset_ns = min(offset_ns, risen_ns)
         self._timestamp_s, self._offset_ns, self._seen_ns = timestamp_s, offset_ns, now_ns

@@ -14,7 +14,7 @@ from shearloop.drivers.errors import ProtocolError
 from shearloop.drivers.ur.settings import Bound, InstalledTool, JointRange, Six, Three, UrLimits, UrSettings, Workspace
 
 MotionKind = Literal["idle", "wrist", "linear", "stopping"]
-FailureKind = Literal["unreachable", "silent", "version", "registers-in-use", "local-control", "lost"]
+FailureKind = Literal["unreachable", "silent", "protocol", "version", "registers-in-use", "local-control", "lost"]
 
 # `RobotState.end_reason` of a motion that ended as commanded; any other reason is a sentence.
 ARRIVED: Final = "arrived"

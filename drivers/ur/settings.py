@@ -22,9 +22,20 @@ _CLIENT_BOUNDS = {
     "linear_acceleration_m_per_s2": 150.0,
 }
 
-# No file may let the robot go on without commands for longer.
-_LONGEST_S = {"command_timeout_s": 1.0, "silence_timeout_s": 1.0, "state_timeout_s": 1.0, "reaction_s": 0.5}
+_ALONE, _WAITING = "the robot goes on that long alone", "the operator waits that long for an answer"
+# The longest times that a file may set, and why.
+_LONGEST_S = {
+    "command_timeout_s": (1.0, _ALONE),
+    "silence_timeout_s": (1.0, _ALONE),
+    "state_timeout_s": (1.0, _ALONE),
+    "reaction_s": (0.5, _ALONE),
+    "connect_timeout_s": (60.0, _WAITING),
+    "hang_timeout_s": (10.0, _WAITING),
+    "recover_timeout_s": (300.0, _WAITING),
+}
 _LEAST_WATCHDOG_HZ = 1.0
+# The wrist stands this long after the last decision (docs/safety.md).
+_PROMISED_S = 0.2
 
 
 class _Checked:
@@ -159,19 +170,21 @@ class UrSettings(_Checked):
     """Delay until a commanded speed takes effect; distances to the joint limits include it. At most 0.5 s."""
 
     def __post_init__(self) -> None:
-        """Refuse an empty host, and deadlines that contradict each other."""
+        """Refuse a host that is none, and deadlines that contradict each other."""
         if not self.host.strip():
             raise ValueError("host is empty; give the robot's address")
+        try:
+            self.host.encode("idna")
+        except UnicodeError:
+            raise ValueError("host is no name or address of a computer; give the robot's address") from None
         for name in self.__dataclass_fields__:
             value = getattr(self, name)
             if isinstance(value, float | int) and not 0 < value < math.inf:
                 raise ValueError(f"{name} must be above 0, not {value:g}")
-        for name, longest_s in _LONGEST_S.items():
+        for name, (longest_s, reason) in _LONGEST_S.items():
             value = getattr(self, name)
             if value > longest_s:
-                raise ValueError(
-                    f"{name} must be at most {longest_s:g} s, not {value:g}: the robot goes on that long alone"
-                )
+                raise ValueError(f"{name} must be at most {longest_s:g} s, not {value:g}: {reason}")
         if self.watchdog_hz < _LEAST_WATCHDOG_HZ:
             raise ValueError(
                 f"watchdog_hz must be at least {_LEAST_WATCHDOG_HZ:g}, not {self.watchdog_hz:g}: "
@@ -182,6 +195,23 @@ class UrSettings(_Checked):
                 f"rate_hz ({self.rate_hz:g}) must be at least three times watchdog_hz ({self.watchdog_hz:g}), "
                 "or one late cycle ends the robot's program"
             )
+
+    @property
+    def standstill_s(self) -> float:
+        """Longest time until the wrist stands after the last decision: deadline, two cycles, braking."""
+        wrist = self.limits
+        braking_s = wrist.wrist_speed_rad_per_s.inner / wrist.wrist_acceleration_rad_per_s2.hard
+        return max(self.command_timeout_s, self.silence_timeout_s) + 2 / self.rate_hz + braking_s
+
+    @property
+    def warning(self) -> str:
+        """A sentence where that is longer than docs/safety.md promises, else empty."""
+        if self.standstill_s <= _PROMISED_S:
+            return ""
+        return (
+            f"With these deadlines and accelerations the wrist may turn for {self.standstill_s:.2g} s after the last "
+            f"decision, longer than {_PROMISED_S:g} s: lower command_timeout_s and silence_timeout_s."
+        )
 
 
 def _check_range(lower: tuple[float, ...], upper: tuple[float, ...], margin: float) -> None:

@@ -226,7 +226,7 @@ async def test_silent_controller_is_reported_and_the_robot_stops(controller):
     [
         ("registers-in-use", "registers-in-use", "EtherNet/IP or PROFINET"),
         ("local-control", "local-control", "switch it to remote control"),
-        ("refuse-protocol", "version", "PolyScope 3.10 (CB3) or 5.4 (e-Series)"),
+        ("refuse-protocol", "protocol", "refuses version 2 of the RTDE protocol"),
         ("mute-dashboard", "silent", "while asking its dashboard server (port 29999): it is starting, hangs"),
     ],
 )

@@ -50,6 +50,11 @@ def test_all_mistakes_are_reported_together(tmp_path):
         ("host: 192.168.1.10", "host: 192.168.1.10\nwatchdog_hz: 0.5", "at least 1, not 0.5"),
         ("host: 192.168.1.10", "host: 192.168.1.10\ncommand_timeout_s: 3", "at most 1 s, not 3"),
         ("host: 192.168.1.10", "host: 192.168.1.10\nsilence_timeout_s: 30", "at most 1 s, not 30"),
+        ("host: 192.168.1.10", "host: 192.168.1.10\nconnect_timeout_s: 1.0e+300", "at most 60 s, not 1e.300"),
+        ("host: 192.168.1.10", "host: 192.168.1.10\nhang_timeout_s: 1.0e+12", "at most 10 s, not 1e.12"),
+        ("host: 192.168.1.10", "host: a..b", "host is no name or address of a computer"),
+        ("host: 192.168.1.10", f"host: {'a' * 300}", "host is no name or address of a computer"),
+        ("host: 192.168.1.10", 'host: "\\ud800"', "host is no name or address of a computer"),
         ("host: 192.168.1.10", "host: 192.168.1.10\ntool: {payload_kg: -1}", "payload_kg must be at least 0, not -1"),
         ("margin_rad: 0.1", "margin_rad: 3.2", "no room"),
         ("{inner: 4.0, hard: 8.0}", "{inner: 4.0, hard: 50.0}", "more than ur-rtde takes, which is 40"),
@@ -74,4 +79,10 @@ def test_a_wrist_without_decisions_stands_within_0_2_s() -> None:
     settings = read_settings(Path("config/ur.yaml"))
     limits = settings.limits
     braking_s = limits.wrist_speed_rad_per_s.inner / limits.wrist_acceleration_rad_per_s2.hard
-    assert settings.command_timeout_s + 2 / settings.rate_hz + braking_s <= 0.2
+    assert settings.command_timeout_s + 2 / settings.rate_hz + braking_s == settings.standstill_s <= 0.2
+    assert settings.warning == ""
+
+
+def test_deadlines_that_loosen_the_promise_are_named(tmp_path) -> None:
+    slow = read_settings(changed(tmp_path, ("host: 192.168.1.10", "host: 192.168.1.10\ncommand_timeout_s: 1")))
+    assert "the wrist may turn for 1.1 s after the last decision, longer than 0.2 s" in slow.warning

@@ -7,7 +7,11 @@ export OPENBLAS_NUM_THREADS := 1
 # Without bytecode files every test process would compile all modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install install-dev system-packages demo docs docs-site test test-fast lint format clean
+.PHONY: install install-dev system-packages demo demo-python docs docs-site test test-fast lint format clean
+
+# Before anything is installed.
+demo-python:
+	@[ -e $(VENV)/.installed ] || $(PYTHON) -c 'import sys; v = sys.version.split()[0]; sys.version_info < (3, 13) or sys.exit(f"The demo drives an emulated robot, and its package ur-rtde has no wheel for Python {v}: make demo PYTHON=python3.12. To build ur-rtde, see docs/hardware-setup.md.")'
 
 # The demo needs the least; `install` adds what the exports need, `install-dev` the tools of tests and checks.
 install: $(VENV)/.installed-exports
@@ -35,7 +39,7 @@ system-packages:
 	[ -z "$$missing" ] || { apt-get update -qq -o Acquire::Retries=2 -o Acquire::http::Timeout=30 && apt-get install -y -qq --no-install-recommends $$missing; }
 
 # The whole emulated rig; with RECORDING=FILE one fingertip that plays a recorded stream (.mat).
-demo: $(VENV)/.installed
+demo: demo-python $(VENV)/.installed
 	$(BIN)/shearloop demo --folder . $(if $(RECORDING),--recording '$(RECORDING)')
 
 # Test files run in parallel, the longest first (tests/conftest.py). Tests that drive a robot run afterwards, by themselves,

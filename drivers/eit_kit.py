@@ -345,8 +345,8 @@ class EitKit(SerialSensor[Frame]):
         frame_period_s: float = FRAME_PERIOD_S,
         inputs: InputRecorder | None = None,
     ) -> None:
-        super().__init__(link, frame_period_s, inputs)
         self._parser = FrameParser(zero_slots, nominal_period_ns=round(frame_period_s * 1e9))
+        super().__init__(link, frame_period_s, self._parser.handle, inputs)
 
     @property
     def period_s(self) -> float:
@@ -365,10 +365,9 @@ class EitKit(SerialSensor[Frame]):
             "measured_hz": 1.0 / self.period_s if parser.clock.learned else None,
         }
 
-    def _parse(self, event: RawEvent) -> list[Frame]:
-        frames = self._parser.handle(event)
-        self._longest_silence_s = max(SILENT_PERIODS * self._parser.clock.period_ns / 1e9, MIN_SILENCE_S)
-        return frames
+    @property
+    def _longest_silence_s(self) -> float:
+        return max(SILENT_PERIODS * self.period_s, MIN_SILENCE_S)
 
     async def _on_open(self, port: Port) -> None:
         await port.write(START)

@@ -119,7 +119,7 @@ class LoadParser(serial_sensor.LineParser[LoadSample]):
     def __init__(self, calibration: LoadCalibration, rate_hz: float = LOAD_CELL_RATE_HZ) -> None:
         super().__init__(_DECIMAL, MAX_LINE_BYTES, BAUD_RATE, rate_hz)
         self._stuck_after = max(STUCK_AFTER, round(STUCK_AFTER * rate_hz / LOAD_CELL_RATE_HZ))
-        self._seq = 0
+        self.flagged = 0
         self.calibration = calibration
         self.restart()
 
@@ -137,7 +137,7 @@ class LoadParser(serial_sensor.LineParser[LoadSample]):
         self._repeats = 0
         self._spikes = SpikeFilter(self._period_ns)
 
-    def _values(self, line: serial_sensor.TimedLine) -> list[LoadSample]:
+    def _value(self, line: serial_sensor.TimedLine) -> LoadSample:
         raw = float(line.text)
         torque_nm = self.calibration.torque_nm(raw)
         self._repeats = self._repeats + 1 if raw == self._last_raw else 1
@@ -150,14 +150,14 @@ class LoadParser(serial_sensor.LineParser[LoadSample]):
             torque_nm=torque_nm,
             t_mid_ns=line.t_mid_ns,
             t_arrival_ns=line.t_arrival_ns,
-            seq=self._seq,
+            seq=self.count,
             saturated=saturated,
             spike=abs(torque_nm) > CAPACITY_NM if unreliable else self._spikes.is_spike(torque_nm, line.t_mid_ns),
             stuck=self._repeats >= self._stuck_after,
             partial=line.partial,
         )
-        self._seq += 1
-        return [sample]
+        self.flagged += not sample.trusted
+        return sample
 
 
 class LoadCell(serial_sensor.SerialSensor[LoadSample]):
@@ -172,11 +172,9 @@ class LoadCell(serial_sensor.SerialSensor[LoadSample]):
         rate_hz: float = LOAD_CELL_RATE_HZ,
         inputs: serial_sensor.InputRecorder | None = None,
     ) -> None:
-        # A fast board may seem silent to a busy computer; reopening would reset it.
-        super().__init__(link, 1.0 / min(rate_hz, LOAD_CELL_RATE_HZ), inputs)
         self._parser = LoadParser(calibration, rate_hz)
-        self._samples = 0
-        self._flagged = 0
+        # A fast board may seem silent to a busy computer; reopening would reset it.
+        super().__init__(link, 1.0 / min(rate_hz, LOAD_CELL_RATE_HZ), self._parser.handle, inputs)
 
     def tare(self, raw_at_rest: float) -> None:
         """Make a raw value the zero of the samples to come."""
@@ -184,15 +182,6 @@ class LoadCell(serial_sensor.SerialSensor[LoadSample]):
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
-        return {
-            **super().diagnostics(),
-            "samples": self._samples,
-            "flagged": self._flagged,
-            "errors": self._parser.errors,
-        }
-
-    def _parse(self, event: serial_sensor.RawEvent) -> list[LoadSample]:
-        samples = self._parser.handle(event)
-        self._samples += len(samples)
-        self._flagged += sum(not sample.trusted for sample in samples)
-        return samples
+        parser = self._parser
+        counts = {"samples": parser.count, "flagged": parser.flagged}
+        return {**super().diagnostics(), **counts, "errors": parser.errors}

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeAlias, TypeVar
 
 from shearloop.drivers.connection import Diagnostics, Link, Port
 from shearloop.drivers.errors import DeviceLostError, DriverError
@@ -41,6 +41,10 @@ class RawEvent:
     kind: InputKind
     t_ns: int
     data: bytes = b""
+
+
+# Returns the values that an event completes.
+Parse: TypeAlias = Callable[[RawEvent], Sequence[ValueT]]
 
 
 class InputRecorder(Protocol):
@@ -107,6 +111,7 @@ class LineParser(ABC, Generic[ValueT]):
 
     def __init__(self, pattern: re.Pattern[bytes], max_bytes: int, baud: int, rate_hz: float) -> None:
         """Accept lines that match the pattern, of at most `max_bytes`; the board sends `rate_hz` lines a second."""
+        self.count = 0
         self._pattern = pattern
         self._lines = LineSplitter(max_bytes)
         self._byte_ns = 10 * 10**9 // baud  # with start and stop bit
@@ -121,8 +126,8 @@ class LineParser(ABC, Generic[ValueT]):
         return dict(self._rejected + Counter({"too long": self._lines.too_long}))
 
     @abstractmethod
-    def _values(self, line: TimedLine) -> list[ValueT]:
-        """Return the values in a line that matches the pattern."""
+    def _value(self, line: TimedLine) -> ValueT | None:
+        """Return the value in a line that matches the pattern, or None where that is not certain."""
 
     def handle(self, event: RawEvent) -> list[ValueT]:
         """Process a live or recorded event; return the values that it completes."""
@@ -152,7 +157,10 @@ class LineParser(ABC, Generic[ValueT]):
             self._last_mid_ns = max(t_mid_ns, self._last_mid_ns + 1)
             line = TimedLine(text.strip(b"\r"), arrived_ns, self._last_mid_ns, partial)
             if self._pattern.fullmatch(line.text):
-                values += self._values(line)
+                value = self._value(line)
+                if value is not None:
+                    values.append(value)
+                    self.count += 1
             elif not partial:
                 self._rejected["not a number" if line.text else "empty"] += 1
         return values
@@ -185,17 +193,17 @@ class StepFilter(Generic[ValueT]):
         self._candidates.clear()
 
 
-class SerialSensor(ABC, Generic[ValueT]):
+class SerialSensor(Generic[ValueT]):
     """One board behind a link, kept connected, with a parser for its bytes. A silent board counts as lost."""
 
     # The operator's checklist when nothing comes.
     silence_hint = ""
 
-    def __init__(self, link: Link, period_s: float, inputs: InputRecorder | None = None) -> None:
+    def __init__(self, link: Link, period_s: float, parse: Parse[ValueT], inputs: InputRecorder | None = None) -> None:
         """Use the link, not yet open, of a board with a line every `period_s`; `inputs` keeps every parser input."""
         self._link = link
         self._period_s = period_s
-        self._longest_silence_s = SILENT_PERIODS * period_s
+        self._parse = parse
         self._inputs = inputs
         self._silence_s = BOOT_S
 
@@ -244,9 +252,9 @@ class SerialSensor(ABC, Generic[ValueT]):
         await self._on_open(port)
         return port
 
-    @abstractmethod
-    def _parse(self, event: RawEvent) -> Sequence[ValueT]:
-        """Return the values that an event completes."""
+    @property
+    def _longest_silence_s(self) -> float:
+        return SILENT_PERIODS * self._period_s
 
     async def _on_open(self, port: Port) -> None:
         """Set up a board after its port was opened."""

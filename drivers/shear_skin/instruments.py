@@ -420,13 +420,13 @@ class PairParser(LineParser[Voltages]):
         super().__init__(_PAIR, MAX_PAIR_BYTES, ADC_BAUD, rate_hz)
         self._end_v = _END_OF_RANGE * full_scale_v
 
-    def _values(self, line: TimedLine) -> list[Voltages]:
+    def _value(self, line: TimedLine) -> Voltages | None:
         if line.partial:
             # The rest of a number may look like a number.
-            return []
+            return None
         v1_v, v2_v = map(float, line.text.split(b","))
         over_1, over_2 = abs(v1_v) >= self._end_v, abs(v2_v) >= self._end_v
-        return [Voltages(v1_v, v2_v, line.t_mid_ns, line.t_arrival_ns, over_1, over_2)]
+        return Voltages(v1_v, v2_v, line.t_mid_ns, line.t_arrival_ns, over_1, over_2)
 
 
 class AdcBoard(SerialSensor[Voltages]):
@@ -441,19 +441,13 @@ class AdcBoard(SerialSensor[Voltages]):
         full_scale_v: float = ADC_FULL_SCALE_V,
         inputs: InputRecorder | None = None,
     ) -> None:
-        super().__init__(link, 1.0 / rate_hz, inputs)
         self.period_s = 1.0 / rate_hz
         self._parser = PairParser(rate_hz, full_scale_v)
-        self._count = 0
+        super().__init__(link, self.period_s, self._parser.handle, inputs)
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
-        return {**super().diagnostics(), "lines": self._count, "errors": self._parser.errors}
-
-    def _parse(self, event: RawEvent) -> list[Voltages]:
-        found = self._parser.handle(event)
-        self._count += len(found)
-        return found
+        return {**super().diagnostics(), "lines": self._parser.count, "errors": self._parser.errors}
 
 
 Daq: TypeAlias = ScpiScanner | AdcBoard

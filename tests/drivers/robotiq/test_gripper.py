@@ -51,21 +51,6 @@ async def test_gripper_activates_moves_and_measures_an_object(way, tmp_path):
 
 
 @WAYS
-async def test_old_contact_is_ignored_until_the_command_is_taken_up(way, tmp_path):
-    async with a_rig(way, tmp_path, active=True) as rig:
-        rig.model.object_mm = 20.0
-        await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
-        rig.stopped = True
-        sent = await rig.driver.move(messages.GripperCommand(100.0))
-        # The registers still say "contact closing" of the motion before.
-        assert rig.model.obj == 2
-        assert (await rig.driver.read()).object is messages.ObjectStatus.MOVING
-        assert (await rig.driver.read()).diameter_mm is None
-        rig.stopped = False
-        assert (await rig.driver.finish(sent)).object is messages.ObjectStatus.AT_TARGET
-
-
-@WAYS
 async def test_halted_gripper_reports_no_object(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig:
         sent = await rig.driver.move(messages.GripperCommand(0.0, speed_mm_s=30.0))

@@ -8,12 +8,6 @@ from shearloop.drivers.ur.messages import Enable, MoveLinear, RtdeSample, Stop, 
 from tests.drivers.ur.flight import POSE, Flight, flying, turning
 
 
-def test_start_clears_the_last_command_uploads_and_arms_the_watchdog_in_this_order():
-    flight = Flight()
-    flight.fly(5)
-    assert flight.arm.calls == ["clear_command", "upload", "arm_watchdog", "send_heartbeat", "send_heartbeat"]
-
-
 def test_nothing_moves_before_it_is_enabled():
     flight = Flight()
     assert "made ready" in flight.ask(WristSpeed(0.1, 1.0)).refusal

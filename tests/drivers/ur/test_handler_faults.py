@@ -248,16 +248,6 @@ def test_unlocking_is_ended_by_disconnecting_and_by_a_stop(command):
     assert not flight.decided[98].accepted
 
 
-def test_starting_the_program_is_ended_by_disconnecting():
-    flight = Flight()
-    assert flight.ask(Disconnect()).accepted
-    flight.fly(300)
-    assert flight.arm.calls == []
-    assert flight.handler.at_rest
-    for command in (Enable(), Unlock(), WristSpeed(0.1, 1.0)):
-        assert "disconnects" in flight.ask(command).refusal
-
-
 def test_unlocking_with_old_samples_times_out():
     flight = turning()
     flight.arm.protective_stop()

@@ -69,17 +69,6 @@ def test_linear_move_ends_the_thread_for_speeds_first():
     assert flight.arm.calls[-2:] == ["end_speed", "move"]
 
 
-def test_silent_daemon_ends_the_motion():
-    flight = flying()
-    assert flight.ask(MoveLinear(POSE, 0.05, 0.1)).accepted
-    flight.fly(30, daemon_alive=False)
-    assert flight.state.motion == "linear"
-    flight.fly(30, daemon_alive=False)
-    assert flight.state.motion == "idle"
-    assert "silent" in flight.state.end_reason
-    assert "stop_move" in flight.arm.calls
-
-
 def test_linear_move_gets_heartbeats_and_reports_its_arrival():
     flight = flying()
     reply = flight.ask(MoveLinear((-2.0, *POSE[1:]), 9.0, 0.1))

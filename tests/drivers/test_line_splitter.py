@@ -1,7 +1,5 @@
 """Lines come through whole in any slices; what is no line is counted once."""
 
-import tracemalloc
-
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,17 +17,6 @@ def test_slices_change_nothing_and_every_line_is_given_or_counted(slices):
     *ended, rest = data.split(b"\n")
     assert expected == [line if len(line) <= LONGEST else None for line in ended] + [None] * (len(rest) > LONGEST)
     assert whole.too_long == sliced.too_long == sum(len(line) > LONGEST for line in [*ended, rest])
-
-
-def test_memory_stays_bounded_where_no_line_ever_ends():
-    lines, slice_ = LineSplitter(LONGEST), b"7" * 1000
-    tracemalloc.start()
-    for _ in range(1000):
-        lines.feed(slice_)
-    _, peak_bytes = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak_bytes < 10 * len(slice_)
-    assert lines.too_long == 1
 
 
 def test_what_had_begun_when_the_port_was_opened_again_is_forgotten():

@@ -120,16 +120,6 @@ async def test_halt_after_a_failed_activation_keeps_the_fault(way, tmp_path):
 
 
 @WAYS
-async def test_overheating_passes_without_activation(way, tmp_path):
-    async with a_rig(way, tmp_path, active=True) as rig:
-        rig.model.fail(8)
-        with pytest.raises(messages.GripperFaultError, match="too hot"):
-            await rig.driver.move(messages.GripperCommand(50.0))
-        rig.model.clear_minor()
-        await rig.driver.finish(await rig.driver.move(messages.GripperCommand(50.0)))
-
-
-@WAYS
 async def test_activating_an_active_gripper_moves_nothing(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig:
         rig.model.object_mm = 25.0

@@ -41,7 +41,7 @@ class ReciprocityCheck:
     """Checks the voltages that a frame has twice (`ChannelTable.twins`).
 
     Their means have half of the noise, so other errors stand out. A gel's drift is large in some channels, a foreign
-    frame differs in all: the median of the channels separates the two better than their mean (docs/charts.md).
+    frame differs in all: the median of the channels separates the two better than their mean.
     mean (c/2,) and spread (c/2,) of the means are in volts; directions (r, c/2) in units of the spread.
     """
 

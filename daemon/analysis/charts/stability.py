@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import groupby, pairwise, product
+from itertools import groupby, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import conductivity
@@ -27,10 +26,9 @@ from shearloop.bank.estimation import (
 )
 from shearloop.bank.estimation.bank_match import NOT_TURNED
 from shearloop.bank.estimation.interval_regressor import Ridge, fit_interval_regressor
-from shearloop.bank.estimation.novelty import NoveltyDetector, ReciprocityCheck
 from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.analysis.charts import skin_loop
-from shearloop.daemon.analysis.charts.drawing import SHADES, figure, look, save, slug
+from shearloop.daemon.analysis.charts.drawing import figure, look, save, slug
 from shearloop.daemon.analysis.charts.fault_sweeps import (
     BROKEN_SHARE,
     FaultCurve,
@@ -89,7 +87,7 @@ def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Pa
 
 
 def _of_slices(split: Split, bank: Bank, mesh: Mesh, out: Path, executor: Executor) -> list[Path]:
-    """Write the charts of slices: continuity, torques beyond the calibrated ones, foreign frames."""
+    """Write the charts of slices: continuity, and torques beyond the calibrated ones."""
     name, physics = slug(split.title), Physics(bank, mesh)
     found = walks(split, bank, fitted(split, ("regression", "motion_regression"), physics))
     rows = [asdict(one) | {"largest_hop_nm": one.largest_hop_nm, "hops": one.hops} for one in found]
@@ -100,12 +98,7 @@ def _of_slices(split: Split, bank: Bank, mesh: Mesh, out: Path, executor: Execut
         "title": split.title,
         "extrapolations": [asdict(one) | {"times_good": one.times_good} for one in beyond],
     }
-    written += save(extrapolation_figure(split.title, beyond), content, out, f"extrapolation-{name}")
-    seen = detect_mixtures(split.whole)
-    return written + save(
-        detectability_figure(split.title.split(",", maxsplit=1)[0], seen),
-        {"mixtures": [asdict(one) for one in seen]}, out, f"detectability-{name}",
-    )  # fmt: skip
+    return written + save(extrapolation_figure(split.title, beyond), content, out, f"extrapolation-{name}")
 
 
 def _written(name: str, title: str, curves: Sequence[FaultCurve], out: Path) -> list[Path]:
@@ -273,65 +266,6 @@ def judge_others(
     return judge_level(estimates, others.torque_nm, part.limit_nm), float(np.median(widths)) if widths else None, ""
 
 
-FOREIGN_SHARES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
-ORIGINS = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-_TURNED_ELECTRODES = 5
-
-
-@dataclass(frozen=True, slots=True)
-class ForeignMixture:
-    """Misfits of later slices, in units of their limit, for one origin, kind and share of a foreign frame.
-
-    The misfit is from reciprocal channels. `passing` is the share that the validity check accepts, `passing_best`
-    the best limit's.
-    """
-
-    origin: float
-    kind: str
-    share: float
-    misfits: tuple[float, ...]
-    passing: float
-    passing_best: float
-
-
-def detect_mixtures(series: FrameSeries, origins: Sequence[float] = ORIGINS) -> list[ForeignMixture]:
-    """Return how each share of a foreign frame looks to a validity check fitted to the slices before each origin.
-
-    The best limit is the lowest that refuses no good later slice; no rule on the misfit can refuse more mixtures.
-    """
-    frames = np.abs(series.channels[:, 0])
-    usable = np.ones(PAPER_TABLE.n_channels, dtype=np.bool_)
-    turned = bank_match.ElectrodeNumbering(_TURNED_ELECTRODES, reflected=False)
-    found = []
-    for origin in origins:
-        n = round(origin * len(frames))
-        guard, later = NoveltyDetector.fit(frames[:n], PAPER_TABLE), frames[n:]
-        mean = later.mean(axis=0)
-        foreign = {
-            "another fingertip": mean[np.random.default_rng(7).permutation(PAPER_TABLE.n_channels)],
-            f"turned by {_TURNED_ELECTRODES} electrodes": mean[turned.model_channels(PAPER_TABLE)],
-        }
-        twins = ReciprocityCheck.fit(frames[:n], PAPER_TABLE)
-        good = _misfits(twins, later)
-        for kind, one in foreign.items():
-            for share in FOREIGN_SHARES:
-                mixed = (1 - share) * later + share * one
-                misfits = _misfits(twins, mixed)
-                found.append(
-                    ForeignMixture(
-                        origin, kind, share, tuple(misfits),
-                        float(np.mean([not guard.assess(frame, usable).reasons for frame in mixed])),
-                        float((misfits <= good.max()).mean()),
-                    )
-                )  # fmt: skip
-    return found
-
-
-def _misfits(twins: ReciprocityCheck, frames: FloatArray) -> FloatArray:
-    usable = np.ones(PAPER_TABLE.n_channels, dtype=np.bool_)
-    return np.array([twins.residual(one, usable) for one in frames]) / twins.largest_residual
-
-
 MODEL = "gaussian_derivative"
 _K, _SIGMA = 3.2, 1.5
 _FRAMES = 6
@@ -447,42 +381,4 @@ def continuity_figure(title: str, walks: Sequence[ContinuityWalk]) -> Figure:
     way.grid(alpha=0.25)
     way.legend(fontsize=8.5)
     made.suptitle(f"Continuity: how far the estimate jumps for a small change of the frame, {title}")
-    return made
-
-
-def detectability_figure(title: str, found: Sequence[ForeignMixture]) -> Figure:
-    """Draw the misfits of one origin, and the share that passes at all origins."""
-    made = figure(15, 6)
-    clouds, passing = made.subplots(1, 2, gridspec_kw={"width_ratios": [1, 1.15]})
-    kinds = list(dict.fromkeys(one.kind for one in found))
-    origins = list(dict.fromkeys(one.origin for one in found))
-    shown = min(origins, key=lambda one: abs(one - 0.6))
-    for one in found:
-        if one.origin == shown and one.kind == kinds[0]:
-            x = np.full(len(one.misfits), one.share) + np.linspace(-0.008, 0.008, len(one.misfits))
-            clouds.plot(x, one.misfits, "o", color=SHADES[1], markersize=4, alpha=0.7)
-    best = max(next(one.misfits for one in found if one.origin == shown and one.share == 0))
-    clouds.axhline(1.0, color="black", linewidth=1.4, label="limit of the validity check, from earlier slices")
-    clouds.axhline(best, color="black", linestyle=":", linewidth=1.4, label="best limit: the worst good slice")
-    clouds.set(
-        xlabel=f"share of a foreign frame ({kinds[0]})", ylabel="misfit of each later slice's reciprocal channels",
-        title=f"calibrated on the first {shown:.0%}", yscale="log",
-    )  # fmt: skip
-    clouds.legend(fontsize=8.5, loc="upper left")
-    labels = (("passing", "validity check"), ("passing_best", "best possible limit"))
-    for number, (kind, (name, label)) in enumerate(product(kinds, labels)):
-        of_kind = [one for one in found if one.kind == kind]
-        rows = np.array([[getattr(one, name) for one in of_kind if one.share == share] for share in FOREIGN_SHARES])
-        mean = rows.mean(axis=1)
-        bars = mean - rows.min(axis=1), rows.max(axis=1) - mean
-        x = np.array(FOREIGN_SHARES) + 0.003 * (number - 1.5)
-        passing.errorbar(x, mean, yerr=bars, linewidth=1.4, elinewidth=0.8, label=f"{kind}: {label}", **look(number))
-    passing.set(
-        xlabel="share of the foreign frame", ylabel="share of the slices that passes",
-        title=f"mean of {len(origins)} origins (bars: lowest and highest)", ylim=(-0.04, 1.04),
-    )  # fmt: skip
-    passing.legend(fontsize=8.5, loc="upper right")
-    for panel in (clouds, passing):
-        panel.grid(alpha=0.25)
-    made.suptitle(f"Detectable share of a foreign frame: {title}")
     return made

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import Estimate, EstimatorSession, FrameSeries, Physics, fit
-from shearloop.bank.estimation.novelty import ReciprocityCheck
 from shearloop.daemon.analysis.charts import fault_sweeps, stability
 from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
@@ -109,48 +107,6 @@ def test_the_mean_of_similar_cells_does_not_hop_and_the_rims_are_swept(parts, ba
     for figure in (stability.sweeps_figure("rims", rims), stability.continuity_figure("slices", found)):
         assert len(figure.axes) >= 2
     assert json.dumps([one.hops for one in found])
-
-
-def drifting(n: int, seed: int) -> FrameSeries:
-    """Return slices that lie along two directions about a mean, with noise: what they leave of another is known."""
-    rng = np.random.default_rng(seed)
-    mean = rng.uniform(0.02, 0.1, 896)
-    frames = mean + rng.normal(size=(n, 2)) @ (0.004 * rng.normal(size=(2, 896))) + rng.normal(0.0, 0.004, (n, 896))
-    t_s = np.arange(float(n))
-    return FrameSeries(
-        "difference", ("right",), t_s, np.abs(frames)[:, None], t_s, np.linspace(0, 0.1, n), np.full(n, np.nan)
-    )
-
-
-@pytest.mark.usefixtures("fonts")
-def test_the_passing_share_of_a_foreign_frame_follows_from_its_size():
-    """Off the slices' directions nothing but the foreign part stands out: its square adds to that of the noise."""
-    series = drifting(100, 4)
-    found = stability.detect_mixtures(series, origins=(0.6,))
-    past, later = series.channels[:60, 0], series.channels[60:, 0]
-    opposite = PAPER_TABLE.electrodes[:, 0] >= 16
-    order = np.lexsort((PAPER_TABLE.electrodes[:, 2], PAPER_TABLE.electrodes[:, 0] % 16, opposite)).reshape(2, 448)
-    pairs, foreign = past[:, order].mean(axis=1), later.mean(axis=0)[np.random.default_rng(7).permutation(896)]
-    spread = np.sqrt(0.5 * pairs.var(axis=0) + 0.5 * np.median(pairs.var(axis=0)))
-    directions = np.linalg.svd((pairs - pairs.mean(axis=0)) / spread, full_matrices=False)[2][:12]
-
-    def off(frames: np.ndarray) -> np.ndarray:
-        scaled = (frames[..., order].mean(axis=-2) - pairs.mean(axis=0)) / spread
-        return scaled - scaled @ directions.T @ directions
-
-    limit = ReciprocityCheck.fit(past, PAPER_TABLE).largest_residual
-    own = [one for one in found if one.kind == "another fingertip"]
-    # What is off adds channel by channel: the two, in their shares.
-    expected = [
-        np.median(((1 - one.share) * off(later) + one.share * off(foreign)) ** 2, axis=1) / limit for one in own
-    ]
-    for one, misfits in zip(own, expected, strict=True):
-        np.testing.assert_allclose(one.misfits, misfits, rtol=1e-6)
-        assert one.passing <= (misfits <= 1.0).mean()
-    assert own[0].passing == 1.0
-    assert {one.passing for one in own if one.share >= 0.2} == {0.0}
-    assert {one.passing_best for one in own if one.share >= 0.2} == {0.0}
-    assert len(stability.detectability_figure("slices", found).axes) == 2
 
 
 def test_a_recording_that_no_estimator_can_be_calibrated_on_is_one_sentence(bank, tmp_path, capsys):

@@ -221,8 +221,8 @@ class Estimator(ABC):
     ) -> tuple[Self, IntervalRegressor, float]:
         """Return the torque's regressor on raw frames of numbered recordings (n,), and the estimator as it uses them.
 
-        The third value is the share of the torque's variance that a tool's motion leaves unexplained on later frames,
-        0 where that is not tested.
+        The third value is the share of the torque's variance that a tool's motion leaves unexplained on frames left
+        out, 0 where that is not tested.
         """
         # Without memory the gel's drift enters the torque, so validation uses later frames only.
         regressor = fit_interval_regressor(

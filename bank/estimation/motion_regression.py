@@ -51,7 +51,7 @@ _N_DIRECTIONS, _N_LAGS = 4, 12
 # A hundred features of a few directions need little penalty.
 _MOTION_STRENGTHS = (1e-6, 1e-5, 1e-4, 1e-3)
 # Positions drift between recordings, motion does not. So motion alone is preferred unless it leaves more than the first
-# share of the torque's variance unexplained on later frames and the position lowers the error by the second.
+# share of the torque's variance unexplained on frames left out and the position lowers the error by the second.
 _MOTION_MAY_LEAVE, _POSITION_MUST_GAIN = 0.5, 0.5
 # Directions of motion within recordings that the diameter's line shrinks, and the most frames that they are fitted to.
 _N_NUISANCE, _MOST_FRAMES = 16, 500

@@ -150,13 +150,13 @@ class Intervals:
         inflation: float,
         least_half_width: float = 0.0,
     ) -> Self:
-        """Fit to (n,) predictions and their residuals on later data; a stratum with few of them joins the next.
+        """Fit to (n,) predictions and their residuals on data left out; a stratum with few of them joins the next.
 
         Raises CalibrationError for too few residuals.
         """
         if len(residuals) < _LEAST_RESIDUALS:
             raise CalibrationError(
-                f"{len(residuals)} later frames are too few to determine the error; record more repeats"
+                f"{len(residuals)} frames left out of the fit are too few to determine the error; record more repeats"
             )
         kept: list[float] = []
         for edge in sorted(edges):

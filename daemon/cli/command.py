@@ -62,7 +62,11 @@ def run(args: argparse.Namespace) -> int:
     timeout_s = addresses.COMMAND_TIMEOUT_S if args.timeout is None else check_timeout_s(args.timeout)
     if args.name in ("stop", "status") and args.key is None and not addresses.needs_keys(address):
         # These two need no key on the daemon's own machine.
-        reply = send_to_stop_socket(address, request, timeout_s)
+        try:
+            reply = send_to_stop_socket(address, request, timeout_s)
+        except TimeoutError:
+            # The daemon may have stopped the motion by now. A second `stop` must not end the daemon.
+            request["spare_daemon"] = True
     else:
         keys = client_keys(args)
     if args.name == "unlock" and args.timeout is None:

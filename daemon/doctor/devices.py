@@ -245,7 +245,7 @@ def daemon_tasks(address: str) -> Mapping[str, Mapping[str, Any]] | None:
         request = {"command": "status"}
         reply = send_to_stop_socket(address, request, DAEMON_TIMEOUT_S)
         tasks = (reply or send_command(address, request, DAEMON_TIMEOUT_S)).get("tasks")
-    except UserError:
+    except (UserError, TimeoutError):
         return None
     return tasks if isinstance(tasks, dict) else {}
 

@@ -1,8 +1,7 @@
 """The stop socket: a Unix datagram socket that accepts `stop` and `status` from every user of this machine.
 
-A datagram needs no connection, so that the socket works when ZeroMQ's sockets are flooded and when the process has no
-descriptors left. Its abstract name follows from the address of `commands`. Requests and replies are those of the
-command server, one datagram each, without keys.
+A datagram needs no connection, so that the socket works when ZeroMQ's sockets are flooded. Its abstract name follows
+from the address of `commands`. Requests and replies are those of the command server, one datagram each, without keys.
 """
 
 import asyncio
@@ -13,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.client import decode_reply, no_reply
+from shearloop.daemon.messaging.client import decode_reply
 from shearloop.daemon.messaging.command_server import Handler, Reply, RequestExecutor
 from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import encode
@@ -61,7 +60,9 @@ class StopSocket:
 
     def _reply(self, client: Any, reply: Reply) -> None:
         try:
-            self._socket.sendto(encode(reply), client)
+            # Unread replies of a shared socket would fill its send buffer, and then nobody could get one.
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as own:
+                own.sendto(encode(reply), client)
         except OSError:
             self._refusals.counts["client does not read its replies"] += 1
 
@@ -73,17 +74,15 @@ class StopSocket:
 def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any] | None:
     """Send `stop` or `status` to the local daemon with this command address; return its reply, None without a daemon.
 
-    Raises UserError if no reply comes in time.
+    Raises TimeoutError if no reply comes in time.
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
         client.settimeout(timeout_s)
         # The kernel chooses an abstract name.
         client.bind("")
         try:
-            client.connect(stop_name(address))
-            client.send(encode(content))
-            return decode_reply(client.recv(_LARGEST_REPLY_BYTES), address)
+            # Without `connect`, after which only the bound socket itself could reply.
+            client.sendto(encode(content), stop_name(address))
         except ConnectionError:
             return None
-        except TimeoutError as error:
-            raise no_reply(address, timeout_s, None) from error
+        return decode_reply(client.recv(_LARGEST_REPLY_BYTES), address)

@@ -154,7 +154,8 @@ class Bridge:
         reply = None
         if not needs_keys(address):
             # A local daemon accepts it even without valid keys.
-            reply = await asyncio.to_thread(send_to_stop_socket, address, content, COMMAND_TIMEOUT_S)
+            with contextlib.suppress(TimeoutError):
+                reply = await asyncio.to_thread(send_to_stop_socket, address, content, COMMAND_TIMEOUT_S)
         return reply or await self._request(content, COMMAND_TIMEOUT_S)
 
     async def _request(self, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:

@@ -7,18 +7,21 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import ExitStack, closing, suppress
+from collections.abc import AsyncIterator
+from contextlib import ExitStack, asynccontextmanager, closing, suppress
 
 import pytest
+import zmq.asyncio
 from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.daemon.cli import main
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.client import receive_messages
-from shearloop.daemon.messaging.command_server import CommandRefusedError, Reply, Request
+from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer, Reply, Request
 from shearloop.daemon.messaging.connections import MAX_CONNECTIONS, RESERVED_DESCRIPTORS, most_connections
 from shearloop.daemon.messaging.keys import Refusals
+from shearloop.daemon.messaging.messages import encode
 from shearloop.daemon.messaging.stop_socket import StopSocket, send_to_stop_socket, stop_name
 from shearloop.daemon.process import MAX_DESCRIPTORS
 from tests.daemon.conftest import DEADLINE_S
@@ -69,36 +72,82 @@ async def test_stop_is_fast_in_a_flood_of_idle_connections(key, config):
     assert f"clients are connected to `{key}`; others wait until one has disconnected" in errors.decode()
 
 
-async def test_the_stop_socket_answers_in_a_flood_of_datagrams():
+@asynccontextmanager
+async def stop_socket(address: str, refusals: Refusals) -> AsyncIterator[None]:
+    """Serve the stop socket of a command address: `stop` is accepted and `start` refused."""
+
     async def handle(_request: Request) -> Reply:
         return {"stopped": "test"}
 
     async def refuse(_request: Request) -> Reply:
         raise CommandRefusedError("not here")
 
-    refusals, address = Refusals(), f"tcp://127.0.0.1:{free_port()}"
     stop = StopSocket(address, {"stop": handle, "start": refuse}, refusals)
-    with pytest.raises(UserError, match="is another daemon running"):
-        StopSocket(address, {}, refusals)
-    flooding = threading.Event()
-    flood = threading.Thread(target=send_garbage, args=(stop_name(address), flooding))
     serving = asyncio.create_task(stop.run())
-    flooding.set()
-    flood.start()
     try:
-        for name, reply in (("stop", {"ok": True, "stopped": "test"}), ("start", {"ok": False, "reason": "not here"})):
-            replied = await asyncio.to_thread(send_to_stop_socket, address, {"command": name}, DEADLINE_S)
-            assert replied == reply
-        assert sum(refusals.counts.values()) > 1
+        yield
     finally:
-        flooding.clear()
         serving.cancel()
         await asyncio.gather(serving, return_exceptions=True)
         stop.close()
-        flood.join()
+
+
+async def test_the_stop_socket_answers_in_a_flood_of_datagrams():
+    refusals, address = Refusals(), f"tcp://127.0.0.1:{free_port()}"
+    flooding = threading.Event()
+    flood = threading.Thread(target=send_garbage, args=(stop_name(address), flooding))
+    async with stop_socket(address, refusals):
+        with pytest.raises(UserError, match="is another daemon running"):
+            StopSocket(address, {}, refusals)
+        flooding.set()
+        flood.start()
+        try:
+            for name, reply in (
+                ("stop", {"ok": True, "stopped": "test"}),
+                ("start", {"ok": False, "reason": "not here"}),
+            ):
+                replied = await asyncio.to_thread(send_to_stop_socket, address, {"command": name}, DEADLINE_S)
+                assert replied == reply
+            assert sum(refusals.counts.values()) > 1
+        finally:
+            flooding.clear()
+            flood.join()
     assert send_to_stop_socket(address, {"command": "stop"}, DEADLINE_S) is None
     assert send_to_stop_socket("ipc:///" + "ä" * 500, {"command": "stop"}, DEADLINE_S) is None
     assert stop_name("tcp://0.0.0.0:7762") == stop_name("tcp://127.0.0.1:7762")
+
+
+async def test_a_client_that_reads_no_replies_does_not_keep_those_of_others(capsys):
+    address = f"tcp://127.0.0.1:{free_port()}"
+    async with stop_socket(address, Refusals()):
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as idle:
+            idle.bind("")
+            idle.connect(stop_name(address))
+            # Far more than the send buffer of a socket holds.
+            for _ in range(2000):
+                await asyncio.to_thread(idle.send, encode({"command": "start"}))
+            assert await asyncio.to_thread(main, ["command", "stop", "--connect", address]) == 0
+    assert capsys.readouterr().out.endswith("\nstop: stopped test\n")
+
+
+async def test_a_stop_without_a_reply_is_sent_again_and_spares_the_daemon():
+    received: list[Request] = []
+
+    async def stop(request: Request) -> Reply:
+        received.append(request)
+        return {}
+
+    with zmq.asyncio.Context() as context, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as silent:
+        server = CommandServer(context, "tcp://127.0.0.1:*", {"stop": stop}, Refusals())
+        silent.bind(stop_name(server.address))
+        serving = asyncio.create_task(server.run())
+        try:
+            assert await asyncio.to_thread(main, ["command", "stop", "--connect", server.address]) == 0
+        finally:
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+            server.close()
+    assert received == [{"command": "stop", "spare_daemon": True}]
 
 
 def open_connections(address: tuple[str, int], stack: ExitStack) -> None:

@@ -6,7 +6,6 @@ module is the reference in float64; `pruned_matching` is faster and is tested ag
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Self
 
@@ -87,7 +86,7 @@ class Matcher(ABC):
         """
         frames = unit_magnitudes(differences, self.n_channels)
         maps = np.full((len(frames), self.valid.size), np.nan)
-        for cells in self._chunks():
+        for cells in in_chunks(self._cells):
             maps[:, cells] = self._scores(frames, self._unit_signals(cells))
         # Rounding may carry a perfect fit past 1 by one bit.
         return np.clip(maps, 0.0, 1.0, out=maps).reshape(-1, *self.valid.shape)
@@ -95,10 +94,6 @@ class Matcher(ABC):
     def match(self, difference: ArrayLike) -> Match:
         """Return the maximum of one (n,) difference's heatmap and its runner-up. Errors as `heatmaps`."""
         return best_match(self.heatmap(difference), self.k_grid, self.sigma_grid)
-
-    def _chunks(self) -> Iterator[IntArray]:
-        for start in range(0, len(self._cells), CHUNK_CELLS):
-            yield self._cells[start : start + CHUNK_CELLS]
 
     def _unit_signals(self, cells: IntArray) -> FloatArray:
         magnitudes = self._magnitudes(cells)
@@ -137,6 +132,11 @@ class ZeroLagMatcher(Matcher):
 
     def _scores(self, frames: FloatArray, signals: FloatArray) -> FloatArray:
         return np.asarray(frames @ signals.T)
+
+
+def in_chunks(cells: IntArray, size: int = CHUNK_CELLS) -> list[IntArray]:
+    """Return (n,) cells in parts of at most `size`."""
+    return np.split(cells, range(size, len(cells), size))
 
 
 def unit_magnitudes(differences: ArrayLike, n_channels: int) -> FloatArray:

@@ -17,7 +17,7 @@ and a column (g, ‖g‖, t), so many bounds are one matrix product in float32.
 import heapq
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
 from operator import itemgetter
@@ -29,13 +29,13 @@ from scipy import fft, linalg
 
 from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from shearloop.bank.eit.matching import (
-    CHUNK_CELLS,
     RUNNER_UP_RADIUS,
     TIE,
     Match,
     Matcher,
     ReferenceMatcher,
     ZeroLagMatcher,
+    in_chunks,
     unit_magnitudes,
 )
 
@@ -68,6 +68,11 @@ class Candidates(NamedTuple):
     bounds: Float32Array
     frames: FloatArray
 
+    def where(self, keep: BoolArray) -> "Candidates":
+        """Return those that are among some of the bank's cells."""
+        kept = keep[self.cells]
+        return Candidates(self.cells[kept], self.bounds[kept], self.frames)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CompressedBank:
@@ -94,7 +99,7 @@ def compress(unit_signals: Callable[[IntArray], FloatArray], cells: IntArray) ->
     n = unit_signals(cells[:1]).shape[1]
     gram, total = np.zeros((n, n)), np.zeros(n)
     fitted = cells[:: max(len(cells) // _FITTED_CELLS, 1)]
-    for some in _chunks(fitted):
+    for some in in_chunks(fitted, _COMPRESSED_CELLS):
         part = unit_signals(some)
         gram += part.T @ part
         total += part.sum(axis=0)
@@ -108,7 +113,7 @@ def compress(unit_signals: Callable[[IntArray], FloatArray], cells: IntArray) ->
     basis = np.column_stack([mean, ascending[:, -2::-1]])
     found = []
     least, most = np.ones(n), np.zeros(n)
-    for some in _chunks(cells):
+    for some in in_chunks(cells, _COMPRESSED_CELLS):
         part = unit_signals(some)
         found.append(part @ basis)
         energy = np.cumsum(np.square(part), axis=1)
@@ -139,10 +144,6 @@ def columns(parts: NDArray[np.floating[Any]], squared_norms: FloatArray) -> Floa
     found[-2] = np.sqrt(across)
     found[-1] = np.sqrt(np.maximum(squared_norms - parts[0] ** 2 - across, 0.0) + _SQUARE_ROUNDING)
     return found
-
-
-def _chunks(cells: IntArray) -> Iterable[IntArray]:
-    return (cells[start : start + _COMPRESSED_CELLS] for start in range(0, len(cells), _COMPRESSED_CELLS))
 
 
 def _cell_rows(numbers: FloatArray) -> Float32Array:
@@ -196,29 +197,6 @@ def _squared_distances(points: Float32Array, place: Float32Array) -> Float32Arra
     apart = points - place
     squares: Float32Array = np.einsum("ij,ij->i", apart, apart)
     return squares
-
-
-class ZeroLagBounds:
-    """A unit frame (n,), bounded at lag 0 for all cells; frames (1, n) is that frame."""
-
-    def __init__(self, bank: CompressedBank, frame: FloatArray) -> None:
-        self._bank, self.frames = bank, frame[None]
-        parts = (bank.basis @ frame.astype(np.float32))[:, None]
-        self._fine = columns(parts, np.ones(1))[:, 0]
-        self._bounds = bank.coarse @ columns(parts[:COARSE_RANK], np.ones(1))[:, 0]
-
-    def leave_out(self, cells: BoolArray) -> None:
-        """Exclude some of all cells (n,) from now on."""
-        self._bounds[cells] = -np.inf
-
-    def seed(self) -> int:
-        """Return the cell of the highest bound."""
-        return int(self._bounds.argmax())
-
-    def candidates(self, score: float) -> Candidates:
-        """Return the cells that may reach a score."""
-        cells = np.flatnonzero(self._bounds >= score - ROUNDING)
-        return Candidates(cells, self._bank.fine.take(cells, axis=0) @ self._fine, self.frames)
 
 
 class AllLagsBounds:
@@ -308,7 +286,9 @@ class _PruningMatcher(Matcher):
         """
         super().__init__(signals, valid, k_grid, sigma_grid)
         self.compressed = compress(self._unit_signals, self._cells)
-        self._norms = np.concatenate([np.linalg.norm(self._magnitudes(cells), axis=1) for cells in self._chunks()])
+        self._norms = np.concatenate(
+            [np.linalg.norm(self._magnitudes(cells), axis=1) for cells in in_chunks(self._cells)]
+        )
         self._row, self._column = np.divmod(self._cells, valid.shape[1])
 
     def match(self, difference: ArrayLike) -> Match:
@@ -330,11 +310,7 @@ class _PruningMatcher(Matcher):
         likeliest = int(candidates.cells[candidates.bounds.argmax()])
         reached = max(reached, self.score(likeliest, candidates.frames))
         cells = candidates.cells[candidates.bounds >= reached - ROUNDING]
-        parts = [
-            self._highest_scores(cells[i : i + CHUNK_CELLS], candidates.frames)
-            for i in range(0, len(cells), CHUNK_CELLS)
-        ]
-        scores = np.concatenate(parts)
+        scores = np.concatenate([self._highest_scores(some, candidates.frames) for some in in_chunks(cells)])
         winner = int(np.argmax(scores >= scores.max() - TIE))
         return int(cells[winner]), min(float(scores[winner]), 1.0)
 
@@ -372,16 +348,17 @@ class PrunedZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
     """Matches at lag 0 alone. All cells are bounded at once: one lag takes few operations per cell."""
 
     def _search(self, frame: FloatArray) -> Match:
-        bounds = ZeroLagBounds(self.compressed, frame)
-        best = self._best(bounds)
-        outside = self._outside(best[0], RUNNER_UP_RADIUS)
-        bounds.leave_out(~outside)
-        return self._match(best, self._best(bounds) if outside.any() else None)
+        bounds = self.bounds(frame)
+        best = self._best_candidate(bounds, 0.0)
+        rest = bounds.where(self._outside(best[0], RUNNER_UP_RADIUS))
+        return self._match(best, self._best_candidate(rest, 0.0) if len(rest.cells) else None)
 
-    def _best(self, bounds: ZeroLagBounds) -> tuple[int, float]:
-        """Return the cell of the highest score among those not left out, and the score."""
-        reached = self.score(bounds.seed(), bounds.frames)
-        return self._best_candidate(bounds.candidates(reached), reached)
+    def bounds(self, frame: FloatArray) -> Candidates:
+        """Return all cells with their bounds for a unit frame (n,)."""
+        bank = self.compressed
+        parts = (bank.basis @ frame.astype(np.float32))[:, None]
+        bounds = bank.fine @ columns(parts, np.ones(1))[:, 0]
+        return Candidates(np.arange(len(bounds)), bounds, frame[None])
 
 
 class PrunedMatcher(_PruningMatcher, ReferenceMatcher):
@@ -404,6 +381,5 @@ class PrunedMatcher(_PruningMatcher, ReferenceMatcher):
         if far >= 0 and not outside[far]:
             _, least = bounds.seed(outside) or (-1, 0.0)
             candidates = bounds.candidates(least)
-        kept = outside[candidates.cells]
-        rest = Candidates(candidates.cells[kept], candidates.bounds[kept], candidates.frames)
+        rest = candidates.where(outside)
         return self._match(best, self._best_candidate(rest, least) if len(rest.cells) else None)

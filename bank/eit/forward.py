@@ -29,28 +29,20 @@ _GROUND = 0
 MAX_LEAK = 1e-11
 
 
-class CompleteElectrodeModel:
-    """The electrode potentials of a mesh with any number of electrodes, for any conductivity; keeps no state."""
+def electrode_potentials(mesh: Mesh, terms: Terms, conductivity: FloatArray, currents: FloatArray) -> FloatArray:
+    """Return the (L, R) potentials of the electrodes for (T,) conductivities and (L, R) currents into them.
 
-    def __init__(self, mesh: Mesh) -> None:
-        """Assemble the parts that do not depend on conductivity."""
-        self.mesh, self._terms = mesh, assemble(mesh)
-
-    def electrode_potentials(self, conductivity: FloatArray, currents: FloatArray) -> FloatArray:
-        """Return the (L, R) potentials of the electrodes for (T,) conductivities and (L, R) currents into them.
-
-        Currents must add up to zero over the electrodes. Raises ConductivityError where conductivity is not positive:
-        the matrix would be indefinite, its solution finite and meaningless.
-        """
-        require_positive(conductivity, len(self.mesh.triangles))
-        terms, n_electrodes = self._terms, self.mesh.n_electrodes
-        n = len(self.mesh.nodes) + n_electrodes
-        entries: Any = terms.values * np.append(conductivity, 1.0)[terms.source], (terms.rows, terms.columns)
-        free = np.delete(np.arange(n), _GROUND)
-        right = np.zeros((n, currents.shape[1]))
-        right[-n_electrodes:] = currents
-        factors = splu(sp.csc_array(entries, shape=(n, n))[free][:, free], **_LITTLE_FILL)
-        return np.asarray(factors.solve(right[free])[-n_electrodes:])
+    `terms` are the assembled mesh's. Currents must add up to zero over the electrodes. Raises ConductivityError where
+    conductivity is not positive: the matrix would be indefinite, its solution finite and meaningless.
+    """
+    require_positive(conductivity, len(mesh.triangles))
+    n = len(mesh.nodes) + mesh.n_electrodes
+    entries: Any = terms.values * np.append(conductivity, 1.0)[terms.source], (terms.rows, terms.columns)
+    free = np.delete(np.arange(n), _GROUND)
+    right = np.zeros((n, currents.shape[1]))
+    right[-mesh.n_electrodes :] = currents
+    factors = splu(sp.csc_array(entries, shape=(n, n))[free][:, free], **_LITTLE_FILL)
+    return np.asarray(factors.solve(right[free])[-mesh.n_electrodes :])
 
 
 class ForwardModel:
@@ -65,8 +57,7 @@ class ForwardModel:
             raise GeometryError(
                 f"the mesh has {mesh.n_electrodes} electrodes, but the channel table needs {table.n_electrodes}"
             )
-        self.mesh, self.table = mesh, table
-        self._solver = CompleteElectrodeModel(mesh)
+        self.mesh, self.table, self.terms = mesh, table, assemble(mesh)
         sink, source, self._positive, self._negative = table.electrodes.T
         # The second half of opposite injections is the first with the current reversed.
         patterns = table.n_electrodes // (2 if table.injection == "opposite" else 1)
@@ -82,7 +73,7 @@ class ForwardModel:
 
         Raises ConductivityError, before anything is solved, where conductivity is not positive.
         """
-        return self.channels_of(self._solver.electrode_potentials(conductivity, self.currents))
+        return self.channels_of(electrode_potentials(self.mesh, self.terms, conductivity, self.currents))
 
     def channels_of(self, potentials: FloatArray) -> FloatArray:
         """Return the (…, n) voltages of the (…, L, p) potentials that `currents` raise."""
@@ -112,13 +103,12 @@ class BatchForwardModel:
 
         self.mesh = mesh
         self.direct = ForwardModel(mesh, table)
-        terms = assemble(mesh)
-        place = elimination_order(mesh, terms)
+        place = elimination_order(mesh, self.direct.terms)
         # The node that the direct solve grounds is the last one here.
         n_nodes = len(mesh.nodes)
         place[n_nodes:] += 1
         place[place < 0] = n_nodes - 1
-        self._elimination = Elimination(terms.moved(place), n_nodes + mesh.n_electrodes, mesh.n_electrodes)
+        self._elimination = Elimination(self.direct.terms.moved(place), n_nodes + mesh.n_electrodes, mesh.n_electrodes)
 
     def voltages(self, conductivities: FloatArray) -> FloatArray:
         """Return the (m, n) voltages of (m, T) conductivities of the mesh's triangles.

@@ -16,7 +16,7 @@ from scipy.spatial import Delaunay
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.channels import INJECTION, ChannelTable, Injection
-from shearloop.bank.eit.mesh import Mesh
+from shearloop.bank.eit.mesh import Mesh, joined_edges
 from shearloop.bank.errors import GeometryError
 
 Side = Literal["left", "top", "right", "bottom"]
@@ -119,11 +119,7 @@ class RectangularFingertip:
         ends = np.array([end for place in self.electrodes if place.side in sides for end in self.ends_cm(place)])
         inside = np.sort(ends[(ends > _SAME_CM) & (ends < length - _SAME_CM)])
         stops = np.concatenate([[0.0], inside[np.diff(inside, prepend=0.0) > _SAME_CM], [length]])
-        pieces = [
-            np.linspace(start, end, max(1, int(np.ceil((end - start) / self.mesh_size_cm - _SAME_CM))), endpoint=False)
-            for start, end in pairwise(stops.tolist())
-        ]
-        lines = np.append(np.concatenate(pieces), stops[-1])
+        lines = np.append(_cut(stops, self.mesh_size_cm), stops[-1])
         for _ in range(_BOUNDARY_HALVINGS):
             lines = np.insert(lines, [1, len(lines) - 1], [lines[:2].mean(), lines[-2:].mean()])
         return lines
@@ -142,7 +138,7 @@ class RectangularFingertip:
             start, end = self.ends_cm(place)
             covered = nodes[(lines > start - _SAME_CM) & (lines < end + _SAME_CM)]
             edges.append(np.column_stack([covered[:-1], covered[1:]]))
-        return np.vstack(edges), np.repeat(np.arange(len(edges)), [len(each) for each in edges])
+        return joined_edges(edges)
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,11 +193,7 @@ class RoundFingertip:
         starts = np.deg2rad(self.angles_deg) - self.electrode_width_cm / self.diameter_cm
         ends = np.deg2rad(self.angles_deg) + self.electrode_width_cm / self.diameter_cm
         stops = np.sort(np.mod(np.concatenate([starts, ends]), 2 * np.pi))
-        pieces = [
-            np.linspace(start, end, max(1, int(np.ceil((end - start) * radius / size - _SAME_CM))), endpoint=False)
-            for start, end in pairwise([*stops.tolist(), stops[0] + 2 * np.pi])
-        ]
-        around = np.concatenate(pieces)
+        around = _cut(np.append(stops, stops[0] + 2 * np.pi), size / radius)
         n_around, n_rows = len(around), int(np.ceil(radius / size))
         spacing = radius / n_rows
         radii = radius - spacing * np.array([0.0, 0.25, 0.5, 1.0])[: n_rows + 2]
@@ -216,21 +208,30 @@ class RoundFingertip:
         within = Delaunay(nodes[innermost:]).simplices + innermost
         following = np.append(np.arange(1, n_around), 0)
         middles = around + np.diff(around, append=around[0] + 2 * np.pi) / 2
-        edges, of_edge = [], []
-        for electrode, (start, end) in enumerate(zip(starts, ends, strict=True)):
-            covered = np.flatnonzero(np.mod(middles - start, 2 * np.pi) < end - start)
-            edges.append(np.column_stack([covered, following[covered]]))
-            of_edge += [electrode] * len(covered)
+        covered = [
+            np.flatnonzero(np.mod(middles - start, 2 * np.pi) < end - start)
+            for start, end in zip(starts, ends, strict=True)
+        ]
+        edges, of_edge = joined_edges([np.column_stack([each, following[each]]) for each in covered])
         return Mesh(
             nodes=nodes,
             triangles=np.vstack([ring * n_around + place % n_around, within]),
-            electrode_edges=np.vstack(edges),
-            electrode_of_edge=np.array(of_edge),
+            electrode_edges=edges,
+            electrode_of_edge=of_edge,
             contact_impedance=np.full(len(self.angles_deg), self.contact_impedance),
         )
 
 
 Fingertip: TypeAlias = RectangularFingertip | RoundFingertip
+
+
+def _cut(stops: FloatArray, spacing: float) -> FloatArray:
+    """Return places from the first stop to before the last, at all stops and at most the spacing apart."""
+    pieces = [
+        np.linspace(start, end, max(1, int(np.ceil((end - start) / spacing - _SAME_CM))), endpoint=False)
+        for start, end in pairwise(stops.tolist())
+    ]
+    return np.concatenate(pieces)
 
 
 def _chessboard(columns: int, rows: int) -> IntArray:

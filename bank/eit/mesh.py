@@ -174,19 +174,14 @@ def _eidors_fields(path: Path) -> dict[str, Any]:
         ) from error
     if triangles.ndim != 2 or triangles.shape[1] != 3:
         raise GeometryError(f"{path}: the EIDORS model is not of triangles: elems has shape {triangles.shape}")
-    edges, of_edge = _edges_of_electrodes(boundary_edges(triangles), members)
-    return {
-        "nodes": nodes,
-        "triangles": triangles,
-        "electrode_edges": edges,
-        "electrode_of_edge": of_edge,
-        "contact_impedance": impedance,
-    }
+    # The boundary edges between an electrode's nodes are its own, as EIDORS reads them.
+    boundary = boundary_edges(triangles)
+    edges, of_edge = joined_edges([boundary[np.isin(boundary, own).all(axis=1)] for own in members])
+    return dict(zip(_FIELDS, (nodes, triangles, edges, of_edge, impedance), strict=True))
 
 
-def _edges_of_electrodes(boundary: IntArray, members: list[IntArray]) -> tuple[IntArray, IntArray]:
-    """Return the boundary edges between each electrode's nodes, as EIDORS reads them."""
-    edges = [boundary[np.isin(boundary, nodes).all(axis=1)] for nodes in members]
+def joined_edges(edges: list[IntArray]) -> tuple[IntArray, IntArray]:
+    """Return all electrodes' (E, 2) edges from those of each, and the electrode (E,) of each."""
     return np.vstack(edges), np.repeat(np.arange(len(edges)), [len(each) for each in edges])
 
 

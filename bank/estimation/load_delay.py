@@ -58,13 +58,21 @@ _NOISE_READINGS, _LEAST_QUIET = 64, 4
 class LoadDelay:
     """Delay of the torques after the frames' motion in s, its standard error, and the explained share of change.
 
-    few_frames is the number of gripped frames where they are too few to be sure, else 0.
+    late_s is the delay beyond the load cell's own one, 0 where that is usual. few_frames is the number of gripped
+    frames where they are too few to be sure, else 0.
     """
 
     delay_s: float
     error_s: float
     explained: float
+    late_s: float = 0.0
     few_frames: int = 0
+
+    @property
+    def text(self) -> str:
+        """The delay as a part of a sentence."""
+        apart = f"{abs(self.delay_s):.2f} ± {self.error_s:.2f} s {'before' if self.delay_s > 0 else 'after'}"
+        return f"the frames move {apart} the load that moves them is stamped"
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,13 +105,12 @@ def measure_timing(recordings: Sequence[FrameSeries], others: Sequence[FrameSeri
     if not any(_is_sure(delay) for _, delay in timed):
         timed = _sure_delays(others) or timed
     sure = [delay if _is_sure(delay) else None for _, delay in timed]
-    for (one, _), delay in zip(timed, sure, strict=True):
-        if delay is not None and (unusual := _unusual(one, delay)):
-            what, usual_s = unusual
+    for delay in sure:
+        if delay is not None and delay.late_s:
             raise CalibrationError(
-                f"{what}, and this load cell's own delay is {usual_s:.2f} s: a calibration would learn the torque of "
-                "another moment; correct the load cell's clock and record again, or calibrate with "
-                f"--load-cell-delay-s {delay.delay_s - usual_s:.2f}"
+                f"{delay.text}, and this load cell's own delay is {delay.delay_s - delay.late_s:.2f} s: a calibration "
+                "would learn the torque of another moment; correct the load cell's clock and record again, or "
+                f"calibrate with --load-cell-delay-s {delay.late_s:.2f}"
             )
     error_s = min((delay.error_s for delay in sure if delay is not None), default=np.inf)
     uncertainty_s = min(TWO_SIDED_95 * error_s, _UNCHECKED_S) if error_s > _LARGE_ERROR_S else 0.0
@@ -120,20 +127,14 @@ def find_load_delay(series: FrameSeries) -> LoadDelay | None:
         return None
     sides = (_delay_of_side(series, part, layer) for layer in range(len(series.sides)))
     best = max((one for one in sides if one is not None), key=lambda one: one.explained, default=None)
-    return best if best is None or n >= _SURE_FRAMES else replace(best, few_frames=n)
-
-
-def measured_delay(fingertips: Sequence[FrameSeries]) -> tuple[LoadDelay, float] | None:
-    """Return the delay in the series of the fingertip that shows it best, None where none is sure.
-
-    The second value is how far in s the torques are stamped later than a load cell stamps them, 0 if as usual.
-    """
-    found = _sure_delays(fingertips)
-    if not found:
+    if best is None:
         return None
-    series, delay = max(found, key=lambda each: each[1].explained)
-    unusual = _unusual(series, delay)
-    return delay, delay.delay_s - unusual[1] if unusual else 0.0
+    return replace(best, late_s=_lateness(series, best), few_frames=0 if n >= _SURE_FRAMES else n)
+
+
+def measured_delay(fingertips: Sequence[FrameSeries]) -> LoadDelay | None:
+    """Return the delay in the series of the fingertip that shows it best, None where none is sure."""
+    return max((delay for _, delay in _sure_delays(fingertips)), key=lambda one: one.explained, default=None)
 
 
 def _sure_delays(recordings: Sequence[FrameSeries]) -> list[tuple[FrameSeries, LoadDelay]]:
@@ -160,14 +161,10 @@ def _doubt(series: FrameSeries, found: LoadDelay | None) -> str:
     """Return why a delay is unusual. With few gripped frames it can be chance: a warning and not a refusal."""
     if found is None or (found.few_frames and found.explained < _WARN_EXPLAINED):
         return series.load_doubt
-    if not (unusual := _unusual(series, found)):
+    if not found.late_s:
         return ""
-    what, usual_s = unusual
     sure = f" (though {found.few_frames} gripped frames are too few to be sure)" if found.few_frames else ""
-    return (
-        f"{what}{sure}; check the load cell's clock, or calibrate with --load-cell-delay-s "
-        f"{found.delay_s - usual_s:.2f}"
-    )
+    return f"{found.text}{sure}; check the load cell's clock, or calibrate with --load-cell-delay-s {found.late_s:.2f}"
 
 
 def torque_bounds(series: FrameSeries, uncertainty_s: float) -> tuple[FloatArray, FloatArray]:
@@ -178,18 +175,14 @@ def torque_bounds(series: FrameSeries, uncertainty_s: float) -> tuple[FloatArray
     return np.min(found, axis=0), np.max(found, axis=0)
 
 
-def _unusual(series: FrameSeries, found: LoadDelay) -> tuple[str, float] | None:
-    """Return what is unusual as a sentence, and the load cell's own delay; None for a usual delay."""
+def _lateness(series: FrameSeries, found: LoadDelay) -> float:
+    """Return the delay beyond the load cell's own one in s, 0 for a usual delay."""
     period_s = float(np.median(np.diff(series.torque_t_s)))
     earliest_s, latest_s = (each * period_s for each in _USUAL_PERIODS[is_filtered(series.torque_nm)])
     tolerance_s = _STAMPS_S + _CERTAIN * found.error_s
     if earliest_s - tolerance_s <= found.delay_s <= latest_s + tolerance_s:
-        return None
-    order = "before" if found.delay_s > 0 else "after"
-    what = (
-        f"the frames move {abs(found.delay_s):.2f} ± {found.error_s:.2f} s {order} the load that moves them is stamped"
-    )
-    return what, (earliest_s + latest_s) / 2
+        return 0.0
+    return found.delay_s - (earliest_s + latest_s) / 2
 
 
 def is_filtered(torque_nm: FloatArray) -> bool | None:

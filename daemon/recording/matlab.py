@@ -228,15 +228,14 @@ def import_mat(sources: Sequence[Path], out: Path) -> ImportResult:
     load = _valid_load(load, remarks)
     arrivals = {side: [round(float(unix_s) * 1e9) for unix_s in one.unix_s] for side, one in streams.items()}
     middles = {side: frame_middles(one) for side, one in arrivals.items()}
-    found = measured_delay([_series_of_side(side, one, middles[side], load) for side, one in streams.items()])
-    delay, late_s = found or (None, 0.0)
-    if delay is not None and late_s:
-        load = replace(load, unix_s=load.unix_s - late_s)
+    delay = measured_delay([_series_of_side(side, one, middles[side], load) for side, one in streams.items()])
+    if delay is not None and delay.late_s:
+        load = replace(load, unix_s=load.unix_s - delay.late_s)
         remarks.append(
-            f"The load was stamped {late_s:.2f} ± {delay.error_s:.2f} s too late against the gel's motion, "
+            f"The load was stamped {delay.late_s:.2f} ± {delay.error_s:.2f} s too late against the gel's motion, "
             "and its times were corrected."
         )
-    if found is None and not sure:
+    if delay is None and not sure:
         notes[LOAD_DOUBT_NOTE] = LOAD_DOUBT
     if remarks:
         notes["remarks"] = " ".join(remarks)

@@ -165,27 +165,24 @@ class _Models:
     def in_2d(self, shear_n: FloatArray, normal_n: float, friction: float | None = None) -> FloatArray:
         return gauge_responses(self.skin, states_along(self.skin, normal_n, shear_n.tolist(), friction=friction))
 
+    def both(self, shear_n: FloatArray, normal_n: float) -> list[FloatArray]:
+        return [self.in_1d(shear_n, normal_n), self.in_2d(shear_n, normal_n)]
+
     def curve(self, shear_n: FloatArray, normal_n: float) -> ResponseCurve:
-        return ResponseCurve(
-            shear_n,
-            self.in_1d(shear_n, normal_n),
-            self.in_2d(shear_n, normal_n),
-            self.in_2d(shear_n, normal_n, friction=0.0),
-        )
+        in_1d, in_2d = self.both(shear_n, normal_n)
+        return ResponseCurve(shear_n, in_1d, in_2d, self.in_2d(shear_n, normal_n, friction=0.0))
 
 
 def _model_rows(models: _Models, fully_loaded: ContactState) -> list[FigureOfMerit]:
     skin = models.skin
-
-    def lines(normal_n: float) -> list[tuple[FloatArray, FloatArray]]:
-        shear_n = loading(PAPER_LINEAR_N)
-        return [(shear_n, model(shear_n, normal_n)) for model in (models.in_1d, models.in_2d)]
-
+    straight, near = loading(PAPER_LINEAR_N), np.array([0.02])
     rows = []
     for normal_n, measured in PAPER_MEASURED_SENSITIVITY.items():
-        slopes, name = (origin_slope(*line) for line in lines(normal_n)), "sensitivity, fit through origin"
-        rows.append(FigureOfMerit(f"{name}, Fn = {normal_n} N", "1/N", "0.078", measured, *slopes))
-    fitted = [fit_line(*line) for line in lines(1.0)]
+        slopes = (origin_slope(straight, found) for found in models.both(straight, normal_n))
+        name = f"sensitivity, fit through origin, Fn = {normal_n} N"
+        rows.append(FigureOfMerit(name, "1/N", "0.078", measured, *slopes))
+    fitted = [fit_line(straight, found) for found in models.both(straight, 1.0)]
+    in_deadband = [origin_slope(near, found) for found in models.both(near, 1.0)]
     strain = line_strain(skin, fully_loaded)
     flank = strain[(skin.line_deg > 15) & (skin.line_deg < 75)]
     falls = 100 * (1 - float(np.exp(-models.membrane.belt.friction * np.radians(60))))
@@ -198,7 +195,7 @@ def _model_rows(models: _Models, fully_loaded: ContactState) -> list[FigureOfMer
         *rows,
         FigureOfMerit("slope beyond the deadband, Fn = 1 N", "1/N", "", "", *(line.slope_per_n for line in fitted)),
         FigureOfMerit("slope without friction", "1/N", "0.088", "", *without),
-        FigureOfMerit("slope within the deadband, Fn = 1 N", "1/N", "0", "0", *_deadband_slopes(models)),
+        FigureOfMerit("slope within the deadband, Fn = 1 N", "1/N", "0", "0", *in_deadband),
         FigureOfMerit("deadband, Fn = 1 N", "N", "0.04", "0.04", *(line.kink_n for line in fitted)),
         FigureOfMerit("response at 1.6 N above the line, Fn = 1 N", "%", "", "< 30", *_upturns(models)),
         FigureOfMerit("fall of tension between 75° and 15°", "%", "< 4", "", falls, 100 * np.ptp(flank) / flank.max()),
@@ -213,16 +210,10 @@ def _model_rows(models: _Models, fully_loaded: ContactState) -> list[FigureOfMer
     ]
 
 
-def _deadband_slopes(models: _Models) -> list[float]:
-    """Return the slopes over the first half of the deadband."""
-    shear_n = np.array([0.02])
-    return [float(model(shear_n, 1.0)[0] / 0.02) for model in (models.in_1d, models.in_2d)]
-
-
 def _upturns(models: _Models) -> list[float]:
     """Return by how much (%) the last response of a loading to 1.6 N exceeds the line through the origin to 1.2 N."""
     shear_n, straight = loading(1.6), slice(len(loading(PAPER_LINEAR_N)))
-    found = [model(shear_n, 1.0) for model in (models.in_1d, models.in_2d)]
+    found = models.both(shear_n, 1.0)
     return [100 * (each[-1] / (1.6 * origin_slope(shear_n[straight], each[straight])) - 1) for each in found]
 
 
@@ -233,8 +224,8 @@ def _prediction_rows(models: _Models) -> list[FigureOfMerit]:
         return fit_line(shear_n, response).prediction_half_width_n(0.0)
 
     both_ways = np.concatenate([-up, up])
-    loaded = [half_width(both_ways, np.concatenate([-y, y])) for y in (models.in_1d(up, 1.0), models.in_2d(up, 1.0))]
-    cycled = [half_width(around, model(around, 1.0)) for model in (models.in_1d, models.in_2d)]
+    loaded = [half_width(both_ways, np.concatenate([-y, y])) for y in models.both(up, 1.0)]
+    cycled = [half_width(around, found) for found in models.both(around, 1.0)]
     return [
         FigureOfMerit("95 % prediction interval", "± N", "", "0.0802"),
         FigureOfMerit("  from friction alone, loading ± 1 N", "± N", "", "", *loaded),

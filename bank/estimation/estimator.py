@@ -34,7 +34,7 @@ from shearloop.bank.estimation.interval_regressor import (
     fit_interval_regressor,
 )
 from shearloop.bank.estimation.novelty import NoveltyDetector
-from shearloop.bank.estimation.regressors import ChannelImputer, later_origins
+from shearloop.bank.estimation.regressors import ChannelImputer, later_origins, left_out_groups
 from shearloop.bank.estimation.session_state import Motion, ProcessedFrame
 
 if TYPE_CHECKING:
@@ -248,9 +248,8 @@ class Estimator(ABC):
         diameters = np.array([row.diameter_mm for row in rows])
         features = np.array([row.features for row in rows])
         # A new grip is another recording, not a later part of this one.
-        number = np.array([row.recording for row in rows])
-        each = [(np.flatnonzero(number != one), np.flatnonzero(number == one)) for one in np.unique(number)]
-        left_out = [pair for pair in each if len(np.unique(diameters[pair[0]])) >= LEAST_LEFT]
+        recordings = left_out_groups(np.array([row.recording for row in rows]))
+        left_out = [pair for pair in recordings if len(np.unique(diameters[pair[0]])) >= LEAST_LEFT]
         regressor = fit_interval_regressor(
             features[:, self.columns["diameter"]],
             diameters,

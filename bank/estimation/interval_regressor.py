@@ -20,11 +20,7 @@ from scipy.special import stdtrit
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.regressors import (
-    InverseCalibration,
-    later_splits,
-    left_out_blocks,
-)
+from shearloop.bank.estimation.regressors import InverseCalibration, later_splits, left_out_blocks, left_out_groups
 from shearloop.bank.estimation.values import INLINE
 from shearloop.bank.gain import LOADED_SHARE, GainCorrection, GainSpread, find_twists, loaded_gain
 from shearloop.bank.polynomial import TWO_SIDED_95, Polynomial
@@ -202,6 +198,10 @@ class ValueRange:
     low_end: float = -math.inf
     high_end: float = math.inf
 
+    def scaled(self, factor: float) -> "ValueRange":
+        """Return the range of values larger by a factor, whose predictions hide nothing."""
+        return ValueRange(*(factor * end for end in (self.low, self.high, self.lowest, self.highest)))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IntervalRegressor:
@@ -234,20 +234,17 @@ class IntervalRegressor:
         """
         rows = features[None] if complete is None else np.array([features, complete])
         raws = self.point.predict(rows)
-        lever = self.point if isinstance(self.point, CensoredRidge) else None
-        # No torque where the lever would not touch.
-        reported = raws if lever is None else lever.sign * np.maximum(raws, 0.0)
-        raw, (value, *others) = float(raws[0]), reported.tolist()
+        raw, (value, *others) = float(raws[0]), _reported(self.point, raws).tolist()
         widening = 1.0 / math.sqrt(max(usable_share, 0.1))
-        half = widening * float(self.intervals.half_widths[self.intervals.edges.searchsorted(raw)])
+        half = widening * self.intervals.half_width(raw)
         moved = others[0] - value if others else 0.0
         down, up = self.gain.reach(value)
         below, above = math.hypot(half, down) + max(-moved, 0.0), math.hypot(half, up) + max(moved, 0.0)
         if self.misses_loads:
             below, above = below + max(value - self.range.low, 0.0), above + max(self.range.high - value, 0.0)
-        if lever is not None and raw < 0:
-            other_way = widening * TWO_SIDED_95 * lever.sigma - raw
-            below, above = (max(below, other_way), above) if lever.sign > 0 else (below, max(above, other_way))
+        if isinstance(self.point, CensoredRidge) and raw < 0:
+            other_way = widening * TWO_SIDED_95 * self.point.sigma - raw
+            below, above = (max(below, other_way), above) if self.point.sign > 0 else (below, max(above, other_way))
         span = self.range
         if value <= span.low_end:
             below = math.inf
@@ -262,7 +259,7 @@ class IntervalRegressor:
 
     def scaled(self, factor: float, spread: float) -> "IntervalRegressor":
         """Return the regressor of values larger by a factor, whose gain and zero have this spread."""
-        point, span = self.point, self.range
+        point = self.point
         if isinstance(point, CensoredRidge):
             point = replace(point, sigma=factor * point.sigma)
         if isinstance(point, InverseCalibration):
@@ -271,7 +268,7 @@ class IntervalRegressor:
             self,
             point=replace(point, weights=factor * point.weights, offset=factor * point.offset),
             intervals=Intervals(factor * self.intervals.edges, factor * self.intervals.half_widths),
-            range=ValueRange(*(factor * end for end in (span.low, span.high, span.lowest, span.highest))),
+            range=self.range.scaled(factor),
             gain=replace(self.gain, between=spread, zero=spread, noise_nm=factor * self.gain.noise_nm),
         )
 
@@ -283,20 +280,19 @@ class IntervalRegressor:
         `sides` (d,) is the side of each feature. Raises CalibrationError without a load that is large enough to show
         the gain.
         """
-        point, span = self.point, self.range
-        least_nm = LOADED_SHARE * max(abs(span.low), abs(span.high))
+        point = self.point
+        least_nm = LOADED_SHARE * max(abs(self.range.low), abs(self.range.high))
         twists = [one for one in find_twists(torque_nm) if np.abs(torque_nm[one]).max() >= least_nm]
         if isinstance(point, InverseCalibration) or not twists:
             raise CalibrationError(
                 f"no twist reaches {least_nm:.3g} N·m while an estimate is possible; twist further, some seconds "
                 "after the grip"
             )
-        lever = isinstance(point, CensoredRidge)
         sign = point.sign if isinstance(point, CensoredRidge) else 1.0
         m, weighted = int(sides.max()) + 1, features * point.weights
         constant = point.offset - float(point.mean @ point.weights)
         parts = np.array([weighted[:, sides == side].sum(axis=1) + constant / m for side in range(m)]).T
-        correction = self.gain.correct(parts, sign * torque_nm, twists, bounded=lever)
+        correction = self.gain.correct(parts, sign * torque_nm, twists, bounded=isinstance(point, CensoredRidge))
         factors, loaded = correction.factors, np.concatenate(twists)
         # Torques of both directions would cancel in a sum.
         before = parts[loaded].sum(axis=1)
@@ -307,7 +303,7 @@ class IntervalRegressor:
             self,
             point=replace(point, weights=weights, offset=offset),
             intervals=Intervals(self.intervals.edges * total, self.intervals.half_widths * larger),
-            range=ValueRange(*(larger * end for end in (span.low, span.high, span.lowest, span.highest))),
+            range=self.range.scaled(larger),
             gain=correction.spread,
         )
         return adapted, correction
@@ -431,8 +427,7 @@ def _check_values(values: FloatArray) -> None:
 def _gains_of_recordings(features: FloatArray, values: FloatArray, recordings: IntArray, refit: Refit) -> list[float]:
     """Return the gain of each recording that the others can predict."""
     gains: list[float] = []
-    for one in np.unique(recordings):
-        kept, out = np.flatnonzero(recordings != one), np.flatnonzero(recordings == one)
+    for kept, out in left_out_groups(recordings):
         if len(kept) and np.ptp(values[kept]) > 0 and np.ptp(values[out]) > 0:
             part = refit(kept)
             gains.append(loaded_gain(_reported(part, part.predict(features[out])), values[out]))

@@ -62,12 +62,10 @@ class ReciprocityCheck:
 
     @classmethod
     def _model(cls, differences: FloatArray, table: ChannelTable, largest_residual: float) -> Self:
-        pairs = table.twin_means(differences)
-        mean, variance = pairs.mean(axis=0), pairs.var(axis=0)
-        # Shrink towards the median: few slices determine a channel's own variance badly.
-        spread = np.sqrt(0.5 * variance + 0.5 * np.median(variance) + np.finfo(np.float64).tiny)
-        directions = np.linalg.svd((pairs - mean) / spread, full_matrices=False)[2]
-        return cls(table, mean, spread, directions[: min(_RECIPROCITY_DIRECTIONS, len(pairs) // 2)], largest_residual)
+        mean, spread, _, directions = _principal_components(table.twin_means(differences))
+        return cls(
+            table, mean, spread, directions[: min(_RECIPROCITY_DIRECTIONS, len(differences) // 2)], largest_residual
+        )
 
     def residual(self, difference: FloatArray, usable: BoolArray) -> float:
         """Return the median squared residual of a (c,) difference off the directions."""
@@ -138,11 +136,8 @@ class NoveltyDetector:
 
     @classmethod
     def _model(cls, differences: FloatArray) -> Self:
-        mean, rank = differences.mean(axis=0), min(_MOST_DIRECTIONS, len(differences) // 4)
-        variance = differences.var(axis=0)
-        # Shrink towards the median: few frames determine a channel's own variance badly.
-        spread = np.sqrt(0.5 * variance + 0.5 * np.median(variance))
-        _, s, vt = np.linalg.svd((differences - mean) / spread, full_matrices=False)
+        mean, spread, s, vt = _principal_components(differences)
+        rank = min(_MOST_DIRECTIONS, len(differences) // 4)
         if np.sqrt((s[rank:] ** 2).sum()) <= _LEAST_NOISE * s[0]:
             raise CalibrationError(
                 "the slices have no noise: they are multiples or sums of a few; record slices as they come"
@@ -221,6 +216,15 @@ class NoveltyDetector:
 
 def _refused(reason: str) -> Novelty:
     return Novelty((reason,))
+
+
+def _principal_components(rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return mean (c,), spread (c,), singular values and directions of (n, c) rows, the latter in units of spread."""
+    mean, variance = rows.mean(axis=0), rows.var(axis=0)
+    # Shrink towards the median: few frames determine a channel's own variance badly.
+    spread = np.sqrt(0.5 * variance + 0.5 * np.median(variance) + np.finfo(np.float64).tiny)
+    _, s, directions = np.linalg.svd((rows - mean) / spread, full_matrices=False)
+    return mean, spread, s, directions
 
 
 def _coordinates(directions: FloatArray, values: FloatArray, usable: BoolArray) -> FloatArray:

@@ -200,11 +200,14 @@ class ChannelImputer:
         return np.where(usable, difference, self.mean + moved), np.where(usable, 0.0, errors)
 
 
-def left_out_blocks(n: int) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield (rest, block) for N_BLOCKS blocks of n rows, each one stretch of time."""
-    block = np.arange(n) * N_BLOCKS // n
-    for one in range(N_BLOCKS):
-        yield np.flatnonzero(block != one), np.flatnonzero(block == one)
+def left_out_groups(numbers: IntArray) -> list[tuple[IntArray, IntArray]]:
+    """Return (rest, group) for each group of rows, from the group's number of each of (n,) rows."""
+    return [(np.flatnonzero(numbers != one), np.flatnonzero(numbers == one)) for one in np.unique(numbers)]
+
+
+def left_out_blocks(n: int) -> list[tuple[IntArray, IntArray]]:
+    """Return (rest, block) for N_BLOCKS blocks of n rows, each one stretch of time."""
+    return left_out_groups(np.arange(n) * N_BLOCKS // n)
 
 
 def later_origins(n: int) -> list[tuple[IntArray, IntArray]]:

@@ -98,7 +98,7 @@ def searched_settings(model: str, height: float, places: FloatArray = _PLACES) -
 
 
 def simulated_signals(forward: BatchForwardModel, model: str, settings: Sequence[Setting]) -> FloatArray:
-    """Return the (m, n) difference signals of the settings whose conductivity is positive everywhere."""
+    """Return the (m, n) difference signals of the settings with a positive conductivity everywhere."""
     of = ConductivityModel(forward.mesh)
     cells = [cell for cell in (of.conductivity(model, *one) for one in settings) if cell.min() > 0]
     voltages = forward.voltages(np.array([np.ones(len(forward.mesh.triangles)), *cells]))
@@ -374,7 +374,7 @@ def _mesh_choice(fingertip: Fingertip, model: str, place: Setting, noise: float)
 def _count_choice(
     forward: BatchForwardModel, model: str, middle: Setting, name: str, ends: tuple[float, float], noise: float
 ) -> DesignChoice:
-    """Choose the number of cells along `name` (k or sigma): the error is that of a frame half-way between two cells."""
+    """Choose the number of cells along `name` (k or sigma), by the error of a frame half-way between two cells."""
     steps, unit = [], getattr(MODELS[model], f"{name}_unit")
     for count in COUNTS:
         spacing = (ends[1] - ends[0]) / (count - 1)
@@ -384,7 +384,7 @@ def _count_choice(
             np.abs(simulated_signals(forward, model, [middle._replace(**{name: at}) for at in (v, v + spacing / 2)]))
             for v in places
         )
-        # A cell whose conductivity would not be positive does not exist.
+        # A bank has no cells where the conductivity is not positive.
         found = [_shape_error(*pair) for pair in pairs if len(pair) == 2]
         if not found:
             raise CalibrationError(

@@ -20,8 +20,8 @@ LANES: Final = 8
 class _Plan(NamedTuple):
     """The factor's entries, column by column from the diagonal down: their rows, and where each column starts.
 
-    by_row are those of eliminated columns below the diagonal, row by row; each row starts at row_starts, and the column
-    of each ends at ends.
+    by_row holds the entries of eliminated columns below the diagonal, row by row; each row starts at row_starts, and
+    the column of each ends at ends.
     """
 
     rows: NDArray[np.uint32]
@@ -91,7 +91,7 @@ def _structures(lower: Terms, n: int, eliminated: int) -> list[IntArray]:
 
 @compiled
 def _factorise(plan: _Plan, work: FloatArray, kept: int) -> None:
-    """Replace the (entries, LANES) lower triangles in `work` by Cholesky factors, and the last columns by what is left.
+    """Replace the (entries, LANES) lower triangles in `work` by Cholesky factors, the last columns by Schur complements.
 
     A column begins as its own entries; each earlier column with an entry in its row then subtracts its products.
     """

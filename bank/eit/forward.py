@@ -1,7 +1,7 @@
 """The forward model: from conductivity to voltages, by linear finite elements and the complete electrode model.
 
-Cheng, Isaacson, Newell and Gisser 1989; Somersalo, Cheney and Isaacson 1992. With u the potential inside, U_e that of
-electrode e with contact impedance z_e, and I_e the current into it, for all test functions (v, V):
+Cheng, Isaacson, Newell and Gisser 1989; Somersalo, Cheney and Isaacson 1992. With u the potential inside, U_e the
+potential of electrode e, z_e its contact impedance and I_e the current into it, for all test functions (v, V):
 
     ∫ s ∇u·∇v dx + Σ_e 1/z_e ∫_e (u − U_e)(v − V_e) ds = Σ_e I_e V_e
 """
@@ -131,7 +131,7 @@ class BatchForwardModel:
 
 
 def rounding_leaks(schur: FloatArray) -> FloatArray:
-    """Return the largest current, of (n, L, L) matrices, that equal potentials drive, over that of one potential."""
+    """Return the largest current, of (n, L, L) matrices, that equal potentials drive, over the current of one."""
     with np.errstate(invalid="ignore", divide="ignore"):
         leaks = np.abs(schur.sum(axis=2)) / np.einsum("nii->ni", schur)
         return np.asarray(np.where((leaks >= 0).all(axis=1), leaks.max(axis=1), np.inf))

@@ -181,7 +181,7 @@ def _eidors_fields(path: Path) -> dict[str, Any]:
 
 
 def joined_edges(edges: list[IntArray]) -> tuple[IntArray, IntArray]:
-    """Return all electrodes' (E, 2) edges from those of each, and the electrode (E,) of each."""
+    """Return the (E, 2) edges of all electrodes, and the electrode (E,) of each edge."""
     return np.vstack(edges), np.repeat(np.arange(len(edges)), [len(each) for each in edges])
 
 

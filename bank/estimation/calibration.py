@@ -1,6 +1,6 @@
 """Calibration of one estimator: its fingertips, its outputs, and its file.
 
-The file is a zip of a YAML header and NumPy arrays, whose checksums the zip holds. It keeps any tree of frozen
+The file is a zip of a YAML header and NumPy arrays; the zip holds their checksums. It keeps any tree of frozen
 dataclasses of numbers, texts, tuples and arrays. Equal calibrations are equal bytes: no dates, fixed order, no
 compression.
 """
@@ -69,7 +69,7 @@ class Calibration:
     tools: ToolLaw | None = None
 
     def for_tool(self, tool: Measured | None) -> Self:
-        """Return the calibration for a tool, or itself where it is for it; raises CalibrationError for another tool.
+        """Return the calibration for a tool, itself where it is made for that tool; else raises CalibrationError.
 
         On a tool of another diameter the same motion of the gel is another torque: four times as much on one of 10 mm
         as on one of 20 mm.
@@ -93,7 +93,7 @@ class Calibration:
         return replace(self, torque=replace(self.torque, regressor=regressor), tools=None, tool_mm=tool.value)
 
     def gain_regressor(self) -> IntervalRegressor:
-        """Return the torque's regressor, whose gain twists can correct; raises CalibrationError without one."""
+        """Return the torque's regressor, for a correction of its gain; raises CalibrationError without one."""
         if self.kind == "raw" and self.torque is not None and isinstance(self.torque.regressor, IntervalRegressor):
             return self.torque.regressor
         raise CalibrationError("only the torque of raw frames has a gain to correct; calibrate on raw recordings")

@@ -199,7 +199,7 @@ class ValueRange:
     high_end: float = math.inf
 
     def scaled(self, factor: float) -> "ValueRange":
-        """Return the range of values larger by a factor, whose predictions hide nothing."""
+        """Return the range of values larger by a factor, where no prediction hides a value."""
         return ValueRange(*(factor * end for end in (self.low, self.high, self.lowest, self.highest)))
 
 

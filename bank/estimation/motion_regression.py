@@ -127,7 +127,7 @@ class TemporalFeatures(Motion):
 class MotionRegression(Estimator):
     """A ridge on the gel's motion over the last frames; for slices a curve of frames over the value.
 
-    temporal is None for slices.
+    Slices have no temporal features.
     """
 
     name: ClassVar[str] = "motion_regression"
@@ -297,7 +297,7 @@ def fit_line(grips: Sequence[CylinderGrip], table: ChannelTable) -> Ridge:
 
 
 def _noise_reduction(n_sides: int, table: ChannelTable) -> FloatArray:
-    """Return the (m·c, m·c/2) matrix that smooths m sides' channels and averages those of one voltage."""
+    """Return the (m·c, m·c/2) matrix that smooths m sides' channels and averages channels of one voltage."""
     smoothed = smoothed_along_channels(np.eye(table.n_channels))
     return np.asarray(np.kron(np.eye(n_sides), table.twin_means(smoothed)))
 

@@ -3,9 +3,8 @@
 The curve is a straight line through the origin up to 1.2 N. Beyond, to 5 N and more, it has as many straight pieces as
 the recorded data support. Rising straight pieces invert without iteration. The fit reads a table of recorded
 resistances and forces: the belt's two plays turn the forces into the tension at the gauges, friction included, and
-leave the coefficient of friction and the curve to be fitted. The stretched gauge gives the angle by which the load has
-turned with the skin, in the fit and in the inverse. scipy.optimize is imported only to fit: the daemon loads
-calibrations.
+leave the coefficient of friction and the curve to be fitted. The load turns with the skin. The stretched gauge gives
+its angle, in the fit and in the inverse. scipy.optimize is imported only to fit: the daemon loads calibrations.
 
 Friction gives one response a band of forces. A rising or falling response proves slip, and the force is at an end of
 the band. A constant one leaves it anywhere within: it is then taken to be at its last known place, moved no further
@@ -273,7 +272,7 @@ def _slack_at(response: float, knots: Sequence[float], slack: Sequence[float]) -
 def _fit_slack(changes: FloatArray, knots: FloatArray) -> tuple[FloatArray, float]:
     """Return the slack gauge's change at the curve's responses (knots,), and ± its 95 % interval.
 
-    `changes` (rows, 2) are those of both gauges.
+    `changes` (rows, 2) has a column for each gauge.
     """
     response, slack = changes[:, 0] - changes[:, 1], changes.min(axis=1)
     hats = np.eye(len(knots))
@@ -304,7 +303,7 @@ def _changes(table: CalibrationTable) -> tuple[FloatArray, IntArray]:
 
 
 def turned_rad(stretched: FloatArray | float) -> FloatArray:
-    """Return the angle by which the load has turned about the core, from the stretched gauge's change λ² − 1.
+    """Return the load's angle about the core, from the stretched gauge's change λ² − 1.
 
     The load moves by the lengthening of a quarter of the ring, π/2 (λ − 1).
     """
@@ -330,8 +329,8 @@ def _tensions(forces: FloatArray, friction: float) -> FloatArray:
 class _CurveFit:
     """Response against tension in straight pieces: one through the origin, others beyond its ends.
 
-    forces are rows as `_tensions` takes them; response (m,) are those of the rows kept; upper and lower are the
-    tensions where the pieces beyond begin.
+    forces are rows as `_tensions` takes them; response (m,) belongs to the rows kept; upper and lower are the tensions
+    where the pieces beyond begin.
     """
 
     forces: FloatArray

@@ -51,7 +51,7 @@ class Section:
 
     @property
     def outer_radius_mm(self) -> float:
-        """Radius at which the load acts."""
+        """Radius of the surface, where the load acts."""
         return self.mid_radius_mm + self.thickness_mm / 2
 
     @property
@@ -153,7 +153,7 @@ class Belt:
         return self.follow(state, _clip(state.net_tension_n, low, high))
 
     def pull(self, shear_n: float, normal_n: float, turned_rad: float, sign: float) -> float:
-        """Return the net tension (N) at which the skin slips under the load; a positive sign is towards side 2."""
+        """Return the net tension (N) that makes the skin slip under the load; a positive sign is towards side 2."""
         cosine, sine = math.cos(turned_rad), math.sin(turned_rad)
         pressing = max(normal_n * cosine - shear_n * sine, 0.0)
         return shear_n * cosine + normal_n * sine - sign * self.friction * pressing
@@ -187,7 +187,7 @@ class Belt:
         return min(loading, unloading), max(loading, unloading)
 
     def _shear(self, net_n: float, normal_n: float, turned_rad: float, sign: float) -> float:
-        """Return the shear force whose `pull` is this net tension."""
+        """Return the shear force for a net tension: the inverse of `pull`."""
         normal_n, friction = max(normal_n, 0.0), sign * self.friction
         cosine, sine = math.cos(turned_rad), math.sin(turned_rad)
         shear_n = (net_n - normal_n * (sine - friction * cosine)) / (cosine + friction * sine)
@@ -241,7 +241,7 @@ class Membrane:
         return first**2 - second**2 + GAUGE_FACTOR * self._slack_per_n * state.net_tension_n / bent
 
     def turned_rad(self, state: BeltState) -> float:
-        """Return the angle by which the load has turned about the core."""
+        """Return the load's angle about the core."""
         return self._turned(state.net_tension_n)[0]
 
     def _turned(self, net_n: float) -> tuple[float, float]:

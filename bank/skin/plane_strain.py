@@ -351,12 +351,6 @@ def solve_contact(
     return ContactSolution(polished.force_n if converged else pivoted, found.steps + polished.steps, True)
 
 
-class _Guess(NamedTuple):
-    touching: BoolArray
-    # Sign of λ_t where a node slips, 0 where it sticks; meaningless at a node that does not touch.
-    slipping: FloatArray
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
     compliance: FloatArray
@@ -370,17 +364,21 @@ class _Problem:
         """Return where a semismooth Newton method comes from these forces, and whether it converged."""
         smallest = np.finfo(np.float64).tiny
         for step in range(MAX_STEPS):
-            residual, guess = self.residual(force)
+            residual, touching, slipping = self.residual(force)
             if np.linalg.norm(residual) <= max(TOLERANCE * abs(force).max(), smallest):
                 return ContactSolution(force, step), True
-            solved = self.solve(guess)
+            solved = self.solve(touching, slipping)
             if solved is None:
                 return ContactSolution(force, step), False
             force = solved
         return ContactSolution(force, MAX_STEPS), False
 
-    def residual(self, force: FloatArray) -> tuple[FloatArray, _Guess]:
-        """Return Φ (2n,) in N, and the piece of Φ that contains the forces."""
+    def residual(self, force: FloatArray) -> tuple[FloatArray, BoolArray, FloatArray]:
+        """Return Φ (2n,) in N, and the piece of Φ that contains the forces.
+
+        That is which nodes (n,) touch, and the sign (n,) of λ_t where one slips, 0 where it sticks; the sign means
+        nothing at a node that does not touch.
+        """
         n = len(self.along_before)
         moved = self.compliance @ force + self.displacement
         moved[n:] -= self.along_before
@@ -389,16 +387,16 @@ class _Problem:
         bound = self.friction * pressing
         wanted = np.concatenate([pressing, np.clip(trial[n:], -bound, bound)])
         slipping = np.sign(trial[n:]) * (abs(trial[n:]) >= bound)
-        return force - wanted, _Guess(trial[:n] > 0, slipping)
+        return force - wanted, trial[:n] > 0, slipping
 
-    def solve(self, guess: _Guess) -> FloatArray | None:
-        """Return the forces of a guess: u_n = 0 where touching; there u_t as before or λ_t = ±μ λ_n.
+    def solve(self, touching: BoolArray, slipping: FloatArray) -> FloatArray | None:
+        """Return the forces of a piece: u_n = 0 where touching; there u_t as before or λ_t = ±μ λ_n.
 
-        None where the guess is singular: the sliding skin wedges.
+        None where the piece is singular: the sliding skin wedges.
         """
-        n, nodes = len(self.along_before), np.flatnonzero(guess.touching)
-        sticking = n + nodes[guess.slipping[nodes] == 0]
-        slip = self.friction * guess.slipping[nodes]
+        n, nodes = len(self.along_before), np.flatnonzero(touching)
+        sticking = n + nodes[slipping[nodes] == 0]
+        slip = self.friction * slipping[nodes]
         rows = np.concatenate([nodes, sticking])
         by_pressing = self.compliance[np.ix_(rows, nodes)] + self.compliance[np.ix_(rows, n + nodes)] * slip
         matrix = np.hstack([by_pressing, self.compliance[np.ix_(rows, sticking)]])

@@ -35,16 +35,6 @@ def test_the_linear_model_averages_to_its_value_at_the_centroid(fingertip, k, si
     np.testing.assert_allclose(conductivity(fingertip, "linear", k, sigma), 1 + (centroid - k) / sigma, atol=1e-12)
 
 
-def test_the_means_converge_to_the_functions_on_finer_meshes(fingertip):
-    """A smooth f differs from its value at the centroid by O(h²)."""
-    errors = []
-    for mesh in (fingertip, fingertip.refined(), fingertip.refined().refined()):
-        y = mesh.nodes[mesh.triangles, 1].mean(axis=1)
-        exact = 1 + np.exp(-((y - 1.6) ** 2) / 2) * np.cos(1.3 * (y - 1.6))
-        errors.append(np.abs(conductivity(mesh, "modulated_gaussian", 1.3, 1.0) - exact).max())
-    np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), 2, atol=0.1)
-
-
 def test_the_functions_have_the_values_of_the_equations():
     y = np.array([1.0, 2.0, 3.0])
     values = {name: model.function(y, 2.0, 0.5, 1.5) for name, model in MODELS.items()}

@@ -47,14 +47,6 @@ def test_points_that_do_not_determine_a_curve_are_refused(x, y, says):
         Polynomial.fit(np.array(x), np.array(y), 2)
 
 
-def test_torque_and_diameter_come_with_intervals():
-    value, below, above = CALIBRATION.torque.regressor.predict(np.array([1.5, 2.25]))
-    assert value == pytest.approx(0.4 - 0.15 - 0.1125, abs=0.003)
-    assert below > 0
-    assert below == pytest.approx(above)
-    assert CALIBRATION.diameter.regressor.predict(np.array([3.6]))[0] == pytest.approx(34, abs=1.5)
-
-
 def test_outside_of_the_calibrated_range_a_reason_is_given():
     def reasons(k: float, sigma: float) -> tuple[str, ...]:
         return tuple(
@@ -82,12 +74,6 @@ def test_one_of_the_fits_may_be_missing_and_not_both():
         Calibration.from_matches(BANK, "nothing")
 
 
-def test_a_saved_calibration_is_loaded_as_it_was_and_has_the_same_bytes_each_time(tmp_path):
-    paths = [tmp_path / "a.cal", tmp_path / "b.cal"]
-    for path in paths:
-        CALIBRATION.save(path)
-    assert paths[0].read_bytes() == paths[1].read_bytes()
-    loaded = Calibration.load(paths[0])
-    assert loaded.torque.regressor == CALIBRATION.torque.regressor
-    assert loaded.sides == ()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.cal", "b.cal"]
+def test_a_saved_calibration_is_loaded_as_it_was(tmp_path):
+    CALIBRATION.save(tmp_path / "a.cal")
+    assert Calibration.load(tmp_path / "a.cal").torque.regressor == CALIBRATION.torque.regressor

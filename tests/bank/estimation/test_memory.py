@@ -21,6 +21,23 @@ def like(motion_calibration):
     return lambda t_s, share: TactileFrame.of(t_s, 1.1 * (idle + share * (gripped - idle)) + 1e-13 * t_s)
 
 
+@pytest.fixture
+def process(like):
+    """Return what plays shares of a grip to a session, every half second from a time on, and returns what it says."""
+
+    def play(session, shares, start_s=0.0, step_s=0.5):
+        take = session.estimate if isinstance(session, EstimatorSession) else session.process
+        return [take(like(start_s + step_s * i, share)) for i, share in enumerate(shares)]
+
+    return play
+
+
+@pytest.fixture
+def taring(motion_calibration):
+    """Return what begins a session with so many frames for its zero."""
+    return lambda n: SessionState(motion_calibration.validators, motion_calibration.estimator.motion, idle_frames=n)
+
+
 def test_a_frame_from_before_a_zero_is_not_one_of_the_last_frames(motion_calibration, like):
     """A zero that is asked for while a tool is held, which is let go and gripped again before it is complete."""
     tracker, reasons = EstimatorSession(motion_calibration), []
@@ -36,20 +53,17 @@ def test_a_frame_from_before_a_zero_is_not_one_of_the_last_frames(motion_calibra
     assert not after[-1]
 
 
-def test_a_grip_a_third_as_strong_as_the_one_before_the_zero_is_one(motion_calibration, like):
+def test_a_grip_a_third_as_strong_as_the_one_before_the_zero_is_one(motion_calibration, process):
     """What a grip was before a zero says nothing of the next one, which comes before an idle frame was seen again."""
     tracker = EstimatorSession(motion_calibration)
-    for i, share in enumerate([*np.zeros(12), *UP, *np.ones(13)]):
-        tracker.estimate(like(0.5 * i, share))
+    process(tracker, [*np.zeros(12), *UP, *np.ones(13)])
     tracker.tare(10)
-    shares = [*np.zeros(10), *np.full(18, 0.3)]
-    reasons = [tracker.estimate(like(100 + 0.5 * i, share)).reasons for i, share in enumerate(shares)]
-    assert not reasons[-1]
+    assert not process(tracker, [*np.zeros(10), *np.full(18, 0.3)], start_s=100.0)[-1].reasons
 
 
-def test_a_zero_during_which_a_tool_is_let_go_begins_anew(motion_calibration, like):
-    memory = SessionState(motion_calibration.validators, motion_calibration.estimator.motion, idle_frames=8)
-    reasons = [memory.process(like(0.5 * i, share)).reasons for i, share in enumerate([1, 1, 1, 1, 1, *np.zeros(9)])]
+def test_a_zero_during_which_a_tool_is_let_go_begins_anew(taring, process, like):
+    memory = taring(8)
+    reasons = [one.reasons for one in process(memory, [1, 1, 1, 1, 1, *np.zeros(9)])]
     assert [why[0] for why in reasons[2:5]] == [f"taking the idle frame, {n} of 8" for n in (3, 4, 5)]
     assert all("jumped" in why[0] for why in reasons[5:7])
     assert reasons[7] == ("taking the idle frame, 1 of 8",)
@@ -61,26 +75,24 @@ def test_a_zero_during_which_a_tool_is_let_go_begins_anew(motion_calibration, li
 
 @pytest.mark.parametrize(("first", "then"), [(1.0, 0.0), (0.0, 1.0)])
 @pytest.mark.parametrize("step_s", [1.5, 20.0, -5.0])
-def test_a_zero_in_whose_gap_a_tool_is_let_go_or_gripped_begins_anew(motion_calibration, like, first, then, step_s):
-    memory = SessionState(motion_calibration.validators, motion_calibration.estimator.motion, idle_frames=8)
-    for i in range(5):
-        memory.process(like(0.5 * i, first))
-    reasons = [memory.process(like(2.0 + step_s + 0.5 * i, then)).reasons for i in range(9)]
+def test_a_zero_in_whose_gap_a_tool_is_let_go_or_gripped_begins_anew(taring, process, first, then, step_s):
+    memory = taring(8)
+    process(memory, [first] * 5)
+    reasons = [one.reasons for one in process(memory, [then] * 9, start_s=2.0 + step_s)]
     assert all("jumped" in why[0] for why in reasons[:2])
     assert [why[0] for why in reasons[2:]] == [f"taking the idle frame, {n} of 8" for n in range(1, 8)]
     assert memory.taring
 
 
-def test_a_zero_with_a_gap_in_which_nothing_happens_goes_on(motion_calibration, like):
-    memory = SessionState(motion_calibration.validators, motion_calibration.estimator.motion, idle_frames=8)
-    for i in range(8):
-        memory.process(like(0.5 * i + 20.0 * (i > 4), 0.0))
+def test_a_zero_with_a_gap_in_which_nothing_happens_goes_on(taring, process):
+    memory = taring(8)
+    process(memory, [0.0] * 5)
+    process(memory, [0.0] * 3, start_s=22.5)
     assert not memory.taring
 
 
-def test_a_zero_of_two_frames_is_a_baseline_for_a_weak_grip(motion_calibration, like):
-    memory = SessionState(motion_calibration.validators, motion_calibration.estimator.motion, idle_frames=2)
-    seen = [memory.process(like(0.5 * i, share)) for i, share in enumerate([0, 0, *np.full(18, 0.3)])]
+def test_a_zero_of_two_frames_is_a_baseline_for_a_weak_grip(motion_calibration, taring, process):
+    seen = process(taring(2), [0, 0, *np.full(18, 0.3)])
     assert not seen[-1].reasons
     steps = np.array([guard.gripped - guard.idle for guard in motion_calibration.validators])
     assert seen[-1].difference == pytest.approx(0.3 * steps)
@@ -88,12 +100,12 @@ def test_a_zero_of_two_frames_is_a_baseline_for_a_weak_grip(motion_calibration, 
 
 @pytest.mark.parametrize("kind", ["garbled", "saturated"])
 @pytest.mark.parametrize("spoilt", [1, 3, 4])
-def test_up_to_three_spoilt_frames_are_left_out_and_more_end_the_memory(motion_calibration, like, spoilt, kind):
+def test_up_to_three_spoilt_frames_are_left_out_and_more_end_the_memory(
+    motion_calibration, process, like, spoilt, kind
+):
     tracker, rng = EstimatorSession(motion_calibration), np.random.default_rng(4)
     shares = [*np.zeros(12), *UP, *np.ones(14)]
-    for i, share in enumerate(shares):
-        estimate = tracker.estimate(like(0.5 * i, share))
-    assert estimate.valid
+    assert process(tracker, shares)[-1].valid
     for i in range(len(shares), len(shares) + spoilt):
         frame = like(0.5 * i, 1.0)
         if kind == "garbled":
@@ -106,14 +118,12 @@ def test_up_to_three_spoilt_frames_are_left_out_and_more_end_the_memory(motion_c
 
 
 @pytest.mark.parametrize("lost", [2, 3, 4])
-def test_of_a_quick_board_two_lost_frames_are_too_many_as_of_a_slow_one(motion_calibration, like, lost):
+def test_of_a_quick_board_two_lost_frames_are_too_many_as_of_a_slow_one(motion_calibration, process, lost):
     """A frame is put halfway where one is missing: with more of them lost, all before would be of another time."""
     tracker = EstimatorSession(motion_calibration, period_s=0.27)
     shares = [*np.zeros(12), *UP, *np.ones(14)]
-    for i, share in enumerate(shares):
-        estimate = tracker.estimate(like(0.27 * i, share))
-    assert estimate.valid
-    after = [tracker.estimate(like(0.27 * (len(shares) + lost + i), 1.0)).reasons for i in range(2)]
+    assert process(tracker, shares, step_s=0.27)[-1].valid
+    after = [one.reasons for one in process(tracker, [1.0, 1.0], 0.27 * (len(shares) + lost), 0.27)]
     assert after[0] == ("there is no earlier frame to compare with",)
     assert after[1] == ("gripped too recently: 12 more frames are needed",)
 

@@ -128,8 +128,7 @@ def test_its_response_is_homogeneous_of_degree_one(skin_112, loadings):
 def test_its_sensitivity_is_the_paper_s_within_20_percent(skin_112, loadings):
     for estimate in (origin_slope, lambda x, y: fit_line(x, y).slope_per_n):
         found = [estimate(shears(states), gauge_responses(skin_112, states)) for states in loadings.values()]
-        assert 0.085 <= min(found) <= max(found) <= 0.090
-        assert found == pytest.approx([0.078] * len(found), rel=0.2)
+        assert 0.085 <= min(found) <= max(found) <= 0.090 < 1.2 * 0.078
 
 
 def test_it_begins_to_respond_at_the_paper_s_0_04_newton(skin_112, loadings):
@@ -190,21 +189,15 @@ def test_it_agrees_with_the_closed_form_within_one_percent(changed, tolerance):
     assert slope == pytest.approx(membrane_model.sensitivity_per_n(section), rel=tolerance)
 
 
-def gaps_and_forces(skin: CondensedSkin, state: ContactState) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return each contact node's gap, and its forces into and along the core."""
-    n = len(skin.contact_deg)
-    moved = skin.compliance @ state.contact_force_n + skin.load_displacement @ (state.normal_n, state.shear_n)
-    return moved[:n], state.contact_force_n[:n], state.contact_force_n[n:]
-
-
 def test_the_contact_conditions_hold_at_every_node(loadings, skin_112):
     for state in itertools.chain(*loadings.values()):
         assert_contact(skin_112, state)
 
 
 def assert_contact(skin: CondensedSkin, state: ContactState) -> None:
-    gap, pressing, along = gaps_and_forces(skin, state)
     free = skin.load_displacement @ (state.normal_n, state.shear_n)
+    gap = np.split(skin.compliance @ state.contact_force_n + free, 2)[0]
+    pressing, along = np.split(state.contact_force_n, 2)
     force_n, way_mm = abs(state.contact_force_n).max(), abs(free).max()
     assert gap.min() > -1e-9 * way_mm
     assert pressing.min() >= 0

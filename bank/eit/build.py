@@ -1,7 +1,7 @@
 """Building a bank: row by row (a row is one k), with the same bytes from any number of threads."""
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -84,10 +84,10 @@ def build_bank(
         on_row(len(found))
     rows = [found[row] for row in range(total)]
     if not any(cells.valid.any() for cells in rows):
-        highest = max(float(cells.min_conductivity.max()) for cells in rows)
-        raise ModelError(
-            f"{path}: no cell of this bank is valid: {_why_empty(highest)}; choose other values of k and sigma"
-        )
+        why = f"no signal has a norm of {MIN_SIGNAL_NORM:g} or more"
+        if (highest := max(float(cells.min_conductivity.max()) for cells in rows)) <= 0:
+            why = f"the conductivity of each falls to {highest:.3g} or below, and must be above 0"
+        raise ModelError(f"{path}: no cell of this bank is valid: {why}; choose other values of k and sigma")
     write_bank(
         path,
         definition,
@@ -111,18 +111,9 @@ _solvers: dict[str, RowSolver] = {}
 
 
 def _solve(solver: RowSolver, rows: int, jobs: int) -> Iterator[tuple[int, BankRow]]:
-    """Yield rows as they are finished; the solver releases the interpreter's lock."""
+    """Yield rows in order; the solver releases the interpreter's lock."""
     with ThreadPoolExecutor(min(jobs, rows)) as pool:
         try:
-            tasks = {pool.submit(solver.solve, row): row for row in range(rows)}
-            for task in as_completed(tasks):
-                yield tasks.pop(task), task.result()
+            yield from enumerate(pool.map(solver.solve, range(rows)))
         finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _why_empty(highest: float) -> str:
-    """Return why no cell is valid, by the highest of their smallest conductivities."""
-    if highest > 0:
-        return f"no signal has a norm of {MIN_SIGNAL_NORM:g} or more"
-    return f"the conductivity of each falls to {highest:.3g} or below, and must be above 0"
+            pool.shutdown(cancel_futures=True)

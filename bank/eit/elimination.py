@@ -91,7 +91,7 @@ def _structures(lower: Terms, n: int, eliminated: int) -> list[IntArray]:
 
 @compiled
 def _factorise(plan: _Plan, work: FloatArray, kept: int) -> None:
-    """Replace the (entries, LANES) lower triangles in `work` by Cholesky factors, the last columns by Schur complements.
+    """Factorise the (entries, LANES) lower triangles in `work` in place; the last columns become Schur complements.
 
     A column begins as its own entries; each earlier column with an entry in its row then subtracts its products.
     """

@@ -121,9 +121,11 @@ def compress(unit_signals: Callable[[IntArray], FloatArray], cells: IntArray) ->
     numbers = np.vstack(found)
     coarse = _cell_rows(numbers[:, :COARSE_RANK])
     members, rows = zip(*_partition(coarse, min(_N_GROUPS, len(cells) // _MIN_GROUP_CELLS)), strict=True)
-    group_of = np.empty(len(cells), dtype=np.int64)
+    group_of, centres = np.empty(len(cells), dtype=np.int64), []
     for group, chosen in enumerate(members):
+        points = coarse[chosen, :-2]
         group_of[chosen] = group
+        centres.append(int(chosen[np.argmin(_squared_distances(points, points.mean(axis=0)))]))
     return CompressedBank(
         basis=np.ascontiguousarray(basis.T, dtype=np.float32),
         fine=_cell_rows(numbers),
@@ -132,7 +134,7 @@ def compress(unit_signals: Callable[[IntArray], FloatArray], cells: IntArray) ->
         overlaps=np.sqrt(np.maximum(np.concatenate([1 - least[::-1], most[::-1]]), 0.0)),
         group_of=group_of,
         members=members,
-        centres=np.array([_central_cell(coarse, chosen) for chosen in members]),
+        centres=np.array(centres),
     )
 
 
@@ -186,11 +188,6 @@ def _partition(cells: Float32Array, size: int) -> list[tuple[IntArray, Float32Ar
         heapq.heappush(heap, entry(chosen[nearer]))
         heapq.heappush(heap, entry(chosen[~nearer]))
     return [(chosen, row) for _, _, chosen, row in heap]
-
-
-def _central_cell(cells: Float32Array, chosen: IntArray) -> int:
-    points = cells[chosen, :-2]
-    return int(chosen[np.argmin(_squared_distances(points, points.mean(axis=0)))])
 
 
 def _squared_distances(points: Float32Array, place: Float32Array) -> Float32Array:

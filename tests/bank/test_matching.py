@@ -93,21 +93,6 @@ def test_a_bank_of_more_cells_than_fit_a_chunk_is_scored_cell_by_cell_all_the_sa
     np.testing.assert_allclose(large.heatmap(frame)[1020:], small.heatmap(frame), atol=1e-14)
 
 
-@both
-@pytest.mark.parametrize(
-    ("frame", "says"),
-    [
-        (np.zeros(PAPER_TABLE.n_channels), "zero in all channels"),
-        (np.full(PAPER_TABLE.n_channels, np.nan), "896 channels of the difference are not finite"),
-        (np.append(np.ones(PAPER_TABLE.n_channels - 1), np.inf), "1 channels of the difference are not finite"),
-        (np.ones(1024), "896 channels; the array has shape"),
-    ],
-)
-def test_frames_that_cannot_be_matched_are_refused(matcher, frame, says):
-    with pytest.raises(MatchingError, match=says):
-        matcher.heatmap(frame)
-
-
 def test_banks_that_cannot_be_matched_are_refused():
     with pytest.raises(MatchingError, match="no cell of the bank is valid"):
         ReferenceMatcher(SIGNALS, np.zeros_like(VALID), K_GRID, SIGMA_GRID)

@@ -136,25 +136,28 @@ def test_where_values_beyond_are_read_as_such_intervals_reach_twice_as_far_beyon
     assert below < 0.01
 
 
+def loads(frames):
+    """Return torques (600,), loaded for so many frames in turn, and features that hardly and that clearly show them."""
+    rng = np.random.default_rng(3)
+    torque = np.where(np.arange(600) % 40 < frames, rng.uniform(0.02, 0.06, 600), 0.0)
+    blind = rng.normal(0, 1, (600, 2)) + torque[:, None]
+    return torque, blind, np.column_stack([torque, rng.normal(0, 1, 600)]) + rng.normal(0, 1e-3, (600, 2))
+
+
 def test_a_load_that_an_estimator_does_not_see_lies_in_its_interval():
     """Of a stream most is free of load: its small residuals must not stand for a load that leaves no trace."""
-    rng = np.random.default_rng(3)
-    torque = np.where(np.arange(600) % 40 < 3, rng.uniform(0.02, 0.06, 600), 0.0)
-    blind = rng.normal(0, 1, (600, 2)) + torque[:, None]
+    torque, blind, seeing = loads(frames=3)
     reader = fit_interval_regressor(blind, torque, Ridge.fit)
     loaded = np.flatnonzero(torque > 0.01)
     read = np.array([reader.predict(blind[i]) for i in loaded])
     assert (torque[loaded] - read[:, 0] <= read[:, 2]).mean() > 0.9
     assert reader.misses_loads
     # One that sees it pays nothing.
-    seeing = np.column_stack([torque, rng.normal(0, 1, 600)]) + rng.normal(0, 1e-3, (600, 2))
     assert not fit_interval_regressor(seeing, torque, Ridge.fit).misses_loads
 
 
 def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
-    rng = np.random.default_rng(3)
-    torque = np.where(np.arange(600) % 40 < 5, rng.uniform(0.02, 0.06, 600), 0.0)
-    blind = rng.normal(0, 1, (600, 2)) + torque[:, None]
+    torque, blind, seeing = loads(frames=5)
     beside = np.array([np.roll(torque, shift) for shift in range(-6, 7)])
     reader = fit_interval_regressor(blind, torque, Ridge.fit, bounds=(beside.min(axis=0), beside.max(axis=0)))
     assert reader.timing_widening > 1.2
@@ -163,7 +166,6 @@ def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
     half = np.array([reader.intervals.half_width(one) for one in read[:, 0]])
     assert (np.abs(torque[loaded] - read[:, 0]) <= half).mean() > 0.75, "as wide as that they would hold these loads"
     assert reader.misses_loads
-    seeing = np.column_stack([torque, rng.normal(0, 1, 600)]) + rng.normal(0, 1e-3, (600, 2))
     sighted = fit_interval_regressor(seeing, torque, Ridge.fit, bounds=(beside.min(axis=0), beside.max(axis=0)))
     assert not sighted.misses_loads, "one that sees loads pays no more than the times cost"
 

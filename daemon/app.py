@@ -144,7 +144,10 @@ class Daemon:
         if self.recorder is None:
             return
         for path in self.recorder.finished:
-            structlog.get_logger().info("recorded", file=str(path))
+            if path.exists():
+                structlog.get_logger().info("recorded", file=str(path))
+            else:
+                structlog.get_logger().error("the recorded file was removed", file=str(path))
         if self.recorder.failure:
             structlog.get_logger().error("the recording could not be finished", reason=self.recorder.failure)
 

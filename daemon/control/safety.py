@@ -157,7 +157,7 @@ class FaultCode(Enum):
     RECORDING_FAILED = Rule(
         Response.REFUSE_START,
         "the recording cannot be written: {detail}.",
-        "Make room on the disk or name another folder; the running experiment continues unrecorded.",
+        "Make room on the disk, or make the folder again; the running experiment continues unrecorded.",
     )
     COMMAND_REFUSED = Rule(
         Response.NOTE,

@@ -267,6 +267,11 @@ class Recorder:
 
     def _write(self) -> None:
         self.failure = ""
+        if self._current.file.is_removed():
+            self.failure = f"{self.path}: the file was removed while it was written"
+            self._change_file(self._queue[0].dropped if self._queue else self._counts.dropped)
+            if self._current.file.is_removed():
+                return
         # Items that arrive meanwhile wait for the next flush.
         for _ in range(len(self._queue)):
             item = self._queue.popleft()
@@ -292,7 +297,8 @@ class Recorder:
 
     def _change_file(self, dropped: int) -> None:
         """Begin the next file; on failure continue with the current one. `dropped` counts the drops so far."""
-        if not self._flush():
+        removed = self._current.file.is_removed()
+        if not removed and not self._flush():
             return
         previous, lost = self._current, dropped + self._counts.unwritable
         try:
@@ -300,7 +306,10 @@ class Recorder:
         except OSError as error:
             self.failure = f"{self._folder}: {error.strerror}"
             return
-        self._finish_file(previous, lost)
+        if removed:
+            previous.file.discard()
+        else:
+            self._finish_file(previous, lost)
         for source, event in self._tools.items():
             # The tool is still held, and a replay of this file must know it.
             self._add_input(source, replace(event, t_ns=self._current.began_ns), self._clock.offset_ns)

@@ -129,10 +129,19 @@ class McapFile:
             self.partial.replace(path)
             sync_directory(path.parent)
 
+    def is_removed(self) -> bool:
+        """Return whether another program removed, moved or replaced the file: what is written is lost."""
+        try:
+            return not os.path.samestat(os.fstat(self._file.fileno()), self.partial.stat())
+        except OSError:
+            return True
+
     def discard(self) -> None:
-        """Close and delete the file."""
+        """Close the file, and delete it if it is still there."""
+        removed = self.is_removed()
         self._file.close()
-        self.partial.unlink(missing_ok=True)
+        if not removed:
+            self.partial.unlink()
 
     def _register(self, topic: str) -> int:
         name = schema.schema_name(topic)

@@ -3,14 +3,19 @@
 import errno
 import io
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import zmq.asyncio
+from structlog.testing import capture_logs
 
+from shearloop.daemon.app import Daemon
 from shearloop.daemon.clock import Clock
+from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import recorder as recorder_module
 from shearloop.daemon.recording.reader import repair, summarise
@@ -141,3 +146,47 @@ def test_an_unwritable_folder_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot record there"):
         Recorder(tmp_path / "file", IDENTITY, Clock())
+
+
+@pytest.mark.parametrize("removed", ["file", "folder", "replaced"])
+def test_a_removed_file_is_a_failure_and_a_new_one_begins(removed, tmp_path):
+    folder = tmp_path / "recordings"
+    recorder = Recorder(folder, IDENTITY, Clock())
+    recorder.record_message("load.torque", torque(0))
+    recorder.write()
+    assert recorder.failure == ""
+    if removed == "folder":
+        shutil.rmtree(folder)
+        for number in (1, 2):
+            recorder.record_message("load.torque", torque(number))
+            recorder.write()
+            assert recorder.failure == f"{folder}: No such file or directory"
+        folder.mkdir()
+    else:
+        recorder.path.unlink()
+        if removed == "replaced":
+            recorder.path.write_text("another's file")
+        for number in (1, 2):
+            recorder.record_message("load.torque", torque(number))
+    replaced = recorder.path
+    recorder.write()
+    assert recorder.failure == f"{replaced}: the file was removed while it was written"
+    recorder.write()
+    assert recorder.failure == ""
+    recorder.close()
+    assert [[one["seq"] for one in topics(path)["load.torque"]] for path in recorder.finished] == [[1, 2]]
+    assert summarise(recorder.finished[0]).dropped == 0
+    assert not replaced.exists() or replaced.read_text() == "another's file"
+
+
+async def test_a_removed_recording_is_not_logged_as_recorded(config):
+    with zmq.asyncio.Context() as context, capture_logs() as logs:
+        daemon = Daemon(load_daemon_config(config(recording={"folder": "recordings"})), context)
+        daemon.recorder.record_experiment("one")
+        daemon.recorder.record_experiment("two")
+        daemon.recorder.write()
+        daemon.recorder.finished[0].unlink()
+        daemon.stop()
+        await daemon.run()
+    events = [one["event"] for one in logs if one.get("file") in map(str, daemon.recorder.finished)]
+    assert events == ["the recorded file was removed", "recorded"]

@@ -20,6 +20,9 @@ from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
 from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.drivers.shear_skin.instruments import (
+    OUTPUT,
+    READ,
+    SCAN,
     SOURCE_PERIOD_S,
     AdcBoard,
     Daq,
@@ -29,6 +32,9 @@ from shearloop.drivers.shear_skin.instruments import (
     ScpiScanner,
     SourceReading,
     Voltages,
+    read_elements,
+    read_output,
+    read_scan,
 )
 from shearloop.drivers.shear_skin.skin import SampleAverager, SampleValidator, ShearSkin, SkinSample
 
@@ -157,10 +163,10 @@ class RecordedSkin:
         self._validator = SampleValidator(current_a, SOURCE_PERIOD_S, daq_period_s, _gauge_ohm(calibration))
         self._averager = SampleAverager(config.daq.averaged)
         self._radius_m = _radius_m(config)
-        self._source = RecordedInstrument(Keithley6430)
+        self._source = RecordedInstrument({READ: read_elements, OUTPUT: read_output})
         adc = config.daq.adc
         self._daq: RecordedInstrument[Voltages] | PairParser = (
-            RecordedInstrument(ScpiScanner) if adc is None else PairParser(config.daq.rate_hz, adc.full_scale_v)
+            RecordedInstrument({SCAN: read_scan}) if adc is None else PairParser(config.daq.rate_hz, adc.full_scale_v)
         )
         self._latest: SourceReading | None = None
 

@@ -7,7 +7,7 @@ import asyncio
 import re
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from time import monotonic_ns
@@ -110,11 +110,6 @@ class PolledInstrument(ABC, Generic[ReadingT]):
     @abstractmethod
     async def _read(self) -> ReadingT:
         """Ask for one reading."""
-
-    @staticmethod
-    @abstractmethod
-    def parse(query: str, reply: Reply) -> ReadingT | None:
-        """Return the reading in a reply to a query, if it has one; ProtocolError for a bad reply."""
 
     async def _shut_down(self) -> None:
         """Leave the instrument in a safe state; its port may be gone."""
@@ -227,8 +222,9 @@ class SourceReading:
 class RecordedInstrument(Generic[ReadingT]):
     """Parses an instrument's recorded replies. No I/O."""
 
-    def __init__(self, instrument: type[PolledInstrument[ReadingT]]) -> None:
-        self._instrument = instrument
+    def __init__(self, parsers: Mapping[str, Callable[[Reply], ReadingT | None]]) -> None:
+        """Parse the replies to these queries."""
+        self._parsers = parsers
         self._asked: RawEvent | None = None
 
     def handle(self, event: RawEvent) -> list[ReadingT]:
@@ -238,9 +234,10 @@ class RecordedInstrument(Generic[ReadingT]):
         elif event.kind is InputKind.DATA and self._asked is not None:
             asked, self._asked = self._asked, None
             reply = Reply(event.data.decode("latin-1"), asked.t_ns, event.t_ns)
-            with suppress(ProtocolError):
-                reading = self._instrument.parse(asked.data.decode("latin-1"), reply)
-                return [] if reading is None else [reading]
+            if parse := self._parsers.get(asked.data.decode("latin-1")):
+                with suppress(ProtocolError):
+                    reading = parse(reply)
+                    return [] if reading is None else [reading]
         return []
 
 
@@ -318,11 +315,6 @@ class Keithley6430(PolledInstrument[SourceReading]):
                 raise
             return off
         return read_elements(reply)
-
-    @staticmethod
-    def parse(query: str, reply: Reply) -> SourceReading | None:
-        """Return the reading in a reply to READ, or in one to OUTPUT that says off."""
-        return read_elements(reply) if query == READ else read_output(reply) if query == OUTPUT else None
 
     async def _shut_down(self) -> None:
         """Switch the output off and wait for the confirmation."""
@@ -406,11 +398,6 @@ class ScpiScanner(PolledInstrument[Voltages]):
 
     async def _read(self) -> Voltages:
         return read_scan(await self._ask(SCAN))
-
-    @staticmethod
-    def parse(query: str, reply: Reply) -> Voltages | None:
-        """Return the voltages in a reply to SCAN."""
-        return read_scan(reply) if query == SCAN else None
 
 
 class PairParser(LineParser[Voltages]):

@@ -65,17 +65,6 @@ class Gauges(Protocol):
         """Return R₁ and R₂ now."""
 
 
-@dataclass(frozen=True, slots=True)
-class CircuitState:
-    """Current and voltages at one time: of the source, and across each pair of sense wires."""
-
-    current_a: float
-    source_v: float
-    v1_v: float
-    v2_v: float
-    compliance: bool
-
-
 CIRCUIT_COMMANDS = "open 1|2, short 1|2, reversed 1|2, swapped, leads OHM (the source goes into compliance), mend"
 
 
@@ -92,24 +81,21 @@ class Circuit:
     # Pairs of a fault, open, short or reversed, and its gauge.
     faults: set[tuple[str, str]] = field(default_factory=set)
 
-    def state(self) -> CircuitState:
-        """Return current and voltages."""
-        ohm = [self._resistance(name, r) for name, r in zip(GAUGES, self.gauges.resistances_ohm(), strict=True)]
-        whole_ohm = sum(ohm) + self.lead_ohm
-        compliance = self.output_on and abs(self.level_a * whole_ohm) > self.compliance_v
-        current_a = 0.0
-        if self.output_on:
-            current_a = self.compliance_v / whole_ohm if compliance else self.level_a
-        signs = [-1 if ("reversed", name) in self.faults else 1 for name in GAUGES]
-        v = [sign * r * current_a for sign, r in zip(signs, ohm, strict=True)]
-        if self.swapped:
-            v.reverse()
-        return CircuitState(current_a, current_a * whole_ohm, v[0], v[1], compliance)
+    def source(self) -> tuple[float, float, bool]:
+        """Return the source's current and voltage now, and whether it is in compliance."""
+        whole_ohm = sum(self._resistances_ohm()) + self.lead_ohm
+        if not self.output_on:
+            return 0.0, 0.0, False
+        if abs(self.level_a * whole_ohm) > self.compliance_v:
+            return self.compliance_v / whole_ohm, self.compliance_v, True
+        return self.level_a, self.level_a * whole_ohm, False
 
     def voltages(self) -> tuple[float, float]:
-        """Return the voltages of both gauges now."""
-        state = self.state()
-        return state.v1_v, state.v2_v
+        """Return the voltages across each pair of sense wires now."""
+        current_a, _, _ = self.source()
+        signs = (-1 if ("reversed", gauge) in self.faults else 1 for gauge in GAUGES)
+        v1_v, v2_v = (sign * ohm * current_a for sign, ohm in zip(signs, self._resistances_ohm(), strict=True))
+        return (v2_v, v1_v) if self.swapped else (v1_v, v2_v)
 
     def command(self, text: str) -> None:
         """Apply a fault; ValueError, with a sentence, for an unknown one."""
@@ -131,10 +117,11 @@ class Circuit:
         self.lead_ohm = LEAD_OHM
         self.faults.clear()
 
-    def _resistance(self, gauge: str, ohm: float) -> float:
-        if ("open", gauge) in self.faults:
-            return OPEN_OHM
-        return 0.0 if ("short", gauge) in self.faults else ohm
+    def _resistances_ohm(self) -> list[float]:
+        return [
+            OPEN_OHM if ("open", gauge) in self.faults else 0.0 if ("short", gauge) in self.faults else ohm
+            for gauge, ohm in zip(GAUGES, self.gauges.resistances_ohm(), strict=True)
+        ]
 
 
 class ScpiError(Exception):
@@ -237,14 +224,14 @@ class EmulatedKeithley6430(ScpiInterpreter):
     def _read(self, _: str) -> str:
         if not self.circuit.output_on:
             raise ScpiError(OUTPUT_IS_OFF)
-        state = self.circuit.state()
-        volts = state.source_v + self._random.gauss(0.0, SOURCE_NOISE_V)
+        current_a, volts, compliance = self.circuit.source()
+        volts += self._random.gauss(0.0, SOURCE_NOISE_V)
         values = {
             "VOLT": volts if "VOLT" in self._measured else NOT_MEASURED,
-            "CURR": state.current_a + self._random.gauss(0.0, SOURCE_NOISE_A),
+            "CURR": current_a + self._random.gauss(0.0, SOURCE_NOISE_A),
             "RES": NOT_MEASURED,
             "TIME": time.monotonic() % 1e5,
-            "STAT": float(_STATUS | (_COMPLIANCE if state.compliance else 0)),
+            "STAT": float(_STATUS | (_COMPLIANCE if compliance else 0)),
         }
         return ",".join(f"{values[name]:+.6E}" for name in ELEMENTS if name in self._elements)
 

@@ -53,8 +53,8 @@ Sides = tuple[str, ...]
 
 def lines_of(scene: Scene, frames: RigFrames) -> list[NDArray[np.float64]]:
     """Return the lines of both boards, (v,) in volts, for frames that end now."""
-    gel = scene.frame(FRAME_PERIOD_S)
-    return [frames.line(gel.grip, sign * gel.shear_torque_nm, gel.diameter_mm) for sign in SIDES.values()]
+    grip, shear_nm, width_mm = scene.frame(FRAME_PERIOD_S)
+    return [frames.line(grip, sign * shear_nm, width_mm) for sign in SIDES.values()]
 
 
 class TwistPlayer:

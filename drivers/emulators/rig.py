@@ -129,8 +129,8 @@ class EmulatedRig:
 
     def _frames(self, synthesiser: FrameSynthesiser, sign: float) -> Iterator[FloatArray]:
         while True:
-            gel = self.scene.frame(FRAME_PERIOD_S)
-            yield synthesiser.line(gel.grip, sign * gel.shear_torque_nm, gel.diameter_mm)
+            grip, shear_nm, width_mm = self.scene.frame(FRAME_PERIOD_S)
+            yield synthesiser.line(grip, sign * shear_nm, width_mm)
 
     def _torques_nm(self) -> Iterator[float]:
         while True:

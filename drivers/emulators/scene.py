@@ -160,15 +160,6 @@ class Truth(TwinState):
     joint: str
 
 
-@dataclass(frozen=True, slots=True)
-class ShearedFrame:
-    """The gel at each of a frame's 32 injections: whether the tool was gripped (0…1) and its shear in N·m."""
-
-    grip: FloatArray
-    shear_torque_nm: FloatArray
-    diameter_mm: float
-
-
 class Scene:
     """Gripper, tool and joint, `speed` times as fast as real time.
 
@@ -207,13 +198,13 @@ class Scene:
         """Return the mean torque on the lever, in N·m, over the last `duration_s` of the scene's time."""
         return float(self._history("torque_nm", duration_s, N_MOMENTS).mean())
 
-    def frame(self, duration_s: float) -> ShearedFrame:
-        """Return the gel at each injection of a frame over the last `duration_s` of the scene's time."""
-        return ShearedFrame(
-            grip=self._history("gripped", duration_s, N_INJECTIONS),
-            shear_torque_nm=self._history("shear_torque_nm", duration_s, N_INJECTIONS),
-            diameter_mm=self.gripper.width_mm,
-        )
+    def frame(self, duration_s: float) -> tuple[FloatArray, FloatArray, float]:
+        """Return grip (0…1) and shear (N·m) at each injection of a frame, (32,) each, and the fingers' width in mm.
+
+        The frame covers the last `duration_s` of the scene's time.
+        """
+        grip = self._history("gripped", duration_s, N_INJECTIONS)
+        return grip, self._history("shear_torque_nm", duration_s, N_INJECTIONS), self.gripper.width_mm
 
     def truth(self) -> Truth:
         """Return the true state now."""

@@ -68,11 +68,11 @@ def test_a_load_cell_gives_the_mean_over_its_conversion():
 
 def test_each_injection_of_a_frame_sees_the_shear_of_its_own_moment():
     hands, truth = twisted(0.2, 1.0)
-    seen = hands.scene.frame(0.5)
-    assert seen.diameter_mm == pytest.approx(20.0)
-    assert (seen.grip == 1.0).all()
+    grip, shear_nm, width_mm = hands.scene.frame(0.5)
+    assert width_mm == pytest.approx(20.0)
+    assert (grip == 1.0).all()
     before_s = 0.5 * (1 - (np.arange(32) + 0.5) / 32)
-    np.testing.assert_allclose(seen.shear_torque_nm, truth.shear_torque_nm - STIFF * 0.2 * before_s, rtol=1e-4)
+    np.testing.assert_allclose(shear_nm, truth.shear_torque_nm - STIFF * 0.2 * before_s, rtol=1e-4)
 
 
 def test_a_faster_scene_relaxes_faster_and_its_measurements_cover_its_own_time():

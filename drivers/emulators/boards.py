@@ -50,7 +50,7 @@ class EmulatedBoard(ABC):
     """A board on a pseudo-terminal that sends a line each period, whether or not anyone listens.
 
     Without a reader the terminal fills up; then the board waits and `port.held_up` is set. Timed faults without a
-    duration last until the next one or `recover`.
+    duration last until the next one or `normal`.
     """
 
     faults: Collection[str]
@@ -96,19 +96,15 @@ class EmulatedBoard(ABC):
             await loop.create_future()
 
     def command(self, text: str) -> None:
-        """Apply a fault to the next line, or recover on `normal`; ValueError, with a sentence, for other text.
+        """Apply a fault to the next line, or end all on `normal`; ValueError, with a sentence, for other text.
 
         Several faults apply to one line each, in order.
         """
         if text.strip() == "normal":
-            self.recover()
+            self._injected.clear()
+            self._end_lasting()
         else:
             self._injected.append(parse_fault(text, self.faults))
-
-    def recover(self) -> None:
-        """End every fault and plug the port in."""
-        self._injected.clear()
-        self._end_lasting()
 
     def _next_line(self, now_s: float) -> bytes:
         """Return the next line with its faults, or nothing; StopIteration at the end of the data."""

@@ -26,6 +26,8 @@ _COMMANDS = {"ACT": "act", "GTO": "gto", "POS": "pos", "SPE": "spe", "FOR": "for
 DEVICE_ID = 9
 COMMAND_REGISTERS, STATUS_REGISTERS = struct.pack(">HH", 0x03E8, 3), struct.pack(">HH", 0x07D0, 3)
 READ, WRITE = 3, 16
+# A request with its check: to read the status, or to write the three command registers.
+READ_BYTES, WRITE_BYTES = 8, 15
 
 STEP_S = 0.008
 
@@ -230,7 +232,7 @@ class ModbusSlave:
         """Return the reply frames to the requests that `data` completes; damaged ones get none."""
         self._buffer += data
         replies = b""
-        while (length := _request_length(self._buffer)) is not None and len(self._buffer) >= length:
+        while len(self._buffer) >= (length := WRITE_BYTES if self._buffer[1:2] == bytes([WRITE]) else READ_BYTES):
             frame, self._buffer = self._buffer[:length], self._buffer[length:]
             if crc16(frame[:-2]) != frame[-2:]:
                 # The start of the next frame is unknown.
@@ -250,15 +252,6 @@ class ModbusSlave:
         action, _, _, pos, spe, force = request[6:]
         gripper.write(GripperRegisters(bool(action & 1), bool(action & 1 << 3), pos, spe, force))
         return request[:5]
-
-
-def _request_length(buffer: bytes) -> int | None:
-    """Return the length of the request at the buffer's start, with its check, or None when too little has come."""
-    if len(buffer) < 2:
-        return None
-    if buffer[1] == WRITE:
-        return 9 + buffer[6] if len(buffer) > 6 else None
-    return 8
 
 
 class GripperPlayer:

@@ -64,7 +64,8 @@ class SkinFault(StrEnum):
 class SkinSample:
     """Both gauges at one time: resistances in Ω, or None with the faults.
 
-    Every reading of the voltages becomes one. `missed` readings are missing right before it; `seq` counts from 0.
+    A reading of the voltages becomes one, or a block of them where they are averaged. `missed` readings are missing
+    right before it; `seq` counts from 0.
     """
 
     r1_ohm: float | None

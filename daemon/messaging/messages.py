@@ -112,10 +112,10 @@ class EitAdapted(Message):
 
 @message("eit.heatmap", rate_hz=None)
 class EitHeatmap(Message):
-    """The scores of all cells for one frame, NaN for invalid cells; sent only while there is a subscriber."""
+    """The scores of all cells for one frame, NaN for invalid cells; sent while there is a subscriber, or always."""
 
     scores: NDArray[np.floating] = column("", "score of each cell, k by sigma")
-    k_low: float = column("cm", "first k of the grid")
+    k_low: float = column("cm", "first k of the grid; in rad/cm for modulated_gaussian")
     k_high: float = column("cm", "last k of the grid")
     sigma_low: float = column("cm", "first sigma of the grid")
     sigma_high: float = column("cm", "last sigma of the grid")

@@ -132,6 +132,24 @@ def test_pages_list_every_command_step_estimator_and_basis_model():
         assert [name for name in names if f"`{name}`" not in text] == [], page
 
 
+@pytest.mark.parametrize("page", ["architecture", "where-to-add", "another-robot", "calibrations"])
+def test_files_classes_and_functions_that_a_page_names_exist(page):
+    folders = ("bank", "drivers", "daemon", "src", "config", "tests", "benchmarks")
+    files = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
+    code = [path for path in files if path.suffix == ".py" and "tests" not in path.parts]
+    words = {word for path in code for word in re.findall(r"\w+", path.read_text())}
+    paths = [f"/{path.relative_to(ROOT)}" for path in files]
+    text = re.sub(r"```.*?```", "", (ROOT / f"docs/{page}.md").read_text(), flags=re.DOTALL)
+    missing = []
+    for name in set(re.findall(r"`([\w./-]+)`", text)) - {"drivers/NAME", "calibration.yaml", ".npz"}:
+        if "/" in name or name.endswith((".py", ".js", ".yaml")):
+            found = (ROOT / name).exists() or any(path.endswith(f"/{name}") for path in paths)
+        else:
+            found = words.issuperset(re.findall(r"\w+", name))
+        missing += [] if found else [name]
+    assert missing == []
+
+
 def program_texts() -> list[str]:
     """Return the string literals of the code, with `…` in place of each formatted value."""
 

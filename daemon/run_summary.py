@@ -27,6 +27,7 @@ TORQUES = ("eit.estimate", "load.torque", "skin.shear")
 # The name of the emulated tool's torque, which no sensor measures.
 TRUE = "true torque"
 _ENDS = ("done", "stopped")
+_EMULATED_STOP = "  The rig is emulated. Unless you stopped it, this computer was too busy for it: close other programs, run it again."
 # The time of each disturbance in ns, and its description.
 _Events: TypeAlias = Sequence[tuple[int, str]]
 
@@ -110,7 +111,9 @@ class RunSummary:
         if phase in _ENDS:
             self._run = None
             rig = self._emulated
-            lines = _lines(run, None, ()) if rig is None else _lines(run, rig.torques(), rig.sent)
+            lines = list(_lines(run, None, ()) if rig is None else _lines(run, rig.torques(), rig.sent))
+            if rig is not None and phase != "done":
+                lines.append(_EMULATED_STOP)
             self.text = ""
             self._add("\n".join(lines))
 

@@ -142,6 +142,15 @@ def test_where_a_screw_ended_and_what_it_took_is_told():
     assert "    load_cell   -0.1210 N·m at the end, -0.1760 at most" in text
 
 
+@pytest.mark.parametrize(("phase", "shown"), [("stopped", 1), ("done", 0)])
+def test_a_stop_of_an_emulated_rig_names_the_busy_computer(phase, shown):
+    assert summary_of(loop_state(0), loop_state(5, phase=phase)).count("The rig is emulated.") == shown
+    on_a_rig = RunSummary(out := StringIO())
+    for content in (loop_state(0), loop_state(5, phase=phase)):
+        on_a_rig("loop.state", content)
+    assert "emulated" not in out.getvalue()
+
+
 def test_the_times_of_a_stop_follow_the_summary():
     times = {"decided_after_s": 0.004, "sent_after_s": 0.006, "stands_after_s": None}
     stop = {"source": "stop", "t_mono_ns": 5 * S, **times}

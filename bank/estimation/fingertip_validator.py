@@ -149,7 +149,7 @@ class FingertipValidator:
 
     def grip_score(self, frame: FloatArray, idle: FloatArray) -> float:
         """Return the grip's score, about 0 when idle and 1 when gripped as at calibration; idle is this session's."""
-        return float((frame - idle) / (idle + SMALL_V) @ self.grip_weights)
+        return float(relative_change(frame, idle) @ self.grip_weights)
 
     def released(self, frame: FloatArray, earlier: FloatArray, idle: FloatArray) -> bool | None:
         """Return whether the grip opened (True) or closed (False) since a frame STEP_FRAMES ago; None for neither."""

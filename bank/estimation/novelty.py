@@ -6,7 +6,6 @@ are in units of each channel's own spread: on recorded slices some channels vary
 limits come from stretches of time that were left out in turn (docs/charts.md).
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -205,13 +204,10 @@ class NoveltyDetector:
                 f"outside the calibration: the frame lies {np.sqrt(t2):.1f} standard deviations from the calibrated "
                 f"ones (limit {np.sqrt(self.largest_t2):.1f})"
             )
-        return Novelty((), self._missing_share(difference, usable))
-
-    def _missing_share(self, difference: FloatArray, usable: BoolArray) -> float:
         if self.typical_response <= 0:
-            return 0.0
+            return FAMILIAR
         left = self.response_share(difference, usable) / self.typical_response
-        return min(max(1.0 - left, 0.0), _MOST_MISSING)
+        return Novelty((), min(max(1.0 - left, 0.0), _MOST_MISSING))
 
 
 def _refused(reason: str) -> Novelty:
@@ -250,11 +246,7 @@ def _check_slices(differences: FloatArray) -> None:
             )
 
 
-def fitted_parts(n: int) -> Iterator[IntArray]:
-    """Yield the rows of all slices, then of each part that is fitted separately."""
-    yield np.arange(n)
-    for rest, _ in left_out_blocks(n):
-        yield rest
+def fitted_parts(n: int) -> list[IntArray]:
+    """Return the rows of all slices, then of each part that is fitted separately."""
     # All later origins contain the first.
-    for earlier, _ in later_origins(n)[:1]:
-        yield earlier
+    return [np.arange(n), *(earlier for earlier, _ in (*left_out_blocks(n), *later_origins(n)[:1]))]

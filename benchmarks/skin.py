@@ -224,11 +224,11 @@ def compare_calibrations() -> None:
 
 def compare_depths() -> None:
     """Print the strains of both gauges at 1 N of both forces, by their depth outwards from mid-thickness."""
-    print("\n" + table_head("depth, mm", "stretched side", "slack side", "ratio"))
-    for depth_mm in (-0.35, -0.026, 0.0, 0.35):
-        skin = condense(replace(PAPER_SECTION, gauge_depth_mm=depth_mm))
+    print("\n" + table_head("thickness, mm", "depth, mm", "stretched side", "slack side", "ratio"))
+    for section, depth_mm in product((PAPER_SECTION, THICK_SECTION), (-0.35, -0.026, 0.0, 0.35)):
+        skin = condense(replace(section, gauge_depth_mm=depth_mm))
         stretched, slack = gauge_strains(skin, states_along(skin, NORMAL_N, loading(AMPLITUDE_N).tolist()))[-1].tolist()
-        print(table_row(depth_mm, f"{stretched:.2%}", f"{slack:.2%}", slack / stretched))
+        print(table_row(section.thickness_mm, depth_mm, f"{stretched:.2%}", f"{slack:.2%}", slack / stretched))
 
 
 def random_states(seed: int) -> Iterator[tuple[CondensedSkin, ContactState]]:

@@ -27,7 +27,7 @@ TORQUES = ("eit.estimate", "load.torque", "skin.shear")
 # The name of the emulated tool's torque, which no sensor measures.
 TRUE = "true torque"
 _ENDS = ("done", "stopped")
-_EMULATED_STOP = "  The rig is emulated. Unless you stopped it, this computer was too busy for it: close other programs, run it again."
+_EMULATED_STOP = "  The rig is emulated. Unless you stopped it, this computer was too busy: close other programs."
 # The time of each disturbance in ns, and its description.
 _Events: TypeAlias = Sequence[tuple[int, str]]
 

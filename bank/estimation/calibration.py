@@ -6,6 +6,8 @@ compression.
 """
 
 import io
+import math
+import os
 import types
 import zipfile
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
@@ -28,13 +30,16 @@ from shearloop.bank.estimation.values import INLINE, Kind, Measured
 from shearloop.bank.estimators import estimator_class
 from shearloop.bank.gain import GainCorrection, ToolLaw
 from shearloop.bank.polynomial import Polynomial
-from shearloop.files import replace_file
+from shearloop.files import open_file, refusing_damage, replace_file
+from shearloop.yaml_files import parse_yaml, shown
 
 FORMAT_VERSION = 7
 # First bytes of a zip that is not empty.
 ARCHIVE_MAGIC = b"PK\x03\x04"
 _FILE_KIND = "shearloop estimator calibration"
 _HEADER = "calibration.yaml"
+# Calibrations take some MB.
+_LARGEST_BYTES = 64 << 20
 
 # What the user guarantees, with the end of a sentence that says so.
 Assumption = Literal["full range", "load timing"]
@@ -131,7 +136,9 @@ class Calibration:
         if torque is None and diameter is None:
             raise CalibrationError("a calibration needs measurements of torque, of diameter, or of both")
 
-        def model(symbol: str, degree: int, points: tuple[FloatArray, FloatArray] | None) -> OutputModel | None:
+        def model(
+            symbol: Literal["sigma", "k"], degree: int, points: tuple[FloatArray, FloatArray] | None
+        ) -> OutputModel | None:
             if points is None:
                 return None
             return OutputModel(PolynomialRegressor(symbol, Polynomial.fit(*points, degree)), None, np.zeros(0))
@@ -182,21 +189,24 @@ class Calibration:
         version, or made with another channel table.
         """
         path = Path(path)
-        header, arrays = _read_members(path)
+        damage = "this is not a calibration, or it is truncated or damaged ({}); calibrate again"
+        with refusing_damage(path, CalibrationError, "the calibration", damage):
+            header, arrays = _read_members(path)
         if not isinstance(header, dict) or header.get("kind") != _FILE_KIND:
             raise CalibrationError(f"{path} is not an estimator's calibration: make one with `shearloop calibrate`")
         version = header.get("format_version")
         if version != FORMAT_VERSION:
             raise CalibrationError(
-                f"{path}: the calibration has format version {version}, expected {FORMAT_VERSION}; calibrate again"
+                f"{path}: the calibration has format version {shown(version)}, expected {FORMAT_VERSION}; "
+                "calibrate again"
             )
-        try:
+        damage = (
+            "the file does not describe a calibration of this version ({}); use the version that wrote it, or "
+            "calibrate again"
+        )
+        with refusing_damage(path, CalibrationError, "the calibration", damage):
             restored: Self = _from_plain(cls, header["content"], "", arrays)
-        except (KeyError, TypeError, ValueError, IndexError, StopIteration, CalibrationError) as error:
-            raise CalibrationError(
-                f"{path}: the file does not describe a calibration of this version ({error}); use the version that "
-                "wrote it, or calibrate again"
-            ) from error
+            restored.check_shapes()
         table, expected = str(header.get("channel_table")), restored.estimator.table.digest
         if table != expected:
             raise CalibrationError(
@@ -204,6 +214,25 @@ class Calibration:
                 "calibrate again"
             )
         return restored
+
+    def check_shapes(self) -> None:
+        """Raise ValueError where arrays do not fit together, as in a file that another program wrote."""
+        c, m = self.estimator.table.n_channels, max(len(self.sides), 1)
+        rows = [a for one in self.validators for a in (one.idle, one.gripped, one.noise, one.grip_weights)]
+        whole = self.estimator.scale.shape == (m, c) and all(row.shape == (c,) for row in rows)
+        if not whole or len(self.validators) not in (0, len(self.sides)):
+            raise ValueError(f"it is of {len(self.sides)} sides of {c} channels, and its arrays have other shapes")
+        for model in self.outputs.values():
+            if model.k_range.shape not in ((0,), (2,)):
+                raise ValueError(f"k_range has the shape {model.k_range.shape}, expected two values")
+            if model.novelty is not None:
+                model.novelty.assess(np.ones(c), np.ones(c, dtype=np.bool_))
+            regressor = model.regressor
+            features = regressor.mean_feature if isinstance(regressor, IntervalRegressor) else np.zeros(1)
+            value, below, above = regressor.predict(features)
+            regressor.range_reasons(value, features, "torque", "")
+            if not math.isfinite(value) or math.isnan(below + above):
+                raise ValueError("its coefficients give no finite value")
 
     def check_bank(self, bank: Bank | None) -> Bank:
         """Return the bank; raises CalibrationError where it is missing or not the calibration's."""
@@ -227,26 +256,19 @@ def _paper_estimator(table: ChannelTable) -> PaperEstimator:
 
 def _read_members(path: Path) -> tuple[Any, dict[str, NDArray[Any]]]:
     """Return header and arrays; the zip compares their checksums."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            # Stored members are no larger than the file; compressed or overlapping ones may fill the memory.
-            if sum(member.file_size for member in archive.infolist()) > path.stat().st_size:
-                raise ValueError("its members are larger than the file")
-            arrays: dict[str, NDArray[Any]] = {
-                name.removesuffix(".npy"): np.load(io.BytesIO(archive.read(name)), allow_pickle=False)
-                for name in archive.namelist()
-                if name != _HEADER
-            }
-            return yaml.safe_load(archive.read(_HEADER)), arrays
-    except OSError as error:
-        raise CalibrationError(f"{path}: the calibration cannot be read: {error.strerror or error}") from error
-    except (
-        *(zipfile.BadZipFile, yaml.YAMLError, EOFError, KeyError, ValueError),
-        *(MemoryError, NotImplementedError, RecursionError),
-    ) as error:
-        raise CalibrationError(
-            f"{path}: this is not a calibration, or it is truncated or damaged ({error}); calibrate again"
-        ) from error
+    with open_file(path) as file, zipfile.ZipFile(file) as archive:
+        members, size = archive.infolist(), os.fstat(file.fileno()).st_size
+        # Stored members are no larger than the file; compressed or overlapping ones may fill the memory.
+        if sum(member.file_size for member in members) > size or any(member.compress_type for member in members):
+            raise ValueError("its members are larger than the file, or compressed")
+        if size > _LARGEST_BYTES:
+            raise ValueError(f"it is larger than {_LARGEST_BYTES >> 20} MB")
+        arrays: dict[str, NDArray[Any]] = {
+            name.removesuffix(".npy"): np.load(io.BytesIO(archive.read(name)), allow_pickle=False)
+            for name in archive.namelist()
+            if name != _HEADER
+        }
+        return parse_yaml(archive.read(_HEADER)), arrays
 
 
 def _to_plain(value: Any, path: str, arrays: dict[str, NDArray[Any]]) -> Any:
@@ -282,29 +304,38 @@ def _from_plain(kind: Any, plain: Any, path: str, arrays: dict[str, NDArray[Any]
             choices = [choice for choice in choices if _names(choice) == set(plain)]
         return _from_plain(choices[0], plain, path, arrays)
     if origin is Literal and plain not in get_args(kind):
-        raise ValueError(f"{name} is {plain!r}, which this version does not know")
+        raise ValueError(f"{name} is {shown(plain)}, which this version does not know")
     if origin is tuple:
         if not isinstance(plain, list):
             raise TypeError(f"{name} is not a list")
         return tuple(_from_plain(get_args(kind)[0], item, f"{path}/{i}", arrays) for i, item in enumerate(plain))
     if isinstance(plain, dict) and set(plain) == {"array"}:
-        array = arrays[plain["array"]]
-        array.setflags(write=False)
-        return array
+        return _checked(arrays[plain["array"]], kind, name)
     if is_dataclass(kind):
         kind = estimator_class(plain["estimator"]) if kind is Estimator else kind
         hints, values = get_type_hints(kind), {}
         for one in fields(kind):
             if one.metadata == INLINE:
                 values[one.name] = _from_plain(hints[one.name], plain, path, arrays)
+            elif isinstance(one.default, float) and math.isnan(one.default):
+                values[one.name] = float(plain.get(one.name, one.default))  # may be unknown
             elif one.name in plain or one.default is MISSING:
                 values[one.name] = _from_plain(hints[one.name], plain[one.name], f"{path}/{one.name}", arrays)
         return kind(**values)
-    if kind is float:
+    if kind is float and type(plain) in (int, float) and not math.isnan(plain):
         return float(plain)
-    if not isinstance(plain, str | bool | int | float | list) and plain is not None:
-        raise TypeError(f"{name} is a {type(plain).__name__}")
+    if origin is not Literal and (kind is float or kind is not type(plain)):
+        raise TypeError(f"{name} is {shown(plain)}, expected a value of type {kind.__name__}")
     return plain
+
+
+def _checked(array: NDArray[Any], kind: Any, name: str) -> NDArray[Any]:
+    """Return the array, read-only; raises ValueError where its numbers are not those of the type `kind`."""
+    expected = get_args(get_args(kind)[1])[0]
+    if array.dtype != expected or np.isnan(array).any():
+        raise ValueError(f"{name} holds {array.dtype}, expected {expected.__name__} without NaN")
+    array.setflags(write=False)
+    return array
 
 
 def _names(kind: Any) -> set[str]:

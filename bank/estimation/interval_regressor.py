@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import ClassVar, Self, TypeAlias
+from typing import ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 from scipy.special import stdtrit
@@ -328,7 +328,7 @@ class PolynomialRegressor:
 
     gain: ClassVar[GainSpread] = GainSpread()
 
-    symbol: str
+    symbol: Literal["sigma", "k"]
     polynomial: Polynomial
     misses_loads: bool = False
 

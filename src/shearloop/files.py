@@ -1,10 +1,14 @@
-"""Files that are replaced whole: a reader sees the old content or the new, never half of it."""
+"""Files that are replaced whole, so that a reader never sees half of one, and files of unknown content."""
 
+import errno
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
+
+_LONGEST_DETAIL = 300
 
 
 @contextmanager
@@ -33,6 +37,31 @@ def replace_file(path: Path) -> Iterator[BinaryIO]:
         with suppress(OSError):
             temporary.unlink()
         raise
+
+
+@contextmanager
+def refusing_damage(path: Path, raises: type[Exception], what: str, damage: str, missing: str = "") -> Iterator[None]:
+    """Turn every error of the block into `raises`: a foreign or damaged file raises many types of exceptions.
+
+    `what` names the file where it cannot be read, which `missing` ends; `damage` says the rest, with {} for the detail.
+    """
+    try:
+        yield
+    except raises:
+        raise
+    except OSError as error:
+        raise raises(f"{path}: {what} cannot be read: {error.strerror or error}{missing}") from error
+    except Exception as error:
+        detail = str(error)[:_LONGEST_DETAIL] or repr(error)
+        raise raises(f"{path}: {damage.replace('{}', detail)}") from error
+
+
+def open_file(path: Path) -> BinaryIO:
+    """Open a file to read; raises OSError, also for a device or a pipe, which may have no end."""
+    mode = path.stat().st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise OSError(errno.EINVAL, "it is a device or a pipe; name a file")
+    return path.open("rb")
 
 
 def sync_directory(directory: Path) -> None:

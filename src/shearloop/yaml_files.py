@@ -113,6 +113,13 @@ def read_yaml(path: Path, raises: type[Exception], what: str = "configuration", 
     return content
 
 
+def parse_yaml(text: bytes) -> Any:
+    """Return the content of a YAML text; raises yaml.YAMLError, ValueError or RecursionError."""
+    if len(text) > _MOST_BYTES:
+        raise ValueError(f"its header is larger than {_MOST_BYTES >> 10} kB")
+    return yaml.load(text.decode(), _Loader)  # noqa: S506 - it is a SafeLoader
+
+
 def load_model(
     path: Path, model: type[Model], raises: type[Exception], what: str = "configuration", cure: str = ""
 ) -> Model:
@@ -120,7 +127,7 @@ def load_model(
     content = read_yaml(path, raises, what, cure)
     if not isinstance(content, dict):
         example = next(iter(TypeAdapter(model).json_schema()["properties"]), "key")
-        raise raises(f"{path}: expected keys and values such as `{example}: …`, found {_shown(content)}")
+        raise raises(f"{path}: expected keys and values such as `{example}: …`, found {shown(content)}")
     try:
         return _validated(content, model, path.resolve().parent)
     except ValidationError as error:
@@ -248,7 +255,7 @@ def _place(details: ErrorDetails, content: object, node: yaml.Node | None) -> tu
 def _sentence(details: ErrorDetails, schema: Mapping[str, Any]) -> str:
     location, kind, found = details["loc"], details["type"], details["input"]
     if kind == "invalid_key":
-        return f"the key {_shown(found)} is a number; a name is expected"
+        return f"the key {shown(found)} is a number; a name is expected"
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
         return f"is not a known key{_known_keys(str(location[-1]), _schema_at(schema, location[:-1], schema))}"
     if kind in ("value_error", "assertion_error"):
@@ -261,10 +268,10 @@ def _sentence(details: ErrorDetails, schema: Mapping[str, Any]) -> str:
     if kind in ("missing", "union_tag_not_found"):
         sentence = "is missing"
     elif kind == "union_tag_invalid":
-        sentence = f"{_shown(found)} does not exist"
+        sentence = f"{shown(found)} does not exist"
     else:
         wrong = (words for begin, words in _WRONG if kind.startswith(begin))
-        sentence = f"{_shown(found)} {next(wrong, details['msg'])}"
+        sentence = f"{shown(found)} {next(wrong, details['msg'])}"
     near = get_close_matches(str(found), choices, 1)
     hint = f"did you mean {near[0]}?" if near else _unit_hint(location, found, here)
     return "; ".join(filter(None, (sentence, f"allowed: {allowed}" if allowed else "", hint)))
@@ -336,6 +343,7 @@ def _allowed(schema: Mapping[str, Any]) -> str:
     return " ".join(bounds)
 
 
-def _shown(value: object) -> str:
+def shown(value: object) -> str:
+    """Return a value of a file for a message, at most 60 characters."""
     text = repr(value)
     return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 1]}…"

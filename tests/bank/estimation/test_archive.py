@@ -1,7 +1,10 @@
 import io
+import os
+import re
 import tracemalloc
 import zipfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +15,8 @@ from hypothesis import strategies as st
 from shearloop.bank.errors import BankError, CalibrationError
 from shearloop.bank.estimation import TRUSTED, Calibration, fit
 from tests.bank.estimation.conftest import follow
+
+DEMO = Path(__file__).parents[3] / "config/calibrations/demo.cal"
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +95,7 @@ def test_members_that_would_fill_the_memory_are_refused(tmp_path):
         for _ in range(200):
             member.write(bytes(1 << 20))
     tracemalloc.start()
-    with pytest.raises(CalibrationError, match="its members are larger than the file"):
+    with pytest.raises(CalibrationError, match="its members are larger than the file, or compressed"):
         Calibration.load(large)
     assert tracemalloc.get_traced_memory()[1] < 16e6
     tracemalloc.stop()
@@ -138,3 +143,113 @@ def test_an_unknown_value_is_refused_by_name(motion_calibration, tmp_path, name,
     _with_header(motion_calibration, other, {name: value})
     with pytest.raises(CalibrationError, match=name):
         Calibration.load(other)
+
+
+def _damage(path, find, replace):
+    """Write a calibration whose header has another text."""
+    with zipfile.ZipFile(DEMO) as read, zipfile.ZipFile(path, "w") as written:
+        for member in read.namelist():
+            content = read.read(member)
+            if member == "calibration.yaml":
+                assert find in content.decode()
+                content = content.decode().replace(find, replace).encode()
+            written.writestr(member, content)
+
+
+BOMB = "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}' if i else 'x'] * 10)}]\n" for i in range(9))
+
+
+@pytest.mark.parametrize("key", ["kind", "format_version", "channel_table", "content"])
+def test_aliases_that_would_fill_the_memory_are_refused(key, tmp_path):
+    bomb = tmp_path / "bomb.cal"
+    with zipfile.ZipFile(bomb, "w") as archive:
+        archive.writestr("calibration.yaml", f"{BOMB}{key}: *a8\n")
+    tracemalloc.start()
+    with pytest.raises(CalibrationError, match="with every alias written out"):
+        Calibration.load(bomb)
+    assert tracemalloc.get_traced_memory()[1] < 16e6
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("find", "replace", "problem"),
+    [
+        ("bank_identity: ", "bank_identity: null #", "bank_identity is None"),
+        ("symbol: sigma", "symbol: evil", "symbol is 'evil'"),
+        ("0.0787319505227407", ".nan", "coefficients/0 is nan"),
+        ("0.0787319505227407", ".inf", "no finite value"),
+        ("0.0787319505227407", "'abc'", "coefficients/0 is 'abc'"),
+        ("x_low: 1.3285714285714285", "x_low: .nan", "x_low is nan"),
+        ("n: 49", "n: -1", "no finite value"),
+        ("n: 49", "n: 4.5", "n is 4.5, expected a value of type int"),
+        ("sides: []", "sides: 5", "sides is not a list"),
+        ("sides: []", "sides: [right, left]", "its arrays have other shapes"),
+    ],
+)  # fmt: skip
+def test_a_header_with_a_wrong_value_is_refused(find, replace, problem, tmp_path):
+    _damage(tmp_path / "x.cal", find, replace)
+    with pytest.raises(CalibrationError, match=problem):
+        Calibration.load(tmp_path / "x.cal")
+
+
+@pytest.mark.parametrize(
+    "array", ["scale", "torque.regressor.mean_feature", "validators.0.noise", "torque.regressor.point.weights"]
+)
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda a: np.full(a.shape, "abc"),
+        lambda a: np.full(a.shape, np.nan),
+        lambda a: a.astype(np.complex128),
+        lambda a: a.astype(np.int8),
+        lambda _: np.ones(7),
+        lambda _: np.ones((2, 3, 4)),
+        lambda _: np.array(1.0),
+    ],
+    ids=["text", "nan", "complex", "small integers", "7 values", "three dimensions", "no dimension"],
+)
+def test_an_array_of_another_type_or_shape_is_refused(saved, array, change, tmp_path):
+    with zipfile.ZipFile(saved) as read, zipfile.ZipFile(tmp_path / "x.cal", "w") as written:
+        assert f"{array}.npy" in read.namelist()
+        for member in read.namelist():
+            content = io.BytesIO(read.read(member))
+            if member == f"{array}.npy":
+                changed = change(np.load(content))
+                content = io.BytesIO()
+                np.save(content, changed)
+            written.writestr(member, content.getvalue())
+    with pytest.raises(CalibrationError, match="does not describe a calibration of this version"):
+        Calibration.load(tmp_path / "x.cal")
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
+def test_compressed_and_encrypted_members_are_refused(method, tmp_path):
+    packed = tmp_path / "packed.cal"
+    with zipfile.ZipFile(DEMO) as read, zipfile.ZipFile(packed, "w", method) as written:
+        for member in read.namelist():
+            written.writestr(member, read.read(member))
+    content = packed.read_bytes().replace(b"\x93NUMPY", b"\x00NUMPY")
+    packed.write_bytes(bytes(len(DEMO.read_bytes())) + content)
+    with pytest.raises(CalibrationError, match="or compressed"):
+        Calibration.load(packed)
+    encrypted = bytearray(DEMO.read_bytes())
+    for mark, flags in ((b"PK\x01\x02", 8), (b"PK\x03\x04", 6)):
+        for at in (one.start() for one in re.finditer(mark, encrypted)):
+            encrypted[at + flags] |= 1
+    packed.write_bytes(encrypted)
+    with pytest.raises(CalibrationError, match="encrypted"):
+        Calibration.load(packed)
+
+
+@pytest.mark.parametrize("kind", ["device", "pipe", "large"])
+def test_a_file_without_an_end_is_not_read(kind, tmp_path):
+    path = tmp_path / "x.cal" if kind != "device" else Path("/dev/zero")
+    if kind == "pipe":
+        os.mkfifo(path)
+    if kind == "large":
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("calibration.yaml", bytes(65 << 20))
+    with pytest.raises(
+        CalibrationError, match="larger than 64 MB" if kind == "large" else "a device or a pipe; name a"
+    ):
+        Calibration.load(path)

@@ -8,7 +8,6 @@ counts from before the last byte is written until the subscriber has the estimat
 Needs the extra `bench`.
 """
 
-import argparse
 import contextlib
 import os
 import subprocess
@@ -32,9 +31,11 @@ from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.emulators.boards import format_line
 
-MEASUREMENTS = ("commands", "latency", "flood", "rated")
 REPEATS = 5
-FLOOD_HZ = 500.0
+# Timed frames of a latency.
+FRAMES = 240
+FLOOD_HZ, FLOOD_FRAMES = 500.0, 2400
+RATED_S = 30.0
 # Before processor time counts: until everything is connected.
 SETTLING_S = 10.0
 
@@ -57,14 +58,13 @@ def recorded_lines(rig: Path, side: str, n: int) -> list[bytes]:
     return list(islice(cycle([format_line(values) for values in recorded]), n))
 
 
-def by_bank(args: argparse.Namespace, matching: str) -> dict[str, Any]:
+def by_bank(bank: Path, matching: str) -> dict[str, Any]:
     """Return the configuration of one fingertip that is matched in a bank."""
-    return {"fingertips": {"right": {"bank": str(args.bank.resolve()), "matching": matching}}}
+    return {"fingertips": {"right": {"bank": str(bank), "matching": matching}}}
 
 
-def by_default(args: argparse.Namespace, sides: Sequence[str]) -> dict[str, Any]:
+def by_default(rig: Path, sides: Sequence[str]) -> dict[str, Any]:
     """Return the configuration of fingertips with the default estimator, and of the combined one for several."""
-    rig = args.rig.resolve()
     fingertips = {
         side: {"calibration": str(rig / f"rig-{side}.cal"), "estimator": "motion_regression"} for side in sides
     }
@@ -134,10 +134,10 @@ def latency(config: dict[str, Any], rig: Path, n_frames: int, period_s: float) -
     }  # fmt: skip
 
 
-def flood(args: argparse.Namespace, n_frames: int) -> dict[str, Any]:
+def flood(config: dict[str, Any], rig: Path) -> dict[str, Any]:
     """Return the losses and the load at five hundred frames a second."""
-    lines = recorded_lines(args.rig, "right", n_frames)
-    with played(by_bank(args, "zero_lag"), 1 / FLOOD_HZ) as (boards, pid, _, estimates):
+    lines = recorded_lines(rig, "right", FLOOD_FRAMES)
+    with played(config, 1 / FLOOD_HZ) as (boards, pid, _, estimates):
         process = psutil.Process(pid)
         before, begun = cpu_s(process), time.monotonic()
 
@@ -153,18 +153,18 @@ def flood(args: argparse.Namespace, n_frames: int) -> dict[str, Any]:
         player.join()
         busy = (cpu_s(process) - before) / took_s
     return {
-        "estimates_hz": n_frames / took_s,
-        "lost": n_frames - len(set(frames)),
+        "estimates_hz": FLOOD_FRAMES / took_s,
+        "lost": FLOOD_FRAMES - len(set(frames)),
         "in_order": frames == sorted(frames),
         "cores_busy": busy,
     }
 
 
-def rated(bank: Path, rig_bank: Path, seconds: float) -> dict[str, float]:
+def rated(bank: Path, rig_bank: Path) -> dict[str, float]:
     """Return processor time and memory with the whole emulated rig at its rated speeds, recording."""
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as opened:
         folder = Path(name)
-        fingertip = {"bank": str(bank.resolve()), "matching": "all_lags"}
+        fingertip = {"bank": str(bank), "matching": "all_lags"}
         config = common.write_rig_config(
             folder,
             "config/demo_ur.yaml",
@@ -178,7 +178,7 @@ def rated(bank: Path, rig_bank: Path, seconds: float) -> dict[str, float]:
         _listen(health, SETTLING_S)
         own = psutil.Process(daemon.pid)
         before, begun = {each: cpu_s(each) for each in (own, *own.children(recursive=True))}, time.monotonic()
-        _listen(health, seconds)
+        _listen(health, RATED_S)
         took_s = time.monotonic() - begun
         shares = {each: (cpu_s(each) - cpu) / took_s for each, cpu in before.items()}
         memory = {each: each.memory_info().rss / 2**20 for each in before}
@@ -208,32 +208,28 @@ def command_s(*arguments: str, repeats: int = 1) -> float:
     return float(np.median(taken))
 
 
-def measure(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the figures of the chosen measurements."""
+def measure(bank: Path, rig: Path) -> dict[str, Any]:
+    """Return all figures."""
     found: dict[str, Any] = {"load_average": os.getloadavg()[0], "cores": os.cpu_count()}
-    if "commands" in args.only:
-        with tempfile.TemporaryDirectory() as folder:
-            built = ("bank", "build", "--config", "config/banks/paper.yaml", "--out", f"{folder}/paper.bank")
-            found["build_10000_cells_s"] = command_s(*built)
-        found["help_s"] = command_s("--help", repeats=REPEATS)
-    if "latency" in args.only:
-        configs = {
-            "zero_lag": by_bank(args, "zero_lag"),
-            "all_lags": by_bank(args, "all_lags"),
-            "default_one_fingertip": by_default(args, ("right",)),
-            "default_both": by_default(args, ("right", "left")),
+    with tempfile.TemporaryDirectory() as folder:
+        built = ("bank", "build", "--config", "config/banks/paper.yaml", "--out", f"{folder}/paper.bank")
+        found["build_10000_cells_s"] = command_s(*built)
+    found["help_s"] = command_s("--help", repeats=REPEATS)
+    configs = {
+        "zero_lag": by_bank(bank, "zero_lag"),
+        "all_lags": by_bank(bank, "all_lags"),
+        "default_one_fingertip": by_default(rig, ("right",)),
+        "default_both": by_default(rig, ("right", "left")),
+    }
+    found["latency"] = {
+        name: {
+            "every_30_ms": latency(config, rig, FRAMES, common.PAUSE_S),
+            "at_the_boards_rate": latency(config, rig, FRAMES // 3, FRAME_PERIOD_S),
         }
-        found["latency"] = {
-            name: {
-                "every_30_ms": latency(config, args.rig, args.frames, common.PAUSE_S),
-                "at_the_boards_rate": latency(config, args.rig, args.frames // 3, FRAME_PERIOD_S),
-            }
-            for name, config in configs.items()
-        }
-    if "flood" in args.only:
-        found["flood"] = flood(args, 10 * args.frames)
-    if "rated" in args.only:
-        found["rated"] = rated(args.bank, args.rig / "demo.bank", args.rated_s)
+        for name, config in configs.items()
+    }
+    found["flood"] = flood(configs["zero_lag"], rig)
+    found["rated"] = rated(bank, rig / "demo.bank")
     return found
 
 
@@ -242,11 +238,8 @@ def main() -> None:
     parser = common.parser_of(__doc__)
     parser.add_argument("--bank", type=Path, required=True, help="the fingertips' bank, of 100 × 100 cells")
     parser.add_argument("--rig", type=Path, required=True, help="folder with rig-25mm.mcap, rig*.cal and demo.bank")
-    parser.add_argument("--frames", type=int, default=240, help="number of timed frames")
-    parser.add_argument("--rated-s", type=float, default=30.0, help="seconds at rated speeds")
-    parser.add_argument("--only", nargs="+", choices=MEASUREMENTS, default=MEASUREMENTS)
     args = parser.parse_args()
-    print(common.write_figures(args.out, measure(args)))
+    print(common.write_figures(args.out, measure(args.bank.resolve(), args.rig.resolve())))
 
 
 if __name__ == "__main__":

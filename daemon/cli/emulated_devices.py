@@ -3,10 +3,10 @@
 import argparse
 import contextlib
 import json
+import os
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from shearloop.daemon.run_summary import TorqueSeries
 
 # An emulator prints a line once its ports are open, which takes about two seconds.
-READY_S = 20.0
+READY_S, POLL_S = 20.0, 0.02
 # An emulator needs some of it to remove its port's link; a clean stop takes less than a second in all.
 STOP_S = 0.5
 
@@ -65,23 +65,19 @@ class EmulatedDevices:
             if any(emulator.device == "rig" and "--truth" not in emulator.arguments for emulator in self._emulators):
                 folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="shearloop-"))
                 self._truth = Path(folder) / "truth.jsonl"
-            processes: list[subprocess.Popen[bytes]] = []
-            ready: list[threading.Event] = []
-            readers: list[threading.Thread] = []
-            stack.callback(_stop, processes, readers)
+            devices: list[tuple[subprocess.Popen[bytes], IO[bytes]]] = []
+            stack.callback(_stop, devices)
             for emulator in self._emulators:
+                output = stack.enter_context(tempfile.TemporaryFile())
                 # An emulator ends when its standard input is closed.
                 process = subprocess.Popen(
-                    self._command(emulator), cwd=self._folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+                    self._command(emulator), cwd=self._folder, stdin=subprocess.PIPE, stdout=output
                 )
-                processes.append(process)
-                ready.append(threading.Event())
-                readers.append(threading.Thread(target=_read_lines, args=(process.stdout, ready[-1]), daemon=True))
-                readers[-1].start()
+                devices.append((process, output))
                 self._waiting += [(event, process) for event in emulator.events]
             until_s = time.monotonic() + READY_S
-            for one in ready:
-                one.wait(max(0.0, until_s - time.monotonic()))
+            while time.monotonic() < until_s and any(_is_starting(*device) for device in devices):
+                time.sleep(POLL_S)
             self._stack = stack.pop_all()
         return self
 
@@ -127,18 +123,14 @@ class EmulatedDevices:
                     self.sent.append((time.monotonic_ns(), event.command))
 
 
-def _read_lines(output: IO[bytes], ready: threading.Event) -> None:
-    """Read what a device prints, so that it never waits; set `ready` at its first line or its end."""
-    with output:
-        for _ in output:
-            ready.set()
-    ready.set()
+def _is_starting(process: "subprocess.Popen[bytes]", output: IO[bytes]) -> bool:
+    return process.poll() is None and not os.fstat(output.fileno()).st_size
 
 
-def _stop(processes: "list[subprocess.Popen[bytes]]", readers: list[threading.Thread]) -> None:
-    for process in processes:
+def _stop(devices: "list[tuple[subprocess.Popen[bytes], IO[bytes]]]") -> None:
+    for process, _ in devices:
         process.terminate()
-    for process in processes:
+    for process, _ in devices:
         try:
             process.wait(STOP_S)
         except subprocess.TimeoutExpired:
@@ -148,6 +140,3 @@ def _stop(processes: "list[subprocess.Popen[bytes]]", readers: list[threading.Th
             # Closing flushes unread input to a process that has ended.
             with contextlib.suppress(BrokenPipeError):
                 process.stdin.close()
-    # A device has closed its output by now.
-    for reader in readers:
-        reader.join(STOP_S)

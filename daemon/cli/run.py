@@ -21,11 +21,8 @@ if TYPE_CHECKING:
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `run`."""
     add_option(parser, "config", Path, "CONFIG", "a YAML file such as config/demo.yaml")
-    parser.add_argument(
-        "--show",
-        action="store_true",
-        help="show the state (to a file: each estimate), and a summary",
-    )
+    text = "show the state (to a file: each estimate), and a summary"
+    parser.add_argument("--show", action="store_true", help=text)
     text = "log JSON lines (the default under systemd)"
     parser.add_argument("--json-log", action="store_true", default=None, help=text)
     add_option(parser, "--recording", Path, "FILE", "let the configuration's EIT emulators play this .mat recording")
@@ -59,13 +56,7 @@ def run(args: argparse.Namespace) -> int:
         return _run(args, out, on_ready, terminal=terminal)
 
 
-def _run(
-    args: argparse.Namespace,
-    out: "NonBlockingWriter",
-    on_ready: Callable[[], None],
-    *,
-    terminal: bool,
-) -> int:
+def _run(args: argparse.Namespace, out: "NonBlockingWriter", on_ready: Callable[[], None], *, terminal: bool) -> int:
     from shearloop.daemon.app import run_daemon
     from shearloop.daemon.cli import EXIT_OK, EXIT_UNFINISHED
     from shearloop.daemon.cli.emulated_devices import EmulatedDevices
@@ -77,17 +68,15 @@ def _run(
     raise_descriptor_limit()
     if config.lock_memory:
         lock_memory()
-    listeners: list[Listener] = []
     with ExitStack() as stack:
         # Without permission the loop still detects late commands and holds the wrist.
         stack.enter_context(high_priority() if config.robot is not None else nullcontext())
         emulated = stack.enter_context(EmulatedDevices(config.emulators, args.config.parent, args.recording))
-        listeners.append(emulated)
+        listeners: list[Listener] = [emulated]
         if args.show:
             listeners.append(stack.enter_context(StatusLine(out)) if terminal else EstimatePrinter(out))
         shown = out if args.show or config.recording is not None else None
-        summary = RunSummary(shown, emulated)
-        finished = asyncio.run(run_daemon(config, tuple(listeners), on_ready, summary))
+        finished = asyncio.run(run_daemon(config, tuple(listeners), on_ready, RunSummary(shown, emulated)))
     return EXIT_OK if finished else EXIT_UNFINISHED
 
 

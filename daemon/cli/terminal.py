@@ -7,7 +7,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, Self, TextIO
 
@@ -101,61 +101,66 @@ class StatusLine:
         self._out.flush()
 
 
+@contextmanager
+def stdin_lines(on_line: Callable[[str | None], None]) -> Iterator[None]:
+    """Have the event loop call `on_line` with each line of standard input, and with None at its end.
+
+    Raises PermissionError for a file, which an event loop cannot watch.
+    """
+    loop, partial = asyncio.get_running_loop(), b""
+
+    def read() -> None:
+        nonlocal partial
+        data = os.read(STDIN, READ_BYTES)
+        *lines, partial = (partial + data).split(b"\n")
+        # An unfinished line must not grow without limit.
+        partial = partial[-READ_BYTES:]
+        for line in lines:
+            on_line(line.decode(errors="replace").strip())
+        if not data:
+            loop.remove_reader(STDIN)
+            on_line(None)
+
+    loop.add_reader(STDIN, read)
+    try:
+        yield
+    finally:
+        loop.remove_reader(STDIN)
+
+
 class Operator:
-    """The person at the terminal, as an asynchronous context; a pipe or a file works too."""
+    """The person at the terminal, as a context within an event loop; a pipe or a file works too."""
 
     def __init__(self, *, stdout_is_for_json: bool = False) -> None:
         """Print to stdout, or to stderr if stdout is for a result in JSON."""
         self._out = sys.stderr if stdout_is_for_json else sys.stdout
-        self._partial = b""
         self._lines: asyncio.Queue[str | None] = asyncio.Queue()
-        self._watching = False
+        self._reading = ExitStack()
 
-    async def __aenter__(self) -> Self:
+    def __enter__(self) -> Self:
         """Start reading."""
         try:
-            asyncio.get_running_loop().add_reader(STDIN, self._read)
-            self._watching = True
+            self._reading.enter_context(stdin_lines(self._lines.put_nowait))
         except PermissionError:
-            # epoll refuses a file; reading a file never blocks.
-            while self._read():
-                pass
+            # Reading a file never blocks.
+            with open(STDIN, closefd=False) as file:
+                for line in (*file, None):
+                    self._lines.put_nowait(line)
         return self
 
-    async def __aexit__(self, *_: object) -> None:
+    def __exit__(self, *_: object) -> None:
         """Stop reading."""
-        self._stop()
+        self._reading.close()
 
-    async def ask(self, prompt: str) -> str:
-        """Print the prompt and return the next line; raise UserError at the end of the input."""
-
+    async def ask(self, prompt: str) -> None:
+        """Print the prompt and wait for the next line; raise UserError at the end of the input."""
         self.say(prompt)
-        line = await self._lines.get()
-        if line is None:
-            self._lines.put_nowait(None)
+        if await self._lines.get() is None:
             raise UserError("the input ended before all was measured; press Enter after each step")
-        return line
 
     def say(self, sentence: str) -> None:
         """Print a sentence."""
         print(sentence, file=self._out, flush=True)
-
-    def _read(self) -> bool:
-        data = os.read(STDIN, READ_BYTES)
-        *lines, self._partial = (self._partial + data).split(b"\n")
-        # An unfinished line must not grow without limit.
-        self._partial = self._partial[-READ_BYTES:]
-        for line in lines:
-            self._lines.put_nowait(line.decode(errors="replace").strip())
-        if not data:
-            self._lines.put_nowait(None)
-            self._stop()
-        return bool(data)
-
-    def _stop(self) -> None:
-        if self._watching:
-            asyncio.get_running_loop().remove_reader(STDIN)
-            self._watching = False
 
 
 def message_line(topic: str, content: Mapping[str, Any]) -> str:
@@ -217,7 +222,7 @@ def task_row(name: str, facts: Mapping[str, Any]) -> tuple[str, str, str, str]:
     if lost and not down:
         notes.append(f"reconnected {times(lost)}")
     notes += [f"{kind} {times(count)}" for kind, count in errors.items()]
-    if error := facts.get("error") or facts.get("last_error"):
+    if error := facts.get("error") or facts.get("last_error") or (down and facts.get("last_loss")):
         notes.append(error)
     return name, state, _rate(facts.get("rate_hz"), facts.get("expected_hz")), ", ".join(notes)
 

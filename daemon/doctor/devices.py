@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from shearloop.daemon.cli.terminal import task_row
 from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.client import receive_messages, send_command
@@ -23,7 +24,7 @@ from shearloop.daemon.sensing.estimators import fingertip_table
 from shearloop.daemon.serial_ports import access_error
 from shearloop.drivers.connection import SerialLink, find_port
 from shearloop.drivers.eit_kit import EitKit
-from shearloop.drivers.errors import DriverError, times
+from shearloop.drivers.errors import DriverError
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.messages import ActivationStatus
 from shearloop.drivers.ur.controller import query_controller, untested_sentence
@@ -279,19 +280,15 @@ def check_daemon(
 
 
 def check_task(name: str, status: Mapping[str, Any]) -> Finding:
-    """Judge one task by the counters that it reports."""
-    subject = f"task {name}"
-    counted = ", ".join(f"{kind} {times(count)}" for kind, count in (status.get("errors") or {}).items() if count)
-    reason = str(status.get("error") or status.get("last_loss") or "")
-    restarts, last_error = status.get("restarts", 0), str(status.get("last_error", ""))
-    read_log = "read the daemon's log; report it if it comes back"
-    if status.get("alive") is False:
-        return trouble(subject, f"dead, restarted {times(restarts)}" if restarts else "dead", last_error, read_log)
-    if status.get("connected") is False:
-        return trouble(subject, "its device is not connected", reason, "check its port, cable and power")
-    if restarts:
-        return note(subject, f"alive, restarted {times(restarts)}", last_error, read_log)
-    if counted:
-        means = reason or "refused data is not used"
-        return note(subject, f"alive; refused: {counted}", means, "see docs/troubleshooting.md")
-    return good(subject, "alive")
+    """Judge one task by what it reports."""
+    subject, (_, state, _, notes) = f"task {name}", task_row(name, status)
+    found = f"{state}, {notes}" if notes else state
+    if state == "DEAD" or status.get("restarts"):
+        judge = trouble if state == "DEAD" else note
+        means = "an error ended it, and it starts again by itself"
+        return judge(subject, found, means, "read the daemon's log; report it if it comes back")
+    if state == "not connected":
+        return trouble(subject, found, "nothing comes from its device", "check its port, cable and power")
+    if notes:
+        return note(subject, found, "refused data is not used", "see docs/troubleshooting.md")
+    return good(subject, found)

@@ -88,6 +88,11 @@ _Loader.add_implicit_resolver(
 
 def read_yaml(path: Path, raises: type[Exception], what: str = "configuration", cure: str = "") -> Any:
     """Return the content of a YAML file that is neither missing nor empty; `cure` ends the message of a missing one."""
+    return _read(path, raises, what, cure)[0]
+
+
+def _read(path: Path, raises: type[Exception], what: str, cure: str) -> tuple[Any, yaml.Node | None]:
+    """Return the content of a YAML file, and the node with its line numbers."""
     try:
         status = path.stat()
         if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
@@ -95,7 +100,9 @@ def read_yaml(path: Path, raises: type[Exception], what: str = "configuration", 
             raise raises(f"{path}: the {what} is a device or a pipe; name a file")
         if status.st_size > _MOST_BYTES:
             raise raises(f"{path}: the {what} is larger than {_MOST_BYTES >> 10} kB; is it another file?")
-        content = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # noqa: S506 - it is a SafeLoader
+        loader = _Loader(path.read_text(encoding="utf-8"))
+        root = loader.get_single_node()
+        content = loader.construct_document(root) if root is not None else None
     except OSError as error:
         raise raises(f"{path}: the {what} cannot be read: {error.strerror}{cure}") from error
     except UnicodeDecodeError as error:
@@ -110,7 +117,7 @@ def read_yaml(path: Path, raises: type[Exception], what: str = "configuration", 
         raise raises(f"{path}: the {what} is nested too deeply") from error
     if content is None:
         raise raises(f"{path}: the {what} is empty")
-    return content
+    return content, root
 
 
 def parse_yaml(text: bytes) -> Any:
@@ -124,24 +131,22 @@ def load_model(
     path: Path, model: type[Model], raises: type[Exception], what: str = "configuration", cure: str = ""
 ) -> Model:
     """Return a YAML file's content as a pydantic model or dataclass; its validators get the file's `folder`."""
-    content = read_yaml(path, raises, what, cure)
+    content, root = _read(path, raises, what, cure)
     if not isinstance(content, dict):
         example = next(iter(TypeAdapter(model).json_schema()["properties"]), "key")
         raise raises(f"{path}: expected keys and values such as `{example}: …`, found {shown(content)}")
     try:
         return _validated(content, model, path.resolve().parent)
     except ValidationError as error:
-        root = _Loader(path.read_text(encoding="utf-8")).get_single_node()
         raise raises("\n".join(_mistakes(error, model, content, str(path), root))) from error
 
 
 def located(path: Path, mistakes: Iterable[tuple[tuple[int | str, ...], str]], raises: type[Exception]) -> list[str]:
     """Return `file:line: key: sentence` for each mistake of a YAML file, given by its location in the content."""
-    content = read_yaml(path, raises)
-    root = _Loader(path.read_text(encoding="utf-8")).get_single_node()
+    content, root = _read(path, raises, "configuration", "")
     found = []
     for location, sentence in mistakes:
-        key, line = _place(ErrorDetails(type="missing", loc=location, msg="", input=None), content, root)
+        key, line = _place(location, content, root, missing=True)
         found.append((line, f"{path}:{line}: {key}: {sentence}"))
     return [text for _, text in sorted(found)]
 
@@ -219,18 +224,20 @@ def _mistakes(
         # A list counts only its valid entries, so that mistakes within it make it too short as well.
         if details["type"] == "too_short" and any(one["loc"][:-1][: len(location)] == location for one in every):
             continue
-        key, line = _place(details, content, root)
+        kind, key, line = details["type"], "", 1
+        if kind != "invalid_key":
+            key, line = _place(location, content, root, missing=kind == "missing")
+        if kind.startswith("union_tag"):
+            key += "." + details["ctx"]["discriminator"].strip("'")
         subject = f"{key}: " if key else ""
         found[f"{where}{f':{line}' if root is not None else ''}: {subject}{_sentence(details, schema)}"] = line
     return sorted(found, key=lambda text: found[text])
 
 
-def _place(details: ErrorDetails, content: object, node: yaml.Node | None) -> tuple[str, int]:
-    """Return the key of a mistake as it stands in the file, without the names of alternatives, and its line."""
-    key, line, last = "", 1, len(details["loc"]) - 1
-    if details["type"] == "invalid_key":
-        return key, line
-    for number, part in enumerate(details["loc"]):
+def _place(location: Sequence[int | str], content: object, node: yaml.Node | None, *, missing: bool) -> tuple[str, int]:
+    """Return a location's key, without the names of alternatives, and its line; its last part may be `missing`."""
+    key, line, last = "", 1, len(location) - 1
+    for number, part in enumerate(location):
         child: yaml.Node | None = None
         if isinstance(content, Mapping) and part in content:
             content = content[part]
@@ -242,13 +249,10 @@ def _place(details: ErrorDetails, content: object, node: yaml.Node | None) -> tu
             if isinstance(node, yaml.SequenceNode):
                 child = node.value[part]
                 line = child.start_mark.line + 1
-        elif not (number == last and details["type"] == "missing"):
+        elif not (missing and number == last):
             continue
         node = child
         key += f"[{part}]" if isinstance(part, int) else f".{part}"
-    if details["type"].startswith("union_tag"):
-        discriminator = details["ctx"]["discriminator"].strip("'")
-        key += f".{discriminator}"
     return key.lstrip("."), line
 
 
@@ -331,16 +335,8 @@ def _schema_at(schema: Mapping[str, Any], location: Sequence[int | str], root: M
 def _allowed(schema: Mapping[str, Any]) -> str:
     if "enum" in schema:
         return ", ".join(map(str, schema["enum"]))
-    bounds = []
-    for name, word in (
-        ("exclusiveMinimum", "above"),
-        ("minimum", "from"),
-        ("exclusiveMaximum", "below"),
-        ("maximum", "to"),
-    ):
-        if name in schema:
-            bounds.append(f"{word} {schema[name]:g}")
-    return " ".join(bounds)
+    bounds = {"exclusiveMinimum": "above", "minimum": "from", "exclusiveMaximum": "below", "maximum": "to"}
+    return " ".join(f"{word} {schema[name]:g}" for name, word in bounds.items() if name in schema)
 
 
 def shown(value: object) -> str:

@@ -59,54 +59,41 @@ class Process:
         return self._child.returncode, out, err
 
 
-def test_the_load_cell_is_calibrated_step_by_step_and_a_step_can_be_refused(tmp_path):
+@pytest.mark.parametrize("script", [False, True], ids=["for a person", "for a script"])
+def test_the_load_cell_is_calibrated_step_by_step_and_a_step_can_be_refused(tmp_path, script):
     link, out = tmp_path / "load", tmp_path / "load.yaml"
     with Process("emulate", "hx711", "--link", str(link), "--speed", "20") as board:
         board.hear(str(link))
-        masses = ("--mass-g", "100", "--mass-g", "200")
-        with Process("calibrate", "load", "--port", str(link), *masses, "--out", str(out)) as calibrate:
-            calibrate.hear("Take every load off")
+        arguments = ("--port", str(link), "--mass-g", "100", "--mass-g", "200", "--out", str(out))
+        with Process("calibrate", "load", *arguments, *["--json"] * script) as calibrate:
+            calibrate.hear("Take every load off", on_stderr=script)
             calibrate.tell("")
-            calibrate.hear("  0 g:")
+            calibrate.hear("  0 g:", on_stderr=script)
             # The mass was forgotten: the step is refused and asked for again.
-            calibrate.hear("Put 100 g on")
+            calibrate.hear("Put 100 g on", on_stderr=script)
             calibrate.tell("")
-            calibrate.hear("Put 100 g on")
+            calibrate.hear("Put 100 g on", on_stderr=script)
             board.carry_out("mass 100")
             calibrate.tell("")
-            calibrate.hear("  100 g:")
-            calibrate.hear("Put 200 g on")
+            calibrate.hear("  100 g:", on_stderr=script)
+            calibrate.hear("Put 200 g on", on_stderr=script)
             board.carry_out("mass 200")
             calibrate.tell("")
             status, said, refused = calibrate.end()
         board.tell("nonsense")
         assert "there is no fault 'nonsense'" in board.end()[2]
     assert status == 0
-    assert "Refused: The reading did not change with 100 g" in refused
-    assert f"Written to {out}." in said
+    assert "Refused: The reading did not change with 100 g" in "\n".join([*calibrate.said, refused])
     calibration = load_calibration(out, LoadCalibration)
+    if script:
+        result = json.loads(said)
+        assert result["path"] == str(out)
+        assert [level["mass_g"] for level in result["levels"]] == [0, 100, 200]
+        assert result["calibration"] == calibration.model_dump(mode="json")
+    else:
+        assert f"Written to {out}." in said
     assert calibration.nm_per_count * COUNTS_PER_NM == pytest.approx(1.0, rel=2e-3)
     assert calibration.torque_nm(81_250) == pytest.approx(0.0, abs=2e-4)
-
-
-def test_for_a_script_the_result_alone_is_on_stdout(tmp_path):
-    link, out = tmp_path / "load", tmp_path / "load.yaml"
-    with Process("emulate", "hx711", "--link", str(link), "--speed", "20") as board:
-        board.hear(str(link))
-        with Process(
-            "calibrate", "load", "--port", str(link), "--mass-g", "100", "--out", str(out), "--json"
-        ) as script:
-            script.hear("Take every load off", on_stderr=True)
-            script.tell("")
-            script.hear("Put 100 g on", on_stderr=True)
-            board.carry_out("mass 100")
-            script.tell("")
-            status, said, _ = script.end()
-    assert status == 0
-    result = json.loads(said)
-    assert result["path"] == str(out)
-    assert [level["mass_g"] for level in result["levels"]] == [0, 100]
-    assert result["calibration"] == load_calibration(out, LoadCalibration).model_dump(mode="json")
 
 
 @pytest.mark.parametrize("way", ["socket", "modbus"])

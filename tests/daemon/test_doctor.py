@@ -110,8 +110,8 @@ def test_the_disk(tmp_path, monkeypatch):
     ("facts", "state", "part"),
     [
         ({"alive": True, "errors": {}}, "good", "alive"),
-        ({"alive": False, "restarts": 3, "last_error": "ValueError: x"}, "trouble", "dead, restarted 3 times"),
-        ({"alive": True, "connected": False, "last_loss": "unplugged"}, "trouble", "not connected"),
+        ({"alive": False, "restarts": 3, "last_error": "E: x"}, "trouble", "DEAD, restarted 3 times, E: x"),
+        ({"alive": True, "connected": False, "last_loss": "unplugged"}, "trouble", "not connected, unplugged"),
         ({"alive": True, "restarts": 1, "last_error": "x"}, "note", "restarted once"),
         ({"alive": True, "connected": True, "errors": {"nan": 2}}, "note", "nan twice"),
     ],

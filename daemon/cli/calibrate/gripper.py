@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 async def _grip(gripper: "RobotiqGripper", diameters_mm: list[float], operator: Operator) -> list[tuple[float, float]]:
-    async with operator:
+    with operator:
         try:
             await gripper.connect()
             warning = "The fingers will open and close. Keep clear, take out what they hold, then press Enter."

@@ -101,7 +101,7 @@ async def _measure(port: "SerialPort", masses_g: list[float], operator: Operator
                 levels.append(level)
                 operator.say(f"  {mass_g:g} g: {level.mean:.6g}, noise {level.std:.3g}, {level.n} readings.")
 
-    async with operator:
+    with operator:
         # Reading never pauses: bytes in the port's buffer belong to an earlier load.
         tasks = {asyncio.create_task(read_port()), asyncio.create_task(guide_operator())}
         try:

@@ -5,7 +5,6 @@ import asyncio
 import contextlib
 import json
 import math
-import os
 import sys
 import time
 from collections.abc import Callable, Coroutine, Iterator, Mapping
@@ -14,11 +13,9 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from shearloop.daemon.cli.options import add_option
+from shearloop.daemon.cli.terminal import stdin_lines
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.process import ending_signals
-
-STDIN = 0
-READ_BYTES = 4096
 
 
 class Device(NamedTuple):
@@ -68,36 +65,28 @@ def report_busy_address(what: str, cure: str) -> Iterator[None]:
 async def _play(
     device: Coroutine[None, None, None], on_command: Callable[[str], None], ports: "Mapping[str, asyncio.Queue[str]]"
 ) -> None:
-    loop = asyncio.get_running_loop()
     task = asyncio.create_task(device)
     printing = [asyncio.create_task(_print_port(*port)) for port in ports.items()]
-    partial_line = bytearray()
 
-    def read() -> None:
-        data = os.read(STDIN, READ_BYTES)
-        if not data:
-            loop.remove_reader(STDIN)
+    def obey(line: str | None) -> None:
+        if line is None:
             task.cancel()
-        *lines, rest = (bytes(partial_line) + data).split(b"\n")
-        partial_line[:] = rest[:READ_BYTES]
-        for line in filter(None, (line.decode(errors="replace").strip() for line in lines)):
+        elif line:
             try:
                 on_command(line)
             except ValueError as error:
                 print(error, file=sys.stderr, flush=True)
 
     for number in ending_signals():
-        loop.add_signal_handler(number, task.cancel)
-    # A file or /dev/null cannot be watched, and gives no commands.
-    with contextlib.suppress(PermissionError):
-        loop.add_reader(STDIN, read)
-    try:
+        asyncio.get_running_loop().add_signal_handler(number, task.cancel)
+    with contextlib.ExitStack() as reading:
+        # A file or /dev/null cannot be watched, and gives no commands.
+        with contextlib.suppress(PermissionError):
+            reading.enter_context(stdin_lines(obey))
         with contextlib.suppress(asyncio.CancelledError):
             await task
-    finally:
-        loop.remove_reader(STDIN)
-        for each in printing:
-            each.cancel()
+    for each in printing:
+        each.cancel()
 
 
 def checked_port(option: str, port: int) -> int:

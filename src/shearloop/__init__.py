@@ -5,7 +5,8 @@ Match a frame against a bank of simulated signals:
     import shearloop
 
     bank = shearloop.Bank.open("demo.bank")
-    match = shearloop.Matcher.from_bank(bank).match(difference)  # (896,) volts, frame - idle frame
+    difference = bank.signals[3, 4]  # in volts; of your fingertip: a frame minus the idle frame
+    match = shearloop.Matcher.from_bank(bank).match(difference)
     print(match.k, match.sigma, match.score)
 
 Estimate the torque along a recording:

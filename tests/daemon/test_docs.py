@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+import shearloop
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.estimators import ESTIMATORS
 from shearloop.daemon.bank_config import load_bank_plan
@@ -46,15 +47,15 @@ def test_commands_and_options_exist(page):
                 assert word.rstrip(",.").split("=")[0] in known, f"{page.name}: shearloop {text}"
 
 
-def blocks(page: Path) -> list[str]:
-    """Return the indented blocks of a page."""
-    found = re.findall(
-        r"^ {4}.*\n(?:\n* {4}.*\n)*", re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL), re.MULTILINE
-    )
+def blocks(text: str) -> list[str]:
+    """Return the indented blocks of a page or a docstring."""
+    found = re.findall(r"^ {4}.*\n(?:\n* {4}.*\n)*", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE)
     return [textwrap.dedent(block) for block in found]
 
 
-BLOCKS = [pytest.param(block, id=f"{page.stem}-{n}") for page in PAGES for n, block in enumerate(blocks(page))]
+BLOCKS = [
+    pytest.param(block, id=f"{page.stem}-{n}") for page in PAGES for n, block in enumerate(blocks(page.read_text()))
+]
 SYSTEM_PROGRAMS = {"sudo", "apt", "pip", "uvx", "ssh", "dask", "systemctl", "journalctl"}
 
 
@@ -111,8 +112,10 @@ def check_command(line: str) -> None:
 
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "docs/first-recording.ipynb"], ids=lambda page: page.name)
-def test_no_page_installs_from_an_index_where_shearloop_is_not(page):
-    assert re.findall(r"(?:install|--from) '?shearloop\b", page.read_text()) == []
+def test_a_page_installs_in_a_clone_and_not_from_an_index_where_shearloop_is_not(page):
+    text = page.read_text()
+    assert re.findall(r"(?:install|--from) '?shearloop\b", text) == []
+    assert not re.search(r"pip install (?:-e )?'?\.", text) or "clone of " in text
 
 
 def test_the_readmes_recordings_are_ignored_by_git():
@@ -204,7 +207,7 @@ def test_the_readme_is_short_and_begins_with_what_for_whom_and_why():
     first_screen = "\n".join(lines[:25])
     for part in ("**What.**", "**For whom.**", "**Why.**", "](docs/images/overview.gif)", "shearloop demo"):
         assert part in first_screen
-    start = blocks(ROOT / "README.md")[0].splitlines()
+    start = blocks((ROOT / "README.md").read_text())[0].splitlines()
     assert [line.split(" #")[0].strip() for line in start] == ["make demo", "make test"]
 
 
@@ -231,7 +234,14 @@ def test_the_notebook_compares_estimators_on_loaded_frames(notebook_run):
 
 
 # test_publisher tests the subscriber, which needs a daemon.
-PROGRAMS = [one for one in blocks(ROOT / "docs/python.md") if "import shearloop" in one and "Subscriber" not in one]
+PROGRAMS = [
+    one
+    for one in blocks((ROOT / "docs/python.md").read_text())
+    if "import shearloop" in one and "Subscriber" not in one
+]
+# The examples of `help(shearloop)` use one another's names, and the files that the programs have made.
+EXAMPLES = "".join(one for one in blocks(f"{shearloop.__doc__}\n") if "Subscriber" not in one)
+PROGRAMS.append(EXAMPLES.replace("twists.mcap", "rig-20mm.mcap"))
 
 
 @pytest.fixture(scope="module")
@@ -239,8 +249,8 @@ def empty_folder(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp("programs")
 
 
-@pytest.mark.parametrize("program", PROGRAMS, ids=["record", "read", "calibrate", "estimate", "match"])
-def test_the_programs_of_the_python_page_run_one_after_another(program, empty_folder, monkeypatch, capsys):
+@pytest.mark.parametrize("program", PROGRAMS, ids=["record", "read", "calibrate", "estimate", "match", "help"])
+def test_the_programs_of_the_python_page_and_of_help_run_one_after_another(program, empty_folder, monkeypatch, capsys):
     if ".frame(" in program:
         pytest.importorskip("pandas", reason="frames need the extra `notebook`")
     monkeypatch.chdir(empty_folder)

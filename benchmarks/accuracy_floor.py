@@ -3,10 +3,10 @@
     python -m benchmarks.accuracy_floor RECORDINGS --out FILE
 
 A frame is response · torque + drift + noise. Drift is a random walk along a few directions, fitted to increments of
-unloaded frames over one frame and over six: longer ones hold the gel's relaxation, which can be predicted. The bound is
-of an unbiased estimate of the last of some unknown torques, after frames of known torque, where response, drift and
-noise are known exactly. The load cell's noise, the jitter of its stamps and the standard error of its delay are added.
-RECORDINGS holds torque_slices and streams. First, synthetic frames with a known bound check the calculation.
+unloaded frames over one frame and over six. Longer increments contain the gel's relaxation, which is predictable. The
+bound is for an unbiased estimate of the last of several unknown torques, after frames of known torque. Response, drift
+and noise are known exactly. The load cell's noise, the jitter of its timestamps and the standard error of its delay are
+added. RECORDINGS holds torque_slices and streams. First, synthetic frames with a known bound check the calculation.
 """
 
 import math
@@ -25,16 +25,16 @@ from shearloop.bank.gain import find_twists
 from shearloop.daemon.analysis.series import read_series, series_of
 from shearloop.daemon.recording.reader import read_recording
 
-# Increments in frames; numbers of directions to try, of which the least bound counts, and increments for each.
+# Increments, in frames. The least bound over these numbers of directions counts; each direction needs some increments.
 SHORT, LONG = 1, 6
 DIRECTIONS, LEAST_PER_DIRECTION = (8, 16, 32), 5
-# Frames of known torque that an estimator remembers, and frames of unknown torque: a twist of 2.7 s.
+# An estimator remembers the first number of frames, with known torques. The second number is a twist of 2.7 s.
 KNOWN, UNKNOWN = 13, 5
 DEGREES = (1, 2, 3)
-# The check may miss the known bound by this share: directions fitted to few increments look a little too quiet.
+# Allowed relative error of the check. Directions fitted to few increments look a little too quiet.
 TOLERANCE = 0.15
 COLUMNS = ("always 0", "floor", "channels", "load cell", "alignment")
-# From the median of absolute values to the standard deviation of normal noise; frames below this show the drift.
+# Standard deviation of normal noise over the median of its absolute values; frames with less torque show the drift.
 _MAD, _UNLOADED_NM, _LEAST_NOISE_V = 1.4826, 0.002, 1e-5
 
 
@@ -42,7 +42,7 @@ def bound_nm(response: FloatArray, white: float, drift: FloatArray) -> float:
     """Return the bound in N·m of the last torque, for a response (q,) per N·m, white variance and drift's (q, q)."""
     q, steps = len(response), np.arange(KNOWN + UNKNOWN)
     covariance = np.kron(np.minimum.outer(steps, steps), drift) + white * np.eye(len(steps) * q)
-    # Unknown are the level at the start, and the torques.
+    # The unknowns are the level at the start and the torques.
     torques = np.vstack([np.zeros((KNOWN * q, UNKNOWN)), np.kron(np.eye(UNKNOWN), response[:, None])])
     design = np.hstack([np.tile(np.eye(q), (len(steps), 1)), torques])
     return math.sqrt(np.linalg.inv(design.T @ np.linalg.solve(covariance, design))[-1, -1])
@@ -51,7 +51,7 @@ def bound_nm(response: FloatArray, white: float, drift: FloatArray) -> float:
 def least_bound_nm(short: FloatArray, long: FloatArray, responses: tuple[FloatArray, FloatArray]) -> float:
     """Return the least bound over the numbers of directions, from increments (n, c).
 
-    `responses` (c,) are of different twists, so that their noise does not count as response.
+    `responses` (c,) come from different twists, so that their noise does not count as response.
     """
     first, second = responses
     axes, found = np.linalg.svd(long, full_matrices=False)[2], []
@@ -61,14 +61,14 @@ def least_bound_nm(short: FloatArray, long: FloatArray, responses: tuple[FloatAr
         white = (float((short**2).sum() / len(short)) - np.trace(at_short)) / (short.shape[1] - k) / 2
         values, vectors = np.linalg.eigh((at_long - at_short) / (LONG - SHORT))
         drift = np.pad(vectors @ np.diag(np.maximum(values, 0.0)) @ vectors.T, (0, 1))
-        # White noise is alike in all directions, so what is left of the response counts as one.
+        # White noise is equal in all directions, so the rest of the response counts as one direction.
         left = math.sqrt(max(float(first @ second - (rows @ first) @ (rows @ second)), 0.0))
         found.append(bound_nm(np.append(rows @ (first + second) / 2, left), float(white), drift))
     return min(found)
 
 
 def twisted_bound_nm(frames: FloatArray, torque_nm: FloatArray) -> float:
-    """Return the bound for frames (n, c) in units of noise, of which some are loaded."""
+    """Return the bound for frames (n, c) in units of noise; some are loaded."""
     loaded = np.abs(torque_nm) >= _UNLOADED_NM
     twists = [rows for rows in find_twists(np.where(loaded, torque_nm, 0.0)) if len(rows) > 2 and rows[0] > 3]
     responses: list[FloatArray] = []
@@ -83,7 +83,7 @@ def twisted_bound_nm(frames: FloatArray, torque_nm: FloatArray) -> float:
 
 
 def stream_floor_nm(series: FrameSeries, delay_error_s: float) -> dict[str, float]:
-    """Return the floor of a stream's loaded frames, its parts, and the error of always saying 0."""
+    """Return the floor of a stream's loaded frames, its parts, and the error of an estimate that is always 0."""
     grip, torque_nm = segment_grip(series)[1], series.torque_at_frames()
     noise = np.concatenate([channel_noise(series.channels[grip, layer]) for layer in range(len(series.sides))])
     live = np.isfinite(noise) & (noise > 0)
@@ -99,7 +99,7 @@ def stream_floor_nm(series: FrameSeries, delay_error_s: float) -> dict[str, floa
 
 
 def slices_floor_nm(series: FrameSeries, degree: int) -> float:
-    """Return the bound of slices whose channels are polynomials of the torque, at the root mean square response."""
+    """Return the bound of slices at the root mean square response; channels are polynomials of the torque."""
     torque_nm, frames = series.torque_at_frames(), series.channels[:, 0]
     powers = np.column_stack([torque_nm**d for d in range(1, degree + 1)])
     fitted = np.linalg.lstsq(np.diff(powers, axis=0), np.diff(frames, axis=0), rcond=None)[0]

@@ -101,7 +101,7 @@ class RunningRig:
     """One emulated rig, and a daemon that is started again when it ends."""
 
     def __init__(self, folder: Path, stack: ExitStack, speed: int = 1, **content: Any) -> None:
-        """Start both, with boards, gel and fingers so many times as fast, and further keys of the configuration."""
+        """Start both; boards, gel and fingers are `speed` times as fast. `content` has further configuration keys."""
         write_rig_bank(folder / "rig.bank")
         os.mkfifo(folder / "cause")
         self._causes = stack.enter_context((folder / "cause").open("r+b", buffering=0))

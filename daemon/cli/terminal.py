@@ -66,7 +66,7 @@ class StatusLine:
     def __init__(self, out: "TextIO | NonBlockingWriter") -> None:
         self._out = out
         self._state = self._torque = ""
-        # None until a control loop reports; without a robot there is none.
+        # None until a control loop reports; a daemon without a robot has no loop.
         self._driving: str | None = None
 
     def __enter__(self) -> Self:
@@ -234,7 +234,7 @@ def _rate(rate_hz: float | None, expected_hz: float | None) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Return the lines of a table whose columns are aligned."""
+    """Return the lines of a table with aligned columns."""
     every = [tuple(head), *map(tuple, rows)]
     widths = [max(map(len, column)) for column in zip(*every, strict=True)]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in every]

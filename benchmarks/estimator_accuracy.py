@@ -168,15 +168,15 @@ def main() -> None:
     found: dict[str, dict[str, dict[str, Figures]]] = {}
     print(table_head("fitted to", "estimator", *LOADED, *ALL))
     for title, name, track in later_frames(args.recordings, args.out, names, physics):
-        found.setdefault(title, {})[name] = judged(track)
-        print(table_row(title, name, *row_of(judged(track))), flush=True)
+        result = found.setdefault(title, {})[name] = judged(track)
+        print(table_row(title, name, *row_of(result)), flush=True)
     print(table_head("fitted to", "estimator", *LOADED, *ALL))
-    for title, result in other_recordings(args.recordings, args.out):
-        if isinstance(result, str):
-            print(table_row(title, result, *[None] * len([*LOADED, *ALL])))
+    for title, figures_or_reason in other_recordings(args.recordings, args.out):
+        if isinstance(figures_or_reason, str):
+            print(table_row(title, figures_or_reason, *[None] * len([*LOADED, *ALL])))
             continue
-        found[title] = {DEFAULT: result}
-        print(table_row(title, DEFAULT, *row_of(result)))
+        found[title] = {DEFAULT: figures_or_reason}
+        print(table_row(title, DEFAULT, *row_of(figures_or_reason)))
     if args.rig:
         print(table_head("cylinders", "fingertips", "diameter RMSE, mm", "coverage"))
         for count, sides, figures in other_tools(args.bank, 5000, 4):

@@ -105,30 +105,13 @@ class RunningRig:
         write_rig_bank(folder / "rig.bank")
         os.mkfifo(folder / "cause")
         self._causes = stack.enter_context((folder / "cause").open("r+b", buffering=0))
-        options: tuple[str, ...] = (
-            "--paper-sketch",
-            "--unlock-wait-s",
-            "0.5",
-            "--power-on-s",
-            "0.2",
-            "--gel-stiffness",
-            "0.02",
-        )
-        options += ("--speed", str(speed))
-        self._rig = stack.enter_context(emulated_rig(folder, folder / "rig.bank", *options))
+        options = f"--paper-sketch --unlock-wait-s 0.5 --power-on-s 0.2 --gel-stiffness 0.02 --speed {speed}"
+        self._rig = stack.enter_context(emulated_rig(folder, folder / "rig.bank", *options.split()))
         os.set_blocking(self._events.fileno(), False)
+        right = {"device": {"path": "eit-right"}, "bank": "rig.bank", "frame_period_s": FRAME_PERIOD_S / speed}
+        load_cell = {"device": {"path": "load-cell"}, "rate_hz": LOAD_CELL_RATE_HZ * speed}
         self._config = write_rig_config(
-            folder,
-            "config/ur.yaml",
-            fingertips={
-                "right": {
-                    "device": {"path": "eit-right"},
-                    "bank": "rig.bank",
-                    "frame_period_s": FRAME_PERIOD_S / speed,
-                }
-            },
-            load_cell={"device": {"path": "load-cell"}, "rate_hz": LOAD_CELL_RATE_HZ * speed},
-            **content,
+            folder, "config/ur.yaml", fingertips={"right": right}, load_cell=load_cell, **content
         )
         self._folder = folder
         self._unread = b""

@@ -232,7 +232,7 @@ class GripMemory:
         self.positions.append(position)
         self._bridged.append(False)
         if wanted := self._motion.n_lags + 1 - len(self.positions):
-            return f"gripped too recently: {wanted} more frames are needed"
+            return f"gripped too recently: {wanted} more {'frames are' if wanted > 1 else 'frame is'} needed"
         if sum(self._bridged) > _LARGEST_BRIDGED:
             return "too many of the last frames were disturbed or are missing"
         self.held_frames = min(self.held_frames + 1, _HELD_FRAMES)

@@ -37,15 +37,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _server(args: argparse.Namespace) -> int:
-    from shearloop.daemon.messaging.keys import make_key_pair, write_error
+    from shearloop.daemon.messaging.keys import make_key_pair, writing_keys
 
     public, secret = make_key_pair(args.dir, "server")
     clients = args.dir / "clients"
-    try:
+    with writing_keys():
         clients.mkdir(exist_ok=True)
         clients.chmod(0o755)
-    except OSError as error:
-        raise write_error(error) from error
     sentences = [
         f"{secret}: the daemon's secret key; only the daemon may read it",
         f"{public}: give this file to every client, as ~/.config/shearloop/server.key",
@@ -69,37 +67,30 @@ def _client(args: argparse.Namespace) -> int:
 
 
 def _allow(args: argparse.Namespace) -> int:
-    from shearloop.daemon.messaging.keys import allowed_clients, load_public_key, write_error, write_public_key
+    from shearloop.daemon.messaging.keys import allowed_clients, load_public_key, write_public_key
 
     public = load_public_key(args.key)
     name, clients = args.name or args.key.stem, args.dir / "clients"
     _check_name(name)
-    known = allowed_clients(clients).get(public)
-    if known is not None:
-        raise UserError(f"{args.key} is allowed already, as {known}")
-    try:
-        write_public_key(clients / f"{name}.key", public)
-    except FileExistsError as error:
-        raise UserError(
-            f"there is a client {name!r} already; choose another with --name, or revoke it first"
-        ) from error
-    except OSError as error:
-        raise write_error(error) from error
+    allowed = allowed_clients(clients)
+    if public in allowed:
+        raise UserError(f"{args.key} is allowed already, as {allowed[public]}")
+    if name in allowed.values():
+        raise UserError(f"there is a client {name!r} already; choose another with --name, or revoke it first")
+    write_public_key(clients / f"{name}.key", public)
     return print_result({"allowed": name}, [f"{name} may connect now"], as_json=args.json)
 
 
 def _revoke(args: argparse.Namespace) -> int:
-    from shearloop.daemon.messaging.keys import allowed_clients, write_error
+    from shearloop.daemon.messaging.keys import allowed_clients, writing_keys
 
-    clients = args.dir / "clients"
     _check_name(args.name)
-    try:
-        (clients / f"{args.name}.key").unlink()
-    except FileNotFoundError as error:
-        known = ", ".join(sorted(allowed_clients(clients).values())) or "none"
-        raise UserError(f"there is no client {args.name!r}; the allowed clients are {known}") from error
-    except OSError as error:
-        raise write_error(error) from error
+    path = args.dir / "clients" / f"{args.name}.key"
+    if not path.exists():
+        known = ", ".join(sorted(allowed_clients(path.parent).values())) or "none"
+        raise UserError(f"there is no client {args.name!r}; the allowed clients are {known}")
+    with writing_keys():
+        path.unlink()
     sentence = f"{args.name} may not connect any more; restart the daemon to end an open connection"
     return print_result({"revoked": args.name}, [sentence], as_json=args.json)
 

@@ -7,7 +7,8 @@ folder of the allowed clients' `.key` files is read again for each new connectio
 import os
 import struct
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -98,26 +99,33 @@ def make_key_pair(folder: Path, name: str) -> tuple[Path, Path]:
     """
     public, secret = zmq.curve_keypair()
     public_path, secret_path = folder / f"{name}.key", folder / f"{name}.key_secret"
-    try:
+    with writing_keys():
         folder.mkdir(parents=True, exist_ok=True)
         _write_new(secret_path, _key_file(public, secret), 0o600)
-        write_public_key(public_path, public)
-    except FileExistsError as error:
-        raise UserError(f"{error.filename} exists already; remove it first if you want a new one") from error
-    except OSError as error:
-        raise write_error(error) from error
+    write_public_key(public_path, public)
     return public_path, secret_path
 
 
 def write_public_key(path: Path, public: bytes) -> None:
-    """Write a new public key file, readable by all; raises OSError, FileExistsError if it exists."""
-    _write_new(path, _key_file(public), 0o644)
+    """Write a new public key file, readable by all; raises UserError if it exists or cannot be written."""
+    with writing_keys():
+        _write_new(path, _key_file(public), 0o644)
 
 
-def write_error(error: OSError) -> UserError:
-    """Return the error for a key file that cannot be written."""
-    cure = "run it with sudo, or choose another --dir" if isinstance(error, PermissionError) else "choose another --dir"
-    return UserError(f"{error.filename} cannot be written: {error.strerror}; {cure}")
+@contextmanager
+def writing_keys() -> Iterator[None]:
+    """Raise UserError where a key file or its folder exists already or cannot be written."""
+    try:
+        yield
+    except FileExistsError as error:
+        raise UserError(f"{error.filename} exists already; remove it first if you want a new one") from error
+    except OSError as error:
+        cure = (
+            "run it with sudo, or choose another --dir"
+            if isinstance(error, PermissionError)
+            else "choose another --dir"
+        )
+        raise UserError(f"{error.filename} cannot be written: {error.strerror}; {cure}") from error
 
 
 def allowed_clients(folder: Path) -> dict[bytes, str]:

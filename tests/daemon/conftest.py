@@ -18,6 +18,7 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
+from shearloop.daemon.cli import main
 from shearloop.daemon.config import load_daemon_config
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import ADC_STEP_V
@@ -66,6 +67,22 @@ def config(tmp_path, tiny_bank, tiny_calibration) -> Callable[..., Path]:
         return path
 
     return write
+
+
+@pytest.fixture
+def mistake(capsys) -> Callable[..., str]:
+    """Return a function that runs a command, which must end with status 2 and a line for each mistake."""
+
+    def run(*arguments: object) -> str:
+        assert main([*map(str, arguments)]) == 2
+        out, err = capsys.readouterr()
+        assert out == ""
+        # No traceback.
+        assert all(": " in line and not line.startswith(" ") for line in err.splitlines()), err
+        assert err.startswith(f"shearloop {arguments[0]}: ")
+        return err
+
+    return run
 
 
 @asynccontextmanager

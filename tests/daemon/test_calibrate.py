@@ -9,7 +9,6 @@ from typing import Self
 
 import pytest
 
-from shearloop.daemon.cli import main
 from shearloop.drivers.calibration_files import load_calibration
 from shearloop.drivers.load_cell import LoadCalibration
 from shearloop.drivers.robotiq.gripper import WidthCalibration
@@ -142,12 +141,10 @@ def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path, way):
         ("gripper --port /dev/none --diameter-mm 2 --diameter-mm 4 --out g.yaml", "/dev/none"),
     ],
 )
-def test_a_mistake_ends_in_one_sentence(arguments, said, tmp_path, capfd, monkeypatch):
+def test_a_mistake_ends_in_one_sentence(arguments, said, tmp_path, mistake, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["calibrate", *arguments.split()]) == 2
-    message = capfd.readouterr().err
+    message = mistake("calibrate", *arguments.split())
     assert said in message
-    assert message.startswith("shearloop calibrate: ")
     assert message.count("\n") == 1
 
 

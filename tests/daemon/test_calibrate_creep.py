@@ -64,16 +64,15 @@ def test_it_prints_the_line_of_the_configuration(monkeypatch, capsys, tmp_path):
     CreepConfig(share=result["share"], time_s=result["time_s"])
 
 
-def test_a_recording_without_held_twists_is_refused(monkeypatch, capsys):
+def test_a_recording_without_held_twists_is_refused(monkeypatch, mistake):
     found = track(np.arange(1109) < 10)
     played(monkeypatch, found)
-    assert main(["calibrate", "creep", "held.mcap", "--calibration", "right.cal"]) == 2
-    assert "10 readings are too few for a fit; hold a twist for a minute" in capsys.readouterr().err
+    said = mistake("calibrate", "creep", "held.mcap", "--calibration", "right.cal")
+    assert "10 readings are too few for a fit; hold a twist for a minute" in said
 
 
-def test_twists_that_are_given_twice_are_refused(monkeypatch, capsys):
+def test_twists_that_are_given_twice_are_refused(monkeypatch, mistake):
     played(monkeypatch, track())
     refusals = {"held.mcap": "is given twice; name it once", "copy.mcap": "equals held.mcap"}
     for copy, refusal in refusals.items():
-        assert main(["calibrate", "creep", "held.mcap", copy, "--calibration", "right.cal"]) == 2
-        assert f"{copy} {refusal}" in capsys.readouterr().err
+        assert f"{copy} {refusal}" in mistake("calibrate", "creep", "held.mcap", copy, "--calibration", "right.cal")

@@ -35,16 +35,6 @@ from shearloop.daemon.sensing.skin_task import SKIN
 from tests.daemon.sample_messages import sample
 
 
-def mistake(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    assert main(arguments) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    # One line for each mistake, and no traceback.
-    assert all(": " in line and not line.startswith(" ") for line in err.splitlines()), err
-    assert err.startswith(f"shearloop {arguments[0]}: ")
-    return err
-
-
 def test_check_accepts_a_valid_configuration(config, capsys):
     assert main(["check", str(config())]) == 0
     assert "is in order" in capsys.readouterr().out
@@ -52,7 +42,7 @@ def test_check_accepts_a_valid_configuration(config, capsys):
 
 @pytest.mark.usefixtures("ur_rtde")
 @pytest.mark.parametrize("command", ["run", "check"])
-def test_a_calibration_without_torques_cannot_drive_the_loop(command, config, tiny_bank, tmp_path, capsys):
+def test_a_calibration_without_torques_cannot_drive_the_loop(command, config, tiny_bank, tmp_path, capsys, mistake):
     grid, path = np.linspace(0.9, 2.1, 30), tmp_path / "diameters.yaml"
     Calibration.from_matches(Bank.open(tiny_bank).identity, "synthetic", diameter=(grid, 20.0 * grid)).save(path)
     section = {"right": {"device": {"path": "eit"}, "bank": str(tiny_bank), "calibration": str(path)}}
@@ -61,17 +51,17 @@ def test_a_calibration_without_torques_cannot_drive_the_loop(command, config, ti
     shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
     steps = {"name": "one", "torque_source": "right", "steps": [{"do": "wait", "wait_s": 1}]}
     (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(steps))
-    said = mistake(capsys, command, str(config(fingertips=section, robot="ur.yaml", experiment="experiment.yaml")))
+    said = mistake(command, str(config(fingertips=section, robot="ur.yaml", experiment="experiment.yaml")))
     assert "torque_source: `right` has a calibration without torques" in said
 
 
-def test_a_file_that_is_not_there_hides_no_other_mistake(config, tmp_path, capsys):
+def test_a_file_that_is_not_there_hides_no_other_mistake(config, tmp_path, mistake):
     steps = "[{do: wiat}, {do: turn_to, angle_rad: 90}, {do: hold_torque, torque_nm: 9}]"
     (tmp_path / "experiment.yaml").write_text(f"name: one\nsteps: {steps}\n")
     tips = {name: {"device": {"path": name}, "bank": f"{name}.bank"} for name in ("right", "left")}
     files = {"load_cell": {"device": {"path": "load"}, "calibration": "load.yaml"}, "robot": "ur.yaml"}
     parts = {"fingertips": tips, "experiment": "experiment.yaml", **files}
-    said = mistake(capsys, "check", str(config(**parts)))
+    said = mistake("check", str(config(**parts)))
     for part in ("right.bank: the bank", "left.bank: the bank", "load.yaml: the calibration", "ur.yaml: the robot"):
         assert f"{tmp_path}/{part}" in said
     assert "torque_source: `right` is a fingertip without a calibration" in said
@@ -82,7 +72,7 @@ def test_a_file_that_is_not_there_hides_no_other_mistake(config, tmp_path, capsy
         "steps[2]: hold_torque needs an identified tool",
     )
     assert [said.count(one) for one in of_steps] == [1] * 4
-    said = mistake(capsys, "check", str(config(**parts, fingertip={})))
+    said = mistake("check", str(config(**parts, fingertip={})))
     assert [said.count(one) for one in ("fingertip: is not a known key", *of_steps)] == [1] * 5
 
 
@@ -100,9 +90,9 @@ def test_a_file_that_is_not_there_hides_no_other_mistake(config, tmp_path, capsy
         ({"fingertips": {"load_cell": {"device": {"path": "eit"}}}}, ["cannot be named 'load_cell', as another part"]),
     ],
 )
-def test_a_configuration_mistake_names_file_key_and_cure(command, changes, parts, config, capsys):
+def test_a_configuration_mistake_names_file_key_and_cure(command, changes, parts, config, mistake):
     path = config(**changes)
-    said = mistake(capsys, command, str(path))
+    said = mistake(command, str(path))
     for part in (str(path), *parts):
         assert part in said
 
@@ -142,18 +132,18 @@ def fingertip(**changes: Any) -> dict[str, Any]:
         (fingertip(baseline_frames=0, average_frames=0), ["baseline_frames", "average_frames"]),
     ],
 )
-def test_a_fingertip_mistake_is_named(section, parts, config, capsys):
-    said = mistake(capsys, "check", str(config(fingertips=section)))
+def test_a_fingertip_mistake_is_named(section, parts, config, mistake):
+    said = mistake("check", str(config(fingertips=section)))
     for part in parts:
         assert part in said
 
 
-def test_a_calibration_of_another_bank_is_refused(config, tiny_bank, tmp_path, capsys):
+def test_a_calibration_of_another_bank_is_refused(config, tiny_bank, tmp_path, mistake):
     foreign = tmp_path / "foreign.yaml"
     grid = np.linspace(1, 2, 9)
     Calibration.from_matches("cd" * 32, "synthetic", torque=(grid, grid)).save(foreign)
     section = fingertip(bank=str(tiny_bank), calibration=str(foreign))
-    said = mistake(capsys, "check", str(config(fingertips=section)))
+    said = mistake("check", str(config(fingertips=section)))
     for part in (str(foreign), "made with the bank cdcdcd", "calibrate again"):
         assert part in said
 
@@ -178,8 +168,8 @@ def test_a_calibration_of_another_bank_is_refused(config, tiny_bank, tmp_path, c
         (["command", "tare", "--connect", "ipc:///nobody", "--timeout", "0.05"], "no daemon answered at ipc:///nobody"),
     ],
 )
-def test_a_command_line_mistake_is_one_sentence(arguments, part, capsys):
-    assert part in mistake(capsys, *arguments)
+def test_a_command_line_mistake_is_one_sentence(arguments, part, mistake):
+    assert part in mistake(*arguments)
 
 
 @pytest.mark.usefixtures("default_signals")
@@ -232,8 +222,8 @@ def test_missing_arguments_are_named_in_one_sentence(arguments, missing, capsys)
     assert (end.value.code, *capsys.readouterr()) == (2, "", said)
 
 
-def test_recording_option_needs_an_emulator(config, capsys):
-    said = mistake(capsys, "run", str(config()), "--recording", "some.mat")
+def test_recording_option_needs_an_emulator(config, mistake):
+    said = mistake("run", str(config()), "--recording", "some.mat")
     assert "has no eit-kit among its `emulators`" in said
 
 
@@ -341,10 +331,10 @@ def test_the_status_line_is_redrawn_in_place(monkeypatch):
     assert loop_line("loop.state", stopped) == "stopped  step 2 of 3 grip  the operator stopped it"
 
 
-def test_invalid_emulators_and_recordings_are_refused_before_the_start(config, tmp_path, capsys):
+def test_invalid_emulators_and_recordings_are_refused_before_the_start(config, tmp_path, mistake):
     unknown = str(config(emulators=[{"device": "eit-kitt"}]))
     for command in ("check", "run"):
-        assert "`emulators[0].device` is 'eit-kitt'; there are eit-kit" in mistake(capsys, command, unknown)
+        assert "`emulators[0].device` is 'eit-kitt'; there are eit-kit" in mistake(command, unknown)
     for arguments, part in (
         (["--bank", "b"], "--bank b: there is no such file; make it with `shearloop bank build`"),
         (["--speed", "fast"], "argument --speed: invalid float value: 'fast'"),
@@ -353,20 +343,20 @@ def test_invalid_emulators_and_recordings_are_refused_before_the_start(config, t
     ):
         wrong = str(config(emulators=[{"device": "eit-kit", "arguments": arguments}]))
         for command in ("check", "run"):
-            said = mistake(capsys, command, wrong)
+            said = mistake(command, wrong)
             assert "`emulators[0].arguments`: eit-kit: " in said
             assert part in said
     known = str(config(emulators=[{"device": "eit-kit"}]))
-    assert "the recording cannot be read" in mistake(capsys, "run", known, "--recording", str(tmp_path / "none.mat"))
+    assert "the recording cannot be read" in mistake("run", known, "--recording", str(tmp_path / "none.mat"))
 
 
-def test_missing_paths_and_shared_addresses_are_named(config, capsys):
+def test_missing_paths_and_shared_addresses_are_named(config, mistake):
     assert "experiment: must be the path of a file, not '.'" in mistake(
-        capsys, "check", str(config(experiment="", robot="ur.yaml"))
+        "check", str(config(experiment="", robot="ur.yaml"))
     )
-    assert "robot: must be the path of a file" in mistake(capsys, "check", str(config(robot="a\0b")))
+    assert "robot: must be the path of a file" in mistake("check", str(config(robot="a\0b")))
     both = "ipc:///tmp/one-for-both"
-    assert f"are both {both}" in mistake(capsys, "check", str(config(publish=both, commands=both)))
+    assert f"are both {both}" in mistake("check", str(config(publish=both, commands=both)))
 
 
 def test_unlock_waits_and_a_missing_daemon_is_reported_at_once(monkeypatch, capsys, tmp_path):
@@ -385,20 +375,20 @@ def test_unlock_waits_and_a_missing_daemon_is_reported_at_once(monkeypatch, caps
 
 
 @pytest.mark.parametrize("command", ["check", "run", "demo"])
-def test_a_broken_robot_library_is_one_sentence(config, command, capsys, monkeypatch, tmp_path):
+def test_a_broken_robot_library_is_one_sentence(config, command, monkeypatch, tmp_path, mistake):
     (tmp_path / "rtde_control.py").write_text("raise ImportError('librtde.so.1.6: cannot open shared object file')")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "rtde_control", raising=False)
     robot = str(config(robot=str(Path("config/ur.yaml").resolve())))
     arguments = ["--folder", str(tmp_path / "demo")] if command == "demo" else [robot]
-    said = mistake(capsys, command, *arguments)
+    said = mistake(command, *arguments)
     assert "the package ur-rtde, which drives the robot, cannot be loaded: install it again with" in said
     assert said.endswith("--no-deps ur-rtde` (librtde.so.1.6: cannot open shared object file)\n")
 
 
 @pytest.mark.parametrize("command", ["check", "run"])
-def test_a_missing_robot_library_is_one_sentence(config, command, capsys, monkeypatch):
+def test_a_missing_robot_library_is_one_sentence(config, command, monkeypatch, mistake):
     monkeypatch.setattr("shearloop.drivers.ur.client.find_spec", lambda _name: None)
-    said = mistake(capsys, command, str(config(robot=str(Path("config/ur.yaml").resolve()))))
+    said = mistake(command, str(config(robot=str(Path("config/ur.yaml").resolve()))))
     assert "the robot needs the package ur-rtde, which is not installed for Python 3." in said
     assert "-m pip install ur-rtde" in said

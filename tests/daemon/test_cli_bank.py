@@ -26,17 +26,6 @@ def folder(tmp_path_factory):
     return folder
 
 
-def refused(capsys, *arguments):
-    """Run a command that must end in one sentence and status 2, and return the sentence."""
-    assert main(["bank", *map(str, arguments)]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    sentences = captured.err.splitlines()
-    assert all(": " in sentence and not sentence.startswith(" ") for sentence in sentences)
-    assert sentences[0].startswith("shearloop bank: ")
-    return sentences[0]
-
-
 def test_build_writes_the_bank_and_tells_its_identity(folder, tmp_path, capsys):
     capsys.readouterr()
     build = ["bank", "build", "--config", f"{folder}/bank.yaml", "--out", f"{tmp_path}/b.bank", "--jobs", "1", "--json"]
@@ -56,11 +45,11 @@ def test_info_checks_the_bank_and_says_what_it_is_of(folder, capsys):
     assert "3 values from 0.5 to 3 (cm)" in capsys.readouterr().out
 
 
-def test_info_refuses_a_damaged_bank(folder, tmp_path, capsys):
+def test_info_refuses_a_damaged_bank(folder, tmp_path, mistake):
     content = bytearray((folder / "a.bank").read_bytes())
     content[-5] ^= 1
     (tmp_path / "bad.bank").write_bytes(content)
-    sentence = refused(capsys, "info", tmp_path / "bad.bank")
+    sentence = mistake("bank", "info", tmp_path / "bad.bank")
     assert "bad.bank: the file is damaged: the checksum of signals" in sentence
     assert "shearloop bank build" in sentence
 
@@ -108,10 +97,10 @@ def test_solve_on_the_papers_mesh_gives_the_voltages_of_eidors(shared, tmp_path)
         assert np.linalg.norm(found - expected) < 1e-9 * np.linalg.norm(expected)
 
 
-def test_solve_refuses_a_conductivity_that_is_not_positive_and_writes_nothing(folder, tmp_path, capsys):
+def test_solve_refuses_a_conductivity_that_is_not_positive_and_writes_nothing(folder, tmp_path, mistake):
     out = tmp_path / "v.npy"
-    sentence = refused(
-        capsys,
+    sentence = mistake(
+        "bank",
         *("solve", "--mesh", folder / "tip.yaml", "--model", "gaussian_derivative"),
         *("--k", "1.5", "--sigma", "0.4", "--out", out),
     )
@@ -130,9 +119,9 @@ def test_solve_refuses_a_conductivity_that_is_not_positive_and_writes_nothing(fo
         (["--config", "{folder}/tip.yaml"], "model: is missing; allowed: step, linear"),
     ],
 )
-def test_mistakes_of_build_are_one_sentence(folder, tmp_path, capsys, options, part):
+def test_mistakes_of_build_are_one_sentence(folder, tmp_path, options, part, mistake):
     build = ["build", "--config", f"{folder}/bank.yaml", "--out", f"{tmp_path}/new.bank", "--jobs", "1"]
-    assert part in refused(capsys, *build, *(option.format(folder=folder) for option in options))
+    assert part in mistake("bank", *build, *(option.format(folder=folder) for option in options))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -149,8 +138,8 @@ def test_mistakes_of_build_are_one_sentence(folder, tmp_path, capsys, options, p
         ([*SOLVE, "--out", "{folder}"], "the voltages cannot be written: Is a directory"),
     ],
 )
-def test_mistakes_of_the_others_are_one_sentence(folder, capsys, arguments, part):
-    assert part in refused(capsys, *(argument.format(folder=folder) for argument in arguments))
+def test_mistakes_of_the_others_are_one_sentence(folder, arguments, part, mistake):
+    assert part in mistake("bank", *(argument.format(folder=folder) for argument in arguments))
     assert not (folder / "v").exists()
 
 

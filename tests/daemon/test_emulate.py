@@ -10,7 +10,7 @@ from scipy.io import loadmat
 
 from shearloop.bank.eit.bank_file import BankDefinition, write_bank
 from shearloop.bank.eit.channels import PAPER_TABLE
-from shearloop.daemon.cli import EXIT_USAGE, main
+from shearloop.daemon.cli import main
 from shearloop.drivers.connection import SerialLink
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.emulators.boards import EitKitBoard
@@ -128,9 +128,8 @@ async def test_twists_are_synthesised_from_a_bank(tmp_path):
         ("skin", "--daq-link /dev/null/daq", "--link /dev/null/daq cannot be made"),
     ],
 )
-def test_a_mistake_is_one_sentence_and_status_two(device, arguments, sentence, capsys):
-    assert main(["emulate", device, *arguments.split()]) == EXIT_USAGE
-    complaint = capsys.readouterr().err
+def test_a_mistake_is_one_sentence_and_status_two(device, arguments, sentence, mistake):
+    complaint = mistake("emulate", device, *arguments.split())
     assert sentence in complaint
     assert complaint.count("\n") == 1
 

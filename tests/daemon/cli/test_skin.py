@@ -40,10 +40,9 @@ def test_characterise_holds_the_models_against_the_paper_and_draws_its_figures(t
     assert "0.0802" in table
 
 
-def test_figures_that_cannot_be_written_are_a_sentence(tmp_path, capsys):
+def test_figures_that_cannot_be_written_are_a_sentence(tmp_path, mistake):
     (tmp_path / "file").write_text("in the way")
-    assert main(["skin", "characterise", "--out", str(tmp_path / "file")]) == 2
-    assert "the figures cannot be written" in capsys.readouterr().err
+    assert "the figures cannot be written" in mistake("skin", "characterise", "--out", tmp_path / "file")
 
 
 def write_table(path: Path) -> None:
@@ -79,13 +78,13 @@ def test_calibrate_takes_a_table_to_a_file(tmp_path, capsys):
     assert result["rows"] == calibration.rows
 
 
-def test_a_table_that_no_curve_fits_is_refused_by_its_name(tmp_path, capsys):
+def test_a_table_that_no_curve_fits_is_refused_by_its_name(tmp_path, mistake):
     table, out = tmp_path / "table.csv", tmp_path / "skin.yaml"
     write_table(table)
     # The gauges the other way round.
     table.write_text(table.read_text().replace("r1_ohm,r2_ohm", "r2_ohm,r1_ohm"))
-    assert main(["skin", "calibrate", str(table), "--out", str(out)]) == 2
-    assert f"{table}: The response does not rise with the shear force" in capsys.readouterr().err
+    said = mistake("skin", "calibrate", table, "--out", out)
+    assert f"{table}: The response does not rise with the shear force" in said
     assert not out.exists()
 
 
@@ -93,8 +92,7 @@ def test_a_table_that_no_curve_fits_is_refused_by_its_name(tmp_path, capsys):
     ("arguments", "named"),
     [(["none.csv"], "none.csv: the table cannot be read"), (["none.csv", "--friction", "2"], "--friction is 2.0")],
 )
-def test_a_mistake_ends_in_one_sentence(arguments, named, tmp_path, capsys, monkeypatch):
+def test_a_mistake_ends_in_one_sentence(arguments, named, tmp_path, mistake, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["skin", "calibrate", *arguments, "--out", "skin.yaml"]) == 2
-    assert named in capsys.readouterr().err
+    assert named in mistake("skin", "calibrate", *arguments, "--out", "skin.yaml")
     assert not list(tmp_path.iterdir())

@@ -101,22 +101,27 @@ def test_a_running_system_is_notified(tmp_path):
         assert any(f"run `{command}`" in sentence for sentence in sentences)
 
 
-def test_mistakes_are_one_sentence(tmp_path, monkeypatch, mistake):
-    assert "is not a file" in mistake("install", "--root", str(tmp_path), "--program", "no/such/shearloop")
+def mistake(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(arguments) == 2
+    return capsys.readouterr().err
+
+
+def test_mistakes_are_one_sentence(tmp_path, capsys, monkeypatch):
+    assert "is not a file" in mistake(capsys, "install", "--root", str(tmp_path), "--program", "no/such/shearloop")
     monkeypatch.setenv("PATH", "")
-    said = mistake("install", "--root", str(tmp_path), "--program", PROGRAM)
+    said = mistake(capsys, "install", "--root", str(tmp_path), "--program", PROGRAM)
     assert "there is no program systemd-sysusers on this system" in said
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    assert "run it with sudo" in mistake("uninstall")
+    assert "run it with sudo" in mistake(capsys, "uninstall")
 
 
-def test_a_program_hidden_from_the_service_is_refused(tmp_path, monkeypatch, mistake):
+def test_a_program_hidden_from_the_service_is_refused(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sys.executable", str(tmp_path / "bin/python3"))
-    assert "there is no program" in mistake("install", "--dry-run")
+    assert "there is no program" in mistake(capsys, "install", "--dry-run")
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin/shearloop").touch()
     monkeypatch.setattr("shearloop.daemon.service._HIDDEN", (str(tmp_path),))
-    said = mistake("install", "--dry-run")
+    said = mistake(capsys, "install", "--dry-run")
     assert f"lies in {tmp_path}, which the service is not allowed to see" in said
     monkeypatch.setattr("shearloop.daemon.service._HIDDEN", ("/nowhere",))
     assert find_program() == tmp_path / "bin/shearloop"

@@ -225,6 +225,7 @@ class ControlLoopRunner:
             if output.action is not None:
                 self._actions.begin(output.action)
             self._velocity.send(WristSpeed(output.wrist_rad_per_s, self._acceleration_rad_per_s2, now_ns))
+            self._robot.keep_moving()
         self._states.publish_loop(self._velocity.sent_rad_per_s, now_ns)
         self._states.publish_stop(self._stops.update(self._robot.state, now_ns))
 

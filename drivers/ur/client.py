@@ -103,6 +103,11 @@ class UrRobot:
             self._connection.send(command, self._number)
         return replied
 
+    def keep_moving(self) -> None:
+        """Let a straight move that is under way go on for `silence_timeout_s`; each decision calls this."""
+        if self._connection is not None and self.state is not None and self.state.motion == "linear":
+            self._connection.send(messages.Heartbeat())
+
     async def run(self) -> None:
         """Keep the robot connected until cancelled; then stop it and disconnect."""
         while True:
@@ -145,9 +150,6 @@ class UrRobot:
                     connected = f"The robot at {self.settings.host} is connected."
                     said = (connected, untested, self.settings.warning, message.blocked)
                     self.link.connected(" ".join(filter(None, said)), time.monotonic_ns())
-                if message.motion == "linear" and self._connection is not None:
-                    # A straight move stops when the daemon falls silent; other commands are renewed by the loop.
-                    self._connection.send(messages.Heartbeat())
                 if self._next is not None:
                     self._next.set_result(message)
                     self._next = None

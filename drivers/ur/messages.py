@@ -221,7 +221,7 @@ class RobotState(RtdeSample):
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """The daemon is alive."""
+    """The daemon has decided that a straight move goes on."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.loop_inputs import GripperStatus, LoopConfig, TorqueSample
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
 from shearloop.drivers.ur.client import UrRobot
-from shearloop.drivers.ur.messages import Command, CommandReply, MoveLinear, RobotState, WristSpeed
+from shearloop.drivers.ur.messages import Command, CommandReply, Heartbeat, MoveLinear, RobotState, WristSpeed
 from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, Flight
 
 SPEED_M_PER_S = 0.1
@@ -64,6 +64,10 @@ class Robot(UrRobot):
         elif not replied.done():
             replied.set_result(reply)
 
+    def keep_moving(self) -> None:
+        if self.state is not None and self.state.motion == "linear":
+            self.flight.handler.request(0, Heartbeat(), self.flight.arm.reading, self.flight.now_ns)
+
     def die(self, gone_for: int) -> None:
         """End the process with all that it has not said; the next one is there after so many cycles."""
         self.gone_for = gone_for
@@ -93,7 +97,8 @@ class Robot(UrRobot):
             z += math.copysign(min(step_m, abs(missing_m)), missing_m)
             arm.be(tcp_pose=(*arm.reading.tcp_pose[:2], z, *arm.reading.tcp_pose[3:]), moving_linearly=z != self.end_m)
         arm.be(t_mono_ns=self.flight.now_ns)
-        self.flight.fly(1)
+        # A straight move goes on as long as the loop decides so.
+        self.flight.fly(1, daemon_alive=self.flight.state.motion != "linear")
         self._unread.append(self.flight.state)
         if not read:
             return

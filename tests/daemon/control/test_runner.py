@@ -67,6 +67,15 @@ async def test_a_straight_move_that_is_paused_brakes_and_goes_on_to_its_end():
         assert cell.robot.z_m == pytest.approx(end_m), "where it was to go from the start"
 
 
+async def test_a_straight_move_stops_without_decisions():
+    async with driven(MOVE, cycles=40) as cell:
+        assert cell.state.motion == "linear", "each decision lets it go on"
+        for _ in range(50):
+            cell.robot.cycle(read=False)
+        assert cell.state.motion == "idle"
+        assert "silent" in cell.state.end_reason
+
+
 async def test_a_straight_move_is_not_begun_while_the_experiment_is_paused():
     async with driven() as cell:
         starting = asyncio.create_task(cell.runner.start(experiment(MOVE)))

@@ -56,6 +56,7 @@ async def until(robot: UrRobot, condition: Callable[[RobotState], bool], within_
         async with asyncio.timeout(within_s):
             while not (state and condition(state)):
                 state = await robot.next_state()
+                robot.keep_moving()
     except TimeoutError:
         raise AssertionError(f"never came about; link {robot.link}, state {state}") from None
     return state

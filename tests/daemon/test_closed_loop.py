@@ -136,10 +136,11 @@ async def started(command: Callable[..., Any], path: str) -> None:
     assert reply["ok"], reply
 
 
-async def test_a_tool_is_gripped_twisted_and_released(rig_config, tiny_bank, tmp_path):
+async def test_a_tool_is_gripped_twisted_released_and_left(rig_config, tiny_bank, tmp_path):
     twist = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.3, "hold_s": 1.0}
+    leave = {"do": "approach", "along_tool_m": -0.03, "speed_m_per_s": 0.05}
     async with running_rig(rig_config, tiny_bank) as (_, watcher, _fault, command):
-        await started(command, experiment(tmp_path, twist, {"do": "release"}))
+        await started(command, experiment(tmp_path, twist, {"do": "release"}, leave))
         state = await watcher.until("loop.state", lambda state: state["phase"] in ("done", "stopped"))
     assert state["phase"] == "done", state["activity"]
     torques = [message["torque_nm"] for message in watcher.seen["load.torque"]]
@@ -152,6 +153,8 @@ async def test_a_tool_is_gripped_twisted_and_released(rig_config, tiny_bank, tmp
     assert max(valid) == pytest.approx(max(torques), abs=0.03)
     wrench = max(abs(message["wrist_torque_nm"]) for message in watcher.seen["robot.state"])
     assert wrench == pytest.approx(max(torques), rel=0.1)
+    heights_m = [np.frombuffer(message["tcp_pose"], "<f4")[2] for message in watcher.seen["robot.state"]]
+    assert max(heights_m) - heights_m[0] == pytest.approx(0.03, abs=0.005)
 
 
 def write_calibration(bank: Path, path: Path, gain: float) -> None:

@@ -6,7 +6,7 @@ Poses are UR's: position and rotation vector of the flange.
 
 import math
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,15 +116,23 @@ class LinearMove:
         return 1.0 if self._length <= 0 else self._done / self._length
 
 
+class WristPlant(Protocol):
+    """What the wrist turns."""
+
+    def step(self, dt_s: float, wrist_rad: float) -> float:
+        """Advance by dt_s with the wrist's angle; return the torque on the tool about its own axis in N·m."""
+
+
 class Arm:
     """The arm's joints, what moves them, and the wrench at the tool (6,) in base coordinates."""
 
-    def __init__(self) -> None:
+    def __init__(self, plant: WristPlant | None = None) -> None:
         # Elbow up, the tool pointing straight down.
         self.q_rad: Vector = np.array([0.0, -1.0, 1.0, -1.0, -1.0, 0.0]) * (math.pi / 2)
         self.qd_rad_per_s: Vector = np.zeros(6)
         self.motion: Speed | LinearMove | None = None
         self._framed_q_rad, self._last_frame = self.q_rad, link_frames(self.q_rad)[-1]
+        self._plant = plant
         self._wrench = np.zeros(6)
         self._wrench_zero = np.zeros(6)
 
@@ -182,9 +190,11 @@ class Arm:
             self.q_rad, self.qd_rad_per_s, finished = self.motion.advance(self.q_rad, self.qd_rad_per_s, dt_s)
             self.motion = None if finished else self.motion
 
-    def load(self, torque_nm: float) -> None:
-        """Take a torque about the tool's axis."""
-        self._wrench = np.concatenate([np.zeros(3), torque_nm * self._frame[:3, 2]])
+    def feel(self, dt_s: float) -> None:
+        """Let the wrist turn its plant for one cycle, and feel its torque about the tool's axis."""
+        if self._plant is not None:
+            torque_nm = self._plant.step(dt_s, float(self.q_rad[5]))
+            self._wrench = np.concatenate([np.zeros(3), torque_nm * self._frame[:3, 2]])
 
     def zero_wrench(self) -> None:
         """Make the present wrench zero."""

@@ -34,6 +34,7 @@ class Controller:
     def __init__(self, robot: Robot, *, host: str = "127.0.0.1", rate_hz: float = 500.0) -> None:
         """Take a robot; nothing is opened yet."""
         self.robot = robot
+        self._first_spec = robot.spec
         # What the controller refuses or ignores.
         self.faults: set[str] = set()
         self._host = host
@@ -104,6 +105,7 @@ class Controller:
                 self.robot.change(replace(self.robot.spec, payload_kg=payload_kg))
             case ["normal"]:
                 self.robot.clear_faults()
+                self.robot.change(self._first_spec)
                 self.faults.clear()
                 self.silence(0.0)
             case [name, *arguments] if name in FAULTS:

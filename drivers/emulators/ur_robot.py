@@ -5,22 +5,14 @@ Nothing here reads a clock. A process that plays more of the rig gives the robot
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
-from shearloop.drivers.emulators.ur_arm import Arm, PathError
+from shearloop.drivers.emulators.ur_arm import Arm, PathError, WristPlant
 from shearloop.drivers.emulators.urscript import Program, ProgramEndedError, Registers
 
 STOPPED, PLAYING, PAUSED = 1, 2, 4
 MODE_POWER_OFF, MODE_IDLE, MODE_RUNNING = 3, 5, 7
 SAFETY_NORMAL, SAFETY_PROTECTIVE_STOP, SAFETY_EMERGENCY_STOP = 1, 3, 7
 PROGRAM_END_DECELERATION, SAFETY_DECELERATION = 10.0, 20.0
-
-
-class WristPlant(Protocol):
-    """What the wrist turns."""
-
-    def step(self, dt_s: float, wrist_rad: float) -> float:
-        """Advance by dt_s with the wrist's angle; return the torque on the tool about its own axis in N·m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +41,8 @@ class Robot:
 
     def __init__(self, spec: ControllerSpec | None = None, plant: WristPlant | None = None) -> None:
         """Be switched on, safe, at rest, without a program."""
-        self.spec = self._first_spec = spec or ControllerSpec()
-        self.arm = Arm()
+        self.spec = spec or ControllerSpec()
+        self.arm = Arm(plant)
         self.robot_mode, self.safety_mode = MODE_RUNNING, SAFETY_NORMAL
         self._stopped_s, self._power_step_s = 0.0, math.inf
         self.registers = Registers()
@@ -59,7 +51,6 @@ class Robot:
         # The controller's clock, which never stands still.
         self.clock_s = 0.0
         self._events: list[RobotEvent] = []
-        self._plant = plant
         self._program: Program | None = None
 
     def step(self, dt_s: float) -> None:
@@ -76,8 +67,7 @@ class Robot:
             except ProgramEndedError as ended:
                 self.end_program(str(ended))
         self._move(dt_s)
-        if self._plant is not None:
-            self.arm.load(self._plant.step(dt_s, float(self.arm.q_rad[5])))
+        self.arm.feel(dt_s)
 
     def stand_still(self, seconds: float) -> None:
         """Let only the clock go on."""
@@ -167,9 +157,8 @@ class Robot:
         self.spec = spec
 
     def clear_faults(self) -> None:
-        """Be safe and powered, without a program, as it was at first."""
+        """Be safe and powered, without a program."""
         self.end_program("the faults are cleared")
-        self.spec = self._first_spec
         self.robot_mode, self.safety_mode, self._power_step_s = MODE_RUNNING, SAFETY_NORMAL, math.inf
         self._note("faults-cleared")
 

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray
 from shearloop.bank.eit.channels import PAPER_TABLE, STIMULATION_CURRENT, ChannelTable
 from shearloop.bank.eit.models import MODELS, model_named
-from shearloop.bank.errors import BankFileError, GeometryError, ModelError
-from shearloop.files import replace_file
+from shearloop.bank.errors import BankFileError, ModelError
+from shearloop.files import open_file, refusing_damage, replace_file
 
 FORMAT_VERSION = 1
 # A signal with a smaller norm (the homogeneous voltages have about 20) has no shape: its correlation is 0/0.
@@ -114,26 +114,24 @@ class Bank(BankDefinition):
         or channel table.
         """
         path = Path(path)
+        damage = f"its header does not describe a bank ({{}}); {_cure(path)}"
         # One descriptor: a bank that replaces this one meanwhile does not mix with it.
-        try:
-            with path.open("rb") as file:
-                header = _read_header(path, file)
-                try:
-                    arrays = {name: _read_array(path, file, name, header["arrays"][name]) for name in _TYPES}
-                    checksums = {name: str(header["arrays"][name]["sha256"]) for name in _TYPES}
-                    identity = str(header["identity"])
-                    bank = cls(
-                        geometry_hash=header["geometry"],
-                        model=header["model"],
-                        table=ChannelTable(**header.get("channels", {})),
-                        path=path,
-                        signals_sha256=checksums["signals"],
-                        **arrays,
-                    )
-                except (KeyError, TypeError, ValueError, ModelError, GeometryError) as error:
-                    raise _unusable(path, f"its header does not describe a bank ({error!r})") from error
-        except OSError as error:
-            raise BankFileError(f"{path}: the bank cannot be read: {error.strerror}; {_cure(path)}") from error
+        with (
+            refusing_damage(path, BankFileError, "the bank", damage, missing=f"; {_cure(path)}"),
+            open_file(path) as file,
+        ):
+            header = _read_header(path, file)
+            arrays = {name: _read_array(path, file, name, header["arrays"][name]) for name in _TYPES}
+            checksums = {name: str(header["arrays"][name]["sha256"]) for name in _TYPES}
+            identity = str(header["identity"])
+            bank = cls(
+                geometry_hash=header["geometry"],
+                model=header["model"],
+                table=ChannelTable(**header.get("channels", {})),
+                path=path,
+                signals_sha256=checksums["signals"],
+                **arrays,
+            )
         for name, array in arrays.items():
             if (verify or name != "signals") and _sha256(array) != checksums[name]:
                 raise _unusable(path, f"the file is damaged: the checksum of {name} is not {checksums[name][:12]}…")
@@ -145,6 +143,13 @@ class Bank(BankDefinition):
             )
         if bank.identity != identity:
             raise _unusable(path, f"its grids, model and geometry do not give its identity {identity[:12]}…")
+        cells, channels = (bank.k_grid.size, bank.sigma_grid.size), (bank.table.n_channels,)
+        shapes = {"homogeneous": channels, "min_conductivity": cells, "valid": cells, "signals": cells + channels}
+        for name, shape in shapes.items():
+            if arrays[name].shape != shape:
+                raise _unusable(path, f"{name} has the shape {arrays[name].shape}, expected {shape}")
+            if (verify or name != "signals") and not np.isfinite(arrays[name]).all():
+                raise _unusable(path, f"{name} has values that are not finite numbers")
         return bank
 
 
@@ -213,9 +218,7 @@ def _read_header(path: Path, file: BinaryIO) -> dict[str, Any]:
     text = page[_PREAMBLE.size :]
     if hashlib.sha256(text).digest() != checksum:
         raise _unusable(path, "the file is damaged: its header does not have the expected checksum")
-    header = json.loads(text)
-    if not isinstance(header, dict):
-        raise _unusable(path, "its header does not describe a bank")
+    header: dict[str, Any] = json.loads(text)
     return header
 
 

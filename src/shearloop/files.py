@@ -52,7 +52,7 @@ def refusing_damage(path: Path, raises: type[Exception], what: str, damage: str,
     except OSError as error:
         raise raises(f"{path}: {what} cannot be read: {error.strerror or error}{missing}") from error
     except Exception as error:
-        detail = str(error)[:_LONGEST_DETAIL] or repr(error)
+        detail = (repr(error) if isinstance(error, KeyError) or not str(error) else str(error))[:_LONGEST_DETAIL]
         raise raises(f"{path}: {damage.replace('{}', detail)}") from error
 
 

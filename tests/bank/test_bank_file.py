@@ -4,6 +4,7 @@ import hashlib
 import json
 import math
 import os
+import re
 
 import numpy as np
 import pytest
@@ -47,6 +48,18 @@ def rewrite_header(path, change):
     text = json.dumps(change(json.loads(content[48:4096]))).encode().ljust(4048)
     content[16:48], content[48:4096] = hashlib.sha256(text).digest(), text
     path.write_bytes(content)
+
+
+def rewrite_array(path, name, change):
+    """Put another array in the place of one, with its shape and checksum."""
+    content = bytearray(path.read_bytes())
+    old = json.loads(content[48:4096])["arrays"][name]
+    stored = np.frombuffer(content, old["type"], math.prod(old["shape"]), old["offset"]).reshape(old["shape"])
+    changed = np.ascontiguousarray(change(stored), old["type"])
+    new = old | {"shape": changed.shape, "sha256": hashlib.sha256(changed.tobytes()).hexdigest()}
+    content[old["offset"] : old["offset"] + changed.nbytes] = changed.tobytes()
+    path.write_bytes(content)
+    rewrite_header(path, lambda header: header | {"arrays": header["arrays"] | {name: new}})
 
 
 def test_what_is_written_is_read_back(path):
@@ -152,6 +165,39 @@ def test_a_header_that_describes_no_bank_is_refused(path, change):
     rewrite_header(path, change)
     with pytest.raises(BankFileError, match=CURE):
         Bank.open(path)
+
+
+@pytest.mark.parametrize("text", [b"{not JSON", b"[" * 4000, b"\xff\xfe", b"9" * 4048])
+def test_a_header_that_is_no_json_is_refused(path, text):
+    content, text = bytearray(path.read_bytes()), text.ljust(4048)
+    content[16:48], content[48:4096] = hashlib.sha256(text).digest(), text
+    path.write_bytes(content)
+    with pytest.raises(BankFileError, match="its header does not describe a bank"):
+        Bank.open(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "problem"),
+    [
+        ("signals", lambda a: a.reshape(12, 896), "the shape (12, 896), expected (4, 3, 896)"),
+        ("signals", lambda a: a.reshape(3, 4, 896), "the shape (3, 4, 896), expected (4, 3, 896)"),
+        ("homogeneous", lambda a: a[:3], "the shape (3,), expected (896,)"),
+        ("valid", lambda a: a[:2, :2], "the shape (2, 2), expected (4, 3)"),
+        ("signals", lambda a: np.where(a > 0, a, np.nan), "values that are not finite"),
+        ("homogeneous", lambda a: np.full_like(a, np.inf), "values that are not finite"),
+        ("min_conductivity", lambda a: np.full_like(a, np.nan), "values that are not finite"),
+    ],
+)
+def test_an_array_of_another_shape_or_without_numbers_is_refused(path, name, change, problem):
+    rewrite_array(path, name, change)
+    with pytest.raises(BankFileError, match=re.escape(f"{name} has {problem}")):
+        Bank.open(path, verify=True)
+
+
+def test_a_pipe_is_not_read(tmp_path):
+    os.mkfifo(tmp_path / "a.bank")
+    with pytest.raises(BankFileError, match="a device or a pipe; name a file"):
+        Bank.open(tmp_path / "a.bank")
 
 
 def test_a_failed_write_leaves_the_old_bank_and_no_debris(path, monkeypatch):

@@ -5,6 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic_core import to_json
 from scipy.io import savemat
 
@@ -44,14 +45,13 @@ def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress
     files = {topic: out / f"{topic}.{form}" for topic in topics}
     tables: dict[str, _CsvTable | _ParquetTable] = {}
     with ExitStack() as stack:
-        for number, (topic, content, message) in enumerate(read_messages(path, topics), start=1):
+        for topic, content, message in read_messages(path, topics, progress):
             row = row_of(content, message.log_time)
             if topic not in tables:
                 made = _CsvTable(files[topic], row) if form == "csv" else _ParquetTable(files[topic], topic, row)
                 stack.callback(made.close)
                 tables[topic] = made
             tables[topic].add(row)
-            progress(number)
     return list(files.values())
 
 
@@ -90,7 +90,7 @@ class _CsvTable:
 
 
 class _ParquetTable:
-    """A table whose types are those of the topic's schema, written in batches."""
+    """A table whose types are those of the topic's schema, written in batches; missing elements of arrays are NaN."""
 
     def __init__(self, path: Path, topic: str, first: dict[str, Any]) -> None:
         """Begin the file with the columns of the first row."""
@@ -106,17 +106,19 @@ class _ParquetTable:
 
         described = {"log_time_ns": {"type": "integer"}, **schema.schemas()[schema.schema_name(topic)]["properties"]}
         self._schema = pa.schema([(key, arrow_type(described[key])) for key in first])
+        self._arrays = [field.name for field in self._schema if field.type == pa.list_(pa.float64())]
         scalars = [field.name for field in self._schema if not pa.types.is_list(field.type)]
         # Measured values seldom repeat: a dictionary of them would only cost time, and so would limits of arrays.
         self._writer = pq.ParquetWriter(path, self._schema, use_dictionary=False, write_statistics=scalars)
         self._rows: Rows = []
-        self._waiting = 0
+        self._rows_at_once = 1 + _BATCH // sum(len(value) if isinstance(value, list) else 1 for value in first.values())
 
     def add(self, row: dict[str, Any]) -> None:
         """Add one row."""
-        self._waiting += sum(len(value) if isinstance(value, list) else 1 for value in row.values())
-        self._rows.append(row)
-        if self._waiting > _BATCH:
+        # Arrow takes twice as long for a list.
+        arrays = {key: np.array(row[key], dtype=np.float64) for key in self._arrays if row.get(key) is not None}
+        self._rows.append(row | arrays)
+        if len(self._rows) == self._rows_at_once:
             self._write()
 
     def close(self) -> None:
@@ -130,4 +132,3 @@ class _ParquetTable:
 
         self._writer.write_table(pa.table(columns_of(self._rows), schema=self._schema))
         self._rows.clear()
-        self._waiting = 0

@@ -24,7 +24,7 @@ from shearloop.daemon.messaging.messages import (
     SkinShear,
 )
 from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.reader import Progress, open_recording, read_messages, recorded_table
+from shearloop.daemon.recording.reader import Progress, open_recording, read_messages
 
 ROWS_PER_S = 25
 _PERIOD_NS = 10**9 // ROWS_PER_S
@@ -128,16 +128,15 @@ def export_lerobot(path: Path, out: Path, topics: list[str], progress: Progress 
     """
     require("pyarrow", "export", "a LeRobot dataset")
     with open_recording(path) as recording:
-        metadata, attachments = recording.metadata(), recording.attachments()
-    table = recorded_table(metadata[schema.METADATA])
-    held = {topic: _Held(topic, table) for topic in topics if schema.schema_name(topic) in _FEATURES}
+        attachments = recording.attachments()
+    held = {topic: _Held(topic, recording.table) for topic in topics if schema.schema_name(topic) in _FEATURES}
     if not held:
         raise UserError(f"{path}: nothing to export; a dataset needs one of the topics {', '.join(_FEATURES)}")
     dataset = _Dataset(out, held)
     dataset.write_rows(path, progress)
-    experiment = metadata.get(schema.EXPERIMENT_METADATA, {}).get("name", "no experiment")
+    experiment = recording.metadata.get(schema.EXPERIMENT_METADATA, {}).get("name", "no experiment")
     configuration = json.loads(attachments.pop(schema.CONFIGURATION, b"null"))
-    about = {"recording": path.name, "identity": metadata[schema.METADATA], "configuration": configuration}
+    about = {"recording": path.name, "identity": recording.identity, "configuration": configuration}
     return dataset.finish(experiment, about, attachments)
 
 
@@ -201,8 +200,7 @@ class _Dataset:
         # Messages come by the time of their measurement, which is not later than the time at which they are known.
         waiting: list[_Waiting] = []
         now_ns = 0
-        for number, (topic, content, message) in enumerate(read_messages(path, self._held), start=1):
-            progress(number)
+        for number, (topic, content, message) in enumerate(read_messages(path, self._held, progress), start=1):
             known_ns = max(message.publish_time, message.log_time, content.get("arrival_unix_ns") or 0)
             heapq.heappush(waiting, (known_ns, number, topic, content, message.log_time))
             if number == 1:

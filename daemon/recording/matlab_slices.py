@@ -22,7 +22,7 @@ from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import EitFrame, GripperStateMessage, LoadTorque, LoopState
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.matlab import DIAMETER_FOLDER, RAW_FRAME, RAW_HOMOGENEOUS, TORQUE_FOLDER
-from shearloop.daemon.recording.reader import Progress, open_recording, read_messages, recorded_table
+from shearloop.daemon.recording.reader import Progress, open_recording, read_messages
 from shearloop.files import replace_file
 
 # The paper's smoothing: nine frames, with a standard deviation of a fifth of that.
@@ -54,16 +54,15 @@ def export_slices(
     that cannot be written, and UserError for a recording that cannot be read or has no such hold.
     """
     with open_recording(path) as recording:
-        table = recorded_table(recording.metadata().get(schema.METADATA, {}))
+        table = recording.table
     sweep, folder, missed = _Sweep(table), _SliceFolder(out), Counter[str]()
     used = [topic for topic in topics if schema.schema_name(topic) in _TOPICS]
-    for number, (topic, content, _) in enumerate(read_messages(path, used), start=1):
+    for topic, content, _ in read_messages(path, used, progress):
         found = sweep.add(schema.schema_name(topic), content)
         if isinstance(found, _Slice):
             folder.save(found)
         elif found is not None:
             missed[found] += 1
-        progress(number)
     if not folder.written and not missed:
         raise UserError(
             f"{path}: nothing to export; slices need an experiment with the key `slices` that holds angles, as "

@@ -70,10 +70,10 @@ class Recording:
 
 
 class OpenRecording:
-    """An open recording: its topics, metadata, attachments and messages."""
+    """An open recording: its topics with their numbers of messages, metadata, channels, attachments and messages."""
 
-    def __init__(self, file: IO[bytes]) -> None:
-        """Check that the file was closed and matches its checksums; raises many types of errors."""
+    def __init__(self, path: Path, file: IO[bytes]) -> None:
+        """Check that the file was closed, matches its checksums and is usable; raises many types of errors."""
         file.seek(0)
         _check_checksums(file)
         file.seek(0)
@@ -82,12 +82,10 @@ class OpenRecording:
         if summary is None or summary.statistics is None:
             raise McapError("it has no index")
         counts = summary.statistics.channel_message_counts
-        # The number of messages of each topic.
         self.counts = {channel.topic: counts.get(channel.id, 0) for channel in summary.channels.values()}
-
-    def metadata(self) -> dict[str, dict[str, str]]:
-        """Return the metadata records by name."""
-        return {record.name: dict(record.metadata) for record in self._reader.iter_metadata()}
+        # By the records' names.
+        self.metadata = {record.name: dict(record.metadata) for record in self._reader.iter_metadata()}
+        self.identity, self.table = _checked_identity(path, self.metadata.get(schema.METADATA))
 
     def attachments(self) -> dict[str, bytes]:
         """Return the attached files by name."""
@@ -120,26 +118,32 @@ def reading(path: Path) -> Iterator[None]:
 
 @contextmanager
 def open_recording(path: Path) -> Iterator[OpenRecording]:
-    """Open a closed recording; raises UserError, also for errors while it is read in the block."""
+    """Open a closed recording of this version; raises UserError, also for errors while it is read in the block."""
     with reading(path), path.open("rb") as file:
         check_magic(path, file)
-        recording = OpenRecording(file)
+        recording = OpenRecording(path, file)
         try:
             yield recording
         except schema.UnknownTopicError as error:
-            written = recording.metadata().get(schema.METADATA, {}).get("software", "unknown")
             raise UserError(
-                f"{path}: shearloop {schema.software_version()} has no topic {str(error)!r}; version {written} wrote "
-                "this recording: read it with that version, or export other topics"
+                f"{path}: shearloop {schema.software_version()} has no topic {str(error)!r}; version "
+                f"{recording.identity.get('software', 'unknown')} wrote this recording: read it with that version, or "
+                "export other topics"
             ) from error
 
 
-def read_messages(path: Path, topics: Iterable[str]) -> Iterator[tuple[str, dict[str, Any], Message]]:
-    """Yield topic, content and message by log time, None for keys without a value; raises UserError."""
+def read_messages(
+    path: Path, topics: Iterable[str], progress: Progress = lambda _: None
+) -> Iterator[tuple[str, dict[str, Any], Message]]:
+    """Yield topic, content and message by log time, None for keys without a value; raises UserError.
+
+    `progress` receives the number of messages so far.
+    """
     with open_recording(path) as recording:
-        for channel, message in recording.messages(topics):
+        for number, (channel, message) in enumerate(recording.messages(topics), start=1):
             live = schema.schema_name(channel.topic)
             yield channel.topic, schema.with_missing_keys(live, from_json(message.data)), message
+            progress(number)
 
 
 def check_magic(path: Path, file: IO[bytes]) -> None:
@@ -148,23 +152,18 @@ def check_magic(path: Path, file: IO[bytes]) -> None:
         raise UserError(f"{path}: this is not an MCAP file, or is empty; there is nothing to read")
 
 
-def check_identity(path: Path, identity: dict[str, str] | None) -> dict[str, str]:
-    """Return the identity of a recording; raises UserError for other files and other versions."""
+def _checked_identity(path: Path, identity: dict[str, str] | None) -> tuple[dict[str, str], ChannelTable]:
+    """Return a recording's identity and channels, the paper's if it names none; UserError for other files."""
     if identity is None:
         raise _unusable(path, "it is an MCAP file, but not a recording of shearloop")
     if (version := identity.get("format_version")) != schema.FORMAT_VERSION:
         raise _unusable(path, f"it has format version {version}, expected {schema.FORMAT_VERSION}")
-    found, expected = str(identity.get("channel_table_hash")), recorded_table(identity).digest
-    if found != expected:
-        raise _unusable(path, f"it has the channel table {found[:12]}…, expected {expected[:12]}…")
-    return identity
-
-
-def recorded_table(identity: Mapping[str, str]) -> ChannelTable:
-    """Return the channels of a recording's fingertips; those of the paper's where it names none."""
-    paper = asdict(PAPER_TABLE)
-    injection: Any = identity.get("injection", paper["injection"])
-    return ChannelTable(int(identity.get("electrodes", paper["n_electrodes"])), injection)
+    electrodes = int(identity.get("electrodes", PAPER_TABLE.n_electrodes))
+    injection: Any = identity.get("injection", PAPER_TABLE.injection)
+    table = ChannelTable(electrodes, injection)
+    if (found := str(identity.get("channel_table_hash"))) != table.digest:
+        raise _unusable(path, f"it has the channel table {found[:12]}…, expected {table.digest[:12]}…")
+    return identity, table
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -174,13 +173,11 @@ def read_recording(path: str | Path) -> Recording:
     torques: list[tuple[int, float]] = []
     tools: list[tuple[int, Measured | None]] = []
     with open_recording(path) as recording:
-        metadata = recording.metadata()
-        identity = check_identity(path, metadata.get(schema.METADATA))
-        table = recorded_table(identity)
+        identity, table, metadata = recording.identity, recording.table, recording.metadata
         prefix = f"{schema.FRAME_TOPIC}."
         sides = {topic: topic.removeprefix(prefix) for topic in recording.counts if topic.startswith(prefix)}
         inputs = [schema.input_topic(side) for side in sides.values()]
-        topics = set(recording.counts)
+        live = bool(inputs) and recording.counts.keys() >= {*inputs}
         for channel, message in recording.messages([schema.LOAD_TOPIC, *sides, *inputs]):
             topic, t_ns = channel.topic, message.log_time
             try:
@@ -213,7 +210,7 @@ def read_recording(path: str | Path) -> Recording:
         np.array([torque for _, torque in torques], dtype=np.float64),
         tuple(tools),
         table,
-        live=bool(sides) and all(schema.input_topic(side) in topics for side in sides.values()),
+        live,
     )
 
 
@@ -281,27 +278,21 @@ class IntactRecords:
             with self._path.open("rb") as file:
                 check_magic(self._path, file)
                 file.seek(0)
-                yield from self._records(file)
+                for record in StreamReader(file, emit_chunks=True, record_size_limit=_LARGEST_RECORD_BYTES).records:
+                    inside = self._opened(record) if isinstance(record, Chunk) else [record]
+                    self._intact_bytes = file.tell()
+                    self._progress(self._intact_bytes)
+                    if isinstance(record, Footer):
+                        self.closed = True
+                        return
+                    yield from inside
+        except UserError:
+            raise
         except OSError as error:
             raise UserError(f"{self._path}: the recording cannot be read: {error.strerror}") from error
-
-    def _records(self, file: IO[bytes]) -> Iterator[McapRecord]:
-        reader = StreamReader(file, emit_chunks=True, record_size_limit=_LARGEST_RECORD_BYTES).records
-        while True:
-            try:
-                record = next(reader)
-                inside = self._opened(record) if isinstance(record, Chunk) else [record]
-            except OSError:
-                raise
-            # The library raises many types of exceptions for a damaged record.
-            except Exception:  # noqa: BLE001
-                return
-            self._intact_bytes = file.tell()
-            self._progress(self._intact_bytes)
-            if isinstance(record, Footer):
-                self.closed = True
-                return
-            yield from inside
+        # The library raises many types of exceptions for a damaged record.
+        except Exception:  # noqa: BLE001
+            return
 
     def _opened(self, chunk: Chunk) -> list[McapRecord]:
         """Return the records of a chunk, or nothing if it does not match its checksum."""
@@ -322,20 +313,14 @@ class TopicSummary:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FileCondition:
-    """Whether a file was closed, its size, and how much of it is damaged."""
+class RecordingSummary:
+    """The content of a recording in numbers, times in Unix ns; the keys of `recording info --json`."""
 
     path: str
     size_bytes: int
     closed: bool
     torn_bytes: int
     damaged_chunks: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecordingSummary(FileCondition):
-    """The content of a recording in numbers, times in Unix ns; the keys of `recording info --json`."""
-
     dropped: int | None
     first_unix_ns: int | None
     duration_s: float

@@ -26,7 +26,7 @@ from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFrame, EitHeatmap, LoadTorque, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.reader import check_identity, open_recording, reading
+from shearloop.daemon.recording.reader import open_recording, reading
 from shearloop.daemon.rig import load_cell_calibration
 from shearloop.daemon.sensing.estimators import COMBINED, FrameEstimator, open_combined, open_estimator
 from shearloop.daemon.sensing.fingertip_task import (
@@ -82,7 +82,7 @@ class RecordedRun:
         self.path = path
         with open_recording(path) as recording:
             self.counts = recording.counts
-            self.metadata = check_identity(path, recording.metadata().get(schema.METADATA))
+            self.metadata = recording.identity
             self._attached = recording.attachments()
 
     @property

@@ -141,8 +141,7 @@ def export_rerun(
     # The SDK's own error is a sentence of its internals.
     out.open("wb").close()
     file = _RerunFile(out, fingertip)
-    for number, (topic, content, message) in enumerate(read_messages(path, topics), start=1):
+    for topic, content, message in read_messages(path, topics, progress):
         file.add(topic, content, message.log_time)
-        progress(number)
     file.close()
     return out

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.daemon.errors import missing
-from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.reader import Progress, check_identity, open_recording, read_messages
+from shearloop.daemon.recording.reader import Progress, open_recording, read_messages
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -29,7 +28,7 @@ class RecordedTopics(Mapping[str, dict[str, NDArray[Any]]]):
         """Read what a closed recording says about itself; raises UserError for a file that cannot be used."""
         self.path = Path(path)
         with open_recording(self.path) as recording:
-            self.metadata = check_identity(self.path, recording.metadata().get(schema.METADATA))
+            self.metadata = recording.identity
             # The number of messages of each topic.
             self.counts = {topic: count for topic, count in sorted(recording.counts.items()) if count}
         self._topics: dict[str, dict[str, NDArray[Any]]] = {}
@@ -77,11 +76,10 @@ def read(path: str | Path) -> RecordedTopics:
 def read_rows(path: Path, topics: Iterable[str], progress: Progress = lambda _: None) -> dict[str, Rows]:
     """Return the messages of topics by time; `progress` receives the number of messages so far."""
     rows: dict[str, Rows] = {topic: [] for topic in topics}
-    for number, (topic, content, message) in enumerate(read_messages(path, rows), start=1):
+    for topic, content, message in read_messages(path, rows, progress):
         # As arrays, heatmaps take a quarter of the memory.
         held = {key: np.array(value, float) if isinstance(value, list) else value for key, value in content.items()}
         rows[topic].append(row_of(held, message.log_time))
-        progress(number)
     return rows
 
 

@@ -23,16 +23,8 @@ if TYPE_CHECKING:
 
 Figures: TypeAlias = dict[str, float | int | None]
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
+# Of the names of an estimate and of the ends of its interval.
 _ENDS = ("", "_low", "_high")
-# A torque's errors, and their names in the report.
-_ERRORS = {
-    "rmse": "rmse_nm",
-    "zero_rmse": "zero_rmse_nm",
-    "bias": "bias_nm",
-    "coverage": "coverage_95",
-    "width": "interval_nm",
-    "winkler": "winkler_nm",
-}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,46 +64,40 @@ def estimate_in_worker(shared: tuple[Calibration, str | None], series: FrameSeri
 def figures_of(tracks: Sequence[EstimateTrack]) -> Figures:
     """Return the figures of all frames, by the names that `shearloop evaluate` prints.
 
-    They are of valid frames with a known truth, None where there are too few. interval_nm is the median width of their
-    intervals from end to end, winkler_nm the mean score of these, and zero_rmse_nm the error of always saying 0. With
-    known diameters, diameter_rmse_mm, diameter_coverage_95 and diameter_interval_mm are added, and coverage_95 is the
-    diameter's if there is no torque.
+    Valid frames with a known truth are judged; a figure is None where there are too few. interval_nm is the median
+    width of the intervals, winkler_nm their mean score, and zero_rmse_nm the error of an estimate that is always 0.
+    Known diameters add diameter_rmse_mm, diameter_coverage_95 and diameter_interval_mm. Without a torque, coverage_95
+    is the diameter's.
     """
-    torque, diameter = (_compare(_frames(tracks, *one)) for one in (("torque", "nm"), ("diameter", "mm")))
+    torque, diameter = (_compare(_known_frames(tracks, *one), one[1]) for one in (("torque", "nm"), ("diameter", "mm")))
     valid = [estimate.valid for track in tracks for estimate in track.estimates]
     latency = np.concatenate([track.latency_ms for track in tracks])
-    figures: Figures = {
-        "r": torque["r"],
-        **_torque_errors(torque),
+    figures = {name: value for name, value in torque.items() if name not in ("n", "gain")} | {
         "valid_fraction": float(np.mean(valid)) if valid else None,
         "latency_ms_p50": float(np.quantile(latency, 0.5)) if len(latency) else None,
         "latency_ms_p99": float(np.quantile(latency, 0.99)) if len(latency) else None,
         "frames": len(valid),
     }
     if not torque["valid_fraction"]:
-        figures["coverage_95"] = diameter["coverage"]
+        figures["coverage_95"] = diameter["coverage_95"]
     if any(np.isfinite(track.series.diameter_mm).any() for track in tracks):
-        figures["diameter_rmse_mm"] = diameter["rmse"]
-        figures["diameter_coverage_95"] = diameter["coverage"]
-        figures["diameter_interval_mm"] = diameter["width"]
+        figures |= {f"diameter_{name}": diameter[name] for name in ("rmse_mm", "coverage_95", "interval_mm")}
     return figures
 
 
 def figures_by_load(tracks: Sequence[EstimateTrack], loaded_nm: float = LOADED_NM) -> dict[str, Figures]:
-    """Return the torque's figures of `loaded` frames, whose truth is loaded_nm or more in size, and of `unloaded` ones.
+    """Return the torque's figures of `loaded` frames, with a truth of loaded_nm or more in size, and of `unloaded` ones.
 
-    Of n frames with a known truth valid_fraction have a torque; the others are not judged. gain is the mean estimate
-    over the mean truth, both along the truth.
+    valid_fraction is the share of the n frames with a known truth that have a torque; only these are judged. gain is
+    the mean estimate over the mean truth, both along the truth.
     """
-    frames = _frames(tracks, "torque", "nm")
+    frames = _known_frames(tracks, "torque", "nm")
     is_loaded = np.abs(frames[0]) >= loaded_nm
-    found = {"loaded": _compare(frames[:, is_loaded]), "unloaded": _compare(frames[:, ~is_loaded])}
-    by_load: dict[str, Figures] = {
-        name: {"n": one["n"], **_torque_errors(one), "valid_fraction": one["valid_fraction"]}
-        for name, one in found.items()
-    }
-    by_load["loaded"]["gain"] = found["loaded"]["gain"]
-    return by_load
+    found = {"loaded": _compare(frames[:, is_loaded], "nm"), "unloaded": _compare(frames[:, ~is_loaded], "nm")}
+    for figures in found.values():
+        del figures["r"]
+    del found["unloaded"]["gain"]
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,41 +118,42 @@ def invalid_reasons(tracks: Sequence[EstimateTrack]) -> list[InvalidReason]:
     return sorted(found, key=lambda reason: -reason.frames)
 
 
-def _frames(tracks: Sequence[EstimateTrack], quantity: str, unit: str) -> FloatArray:
-    """Return truth, estimate and interval's ends (4, n) of frames with a known truth; NaN for what is not estimated."""
-    names = [f"{quantity}_{unit}", f"{quantity}_low_{unit}", f"{quantity}_high_{unit}"]
-    rows = []
-    for track in tracks:
-        truths = track.series.torque_at_frames() if quantity == "torque" else track.series.diameter_mm
-        for truth, estimate in zip(truths.tolist(), track.estimates, strict=True):
-            rows.append([truth, *(getattr(estimate, name) for name in names)])
-    table = np.array(rows, dtype=np.float64).reshape(-1, 4).T
-    return table[:, np.isfinite(table[0])]
+def _frames(track: EstimateTrack, quantity: str, unit: str) -> FloatArray:
+    """Return truth, estimate and interval's ends (4, n) of all frames, NaN for what is unknown."""
+    truth = track.series.torque_at_frames() if quantity == "torque" else track.series.diameter_mm
+    names = [f"{quantity}{end}_{unit}" for end in _ENDS]
+    found = [[getattr(estimate, name) for estimate in track.estimates] for name in names]
+    # None becomes NaN.
+    return np.array([truth, *found], dtype=np.float64)
 
 
-def _compare(frames: FloatArray) -> Figures:
+def _known_frames(tracks: Sequence[EstimateTrack], quantity: str, unit: str) -> FloatArray:
+    """Return truth, estimate and interval's ends (4, n) of the frames with a known truth."""
+    frames = np.concatenate([_frames(track, quantity, unit) for track in tracks], axis=1)
+    return frames[:, np.isfinite(frames[0])]
+
+
+def _compare(frames: FloatArray, unit: str) -> Figures:
     """Return the figures of a quantity's frames (4, n), None where fewer than two of them are estimated."""
     truth, value, low, high = frames[:, np.isfinite(frames[1])]
     n = frames.shape[1]
     counts: Figures = {"n": n, "valid_fraction": len(truth) / n if n else None}
     if len(truth) < 2:
-        return counts | dict.fromkeys(("r", "gain", *_ERRORS))
+        errors = (f"{name}_{unit}" for name in ("rmse", "zero_rmse", "bias", "interval", "winkler"))
+        return counts | dict.fromkeys(("r", "gain", "coverage_95", *errors))
     error, size = value - truth, float(np.abs(truth).sum())
     changing = value.std() > 0 and truth.std() > 0
-    return counts | {
+    return {
         "r": float(np.corrcoef(value, truth)[0, 1]) if changing else None,
         "gain": float((value * np.sign(truth)).sum()) / size if size else None,
-        "rmse": float(np.sqrt((error**2).mean())),
-        "zero_rmse": float(np.sqrt((truth**2).mean())),
-        "bias": float(error.mean()),
-        "coverage": float(((low <= truth) & (truth <= high)).mean()),
-        "width": float(np.median(high - low)),
-        "winkler": float(winkler_scores(truth, low, high).mean()),
+        f"rmse_{unit}": float(np.sqrt((error**2).mean())),
+        f"zero_rmse_{unit}": float(np.sqrt((truth**2).mean())),
+        f"bias_{unit}": float(error.mean()),
+        "coverage_95": float(((low <= truth) & (truth <= high)).mean()),
+        f"interval_{unit}": float(np.median(high - low)),
+        f"winkler_{unit}": float(winkler_scores(truth, low, high).mean()),
+        **counts,
     }
-
-
-def _torque_errors(torque: Figures) -> Figures:
-    return {name: torque[key] for key, name in _ERRORS.items()}
 
 
 def write_estimates(tracks: Sequence[EstimateTrack], names: Sequence[str], path: Path) -> None:
@@ -186,26 +173,19 @@ def write_estimates(tracks: Sequence[EstimateTrack], names: Sequence[str], path:
 
 def draw_tracks(tracks: Sequence[EstimateTrack], names: Sequence[str], title: str, path: Path) -> None:
     """Write a figure with a named row per series: truth, estimates with intervals, and where none is valid."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    figure = Figure(figsize=(11, 3.2 * len(tracks)), layout="constrained")
-    FigureCanvasAgg(figure)
-    rows = np.ravel(figure.subplots(len(tracks), 1, squeeze=False))
+    from shearloop.daemon.analysis.charts.drawing import figure
+
+    made = figure(11, 3.2 * len(tracks))
+    rows = np.ravel(made.subplots(len(tracks), 1, squeeze=False))
     for axes, track, row_name in zip(rows, tracks, names, strict=True):
-        truth, quantity = track.series.torque_at_frames(), "torque_nm"
-        label, bounds, known = "torque in N·m", ("torque_low_nm", "torque_high_nm"), "load cell"
         slices = track.series.kind == "difference"
         # A stream has one tool, whose diameter would be a flat line.
-        if slices and np.isfinite(track.series.diameter_mm).any():
-            truth, quantity = track.series.diameter_mm, "diameter_mm"
-            label, bounds, known = "diameter in mm", ("diameter_low_mm", "diameter_high_mm"), "known diameter"
+        is_torque = not slices or not np.isfinite(track.series.diameter_mm).any()
+        truth, value, low, high = _frames(track, *(("torque", "nm") if is_torque else ("diameter", "mm")))
         t_s = track.series.t_s
-        value, low, high = (
-            np.array([getattr(one, key) if getattr(one, key) is not None else np.nan for one in track.estimates])
-            for key in (quantity, *bounds)
-        )
+        known = "load cell" if is_torque else "known diameter"
         axes.plot(t_s, truth, "ko" if slices else "k-", linewidth=1.0, markersize=5, label=known)
         if slices:
             shown = "estimate with its 95 % interval"
@@ -213,14 +193,13 @@ def draw_tracks(tracks: Sequence[EstimateTrack], names: Sequence[str], title: st
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         else:
             _draw_intervals(axes, t_s, value, low, high)
-        judged = _loaded_text(track) if quantity == "torque_nm" else ""
-        axes.set_title(row_name + judged, loc="left", fontsize="medium")
+        axes.set_title(row_name + (_loaded_text(track) if is_torque else ""), loc="left", fontsize="medium")
         axes.set_xlabel("slice" if slices else "time in s")
-        axes.set_ylabel(label)
+        axes.set_ylabel("torque in N·m" if is_torque else "diameter in mm")
     labelled = {label: handle for axes in rows for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(labelled.values(), labelled, loc="outside lower left", ncols=3, frameon=False, fontsize="small")
-    figure.suptitle(title)
-    figure.savefig(path, dpi=110)
+    made.legend(labelled.values(), labelled, loc="outside lower left", ncols=3, frameon=False, fontsize="small")
+    made.suptitle(title)
+    made.savefig(path, dpi=110)
 
 
 def _draw_intervals(axes: "Axes", t_s: FloatArray, value: FloatArray, low: FloatArray, high: FloatArray) -> None:

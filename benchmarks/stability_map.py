@@ -96,9 +96,7 @@ def simulated_boundary(case: LoopCase, age_s: float, lost: int) -> float:
 
 
 def _grows(case: LoopCase, age_s: float, lost: int, kp: float) -> bool:
-    sensor = simulated_loop.SimulatedSensor(
-        period_s=FRAME_PERIOD_S, window_s=FRAME_PERIOD_S, transfer_s=age_s - 0.5 * FRAME_PERIOD_S
-    )
+    sensor = simulated_loop.SimulatedSensor(period_s=FRAME_PERIOD_S, transfer_s=age_s - 0.5 * FRAME_PERIOD_S)
     tool = simulated_loop.SimulatedTool(stiffness_nm_per_rad=STIFFNESS, relaxing_share=0.0, actuation_s=ACTUATION_S)
     plant = simulated_loop.Plant(tool, sensor, np.random.default_rng(0), COMMAND_S, disturbance_nm=START_NM)
     frames = FRAMES * CYCLE // (CYCLE - lost) + int(3 * age_s / FRAME_PERIOD_S)

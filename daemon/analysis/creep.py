@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.daemon.analysis.evaluate import EstimateTrack
+from shearloop.daemon.analysis.evaluate import EstimateTrack, values_of
 from shearloop.daemon.control.loop_inputs import Creep
 from shearloop.daemon.errors import UserError
 
@@ -43,7 +43,7 @@ class FittedCreep:
 
 def grips_of(track: EstimateTrack) -> Iterator[Stretch]:
     """Yield the grips of a series in order: valid torques with the load cell's torque."""
-    shear = np.array([np.nan if one.torque_nm is None else one.torque_nm for one in track.estimates])
+    shear = values_of(track.estimates)[0]
     torque = track.series.torque_at_frames()
     known = np.isfinite(shear) & np.isfinite(torque)
     t_s = track.series.t_s[known]

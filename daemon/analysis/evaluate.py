@@ -86,7 +86,7 @@ def figures_of(tracks: Sequence[EstimateTrack]) -> Figures:
 
 
 def figures_by_load(tracks: Sequence[EstimateTrack], loaded_nm: float = LOADED_NM) -> dict[str, Figures]:
-    """Return the torque's figures of `loaded` frames, with a truth of loaded_nm or more in size, and of `unloaded` ones.
+    """Return the torque's figures of `loaded` frames, whose truth is loaded_nm or more in size, and of the others.
 
     valid_fraction is the share of the n frames with a known truth that have a torque; only these are judged. gain is
     the mean estimate over the mean truth, both along the truth.
@@ -118,13 +118,17 @@ def invalid_reasons(tracks: Sequence[EstimateTrack]) -> list[InvalidReason]:
     return sorted(found, key=lambda reason: -reason.frames)
 
 
+def values_of(estimates: Sequence[Estimate], quantity: str = "torque", unit: str = "nm") -> FloatArray:
+    """Return estimate and interval's ends (3, n) in N·m or mm, NaN where there is no estimate."""
+    names = [f"{quantity}{end}_{unit}" for end in _ENDS]
+    # None becomes NaN.
+    return np.array([[getattr(estimate, name) for estimate in estimates] for name in names], dtype=np.float64)
+
+
 def _frames(track: EstimateTrack, quantity: str, unit: str) -> FloatArray:
     """Return truth, estimate and interval's ends (4, n) of all frames, NaN for what is unknown."""
     truth = track.series.torque_at_frames() if quantity == "torque" else track.series.diameter_mm
-    names = [f"{quantity}{end}_{unit}" for end in _ENDS]
-    found = [[getattr(estimate, name) for estimate in track.estimates] for name in names]
-    # None becomes NaN.
-    return np.array([truth, *found], dtype=np.float64)
+    return np.array([truth, *values_of(track.estimates, quantity, unit)])
 
 
 def _known_frames(tracks: Sequence[EstimateTrack], quantity: str, unit: str) -> FloatArray:

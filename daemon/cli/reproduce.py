@@ -33,14 +33,13 @@ def run(args: argparse.Namespace) -> int:
         from shearloop.daemon.analysis.reproduce.report import draw_all
     except ModuleNotFoundError as error:
         raise missing(error.name, "plot", "a figure") from error
-    from shearloop.daemon.analysis.reproduce.report import json_text, save_calibrations, table
+    from shearloop.daemon.analysis.reproduce.report import json_text, table
 
     found, banks = _reproduce(args, jobs)
     numbers = args.out / "reproduce.json"
     with writing(args.out, "the results"):
         numbers.write_text(json_text(found) + "\n", encoding="utf-8")
         written = [numbers, *draw_all(found, banks, args.out)]
-    written += save_calibrations(found, banks, args.recordings, args.out)
     if args.json:
         print(json_text(found))
     else:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_action, add_json, add_option, check_overwrite, run_action, writing
 from shearloop.daemon.cli.terminal import print_result, table
-from shearloop.daemon.errors import UserError
+from shearloop.daemon.errors import UserError, require
 
 if TYPE_CHECKING:
     from shearloop.bank.skin.characterisation import FigureOfMerit
@@ -42,6 +42,7 @@ def _characterise(args: argparse.Namespace) -> int:
 
     if args.out is not None:
         # First, to report a missing library or folder at once.
+        require("matplotlib", "plot", "a figure")
         from shearloop.daemon.analysis.charts.skin_figures import draw
 
         with writing(args.out, "the figures"):
@@ -52,8 +53,9 @@ def _characterise(args: argparse.Namespace) -> int:
     else:
         print(_table(found.rows))
     if args.out is not None:
-        for path in draw(found, args.out):
-            print(f"drawn: {path}", file=sys.stderr)
+        with writing(args.out, "the figures"):
+            written = draw(found, args.out)
+        print(*(f"drawn: {path}" for path in written), sep="\n", file=sys.stderr)
     return 0
 
 

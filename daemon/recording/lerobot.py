@@ -32,12 +32,9 @@ _PERIOD_NS = 10**9 // ROWS_PER_S
 _BATCH = 1500
 _FILE = "chunk-000/file-000.parquet"
 _AGE = "observation.age_s"
-# Feature and keys of each topic; an array's key has its width.
+# The feature of each topic and its keys.
 _FEATURES: Mapping[str, tuple[str, str]] = {
-    RobotStateMessage.topic: (
-        "state",
-        "joints_rad:6 tcp_pose:6 wrench:6 wrist_rad wrist_speed_rad_per_s wrist_torque_nm",
-    ),
+    RobotStateMessage.topic: ("state", "joints_rad tcp_pose wrench wrist_rad wrist_speed_rad_per_s wrist_torque_nm"),
     EitEstimate.topic: (
         "estimate",
         "torque_nm torque_low_nm torque_high_nm diameter_mm diameter_low_mm diameter_high_mm k sigma score valid",
@@ -50,14 +47,15 @@ _FEATURES: Mapping[str, tuple[str, str]] = {
         "width_mm diameter_mm diameter_std_mm tool_diameter_mm tool_diameter_std_mm current_ma",
     ),
 }
+# Keys of six numbers.
+_VECTORS = ("joints_rad", "tcp_pose", "wrench")
 
-
-# When it is known, its number, topic and content, and when it was measured.
+# When the daemon had a message, its number, topic and content, and when it was measured.
 _Waiting: TypeAlias = tuple[int, int, str, dict[str, Any], int]
 
 
 class _Held:
-    """The latest message of one topic as a vector, NaN before the first."""
+    """The latest message of one topic as numbers, NaN before the first."""
 
     def __init__(self, topic: str, table: ChannelTable) -> None:
         live = schema.schema_name(topic)
@@ -65,22 +63,21 @@ class _Held:
         source = topic.removeprefix(live).removeprefix(".")
         self.feature = ".".join(filter(None, ("observation", name, source)))
         self._table = table if live == EitFrame.topic else None
-        widths = [(key.partition(":")[0], int(key.partition(":")[2] or 0)) for key in keys.split()]
-        self._keys = [key for key, _ in widths]
+        self._keys = keys.split()
         self.names = [f"channel_{i}" for i in range(table.n_channels)] if self._table else []
-        for key, width in widths:
-            self.names += [f"{key}_{i}" for i in range(width)] or [key]
+        for key in self._keys:
+            self.names += [f"{key}_{i}" for i in range(6)] if key in _VECTORS else [key]
         values = [0.0 if name == "valid" else np.nan for name in self.names]
         self.vector: NDArray[np.float32] = np.array(values, dtype=np.float32)
         self.measured_ns: int | None = None
 
     def hold(self, content: Mapping[str, Any], measured_ns: int) -> None:
-        """Take a message."""
+        """Keep a message."""
         if self._table is not None:
             line = np.array(content["line"], dtype=np.float64)
             self.vector = self._table.channels_of_line(line).astype(np.float32)
         else:
-            # An imported torque has no other key, and is valid.
+            # An imported torque has no `valid`, and counts as valid.
             values = [np.ravel(content.get(key, key == "valid")) for key in self._keys]
             self.vector = np.concatenate(values).astype(np.float32)
         self.measured_ns = measured_ns

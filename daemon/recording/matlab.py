@@ -266,56 +266,39 @@ def frame_middles(arrivals_ns: Sequence[int]) -> list[int]:
     return [arrivals_ns[0] + round(low + (n - 0.5) * period) for n, low in enumerate(lowest)]
 
 
-@dataclass(frozen=True, slots=True)
-class _LoopClock:
-    """When a loop's lines were sent: the first load value load_late_s after the first stamp, frames frames_late_s after
-    theirs. `sure` is whether the stamps show this.
+def _loop_clock(stamps_s: FloatArray) -> tuple[float, float] | None:
+    """Return when a loop's lines were sent: the first load after the first stamp, and frames after theirs, in s.
+
+    A loop with (n,) stamps reads one line of each board per row, and stamps a row before it reads it. So its lines were
+    sent before the next stamp. After a stall the loop empties the fingertips' buffers, and waits for the load alone:
+    then the load was sent at the next stamp. Frames were sent between the two stamps, in the middle on average.
+    None where the stamps do not show this.
     """
-
-    load_late_s: float = 0.0
-    frames_late_s: float = 0.0
-    sure: bool = False
-
-    @classmethod
-    def of(cls, stamps_s: FloatArray) -> "_LoopClock":
-        """Return the clock of a loop with (n,) stamps, which reads one line of each board per row.
-
-        A row is stamped before it is read, so its lines were sent before the next stamp. After a stall the loop empties
-        the fingertips' buffers, and waits for the load alone: then the load was sent at the next stamp. Frames were
-        sent between the two stamps, in the middle on average.
-        """
-        if len(stamps_s) <= _LEAST_PACED:
-            return cls()
-        latest_s = stamps_s[1:] - stamps_s[0] - LOAD_PERIOD_S * np.arange(len(stamps_s) - 1)
-        if np.count_nonzero(latest_s <= latest_s.min() + _PACED_S) < _LEAST_PACED:
-            return cls()
-        return cls(float(latest_s.min()), float(np.median(np.diff(stamps_s))) / 2, sure=True)
-
-    @property
-    def remark(self) -> str:
-        """What is known of the times, in a sentence."""
-        if not self.sure:
-            return f"Warning: {LOAD_DOUBT}."
-        moved_s = self.load_late_s - self.frames_late_s
-        return (
-            f"The loop waited for its first load values, so the load's times were moved by {moved_s:.2f} ± "
-            f"{self.frames_late_s:.2f} s against the frames."
-        )
+    if len(stamps_s) <= _LEAST_PACED:
+        return None
+    latest_s = stamps_s[1:] - stamps_s[0] - LOAD_PERIOD_S * np.arange(len(stamps_s) - 1)
+    if np.count_nonzero(latest_s <= latest_s.min() + _PACED_S) < _LEAST_PACED:
+        return None
+    return float(latest_s.min()), float(np.median(np.diff(stamps_s))) / 2
 
 
 def _loop_times(load: Stream, streams: dict[str, Stream], remarks: list[str]) -> tuple[Stream, dict[str, Stream], bool]:
     """Return the streams of one loop with the times at which they were sent, and whether these are sure."""
     # The loop read one line per frame and the board sends six. The rest waited in the port's buffer.
-    clock = _LoopClock.of(load.unix_s)
-    t_s = load.unix_s[0] + clock.load_late_s + LOAD_PERIOD_S * np.arange(len(load.unix_s))
+    clock = _loop_clock(load.unix_s)
+    load_late_s, late_s = clock or (0.0, 0.0)
+    t_s = load.unix_s[0] + load_late_s + LOAD_PERIOD_S * np.arange(len(load.unix_s))
     remarks.append(
         f"The load cell was read once per frame but sends a value every {1e3 * LOAD_PERIOD_S:.1f} ms, so its "
         f"values waited in a buffer. Their times are now one period apart, {t_s[-1] - t_s[0]:.0f} s in all."
     )
-    remarks.append(clock.remark)
-    if not clock.sure:
+    if clock is None:
+        remarks.append(f"Warning: {LOAD_DOUBT}.")
         return replace(load, unix_s=t_s), streams, False
-    late_s = clock.frames_late_s
+    remarks.append(
+        f"The loop waited for its first load values, so the load's times were moved by {load_late_s - late_s:.2f} ± "
+        f"{late_s:.2f} s against the frames."
+    )
     frames = {
         # The next stamp less half a period: the first rows were stamped before the loop waited for its frames.
         side: replace(one, unix_s=np.append(one.unix_s[1:] - late_s, one.unix_s[-1] + late_s))

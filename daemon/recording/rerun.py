@@ -19,6 +19,7 @@ TIMELINE = "time"
 _BATCH, _IMAGE_BATCH = 1000, 30
 # Longer arrays are frames and heatmaps.
 _LONGEST_SCALARS = 8
+_NOT_SHOWN = (*ENVELOPE, "scores", schema.SCORES_SHAPE)
 # One chart for each unit, by the end of the keys.
 _CHARTS = {"torque (N·m)": "_nm", "diameter (mm)": "_mm", "shear force (N)": "_n", "angle (rad)": "_rad"}
 
@@ -37,18 +38,14 @@ class _RerunFile:
         self._stream.save(out)
         self._waiting: dict[str, tuple[list[int], list[Any]]] = {}
         self._models: dict[str, str] = {}
-        self._images: dict[str, None] = {}
-        self._poses: dict[str, None] = {}
+        self._images: set[str] = set()
+        self._poses: set[str] = set()
 
     def add(self, topic: str, content: Mapping[str, Any], t_ns: int) -> None:
         """Add one message of a recorded topic."""
         entity = topic.replace(".", "/")
         for key, value in content.items():
-            if (isinstance(value, list) and len(value) > _LONGEST_SCALARS) or key in (
-                *ENVELOPE,
-                "scores",
-                schema.SCORES_SHAPE,
-            ):
+            if (isinstance(value, list) and len(value) > _LONGEST_SCALARS) or key in _NOT_SHOWN:
                 continue
             if isinstance(value, bool | int | float | list):
                 self._add(f"{entity}/{key}", value, t_ns)
@@ -110,12 +107,12 @@ class _RerunFile:
     def _add_image(self, entity: str, share: NDArray[np.floating[Any]], t_ns: int) -> None:
         """Add a grey image; 0 and NaN are black, 1 is white."""
         pixels = np.round(255 * np.fmin(np.fmax(share, 0), 1)).astype(np.uint8)
-        self._images[entity] = None
+        self._images.add(entity)
         self._add(entity, pixels, t_ns)
 
     def _add_pose(self, entity: str, pose: list[float], t_ns: int) -> None:
         if entity not in self._poses:
-            self._poses[entity] = None
+            self._poses.add(entity)
             self._stream.log(entity, self._rr.TransformAxes3D(0.1), static=True)
         self._add(entity, pose, t_ns)
 
@@ -124,8 +121,8 @@ class _RerunFile:
 
         charted = {name: [one for one in self._waiting if one.endswith(end)] for name, end in _CHARTS.items()}
         charts = [blueprint.TimeSeriesView(name=name, contents=lines) for name, lines in charted.items() if lines]
-        images = [blueprint.Spatial2DView(name=one, origin=one) for one in self._images]
-        poses = [blueprint.Spatial3DView(name=one, contents=[one]) for one in self._poses]
+        images = [blueprint.Spatial2DView(name=one, origin=one) for one in sorted(self._images)]
+        poses = [blueprint.Spatial3DView(name=one, contents=[one]) for one in sorted(self._poses)]
         columns = [blueprint.Vertical(*views) for views in (charts, [*images, *poses]) if views]
         return blueprint.Blueprint(blueprint.Horizontal(*columns))
 

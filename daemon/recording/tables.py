@@ -99,20 +99,16 @@ def arrays(rows: Rows) -> dict[str, NDArray[Any]]:
     """Return numbers as (n,), arrays as (n, m) with NaN for missing elements, texts as (n,) objects."""
     found: dict[str, NDArray[Any]] = {}
     for key, values in columns_of(rows).items():
-        present = [value for value in values if value is not None]
-        complete = bool(present) and len(present) == len(values)
-        if any(isinstance(value, np.ndarray) for value in present):
-            matrix = np.full((len(values), max(map(len, present))), np.nan)
-            for row, value in zip(matrix, values, strict=True):
+        types = {type(value) for value in values}
+        if np.ndarray in types:
+            width = max(len(value) for value in values if value is not None)
+            found[key] = np.full((len(values), width), np.nan)
+            for row, value in zip(found[key], values, strict=True):
                 if value is not None:
                     row[: len(value)] = value
-            found[key] = matrix
-        elif any(isinstance(value, str) for value in present):
+        elif str in types:
             found[key] = np.array([value or "" for value in values], dtype=object)
-        elif complete and all(type(value) is int for value in present):
-            found[key] = np.array(values, dtype=np.int64)
-        elif complete and all(type(value) is bool for value in present):
-            found[key] = np.array(values, dtype=bool)
         else:
-            found[key] = np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+            # None becomes NaN.
+            found[key] = np.array(values, dtype=None if types in ({int}, {bool}) else np.float64)
     return found

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.text import Annotation
+from matplotlib.text import Annotation, Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import Bbox
 
@@ -89,11 +89,13 @@ def write_names(axes: Axes, points: Sequence[tuple[float, float, str]]) -> None:
     if legend is not None:
         taken.append(legend.get_window_extent().padded(_GAP_PX))
     inside = axes.get_window_extent()
-    for x, y, name in sorted(points):
+    for point in sorted(points):
         tried: list[tuple[float, int, Annotation, Bbox]] = []
-        for dx, dy in _BESIDE:
-            note = _note(axes, (x, y, name), (dx, dy))
-            box = note.get_window_extent()
+        for offset in _BESIDE:
+            note = _note(axes, point, offset)
+            # This places the text; its own extent is without the line.
+            note.get_window_extent()
+            box = Text.get_window_extent(note)
             within = Bbox.intersection(box, inside)
             outside = _area(box) - (_area(within) if within is not None else 0.0)
             covered = sum(_area(both) for other in taken if (both := Bbox.intersection(box, other)) is not None)
@@ -105,23 +107,15 @@ def write_names(axes: Axes, points: Sequence[tuple[float, float, str]]) -> None:
         for _, _, note, _ in tried:
             if note is not chosen:
                 note.remove()
-        if max(map(abs, chosen.get_position())) > _NEAR:
-            # A name's extent is measured without its line, so add the line last.
-            chosen.remove()
-            _note(axes, (x, y, name), chosen.get_position(), _LEADER)
 
 
-def _note(
-    axes: Axes,
-    point: tuple[float, float, str],
-    offset: tuple[float, float],
-    line: dict[str, Any] | None = None,
-) -> Annotation:
+def _note(axes: Axes, point: tuple[float, float, str], offset: tuple[float, float]) -> Annotation:
     (x, y, name), (dx, dy) = point, offset
     note = axes.annotate(
         name, (x, y), xytext=(dx, dy), textcoords="offset points", fontsize=7,
         ha="center" if dx == 0 else "left" if dx > 0 else "right",
-        va="center" if dx else "bottom" if dy > 0 else "top", arrowprops=line,
+        va="center" if dx else "bottom" if dy > 0 else "top",
+        arrowprops=_LEADER if max(abs(dx), abs(dy)) > _NEAR else None,
     )  # fmt: skip
     note.set_in_layout(False)
     return note

@@ -27,6 +27,7 @@ from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.analysis.bank_design import residual_noise
 from shearloop.daemon.analysis.charts.drawing import figure, look
 from shearloop.daemon.analysis.charts.sources import Split
+from shearloop.daemon.analysis.evaluate import values_of
 from shearloop.daemon.executors import Executor, in_order
 from shearloop.drivers.eit_kit import ADC_STEP_V
 
@@ -53,23 +54,28 @@ class FaultyFrames:
 
 @dataclass(frozen=True, slots=True)
 class FrameFault:
-    """One sweep: `apply(scene, level, rng)` returns faulty frames; the first level is no fault."""
+    """One sweep: `change(scene, level, rng)` returns the series' changed channels; the first level is no fault.
+
+    Of a `reported` fault the board marks the channels that it changes.
+    """
 
     name: str
     unit: str
     levels: tuple[float, ...]
-    apply: Callable[[FaultScene, float, np.random.Generator], FaultyFrames]
+    change: Callable[[FaultScene, float, np.random.Generator], FloatArray]
+    reported: bool = False
+
+    def apply(self, scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
+        """Return the faulty frames; differences are magnitudes."""
+        series, channels = scene.series, self.change(scene, level, rng)
+        usable = channels == series.channels if self.reported else None
+        magnitudes = np.abs(channels) if series.kind == "difference" else channels
+        return FaultyFrames(replace(series, channels=magnitudes), usable)
 
 
-def _faulty(scene: FaultScene, channels: FloatArray, usable: Mask | None = None) -> FaultyFrames:
-    """Return the frames with other channels; differences are magnitudes."""
-    magnitudes = np.abs(channels) if scene.series.kind == "difference" else channels
-    return FaultyFrames(replace(scene.series, channels=magnitudes), usable)
-
-
-def _noise(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
+def _noise(scene: FaultScene, level: float, rng: np.random.Generator) -> FloatArray:
     channels = scene.series.channels
-    return _faulty(scene, channels + rng.normal(0.0, 1.0, channels.shape) * level * scene.noise_v)
+    return channels + rng.normal(0.0, 1.0, channels.shape) * level * scene.noise_v
 
 
 def lost_channels(electrodes: NDArray[np.int64]) -> Mask:
@@ -77,77 +83,68 @@ def lost_channels(electrodes: NDArray[np.int64]) -> Mask:
     return np.asarray(np.isin(PAPER_TABLE.electrodes, electrodes).any(axis=1))
 
 
-def _lost_reported(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
-    """Let electrodes read one ADC step, and mark their channels."""
+def _lost(scene: FaultScene, level: float, rng: np.random.Generator) -> FloatArray:
+    """Let electrodes read one ADC step."""
     lost = lost_channels(rng.choice(PAPER_TABLE.n_electrodes, int(level), replace=False))
     channels = scene.series.channels.copy()
-    dead = ADC_STEP_V - scene.idle[:, lost] if scene.series.kind == "difference" else ADC_STEP_V
-    channels[:, :, lost] = dead
-    return _faulty(scene, channels, np.broadcast_to(~lost, channels.shape))
+    channels[:, :, lost] = ADC_STEP_V - scene.idle[:, lost] if scene.series.kind == "difference" else ADC_STEP_V
+    return channels
 
 
-def _lost_unreported(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
-    return replace(_lost_reported(scene, level, rng), usable=None)
-
-
-def _saturated(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFrames:
+def _saturated(scene: FaultScene, level: float, _: np.random.Generator) -> FloatArray:
     """Clip the amplifier's readings so that this share of the idle frame's channels is at its rail."""
     channels = scene.series.channels
     if not level:
-        return FaultyFrames(scene.series)
+        return channels
     rail = np.quantile(scene.idle, 1.0 - level)
     if scene.series.kind == "raw":
-        return _faulty(scene, np.minimum(channels, rail))
+        return np.minimum(channels, rail)
     # Differences have lost their sign: let half of the channels rise.
     signs = np.where(np.arange(PAPER_TABLE.n_channels) % 2, -1.0, 1.0)
-    read = np.minimum(scene.idle + signs * channels, rail)
-    return _faulty(scene, read - np.minimum(scene.idle, rail))
+    return np.minimum(scene.idle + signs * channels, rail) - np.minimum(scene.idle, rail)
 
 
-def _drift(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
+def _drift(scene: FaultScene, level: float, rng: np.random.Generator) -> FloatArray:
     """Move the baseline over the recording by a random pattern of RMS `level` of the idle frame."""
     channels = scene.series.channels
     pattern = rng.normal(0.0, 1.0, channels.shape[1:]) * scene.idle * level
     if scene.series.kind == "raw":
         pattern = np.linspace(0.5, 1.0, len(channels))[:, None, None] * pattern
-    return _faulty(scene, channels + pattern)
+    return channels + pattern
 
 
-def _gain(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFrames:
+def _gain(scene: FaultScene, level: float, _: np.random.Generator) -> FloatArray:
     """Raise all channels by this share, as when the gel dries or the current source drifts."""
     channels = scene.series.channels
-    moved = level * scene.idle if scene.series.kind == "difference" else level * channels
-    return _faulty(scene, channels + moved)
+    return channels + level * (scene.idle if scene.series.kind == "difference" else channels)
 
 
-def _turned(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFrames:
+def _turned(scene: FaultScene, level: float, _: np.random.Generator) -> FloatArray:
     order = ElectrodeNumbering(int(level), reflected=False).model_channels(PAPER_TABLE)
-    return _faulty(scene, scene.series.channels[:, :, order])
+    return scene.series.channels[:, :, order]
 
 
-def _swapped(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
+def _swapped(scene: FaultScene, level: float, rng: np.random.Generator) -> FloatArray:
     """Exchange the wires of pairs of electrodes; a channel that no longer exists keeps its value."""
     wires = np.arange(PAPER_TABLE.n_electrodes)
     chosen = rng.choice(PAPER_TABLE.n_electrodes, 2 * int(level), replace=False)
     wires[chosen[::2]], wires[chosen[1::2]] = chosen[1::2], chosen[::2]
-    place = {(sink, positive): i for i, (sink, _, positive, _) in enumerate(PAPER_TABLE.electrodes.tolist())}
-    order = np.array(
-        [
-            place.get((wires[sink], wires[positive]), i)
-            for i, (sink, _, positive, _) in enumerate(PAPER_TABLE.electrodes.tolist())
-        ]
-    )
-    return _faulty(scene, scene.series.channels[:, :, order])
+    # The electrodes of the sink and of the positive input name a channel.
+    pairs = PAPER_TABLE.electrodes[:, [0, 2]]
+    place = {(sink, positive): i for i, (sink, positive) in enumerate(pairs.tolist())}
+    order = [place.get((sink, positive), i) for i, (sink, positive) in enumerate(wires[pairs].tolist())]
+    return scene.series.channels[:, :, order]
 
 
-def _foreign(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFrames:
-    return _faulty(scene, (1.0 - level) * scene.series.channels + level * scene.foreign)
+def _foreign(scene: FaultScene, level: float, _: np.random.Generator) -> FloatArray:
+    return (1.0 - level) * scene.series.channels + level * scene.foreign
 
 
+_ELECTRODES = (0, 1, 2, 4, 6, 8, 12, 16)
 FAULTS = (
     FrameFault("noise added", "times the measured noise", (0, 0.5, 1, 2, 4, 8, 16, 32), _noise),
-    FrameFault("lost electrodes, reported by the board", "electrodes", (0, 1, 2, 4, 6, 8, 12, 16), _lost_reported),
-    FrameFault("lost electrodes, unreported", "electrodes", (0, 1, 2, 4, 6, 8, 12, 16), _lost_unreported),
+    FrameFault("lost electrodes, reported by the board", "electrodes", _ELECTRODES, _lost, reported=True),
+    FrameFault("lost electrodes, unreported", "electrodes", _ELECTRODES, _lost),
     FrameFault(
         "saturation, unreported", "share of the channels at the rail", (0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7), _saturated
     ),
@@ -209,18 +206,14 @@ def fault_curve(fault: str, unit: str, estimator: str, levels: Iterable[FaultLev
 
 def judge_level(estimates: Sequence[Estimate], truth_nm: FloatArray, level: float) -> FaultLevel:
     """Return the figures of estimates against (n,) truths; NaN truths do not count."""
-    rows = [
-        (one.torque_nm - truth, one.torque_low_nm <= truth <= one.torque_high_nm)
-        for one, truth in zip(estimates, truth_nm, strict=True)
-        if one.valid
-        and np.isfinite(truth)
-        and one.torque_nm is not None and one.torque_low_nm is not None and one.torque_high_nm is not None
-    ]  # fmt: skip
-    if not rows:
+    torque_nm, low_nm, high_nm = values_of(estimates)
+    known = np.isfinite(truth_nm)
+    judged = known & np.isfinite(torque_nm)
+    if not judged.any():
         return FaultLevel(level, None, None, 0.0, 0.0)
-    error, inside = np.array(rows, dtype=np.float64).T
-    n = int(np.isfinite(truth_nm).sum())
-    return FaultLevel(level, float(error.mean()), float(error.std()), len(rows) / n, float((inside == 0).sum()) / n)
+    error, missed = (torque_nm - truth_nm)[judged], judged & ~((low_nm <= truth_nm) & (truth_nm <= high_nm))
+    valid, false_valid = (float(some.sum() / known.sum()) for some in (judged, missed))
+    return FaultLevel(level, float(error.mean()), float(error.std()), valid, false_valid)
 
 
 def estimate_frames(tracker: EstimatorSession, faulty: FaultyFrames) -> list[Estimate]:

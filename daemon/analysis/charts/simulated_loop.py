@@ -43,13 +43,12 @@ class SimulatedTool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimulatedSensor:
-    """Measures the mean torque of a window once a period; the value is known `transfer_s` after the window's end.
+    """Measures the mean torque of each period; the value is known `transfer_s` after the period's end.
 
     Under constant torque the reading falls by `relaxing_share`, and it has play.
     """
 
     period_s: float
-    window_s: float
     transfer_s: float
     jitter_s: float = 0.0
     noise_nm: float = 0.0
@@ -59,15 +58,14 @@ class SimulatedSensor:
 
 
 EIT = SimulatedSensor(
-    period_s=FRAME_PERIOD_S, window_s=FRAME_PERIOD_S, transfer_s=0.05, jitter_s=0.02, noise_nm=0.012,
-    relaxing_share=0.03, play_nm=0.002,
-)  # fmt: skip
-LOAD_CELL = SimulatedSensor(period_s=1 / 10.9, window_s=1 / 10.9, transfer_s=0.01, jitter_s=0.005, noise_nm=0.0005)
+    period_s=FRAME_PERIOD_S, transfer_s=0.05, jitter_s=0.02, noise_nm=0.012, relaxing_share=0.03, play_nm=0.002
+)
+LOAD_CELL = SimulatedSensor(period_s=1 / 10.9, transfer_s=0.01, jitter_s=0.005, noise_nm=0.0005)
 
 
 @dataclass(frozen=True, slots=True)
 class PlantSample:
-    """One measurement: the torque, the middle of its window, and when it is known."""
+    """One measurement: the torque, the middle of its period, and when it is known."""
 
     torque_nm: float
     t_mid_s: float
@@ -85,7 +83,7 @@ class _Reading:
     # With play, before relaxation.
     torque_nm: float = 0.0
     relaxed_nm: float = 0.0
-    # Of the open window, and its end.
+    # Of the open period, and its end.
     integral: float = 0.0
     ends_s: float = 0.0
 
@@ -109,7 +107,7 @@ class Plant:
 
     def __post_init__(self) -> None:
         """Start the sensor at a random moment of its period, and fill the actuation delay."""
-        self._reading.ends_s = self.sensor.window_s + self.rng.uniform(0.0, self.sensor.period_s)
+        self._reading.ends_s = self.sensor.period_s + self.rng.uniform(0.0, self.sensor.period_s)
         self._speeds = [0.0] * (int(self.tool.actuation_s / self.period_s) + 1)
 
     def step(self, speed_rad_per_s: float) -> None:
@@ -152,17 +150,17 @@ class Plant:
         after_nm = reading.torque_nm - reading.relaxed_nm
         start_s, self.t_s = self.t_s, self.t_s + self.period_s
         while True:
-            # The part of this step inside the window; the reading changes linearly over the step.
-            low, high = max(start_s, reading.ends_s - sensor.window_s), min(self.t_s, reading.ends_s)
+            # The part of this step inside the period; the reading changes linearly over the step.
+            low, high = max(start_s, reading.ends_s - sensor.period_s), min(self.t_s, reading.ends_s)
             if high > low:
                 middle = (0.5 * (low + high) - start_s) / (self.t_s - start_s)
                 reading.integral += (before_nm + (after_nm - before_nm) * middle) * (high - low)
             if reading.ends_s > self.t_s:
                 return
-            mean = reading.integral / sensor.window_s if sensor.window_s else after_nm
+            mean = reading.integral / sensor.period_s
             noise, late_s = self.rng.normal(0.0, 1.0) * sensor.noise_nm, self.rng.uniform(0.0, 1.0) * sensor.jitter_s
             known_s = reading.ends_s + sensor.transfer_s + late_s
-            self._samples.append(PlantSample(mean + noise, reading.ends_s - 0.5 * sensor.window_s, known_s))
+            self._samples.append(PlantSample(mean + noise, reading.ends_s - 0.5 * sensor.period_s, known_s))
             reading.integral = 0.0
             reading.ends_s += sensor.period_s
 
@@ -281,11 +279,8 @@ class LoopScenario:
 
 def _excite(sensor: SimulatedSensor, dwell_s: float, share: float) -> ExciteSettings:
     return ExciteSettings(
-        amplitude_rad=0.35, sample_period_s=sensor.period_s, window_s=sensor.window_s, torque_limit_nm=0.17,
-        stiffness_share=share,
-        speed_rad_per_s=0.5,
-        acceleration_rad_per_s2=2.0,
-        bandwidth_per_s=5.0, dwell_s=dwell_s,
+        amplitude_rad=0.35, sample_period_s=sensor.period_s, window_s=sensor.period_s, torque_limit_nm=0.17,
+        stiffness_share=share, speed_rad_per_s=0.5, acceleration_rad_per_s2=2.0, bandwidth_per_s=5.0, dwell_s=dwell_s,
     )  # fmt: skip
 
 
@@ -319,7 +314,7 @@ def settings_for(found: ToolModel, scenario: LoopScenario) -> ControllerSettings
         allowed_noise_nm=ALLOWED_NOISE_NM, torque_bandwidth_per_s=scenario.wrist_bandwidth_per_s,
         wrist_speed_rad_per_s=0.8, wrist_acceleration_rad_per_s2=6.0,
     )  # fmt: skip
-    source = TorqueSource(name=scenario.name, period_s=scenario.sensor.period_s, window_s=scenario.sensor.window_s)
+    source = TorqueSource(name=scenario.name, period_s=scenario.sensor.period_s, window_s=scenario.sensor.period_s)
     return controller_settings(config, found, source, TrackTorque(0.0, scenario.ramp_nm_per_s), torque_limit_nm=0.2)
 
 
@@ -389,7 +384,7 @@ def tracking_errors(noises_nm: Sequence[float], seeds: int, windows: Sequence[in
     tracked = []
     for (name, noise, frames), errors in rms.items():
         # From the middle of the mean until it is known.
-        delay_s = 0.5 * EIT.window_s + 0.5 * (frames - 1) * EIT.period_s + EIT.transfer_s
+        delay_s = 0.5 * frames * EIT.period_s + EIT.transfer_s
         tracked.append(TrackingError(name, noise, frames, delay_s, float(np.median(errors)), min(errors), max(errors)))
     return tracked
 

@@ -3,19 +3,13 @@
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.skin.characterisation import PAPER_LINEAR_N, WARM_K, Characterisation, ResponseCurve
 from shearloop.bank.skin.membrane import PAPER_SECTION, warming_change
-from shearloop.daemon.errors import UserError
-
-try:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from shearloop.daemon.analysis.charts.drawing import figure
-except ImportError as error:
-    raise UserError("Drawing needs matplotlib: install the extra `plot`, or leave out --out.") from error
+from shearloop.daemon.analysis.charts.drawing import figure
 
 ONE_D, TWO_D, GREY = "#c44e52", "#1f4e79", "#888888"
 MARKERS = {0.5: "^", 1.0: "s", 1.5: "o", 2.0: "D"}
@@ -23,23 +17,20 @@ PAPER_PREDICTION_N, PAPER_SENSITIVITY_PER_N = 0.0802, 0.078
 
 
 def draw(found: Characterisation, out: Path) -> list[Path]:
-    """Write the figures as PNG and SVG into a folder and return their paths."""
+    """Write the figures as PNG and SVG into a folder and return their paths; raises OSError."""
+    drawn_by_name = {
+        "figure_4": _figure_4(found),
+        "figure_5": _figure_5(found),
+        "figure_6": _figure_6(found),
+        "figure_7": _figure_7(found),
+        "figure_8": _figure_8(found),
+        "deadband": _deadband(found),
+    }
     written = []
-    try:
-        drawn_by_name = {
-            "figure_4": _figure_4(found),
-            "figure_5": _figure_5(found),
-            "figure_6": _figure_6(found),
-            "figure_7": _figure_7(found),
-            "figure_8": _figure_8(found),
-            "deadband": _deadband(found),
-        }
-        for name, drawn in drawn_by_name.items():
-            for suffix in ("png", "svg"):
-                written.append(out / f"{name}.{suffix}")
-                drawn.savefig(written[-1], dpi=150)
-    except OSError as error:
-        raise UserError(f"{out}: the figures cannot be written: {error}.") from error
+    for name, drawn in drawn_by_name.items():
+        for suffix in ("png", "svg"):
+            written.append(out / f"{name}.{suffix}")
+            drawn.savefig(written[-1], dpi=150)
     return written
 
 

@@ -29,7 +29,7 @@ from shearloop.daemon.analysis.charts.drawing import LINES, MARKS, SHADES
 from shearloop.daemon.analysis.charts.forward_methods import CELLS, SolvedForward, forward_methods
 from shearloop.daemon.analysis.charts.simulated_loop import GAIN, LOOPS, TrackingError, tracking_errors
 from shearloop.daemon.analysis.charts.sources import Split
-from shearloop.daemon.analysis.evaluate import estimate_series
+from shearloop.daemon.analysis.evaluate import estimate_series, values_of
 
 Single = NDArray[np.float32]
 _ESTIMATORS: tuple[EstimatorName, ...] = ("bank", "regression", "reconstruction", "motion_regression")
@@ -110,8 +110,7 @@ def estimators(split: Split, physics: Physics, sides: tuple[str, ...]) -> Iterat
 
 def _run_estimator(calibration: Calibration, future: FrameSeries, bank: Bank | None) -> tuple[FloatArray, FloatArray]:
     track = estimate_series(calibration, future, bank)
-    # None becomes NaN.
-    return np.array([one.torque_nm for one in track.estimates], dtype=float), track.latency_ms
+    return values_of(track.estimates)[0], track.latency_ms
 
 
 def matchers(split: Split, bank: Bank) -> Iterator[TorqueMethod]:
@@ -173,14 +172,20 @@ def _read_some(reader: IntervalRegressor, channels: NDArray[np.int64], differenc
     return reader.predict(difference[channels])[0]
 
 
-def _read_by(split: Split, name: str, family: str, locate: Callable[[FloatArray], float]) -> TorqueMethod:
+def _read_by(split: Split, name: str, family: str, sigma_of: Callable[[FloatArray], float]) -> TorqueMethod:
+    return TorqueMethod(name, family, _timed(split, parabola(split, sigma_of)))
+
+
+def parabola(split: Split, sigma_of: Callable[[FloatArray], float]) -> Callable[[FloatArray], float]:
+    """Return the torque in N·m of a difference, by the paper's parabola of its σ, fitted to the past slices."""
+
     def features(difference: FloatArray) -> FloatArray:
-        sigma = float(locate(difference))
+        sigma = float(sigma_of(difference))
         return np.array([sigma, sigma**2])
 
     past = np.array([features(frame) for frame in np.abs(split.past.channels[:, 0])])
     reader = fit_interval_regressor(past, split.past.torque_at_frames(), Ridge.fit_scaled, strengths=_POLYNOMIAL)
-    return TorqueMethod(name, family, _timed(split, lambda x: reader.predict(features(x))[0]))
+    return lambda difference: reader.predict(features(difference))[0]
 
 
 def _timed(split: Split, read: Callable[[FloatArray], float]) -> Callable[[], tuple[FloatArray, FloatArray]]:

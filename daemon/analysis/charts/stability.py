@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import groupby, pairwise
 from pathlib import Path
 
@@ -25,7 +26,6 @@ from shearloop.bank.estimation import (
     fit,
 )
 from shearloop.bank.estimation.bank_match import NOT_TURNED
-from shearloop.bank.estimation.interval_regressor import Ridge, fit_interval_regressor
 from shearloop.bank.estimators import EstimatorName
 from shearloop.daemon.analysis.charts import skin_loop
 from shearloop.daemon.analysis.charts.drawing import figure, look, save, slug
@@ -55,6 +55,8 @@ from shearloop.daemon.analysis.charts.sources import (
     splits,
     torque_of,
 )
+from shearloop.daemon.analysis.charts.speed_accuracy import parabola
+from shearloop.daemon.analysis.evaluate import values_of
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.executors import Executor, in_order
 from shearloop.daemon.synthetic_frames import Synthesiser
@@ -140,23 +142,20 @@ def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[Con
         "zero lag: the maximum, refined": bank_match.RefinedMatcher(bank, NOT_TURNED, mean_of_alike=False),
         "zero lag: mean of the cells alike (the fix)": bank_match.RefinedMatcher(bank, NOT_TURNED),
     }
-    found = [ContinuityWalk(name, _read(split, locator, path), share_nm) for name, locator in locators.items()]
+    found = []
+    for name, locator in locators.items():
+        torque_nm_of = parabola(split, partial(_sigma, locator))
+        found.append(ContinuityWalk(name, np.array([torque_nm_of(one) for one in path]), share_nm))
     for calibration in calibrations:
         if not calibration.estimator.needs:
             tracker = EstimatorSession(calibration, bank)
-            torque = [tracker.estimate(TactileFrame.of(0.0, one[None])).torque_nm for one in path]
-            found.append(ContinuityWalk(calibration.estimator.name, np.array(torque, dtype=float), share_nm))
+            estimates = [tracker.estimate(TactileFrame.of(0.0, one[None])) for one in path]
+            found.append(ContinuityWalk(calibration.estimator.name, values_of(estimates)[0], share_nm))
     return found
 
 
-def _read(split: Split, locator: bank_match.BankMatcher, path: FloatArray) -> FloatArray:
-    def features(frames: FloatArray) -> FloatArray:
-        sigma = np.array([locator.match(one).sigma for one in frames])
-        return np.column_stack([sigma, sigma**2])
-
-    past = features(np.abs(split.past.channels[:, 0]))
-    reader = fit_interval_regressor(past, split.past.torque_at_frames(), Ridge.fit_scaled, strengths=(1e-9,))
-    return np.array([reader.predict(one)[0] for one in features(path)])
+def _sigma(locator: bank_match.BankMatcher, frame: FloatArray) -> float:
+    return locator.match(frame).sigma
 
 
 Rows = NDArray[np.int64]
@@ -258,12 +257,9 @@ def judge_others(
         return FaultLevel(part.limit_nm, None, None, 0.0, 0.0), None, str(error)
     others = select_rows(series, part.others)
     estimates = estimate_frames(EstimatorSession(calibration, bank), FaultyFrames(others))
-    widths = [
-        one.torque_high_nm - one.torque_low_nm
-        for one in estimates
-        if one.torque_low_nm is not None and one.torque_high_nm is not None
-    ]
-    return judge_level(estimates, others.torque_nm, part.limit_nm), float(np.median(widths)) if widths else None, ""
+    _, low_nm, high_nm = values_of([one for one in estimates if one.valid])
+    width_nm = float(np.median(high_nm - low_nm)) if len(low_nm) else None
+    return judge_level(estimates, others.torque_nm, part.limit_nm), width_nm, ""
 
 
 MODEL = "gaussian_derivative"

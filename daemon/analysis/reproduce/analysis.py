@@ -57,10 +57,6 @@ def read_inputs(recordings: Path) -> Inputs:
     """
     torque_folder, diameter_folder = recordings / TORQUE_FOLDER, recordings / DIAMETER_FOLDER
     if not torque_folder.is_dir() and not diameter_folder.is_dir():
-        if not recordings.is_dir():
-            raise UserError(
-                f"{recordings} is not a folder; name the folder that contains {TORQUE_FOLDER} or {DIAMETER_FOLDER}"
-            )
         raise UserError(f"{recordings} has neither a folder {TORQUE_FOLDER} nor a folder {DIAMETER_FOLDER}")
     notes: list[str] = []
     torque = diameter = raw = None
@@ -125,16 +121,20 @@ class Matches:
 class TorqueResult:
     """The torque slices' results. Correlations are Pearson's, between torque and the best match's sigma.
 
-    `groups` (n,) are levels of torque, `r_clustered` is between their means, and `fit` is the parabola through these.
-    `parts` (n,) are parts of the recording. `rmse_nm` is of single slices, each predicted by a parabola fitted without
-    its part. `grouping` and `held_out` describe the groups and the parts.
+    `groups` (n,) are levels of torque. `group_torque_nm` and `group_sigma` (g,) are their means on the focused bank,
+    `r_clustered` is between these, and `fit` is the parabola through them. `parts` (n,) are parts of the recording.
+    `rmse_nm` is of single slices, each predicted by a parabola that was fitted without its part. `grouping` and
+    `held_out` describe the groups and the parts.
     """
 
     slices: Slices
     focused: Matches
     wide: Matches
     r_focused: float | None
+    r_wide: float | None
     groups: IntArray
+    group_torque_nm: FloatArray
+    group_sigma: FloatArray
     grouping: str
     r_clustered: float | None
     parts: IntArray
@@ -142,21 +142,6 @@ class TorqueResult:
     rmse_nm: float | None
     held_out: str
     notes: tuple[str, ...]
-
-    @property
-    def r_wide(self) -> float | None:
-        """The correlation on the wide bank."""
-        return correlation(self.wide.sigma, self.slices.torque_nm)
-
-    @property
-    def group_torque_nm(self) -> FloatArray:
-        """The mean torque of each group."""
-        return group_means(self.slices.torque_nm, self.groups)
-
-    @property
-    def group_sigma(self) -> FloatArray:
-        """The mean sigma of each group, on the focused bank."""
-        return group_means(self.focused.sigma, self.groups)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -236,7 +221,10 @@ def analyse_torque(slices: Slices, on_focused: Matches, on_wide: Matches) -> Tor
         focused=on_focused,
         wide=on_wide,
         r_focused=correlation(sigma, torque),
+        r_wide=correlation(on_wide.sigma, torque),
         groups=groups,
+        group_torque_nm=group_torque,
+        group_sigma=group_sigma,
         grouping=grouping,
         r_clustered=r_clustered,
         parts=parts,

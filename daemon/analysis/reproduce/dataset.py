@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.fingertip_validator import segment_grip
+from shearloop.bank.estimation.regressors import ranked_channels
 from shearloop.daemon.analysis.charts.drawing import figure
 from shearloop.daemon.analysis.series import series_of
 from shearloop.daemon.errors import UserError
@@ -80,36 +81,24 @@ def regress_on_channels(slices: Slices, parts: IntArray) -> tuple[ChannelRegress
     counts = np.unique(
         [*range(1, _EVERY_COUNT), PAPER_CHANNELS, *np.geomspace(_EVERY_COUNT, n_channels, _N_COUNTS).astype(int)]
     )
-    everything = np.ones(len(parts), dtype=np.bool_)
     return (
-        _regression("ranked by all slices (paper)", counts, slices, parts, everything),
-        _regression("ranked by the fitted slices", counts, slices, parts, None),
+        _regression("ranked by all slices (paper)", counts, slices, parts, by_all=True),
+        _regression("ranked by the fitted slices", counts, slices, parts, by_all=False),
     )
 
 
-def _regression(
-    ranking: str, counts: IntArray, slices: Slices, parts: IntArray, ranked_by: np.ndarray | None
-) -> ChannelRegression:
+def _regression(ranking: str, counts: IntArray, slices: Slices, parts: IntArray, *, by_all: bool) -> ChannelRegression:
     torque, predicted = slices.torque_nm, np.empty((len(counts), len(parts)))
     for part in np.unique(parts):
         out = parts == part
-        order = _ranked(slices, ~out if ranked_by is None else ranked_by)
-        x, mean = slices.differences[:, order], torque[~out].mean()
-        x = x - x[~out].mean(axis=0)
+        ranked = np.full_like(out, fill_value=True) if by_all else ~out
+        x = slices.differences[:, ranked_channels(slices.differences[ranked], torque[ranked])]
+        x, mean = x - x[~out].mean(axis=0), torque[~out].mean()
         for i, count in enumerate(counts):
             weights = np.linalg.lstsq(x[~out, :count], torque[~out] - mean, rcond=None)[0]
             predicted[i, out] = x[out, :count] @ weights + mean
     r = np.array([np.corrcoef(one, torque)[0, 1] for one in predicted])
     return ChannelRegression(ranking, counts, r, 1.0 - ((predicted - torque) ** 2).mean(axis=1) / torque.var())
-
-
-def _ranked(slices: Slices, rows: np.ndarray) -> IntArray:
-    """Return the channels by falling correlation with torque in some slices."""
-    x, y = slices.differences[rows], slices.torque_nm[rows]
-    x, y = x - x.mean(axis=0), y - y.mean()
-    norms = np.linalg.norm(x, axis=0)
-    # A channel that does not change has no correlation and comes last.
-    return np.argsort(-np.abs(x.T @ y) / np.where(norms > 0, norms, np.inf), kind="stable")
 
 
 def read_twists(recordings: Path, notes: list[str]) -> Twists | None:

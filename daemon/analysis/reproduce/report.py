@@ -18,8 +18,6 @@ from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.matching import Match
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS
-from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import Calibration
 from shearloop.bank.polynomial import Polynomial
 from shearloop.daemon.analysis.charts.bank_figures import models_figure, signal_figure
 from shearloop.daemon.analysis.charts.drawing import figure, lay_out
@@ -208,29 +206,6 @@ def _first_counts(counts: dict[str, int]) -> str:
 
 def _count_range(counts: tuple[int, int] | None) -> str:
     return "none" if counts is None else f"{counts[0]} to {counts[1]}" if counts[0] < counts[1] else str(counts[0])
-
-
-def save_calibrations(found: Reproduction, banks: dict[str, Bank], recordings: Path, folder: Path) -> list[Path]:
-    """Write a calibration file for every fit that the slices determine, and return the paths.
-
-    Fits are to single slices, which scatter as frames do. Raises CalibrationError where a file cannot be written.
-    """
-    fits: dict[str, tuple[str, dict[str, tuple[FloatArray, FloatArray]]]] = {}
-    if found.torque:
-        for bank, matches in (("focused", found.torque.focused), ("wide", found.torque.wide)):
-            fits[f"torque_{bank}"] = (bank, {"torque": (matches.sigma, found.torque.slices.torque_nm)})
-    if found.diameter:
-        fits["diameter_wide"] = ("wide", {"diameter": (found.diameter.single.k, found.diameter.slices.diameter_mm)})
-    written = []
-    for name, (bank, points) in fits.items():
-        source = f"{name.split('_')[0]} slices of {recordings.name}, on the {bank} bank"
-        try:
-            calibration = Calibration.from_matches(banks[bank].identity, source, banks[bank].table, **points)
-        except CalibrationError:  # already in the notes
-            continue
-        written.append(folder / f"calibration_{name}.cal")
-        calibration.save(written[-1])
-    return written
 
 
 def _first(scores: dict[str, float | None]) -> str:

@@ -115,9 +115,13 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
             "--load-cell-delay-s 0."
         )
     if calibration.kind == "raw":
-        unnamed = "The recordings do not name one tool's diameter, and on another tool the torque would be wrong"
-        named = f"{unnamed}: name it with --tool-mm." if result.tool_mm is None else ""
-        sentences.append(named or f"The tool's diameter is {result.tool_mm:.3g} mm.")
+        if result.tool_mm is not None:
+            sentences.append(f"The tool's diameter is {result.tool_mm:.3g} mm.")
+        elif (law := calibration.tools) is not None:
+            sentences.append(f"The tools' diameters are {law.low_mm:.3g} to {law.high_mm:.3g} mm.")
+        else:
+            unnamed = "The recordings do not name one tool's diameter, and on another tool the torque would be wrong"
+            sentences.append(f"{unnamed}: name it with --tool-mm.")
     return sentences
 
 

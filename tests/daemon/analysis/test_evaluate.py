@@ -39,14 +39,16 @@ def winkler_by_hand(truth, low, high):
 @given(st.lists(frames, min_size=1, max_size=12), st.floats(0.0, 0.1))
 def test_figures_are_those_of_a_slow_loop(rows, loaded_nm):
     tracks = [track_of(rows[:5]), track_of(rows[5:])]
-    by_load = figures_by_load(tracks, loaded_nm)
+    by_load, whole = figures_by_load(tracks, loaded_nm), figures_of(tracks)
+    assert (whole["latency_ms_p50"], whole["frames"]) == (1.0, len(rows))
+    assert "diameter_rmse_mm" not in whole
     strata = {
         "loaded": [row for row in rows if abs(row[0]) >= loaded_nm],
         "unloaded": [row for row in rows if abs(row[0]) < loaded_nm],
         "all": rows,
     }
     for name, chosen in strata.items():
-        figures = by_load.get(name) or figures_of(tracks)
+        figures = by_load.get(name, whole)
         judged = [(truth, *found) for truth, found in chosen if found is not None]
         n = len(judged)
         if chosen:
@@ -55,6 +57,8 @@ def test_figures_are_those_of_a_slow_loop(rows, loaded_nm):
         if n < 2:
             assert figures["rmse_nm"] is figures["winkler_nm"] is figures["zero_rmse_nm"] is None
             continue
+        if name == "all" and min(np.ptp(judged, axis=0)[:2]) > 0:
+            assert figures["r"] == pytest.approx(np.corrcoef(*np.array(judged)[:, :2].T)[0, 1])
         ends = [(truth, value - below, value + above) for truth, value, below, above in judged]
         assert figures["rmse_nm"] == pytest.approx(math.sqrt(sum((one[1] - one[0]) ** 2 for one in judged) / n))
         assert figures["zero_rmse_nm"] == pytest.approx(math.sqrt(sum(one[0] ** 2 for one in judged) / n))

@@ -42,7 +42,7 @@ class FixedSpeed:
 
 
 def test_the_plant_measures_the_mean_of_its_window_and_reports_it_late():
-    sensor = SimulatedSensor(period_s=0.5, window_s=0.5, transfer_s=0.1)
+    sensor = SimulatedSensor(period_s=0.5, transfer_s=0.1)
     tool = SimulatedTool(relaxing_share=0.0, actuation_s=0.0)
     loop = FixedSpeed(0.2, until_s=1e9)
     run(Plant(tool, sensor, np.random.default_rng(0)), loop, 6.0)

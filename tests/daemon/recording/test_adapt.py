@@ -59,6 +59,7 @@ def test_other_diameters_and_two_twists_estimate_the_torque_on_a_tool(shared, tm
     recordings = [str(tmp_path / f"{name}.mcap") for name in others.split()]
     out, new, tested = (str(tmp_path / name) for name in ("tools.cal", "new.cal", f"{tool}.mcap"))
     assert main(["calibrate", *recordings, "--load-cell-delay-s", "0", "--out", out]) == 0
+    assert "The tools' diameters are 10 to " in capsys.readouterr().out
     before = loaded(out, tested, capsys)
     assert before["coverage_95"] > 0.9, "a tool that was not calibrated"
     assert main(["adapt", out, tested, "--time-range", "0:0.28", "--out", new]) == 0

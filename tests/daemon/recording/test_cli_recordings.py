@@ -256,42 +256,17 @@ def test_what_is_judged_twice_is_refused_as_what_is_fitted_twice_is(slices_folde
     assert f"{copy}: Data_Slice_30.mat equals {slices}: Data_Slice_30.mat, and 19 more are" in refusal
 
 
-def _torque(torque_nm: float, half_nm: float) -> Estimate:
-    return Estimate(
-        True, (), torque_nm=torque_nm, torque_low_nm=torque_nm - half_nm, torque_high_nm=torque_nm + half_nm
-    )
-
-
-def test_figures_are_what_their_names_say():
-    truth = np.array([0.0, 0.1, 0.2, 0.3])
-    estimates = [*(_torque(value, 0.05) for value in (0.02, 0.1, 0.27)), Estimate(False, ("no grip",))]
-    t = np.arange(4.0)
-    series = FrameSeries("difference", ("right",), t, np.zeros((4, 1, 896)), t, truth, np.full(4, np.nan))
-    figures = figures_of([EstimateTrack(series, tuple(estimates), np.array([1.0, 2.0, 3.0, 4.0]))])
-    assert figures["r"] == pytest.approx(np.corrcoef([0.02, 0.1, 0.27], truth[:3])[0, 1])
-    assert (figures["latency_ms_p50"], figures["frames"]) == (2.5, 4)
-    assert "diameter_rmse_mm" not in figures
-
-
-def test_a_coverage_is_told_with_the_median_width_of_its_intervals():
-    t, halves = np.arange(4.0), (0.01, 0.02, 0.1)
-    torques = [_torque(0.1, half) for half in halves]
-    cylinders = [Estimate(True, (), diameter_mm=20.0, diameter_low_mm=15.0, diameter_high_mm=25.0 + n) for n in t]
+def test_known_diameters_have_figures_of_their_own():
+    t, ends = np.arange(4.0), (15.0, 25.0)
+    cylinders = [Estimate(True, (), diameter_mm=19.0, diameter_low_mm=ends[0], diameter_high_mm=ends[1] + n) for n in t]
     refused = [Estimate(False, ("no grip",))]
-    of_torques = FrameSeries("difference", ("right",), t, np.zeros((4, 1, 896)), t, np.full(4, 0.1), np.full(4, np.nan))
-    of_cylinders = replace(of_torques, torque_t_s=t[:0], torque_nm=t[:0], diameter_mm=np.full(4, 20.0))
-    tracks = [
-        EstimateTrack(of_torques, (*torques, *refused), np.ones(4)),
-        EstimateTrack(of_cylinders, tuple(cylinders), np.ones(4)),
-    ]
-    figures = figures_of(tracks)
-    assert figures["coverage_95"] == 1.0
-    assert figures["interval_nm"] == pytest.approx(0.04)
+    nothing = np.zeros(0)
+    series = FrameSeries("difference", ("right",), t, np.zeros((4, 1, 896)), nothing, nothing, np.full(4, 20.0))
+    figures = figures_of([EstimateTrack(series, tuple(cylinders), np.ones(4))])
+    assert figures["coverage_95"] == figures["diameter_coverage_95"] == figures["diameter_rmse_mm"] == 1.0
     assert figures["diameter_interval_mm"] == pytest.approx(11.5)
-    nothing = figures_of(
-        [EstimateTrack(replace(of_torques, diameter_mm=np.full(4, 20.0)), tuple(4 * refused), np.ones(4))]
-    )
-    assert nothing["interval_nm"] is nothing["diameter_interval_mm"] is None
+    without = figures_of([EstimateTrack(series, tuple(4 * refused), np.ones(4))])
+    assert without["interval_nm"] is without["diameter_interval_mm"] is None
 
 
 @pytest.mark.parametrize("unsure_s", [0.0, 0.4])

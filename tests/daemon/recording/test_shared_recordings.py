@@ -22,7 +22,8 @@ from shearloop.bank.estimation import Calibration, FrameSeries, fit, measure_tim
 from shearloop.bank.estimation.load_delay import find_load_delay, is_filtered, load_delay_warning
 from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.bank.estimators import EstimatorName
-from shearloop.daemon.analysis.charts.fault_sweeps import balanced
+from shearloop.daemon.analysis.charts.fault_sweeps import balanced, judge_level
+from shearloop.daemon.analysis.charts.stability import select_rows
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.cli import main
@@ -192,22 +193,15 @@ def _without_ends(regressor):
 def test_torques_beyond_those_calibrated_on_lie_within_the_intervals(name, low_nm, high_nm, slices):
     """They are read within the range, and up to nine tenths of them false-valid; they lie up to 1.6 of it beyond."""
     inside = (low_nm <= slices.torque_nm) & (slices.torque_nm < high_nm)
-    calibration = fit(name, [_some(slices, inside)], "a part of the torques")
-    figures = figures_of([estimate_series(calibration, _some(slices, ~inside))])
+    calibration = fit(name, [select_rows(slices, inside)], "a part of the torques")
+    figures = figures_of([estimate_series(calibration, select_rows(slices, ~inside))])
     assert figures["valid_fraction"] > 0.9, "or nothing would be tested"
     assert figures["coverage_95"] >= 0.9
     # As where somebody has vouched that no other will come, which changes nothing else (test_later_torque_slices).
     reader = _without_ends(calibration.torque.regressor)
     vouched = replace(calibration, torque=replace(calibration.torque, regressor=reader))
-    vouched_for = figures_of([estimate_series(vouched, _some(slices, ~inside))])
+    vouched_for = figures_of([estimate_series(vouched, select_rows(slices, ~inside))])
     assert vouched_for["coverage_95"] < 0.8, "or there was nothing to hold"
-
-
-def _some(series: FrameSeries, chosen) -> FrameSeries:
-    return replace(
-        series, t_s=series.t_s[chosen], channels=series.channels[chosen], torque_t_s=series.torque_t_s[chosen],
-        torque_nm=series.torque_nm[chosen], diameter_mm=series.diameter_mm[chosen],
-    )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ["motion_regression", "regression"])
@@ -267,14 +261,8 @@ def test_a_load_half_a_second_off_in_a_short_recording_lies_within_the_intervals
     calibration = fit("motion_regression", [late], "shifted")
     assert calibration.torque.regressor.timing_widening > 1.1
     estimates = estimate_series(calibration, future).estimates
-    truth_nm = balanced(future.torque_at_frames())
-    missed = [
-        one.valid and not one.torque_low_nm <= truth <= one.torque_high_nm
-        for one, truth in zip(estimates, truth_nm, strict=True)
-        if np.isfinite(truth)
-    ]
     # 11 of 70 frames.
-    assert np.mean(missed) <= 0.16
+    assert judge_level(estimates, balanced(future.torque_at_frames()), late_s).false_valid <= 0.16
 
 
 def test_a_fingertip_that_the_lever_hardly_moves_has_its_times_from_the_other_one(twists):

@@ -64,10 +64,10 @@ def estimate_in_worker(shared: tuple[Calibration, str | None], series: FrameSeri
 def figures_of(tracks: Sequence[EstimateTrack]) -> Figures:
     """Return the figures of all frames, by the names that `shearloop evaluate` prints.
 
-    Valid frames with a known truth are judged; a figure is None where there are too few. interval_nm is the median
-    width of the intervals, winkler_nm their mean score, and zero_rmse_nm the error of an estimate that is always 0.
-    Known diameters add diameter_rmse_mm, diameter_coverage_95 and diameter_interval_mm. Without a torque, coverage_95
-    is the diameter's.
+    Only valid frames with a known truth are judged; with fewer than two of them, errors are None. interval_nm is the
+    median width of the intervals. winkler_nm is their mean score. zero_rmse_nm is the error of an estimate of 0. Known
+    diameters add diameter_rmse_mm, diameter_coverage_95 and diameter_interval_mm. Without a torque, coverage_95 is of
+    the diameter.
     """
     torque, diameter = (_compare(_known_frames(tracks, *one), one[1]) for one in (("torque", "nm"), ("diameter", "mm")))
     valid = [estimate.valid for track in tracks for estimate in track.estimates]
@@ -86,10 +86,10 @@ def figures_of(tracks: Sequence[EstimateTrack]) -> Figures:
 
 
 def figures_by_load(tracks: Sequence[EstimateTrack], loaded_nm: float = LOADED_NM) -> dict[str, Figures]:
-    """Return the torque's figures of `loaded` frames, whose truth is loaded_nm or more in size, and of the others.
+    """Return the torque's figures of `loaded` frames, with a torque of loaded_nm or more in size, and of the others.
 
-    valid_fraction is the share of the n frames with a known truth that have a torque; only these are judged. gain is
-    the mean estimate over the mean truth, both along the truth.
+    n frames have a known truth, and valid_fraction of them an estimate. Only these are judged. gain is the mean
+    estimate over the mean truth, both along the truth.
     """
     frames = _known_frames(tracks, "torque", "nm")
     is_loaded = np.abs(frames[0]) >= loaded_nm
@@ -119,20 +119,20 @@ def invalid_reasons(tracks: Sequence[EstimateTrack]) -> list[InvalidReason]:
 
 
 def values_of(estimates: Sequence[Estimate], quantity: str = "torque", unit: str = "nm") -> FloatArray:
-    """Return estimate and interval's ends (3, n) in N·m or mm, NaN where there is no estimate."""
+    """Return estimate and the interval's ends (3, n) in N·m or mm, NaN without an estimate."""
     names = [f"{quantity}{end}_{unit}" for end in _ENDS]
     # None becomes NaN.
     return np.array([[getattr(estimate, name) for estimate in estimates] for name in names], dtype=np.float64)
 
 
 def _frames(track: EstimateTrack, quantity: str, unit: str) -> FloatArray:
-    """Return truth, estimate and interval's ends (4, n) of all frames, NaN for what is unknown."""
+    """Return truth, estimate and the interval's ends (4, n) of all frames, NaN for unknown ones."""
     truth = track.series.torque_at_frames() if quantity == "torque" else track.series.diameter_mm
     return np.array([truth, *values_of(track.estimates, quantity, unit)])
 
 
 def _known_frames(tracks: Sequence[EstimateTrack], quantity: str, unit: str) -> FloatArray:
-    """Return truth, estimate and interval's ends (4, n) of the frames with a known truth."""
+    """Return truth, estimate and the interval's ends (4, n) of the frames with a known truth."""
     frames = np.concatenate([_frames(track, quantity, unit) for track in tracks], axis=1)
     return frames[:, np.isfinite(frames[0])]
 
@@ -161,7 +161,7 @@ def _compare(frames: FloatArray, unit: str) -> Figures:
 
 
 def write_estimates(tracks: Sequence[EstimateTrack], names: Sequence[str], path: Path) -> None:
-    """Write a CSV row for every frame of each named series; a cell is empty where there is no truth or no estimate."""
+    """Write a CSV row for every frame of each named series; cells without a truth or an estimate are empty."""
     values = [f"{quantity}{end}_{unit}" for quantity, unit in (("torque", "nm"), ("diameter", "mm")) for end in _ENDS]
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
@@ -185,7 +185,7 @@ def draw_tracks(tracks: Sequence[EstimateTrack], names: Sequence[str], title: st
     rows = np.ravel(made.subplots(len(tracks), 1, squeeze=False))
     for axes, track, row_name in zip(rows, tracks, names, strict=True):
         slices = track.series.kind == "difference"
-        # A stream has one tool, whose diameter would be a flat line.
+        # A stream has one tool: its diameter would be a flat line.
         is_torque = not slices or not np.isfinite(track.series.diameter_mm).any()
         truth, value, low, high = _frames(track, *(("torque", "nm") if is_torque else ("diameter", "mm")))
         t_s = track.series.t_s

@@ -59,7 +59,7 @@ class _CsvTable:
     """A table with one column per array element, after the other columns: channels_0, channels_1, …"""
 
     def __init__(self, path: Path, first: dict[str, Any]) -> None:
-        """Write the names of the columns, those of the first row."""
+        """Write the names of the columns, as in the first row."""
         self._path = path
         self._file = path.open("w", newline="", encoding="utf-8")
         self._table = csv.writer(self._file, lineterminator="")
@@ -90,7 +90,7 @@ class _CsvTable:
 
 
 class _ParquetTable:
-    """A table whose types are those of the topic's schema, written in batches; missing elements of arrays are NaN."""
+    """A table with the types of the topic's schema, written in batches; missing elements of arrays are NaN."""
 
     def __init__(self, path: Path, topic: str, first: dict[str, Any]) -> None:
         """Begin the file with the columns of the first row."""

@@ -1,7 +1,7 @@
 """Writes a recording as a LeRobotDataset v3.0 of one episode: 25 rows a second, each with the latest messages.
 
-The format is described at huggingface.co/docs/lerobot. A message counts from the time at which the daemon had it, so a
-row holds only what a policy could have used. Values that are missing are NaN, and `valid` is 1 or 0.
+The format is described at huggingface.co/docs/lerobot. A message counts from the moment when the daemon had it, and a
+policy could have used it. Missing values are NaN, and `valid` is 1 or 0.
 """
 
 import heapq
@@ -88,7 +88,7 @@ class _Held:
 
 
 class _Statistics:
-    """Minimum, maximum, mean and standard deviation of each column, over its finite values."""
+    """Minimum, maximum, mean and standard deviation of each column over its finite values, for any number of rows."""
 
     def __init__(self, width: int) -> None:
         self._rows = 0
@@ -193,8 +193,8 @@ class _Dataset:
         return self._files
 
     def _times(self, path: Path, progress: Progress) -> Iterator[int]:
-        """Yield the time of each row, when `_held` has what was known then."""
-        # Messages come by the time of their measurement, which is not later than the time at which they are known.
+        """Yield the time of each row, while `_held` has the latest messages of that time."""
+        # Messages come in the order of their measurement, and are known then or later.
         waiting: list[_Waiting] = []
         now_ns = 0
         for number, (topic, content, message) in enumerate(read_messages(path, self._held, progress), start=1):

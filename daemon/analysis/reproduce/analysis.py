@@ -98,11 +98,11 @@ _BATCH = 8
 _RESTART_SHARE = 0.5
 # This share of a series' steps must rise: noise may swap neighbouring levels.
 _RISING_SHARE = 0.8
-# The paper does not give the settings of its envelope: these around them show what the ranking depends on.
+# The paper does not give the settings of its envelope. These show how the ranking depends on them.
 ENVELOPES = tuple(
     EnvelopeSettings(distance, averaged) for distance in (30, 40, 50, 60, 70) for averaged in (1, 3, 5, 7, 9)
 )
-# Shares of the height at which a model is tried for the matching score. More change it by less than 0.001.
+# A model is tried at these shares of the height for the matching score. More change it by less than 0.001.
 _PLACES = np.linspace(0.02, 0.98, 49)
 
 
@@ -168,8 +168,8 @@ class DiameterResult:
 class ModelScores:
     """The score of each basis model in two measures (see bank.eit.design), None where it is undefined.
 
-    `envelope` needs the raw frame; `matching` is over the torque slices. `n_slices` counts the slices that a model
-    matches best, and `n_envelopes` the settings of the envelope by which it is first.
+    `envelope` needs the raw frame, and `matching` is over the torque slices. `n_slices` counts the slices that a model
+    matches best. `n_envelopes` counts the settings of the envelope that make it first.
     """
 
     envelope: dict[str, float | None] | None
@@ -351,9 +351,9 @@ def _fit_or_note(x: FloatArray, y: FloatArray, degree: int, what: str, notes: li
 def place_in_series(values: FloatArray) -> tuple[IntArray, IntArray] | None:
     """Return the level and the repeat (n,) of values, in order of time, that repeat one rising series; else None.
 
-    A series restarts where the value falls by more than half of the whole range. The longest series have all levels.
-    The values of a shorter one go, in their order, to the levels whose means over the longest are nearest to them, in
-    the sum of squares. There must be two series, of three levels or more.
+    A series restarts where the value falls by more than half of the whole range. There must be two series, of three
+    levels or more. The longest series have all levels, and their means define the levels. A shorter series keeps its
+    order; its values go to the levels with the least sum of squared differences.
     """
     falls = np.diff(values) < -_RESTART_SHARE * np.ptp(values)
     repeat = np.concatenate([[0], np.cumsum(falls)]).astype(np.int64)

@@ -43,13 +43,13 @@ class ChannelRegression:
     r2: FloatArray
 
     def r_share_at(self, count: int) -> float:
-        """Return the correlation with the nearest number of channels, over that of all."""
+        """Return the correlation with the nearest number of channels, as a share of all channels' correlation."""
         return float(self.r[np.abs(self.counts - count).argmin()] / self.r[-1])
 
     def counts_reaching(self, share: float) -> tuple[int, int] | None:
-        """Return the first number of channels with this share of all channels' R², and the one from which all have it.
+        """Return the least number of channels with this share of all channels' R², and the least that keeps it.
 
-        None where all channels explain nothing.
+        None if all channels explain nothing.
         """
         if self.r2[-1] <= 0:
             return None

@@ -73,12 +73,6 @@ class PlantSample:
 
 
 @dataclass(slots=True)
-class _Grip:
-    relaxed_nm: float = 0.0
-    slipped_rad: float = 0.0
-
-
-@dataclass(slots=True)
 class _Reading:
     # With play, before relaxation.
     torque_nm: float = 0.0
@@ -101,7 +95,8 @@ class Plant:
     angle_rad: float = 0.0
     torque_nm: float = 0.0
     _speeds: list[float] = field(default_factory=list)
-    _grip: _Grip = field(default_factory=_Grip)
+    _relaxed_nm: float = 0.0
+    _slipped_rad: float = 0.0
     _reading: _Reading = field(default_factory=_Reading)
     _samples: list[PlantSample] = field(default_factory=list)
 
@@ -126,13 +121,13 @@ class Plant:
         return known
 
     def _update_torque(self) -> None:
-        tool, grip = self.tool, self._grip
-        elastic = tool.stiffness_nm_per_rad * (self.angle_rad - grip.slipped_rad)
-        grip.relaxed_nm += (tool.relaxing_share * elastic - grip.relaxed_nm) * self.period_s / tool.relaxing_s
-        torque = elastic - grip.relaxed_nm
+        tool = self.tool
+        elastic = tool.stiffness_nm_per_rad * (self.angle_rad - self._slipped_rad)
+        self._relaxed_nm += (tool.relaxing_share * elastic - self._relaxed_nm) * self.period_s / tool.relaxing_s
+        torque = elastic - self._relaxed_nm
         if abs(torque) > tool.slip_nm:
             excess = float(torque - np.sign(torque) * tool.slip_nm)
-            grip.slipped_rad += excess / tool.stiffness_nm_per_rad
+            self._slipped_rad += excess / tool.stiffness_nm_per_rad
             torque -= excess
         self.torque_nm = torque + self.disturbance_nm
 
@@ -175,16 +170,11 @@ class LoopController(Protocol):
         """Return the wrist speed to send now."""
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(slots=True)
 class UncompensatedController:
     """The twist controller without its delay compensator: it takes each torque for the present one."""
 
-    stiffness_nm_per_rad: float
-    kp: float
-    ki: float = 0.0
-    wrist_bandwidth_per_s: float = 5.0
-    ramp_nm_per_s: float = float("inf")
-    speed_limit_rad_per_s: float = float("inf")
+    settings: ControllerSettings
     _set_point_nm: float = 0.0
     _ramp_nm: float = 0.0
     _offset_nm: float = 0.0
@@ -201,19 +191,20 @@ class UncompensatedController:
         if torque_nm is None:
             return
         excess = torque_nm - self._ramp_nm
-        self._creep_nm += self.ki * excess
-        self._offset_nm += self.kp * excess + self._creep_nm
+        self._creep_nm += self.settings.ki * excess
+        self._offset_nm += self.settings.kp * excess + self._creep_nm
 
     def command(self, t_ns: int, wrist_angle_rad: float) -> WristCommand:
         """Return the speed towards the corrected angle."""
+        settings = self.settings
         if self._origin_rad is None:
             self._origin_rad, self._t_ns = wrist_angle_rad, t_ns
-        most = self.ramp_nm_per_s * (t_ns - self._t_ns) / 1e9 if t_ns > self._t_ns else 0.0
+        most = settings.ramp_nm_per_s * (t_ns - self._t_ns) / 1e9 if t_ns > self._t_ns else 0.0
         self._t_ns = t_ns
         self._ramp_nm += max(-most, min(most, self._set_point_nm - self._ramp_nm))
-        goal = self._origin_rad + (self._ramp_nm - self._offset_nm) / self.stiffness_nm_per_rad
-        speed = self.wrist_bandwidth_per_s * (goal - wrist_angle_rad)
-        return WristCommand(max(-self.speed_limit_rad_per_s, min(self.speed_limit_rad_per_s, speed)))
+        goal = self._origin_rad + (self._ramp_nm - self._offset_nm) / settings.stiffness_nm_per_rad
+        speed = settings.wrist_bandwidth_per_s * (goal - wrist_angle_rad)
+        return WristCommand(max(-settings.speed_limit_rad_per_s, min(settings.speed_limit_rad_per_s, speed)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -411,16 +402,8 @@ def _averaged_loop(
             age_limit_s=settings.age_limit_s + frames * found.sample_period_s,
         )  # fmt: skip
     if name == LOOPS[1]:
-        return _AveragedLoop(_uncompensated(settings), latest)
+        return _AveragedLoop(UncompensatedController(settings), latest)
     return _AveragedLoop(started_controller(plant, found, settings), latest)
-
-
-def _uncompensated(settings: ControllerSettings) -> UncompensatedController:
-    return UncompensatedController(
-        stiffness_nm_per_rad=settings.stiffness_nm_per_rad, kp=settings.kp, ki=settings.ki,
-        wrist_bandwidth_per_s=settings.wrist_bandwidth_per_s, ramp_nm_per_s=settings.ramp_nm_per_s,
-        speed_limit_rad_per_s=settings.speed_limit_rad_per_s,
-    )  # fmt: skip
 
 
 def _rms_error(plant: Plant, loop: _AveragedLoop) -> float:
@@ -455,7 +438,7 @@ def held_loops(seeds: int) -> dict[str, list[tuple[Trace, Trace]]]:
         steady = replace(settings, noise_nm=0.0)
         for name in HELD_LOOPS:
             plant = copy.deepcopy(gripped)
-            loop: TwistController | UncompensatedController = _uncompensated(settings)
+            loop: TwistController | UncompensatedController = UncompensatedController(settings)
             if name != HELD_LOOPS[2]:
                 loop = started_controller(plant, found, settings if name == HELD_LOOPS[0] else steady)
             loop.set_point(_TARGET_NM)

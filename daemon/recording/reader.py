@@ -7,6 +7,7 @@ index that is written when a file is closed.
 
 import io
 import json
+import os
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator
@@ -256,16 +257,10 @@ class IntactRecords:
     """
 
     def __init__(self, path: Path, progress: Progress) -> None:
-        """Look at the file; raises UserError if it does not exist."""
         self._path = path
         self._progress = progress
         self.closed = False
-        self.damaged_chunks = 0
-        self._intact_bytes = 0
-        try:
-            self.size = path.stat().st_size
-        except OSError as error:
-            raise UserError(f"{path}: the recording cannot be read: {error.strerror}") from error
+        self.size = self.damaged_chunks = self._intact_bytes = 0
 
     @property
     def torn_bytes(self) -> int:
@@ -273,9 +268,10 @@ class IntactRecords:
         return 0 if self.closed else self.size - self._intact_bytes
 
     def __iter__(self) -> Iterator[McapRecord]:
-        """Read the file; raises UserError if it is not MCAP."""
+        """Read the file; raises UserError if it is missing or not MCAP."""
         try:
             with self._path.open("rb") as file:
+                self.size = os.fstat(file.fileno()).st_size
                 check_magic(self._path, file)
                 file.seek(0)
                 for record in StreamReader(file, emit_chunks=True, record_size_limit=_LARGEST_RECORD_BYTES).records:

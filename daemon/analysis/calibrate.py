@@ -60,8 +60,8 @@ class CalibrationResult:
     @property
     def widening(self) -> float | None:
         """The factor on the loads' intervals for unknown times, None where they are known."""
-        known = self.regressor is None or not self.timing.uncertainty_s
-        return None if known or self.regressor is None else round(self.regressor.timing_widening, 2)
+        one = self.regressor
+        return round(one.timing_widening, 2) if one is not None and self.timing.uncertainty_s else None
 
     def figures(self) -> dict[str, object]:
         """Return the result for scripts."""

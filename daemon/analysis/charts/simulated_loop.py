@@ -163,7 +163,7 @@ class Plant:
 class LoopController(Protocol):
     """The common part of the twist controller and the controllers it is compared with."""
 
-    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> object:
+    def measure(self, torque_nm: float, t_mid_ns: int, t_ns: int) -> object:
         """Process a torque."""
 
     def command(self, t_ns: int, wrist_angle_rad: float) -> WristCommand:
@@ -186,10 +186,8 @@ class UncompensatedController:
         """Set the torque to reach."""
         self._set_point_nm = torque_nm
 
-    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> None:  # noqa: ARG002 - the controller's
+    def measure(self, torque_nm: float, t_mid_ns: int, t_ns: int) -> None:  # noqa: ARG002 - the controller's
         """Correct the offset by the difference from the present ramp."""
-        if torque_nm is None:
-            return
         excess = torque_nm - self._ramp_nm
         self._creep_nm += self.settings.ki * excess
         self._offset_nm += self.settings.kp * excess + self._creep_nm
@@ -347,10 +345,8 @@ class _AveragedLoop:
     controller: TwistController | UncompensatedController
     latest: deque[tuple[float, int]]
 
-    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> None:
+    def measure(self, torque_nm: float, t_mid_ns: int, t_ns: int) -> None:
         """Process one frame's torque."""
-        if torque_nm is None:
-            return
         self.latest.append((torque_nm, t_mid_ns))
         torques, times = zip(*self.latest, strict=True)
         self.controller.measure(float(np.mean(torques)), round(float(np.mean(times))), t_ns)

@@ -1,6 +1,5 @@
 """The analysis of Trehan et al. 2025 (Sensors 25, 5159): torque and diameter from best matches of recorded slices."""
 
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +37,7 @@ from shearloop.daemon.recording.matlab import (
     read_line,
     read_torque_slices,
 )
+from shearloop.daemon.recording.reader import Progress
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,9 +84,6 @@ def _raw_difference(folder: Path, notes: list[str]) -> FloatArray | None:
         return None
     return np.abs(PAPER_TABLE.channels_of_line(read_line(frame)) - PAPER_TABLE.channels_of_line(read_line(homogeneous)))
 
-
-# Called with the number of slices matched so far.
-Progress = Callable[[int], object]
 
 FEWEST_SLICES = 3
 # The paper sorts its torques into ten groups.
@@ -184,7 +181,7 @@ class ModelScores:
 
 
 def match_slices(differences: FloatArray, bank: Bank, progress: Progress) -> Matches:
-    """Return the best matches of (n, 896) differences, over all lags."""
+    """Return the best matches of (n, 896) differences, over all lags; `progress` receives the slices so far."""
     matcher = ReferenceMatcher.from_bank(bank)
     parts = []
     for start in range(0, len(differences), _BATCH):

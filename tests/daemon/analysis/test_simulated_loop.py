@@ -33,8 +33,7 @@ class FixedSpeed:
         self.speed, self.until_ns = speed, nanoseconds(until_s)
         self.seen: list[tuple[float, int, int]] = []
 
-    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> None:
-        assert torque_nm is not None
+    def measure(self, torque_nm: float, t_mid_ns: int, t_ns: int) -> None:
         self.seen.append((torque_nm, t_mid_ns, t_ns))
 
     def command(self, t_ns: int, wrist_angle_rad: float) -> WristCommand:  # noqa: ARG002

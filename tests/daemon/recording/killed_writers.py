@@ -4,10 +4,10 @@ import asyncio
 import mmap
 import os
 import random
+import sched
 import signal
 import struct
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -49,22 +49,21 @@ async def write(folder: Path) -> None:
 
 
 def main(folder: Path, number: int, longest_s: float) -> None:
-    draw = random.Random(7)
-    lives: list[tuple[float, int, Path]] = []
-    begun = 0
-    while begun < number or lives:
-        if begun < number:
-            own = folder / str(begun)
-            begun += 1
-            if (child := os.fork()) == 0:
-                asyncio.run(write(own))
-            lives.append((time.monotonic() + draw.uniform(0.1, longest_s), child, own))
-        time.sleep(BETWEEN_S)
-        for life in [life for life in lives if life[0] < time.monotonic()]:
-            lives.remove(life)
-            os.kill(life[1], signal.SIGKILL)
-            os.waitpid(life[1], 0)
-            print(life[2], flush=True)
+    draw, plan = random.Random(7), sched.scheduler()
+
+    def begin(own: Path) -> None:
+        if (child := os.fork()) == 0:
+            asyncio.run(write(own))
+        plan.enter(draw.uniform(0.1, longest_s), 0, kill, (child, own))
+
+    def kill(child: int, own: Path) -> None:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        print(own, flush=True)
+
+    for n in range(number):
+        plan.enter(n * BETWEEN_S, 0, begin, (folder / str(n),))
+    plan.run()
 
 
 if __name__ == "__main__":

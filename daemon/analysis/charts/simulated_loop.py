@@ -73,6 +73,12 @@ class PlantSample:
 
 
 @dataclass(slots=True)
+class _Grip:
+    relaxed_nm: float = 0.0
+    slipped_rad: float = 0.0
+
+
+@dataclass(slots=True)
 class _Reading:
     # With play, before relaxation.
     torque_nm: float = 0.0
@@ -95,8 +101,7 @@ class Plant:
     angle_rad: float = 0.0
     torque_nm: float = 0.0
     _speeds: list[float] = field(default_factory=list)
-    _relaxed_nm: float = 0.0
-    _slipped_rad: float = 0.0
+    _grip: _Grip = field(default_factory=_Grip)
     _reading: _Reading = field(default_factory=_Reading)
     _samples: list[PlantSample] = field(default_factory=list)
 
@@ -121,13 +126,13 @@ class Plant:
         return known
 
     def _update_torque(self) -> None:
-        tool = self.tool
-        elastic = tool.stiffness_nm_per_rad * (self.angle_rad - self._slipped_rad)
-        self._relaxed_nm += (tool.relaxing_share * elastic - self._relaxed_nm) * self.period_s / tool.relaxing_s
-        torque = elastic - self._relaxed_nm
+        tool, grip = self.tool, self._grip
+        elastic = tool.stiffness_nm_per_rad * (self.angle_rad - grip.slipped_rad)
+        grip.relaxed_nm += (tool.relaxing_share * elastic - grip.relaxed_nm) * self.period_s / tool.relaxing_s
+        torque = elastic - grip.relaxed_nm
         if abs(torque) > tool.slip_nm:
             excess = float(torque - np.sign(torque) * tool.slip_nm)
-            self._slipped_rad += excess / tool.stiffness_nm_per_rad
+            grip.slipped_rad += excess / tool.stiffness_nm_per_rad
             torque -= excess
         self.torque_nm = torque + self.disturbance_nm
 

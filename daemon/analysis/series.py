@@ -56,8 +56,8 @@ def read_series(
 def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_mm: float | None = None) -> FrameSeries:
     """Return a recording's frames, several sides paired by time at their mean time.
 
-    Times are in seconds since the middle of the recording's first frame of the right side, or of the left without a
-    right one, whatever `sides` are wanted.
+    Times are in seconds since the middle of the recording's first frame of the right side, or of the left one without
+    a right side. This does not depend on `sides`.
     """
     known = tuple(side for side in SIDES if side in recording.sides) or tuple(recording.sides)
     wanted = sides or known
@@ -107,7 +107,7 @@ def _nearest(wanted: IntArray, times: IntArray) -> IntArray:
 
 
 def _series_of_slices(slices: Slices) -> FrameSeries:
-    """Return slices in time order; those of cylinders in turn, so that every part in time has all."""
+    """Return slices in time order; slices of cylinders in turn, so that every part in time has all cylinders."""
     diameter_mm, t_s = slices.diameter_mm, slices.numbers.astype(np.float64)
     order = np.arange(len(t_s))
     if np.isfinite(diameter_mm).all():

@@ -302,7 +302,7 @@ class IntactRecords:
 
 @dataclass(slots=True)
 class TopicSummary:
-    """One topic; the mean rate is None for fewer than two messages."""
+    """One topic; fewer than two messages have no mean rate."""
 
     messages: int = 0
     rate_hz: float | None = None

@@ -111,7 +111,8 @@ def run(args: argparse.Namespace) -> int:
     print(f"Loaded frames have a known torque of {args.loaded_nm:g} N·m or more, unloaded frames less.")
     print(*_lines({**by_load, "all": figures}), sep="\n")
     for reason in invalid_reasons(tracks):
-        print(f"{reason.frames:>6} frames not valid{', e.g.' if reason.differ else ''}: {reason.sentence}")
+        frames = "frame" if reason.frames == 1 else "frames"
+        print(f"{reason.frames:>6} {frames} not valid{', e.g.' if reason.differ else ''}: {reason.sentence}")
     return 0
 
 

@@ -185,7 +185,7 @@ def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, 
     assert main(["evaluate", str(calibration), slices]) == 0
     said = capsys.readouterr().out
     assert "12 frames not valid, e.g.: gripped too recently: 12 more frames are needed" in said
-    assert "1 frames not valid: no grip" in said
+    assert "1 frame not valid: no grip" in said
 
 
 @pytest.mark.parametrize(

@@ -3,20 +3,19 @@
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
-from pydantic import ConfigDict, Field
-from pydantic.dataclasses import dataclass as checked_dataclass
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.daemon.control.loop_inputs import NotNegative, Positive
 from shearloop.daemon.errors import UserError
 
 # The grid of the torque's lag behind its stamp.
 _LAG_GRID_S = np.arange(-0.4, 1.0001, 0.02)
 _ACTUATION_GRID_S = np.arange(0.0, 0.3001, 0.002)
 _FEWEST = 12
+_FEWEST_CYCLES = 2
+# After the last swing, the stiffness may be this uncertain.
+_WORST_STIFFNESS_SHARE = 0.1
 _NO_TURN_RAD = 1e-4
 # The share of the angle's range that counts as rest, and the torque at rest that may be lost over the record.
 _REST_SHARE = 0.2
@@ -100,7 +99,7 @@ class _Fit:
         return float(self.residuals @ self.residuals)
 
 
-def identify(record: Record, window_s: float, stiffness_share: float = 0.1) -> ToolModel:
+def identify(record: Record, window_s: float, stiffness_share: float = _WORST_STIFFNESS_SHARE) -> ToolModel:
     """Return the tool model of a record whose torques are means over `window_s`.
 
     For every lag of a grid, the torques are fitted by least squares to the mean angles of their windows, with an offset
@@ -249,7 +248,7 @@ def _actuation(record: Record) -> float:
     return float(min(_ACTUATION_GRID_S, key=misfit))
 
 
-@checked_dataclass(frozen=True, slots=True, kw_only=True, config=ConfigDict(allow_inf_nan=False))
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ExciteSettings:
     """The identification's swings: between the first angle and `amplitude_rad` away.
 
@@ -257,18 +256,16 @@ class ExciteSettings:
     `most_cycles` without that.
     """
 
-    amplitude_rad: Positive
-    sample_period_s: Positive
-    window_s: NotNegative
-    torque_limit_nm: Positive
-    stiffness_share: Positive = 0.03
-    worst_stiffness_share: Positive = 0.1
-    speed_rad_per_s: Positive
-    acceleration_rad_per_s2: Positive
-    bandwidth_per_s: Positive
-    dwell_s: Positive = 2.5
-    fewest_cycles: Annotated[int, Field(gt=0)] = 2
-    most_cycles: Annotated[int, Field(gt=0)] = 8
+    amplitude_rad: float
+    sample_period_s: float
+    window_s: float
+    torque_limit_nm: float
+    stiffness_share: float = 0.03
+    speed_rad_per_s: float
+    acceleration_rad_per_s2: float
+    bandwidth_per_s: float
+    dwell_s: float = 2.5
+    most_cycles: int = 8
 
 
 class StiffnessExcitation:
@@ -358,10 +355,10 @@ class StiffnessExcitation:
     def _end_leg(self) -> None:
         self._leg, self._arrived_s = self._leg + 1, None
         cycles, rests = divmod(self._leg - 1, 2)
-        if self._leg % 2 == 0 or cycles < self.settings.fewest_cycles or rests:
+        if self._leg % 2 == 0 or cycles < _FEWEST_CYCLES or rests:
             return
         last = cycles >= self.settings.most_cycles
-        share = self.settings.worst_stiffness_share if last else self.settings.stiffness_share
+        share = _WORST_STIFFNESS_SHARE if last else self.settings.stiffness_share
         try:
             self.result = identify(self.record(), self.settings.window_s, share)
         except NotYetKnownError as error:

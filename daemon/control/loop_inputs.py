@@ -2,15 +2,11 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
 
 from pydantic import Field
 
 from shearloop.daemon.config_file import ConfigModel
 from shearloop.daemon.errors import UserError
-
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
 
 
 class LoopConfig(ConfigModel):

@@ -22,7 +22,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.polynomial.polynomial import polyadd, polyval
 from numpy.typing import NDArray
-from scipy.linalg import solve_discrete_lyapunov
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.controller import ControllerSettings
@@ -73,17 +72,13 @@ class Margins:
     delay_s: float
 
 
-def wrist_response(model: LoopModel) -> FloatArray:
+@lru_cache(maxsize=64)
+def wrist_response(period_s: float, bandwidth_per_s: float, actuation_s: float) -> FloatArray:
     """Return the wrist angle (n,) after a unit step of its target, at multiples of the command period, until 1.
 
     The recursion of the real loop: a speed of bandwidth × (target − angle), held for one period and applied after the
     actuation delay (with its fraction of a period). Raises ValueError if it does not settle.
     """
-    return _wrist_response(model.command_period_s, model.wrist_bandwidth_per_s, model.actuation_s)
-
-
-@lru_cache(maxsize=64)
-def _wrist_response(period_s: float, bandwidth_per_s: float, actuation_s: float) -> FloatArray:
     gain = bandwidth_per_s * period_s
     whole, part = divmod(actuation_s / period_s, 1.0)
     delay = int(whole)
@@ -107,8 +102,8 @@ def pulse_response(model: LoopModel, lag_s: float = 0.0) -> FloatArray:
     After a unit correction made with measurement 0, coefficient k is the mean angle of measurement k minus the one of
     k−1. `lag_s` moves the windows back. Raises ValueError if a measurement would see its own correction.
     """
-    angle = wrist_response(model)
     period = model.command_period_s
+    angle = wrist_response(period, model.wrist_bandwidth_per_s, model.actuation_s)
     running = np.concatenate([[0.0], np.cumsum(0.5 * (angle[1:] + angle[:-1])) * period])
     t_s = np.arange(angle.size) * period
     # A correction waits for the next command: half a command period on average.
@@ -137,13 +132,7 @@ def gain_limit(model: LoopModel, highest: float = 4.0) -> float:
 
     The smallest gain that is tried is a thousandth of the highest.
     """
-    trials = np.geomspace(1e-3 * highest, highest, 60)
-    unstable = next((n for n, kp in enumerate(trials) if not is_stable(with_gain(model, float(kp)))), None)
-    if unstable is None:
-        return math.inf
-    if unstable == 0:
-        return float(trials[0])
-    return _bisect(lambda kp: is_stable(with_gain(model, kp)), float(trials[unstable - 1]), float(trials[unstable]))
+    return _limit(lambda kp: is_stable(with_gain(model, kp)), np.geomspace(1e-3 * highest, highest, 60))
 
 
 def with_gain(model: LoopModel, kp: float) -> LoopModel:
@@ -171,23 +160,21 @@ def _return_ratio(model: LoopModel, omega: FloatArray) -> ComplexArray:
 
 def _gain_margin(ratio: ComplexArray) -> float:
     """Return the smallest factor above 1 that makes the ratio pass through −1, linear between its samples."""
-    imaginary, real = ratio.imag, ratio.real
-    across = np.flatnonzero(imaginary[:-1] * imaginary[1:] < 0.0)
-    share = imaginary[across] / (imaginary[across] - imaginary[across + 1])
-    crossings = real[across] + share * (real[across + 1] - real[across])
     # At half the sampling rate the ratio is real.
-    factors = -1.0 / np.append(crossings, real[-1])
+    factors = -1.0 / np.append(_at_zeros(ratio.imag, ratio).real, ratio[-1].real)
     return float(min(factors[factors > 1.0], default=math.inf))
 
 
 def _phase_margin_deg(ratio: ComplexArray) -> float:
-    size = np.abs(ratio) - 1.0
-    across = np.flatnonzero(size[:-1] * size[1:] < 0.0)
-    if not across.size:
-        return 180.0
-    share = size[across] / (size[across] - size[across + 1])
-    crossings = ratio[across] + share * (ratio[across + 1] - ratio[across])
-    return float(np.min(np.abs(np.angle(-crossings, deg=True))))
+    crossings = _at_zeros(np.abs(ratio) - 1.0, ratio)
+    return float(np.min(np.abs(np.angle(-crossings, deg=True)), initial=180.0))
+
+
+def _at_zeros(values: FloatArray, ratio: ComplexArray) -> ComplexArray:
+    """Return the ratio where `values` changes its sign, linear between the samples."""
+    across = np.flatnonzero(values[:-1] * values[1:] < 0.0)
+    share = values[across] / (values[across] - values[across + 1])
+    return np.asarray(ratio[across] + share * (ratio[across + 1] - ratio[across]))
 
 
 def _delay_margin_s(model: LoopModel) -> float:
@@ -196,19 +183,22 @@ def _delay_margin_s(model: LoopModel) -> float:
     def stable(extra_s: float) -> bool:
         return is_stable(replace(model, lag_error_s=model.lag_error_s + extra_s))
 
-    step = 0.5 * model.sample_period_s
-    for tried in range(1, 41):
-        if not stable(tried * step):
-            return _bisect(stable, (tried - 1) * step, tried * step)
-    return math.inf
+    return _limit(stable, 0.5 * model.sample_period_s * np.arange(41))
 
 
-def _bisect(good: Callable[[float], bool], low: float, high: float) -> float:
-    """Return the end of `good`, which is true at `low` and false at `high`, with a relative error of 10⁻⁴."""
+def _limit(good: Callable[[float], bool], trials: FloatArray) -> float:
+    """Return the first value that is not good, among ascending trials and between, with a relative error of 10⁻⁴.
+
+    It is the first trial if no trial is good, and infinite if all are.
+    """
+    bad = next((number for number, trial in enumerate(trials.tolist()) if not good(trial)), None)
+    if bad is None:
+        return math.inf
+    low, high = trials[max(bad - 1, 0)], trials[bad]
     while high - low > 1e-4 * high:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if good(middle) else (low, middle)
-    return 0.5 * (low + high)
+    return float(0.5 * (low + high))
 
 
 def is_stable(model: LoopModel) -> bool:
@@ -243,12 +233,11 @@ def integral_gain(kp: float) -> float:
 def noise_share(kp: float, ki: float) -> float:
     """Return the standard deviation of the torque caused by measurement noise of standard deviation 1.
 
-    The stationary variance of the controller's filter d ← d + i + (kp + ki)·ν, i ← i + ki·ν, ν = noise − d. It is exact
-    if the wrist arrives within a period, and slightly too large otherwise.
+    The stationary variance of the controller's filter d ← d + i + (kp + ki)·ν, i ← i + ki·ν, ν = noise − d: that of the
+    prediction of an α-β filter, α = kp and β = ki (Kalata 1984). It is exact if the wrist arrives within a period, and
+    slightly too large otherwise.
     """
-    turn = np.array([[1.0 - kp - ki, 1.0], [-ki, 1.0]]) if ki else np.array([[1.0 - kp]])
-    push = np.array([[kp + ki], [ki]]) if ki else np.array([[kp]])
-    return math.sqrt(float(solve_discrete_lyapunov(turn, push @ push.T)[0, 0]))
+    return math.sqrt((2.0 * kp * kp + kp * ki + 2.0 * ki) / (kp * (4.0 - 2.0 * kp - ki)))
 
 
 def gain_for_noise(noise_nm: float, allowed_nm: float) -> float:
@@ -279,20 +268,14 @@ def loop_model(settings: ControllerSettings, found: ToolModel) -> LoopModel:
 
 
 def passing_gain(model: LoopModel, config: LoopConfig) -> float | None:
-    """Return the largest kp, to 1 % and at most MOST_GAIN, that gives the required margins, or None."""
+    """Return a kp just below the first without the required margins, at most MOST_GAIN, or None."""
 
     def passes(kp: float) -> bool:
         return _passes(margins(with_gain(model, kp)), config, model.sample_period_s)
 
-    trials = [float(kp) for kp in np.geomspace(MOST_GAIN, LEAST_GAIN, 25)]
-    first = next((number for number, kp in enumerate(trials) if passes(kp)), None)
-    if first is None:
-        return None
-    best, too_much = trials[first], trials[max(first - 1, 0)]
-    while too_much > 1.01 * best:
-        middle = math.sqrt(best * too_much)
-        best, too_much = (middle, too_much) if passes(middle) else (best, middle)
-    return best
+    limit = _limit(passes, np.geomspace(LEAST_GAIN, MOST_GAIN, 25))
+    # Rounded to three digits, it passes as well.
+    return min(0.99 * limit, MOST_GAIN) if limit > LEAST_GAIN else None
 
 
 def margin_refusal(settings: ControllerSettings, found: ToolModel, config: LoopConfig) -> str | None:

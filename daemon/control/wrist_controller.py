@@ -124,8 +124,6 @@ class WristController:
 
     def hold(self) -> WristCommand:
         """Stand still; the next `turn` continues without a jump."""
-        if self.controller is not None and not self._held:
-            self.controller.hold()
         self._held = True
         return WristCommand()
 

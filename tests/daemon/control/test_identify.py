@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
 from shearloop.daemon.control.identification import (
     ExciteSettings,
@@ -193,7 +192,3 @@ def test_nonsense_does_not_reach_the_record():
         step.measure(torque, t_mid, 10)
     assert step.record().torque_nm.tolist() == [0.05]
     assert step.record().angle_rad.tolist() == [1.0]
-    with pytest.raises(ValidationError, match="amplitude_rad"):
-        ExciteSettings(**(SETTINGS | {"amplitude_rad": 0.0}))
-    with pytest.raises(ValidationError, match="dwell_s"):
-        ExciteSettings(**(SETTINGS | {"dwell_s": -1.0}))

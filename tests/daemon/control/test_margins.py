@@ -80,15 +80,13 @@ def test_up_to_twice_the_stiffness_no_delay_makes_a_gain_below_one_unstable(age_
 
 
 def test_the_wrist_closes_in_as_the_exponential_that_its_bandwidth_names():
-    model = replace(EIT, actuation_s=0.0, command_period_s=1e-4)
-    times = np.arange(wrist_response(model).size) * 1e-4
-    np.testing.assert_allclose(wrist_response(model), 1.0 - np.exp(-4.0 * times), atol=2e-4)
+    angle = wrist_response(1e-4, 4.0, 0.0)
+    np.testing.assert_allclose(angle, 1.0 - np.exp(-4.0 * np.arange(angle.size) * 1e-4), atol=2e-4)
 
 
 def test_an_actuation_delay_shifts_the_wrist_by_whole_and_broken_periods():
-    prompt = replace(EIT, wrist_bandwidth_per_s=0.05, actuation_s=0.0)
     for delay_s in (0.008, 0.02, 0.0293):
-        late = wrist_response(replace(prompt, actuation_s=delay_s))
+        late = wrist_response(0.008, 0.05, delay_s)
         times = np.arange(5, 30) * 0.008
         # So slow a wrist turns at a constant speed at first.
         np.testing.assert_allclose(late[5:30], 0.05 * (times - delay_s), rtol=1e-2)
@@ -96,7 +94,7 @@ def test_an_actuation_delay_shifts_the_wrist_by_whole_and_broken_periods():
 
 def test_a_wrist_that_cannot_settle_is_refused():
     with pytest.raises(ValueError, match="does not settle"):
-        wrist_response(replace(EIT, wrist_bandwidth_per_s=20.0, actuation_s=0.2))
+        wrist_response(0.008, 20.0, 0.2)
     with pytest.raises(ValueError, match="cannot be the mean"):
         pulse_response(replace(EIT, age_s=0.1))
 

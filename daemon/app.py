@@ -28,6 +28,9 @@ from shearloop.daemon.sensors import SensorBuilder, Sensors
 from shearloop.daemon.service import notify
 from shearloop.daemon.supervisor import HealthReporter, Reporter, Supervisor, Task, TaskFacts
 
+# The end waits this long for the report of an experiment that it has stopped; a dead loop reports none.
+REPORTED_WITHIN_S = 0.2
+
 
 @dataclass(frozen=True, slots=True)
 class RecordingTask:
@@ -97,7 +100,7 @@ class Daemon:
         self._tasks = {name: task for name, task in tasks.items() if task is not None}
         for name, part in {**self._tasks, COMBINED: self.sensors.combined, "commands": refusals}.items():
             if isinstance(part, Reporter):
-                self.health.add(name, part)
+                self.health.reporters[name] = part
 
     async def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
         """Run until `stop`, then end every task and close the sockets; `on_ready` is called once the tasks run."""
@@ -119,10 +122,10 @@ class Daemon:
 
     async def _run_tasks(self, on_ready: Callable[[], None]) -> None:
         async with asyncio.TaskGroup() as group:
-            running = [
-                group.create_task(self.supervisor.keep_running(name, task), name=name)
+            running = {
+                name: group.create_task(self.supervisor.keep_running(name, task), name=name)
                 for name, task in self._tasks.items()
-            ]
+            }
             structlog.get_logger().info("running", fingertips=list(self.sensors.fingertips))
             on_ready()
             notify("READY=1")
@@ -130,10 +133,10 @@ class Daemon:
             notify("STOPPING=1")
             if self._rig is not None:
                 self._rig.close()
-                if self._experiment is not None:
-                    await self._experiment.wait_for_report()
+                if self._experiment is not None and self._experiment.has_begun.is_set():
+                    await asyncio.wait({running["experiment"]}, timeout=REPORTED_WITHIN_S)
                 await self._rig.runner.halt_and_wait()
-            for task in running:
+            for task in running.values():
                 task.cancel()
 
     def stop(self) -> None:

@@ -11,7 +11,7 @@ class Clock:
     """
 
     def __init__(self) -> None:
-        self._offset_ns = _measured_offset_ns()
+        self.synchronise()
 
     def now_ns(self) -> int:
         """Return CLOCK_MONOTONIC in nanoseconds."""
@@ -26,11 +26,6 @@ class Clock:
         """Unix time minus the monotonic clock, in nanoseconds."""
         return self._offset_ns
 
-    def synchronise(self) -> float:
-        """Measure the offset again; return its change in seconds. The daemon calls it once a second."""
-        before, self._offset_ns = self._offset_ns, _measured_offset_ns()
-        return (self._offset_ns - before) / 1e9
-
-
-def _measured_offset_ns() -> int:
-    return time.time_ns() - time.monotonic_ns()
+    def synchronise(self) -> None:
+        """Measure the offset again; the daemon calls this once a second."""
+        self._offset_ns = time.time_ns() - time.monotonic_ns()

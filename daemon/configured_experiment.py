@@ -1,7 +1,6 @@
 """Starts the configured experiment as soon as it can begin, unless the operator starts or stops one first."""
 
 import asyncio
-import contextlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,8 +12,6 @@ from shearloop.daemon.rig import Rig
 
 # Interval between attempts to start.
 START_RETRY_S = 0.5
-# The daemon's end waits this long for the experiment's end; a dead loop does not report it.
-ENDED_WITHIN_S = 0.2
 
 
 class ConfiguredExperiment:
@@ -28,9 +25,6 @@ class ConfiguredExperiment:
         self._stop = stop
         self._awaited = self._called_off = False
         self.has_begun = asyncio.Event()
-        # Cleared while a running experiment has not reported its end.
-        self._end_reported = asyncio.Event()
-        self._end_reported.set()
         self._crash_marker = CrashMarker()
 
     @property
@@ -74,22 +68,10 @@ class ConfiguredExperiment:
     async def wait_for_end(self) -> None:
         """Wait until it has begun, automatically or by hand, and has ended."""
         await self.has_begun.wait()
-        self._end_reported.clear()
-        try:
-            experiment = await self._rig.runner.experiment_ended()
-            self.done = experiment.phase is ExperimentPhase.DONE
-            phase, reason = experiment.phase.value, experiment.stop_reason
-            structlog.get_logger().info(
-                "the experiment has ended", experiment=str(self.path), phase=phase, reason=reason
-            )
-        finally:
-            self._end_reported.set()
-
-    async def wait_for_report(self) -> None:
-        """Wait briefly for the report of an experiment that has just ended."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(ENDED_WITHIN_S):
-                await self._end_reported.wait()
+        experiment = await self._rig.runner.experiment_ended()
+        self.done = experiment.phase is ExperimentPhase.DONE
+        phase, reason = experiment.phase.value, experiment.stop_reason
+        structlog.get_logger().info("the experiment has ended", experiment=str(self.path), phase=phase, reason=reason)
 
     def on_begun(self, path: Path) -> None:
         """Note that an experiment has begun; no other starts automatically afterwards."""

@@ -221,15 +221,12 @@ def _outline(path: Path) -> experiment_schema.ExperimentFile:
 
 def _without_mistakes(path: Path, mistakes: Sequence[experiment_schema.Mistake]) -> experiment_schema.ExperimentFile:
     """Return the experiment of a file; raises UserError with these mistakes, and with those of its keys and values."""
-    lines = located(path, mistakes, UserError)
+    lines: list[str] = []
     try:
         file = load_yaml_model(path, experiment_schema.ExperimentFile)
     except UserError as error:
-        # Each line begins with the path and its line in the file.
-        number = len(str(path)) + 1
-        every = [*lines, *str(error).splitlines()]
-        in_order = sorted(every, key=lambda line: int(line[number:].partition(":")[0])) if lines else every
-        raise UserError("\n".join(in_order)) from error
+        lines.append(str(error))
+    lines += located(path, mistakes, UserError)
     if lines:
         raise UserError("\n".join(lines))
     return file

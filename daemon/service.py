@@ -6,7 +6,6 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
@@ -140,10 +139,9 @@ def _write(target: Path, content: bytes, *, keep: bool = False) -> Step:
         return Step(f"left as it is: {target}")
 
     def write() -> None:
-        with _reported(target, "written"):
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(content)
-            target.chmod(0o644)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(content)
+        target.chmod(0o644)
 
     return Step(f"{'replace' if exists else 'write'} {target}", write)
 
@@ -154,12 +152,7 @@ def _remove(target: Path, unless_edited: bytes | None = None) -> Step:
         return Step(f"not there: {target}")
     if unless_edited not in (None, target.read_bytes()):
         return Step(f"left because it was edited: {target}")
-
-    def remove() -> None:
-        with _reported(target, "removed"):
-            target.unlink()
-
-    return Step(f"remove {target}", remove)
+    return Step(f"remove {target}", target.unlink)
 
 
 def _remove_empty_folder(target: Path) -> Step:
@@ -167,9 +160,8 @@ def _remove_empty_folder(target: Path) -> Step:
         return Step(f"not there: {target}")
 
     def remove() -> None:
-        with _reported(target, "removed"):
-            if not any(target.iterdir()):
-                target.rmdir()
+        if not any(target.iterdir()):
+            target.rmdir()
 
     return Step(f"remove {target} if it is empty", remove)
 
@@ -188,12 +180,3 @@ def _program(arguments: list[str], purpose: str, *, may_fail: bool = False) -> S
             raise UserError(f"`{' '.join(arguments)}` failed with status {done.returncode}: {output}")
 
     return Step(f"run `{' '.join(arguments)}`, which {purpose}", run)
-
-
-@contextmanager
-def _reported(path: Path, action: str) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        cure = "; run it with sudo" if isinstance(error, PermissionError) else ""
-        raise UserError(f"{path} cannot be {action}: {error.strerror}{cure}") from error

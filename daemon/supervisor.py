@@ -94,30 +94,26 @@ class Reporter(Protocol):
         """Return the present counters: frames, errors by kind, rate."""
 
 
+@dataclass(frozen=True, slots=True)
 class HealthReporter:
-    """Collects the supervisor's records and the tasks' own counters, and publishes them."""
+    """Collects the supervisor's records and the counters of the `reporters`, and publishes them."""
 
-    def __init__(self, publisher: Publisher, supervisor: Supervisor, clock: Clock) -> None:
-        self._publisher = publisher
-        self._supervisor = supervisor
-        self._clock = clock
-        self._reporters: dict[str, Reporter] = {}
-
-    def add(self, name: str, reporter: Reporter) -> None:
-        """Add a part of the daemon; it is asked for every message."""
-        self._reporters[name] = reporter
+    publisher: Publisher
+    supervisor: Supervisor
+    clock: Clock
+    reporters: dict[str, Reporter] = field(default_factory=dict)
 
     def tasks(self) -> dict[str, TaskFacts]:
         """Return the present state of each task."""
-        gathered: dict[str, TaskFacts] = {name: asdict(record) for name, record in self._supervisor.records.items()}
-        for name, reporter in self._reporters.items():
+        gathered: dict[str, TaskFacts] = {name: asdict(record) for name, record in self.supervisor.records.items()}
+        for name, reporter in self.reporters.items():
             gathered[name] = {**gathered.get(name, {}), **reporter.diagnostics()}
         return gathered
 
     def publish_end(self, *, finished: bool, summary: str) -> None:
         """Publish that the daemon ends, as its last message."""
-        end = DaemonEnd(source="daemon", t_mono_ns=self._clock.now_ns(), finished=finished, summary=summary)
-        self._publisher.publish(end)
+        end = DaemonEnd(source="daemon", t_mono_ns=self.clock.now_ns(), finished=finished, summary=summary)
+        self.publisher.publish(end)
 
     async def run(self) -> None:
         """Publish once a second until cancelled."""
@@ -133,21 +129,21 @@ class HealthReporter:
                 due_s = loop.time()
             used_s, passed_s = time.process_time() - cpu_s, max(loop.time() - measured_s, 1e-9)
             cpu_s, measured_s = cpu_s + used_s, measured_s + passed_s
-            self._clock.synchronise()
+            self.clock.synchronise()
             # A task that stays dead ends the service: systemd's watchdog is fed only while all are alive.
-            if dead := self._supervisor.dead:
+            if dead := self.supervisor.dead:
                 notify(f"STATUS=dead, restarting: {', '.join(dead)}")
             else:
-                notify("WATCHDOG=1", f"STATUS={len(self._supervisor.records)} tasks are alive")
+                notify("WATCHDOG=1", f"STATUS={len(self.supervisor.records)} tasks are alive")
             health = Health(
                 source="daemon",
-                t_mono_ns=self._clock.now_ns(),
+                t_mono_ns=self.clock.now_ns(),
                 tasks=self.tasks(),
                 loop_lag_s=lag_s,
                 memory_mb=resident_memory_mb(),
                 cpu_percent=100.0 * used_s / passed_s,
             )
-            self._publisher.publish(health)
+            self.publisher.publish(health)
 
 
 def resident_memory_mb() -> float:

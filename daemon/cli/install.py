@@ -43,7 +43,11 @@ def run(args: argparse.Namespace) -> int:
         if not args.json:
             print(f"{'would ' if args.dry_run and acts else ''}{step.sentence}", flush=True)
         if step.run is not None and not args.dry_run:
-            step.run()
+            try:
+                step.run()
+            except OSError as error:
+                cure = "; run it with sudo" if isinstance(error, PermissionError) else ""
+                raise UserError(f"{error.filename} cannot be changed: {error.strerror}{cure}") from error
     if args.json:
         print(json.dumps({"root": str(root), "dry_run": args.dry_run, "steps": done}, ensure_ascii=False))
     return 0

@@ -13,7 +13,6 @@ from shearloop.daemon.control.experiment import (
     Action,
     Experiment,
     ExperimentPhase,
-    GripTo,
     Hold,
     StepCommand,
     TrackTorque,
@@ -22,6 +21,7 @@ from shearloop.daemon.control.experiment_schema import (
     AdaptStep,
     ExperimentFile,
     ExperimentLimits,
+    GripStep,
     IdentifyStep,
     TareStep,
     first_turn_before_grip,
@@ -156,17 +156,9 @@ class ControlLoop:
         """Take the present error of the recording; an empty string ends it."""
         self.inputs.recording_error = error
 
-    def on_command_refused(self, sentence: str) -> None:
-        """Note a command that a device refused."""
-        self._reported.append(Fault(FaultCode.COMMAND_REFUSED, sentence))
-
-    def on_command_unanswered(self, sentence: str) -> None:
-        """Note a command that the robot's process did not answer before its end."""
-        self._reported.append(Fault(FaultCode.COMMAND_UNANSWERED, sentence))
-
-    def on_crash(self, error: str) -> None:
-        """Note an error of the loop's own task or of its commands; it ends the experiment."""
-        self._reported.append(Fault(FaultCode.TASK_DIED, f"loop: {error}"))
+    def on_fault(self, code: FaultCode, detail: str) -> None:
+        """Take a fault that no input shows, for the next tick."""
+        self._reported.append(Fault(code, detail))
 
     def on_speed_sent(self, wrist_rad_per_s: float) -> None:
         """Take the wrist speed that was sent, after all clipping."""
@@ -174,19 +166,19 @@ class ControlLoop:
 
     def on_action_ended(self, error: str = "") -> None:
         """Take the end of the present action, with its error if it failed."""
-        experiment, arm = self.experiment, self.inputs.arm
+        experiment, arm, grip = self.experiment, self.inputs.arm, self._grip
+        action = experiment.command.action if experiment is not None else None
         if experiment is None or not experiment.end_action(error) or error:
             return
-        action, grip = experiment.command.action, self._grip
         if isinstance(action, AdaptStep) and action.fingertip == self.wrist.source.name:
             # The stiffness was identified with another gain.
             self.wrist.reset()
-        if not isinstance(action, TareStep | GripTo):
+        if not isinstance(action, TareStep | GripStep):
             return
         # The tool was identified with another zero, or in another grip.
         self._forget_tool()
         grip.unmeasured_since_ns = arm.t_ns if arm is not None else None
-        if isinstance(action, GripTo):
+        if isinstance(action, GripStep):
             gripper = self.inputs.gripper
             grip.origin_rad = arm.wrist_rad if arm is not None else None
             # An unexpected object is watched as well.
@@ -252,7 +244,7 @@ class ControlLoop:
         if experiment is not None and active:
             command, controller = experiment.command, self.wrist.controller
             state = Grip.HELD if grip.expected else Grip.NONE
-            state = Grip.CHANGING if isinstance(command.action, GripTo) else state
+            state = Grip.CHANGING if isinstance(command.action, GripStep) else state
             needed = state is Grip.HELD and _turns(command) and not self._awaited_torques(experiment, t_ns)
             watched = replace(
                 watched,

@@ -49,31 +49,13 @@ class TrackTorque:
 WristSetpoint: TypeAlias = Hold | MoveToAngle | ConstantVelocity | TrackTorque
 
 
-@dataclass(frozen=True, slots=True)
-class GripTo:
-    """Close or open the gripper."""
-
-    width_mm: float
-    speed_mm_per_s: float
-    force_n: float
-    expect_object: bool
-
-
-# An action of the devices or of the identification; a retreat is an approach as well.
-Action: TypeAlias = steps.ApproachStep | GripTo | steps.TareStep | steps.IdentifyStep | steps.AdaptStep
-
-
-class ActionState(Enum):
-    """State of the present action."""
-
-    IDLE = "idle"
-    RUNNING = "running"
-    DONE = "done"
+# An action of the devices or of the identification; a retreat is an approach, and a release a grip as well.
+Action: TypeAlias = steps.ApproachStep | steps.GripStep | steps.TareStep | steps.IdentifyStep | steps.AdaptStep
 
 
 @dataclass(frozen=True, slots=True)
 class StepContext:
-    """Input of a step: wrist angle since the grip, driving torque, state of its action.
+    """Input of a step: wrist angle since the grip, and driving torque.
 
     `gripped_at_rad` is the wrist joint's angle at the grip. `torque_nm` is None without a fresh valid estimate.
     `elapsed_s` is the experiment's time.
@@ -83,15 +65,14 @@ class StepContext:
     torque_nm: float | None
     gripped_at_rad: float
     elapsed_s: float
-    action: ActionState
 
 
 @dataclass(frozen=True, slots=True)
 class StepCommand:
     """Output of a step.
 
-    An action starts with the first command that has it. `hold_number` counts the held angles or torques of a step, from
-    1; 0 while none is held.
+    An action starts with the first command that has it, and ends the step. `hold_number` counts the held angles or
+    torques of a step, from 1; 0 while none is held.
     """
 
     wrist: WristSetpoint = Hold()
@@ -134,7 +115,7 @@ class Experiment:
         self._t_ns = t_ns
         self._elapsed_s = self._step_began_s = 0.0
         self._program: StepProgram
-        self._action = ActionState.IDLE
+        self._acting = False
         self._begin_next()
 
     @property
@@ -176,7 +157,7 @@ class Experiment:
         if self.phase is ExperimentPhase.PAUSED or held:
             return replace(self.command, wrist=Hold())
         self._elapsed_s += passed_s
-        view = StepContext(wrist_rad, torque_nm, gripped_at_rad, self._elapsed_s, self._action)
+        view = StepContext(wrist_rad, torque_nm, gripped_at_rad, self._elapsed_s)
         try:
             self.command = self._program.send(view)
         except StopIteration:
@@ -189,19 +170,17 @@ class Experiment:
 
     def begin_action(self) -> bool:
         """Return whether the command's action has to begin now; it counts as begun."""
-        begins = self._action is ActionState.IDLE
-        if begins:
-            self._action = ActionState.RUNNING
+        begins, self._acting = not self._acting, True
         return begins
 
     def end_action(self, error: str = "") -> bool:
-        """Note the end of the step's action; an error ends the experiment. Return whether it was under way."""
-        if self._action is not ActionState.RUNNING:
-            return False
-        self._action = ActionState.DONE
-        if error:
+        """End the step with its action, or the experiment with an error; return whether an action was under way."""
+        ends, self._acting = self._acting, False
+        if ends and error:
             self.stop(f"step {self.step_number} ({self.step.do}) failed: {error}")
-        return True
+        elif ends:
+            self._begin_next()
+        return ends
 
     def pause(self) -> str | None:
         """Stand still until `resume`; return None, or why not."""
@@ -229,7 +208,7 @@ class Experiment:
         self.stop(f"step {self.step_number} ({self.step.do}) cannot be done: {reason}")
 
     def _begin_next(self) -> None:
-        self.overdue, self._action = "", ActionState.IDLE
+        self.overdue, self._acting = "", False
         while self.step_number < len(self.file.steps):
             self.step_number += 1
             self._step_began_s = self._elapsed_s
@@ -270,10 +249,9 @@ def _program(step: Step, now_s: float) -> StepProgram:
         case steps.ApproachStep():
             return _act(step, "moving in a straight line")
         case steps.GripStep():
-            grip = GripTo(step.width_mm, step.speed_mm_per_s, step.force_n, step.expect_object)
-            return _act(grip, "closing the gripper")
+            return _act(step, "closing the gripper")
         case steps.ReleaseStep():
-            return _act(GripTo(step.width_mm, 60.0, 10.0, expect_object=False), "opening the gripper")
+            return _act(steps.opening(step.width_mm, 60.0), "opening the gripper")
         case steps.TareStep():
             return _act(step, "taking the zero of every torque sensor")
         case steps.IdentifyStep():
@@ -294,9 +272,7 @@ def _program(step: Step, now_s: float) -> StepProgram:
 
 def _act(action: Action, activity: str) -> StepProgram:
     while True:
-        view = yield StepCommand(Hold(), action, activity)
-        if view.action is ActionState.DONE:
-            return
+        yield StepCommand(Hold(), action, activity)
 
 
 def _wait(wrist: WristSetpoint, wait_s: float, now_s: float, activity: str, hold_number: int = 0) -> StepProgram:

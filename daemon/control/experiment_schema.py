@@ -91,6 +91,12 @@ class GripStep(_Step):
     expect_object: bool = Field(True, description="closing on nothing is an error")
 
 
+def opening(width_mm: float, speed_mm_per_s: float) -> GripStep:
+    """Return the step that opens the gripper, with its least force."""
+    content = {"width_mm": width_mm, "speed_mm_per_s": speed_mm_per_s, "force_n": 10.0, "expect_object": False}
+    return GripStep.model_validate({"do": "grip", **content})
+
+
 class TareStep(_Step):
     """Take the zero of every torque sensor, with the wrist standing still; of fingertips the idle frame."""
 

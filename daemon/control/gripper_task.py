@@ -3,11 +3,12 @@
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
 
 from shearloop.bank.estimation import Measured, combine
 from shearloop.bank.polynomial import TWO_SIDED_95
 from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.experiment import GripTo
+from shearloop.daemon.control.experiment_schema import GripStep, opening
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.loop_inputs import GripperStatus
 from shearloop.daemon.messaging.messages import GripperStateMessage, Scalar
@@ -17,52 +18,43 @@ from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperCommand, GripperState, ObjectStatus
 
-RELEASE_WIDTH_MM = 140.0
+OPENING = opening(140.0, 100.0)
 # The fingers' own stop may lie this far before the widest target.
 OPEN_WITHIN_MM = 10.0
 # A release or halt is retried for longer than a reconnection takes.
 TRIED_FOR_S, TRIED_AGAIN_S = 5.0, 0.1
 
 
+@dataclass(frozen=True, slots=True)
 class GripperTask:
-    """Connects the gripper to publisher and control loop."""
+    """Connects the gripper to publisher and control loop; `diameters` are the fingertips'.
 
-    def __init__(
-        self,
-        gripper: RobotiqGripper,
-        publisher: Publisher,
-        control_loop: ControlLoop,
-        *,
-        diameters: FingertipDiameters | None = None,
-        measures_diameters: bool = True,
-    ) -> None:
-        """Take the gripper and its consumers; `diameters` are the fingertips'.
+    A gripper `measures_diameters` if its widths were calibrated with its fingertips on.
+    """
 
-        A gripper `measures_diameters` if its widths were calibrated with its fingertips on.
-        """
-        self._measures_diameters = measures_diameters
-        self._gripper = gripper
-        self._publisher = publisher
-        self._control_loop = control_loop
-        self._diameters = diameters
+    gripper: RobotiqGripper
+    publisher: Publisher
+    control_loop: ControlLoop
+    diameters: FingertipDiameters | None = None
+    measures_diameters: bool = True
 
     async def run(self) -> None:
         """Publish every state and pass it on, until cancelled."""
-        async with contextlib.aclosing(self._gripper.states()) as states:
+        async with contextlib.aclosing(self.gripper.states()) as states:
             async for state in states:
                 self._publish(state)
-                self._control_loop.on_gripper(_status(state))
+                self.control_loop.on_gripper(_status(state))
 
-    async def grip(self, target: GripTo) -> str:
+    async def grip(self, target: GripStep) -> str:
         """Move to a width and wait for the end; return an error, or an empty string."""
         try:
-            await self._gripper.activate()
-            sent = await self._gripper.move(GripperCommand(target.width_mm, target.speed_mm_per_s, target.force_n))
-            state = await self._gripper.finish(sent)
+            await self.gripper.activate()
+            sent = await self.gripper.move(GripperCommand(target.width_mm, target.speed_mm_per_s, target.force_n))
+            state = await self.gripper.finish(sent)
         except DriverError as error:
             return str(error)
         # The loop needs the state before the end of the action.
-        self._control_loop.on_gripper(_status(state))
+        self.control_loop.on_gripper(_status(state))
         if state.object is ObjectStatus.CONTACT_OPENING and state.width_mm < target.width_mm - OPEN_WITHIN_MM:
             return f"the fingers met something as they opened, and stopped at {state.width_mm:.1f} mm; clear their way"
         if target.expect_object and state.diameter_mm is None:
@@ -74,7 +66,7 @@ class GripperTask:
 
     async def release(self) -> str:
         """Open wide; return an error, or an empty string."""
-        return await _tried(lambda: self.grip(GripTo(RELEASE_WIDTH_MM, 100.0, 10.0, expect_object=False)))
+        return await _tried(lambda: self.grip(OPENING))
 
     async def halt(self) -> str:
         """Stop the fingers; return an error, or an empty string."""
@@ -82,7 +74,7 @@ class GripperTask:
 
     async def _halt(self) -> str:
         try:
-            await self._gripper.halt()
+            await self.gripper.halt()
         except DriverError as error:
             return str(error)
         return ""
@@ -91,17 +83,17 @@ class GripperTask:
         """Activate again after a fault, once the operator says that the fingers are clear."""
         try:
             # Read now: the latest state may be older than the fault, and activating opens the fingers.
-            state = await self._gripper.read()
+            state = await self.gripper.read()
             if state.fault.needs_activation:
-                await self._gripper.activate(operator_confirmed=True)
+                await self.gripper.activate(operator_confirmed=True)
         except DriverError as error:
             return str(error)
         return ""
 
     def held_tool(self, t_ns: int) -> Measured | None:
         """Return the diameter in mm of the held tool at t_ns, or None."""
-        state = self._gripper.latest
-        if state is None or not self._measures_diameters or t_ns - state.t_ns > HAND_STALE_S * 1e9:
+        state = self.gripper.latest
+        if state is None or not self.measures_diameters or t_ns - state.t_ns > HAND_STALE_S * 1e9:
             return None
         if state.diameter_mm is None or state.diameter_std_mm is None:
             return None
@@ -109,11 +101,11 @@ class GripperTask:
 
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the gripper's part of `health`."""
-        return self._gripper.diagnostics()
+        return self.gripper.diagnostics()
 
     def _publish(self, state: GripperState) -> None:
-        tool = tool_diameter(state, self._diameters.latest(state.t_ns) if self._diameters is not None else None)
-        self._publisher.publish(
+        tool = tool_diameter(state, self.diameters.latest(state.t_ns) if self.diameters is not None else None)
+        self.publisher.publish(
             GripperStateMessage(
                 source="gripper",
                 t_mono_ns=state.t_ns,

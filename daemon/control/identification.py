@@ -114,8 +114,7 @@ def identify(record: Record, window_s: float, stiffness_share: float = _WORST_ST
             f"record for longer, and check why torques are missing"
         )
     t_mid_s, torque_nm = record.t_mid_s[used], record.torque_nm[used]
-    angles = _Angles(record)
-    fits = [_fit(angles, t_mid_s, torque_nm, window_s, float(lag)) for lag in _LAG_GRID_S]
+    fits = [_fit(record, t_mid_s, torque_nm, window_s, float(lag)) for lag in _LAG_GRID_S]
     best = min(fits, key=lambda fit: fit.squares)
     noise_nm = _noise(best.residuals)
     _refuse_bad(best, torque_nm, noise_nm, stiffness_share)
@@ -136,8 +135,9 @@ def identify(record: Record, window_s: float, stiffness_share: float = _WORST_ST
     )
 
 
-def _fit(angles: "_Angles", t_mid_s: FloatArray, torque_nm: FloatArray, window_s: float, lag_s: float) -> _Fit:
-    angle = angles.mean(t_mid_s - lag_s, window_s)
+def _fit(record: Record, t_mid_s: FloatArray, torque_nm: FloatArray, window_s: float, lag_s: float) -> _Fit:
+    # The wrist rests before the first motion and after the last.
+    angle = window_means(record.angle_t_s, record.angle_rad, t_mid_s - lag_s, window_s)
     since = (t_mid_s - t_mid_s[-1]) / (t_mid_s[-1] - t_mid_s[0])
     design = np.column_stack([angle, np.ones_like(angle), since])
     degrees = torque_nm.size - design.shape[1]
@@ -152,26 +152,17 @@ def _fit(angles: "_Angles", t_mid_s: FloatArray, torque_nm: FloatArray, window_s
     return _Fit(lag_s, coefficients, covariance, residuals, angle)
 
 
-class _Angles:
-    """The integral of the wrist angle, computed once for all lags."""
+def window_means(t_s: FloatArray, values: FloatArray, middle_s: FloatArray, window_s: float) -> FloatArray:
+    """Return the means (m,) of a broken line over windows around m times; the line stays constant beyond its ends."""
+    integral = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(t_s))])
 
-    def __init__(self, record: Record) -> None:
-        self._t_s, self._rad = record.angle_t_s, record.angle_rad
-        parts = 0.5 * (self._rad[1:] + self._rad[:-1]) * np.diff(self._t_s)
-        self._integral = np.concatenate([[0.0], np.cumsum(parts)])
+    def until(time_s: FloatArray) -> FloatArray:
+        last = np.maximum(np.searchsorted(t_s, time_s, side="right") - 1, 0)
+        here = np.interp(time_s, t_s, values)
+        return np.asarray(integral[last] + 0.5 * (values[last] + here) * (time_s - t_s[last]))
 
-    def mean(self, middle_s: FloatArray, window_s: float) -> FloatArray:
-        """Return the mean angle (m,) over windows around m times."""
-        half = max(0.5 * window_s, 1e-3)
-        mean: FloatArray = (self._until(middle_s + half) - self._until(middle_s - half)) / (2.0 * half)
-        return mean
-
-    def _until(self, time_s: FloatArray) -> FloatArray:
-        # The wrist rests before the first motion and after the last.
-        inside = np.interp(time_s, self._t_s, self._integral)
-        before, after = np.minimum(time_s - self._t_s[0], 0.0), np.maximum(time_s - self._t_s[-1], 0.0)
-        total: FloatArray = inside + before * self._rad[0] + after * self._rad[-1]
-        return total
+    half_s = max(0.5 * window_s, 1e-6)
+    return (until(middle_s + half_s) - until(middle_s - half_s)) / (2.0 * half_s)
 
 
 def _noise(residuals: FloatArray) -> float:

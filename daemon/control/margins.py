@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.controller import ControllerSettings
-from shearloop.daemon.control.identification import ToolModel
+from shearloop.daemon.control.identification import ToolModel, window_means
 from shearloop.daemon.control.loop_inputs import LoopConfig
 
 ComplexArray = NDArray[np.complex128]
@@ -104,27 +104,14 @@ def pulse_response(model: LoopModel, lag_s: float = 0.0) -> FloatArray:
     """
     period = model.command_period_s
     angle = wrist_response(period, model.wrist_bandwidth_per_s, model.actuation_s)
-    running = np.concatenate([[0.0], np.cumsum(0.5 * (angle[1:] + angle[:-1])) * period])
-    t_s = np.arange(angle.size) * period
+    t_s = np.arange(angle.size, dtype=np.float64) * period
     # A correction waits for the next command: half a command period on average.
     start_s = model.age_s + 0.5 * period + lag_s
     count = math.ceil((float(t_s[-1]) + start_s + 0.5 * model.window_s) / model.sample_period_s) + 2
     middle_s = np.arange(count, dtype=np.float64) * model.sample_period_s - start_s
-
-    def integral(time_s: FloatArray) -> FloatArray:
-        """Return the integral of the response from 0: quadratic between the commands, 1 s a second at the end."""
-        place = np.clip(time_s, 0.0, t_s[-1]) / period
-        last = np.minimum(place.astype(int), angle.size - 2)
-        share = place - last
-        within = angle[last] * share + 0.5 * (angle[last + 1] - angle[last]) * share**2
-        total: FloatArray = running[last] + within * period + np.maximum(time_s - t_s[-1], 0.0)
-        return total
-
-    half = max(0.5 * model.window_s, 1e-6)
-    if middle_s[0] + half > 1e-9:
+    if middle_s[0] + 0.5 * model.window_s > 1e-9:
         raise ValueError(f"a torque that is {model.age_s:g} s old cannot be the mean over {model.window_s:g} s")
-    seen = (integral(middle_s + half) - integral(middle_s - half)) / (2.0 * half)
-    return np.diff(seen, prepend=0.0)
+    return np.diff(window_means(t_s, angle, middle_s, model.window_s), prepend=0.0)
 
 
 def gain_limit(model: LoopModel, highest: float = 4.0) -> float:
@@ -183,7 +170,7 @@ def _delay_margin_s(model: LoopModel) -> float:
     def stable(extra_s: float) -> bool:
         return is_stable(replace(model, lag_error_s=model.lag_error_s + extra_s))
 
-    return _limit(stable, 0.5 * model.sample_period_s * np.arange(41))
+    return _limit(stable, 0.5 * model.sample_period_s * np.arange(41, dtype=np.float64))
 
 
 def _limit(good: Callable[[float], bool], trials: FloatArray) -> float:

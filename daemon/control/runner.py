@@ -3,17 +3,26 @@
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import partial
 
 import structlog
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
-from shearloop.daemon.control.experiment import Action, Experiment, ExperimentPhase, GripTo
-from shearloop.daemon.control.experiment_schema import AdaptStep, ApproachStep, ExperimentFile, IdentifyStep, TareStep
+from shearloop.daemon.control.experiment import Action, Experiment, ExperimentPhase
+from shearloop.daemon.control.experiment_schema import (
+    AdaptStep,
+    ApproachStep,
+    ExperimentFile,
+    GripStep,
+    IdentifyStep,
+    TareStep,
+)
 from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
+from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateMessage
 from shearloop.daemon.messaging.publisher import Publisher
@@ -106,7 +115,7 @@ class ControlLoopRunner:
                 self._decide()
         except Exception as error:
             self._running = False
-            self._control_loop.on_crash(error_text(error))
+            self._control_loop.on_fault(FaultCode.TASK_DIED, f"loop: {error_text(error)}")
             self._actions.abort()
             await self._brake()
             # Without this wait the gripper might not receive its final command.
@@ -250,18 +259,18 @@ class ControlLoopRunner:
             structlog.get_logger().exception("the arm could not be stopped")
 
 
+@dataclass(slots=True)
 class CommandSender:
     """Sends wrist velocities and stops to the robot's process, and reports the results to the control loop."""
 
-    def __init__(self, robot: UrRobot, control_loop: ControlLoop, stops: StopTimeline, clock: Clock) -> None:
-        # The speed that the robot's process accepted last.
-        self.sent_rad_per_s = 0.0
-        # Commands that wait for their replies.
-        self.unanswered = 0
-        self._robot = robot
-        self._control_loop = control_loop
-        self._stops = stops
-        self._clock = clock
+    robot: UrRobot
+    control_loop: ControlLoop
+    stops: StopTimeline
+    clock: Clock
+    # The speed that the robot's process accepted last.
+    sent_rad_per_s: float = 0.0
+    # Commands that wait for their replies.
+    unanswered: int = 0
 
     def send(self, command: WristSpeed | Stop) -> None:
         """Send a stop of the arm, or a wrist speed.
@@ -272,7 +281,7 @@ class CommandSender:
             return
         self.unanswered += 1
         try:
-            self._robot.send(command).add_done_callback(self._on_reply)
+            self.robot.send(command).add_done_callback(self._on_reply)
         except Exception as error:  # noqa: BLE001 - the next decision ends the experiment
             self.unanswered -= 1
             self._fail(error)
@@ -281,48 +290,41 @@ class CommandSender:
         self.unanswered -= 1
         try:
             reply = replied.result()
-            if not reply.accepted and self._robot.state is None:
-                self._control_loop.on_command_unanswered(reply.refusal)
-            elif not reply.accepted:
-                self._control_loop.on_command_refused(reply.refusal)
+            if not reply.accepted:
+                unanswered = self.robot.state is None
+                code = FaultCode.COMMAND_UNANSWERED if unanswered else FaultCode.COMMAND_REFUSED
+                self.control_loop.on_fault(code, reply.refusal)
             if isinstance(reply.sent, Stop):
-                self._stops.on_sent(self._clock.now_ns())
+                self.stops.on_sent(self.clock.now_ns())
             self.sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
-            self._control_loop.on_speed_sent(self.sent_rad_per_s)
+            self.control_loop.on_speed_sent(self.sent_rad_per_s)
         except Exception as error:  # noqa: BLE001 - the next decision ends the experiment
             self._fail(error)
 
     def _fail(self, error: Exception) -> None:
         structlog.get_logger().exception("a command to the robot failed")
-        self._control_loop.on_crash(error_text(error))
+        self.control_loop.on_fault(FaultCode.TASK_DIED, f"loop: {error_text(error)}")
 
 
+@dataclass(slots=True)
 class ActionExecutor:
     """Carries out one action at a time; a straight move that is interrupted continues to its end afterwards."""
 
-    def __init__(
-        self,
-        robot: UrRobot,
-        gripper: GripperTask | None,
-        sensors: Mapping[str, Tareable],
-        velocity: CommandSender,
-        control_loop: ControlLoop,
-    ) -> None:
-        self.gripper = gripper
-        # The fingers may be on their way; cleared by a stop of the fingers.
-        self.fingers_move = False
-        # Set while straight moves may go on.
-        self.may_move = asyncio.Event()
-        self.may_move.set()
-        self._robot = robot
-        self._sensors = sensors
-        self._velocity = velocity
-        self._control_loop = control_loop
-        self._moving = self._interrupted = False
-        self._task: asyncio.Task[None] | None = None
-        # The last action of a stop: to open the gripper, or to halt its fingers.
-        self._final_task: asyncio.Task[None] | None = None
-        self._unlocking: asyncio.Task[str] | None = None
+    robot: UrRobot
+    gripper: GripperTask | None
+    sensors: Mapping[str, Tareable]
+    velocity: CommandSender
+    control_loop: ControlLoop
+    # The fingers may be on their way; cleared by a stop of the fingers.
+    fingers_move: bool = False
+    # Set while straight moves may go on.
+    may_move: asyncio.Event = field(default_factory=asyncio.Event)
+    _moving: bool = False
+    _interrupted: bool = False
+    _task: asyncio.Task[None] | None = None
+    # The last action of a stop: to open the gripper, or to halt its fingers.
+    _final_task: asyncio.Task[None] | None = None
+    _unlocking: asyncio.Task[str] | None = None
 
     @property
     def unlocking(self) -> bool:
@@ -331,7 +333,7 @@ class ActionExecutor:
 
     def begin(self, action: Action) -> None:
         """Carry out an action, and report its end to the control loop."""
-        self._start(partial(self._run, action), self._control_loop.on_action_ended)
+        self._start(partial(self._run, action), self.control_loop.on_action_ended)
 
     def release(self) -> None:
         """Open the gripper after a stop."""
@@ -357,7 +359,7 @@ class ActionExecutor:
         return "unlocking was stopped; send `unlock` again" if task.cancelled() else task.result()
 
     async def _unlock(self) -> str:
-        reply = await self._robot.send(Unlock())
+        reply = await self.robot.send(Unlock())
         if not reply.accepted or self.gripper is None:
             return reply.refusal
         # An activation opens and closes the fingers.
@@ -418,19 +420,20 @@ class ActionExecutor:
     def _on_released(self, error: str) -> None:
         if error:
             structlog.get_logger().error("the gripper did not open", reason=error)
-        self._control_loop.on_release_ended(error)
+        self.control_loop.on_release_ended(error)
 
     def _on_halted(self, error: str) -> None:
         if error:
             structlog.get_logger().error("the fingers did not stop", reason=error)
-            self._control_loop.on_command_refused(f"the fingers did not stop, keep clear of them: {error}")
+            detail = f"the fingers did not stop, keep clear of them: {error}"
+            self.control_loop.on_fault(FaultCode.COMMAND_REFUSED, detail)
 
     async def _run(self, action: Action) -> str:
         """Carry out an action; return an error, or an empty string."""
         match action:
             case ApproachStep():
                 return await self._move(action)
-            case GripTo():
+            case GripStep():
                 if self.gripper is None:
                     return "no gripper is configured; add a `gripper` section to the configuration"
                 self.fingers_move = True
@@ -443,12 +446,12 @@ class ActionExecutor:
                 until_s = loop.time() + longest_s - GIVES_UP_BEFORE_S
                 if error := await self._rest():
                     return error
-                reply = await self._robot.send(ZeroForceTorque())
+                reply = await self.robot.send(ZeroForceTorque())
                 if not reply.accepted:
                     return reply.refusal
-                return await tare_all(self._sensors.values(), until_s - loop.time())
+                return await tare_all(self.sensors.values(), until_s - loop.time())
             case AdaptStep():
-                sensor = self._sensors.get(action.fingertip)
+                sensor = self.sensors.get(action.fingertip)
                 if not isinstance(sensor, Adaptable):
                     return f"{action.fingertip} is not a fingertip; name one that is calibrated on recordings"
                 return await sensor.adapt(action.reference)
@@ -460,12 +463,12 @@ class ActionExecutor:
 
         Resting joints are not enough: after a stop the robot's process is busy a little longer, and refuses a move.
         """
-        velocity = self._velocity
+        velocity = self.velocity
         try:
             async with asyncio.timeout(COMES_TO_REST_S):
-                state = await self._robot.next_state()
+                state = await self.robot.next_state()
                 while velocity.sent_rad_per_s or velocity.unanswered or state.motion != "idle" or not state.rests:
-                    state = await self._robot.next_state()
+                    state = await self.robot.next_state()
         except TimeoutError:
             return f"the arm did not come to rest within {COMES_TO_REST_S:g} s; check what moves it"
         return ""
@@ -479,7 +482,7 @@ class ActionExecutor:
             # The loop may have interrupted the move during the wait.
             if not self.may_move.is_set():
                 continue
-            here = self._robot.state
+            here = self.robot.state
             if here is None:
                 return "the robot is not connected"
             # The goal is fixed at the first start, so that an interruption does not lengthen the move.
@@ -496,13 +499,13 @@ class ActionExecutor:
 
     async def _move_once(self, command: MoveLinear, previous_id: int) -> str:
         """Send a straight move and wait for its end; return an error, or an empty string."""
-        reply = await self._robot.send(command)
+        reply = await self.robot.send(command)
         if not reply.accepted:
             return reply.refusal
         for reason in reply.clipped:
             structlog.get_logger().warning("the move was clipped", reason=reason)
         while True:
-            state = await self._robot.next_state()
+            state = await self.robot.next_state()
             if state.motion_id != previous_id and state.end_reason:
                 if state.end_reason not in (ARRIVED, STOPPED_ON_COMMAND):
                     # It ended by itself, just before an interruption; do not repeat it.

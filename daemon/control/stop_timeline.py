@@ -1,6 +1,6 @@
 """The times of a stop: its cause, the decision, the command, and the standstill. No clock and no I/O."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from shearloop.daemon.control.safety import SafetyDecision
 from shearloop.daemon.messaging.messages import LoopStop
@@ -10,21 +10,14 @@ from shearloop.drivers.ur.messages import RobotState
 LONGEST_NS = 5_000_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class _Stop:
-    """A stop on its way; times by CLOCK_MONOTONIC in ns."""
-
-    message: LoopStop
-    cause_ns: int
-    decided_ns: int
-
-
 class StopTimeline:
     """Collects the times of one stop at a time."""
 
     def __init__(self) -> None:
         self._requested_ns: int | None = None
-        self._stop: _Stop | None = None
+        # A stop on its way, and when it was decided (CLOCK_MONOTONIC).
+        self._stop: LoopStop | None = None
+        self._decided_ns = 0
 
     @property
     def pending(self) -> bool:
@@ -39,8 +32,8 @@ class StopTimeline:
         """Take the decision; its cause is the request, or the oldest measurement that shows a fault."""
         measured = [one.t_ns for one in decision.faults if one.t_ns is not None and not one.is_consequence]
         cause_ns = min(measured, default=now_ns) if self._requested_ns is None else self._requested_ns
-        self._requested_ns = None
-        message = LoopStop(
+        self._requested_ns, self._decided_ns = None, now_ns
+        self._stop = LoopStop(
             source="loop",
             t_mono_ns=cause_ns,
             experiment=experiment,
@@ -50,14 +43,12 @@ class StopTimeline:
             sent_after_s=None,
             stands_after_s=None,
         )
-        self._stop = _Stop(message, cause_ns, now_ns)
 
     def on_sent(self, now_ns: int) -> None:
         """Take the reply of the robot's process to the stop."""
         stop = self._stop
-        if stop is not None and stop.message.sent_after_s is None:
-            message = replace(stop.message, sent_after_s=(now_ns - stop.cause_ns) / 1e9)
-            self._stop = replace(stop, message=message)
+        if stop is not None and stop.sent_after_s is None:
+            self._stop = replace(stop, sent_after_s=(now_ns - stop.t_mono_ns) / 1e9)
 
     def update(self, robot: RobotState | None, now_ns: int) -> LoopStop | None:
         """Return the whole stop once, when a state after the decision shows the arm at rest, or after `LONGEST_NS`."""
@@ -65,12 +56,12 @@ class StopTimeline:
         if stop is None:
             return None
         measured_ns = now_ns if robot is None else robot.t_mono_ns - robot.age_ns
-        if robot is not None and robot.rests and measured_ns >= stop.decided_ns:
+        if robot is not None and robot.rests and measured_ns >= self._decided_ns:
             self._stop = None
-            return replace(stop.message, stands_after_s=(measured_ns - stop.cause_ns) / 1e9)
-        return self.end() if now_ns - stop.decided_ns > LONGEST_NS else None
+            return replace(stop, stands_after_s=(measured_ns - stop.t_mono_ns) / 1e9)
+        return self.end() if now_ns - self._decided_ns > LONGEST_NS else None
 
     def end(self) -> LoopStop | None:
         """Return what is known of a stop whose standstill is not awaited any longer."""
         stop, self._stop = self._stop, None
-        return None if stop is None else stop.message
+        return stop

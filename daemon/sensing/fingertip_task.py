@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from operator import attrgetter
 from typing import Generic, TypeVar
 
@@ -106,47 +106,35 @@ class _Tare:
         return ", ".join(f"{count} {'frame' if count == 1 else 'frames'}: {reason}" for count, reason in often)
 
 
+@dataclass(slots=True)
 class FingertipPipeline:
-    """Estimates from the frames of one fingertip, or of several together, for the control loop and for subscribers."""
+    """Estimates from the frames of one fingertip, or of several together, for the control loop and for subscribers.
 
-    def __init__(
-        self,
-        name: str,
-        estimator: FrameEstimator,
-        publisher: Publisher,
-        clock: Clock,
-        *,
-        loop: ControlLoop | None = None,
-        gripper: GripperTask | None = None,
-        diameters: FingertipDiameters | None = None,
-        inputs: InputRecorder | None = None,
-    ) -> None:
-        """Take the estimator and its consumers; the gripper gives the held tool.
+    The gripper gives the held tool. `inputs` keeps the moments of tares and of changes of the tool.
+    """
 
-        `inputs` keeps the moments of tares and of changes of the tool.
-        """
-        self.name = name
-        self.estimator = estimator
-        self.count = 0
-        self._publisher = publisher
-        self._clock = clock
-        self._loop = loop
-        self._gripper = gripper
-        self._diameters = diameters
-        self._inputs = inputs
-        self._tare = _Tare()
-        self._held: Measured | None = None
-        # The source of the known torque of a correction that waits for the next frame, and its result.
-        self._adapting: tuple[str, asyncio.Future[str]] | None = None
+    name: str
+    estimator: FrameEstimator
+    publisher: Publisher
+    clock: Clock
+    loop: ControlLoop | None = None
+    gripper: GripperTask | None = None
+    diameters: FingertipDiameters | None = None
+    inputs: InputRecorder | None = None
+    count: int = 0
+    _tare: _Tare = field(default_factory=_Tare)
+    _held: Measured | None = None
+    # The source of the known torque of a correction that waits for the next frame, and its result.
+    _adapting: tuple[str, asyncio.Future[str]] | None = None
 
     async def process(self, *frames: Frame) -> None:
         """Estimate from the frames of one time, hand the estimate to the control loop, and publish it."""
-        number, now_ns = frames[0].seq, self._clock.now_ns()
+        number, now_ns = frames[0].seq, self.clock.now_ns()
         # A replay tares, takes the held tool, and corrects the gain before the same frame.
         if self._tare.is_due(min(frame.t_begin_ns for frame in frames)):
             self.estimator.session.tare()
             self._record(InputKind.TARE, now_ns, str(number).encode())
-        tool = self._gripper.held_tool(now_ns) if self._gripper is not None else None
+        tool = self.gripper.held_tool(now_ns) if self.gripper is not None else None
         if tool != self._held:
             self._held = tool
             self.estimator.session.set_tool(tool)
@@ -156,20 +144,20 @@ class FingertipPipeline:
             if not ended.done():
                 ended.set_result(self._adapt(reference, frames, now_ns))
         estimate = await self.estimator.estimate(*frames)
-        now_ns = self._clock.now_ns()
+        now_ns = self.clock.now_ns()
         message = estimate_message(self.name, frames, estimate, now_ns)
-        if self._loop is not None:
+        if self.loop is not None:
             t_mid_ns = message.t_mono_ns - round(1e9 * estimate.lag_s)
-            self._loop.on_torque(TorqueSample(self.name, estimate.torque_nm, message.reason, t_mid_ns, now_ns))
-        if self._diameters is not None:
-            self._diameters.update(self.name, estimate, now_ns)
-        self._publisher.publish(message)
+            self.loop.on_torque(TorqueSample(self.name, estimate.torque_nm, message.reason, t_mid_ns, now_ns))
+        if self.diameters is not None:
+            self.diameters.update(self.name, estimate, now_ns)
+        self.publisher.publish(message)
         self.count += 1
         self._tare.add(message.reason, taring=self.estimator.session.taring)
 
     def tare(self) -> None:
         """Take a new idle frame from frames acquired entirely after now."""
-        self._tare.begin(self._clock.now_ns())
+        self._tare.begin(self.clock.now_ns())
 
     async def tare_and_wait(self, within_s: float) -> str:
         """Take a new idle frame and wait until it is complete; return why it is not, or an empty text."""
@@ -198,19 +186,19 @@ class FingertipPipeline:
             self._adapting = None
 
     def _adapt(self, reference: str, frames: tuple[Frame, ...], now_ns: int) -> str:
-        times_ns, torques_nm = self._loop.inputs.history.get(reference, ([], [])) if self._loop else ([], [])
+        times_ns, torques_nm = self.loop.inputs.history.get(reference, ([], [])) if self.loop else ([], [])
         torque_nm = torque_at(self.estimator.session.grip_t_s, np.array(times_ns) / 1e9, np.array(torques_nm))
         try:
             adaptation = self.estimator.session.adapt(torque_nm)
         except CalibrationError as error:
             return f"{self.name} against {reference}: {error}"
         self._record(InputKind.ADAPT, now_ns, torques_as_bytes(frames[0].seq, reference, torque_nm))
-        self._publisher.publish(adapted_message(self.name, frames, reference, adaptation))
+        self.publisher.publish(adapted_message(self.name, frames, reference, adaptation))
         return ""
 
     def _record(self, kind: InputKind, t_ns: int, data: bytes) -> None:
-        if self._inputs is not None:
-            self._inputs.record(RawEvent(kind, t_ns, data))
+        if self.inputs is not None:
+            self.inputs.record(RawEvent(kind, t_ns, data))
 
 
 class CombinedFingertips:
@@ -242,47 +230,37 @@ class CombinedFingertips:
         return {"expected_hz": 1.0 / self._period_s, "estimates": self.pipeline.count}
 
 
+@dataclass(frozen=True, slots=True)
 class FingertipTask:
-    """Reads one board, estimates from each frame, and publishes both."""
+    """Reads one board, estimates from each frame, and publishes both; `combined` also needs the frames."""
 
-    def __init__(
-        self,
-        board: EitKit,
-        pipeline: FingertipPipeline,
-        publisher: Publisher,
-        combined: CombinedFingertips | None = None,
-        *,
-        always_heatmap: bool = False,
-    ) -> None:
-        """Take the board, its estimates, and the estimates that also need its frames, if there are any."""
-        self.name = pipeline.name
-        self.pipeline = pipeline
-        self._always_heatmap = always_heatmap
-        self._board = board
-        self._publisher = publisher
-        self._combined = combined
+    board: EitKit
+    pipeline: FingertipPipeline
+    publisher: Publisher
+    combined: CombinedFingertips | None = None
+    always_heatmap: bool = False
 
     async def run(self) -> None:
         """Process every frame until cancelled."""
-        async with contextlib.aclosing(self._board.batches()) as batches:
+        async with contextlib.aclosing(self.board.batches()) as batches:
             async for frames in batches:
-                if self._combined is not None:
-                    self._combined.add(self.name, frames)
+                if self.combined is not None:
+                    self.combined.add(self.pipeline.name, frames)
                 for frame in frames:
                     await self.process_frame(frame)
 
     async def process_frame(self, frame: Frame) -> None:
         """Estimate from a frame and from the pairs that wait; publish the estimates, then the frame."""
         await self.pipeline.process(frame)
-        if self._combined is not None:
-            await self._combined.process_pairs()
-        self._publisher.publish(frame_message(self.name, frame))
-        if self._always_heatmap or self._publisher.has_subscriber(EitHeatmap.topic):
+        if self.combined is not None:
+            await self.combined.process_pairs()
+        self.publisher.publish(frame_message(self.pipeline.name, frame))
+        if self.always_heatmap or self.publisher.has_subscriber(EitHeatmap.topic):
             await self._publish_heatmap(frame)
 
     def diagnostics(self) -> TaskFacts:
         """Return the values for the health message."""
-        board = self._board.diagnostics()
+        board = self.board.diagnostics()
         return {
             **board,
             "rate_hz": board["measured_hz"],
@@ -296,9 +274,9 @@ class FingertipTask:
         if scores is None or estimator.grids is None:
             return
         k_grid, sigma_grid = estimator.grids
-        self._publisher.publish(
+        self.publisher.publish(
             EitHeatmap(
-                source=self.name,
+                source=self.pipeline.name,
                 t_mono_ns=frame.t_mid_ns,
                 scores=scores,
                 k_low=float(k_grid[0]),

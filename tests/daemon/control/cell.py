@@ -11,8 +11,9 @@ import pytest
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
-from shearloop.daemon.control.experiment import ExperimentPhase, GripTo
-from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.experiment import ExperimentPhase
+from shearloop.daemon.control.experiment_schema import ExperimentFile, GripStep
+from shearloop.daemon.control.gripper_task import OPENING
 from shearloop.daemon.control.loop_inputs import GripperStatus, LoopConfig, TorqueSample
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
 from shearloop.drivers.ur.client import UrRobot
@@ -138,7 +139,7 @@ class Gripper:
         self.there.set()
         self.asked: list[str] = []
 
-    async def grip(self, _wish: GripTo) -> str:
+    async def grip(self, _wish: GripStep) -> str:
         self.asked.append("grip")
         await self.there.wait()
         if isinstance(self.answers, Exception):
@@ -150,7 +151,7 @@ class Gripper:
         return ""
 
     async def release(self) -> str:
-        return await self.grip(GripTo(140.0, 100.0, 10.0, expect_object=False))
+        return await self.grip(OPENING)
 
     async def unlock(self) -> str:
         await self.there.wait()

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
-from shearloop.daemon.control.experiment import Action, ExperimentPhase, GripTo
-from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.experiment import Action, ExperimentPhase
+from shearloop.daemon.control.experiment_schema import ExperimentFile, GripStep
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopConfig, TorqueSample, TorqueSource
 from shearloop.drivers.emulators.scene import Twin, TwinSettings
 
@@ -90,7 +90,7 @@ class Rig:
             self.control_loop.on_torque(TorqueSample("load_cell", value, "", now - 1_000_000, now))
 
     def _finish(self, action: Action) -> None:
-        if isinstance(action, GripTo):
+        if isinstance(action, GripStep):
             holds = action.expect_object or self.meets
             self.force_n = action.force_n if holds else 0.0
             self.width_mm = 30.0 if holds else action.width_mm

@@ -10,14 +10,14 @@ import pytest
 
 from shearloop.bank.polynomial import TWO_SIDED_95
 from shearloop.daemon.control import gripper_task
-from shearloop.daemon.control.experiment import GripTo
+from shearloop.daemon.control.experiment_schema import GripStep
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import GripperStatus
 from tests.daemon.conftest import DEADLINE_S
 from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
 
-GRIP = GripTo(0.0, 60.0, 40.0, expect_object=True)
+GRIP = GripStep(do="grip", width_mm=0.0, force_n=40.0)
 
 
 class Felt(list[GripperStatus]):

@@ -7,8 +7,8 @@ from typing import Any
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from shearloop.daemon.control.experiment import Action, ExperimentPhase, GripTo
-from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile
+from shearloop.daemon.control.experiment import Action, ExperimentPhase
+from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, GripStep
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, TorqueSample
 from shearloop.daemon.control.runner import along_tool
 from shearloop.daemon.control.safety import Response
@@ -187,7 +187,7 @@ class WholeRig:
     def _finish(self, action: Action) -> None:
         self.action = None
         self.arm.be(moving_linearly=False)
-        if isinstance(action, GripTo):
+        if isinstance(action, GripStep):
             self.force_n = action.force_n if action.expect_object else 0.0
             if self.control_loop.inputs.gripper is not None:
                 self.control_loop.on_gripper(

@@ -80,7 +80,7 @@ async def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500
         return replies[-1][0]
 
     robot = SimpleNamespace(settings=SETTINGS, state=None, send=send)
-    brain = SimpleNamespace(on_speed_sent=wrist.on_speed_sent, on_command_refused=pytest.fail, on_crash=pytest.fail)
+    brain = SimpleNamespace(on_speed_sent=wrist.on_speed_sent, on_fault=pytest.fail)
     commands = CommandSender(robot, brain, StopTimeline(), Clock())
     origin_rad, errors = flight.state.wrist_rad, []
     for _ in range(cycles):

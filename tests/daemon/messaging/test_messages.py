@@ -1,5 +1,6 @@
 import dataclasses
 
+import msgpack
 import numpy as np
 import pytest
 from hypothesis import given
@@ -52,6 +53,23 @@ def test_foreign_bytes_raise_a_value_error(payload):
     except ValueError:
         return
     assert all(isinstance(key, str) for key in content)
+
+
+@pytest.mark.parametrize("kind", TOPICS.values(), ids=TOPICS)
+def test_plotjuggler_plots_each_scalar_and_no_array(kind):
+    """Its streamer reads each frame as msgpack without bytes left over, and plots numbers, also within maps.
+
+    Sources: plotjuggler_plugins/DataStreamZMQ/datastream_zmq.cpp and plotjuggler_app/nlohmann_parsers.cpp.
+    """
+    with pytest.raises((ValueError, msgpack.exceptions.ExtraData)):
+        msgpack.unpackb(kind.topic.encode(), strict_map_key=True)
+    message = sample(kind)
+    content = msgpack.unpackb(encode(wire_map(message, timestamp=1.5, seq=3)), strict_map_key=True)
+    assert isinstance(content["timestamp"], float)
+    for name in (item.name for item in dataclasses.fields(kind)):
+        value = getattr(message, name)
+        is_array = isinstance(value, np.ndarray | tuple)
+        assert isinstance(content[name], bytes) if is_array else content[name] == value
 
 
 def test_a_wrong_shape_is_refused():

@@ -84,7 +84,7 @@ async def record(config: Path, boards: dict[str, Path]) -> Messages:
         async with running_daemon(config) as daemon:
             daemon.publisher.add_listener(listen)
             right = daemon.sensors.fingertips["right"].pipeline
-            right._gripper = Gripper(right, Measured(OTHER_MM, 0.5), OTHER_TOOL)
+            right.gripper = Gripper(right, Measured(OTHER_MM, 0.5), OTHER_TOOL)
             await enough.wait()
     return published
 

@@ -8,13 +8,9 @@ from typing import Any
 
 import pytest
 import yaml
-import zmq
-import zmq.asyncio
 
-from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import main
-from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.synthetic_skin import SyntheticSkin
 from shearloop.daemon.taring import tare_all
@@ -275,9 +271,3 @@ def test_a_mistake_in_the_skin_s_section_is_one_sentence_and_status_2(tmp_path, 
         said = capsys.readouterr().err
         assert mistake.replace("FOLDER", str(tmp_path)) in said
         assert said.count("\n") == 1, "one line"
-
-
-def test_a_calibration_that_is_none_is_told_before_anything_is_opened(tmp_path):
-    path = written(tmp_path, {"skin": section(ADC, calibration="none.yaml")})
-    with zmq.asyncio.Context() as context, pytest.raises(CalibrationError, match=r"none\.yaml: the calibration cannot"):
-        Daemon(load_daemon_config(path), context)

@@ -24,7 +24,7 @@ from shearloop.daemon.rig import Rig, check_experiment, make_gripper, make_loop
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.estimators import COMBINED, open_combined, open_estimator, torque_sources
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
-from shearloop.daemon.sensors import SensorBuilder, Sensors
+from shearloop.daemon.sensors import Sensors, build_sensors
 from shearloop.daemon.service import notify
 from shearloop.daemon.supervisor import HealthReporter, Reporter, Supervisor, Task, TaskFacts
 
@@ -171,8 +171,7 @@ def _build_rig(
     loop = make_loop(config, sources)
     diameters = FingertipDiameters(COMBINED) if loop is not None else None
     gripper = make_gripper(config, loop, publisher, diameters) if loop is not None else None
-    builder = SensorBuilder(config, publisher, clock, recorder, loop)
-    sensors = builder.build(estimators, combined, gripper, diameters)
+    sensors = build_sensors(config, publisher, clock, recorder, loop, estimators, combined, gripper, diameters)
     if loop is None:
         return sensors, None
     return sensors, Rig(config, loop, gripper, sensors.tareable(), publisher, clock, supervisor, recorder)

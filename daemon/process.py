@@ -9,7 +9,6 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
@@ -19,8 +18,6 @@ from shearloop.daemon.errors import UserError
 RETRY_S = 0.05
 # Before ordinary programs, behind the system's own.
 NICENESS = -10
-# With autogrouping the kernel compares niceness only within a session; the session has a niceness of its own.
-AUTOGROUP = Path("/proc/self/autogroup")
 # Many times what the daemon and all its clients use; see `messaging/connections.py`.
 MAX_DESCRIPTORS = 4096
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
@@ -96,39 +93,10 @@ def _number(interrupt: BaseException | None) -> int:
     return interrupt.number if isinstance(interrupt, TerminationInterrupt) else signal.SIGINT
 
 
-@contextlib.contextmanager
-def high_priority() -> Iterator[bool]:
-    """Raise the priority of this process, its children and its session; yield whether the system allows it.
-
-    The session's priority is restored at the end, the process's is not.
-    """
-    try:
+def raise_priority() -> None:
+    """Raise the priority of this process and of its later children, if the system allows it."""
+    with contextlib.suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, 0, min(NICENESS, os.getpriority(os.PRIO_PROCESS, 0)))
-    except PermissionError:
-        yield False
-        return
-    before = _session_niceness()
-    try:
-        if before is not None:
-            _set_session_niceness(min(before, NICENESS))
-        yield True
-    finally:
-        if before is not None:
-            _set_session_niceness(before)
-
-
-def _session_niceness() -> int | None:
-    try:
-        # "/autogroup-3 nice 0"
-        return int(AUTOGROUP.read_text().split()[-1])
-    except (OSError, ValueError, IndexError):
-        return None
-
-
-def _set_session_niceness(niceness: int) -> None:
-    # Some kernels have no autogroups, and some containers forbid changing them.
-    with contextlib.suppress(OSError):
-        AUTOGROUP.write_text(str(niceness))
 
 
 def raise_descriptor_limit() -> None:

@@ -52,73 +52,47 @@ class Sensors:
         return tasks
 
 
-@dataclass(frozen=True, slots=True)
-class SensorBuilder:
-    """Builds the sensors' tasks, which publish, are recorded, and drive the control loop, where there is one."""
+def build_sensors(
+    config: DaemonConfig,
+    publisher: Publisher,
+    clock: Clock,
+    recorder: Recorder | None,
+    loop: ControlLoop | None,
+    estimators: Mapping[str, FrameEstimator],
+    combined: FrameEstimator | None,
+    gripper: GripperTask | None,
+    diameters: FingertipDiameters | None,
+) -> Sensors:
+    """Return all sensors, which publish, are recorded, and drive the control loop, where there is one.
 
-    config: DaemonConfig
-    publisher: Publisher
-    clock: Clock
-    recorder: Recorder | None
-    loop: ControlLoop | None
+    `diameters` receives the fingertips' estimates, and the gripper gives the held tool.
+    """
 
-    def build(
-        self,
-        estimators: Mapping[str, FrameEstimator],
-        combined: FrameEstimator | None,
-        gripper: GripperTask | None,
-        diameters: FingertipDiameters | None,
-    ) -> Sensors:
-        """Return all sensors; `diameters` receives the fingertips' estimates, and the gripper gives the held tool."""
+    def inputs(source: str) -> InputRecorder | None:
+        return recorder.input_recorder(source) if recorder is not None else None
 
-        def estimates(name: str, estimator: FrameEstimator) -> FingertipPipeline:
-            return FingertipPipeline(
-                name,
-                estimator,
-                self.publisher,
-                self.clock,
-                loop=self.loop,
-                gripper=gripper,
-                diameters=diameters,
-                inputs=self._inputs(name),
-            )
+    def link(name: str, device: SerialDevice) -> SerialLink:
+        return SerialLink(**device.model_dump(), monitor=LinkMonitor(DeviceLink(name, loop)))
 
-        pairs: CombinedFingertips | None = None
-        if combined is not None:
-            period_s = self.config.fingertips[combined.calibration.sides[0]].frame_period_s
-            pairs = CombinedFingertips(estimates(COMBINED, combined), period_s)
-        fingertips = {
-            name: FingertipTask(
-                self._eit_kit(name, estimator),
-                estimates(name, estimator),
-                self.publisher,
-                pairs,
-                always_heatmap=self.config.fingertips[name].heatmap == "always",
-            )
-            for name, estimator in estimators.items()
-        }
-        return Sensors(fingertips, pairs, self._skin(), self._load_cell())
+    def pipeline(name: str, estimator: FrameEstimator) -> FingertipPipeline:
+        return FingertipPipeline(name, estimator, publisher, clock, loop, gripper, diameters, inputs(name))
 
-    def _eit_kit(self, name: str, estimator: FrameEstimator) -> EitKit:
-        own, slots = self.config.fingertips[name], estimator.table.zero_slots
-        return EitKit(self._link(name, own.device), slots, own.frame_period_s, self._inputs(name))
-
-    def _load_cell(self) -> LoadCellTask | None:
-        own = self.config.load_cell
-        if own is None:
-            return None
-        link, inputs = self._link(LOAD_CELL, own.device), self._inputs(LOAD_CELL)
-        board = LoadCell(link, load_cell_calibration(own), own.rate_hz, inputs)
-        return LoadCellTask(board, self.publisher, self.clock, self.loop, own.rate_hz)
-
-    def _skin(self) -> SkinTask | None:
-        if self.config.skin is None:
-            return None
-        inputs = {name: self._inputs(name) for name in RecordedSkin.sources}
-        return SkinTask(self.config.skin, self.publisher, self.clock, self.loop, inputs)
-
-    def _link(self, name: str, device: SerialDevice) -> SerialLink:
-        return SerialLink(**device.model_dump(), monitor=LinkMonitor(DeviceLink(name, self.loop)))
-
-    def _inputs(self, source: str) -> InputRecorder | None:
-        return self.recorder.input_recorder(source) if self.recorder is not None else None
+    pairs: CombinedFingertips | None = None
+    if combined is not None:
+        period_s = config.fingertips[combined.calibration.sides[0]].frame_period_s
+        pairs = CombinedFingertips(pipeline(COMBINED, combined), period_s)
+    fingertips = {}
+    for name, estimator in estimators.items():
+        own, slots = config.fingertips[name], estimator.table.zero_slots
+        board = EitKit(link(name, own.device), slots, own.frame_period_s, inputs(name))
+        always = own.heatmap == "always"
+        fingertips[name] = FingertipTask(board, pipeline(name, estimator), publisher, pairs, always)
+    skin = load_cell = None
+    if config.skin is not None:
+        sources = {name: inputs(name) for name in RecordedSkin.sources}
+        skin = SkinTask(config.skin, publisher, clock, loop, sources)
+    if (cell := config.load_cell) is not None:
+        calibration = load_cell_calibration(cell)
+        lever = LoadCell(link(LOAD_CELL, cell.device), calibration, cell.rate_hz, inputs(LOAD_CELL))
+        load_cell = LoadCellTask(lever, publisher, clock, loop, cell.rate_hz)
+    return Sensors(fingertips, pairs, skin, load_cell)

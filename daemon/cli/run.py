@@ -5,7 +5,7 @@ import asyncio
 import signal
 import sys
 from collections.abc import Callable
-from contextlib import ExitStack, closing, nullcontext
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,16 +61,17 @@ def _run(args: argparse.Namespace, out: "NonBlockingWriter", on_ready: Callable[
     from shearloop.daemon.cli import EXIT_OK, EXIT_UNFINISHED
     from shearloop.daemon.cli.emulated_devices import EmulatedDevices
     from shearloop.daemon.cli.terminal import EstimatePrinter, StatusLine
-    from shearloop.daemon.process import high_priority, lock_memory, raise_descriptor_limit
+    from shearloop.daemon.process import lock_memory, raise_descriptor_limit, raise_priority
     from shearloop.daemon.run_summary import RunSummary
 
     config = _config(args)
     raise_descriptor_limit()
     if config.lock_memory:
         lock_memory()
-    with ExitStack() as stack:
+    if config.robot is not None:
         # Without permission the loop still detects late commands and holds the wrist.
-        stack.enter_context(high_priority() if config.robot is not None else nullcontext())
+        raise_priority()
+    with ExitStack() as stack:
         emulated = stack.enter_context(EmulatedDevices(config.emulators, args.config.parent, args.recording))
         listeners: list[Listener] = [emulated]
         if args.show:

@@ -520,18 +520,19 @@ def along_tool(pose: tuple[float, ...], distance_m: float) -> tuple[float, ...]:
     return (x + dx * distance_m, y + dy * distance_m, z + dz * distance_m, *turned)
 
 
+@dataclass(slots=True)
 class StatePublisher:
     """Publishes the states of robot and loop, and wakes those who wait for a change of the loop's."""
 
-    def __init__(self, publisher: Publisher, control_loop: ControlLoop) -> None:
-        self.changed = asyncio.Event()
-        # The experiment whose end was published last.
-        self.ended: Experiment | None = None
-        self._publisher = publisher
-        self._control_loop = control_loop
-        self._block = -1
-        self._key: tuple[object, ...] = ()
-        self._hold = self._published_ns = 0
+    publisher: Publisher
+    control_loop: ControlLoop
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
+    # The experiment whose end was published last.
+    ended: Experiment | None = None
+    _block: int = -1
+    _key: tuple[object, ...] = ()
+    _hold: int = 0
+    _published_ns: int = 0
 
     def publish_robot(self, state: RobotState) -> bool:
         """Publish every fifth state; return whether it was this one."""
@@ -559,12 +560,12 @@ class StatePublisher:
             blocked=state.blocked,
             age_s=state.age_ns / 1e9,
         )
-        self._publisher.publish(message)
+        self.publisher.publish(message)
         return True
 
     def publish_loop(self, sent_rad_per_s: float, now_ns: int) -> None:
         """Publish the loop's state at a change and once a second."""
-        status, experiment = self._control_loop.status, self._control_loop.experiment
+        status, experiment = self.control_loop.status, self.control_loop.experiment
         key = (
             status.phase,
             tuple(fault.code for fault in status.decision.faults),
@@ -580,7 +581,7 @@ class StatePublisher:
                 "loop", phase=status.phase, activity=status.activity, reasons=" ".join(status.decision.reasons)
             )
         self._key, self._hold, self._published_ns = key, hold, now_ns
-        self._publisher.publish(loop_state(self._control_loop, sent_rad_per_s, now_ns))
+        self.publisher.publish(loop_state(self.control_loop, sent_rad_per_s, now_ns))
         if experiment is not None and not experiment.running:
             self.ended = experiment
         self._notify()
@@ -588,7 +589,7 @@ class StatePublisher:
     def publish_stop(self, stop: LoopStop | None) -> None:
         """Publish the times of a stop, if there is one."""
         if stop is not None:
-            self._publisher.publish(stop)
+            self.publisher.publish(stop)
             self._notify()
 
     def _notify(self) -> None:

@@ -50,11 +50,11 @@ class LoadCellTask:
         """Publish every sample and pass it on, until cancelled."""
         async with contextlib.aclosing(self._board.readings()) as samples:
             async for sample in samples:
-                self._publisher.publish(load_message(sample))
-                torque_nm = sample.torque_nm if sample.trusted else None
-                self._reason = _reason(sample)
-                now_ns = self._clock.now_ns()
+                message = load_message(sample)
+                self._publisher.publish(message)
+                self._reason = message.reason
                 if self._loop is not None:
+                    torque_nm, now_ns = sample.torque_nm if sample.trusted else None, self._clock.now_ns()
                     self._loop.on_torque(TorqueSample(LOAD_CELL, torque_nm, self._reason, sample.t_mid_ns, now_ns))
                 self._take_zero(sample)
                 self._sampled.set()

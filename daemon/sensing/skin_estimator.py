@@ -5,7 +5,7 @@ that no load explains. All changes are relative: 1 % of one resistance is a resp
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,27 +45,27 @@ class SkinZero:
         return r1_ohm / self.r1_ohm - 1.0, r2_ohm / self.r2_ohm - 1.0
 
 
+@dataclass(frozen=True, slots=True)
 class SkinZeroTaker:
     """Averages resistances until they make a zero, or a reason against it."""
 
-    def __init__(self, n_samples: int, rest_ohm: tuple[float, float], slope_per_n: float) -> None:
-        self.n_samples = n_samples
-        self._rest_ohm = rest_ohm
-        self._slope_per_n = slope_per_n
-        self._samples: list[tuple[float, float]] = []
+    n_samples: int
+    rest_ohm: tuple[float, float]
+    slope_per_n: float
+    samples: list[tuple[float, float]] = field(default_factory=list)
 
     @property
     def progress(self) -> str:
         """The number of samples taken, of those needed."""
-        return f"{len(self._samples)} of {self.n_samples}"
+        return f"{len(self.samples)} of {self.n_samples}"
 
     def add(self, r1_ohm: float, r2_ohm: float) -> SkinZero | str | None:
         """Add a sample; return the zero once there are enough, or the reason to refuse it, and start again."""
-        self._samples.append((r1_ohm, r2_ohm))
-        if len(self._samples) < self.n_samples:
+        self.samples.append((r1_ohm, r2_ohm))
+        if len(self.samples) < self.n_samples:
             return None
-        ohm = np.array(self._samples)
-        self._samples.clear()
+        ohm = np.array(self.samples)
+        self.samples.clear()
         return self._check_rest(ohm) or self._check_calibration(*ohm.mean(axis=0).tolist()) or self._zero(ohm)
 
     def _check_rest(self, ohm: NDArray[np.float64]) -> str | None:
@@ -86,16 +86,16 @@ class SkinZeroTaker:
 
     def _check_calibration(self, r1_ohm: float, r2_ohm: float) -> str | None:
         """Compare the ratio of both with the calibration's: current and temperature cancel."""
-        known, found = _log_ratio(*self._rest_ohm), _log_ratio(r1_ohm, r2_ohm)
+        known, found = _log_ratio(*self.rest_ohm), _log_ratio(r1_ohm, r2_ohm)
         if abs(found - known) <= MAX_CHANGE:
             return None
         seen = f"R₁ {r1_ohm:.2f} Ω and R₂ {r2_ohm:.2f} Ω"
-        common = 0.5 * math.log(r1_ohm * r2_ohm / math.prod(self._rest_ohm))
+        common = 0.5 * math.log(r1_ohm * r2_ohm / math.prod(self.rest_ohm))
         if abs(found + known) < min(MAX_CHANGE, abs(found - known)) and abs(common) < MAX_COMMON_CHANGE:
             return f"{seen} are those of the calibration the other way round: the wires of the gauges are swapped"
         return (
             f"{seen} are not those of the skin at rest: a shear force of about "
-            f"{(found - known) / self._slope_per_n:+.2f} N would look like that; take the load off, or calibrate again"
+            f"{(found - known) / self.slope_per_n:+.2f} N would look like that; take the load off, or calibrate again"
         )
 
     def _zero(self, ohm: NDArray[np.float64]) -> SkinZero:
@@ -103,7 +103,7 @@ class SkinZeroTaker:
         # The upper bound of the noise that a few samples allow.
         bound = math.sqrt((len(ohm) - 1) / float(chdtri(len(ohm) - 1, 0.95)))
         noise = max(bound * float(np.std(ohm[:, 0] / r1_ohm - ohm[:, 1] / r2_ohm, ddof=1)), MIN_NOISE)
-        change = abs(_log_ratio(r1_ohm, r2_ohm) - _log_ratio(*self._rest_ohm))
+        change = abs(_log_ratio(r1_ohm, r2_ohm) - _log_ratio(*self.rest_ohm))
         return SkinZero(r1_ohm, r2_ohm, noise, change + 2.0 * noise / math.sqrt(len(ohm)))
 
 

@@ -21,8 +21,8 @@ from shearloop.files import replace_file
 Model = TypeVar("Model")
 
 _LONGEST_VALUE = 60
-# Bounds on what a file may cost: its bytes, and its values with every alias written out.
-_MOST_BYTES, _MOST_VALUES = 1 << 17, 20_000
+# Bounds on what a file may cost: its bytes, its values with every alias written out, and its mistakes that are shown.
+_MOST_BYTES, _MOST_VALUES, _MOST_MISTAKES = 1 << 17, 20_000, 100
 
 
 class _Loader(yaml.SafeLoader):
@@ -181,6 +181,8 @@ _SYNTAX = (
     ("expected ',' or ']'", "a list is not closed: `,` or `]` is missing"),
     ("expected ',' or '}'", "a section is not closed: `,` or `}` is missing"),
     ("found unhashable key", "a key is a list or a section; a name is expected"),
+    ("could not determine a constructor", "the keys `<<` and `=` are not supported"),
+    ("but found another document", "a second document begins here; a file has one"),
     ("found undefined alias", "an alias `*name` without its anchor `&name`"),
 )
 _WRONG = (
@@ -215,14 +217,18 @@ def _syntax(error: yaml.MarkedYAMLError) -> str:
 def _mistakes(
     error: ValidationError, model: type, content: object, where: str, root: yaml.Node | None = None
 ) -> list[str]:
-    """Return a line for each mistake, in the order of the file; `root` is its content with line numbers."""
+    """Return a line for each mistake, in the order of the file; `root` is its content with line numbers.
+
+    Only the first are shown of very many: each takes a search through the file.
+    """
     schema = TypeAdapter(model).json_schema()
     found: dict[str, int] = {}
     every = error.errors(include_url=False)
-    for details in every:
+    shown, more = every[:_MOST_MISTAKES], every[_MOST_MISTAKES:]
+    for details in shown:
         location = details["loc"]
         # A list counts only its valid entries, so that mistakes within it make it too short as well.
-        if details["type"] == "too_short" and any(one["loc"][:-1][: len(location)] == location for one in every):
+        if details["type"] == "too_short" and any(one["loc"][:-1][: len(location)] == location for one in shown):
             continue
         kind, key, line = details["type"], "", 1
         if kind != "invalid_key":
@@ -231,7 +237,7 @@ def _mistakes(
             key += "." + details["ctx"]["discriminator"].strip("'")
         subject = f"{key}: " if key else ""
         found[f"{where}{f':{line}' if root is not None else ''}: {subject}{_sentence(details, schema)}"] = line
-    return sorted(found, key=lambda text: found[text])
+    return sorted(found, key=lambda text: found[text]) + ([f"{where}: {len(more)} more mistakes"] if more else [])
 
 
 def _place(location: Sequence[int | str], content: object, node: yaml.Node | None, *, missing: bool) -> tuple[str, int]:

@@ -135,6 +135,8 @@ ALIAS_BOMB = "a: &a [x]\n" + "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n"
         (ALIAS_BOMB, ":4: more than 20000 values, with every alias written out"),
         ("#" * 131_073, "is larger than 128 kB"),
         ("? [1, 2]\n: 3\n", ":1:3: a key is a list or a section"),
+        ("spare: {<<: {hold_s: 1}}\n", ":1:9: the keys `<<` and `=` are not supported"),
+        ("low: 1\n---\nlow: 2\n", ":2:1: a second document begins here"),
         ("mode: *other\n", ":1:7: an alias `*name` without its anchor"),
         ("mode: \x00\n", "not a YAML file: unacceptable character"),
         ("[" * 500, "nested too deeply"),
@@ -143,6 +145,7 @@ ALIAS_BOMB = "a: &a [x]\n" + "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n"
         ("torque_limit_nm: 1\nspare: {hold: 1}\n", "spare.hold: is not a known key; did you mean hold_s?"),
         ("torque_limit_nm: 1\nsteps: 3\n", "steps: 3 is not a list"),
         ("1: 2\n", "the key 1 is a number; a name is expected"),
+        ("".join(f"key{number}: 1\n" for number in range(8000)), ": 7901 more mistakes"),
         ("torque_limit_nm: 1\nlow: 3\n", ": low must be below high, but low is 3 and high is 1"),
     ],
 )

@@ -5,12 +5,9 @@ import weakref
 from collections.abc import Callable, Iterator
 
 import pytest
-import zmq.asyncio
 
 from shearloop.daemon import app
-from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import main
-from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.process import without_long_collections
 
 
@@ -71,16 +68,3 @@ def test_daemon_of_the_command_line_is_collected_from_when_it_is_ready(config, m
     monkeypatch.setattr(app, "run_daemon", run_daemon)
     assert main(["run", str(config())]) == 0
     assert collected == [False, True]
-
-
-async def test_daemon_says_when_all_of_it_is_made(config):
-    said = []
-    with zmq.asyncio.Context() as context:
-        daemon = Daemon(load_daemon_config(config()), context)
-
-        def on_ready() -> None:
-            said.append("ready")
-            daemon.stop()
-
-        await daemon.run(on_ready)
-    assert said == ["ready"]

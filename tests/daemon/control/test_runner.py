@@ -256,6 +256,17 @@ async def test_a_wrist_speed_is_sent_at_each_state():
         assert cell.robot.flight.wrist_speed == pytest.approx(0.3)
 
 
+async def test_the_speed_after_clipping_is_published():
+    async with driven(TWIST, cycles=20) as cell:
+        # Close to the limit of the force, the robot's process lets less through.
+        cell.robot.flight.arm.be(wrench=(0.0, 0.0, 0.9 * SETTINGS.limits.force_n.hard, 0.0, 0.0, 0.0))
+        await cell.cycles(150)
+        state = next(one for one in reversed(cell.published.messages) if one.topic == "loop.state")
+        assert state.speed_command_rad_per_s == pytest.approx(0.3)
+        assert state.speed_sent_rad_per_s == cell.robot.flight.wrist_speed
+        assert 0.0 < state.speed_sent_rad_per_s < 0.3
+
+
 async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none():
     """Nobody has sent one that could be mended; what helps is told instead."""
     async with driven(TWIST) as cell:

@@ -1,27 +1,15 @@
 import os
 
-from shearloop.daemon import process
+from shearloop.daemon.process import NICENESS, raise_priority
 
 
-def test_the_sessions_niceness_is_restored(tmp_path, monkeypatch):
+def test_a_priority_that_is_not_allowed_is_not_raised(monkeypatch):
     asked: list[int] = []
-    group = tmp_path / "autogroup"
-    group.write_text("/autogroup-3 nice 2")
-    monkeypatch.setattr(process, "AUTOGROUP", group)
-    monkeypatch.setattr(os, "setpriority", lambda _kind, _who, niceness: asked.append(niceness))
-    with process.high_priority() as allowed:
-        assert allowed
-        assert group.read_text() == "-10"
-    assert group.read_text() == "2"
-    assert asked == [-10]
 
-
-def test_nothing_changes_without_permission(tmp_path, monkeypatch):
-    def refuse(_kind: int, _who: int, _niceness: int) -> None:
+    def refuse(_kind: int, _who: int, niceness: int) -> None:
+        asked.append(niceness)
         raise PermissionError
 
-    monkeypatch.setattr(process, "AUTOGROUP", tmp_path / "absent")
     monkeypatch.setattr(os, "setpriority", refuse)
-    with process.high_priority() as allowed:
-        assert not allowed
-    assert list(tmp_path.iterdir()) == []
+    raise_priority()
+    assert asked == [NICENESS]

@@ -83,6 +83,14 @@ class Parser(argparse.ArgumentParser):
             of = f" of {name}" if name.startswith("--") else ""
             meant = "".join(f"; did you mean {one}?" for one in get_close_matches(given, known, 1))
             return f"there is no {given!r}{of}{meant or '; there are ' + ', '.join(known)}"
+        required = re.fullmatch(r"the following arguments are required: (.*)", message)
+        if required is not None:
+            lists = [
+                f"; {action.metavar or action.dest} is one of {', '.join(action.choices)}"
+                for action in self._actions
+                if action.choices and (action.metavar or action.dest) in required[1].split(", ")
+            ]
+            return message + "".join(lists)
         unknown = re.match(r"unrecognized arguments: (\S+)", message)
         near = get_close_matches(unknown[1], self._option_string_actions, 1) if unknown else []
         return f"{message}; did you mean {near[0]}?" if near else message
@@ -91,6 +99,8 @@ class Parser(argparse.ArgumentParser):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; print a user's mistake as one sentence on stderr and return status 2."""
     arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments[:1] in ([], ["help"]):
+        arguments = [*arguments[1:2], "--help"]
     name = _overview().parse_args(arguments[:1]).command
     command = COMMANDS[name]
     module = importlib.import_module(command.module)

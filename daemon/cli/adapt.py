@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from shearloop.daemon.cli.options import add_json, add_option, check_overwrite, parse_time_range
+from shearloop.daemon.cli.options import add_json, add_option, check_overwrite, load_calibration, parse_time_range
 from shearloop.daemon.cli.terminal import print_result
 
 
@@ -28,14 +28,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Adapt, write, and print the gains."""
     from shearloop.bank.eit.bank_file import Bank
-    from shearloop.bank.estimation import Calibration, Physics
+    from shearloop.bank.estimation import Physics
     from shearloop.bank.estimation.calibration import ARCHIVE_MAGIC
     from shearloop.daemon.analysis.calibrate import adapt_to_recordings
 
     check_overwrite(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
     physics = Physics(bank=Bank.open(args.bank) if args.bank else None)
     adapted, correction = adapt_to_recordings(
-        Calibration.load(args.calibration), args.recordings, physics,
+        load_calibration(args.calibration), args.recordings, physics,
         time_range=parse_time_range(args.time_range), load_cell_delay_s=args.load_cell_delay_s, tool_mm=args.tool_mm,
     )  # fmt: skip
     adapted.save(args.out)

@@ -60,7 +60,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Evaluate, print, and draw on request."""
     from shearloop.bank.eit.bank_file import Bank
-    from shearloop.bank.estimation import Calibration
     from shearloop.bank.estimation.load_delay import load_delay_warning
     from shearloop.daemon.analysis.evaluate import (
         estimate_in_worker,
@@ -70,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
         write_estimates,
     )
     from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, part_of, read_series
-    from shearloop.daemon.cli.options import check_kind, check_overwrite, parse_time_range
+    from shearloop.daemon.cli.options import check_kind, check_overwrite, load_calibration, parse_time_range
     from shearloop.daemon.executors import in_order, open_executor
 
     if args.out is not None and args.out.suffix not in _FIGURES:
@@ -80,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     if args.estimates is not None:
         check_overwrite(args.estimates, "a table")
     check_paths_differ(args.recordings)
-    calibration = Calibration.load(args.calibration)
+    calibration = load_calibration(args.calibration)
     bank = Bank.open(args.bank) if args.bank else None
     start, stop = parse_time_range(args.time_range)
     sides = calibration.sides if calibration.kind == "raw" else None

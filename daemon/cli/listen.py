@@ -21,7 +21,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `listen`."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = EPILOG
-    text = "topics or their beginnings, such as eit (default: all)"
+    text = "topics or their first part, such as eit (default: all)"
     add_option(parser, "topics", str, "TOPIC", text, nargs="*", default=[])
     add_connection(parser, PUBLISH_ADDRESS, "where the daemon publishes")
     parser.add_argument("--json", action="store_true", help="one JSON object per line, with arrays")
@@ -35,8 +35,9 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.messaging.client import QUIET_S, check_timeout_s, receive_messages
     from shearloop.daemon.messaging.messages import TOPICS
 
+    known = {*TOPICS, *(topic.partition(".")[0] for topic in TOPICS)}
     for topic in args.topics:
-        if not any(known.startswith(topic) for known in TOPICS):
+        if topic not in known:
             raise UserError(f"there is no topic {topic!r}; the topics are {', '.join(TOPICS)}")
     if args.count is not None and args.count < 1:
         raise UserError(f"--count {args.count} is not a number of messages; give 1 or more")

@@ -152,6 +152,15 @@ def parse_sides(text: str | None) -> tuple[str, ...] | None:
     return sides
 
 
+def load_calibration(path: Path) -> "Calibration":
+    """Return the calibration in a file; raises UserError for a recording, and CalibrationError as `load` does."""
+    from shearloop.bank.estimation import Calibration
+
+    if ".mcap" in path.suffixes or path.is_dir():
+        raise UserError(f"{path} is a recording, not a calibration; the calibration comes first, then recordings")
+    return Calibration.load(path)
+
+
 def check_kind(path: Path, calibration: "Calibration", series: "Sequence[FrameSeries]") -> None:
     """Raise UserError for a calibration of slices with raw frames, and for the reverse."""
     kinds = {"raw": "raw frames", "difference": "slices"}

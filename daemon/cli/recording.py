@@ -89,10 +89,8 @@ def _summary_text(found: "RecordingSummary") -> str:
         lines.append(f"  {name:<22} {topic.messages:>8} message{plural} {rate}".rstrip())
     lines += [f"  attached {name}" for name in found.attachments]
     if not found.closed:
-        lines.append(
-            f"  It was not closed, or is still being written; {found.torn_bytes} bytes are incomplete. "
-            f"`shearloop recording repair {found.path}` makes an indexed copy."
-        )
+        cure = f"`shearloop recording repair {found.path}` makes an indexed copy" if found.topics else "None is intact"
+        lines.append(f"  It was not closed, or is being written; {found.torn_bytes} bytes are incomplete. {cure}.")
     if found.damaged_chunks:
         lines.append(f"  {found.damaged_chunks} chunks are damaged and left out.")
     if found.dropped:

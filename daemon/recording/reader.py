@@ -38,6 +38,7 @@ from shearloop.files import replace_file
 Progress = Callable[[int], None]
 _LARGEST_RECORD_BYTES = 1 << 30
 _BLOCK_BYTES = 1 << 20
+_NOTHING_INTACT = "it holds no intact message, so nothing can be saved"
 # Opcode and length, then the places of index and its offsets, and the index's checksum; or the data's checksum.
 _FOOTER, _DATA_END = struct.Struct("<BQQQI"), struct.Struct("<BQI")
 # Metadata of every recording; the other keys are notes of this one.
@@ -111,10 +112,9 @@ def reading(path: Path) -> Iterator[None]:
         raise UserError(f"{path}: the recording cannot be read: {error.strerror or error}") from error
     except Exception as error:
         detail = str(error) if isinstance(error, McapError | ValueError) and str(error) else repr(error)
-        raise UserError(
-            f"{path}: the recording was not closed, or is damaged ({detail}); "
-            f"`shearloop recording repair {path}` saves the intact part"
-        ) from error
+        intact = any(isinstance(record, Message) for record in IntactRecords(path, lambda _: None))
+        cure = f"`shearloop recording repair {path}` saves the intact part" if intact else _NOTHING_INTACT
+        raise UserError(f"{path}: the recording was not closed, or is damaged ({detail}); {cure}") from error
 
 
 @contextmanager
@@ -432,7 +432,7 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
                         )
             writer.finish()  # type: ignore[no-untyped-call]  # mcap has no return annotation here
             if not messages:
-                raise UserError(f"{source}: it holds no intact message, so nothing can be saved")
+                raise UserError(f"{source}: {_NOTHING_INTACT}")
     except OSError as error:
         raise UserError(f"{out}: the repaired recording cannot be written: {error.strerror}") from error
     return RepairResult(out, messages, records.torn_bytes, records.damaged_chunks)

@@ -153,6 +153,9 @@ def test_a_calibration_of_another_bank_is_refused(config, tiny_bank, tmp_path, m
     [
         (["check", "no-such.yaml"], "no-such.yaml"),
         (["listen", "eit.torque"], "there is no topic 'eit.torque'; the topics are eit.frame, eit.estimate"),
+        (["listen", "eit.estimat"], "there is no topic 'eit.estimat'; the topics are eit.frame, eit.estimate"),
+        (["evaluate", "rec.mcap", "my.cal"], "rec.mcap is a recording, not a calibration; the calibration comes first"),
+        (["adapt", "rec.mcap.partial", "my.cal", "--out", "new.cal"], "rec.mcap.partial is a recording, not a cal"),
         (["listen", "--count", "0"], "--count 0"),
         (["listen", "--timeout", "-1"], "--timeout -1"),
         (["listen", "--timeout", "inf"], "--timeout inf"),
@@ -212,7 +215,13 @@ def test_a_signal_during_a_callback_from_compiled_code_is_not_lost(number, statu
 
 
 @pytest.mark.parametrize(
-    ("arguments", "missing"), [([], "COMMAND"), (["chart"], "NAME, --out"), (["bank", "info"], "PATH")]
+    ("arguments", "missing"),
+    [
+        (["chart"], "NAME, --out; NAME is one of speed-accuracy, stability, loop, scene"),
+        (["schema"], "kind; kind is one of configuration, experiment, robot, bank, fingertip"),
+        (["import"], "FORMAT; FORMAT is one of mat"),
+        (["bank", "info"], "PATH"),
+    ],
 )
 def test_missing_arguments_are_named_in_one_sentence(arguments, missing, capsys):
     with pytest.raises(SystemExit) as end:
@@ -235,6 +244,14 @@ def test_every_command_explains_itself(name, capsys):
     printed = capsys.readouterr().out
     assert f"usage: shearloop {name}" in printed
     assert "%%" not in printed
+
+
+@pytest.mark.parametrize("arguments", [[], ["help"], ["--help"], ["help", "run"]])
+def test_help_comes_without_a_command_too(arguments, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main(arguments)
+    out, err = capsys.readouterr()
+    assert (out.startswith("usage: shearloop run") if "run" in arguments else "\n  run " in out, err) == (True, "")
 
 
 def test_an_unknown_command_lists_the_known_ones(capsys):

@@ -138,7 +138,8 @@ def test_each_command_exits_with_status_2(arguments, damages, content, tmp_path,
         assert main([one.format(**places) for one in arguments]) == 2
         said = capsys.readouterr().err
         assert f"{path}: the recording was not closed, or is damaged (" in said, what
-        assert f"`shearloop recording repair {path}`" in said, what
+        cure = "it holds no intact message" if what == "short" else f"`shearloop recording repair {path}`"
+        assert cure in said, what
         assert "Traceback" not in said
 
 

@@ -14,6 +14,7 @@ export class Controls {
     this.takeTokenFromAddress();
     this.reasons = {};
     byId("stop").addEventListener("click", () => this.stop());
+    byId("stop").disabled = false;
     document.addEventListener("keydown", (event) => {
       if (event.key === "Escape" && !event.repeat) this.stop();
     });

@@ -55,6 +55,16 @@ def test_stop_needs_no_token_and_motion_does(browsed):
     assert browsed.daemon.asked == ["stop", "stop"]
 
 
+def test_a_page_whose_scripts_do_not_load_offers_no_button(browsed):
+    page = browsed.page
+    page.route("**/chart.js", lambda route: route.abort())
+    page.goto("about:blank")
+    page.goto(browsed.viewer.url_with_token)
+    page.unroute("**/chart.js")
+    assert page.locator("#stop:enabled, [data-command]:enabled").count() == 0
+    assert "until it has, stop at the pendant" in browsed.text("#link-reason")
+
+
 def test_commands_reach_the_daemon_with_the_token(browsed):
     page = browsed.open(token=True)
     assert "token" not in page.url, "it does not stay in the address bar"
@@ -121,9 +131,11 @@ def test_the_page_fits_and_stop_stays_visible(size, browsed):
     browsed.daemon.say(loop={"phase": "held", "response": "hold", "reasons": REASONS})
     browsed.until("#holding-title", "Holding")
     found, cut = browsed.layout(), page.evaluate(CUT)
+    progress = page.locator("#progress").bounding_box()
     page.set_viewport_size({"width": 1024, "height": 700})
     assert found["wide"] <= 0
     assert cut == []
+    assert progress["width"] >= 100
     assert found["spilt"] == []
     assert found["stop"]["top"] >= 0
     assert found["stop"]["bottom"] <= size[1]
@@ -222,9 +234,10 @@ def test_a_daemon_that_ends_well_is_shown_as_done_with_its_summary(browsed):
     page = browsed.open()
     browsed.until("#link-state", "● live")
     silent = dict.fromkeys(name for name in MESSAGES if name != "end")
-    browsed.daemon.say(**silent, end={})
+    browsed.daemon.say(**silent, end={"summary": "What happened: 'hold 0.10 N·m' was done" + ", and more" * 20})
     browsed.until("#link-state", "✓ DONE")
     browsed.until("#summary-text", "What happened: 'hold 0.10 N·m' was done")
+    assert page.evaluate("(({ scrollWidth, clientWidth }) => scrollWidth <= clientWidth)(window['summary-text'])")
     browsed.daemon.kill()
     page.wait_for_timeout(2500)  # longer than a silent daemon stays unnoticed
     assert browsed.text("#link-state") == "✓ DONE"

@@ -22,7 +22,7 @@ from shearloop.bank.estimation import FrameSeries
 from shearloop.bank.estimation.fingertip_validator import channel_noise, segment_grip
 from shearloop.bank.estimation.load_delay import find_load_delay
 from shearloop.bank.gain import find_twists
-from shearloop.daemon.analysis.series import read_series, series_of
+from shearloop.daemon.analysis.frame_series import read_series, series_of
 from shearloop.daemon.recording.reader import read_recording
 
 # Increments, in frames. The least bound over these numbers of directions counts; each direction needs some increments.

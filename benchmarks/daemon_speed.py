@@ -27,7 +27,7 @@ import zmq
 from benchmarks import common
 from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.recording.reader import read_recording
-from shearloop.daemon.sensing.estimators import COMBINED
+from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.emulators.boards import format_line
 

@@ -21,9 +21,9 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import FrameSeries, Physics, fit, measure_timing
-from shearloop.bank.estimators import DEFAULT, EstimatorName
+from shearloop.bank.estimator_names import DEFAULT, EstimatorName
 from shearloop.daemon.analysis.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of
-from shearloop.daemon.analysis.series import part_of, read_series, series_of
+from shearloop.daemon.analysis.frame_series import part_of, read_series, series_of
 from shearloop.daemon.cli.emulated_calibration import calibrate, record
 from shearloop.daemon.recording.matlab import import_mat
 from shearloop.daemon.recording.reader import read_recording

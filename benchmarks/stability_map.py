@@ -14,8 +14,8 @@ import numpy as np
 
 from benchmarks.common import parser_of, table_head, table_row, write_figures
 from shearloop.daemon.analysis.charts import simulated_loop
-from shearloop.daemon.control.controller import ControllerSettings, TwistController
 from shearloop.daemon.control.margins import LoopModel, gain_limit
+from shearloop.daemon.control.twist_controller import ControllerSettings, TwistController
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 
 COMMAND_S = 0.016

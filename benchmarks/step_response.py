@@ -23,9 +23,9 @@ from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFram
 from shearloop.daemon.analysis.charts import simulated_loop as sim
 from shearloop.daemon.analysis.creep import Stretch, fit_creep
 from shearloop.daemon.cli.emulated_calibration import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
-from shearloop.daemon.control.controller import TwistController
 from shearloop.daemon.control.loop_inputs import Creep, LoopConfig
 from shearloop.daemon.control.margins import margin_refusal
+from shearloop.daemon.control.twist_controller import TwistController
 from shearloop.daemon.run_summary import BAND
 from shearloop.daemon.synthetic_frames import RigFrames
 from shearloop.drivers.defaults import FRAME_PERIOD_S

@@ -22,7 +22,7 @@ from shearloop.daemon.process import ending_signals
 from shearloop.daemon.recording.recorder import Recorder, daemon_identity
 from shearloop.daemon.rig import Rig, check_experiment, make_gripper, make_loop
 from shearloop.daemon.run_summary import RunSummary
-from shearloop.daemon.sensing.estimators import COMBINED, open_combined, open_estimator, torque_sources
+from shearloop.daemon.sensing.frame_estimator import COMBINED, open_combined, open_estimator, torque_sources
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.sensors import Sensors, build_sensors
 from shearloop.daemon.service import notify

@@ -11,12 +11,12 @@ from shearloop.daemon.control import experiment_schema
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import Creep, TorqueSource
-from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
+from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, wrench_source
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.logs import LinkLog
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.recorder import AttachedFile, Recorder, experiment_notes
-from shearloop.daemon.sensing.estimators import COMBINED
+from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.supervisor import Supervisor, Task

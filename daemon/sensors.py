@@ -10,8 +10,8 @@ from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.rig import DeviceLink, load_cell_calibration
-from shearloop.daemon.sensing.estimators import COMBINED, FrameEstimator
 from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipPipeline, FingertipTask
+from shearloop.daemon.sensing.frame_estimator import COMBINED, FrameEstimator
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
 from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, RecordedSkin, SkinTask
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters

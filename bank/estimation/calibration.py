@@ -27,7 +27,7 @@ from shearloop.bank.estimation.estimator import Estimator, OutputModel, PaperEst
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor, PolynomialRegressor
 from shearloop.bank.estimation.values import INLINE, Kind, Measured
-from shearloop.bank.estimators import estimator_class
+from shearloop.bank.estimator_names import estimator_class
 from shearloop.bank.gain import GainCorrection, ToolLaw
 from shearloop.bank.polynomial import Polynomial
 from shearloop.files import open_file, refusing_damage, replace_file

@@ -1,6 +1,6 @@
 """What an estimator is: what it needs, its features of a frame, and its fit; and the estimators that read one frame.
 
-An estimator is a subclass of `Estimator`, and a line in `bank/estimators.py`. It must have a `name` and `features`.
+An estimator is a subclass of `Estimator`, and a line in `bank/estimator_names.py`. It must have `name` and `features`.
 """
 
 from abc import ABC, abstractmethod

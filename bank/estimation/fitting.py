@@ -34,7 +34,7 @@ from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.bank.estimation.regressors import later_origins
 from shearloop.bank.estimation.session_state import ProcessedFrame, SessionState
 from shearloop.bank.estimation.values import FrameSeries, Measured, TactileFrame, check_finite, distinct
-from shearloop.bank.estimators import EstimatorName, estimator_class
+from shearloop.bank.estimator_names import EstimatorName, estimator_class
 from shearloop.bank.gain import LOADED_SHARE, GainCorrection, ToolLaw, gains_of_recordings
 
 # With more variance left on a tool of another diameter, the tools have no torque in common.

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from shearloop.bank.eit.design import ALLOWED, Design, MeasuredFrames, design_bank
 from shearloop.bank.estimation.fingertip_validator import channel_noise, segment_grip
 from shearloop.bank.estimation.values import FrameSeries
+from shearloop.daemon.analysis.frame_series import read_series
 from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP
-from shearloop.daemon.analysis.series import read_series
 from shearloop.daemon.bank_config import FingertipGeometryConfig
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.errors import UserError

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from shearloop.bank.estimation import TRUSTED, Calibration, FrameSeries, LoadTiming, Physics, adapt, fit, measure_timing
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor
-from shearloop.bank.estimators import EstimatorName
+from shearloop.bank.estimator_names import EstimatorName
 from shearloop.bank.gain import GainCorrection
-from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, part_of, read_series, series_of
+from shearloop.daemon.analysis.frame_series import check_no_copies, check_paths_differ, part_of, read_series, series_of
 from shearloop.daemon.recording.reader import read_recording
 
 

@@ -14,7 +14,7 @@ from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.daemon.config import CurveConfig, DaemonConfig, SkinConfig
-    from shearloop.daemon.sensing.estimators import FrameEstimator
+    from shearloop.daemon.sensing.frame_estimator import FrameEstimator
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -80,7 +80,7 @@ def check_parts(config: "DaemonConfig", path: Path) -> Parts:
     from shearloop.daemon.cli.emulated_devices import check_emulators
     from shearloop.daemon.control.loop_inputs import TorqueSource
     from shearloop.daemon.rig import check_experiment
-    from shearloop.daemon.sensing.estimators import COMBINED, open_combined, open_estimator, torque_sources
+    from shearloop.daemon.sensing.frame_estimator import COMBINED, open_combined, open_estimator, torque_sources
 
     parts, estimators, combined = Parts(), {}, None
     with parts.of("emulators"):

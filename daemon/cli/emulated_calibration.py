@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from shearloop.bank.eit.build import build_bank
 from shearloop.bank.estimation import Calibration, FrameSeries, fit, measure_timing
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
+from shearloop.daemon.analysis.frame_series import series_of
 from shearloop.daemon.analysis.reproduce.banks import is_built
-from shearloop.daemon.analysis.series import series_of
 from shearloop.daemon.bank_config import load_bank_plan
 from shearloop.daemon.cli.options import checked_jobs, writing
 from shearloop.daemon.cli.terminal import progress_bar

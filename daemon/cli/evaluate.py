@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
         invalid_reasons,
         write_estimates,
     )
-    from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, part_of, read_series
+    from shearloop.daemon.analysis.frame_series import check_no_copies, check_paths_differ, part_of, read_series
     from shearloop.daemon.cli.options import check_kind, check_overwrite, load_calibration, parse_time_range
     from shearloop.daemon.executors import in_order, open_executor
 

@@ -129,15 +129,15 @@ def _export(args: argparse.Namespace) -> int:
         topics = [topic for topic in topics if not topic.startswith(f"{INPUT}.")]
     with progress_bar(form, sum(counts[topic] for topic in topics), "message") as progress, writing(out, "the export"):
         if form == "rrd":
-            from shearloop.daemon.recording.rerun import export_rerun
+            from shearloop.daemon.recording.rerun_export import export_rerun
 
             written = [export_rerun(path, out, topics, load_fingertip(args.fingertip), progress)]
         elif form == "lerobot":
-            from shearloop.daemon.recording.lerobot import export_lerobot
+            from shearloop.daemon.recording.lerobot_export import export_lerobot
 
             written = export_lerobot(path, out, topics, progress)
         elif form == "slices":
-            from shearloop.daemon.recording.matlab_slices import export_slices
+            from shearloop.daemon.recording.slice_export import export_slices
 
             written, missed = export_slices(path, out, topics, progress)
             for reason, count in missed.items():

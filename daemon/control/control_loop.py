@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from shearloop.daemon.control.controller import WristCommand
 from shearloop.daemon.control.experiment import (
     ACTIVE,
     Action,
@@ -43,6 +42,7 @@ from shearloop.daemon.control.loop_inputs import (
     TorqueSource,
 )
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDecision, SafetyMonitor
+from shearloop.daemon.control.twist_controller import WristCommand
 from shearloop.daemon.control.wrist_controller import WristController
 
 # An `adapt` step compares the fingertip with the torques of this time.

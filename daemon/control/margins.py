@@ -24,9 +24,9 @@ from numpy.polynomial.polynomial import polyadd, polyval
 from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.daemon.control.controller import ControllerSettings
 from shearloop.daemon.control.identification import ToolModel, window_means
 from shearloop.daemon.control.loop_inputs import LoopConfig
+from shearloop.daemon.control.twist_controller import ControllerSettings
 
 ComplexArray = NDArray[np.complex128]
 

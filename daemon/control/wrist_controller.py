@@ -3,7 +3,6 @@
 import math
 from collections import deque
 
-from shearloop.daemon.control.controller import LONGEST_STEP_NS, ControllerSettings, TwistController, WristCommand
 from shearloop.daemon.control.experiment import (
     ConstantVelocity,
     Hold,
@@ -15,6 +14,7 @@ from shearloop.daemon.control.experiment_schema import IdentifyStep
 from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.margins import gain_for_noise, integral_gain, margin_refusal
+from shearloop.daemon.control.twist_controller import LONGEST_STEP_NS, ControllerSettings, TwistController, WristCommand
 
 # Torques that wait for the next wrist angle.
 MOST_PENDING = 64

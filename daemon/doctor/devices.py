@@ -20,14 +20,14 @@ from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.stop_socket import send_to_stop_socket
 from shearloop.daemon.rig import make_gripper_client
-from shearloop.daemon.sensing.estimators import fingertip_table
+from shearloop.daemon.sensing.frame_estimator import fingertip_table
 from shearloop.daemon.serial_ports import access_error
 from shearloop.drivers.connection import SerialLink, find_port
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.messages import ActivationStatus
-from shearloop.drivers.ur.controller import query_controller, untested_sentence
+from shearloop.drivers.ur.control_box import query_controller, untested_sentence
 from shearloop.drivers.ur.settings import read_settings
 
 # A larger relative difference between measured and configured rate is reported.

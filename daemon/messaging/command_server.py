@@ -15,7 +15,7 @@ import structlog
 import zmq
 import zmq.asyncio
 
-from shearloop.daemon.messaging.connections import bind
+from shearloop.daemon.messaging.bound_sockets import bind
 from shearloop.daemon.messaging.keys import KeyPair, Refusals
 from shearloop.daemon.messaging.messages import decode, encode
 

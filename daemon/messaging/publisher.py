@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 import zmq
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.messaging.connections import bind
+from shearloop.daemon.messaging.bound_sockets import bind
 from shearloop.daemon.messaging.keys import KeyPair, Refusals
 from shearloop.daemon.messaging.messages import TOPICS, Message, encode, wire_map
 

@@ -32,7 +32,7 @@ from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import LoopState, Scalar
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.writer import PARTIAL, McapFile
-from shearloop.daemon.sensing.estimators import channel_table
+from shearloop.daemon.sensing.frame_estimator import channel_table
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 
 # A kill loses the data since the last flush, less than a second even on a busy computer.

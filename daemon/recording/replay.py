@@ -28,7 +28,6 @@ from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.reader import open_recording, reading
 from shearloop.daemon.rig import load_cell_calibration
-from shearloop.daemon.sensing.estimators import COMBINED, FrameEstimator, open_combined, open_estimator
 from shearloop.daemon.sensing.fingertip_task import (
     FramePairing,
     adapted_message,
@@ -36,6 +35,7 @@ from shearloop.daemon.sensing.fingertip_task import (
     frame_message,
     torques_from_bytes,
 )
+from shearloop.daemon.sensing.frame_estimator import COMBINED, FrameEstimator, open_combined, open_estimator
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
 from shearloop.daemon.sensing.skin_task import SKIN, RecordedSkin
 from shearloop.daemon.sensing.tool_diameter import tool_from_bytes

@@ -14,7 +14,7 @@ import rtde_control
 import script_client
 
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.ur.controller import (
+from shearloop.drivers.ur.control_box import (
     ProbeError,
     RtdeReceiver,
     SampleAge,

@@ -19,7 +19,7 @@ from typing import Any, Literal, cast
 from shearloop.drivers.connection import Diagnostics, LinkMonitor
 from shearloop.drivers.errors import DeviceLostError, ProtocolError
 from shearloop.drivers.ur import messages
-from shearloop.drivers.ur.controller import silent_sentence, untested_sentence
+from shearloop.drivers.ur.control_box import silent_sentence, untested_sentence
 from shearloop.drivers.ur.settings import UrSettings
 
 LossKind = messages.FailureKind | Literal["crashed", "hung", "garbled"]

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.controller import ProbeError, ask_dashboard, probe_controller, registers_in_use
+from shearloop.drivers.ur.control_box import ProbeError, ask_dashboard, probe_controller, registers_in_use
 from shearloop.drivers.ur.motion import why_unfit
 from shearloop.drivers.ur.settings import UrSettings
 

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
         fit,
     )
     from shearloop.daemon.analysis.evaluate import estimate_series, figures_by_load
-    from shearloop.daemon.analysis.series import read_series
+    from shearloop.daemon.analysis.frame_series import read_series
     from shearloop.daemon.cli.emulated_calibration import emulate_recordings
     from shearloop.daemon.messaging.client import Subscriber
     from shearloop.daemon.messaging.keys import ClientKeys
@@ -88,7 +88,7 @@ _HOMES = {
     "figures_by_load": "shearloop.daemon.analysis.evaluate:figures_by_load",
     "fit": "shearloop.bank.estimation:fit",
     "read": "shearloop.daemon.recording.tables:read",
-    "read_series": "shearloop.daemon.analysis.series:read_series",
+    "read_series": "shearloop.daemon.analysis.frame_series:read_series",
 }
 
 

@@ -43,7 +43,7 @@ def played(monkeypatch: pytest.MonkeyPatch, found: EstimateTrack) -> None:
     """Have every recording and every calibration give these estimates."""
     loaded = SimpleNamespace(sides=("right",), kind="raw")
     monkeypatch.setattr("shearloop.bank.estimation.Calibration.load", lambda _: loaded)
-    monkeypatch.setattr("shearloop.daemon.analysis.series.read_series", lambda *_: [found.series])
+    monkeypatch.setattr("shearloop.daemon.analysis.frame_series.read_series", lambda *_: [found.series])
     monkeypatch.setattr("shearloop.daemon.analysis.evaluate.estimate_series", lambda *_: found)
 
 

@@ -28,9 +28,9 @@ from shearloop.daemon.cli.bank import MODEL_NAMES
 from shearloop.daemon.cli.completion import full_parser
 from shearloop.daemon.cli.terminal import StatusLine, loop_line, message_json, message_line, table, task_row
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
-from shearloop.daemon.control.runner import WRENCH
+from shearloop.daemon.control.loop_runner import WRENCH
 from shearloop.daemon.messaging.messages import EitEstimate, RobotStateMessage, decode, encode, wire_map
-from shearloop.daemon.sensing.estimators import COMBINED
+from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from tests.daemon.sample_messages import sample
 

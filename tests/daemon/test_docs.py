@@ -13,7 +13,7 @@ import yaml
 
 import shearloop
 from shearloop.bank.eit.models import MODELS
-from shearloop.bank.estimators import ESTIMATORS
+from shearloop.bank.estimator_names import ESTIMATORS
 from shearloop.daemon.bank_config import load_bank_plan
 from shearloop.daemon.cli import COMMANDS
 from shearloop.daemon.cli.completion import full_parser

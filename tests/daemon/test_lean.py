@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from shearloop.daemon.control.runner import along_tool
+from shearloop.daemon.control.loop_runner import along_tool
 
 # Each costs tens of megabytes and tenths of a second, and none is needed to run.
 HEAVY = ("scipy.stats", "scipy.optimize", "scipy.spatial", "scipy.interpolate", "skfem", "numba", "matplotlib")

@@ -11,7 +11,7 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.build import build_bank
 from shearloop.bank.estimation import fit
 from shearloop.bank.estimation.estimator import Physics
-from shearloop.daemon.analysis.series import read_series
+from shearloop.daemon.analysis.frame_series import read_series
 from shearloop.daemon.bank_config import load_bank_plan
 from shearloop.daemon.cli.emulated_calibration import write_recordings
 from shearloop.daemon.recording.reader import read_recording

@@ -14,7 +14,7 @@ import zmq.asyncio
 
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
-from shearloop.daemon.sensing.estimators import FrameEstimator
+from shearloop.daemon.sensing.frame_estimator import FrameEstimator
 from tests.daemon.conftest import (
     DEADLINE_S,
     collector,

@@ -23,7 +23,7 @@ from shearloop.bank.estimation import (
 )
 from shearloop.bank.estimation.bank_match import ElectrodeNumbering
 from shearloop.bank.estimation.fingertip_validator import channel_noise
-from shearloop.bank.estimators import EstimatorName
+from shearloop.bank.estimator_names import EstimatorName
 from shearloop.daemon.analysis.bank_design import residual_noise
 from shearloop.daemon.analysis.charts.drawing import figure, look
 from shearloop.daemon.analysis.charts.sources import Split

@@ -16,11 +16,11 @@ from typing import Protocol
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.daemon.control.controller import ControllerSettings, TwistController, WristCommand
 from shearloop.daemon.control.experiment import TrackTorque
 from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
 from shearloop.daemon.control.margins import integral_gain
+from shearloop.daemon.control.twist_controller import ControllerSettings, TwistController, WristCommand
 from shearloop.daemon.control.wrist_controller import controller_settings
 from shearloop.daemon.run_summary import BAND, STAYS_S
 from shearloop.drivers.defaults import FRAME_PERIOD_S

@@ -12,8 +12,8 @@ from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.estimation import FrameSeries
+from shearloop.daemon.analysis.frame_series import part_of, read_series
 from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP, Grid, cached_bank
-from shearloop.daemon.analysis.series import part_of, read_series
 from shearloop.daemon.bank_config import FingertipGeometryConfig, load_geometry
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.synthetic_frames import Synthesiser, TwistProgramme

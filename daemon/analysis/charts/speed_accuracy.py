@@ -23,7 +23,7 @@ from shearloop.bank.estimation import Calibration, FrameSeries, Physics, fit, me
 from shearloop.bank.estimation.bank_match import NOT_TURNED, RefinedMatcher
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor, Ridge, fit_interval_regressor
 from shearloop.bank.estimation.regressors import ranked_channels
-from shearloop.bank.estimators import EstimatorName
+from shearloop.bank.estimator_names import EstimatorName
 from shearloop.daemon.analysis.charts import drawing
 from shearloop.daemon.analysis.charts.drawing import LINES, MARKS, SHADES
 from shearloop.daemon.analysis.charts.forward_methods import CELLS, SolvedForward, forward_methods

@@ -26,7 +26,7 @@ from shearloop.bank.estimation import (
     fit,
 )
 from shearloop.bank.estimation.bank_match import NOT_TURNED
-from shearloop.bank.estimators import EstimatorName
+from shearloop.bank.estimator_names import EstimatorName
 from shearloop.daemon.analysis.charts import skin_loop
 from shearloop.daemon.analysis.charts.drawing import figure, look, save, slug
 from shearloop.daemon.analysis.charts.fault_sweeps import (

@@ -14,7 +14,7 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.fingertip_validator import segment_grip
 from shearloop.bank.estimation.regressors import ranked_channels
 from shearloop.daemon.analysis.charts.drawing import figure
-from shearloop.daemon.analysis.series import series_of
+from shearloop.daemon.analysis.frame_series import series_of
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.matlab import Slices, find_streams, import_mat
 from shearloop.daemon.recording.reader import read_recording

@@ -22,7 +22,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.estimation import Calibration
     from shearloop.daemon.analysis.creep import fit_creep, grips_of
     from shearloop.daemon.analysis.evaluate import estimate_series
-    from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, read_series
+    from shearloop.daemon.analysis.frame_series import check_no_copies, check_paths_differ, read_series
     from shearloop.daemon.cli.options import check_kind
 
     check_paths_differ(args.recordings)

@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.bank.estimators import DEFAULT, ESTIMATORS
+from shearloop.bank.estimator_names import DEFAULT, ESTIMATORS
 from shearloop.daemon.cli.options import add_json, add_option, check_overwrite
 from shearloop.daemon.cli.terminal import print_result
 from shearloop.daemon.errors import UserError

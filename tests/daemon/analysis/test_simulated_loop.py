@@ -23,7 +23,7 @@ from shearloop.daemon.analysis.charts.simulated_loop import (
     settings_for,
     started_controller,
 )
-from shearloop.daemon.control.controller import WristCommand
+from shearloop.daemon.control.twist_controller import WristCommand
 
 
 class FixedSpeed:

@@ -3,7 +3,7 @@ from typing import Any
 
 import pytest
 
-from shearloop.daemon.control.controller import ControllerSettings, TwistController
+from shearloop.daemon.control.twist_controller import ControllerSettings, TwistController
 
 DEFAULTS: dict[str, Any] = {
     "stiffness_nm_per_rad": 0.25,

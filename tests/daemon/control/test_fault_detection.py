@@ -19,9 +19,9 @@ from shearloop.daemon.control.loop_inputs import (
     TorqueSample,
     TorqueSource,
 )
-from shearloop.daemon.control.runner import PUBLISH_EVERY, wrench_source
+from shearloop.daemon.control.loop_runner import PUBLISH_EVERY, wrench_source
 from shearloop.daemon.control.safety import TABLE, FaultCode, Response
-from shearloop.drivers.ur.controller import SampleAge
+from shearloop.drivers.ur.control_box import SampleAge
 
 EIT = TorqueSource(name="right", period_s=0.5412, window_s=0.5412)
 LOAD = TorqueSource(name="load_cell", period_s=1 / 10.9)

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shearloop.daemon.control.controller import ControllerSettings
 from shearloop.daemon.control.identification import ToolModel
 from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.control.margins import (
@@ -27,6 +26,7 @@ from shearloop.daemon.control.margins import (
     with_gain,
     wrist_response,
 )
+from shearloop.daemon.control.twist_controller import ControllerSettings
 
 from .conftest import DEFAULTS
 

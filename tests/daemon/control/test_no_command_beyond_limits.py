@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from shearloop.daemon.control.experiment import Action, ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, GripStep
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, TorqueSample
-from shearloop.daemon.control.runner import along_tool
+from shearloop.daemon.control.loop_runner import along_tool
 from shearloop.daemon.control.safety import Response
 from shearloop.drivers.emulators.scene import Twin, TwinSettings
 from shearloop.drivers.ur.command_handler import CommandHandler

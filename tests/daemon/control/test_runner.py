@@ -7,7 +7,7 @@ import pytest
 
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.runner import WRENCH
+from shearloop.daemon.control.loop_runner import WRENCH
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.messaging.messages import LoopStop
 from shearloop.drivers.ur.messages import MoveLinear, Stop, WristSpeed

@@ -9,7 +9,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.experiment import MoveToAngle, TrackTorque
 from shearloop.daemon.control.identification import ToolModel
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSample, TorqueSource
-from shearloop.daemon.control.runner import CommandSender
+from shearloop.daemon.control.loop_runner import CommandSender
 from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.control.wrist_controller import WristController
 from shearloop.drivers.ur.messages import Command, CommandReply, WristSpeed

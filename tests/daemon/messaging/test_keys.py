@@ -14,8 +14,8 @@ import zmq.asyncio
 from shearloop.daemon.cli import main
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import has_valid_port, is_local, needs_keys
+from shearloop.daemon.messaging.bound_sockets import bind
 from shearloop.daemon.messaging.client import Subscriber
-from shearloop.daemon.messaging.connections import bind
 from shearloop.daemon.messaging.keys import (
     ClientKeys,
     KeyPair,

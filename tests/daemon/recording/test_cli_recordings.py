@@ -12,7 +12,7 @@ from shearloop.bank.estimation import Calibration, Estimate, FrameSeries, fit
 from shearloop.bank.estimation.estimator import Estimator, OutputModel, Reading, Regression
 from shearloop.bank.estimation.interval_regressor import Ridge, fit_interval_regressor
 from shearloop.bank.estimation.load_delay import LoadDelay, LoadTiming
-from shearloop.bank.estimators import ESTIMATORS
+from shearloop.bank.estimator_names import ESTIMATORS
 from shearloop.daemon.analysis.calibrate import CalibrationResult
 from shearloop.daemon.analysis.evaluate import EstimateTrack, InvalidReason, draw_tracks, figures_of, invalid_reasons
 from shearloop.daemon.cli import main

@@ -7,7 +7,7 @@ from mcap.writer import Writer
 from scipy.io import savemat
 
 from shearloop.bank.eit.channels import PAPER_TABLE
-from shearloop.daemon.analysis.series import part_of, read_series, series_of
+from shearloop.daemon.analysis.frame_series import part_of, read_series, series_of
 from shearloop.daemon.config import RecordingConfig, load_daemon_config
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import schema

@@ -21,11 +21,11 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration, FrameSeries, fit, measure_timing
 from shearloop.bank.estimation.load_delay import find_load_delay, is_filtered, load_delay_warning
 from shearloop.bank.estimation.novelty import NoveltyDetector
-from shearloop.bank.estimators import EstimatorName
+from shearloop.bank.estimator_names import EstimatorName
 from shearloop.daemon.analysis.charts.fault_sweeps import balanced, judge_level
 from shearloop.daemon.analysis.charts.stability import select_rows
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
-from shearloop.daemon.analysis.series import part_of, read_series, series_of
+from shearloop.daemon.analysis.frame_series import part_of, read_series, series_of
 from shearloop.daemon.cli import main
 from shearloop.daemon.recording.matlab import find_streams, import_mat, read_stream
 from shearloop.daemon.recording.reader import read_recording

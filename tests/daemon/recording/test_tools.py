@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.estimation import Measured
-from shearloop.daemon.analysis.series import read_series, series_of
+from shearloop.daemon.analysis.frame_series import read_series, series_of
 from shearloop.daemon.cli import main
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.experiment_schema import ExperimentFile, WaitStep

@@ -13,7 +13,7 @@ from shearloop.bank.estimation import Calibration, Estimate, FrameSeries, fit
 from shearloop.daemon.cli.check import _torque
 from shearloop.daemon.config import CombinedConfig, FingertipConfig
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.sensing.estimators import FrameEstimator, open_combined, open_estimator
+from shearloop.daemon.sensing.frame_estimator import FrameEstimator, open_combined, open_estimator
 from shearloop.drivers.eit_kit import Frame
 from tests.bank.estimation.conftest import IDLE_S, PERIOD_S, series
 

@@ -9,7 +9,7 @@ import pytest
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.controller import ReceivedSample
+from shearloop.drivers.ur.control_box import ReceivedSample
 from shearloop.drivers.ur.settings import Bound, JointRange, UrLimits, UrSettings, Workspace
 
 LIMITS = UrLimits(

@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import pytest
 
-from shearloop.drivers.ur.controller import ProbeError, ReceivedSample
+from shearloop.drivers.ur.control_box import ProbeError, ReceivedSample
 from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
 from shearloop.drivers.ur.script import NO_MOTION_S
 from tests.drivers.ur.flight import SETTINGS, received

@@ -12,7 +12,7 @@ import pytest
 
 from shearloop.drivers.connection import LinkObserver
 from shearloop.drivers.ur.client import UrRobot
-from shearloop.drivers.ur.controller import ProbeError, probe_controller
+from shearloop.drivers.ur.control_box import ProbeError, probe_controller
 from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed, ZeroForceTorque
 from shearloop.drivers.ur.settings import InstalledTool
 from tests.drivers.ur.robots import ROOT, enable, pid_of, running, settings_for, until

@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.errors import ProtocolError
-from shearloop.drivers.ur import controller as receiver_module
-from shearloop.drivers.ur.controller import ProbeError, ReceivedSample, RtdeReceiver, SampleParser
+from shearloop.drivers.ur import control_box as receiver_module
+from shearloop.drivers.ur.control_box import ProbeError, ReceivedSample, RtdeReceiver, SampleParser
 
 TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,INT32,DOUBLE"
 TOOL_TYPES = TYPES + b",DOUBLE,VECTOR3D,VECTOR6D"

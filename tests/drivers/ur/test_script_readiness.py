@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from shearloop.drivers.ur import controller as ready_module
-from shearloop.drivers.ur.controller import ReceivedSample, ScriptReadiness
+from shearloop.drivers.ur import control_box as ready_module
+from shearloop.drivers.ur.control_box import ReceivedSample, ScriptReadiness
 from tests.drivers.ur.flight import received
 
 READY, DONE = 1, 2

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shearloop.daemon.control.controller import (
+from shearloop.daemon.control.loop_inputs import TorqueSample
+from shearloop.daemon.control.twist_controller import (
     AngleHistory,
     ControllerReason,
     JumpDetector,
     TwistController,
 )
-from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.errors import UserError
 
 from .conftest import Bench

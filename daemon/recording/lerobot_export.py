@@ -24,10 +24,12 @@ from shearloop.daemon.messaging.messages import (
     SkinShear,
 )
 from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.reader import Progress, open_recording, read_messages
+from shearloop.daemon.recording.reader import Progress, open_recording, read_messages, reading
 
 ROWS_PER_S = 25
 _PERIOD_NS = 10**9 // ROWS_PER_S
+# Experiments take hours.
+_LONGEST_NS = 24 * 3600 * 10**9
 # Rows that are written at once: a minute.
 _BATCH = 1500
 _FILE = "chunk-000/file-000.parquet"
@@ -126,13 +128,13 @@ def export_lerobot(path: Path, out: Path, topics: list[str], progress: Progress 
     require("pyarrow", "export", "a LeRobot dataset")
     with open_recording(path) as recording:
         attachments = recording.attachments()
-    held = {topic: _Held(topic, recording.table) for topic in topics if schema.schema_name(topic) in _FEATURES}
+        held = {topic: _Held(topic, recording.table) for topic in topics if schema.schema_name(topic) in _FEATURES}
+        configuration = json.loads(attachments.pop(schema.CONFIGURATION, b"null"))
     if not held:
         raise UserError(f"{path}: nothing to export; a dataset needs one of the topics {', '.join(_FEATURES)}")
     dataset = _Dataset(out, held)
     dataset.write_rows(path, progress)
     experiment = recording.metadata.get(schema.EXPERIMENT_METADATA, {}).get("name", "no experiment")
-    configuration = json.loads(attachments.pop(schema.CONFIGURATION, b"null"))
     about = {"recording": path.name, "identity": recording.identity, "configuration": configuration}
     return dataset.finish(experiment, about, attachments)
 
@@ -198,23 +200,27 @@ class _Dataset:
         waiting: list[_Waiting] = []
         now_ns = 0
         for number, (topic, content, message) in enumerate(read_messages(path, self._held, progress), start=1):
-            known_ns = max(message.publish_time, message.log_time, content.get("arrival_unix_ns") or 0)
-            heapq.heappush(waiting, (known_ns, number, topic, content, message.log_time))
             if number == 1:
                 now_ns = self._started_ns = message.log_time
+            with reading(path):
+                known_ns = max(message.publish_time, message.log_time, content.get("arrival_unix_ns") or 0)
+                if known_ns - self._started_ns > _LONGEST_NS:
+                    raise ValueError("its times span more than a day")
+            heapq.heappush(waiting, (known_ns, number, topic, content, message.log_time))
             while now_ns < message.log_time:
-                self._hold_until(now_ns, waiting)
+                self._hold_until(path, now_ns, waiting)
                 yield now_ns
                 now_ns += _PERIOD_NS
         while waiting:
-            self._hold_until(now_ns, waiting)
+            self._hold_until(path, now_ns, waiting)
             yield now_ns
             now_ns += _PERIOD_NS
 
-    def _hold_until(self, now_ns: int, waiting: list[_Waiting]) -> None:
+    def _hold_until(self, path: Path, now_ns: int, waiting: list[_Waiting]) -> None:
         while waiting and waiting[0][0] <= now_ns:
             _, _, topic, content, measured_ns = heapq.heappop(waiting)
-            self._held[topic].hold(content, measured_ns)
+            with reading(path):
+                self._held[topic].hold(content, measured_ns)
 
     def _table(self, rows: list[list[NDArray[np.float32]]]) -> Any:
         """Return a table of rows, and count them in the statistics."""

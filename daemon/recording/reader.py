@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+import zstandard
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
@@ -33,10 +34,11 @@ from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.writer import PARTIAL, new_writer
 from shearloop.daemon.sensing.tool_diameter import tool_from_bytes
 from shearloop.drivers.serial_sensor import InputKind
-from shearloop.files import replace_file
+from shearloop.files import open_file, replace_file
 
 Progress = Callable[[int], None]
-_LARGEST_RECORD_BYTES = 1 << 30
+# A recorder makes chunks of 16 MB and attaches files of up to 32 MB.
+_LARGEST_RECORD_BYTES = 64 << 20
 _BLOCK_BYTES = 1 << 20
 _NOTHING_INTACT = "it holds no intact message, so nothing can be saved"
 # Opcode and length, then the places of index and its offsets, and the index's checksum; or the data's checksum.
@@ -79,6 +81,16 @@ class OpenRecording:
         file.seek(0)
         _check_checksums(file)
         file.seek(0)
+        for record in StreamReader(file, emit_chunks=True, record_size_limit=_LARGEST_RECORD_BYTES).records:
+            match record:
+                case Chunk():
+                    _check_size(record)
+                # Names of files that an export makes.
+                case Channel(topic=name) if not name.isprintable() or "/" in name:
+                    raise ValueError(f"it has the topic {name[:40]!r}")
+                case Attachment(name=name) if not name.isprintable():
+                    raise ValueError(f"it has the attachment {name[:40]!r}")
+        file.seek(0)
         self._reader = make_reader(file, validate_crcs=True)
         summary = self._reader.get_summary()
         if summary is None or summary.statistics is None:
@@ -120,7 +132,7 @@ def reading(path: Path) -> Iterator[None]:
 @contextmanager
 def open_recording(path: Path) -> Iterator[OpenRecording]:
     """Open a closed recording of this version; raises UserError, also for errors while it is read in the block."""
-    with reading(path), path.open("rb") as file:
+    with reading(path), open_file(path) as file:
         check_magic(path, file)
         recording = OpenRecording(path, file)
         try:
@@ -198,6 +210,8 @@ def read_recording(path: str | Path) -> Recording:
                     tools.append((t_ns, tool_from_bytes(schema.input_event(content).data)[1]))
             except (KeyError, TypeError, ValueError) as error:
                 raise _unusable(path, f"a message on {topic} does not match its schema ({error!r})") from error
+    with reading(path):
+        side_frames = {side: _side_frames(rows) for side, rows in frames.items()}
     notes = {key: value for key, value in identity.items() if key not in _IDENTITY_KEYS}
     experiment = metadata.get(schema.EXPERIMENT_METADATA, {})
     if schema.DIAMETER_NOTE in experiment:
@@ -206,7 +220,7 @@ def read_recording(path: str | Path) -> Recording:
         path,
         notes.pop("source", ""),
         notes,
-        {side: _side_frames(rows) for side, rows in frames.items()},
+        side_frames,
         np.array([t for t, _ in torques], dtype=np.int64),
         np.array([torque for _, torque in torques], dtype=np.float64),
         tuple(tools),
@@ -244,6 +258,13 @@ def _check_checksums(file: IO[bytes]) -> None:
             raise ValueError(f"its {what} does not match its checksum")
 
 
+def _check_size(chunk: Chunk) -> None:
+    """Raise ValueError for a chunk that would fill the memory, or whose packed size is not known."""
+    size = max(chunk.uncompressed_size, zstandard.frame_content_size(chunk.data) if chunk.compression == "zstd" else 0)
+    if size > _LARGEST_RECORD_BYTES or chunk.compression not in ("", "zstd"):
+        raise ValueError(f"a chunk of {size >> 20} MB, packed by {chunk.compression or 'nothing'}")
+
+
 def _unusable(path: Path, reason: str) -> UserError:
     return UserError(
         f"{path}: this recording cannot be used: {reason}; record it again, or import it again with `shearloop import`"
@@ -270,7 +291,7 @@ class IntactRecords:
     def __iter__(self) -> Iterator[McapRecord]:
         """Read the file; raises UserError if it is missing or not MCAP."""
         try:
-            with self._path.open("rb") as file:
+            with open_file(self._path) as file:
                 self.size = os.fstat(file.fileno()).st_size
                 check_magic(self._path, file)
                 file.seek(0)
@@ -293,6 +314,7 @@ class IntactRecords:
     def _opened(self, chunk: Chunk) -> list[McapRecord]:
         """Return the records of a chunk, or nothing if it does not match its checksum."""
         try:
+            _check_size(chunk)
             return breakup_chunk(chunk, validate_crc=True)
         # zstandard raises a plain subclass of Exception.
         except Exception:  # noqa: BLE001
@@ -363,6 +385,8 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
             topics[name].rate_hz = (topics[name].messages - 1) / ((last_ns - first_ns) / 1e9)
     first_unix_ns = min((first_ns for first_ns, _ in spans.values()), default=None)
     ends = named.get(schema.END_METADATA, [])
+    with reading(path):
+        dropped = int(ends[-1].get("dropped", "0")) if ends else None
     metadata = named.get(schema.METADATA, [{}])[-1]
     experiments = named.get(schema.EXPERIMENT_METADATA, [])
     return RecordingSummary(
@@ -371,7 +395,7 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
         closed=records.closed,
         torn_bytes=records.torn_bytes,
         damaged_chunks=records.damaged_chunks,
-        dropped=int(ends[-1].get("dropped", "0")) if ends else None,
+        dropped=dropped,
         first_unix_ns=first_unix_ns,
         duration_s=0.0 if first_unix_ns is None else (max(last for _, last in spans.values()) - first_unix_ns) / 1e9,
         same_code=metadata.get("code_sha256") == schema.code_digest(),

@@ -100,7 +100,7 @@ class RecordedRun:
         with tempfile.TemporaryDirectory(prefix="shearloop-replay-") as folder:
             files: dict[str, str] = {}
             for number, (name, data) in enumerate(self._attached.items()):
-                copy = Path(folder) / f"{number}-{Path(name).name}"
+                copy = Path(folder) / f"{number}-{Path(name).name[-60:]}"
                 copy.write_bytes(data)
                 files[name] = str(copy)
 

@@ -1,7 +1,9 @@
 """What becomes of a recording whose bytes are spoilt or cut off: a sentence, or all that was in it."""
 
 import json
+import re
 import time
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,10 +11,13 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
 
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.daemon.cli import main
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.export import export
 from shearloop.daemon.recording.reader import read_recording, repair, summarise
 from shearloop.daemon.recording.recorder import AttachedFile, Identity, Recorder
@@ -148,3 +153,80 @@ def test_a_check_without_a_comparison_fails(config, imported, tmp_path, capsys):
     assert main(["replay", str(imported), *arguments]) == 0
     assert "Nothing was compared" in capsys.readouterr().err
     assert main(["replay", str(imported), *arguments, "--check"]) == 1
+
+
+LINE = [0.25] * PAPER_TABLE.n_line_values
+TORQUE = (schema.LOAD_TOPIC, {"torque_nm": 0.1})
+FRAME = ("eit.frame.right", {"line": LINE, "arrival_unix_ns": 10**18})
+
+
+def recorded(path, *messages, attachments=(), end=None, **options):
+    """Write a sound MCAP file with these messages, whatever they say."""
+    with path.open("wb") as file:
+        writer = Writer(file, **options)
+        writer.start("x")
+        writer.add_metadata(schema.METADATA, schema.basic_identity("a test"))
+        for name, data in attachments:
+            writer.add_attachment(1, 1, name, "x", data)
+        for number, (topic, content) in enumerate(messages):
+            data = content if isinstance(content, bytes) else json.dumps(content).encode()
+            t_ns = 10**18 + number * 10**9
+            writer.add_message(writer.register_channel(topic, "json", 0), t_ns, data, t_ns, number)
+        if end is not None:
+            writer.add_metadata(schema.END_METADATA, end)
+        writer.finish()
+    return path
+
+
+EVALUATE = ["evaluate", "config/calibrations/demo.cal", "{path}"]
+CSV, LEROBOT = (["recording", "export", "{path}", "--format", form, "--out", "{out}"] for form in ("csv", "lerobot"))
+REPLAY = ["replay", "{path}", "--speed", "max", "--publish", "{address}"]
+INFO = ["recording", "info", "{path}"]
+BARE = json.dumps(CONFIGURATION).encode()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "messages", "others", "problem"),
+    [
+        (EVALUATE, [(FRAME[0], {**FRAME[1], "arrival_unix_ns": 10**30})], {}, "too large"),
+        (EVALUATE, [(FRAME[0], {**FRAME[1], "line": ["x"] * len(LINE)})], {}, "could not convert"),
+        (INFO, [TORQUE], {"end": {"dropped": "abc"}}, "invalid literal"),
+        (CSV, [("eit.frame.a\0b", FRAME[1])], {}, r"it has the topic 'eit.frame.a\\x00b'"),
+        (CSV, [("eit.frame.../../x", FRAME[1])], {}, "it has the topic 'eit.frame.../../x'"),
+        (LEROBOT, [(FRAME[0], {**FRAME[1], "arrival_unix_ns": 10**30})], {}, "more than a day"),
+        (LEROBOT, [(FRAME[0], {**FRAME[1], "arrival_unix_ns": "noon"})], {}, "not supported between"),
+        (LEROBOT, [(FRAME[0], {**FRAME[1], "line": ["x"] * len(LINE)})], {}, "could not convert"),
+        (LEROBOT, [(FRAME[0], {})], {}, "KeyError"),
+        (LEROBOT, [("load.moment", {}), TORQUE], {}, "has no topic 'load.moment'"),
+        (LEROBOT, [TORQUE], {"attachments": [("a\0b", b"")]}, "it has the attachment"),
+        (LEROBOT, [TORQUE], {"attachments": [(schema.CONFIGURATION, b"[" * 100_000)]}, "recursion"),
+        (REPLAY, [TORQUE], {"attachments": [("a\0b", b""), (schema.CONFIGURATION, BARE)]}, "it has the attachment"),
+    ],
+)
+def test_a_sound_file_with_wrong_content_is_refused(arguments, messages, others, problem, tmp_path, capsys):
+    if arguments is LEROBOT:
+        pytest.importorskip("pyarrow")
+    path = recorded(tmp_path / "x.mcap", *messages, **others)
+    places = {"path": path, "address": f"ipc://{tmp_path}/replay", "out": tmp_path / "out"}
+    assert main([one.format(**places) for one in arguments]) == 2
+    said = capsys.readouterr().err
+    assert re.search(problem, said), said
+    assert str(path) in said
+
+
+def test_a_long_name_of_an_attachment_is_no_hindrance(tmp_path):
+    path = recorded(tmp_path / "x.mcap", TORQUE, attachments=[("a" * 3000, b""), (schema.CONFIGURATION, BARE)])
+    with RecordedRun(path).configuration() as config:
+        assert list(config.fingertips) == ["right"]
+
+
+@pytest.mark.parametrize("packed", [CompressionType.ZSTD, CompressionType.LZ4])
+def test_a_chunk_that_would_fill_the_memory_is_not_unpacked(packed, tmp_path):
+    blanks = b'{"torque_nm": 0.1' + b" " * (70 << 20) + b"}"
+    path = recorded(tmp_path / "x.mcap", (TORQUE[0], blanks), compression=packed, chunk_size=1 << 30)
+    tracemalloc.start()
+    with pytest.raises(UserError, match="a chunk of 70 MB, packed by"):
+        read_recording(path)
+    assert summarise(path).damaged_chunks == 1
+    assert tracemalloc.get_traced_memory()[1] < 16e6
+    tracemalloc.stop()

@@ -1,8 +1,6 @@
 """The geometry of a sensor: a triangle mesh whose boundary edges carry electrodes."""
 
 import hashlib
-import pickle
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,9 +12,13 @@ from scipy.sparse.csgraph import connected_components
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import GeometryError
+from shearloop.bank.matlab_file import Struct, read_variables
+from shearloop.files import open_file, refusing_damage
 
 # A triangle with a smaller area over its longest edge squared is an error of the mesh.
 _THINNEST = 1e-8
+_MOST_NODES = 1e9
+_FARTHEST_CM = 1e6
 # The unit of coordinates in the digest: far below any mesh size, far above rounding.
 _DIGEST_UNIT_CM = 1e-9
 
@@ -113,20 +115,19 @@ def load_mesh(path: str | Path) -> Mesh:
     Raises GeometryError, with the file's name, for a file that is missing, truncated, foreign or not of a fingertip.
     """
     path = Path(path)
-    try:
-        with path.open("rb") as file:
+    damage = "the file is truncated or damaged ({}); fetch it or save it again, from MATLAB with `save -v6`"
+    with refusing_damage(path, GeometryError, "the mesh", damage):
+        with open_file(path) as file:
             start = file.read(8)
-    except OSError as error:
-        raise GeometryError(f"{path}: the mesh cannot be read: {error.strerror}") from error
-    if start.startswith(b"PK"):
-        fields = _npz_fields(path)
-    elif start.startswith(b"MATLAB"):
-        fields = _eidors_fields(path)
-    else:
-        raise GeometryError(
-            f"{path} is not a mesh: expected an .npz file with the arrays {', '.join(_FIELDS)}, "
-            "or an EIDORS model saved from MATLAB or Octave with `save -v6`"
-        )
+        if start.startswith(b"PK"):
+            fields = _npz_fields(path)
+        elif start.startswith(b"MATLAB"):
+            fields = _eidors_fields(path)
+        else:
+            raise GeometryError(
+                f"{path} is not a mesh: expected an .npz file with the arrays {', '.join(_FIELDS)}, "
+                "or an EIDORS model saved from MATLAB or Octave with `save -v6`"
+            )
     try:
         return Mesh(**fields)
     except GeometryError as error:
@@ -137,47 +138,41 @@ _FIELDS = tuple(Mesh.__dataclass_fields__)
 
 
 def _npz_fields(path: Path) -> dict[str, Any]:
-    try:
-        # Opened here: numpy leaves a file open that is no archive.
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            missing = [name for name in _FIELDS if name not in archive.files]
-            if missing:
-                raise GeometryError(f"{path}: the mesh lacks {', '.join(missing)}; it has {', '.join(archive.files)}")
-            return {name: archive[name] for name in _FIELDS}
-    # The errors that numpy raises for truncated or damaged files.
-    except (zipfile.BadZipFile, OSError, ValueError, EOFError, KeyError, pickle.UnpicklingError) as error:
-        raise GeometryError(f"{path}: the file is truncated or damaged ({error}); fetch or save it again") from error
+    with open_file(path) as file, np.load(file, allow_pickle=False) as archive:
+        missing = [name for name in _FIELDS if name not in archive.files]
+        if missing:
+            raise GeometryError(f"{path}: the mesh lacks {', '.join(missing)}; it has {', '.join(archive.files)}")
+        return {name: archive[name] for name in _FIELDS}
 
 
 def _eidors_fields(path: Path) -> dict[str, Any]:
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
-
+    with open_file(path) as file:
+        models = read_variables(file.read()).get("mdl")
     try:
-        model: Any = loadmat(path, squeeze_me=True, struct_as_record=False, variable_names=["mdl"]).get("mdl")
-    # The errors that scipy's reader raises for a file that ends early.
-    except (MatReadError, OSError, ValueError, TypeError, IndexError, EOFError, NotImplementedError) as error:
-        raise GeometryError(
-            f"{path}: the EIDORS model is truncated, damaged or not of a MATLAB version before 7.3 ({error}); "
-            "save it again with `save -v6`"
-        ) from error
-    try:
-        electrodes = np.atleast_1d(model.electrode)
-        impedance = np.array([float(electrode.z_contact) for electrode in electrodes])
-        nodes = np.asarray(model.nodes, dtype=np.float64)
-        triangles = np.asarray(model.elems, dtype=np.int64) - 1
-        members = [np.atleast_1d(np.asarray(electrode.nodes, dtype=np.int64)) - 1 for electrode in electrodes]
-    except (AttributeError, TypeError, ValueError) as error:
+        [model] = models if isinstance(models, Struct) else []
+        electrodes: Any = model["electrode"]
+        impedance = np.array([np.asarray(one["z_contact"], np.float64).item() for one in electrodes])
+        nodes, triangles = np.asarray(model["nodes"], np.float64), _numbers(model["elems"])
+        members = [_numbers(one["nodes"]).ravel() for one in electrodes]
+    except (IndexError, KeyError, TypeError, ValueError) as error:
         raise GeometryError(
             f"{path}: expected an EIDORS forward model in the variable `mdl`, with nodes, elems and "
             f"electrode(…).nodes and .z_contact ({error})"
         ) from error
-    if triangles.ndim != 2 or triangles.shape[1] != 3:
+    if triangles.shape[1:] != (3,):
         raise GeometryError(f"{path}: the EIDORS model is not of triangles: elems has shape {triangles.shape}")
     # The boundary edges between an electrode's nodes are its own, as EIDORS reads them.
     boundary = boundary_edges(triangles)
     edges, of_edge = joined_edges([boundary[np.isin(boundary, own).all(axis=1)] for own in members])
     return dict(zip(_FIELDS, (nodes, triangles, edges, of_edge, impedance), strict=True))
+
+
+def _numbers(values: Any) -> IntArray:
+    """Return MATLAB's numbers of nodes, which begin with 1, as ours; raises ValueError for other numbers."""
+    found = np.asarray(values, np.float64)
+    if not (np.abs(found) < _MOST_NODES).all() or (found % 1).any():
+        raise ValueError("the number of a node is not whole")
+    return found.astype(np.int64) - 1
 
 
 def joined_edges(edges: list[IntArray]) -> tuple[IntArray, IntArray]:
@@ -199,8 +194,9 @@ def _array(values: ArrayLike, name: str, dtype: type, shape: tuple[int, ...]) ->
 
 
 def _check_nodes(mesh: Mesh) -> None:
-    if not np.isfinite(mesh.nodes).all():
-        raise GeometryError(f"node {int(np.flatnonzero(~np.isfinite(mesh.nodes).all(axis=1))[0])} is not finite")
+    near = (np.abs(mesh.nodes) < _FARTHEST_CM).all(axis=1)
+    if not near.all():
+        raise GeometryError(f"node {int(np.flatnonzero(~near)[0])} is not finite, or beyond {_FARTHEST_CM:g} cm")
     for name, array in (("triangles", mesh.triangles), ("electrode_edges", mesh.electrode_edges)):
         if array.min() < 0 or array.max() >= len(mesh.nodes):
             raise GeometryError(

@@ -1,17 +1,9 @@
-"""Reads the paper's MATLAB files (version 5 to 7.2) of slices, raw lines and streams; imports streams as a recording.
+"""Reads the paper's MATLAB files of slices, raw lines and streams; imports streams as a recording."""
 
-The format is MathWorks' "MAT-File Format" (level 5). scipy's reader trusts sizes and types in the file, so some damaged
-files end its process with a segmentation fault (docs/decisions/0040).
-"""
-
-import math
 import re
-import struct
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 from scipy.ndimage import minimum_filter1d
@@ -21,11 +13,13 @@ from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import FrameSeries
 from shearloop.bank.estimation.load_delay import measured_delay
 from shearloop.bank.estimation.values import LARGEST_TORQUE_NM
+from shearloop.bank.matlab_file import MatFileError, Variable, read_variables
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, LOAD_DOUBT, LOAD_DOUBT_NOTE, SIDES
 from shearloop.daemon.recording.writer import RecordingWriter
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import slope_below
+from shearloop.files import open_file
 
 # The recording scripts changed these names over time.
 _STREAMS = {
@@ -51,20 +45,6 @@ _ONE_LOOP_S = 0.02
 # A loop waited for its load values where this many end within this time of the line below all of them.
 _LEAST_PACED, _PACED_S = 3, 0.03
 _HDF5_SIGNATURE = b"\x89HDF"
-
-_HEADER_BYTES = 128
-_COMPRESSED, _MATRIX, _INT8, _INT32, _UINT32 = 15, 14, 1, 5, 6
-# The stored type of numbers is often narrower than their class.
-_STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-_NUMBER_CLASSES = range(6, 16)
-_OTHER_CLASSES = {1: "cell array", 2: "struct", 3: "object", 4: "text", 5: "sparse matrix", 16: "function"}
-_COMPLEX_FLAG = 0x0800
-# An hour of lines is 55 MB. A variable that unpacks to more than this is damaged.
-_LARGEST_VARIABLE_BYTES = 1 << 30
-
-
-# A matrix of real numbers, or the description of something else.
-Variable: TypeAlias = FloatArray | str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,7 +134,8 @@ def _read_slices(folder: Path, kind: str, pattern: re.Pattern[str], torque_name:
 
 def _load(path: Path) -> dict[str, Variable]:
     try:
-        content = path.read_bytes()
+        with open_file(path) as file:
+            content = file.read()
     except OSError as error:
         raise UserError(f"{path}: the recording cannot be read: {error.strerror}") from error
     if content.startswith(_HDF5_SIGNATURE) or content.startswith(b"MATLAB 7.3"):
@@ -176,7 +157,7 @@ def _one_of(path: Path, variables: dict[str, Variable], names: Sequence[str]) ->
         others = ", ".join(variables) or "no variable"
         raise UserError(f"{path} holds {others}, expected {' or '.join(names)}")
     values = variables[present[0]]
-    if isinstance(values, str):
+    if not isinstance(values, np.ndarray):
         raise UserError(f"{path}: {present[0]} is {values}, expected a matrix of real numbers")
     if not np.isfinite(values).all():
         raise UserError(f"{path}: {int((~np.isfinite(values)).sum())} values of {present[0]} are not finite numbers")
@@ -344,95 +325,3 @@ def _mat_files(sources: Sequence[Path]) -> list[Path]:
             raise UserError(f"{source} holds no .mat files; name the folder of one recording")
         found += inside
     return found
-
-
-class MatFileError(ValueError):
-    """The content is foreign, truncated or damaged."""
-
-
-def read_variables(content: bytes) -> dict[str, Variable]:
-    """Return the variables of a file's content by name, matrices as (rows, columns); raises only MatFileError."""
-    if len(content) < _HEADER_BYTES:
-        raise MatFileError(f"it ends after {len(content)} bytes, inside its header")
-    mark = content[126:128]
-    if mark not in (b"IM", b"MI"):
-        raise MatFileError(f"its byte order mark is {mark!r}, expected b'IM' or b'MI'")
-    order = "<" if mark == b"IM" else ">"
-    variables: dict[str, Variable] = {}
-    elements = _Elements(memoryview(content)[_HEADER_BYTES:], order, padded=False)
-    while elements.left:
-        kind, data = elements.next_element()
-        if kind == _COMPRESSED:
-            kind, data = _Elements(memoryview(_unpacked(data)), order).next_element()
-        if kind != _MATRIX:
-            raise MatFileError(f"it has an element of type {kind} where a variable is expected")
-        name, variable = _variable(_Elements(data, order))
-        if name in variables:
-            raise MatFileError(f"it has the variable {name!r} twice")
-        variables[name] = variable
-    return variables
-
-
-class _Elements:
-    """Reads consecutive elements; each has a type, a size and that many bytes."""
-
-    def __init__(self, data: memoryview, order: str, padded: bool = True) -> None:
-        self.left = data
-        self.order = order
-        self._padded = padded
-
-    def next_element(self) -> tuple[int, memoryview]:
-        """Return the type and the bytes of the next element."""
-        if len(self.left) < 8:
-            raise MatFileError("it ends inside an element's tag")
-        (first,) = struct.unpack_from(f"{self.order}I", self.left)
-        # A small element keeps up to four bytes in its tag, and their number in the tag's upper half.
-        kind, size, start = (first & 0xFFFF, first >> 16, 4) if first >> 16 else (first, -1, 8)
-        if start == 8:
-            (size,) = struct.unpack_from(f"{self.order}I", self.left, 4)
-        if size > (4 if start == 4 else len(self.left) - 8):
-            raise MatFileError(f"it has {len(self.left) - start} bytes where an element of {size} is expected")
-        data = self.left[start : start + size]
-        padding = -size % 8 if self._padded and start == 8 else 0
-        self.left = self.left[8 if start == 4 else start + size + padding :]
-        return kind, data
-
-    def numbers(self, kinds: dict[int, str]) -> FloatArray:
-        """Return the next element as numbers; `kinds` are the allowed types."""
-        kind, data = self.next_element()
-        if kind not in kinds:
-            raise MatFileError(f"it has an element of type {kind} where numbers are expected")
-        stored = np.dtype(f"{self.order}{kinds[kind]}")
-        if len(data) % stored.itemsize:
-            raise MatFileError(f"it has {len(data)} bytes for numbers of {stored.itemsize} bytes each")
-        return np.frombuffer(data, stored).astype(np.float64)
-
-
-def _variable(parts: _Elements) -> tuple[str, Variable]:
-    flags = parts.numbers({_UINT32: "u4"})
-    shape = tuple(map(int, parts.numbers({_INT32: "i4"})))
-    kind, name_bytes = parts.next_element()
-    if len(flags) != 2 or len(shape) < 2 or min(shape) < 0 or kind != _INT8 or not name_bytes.tobytes().isascii():
-        raise MatFileError("it has a variable without a proper class, shape and name")
-    name = name_bytes.tobytes().decode("ascii")
-    number_class, is_complex = int(flags[0]) & 0xFF, bool(int(flags[0]) & _COMPLEX_FLAG)
-    size = " × ".join(map(str, shape))
-    if number_class not in _NUMBER_CLASSES:
-        return name, f"{size} {_OTHER_CLASSES.get(number_class, f'of the unknown class {number_class}')}"
-    if is_complex or len(shape) != 2:
-        return name, f"{size} {'complex' if is_complex else 'real'} numbers"
-    values = parts.numbers(_STORED)
-    if len(values) != math.prod(shape):
-        raise MatFileError(f"{name} has {len(values)} numbers for a matrix of {size}")
-    return name, values.reshape(shape, order="F")
-
-
-def _unpacked(data: memoryview) -> bytes:
-    unpacker = zlib.decompressobj()
-    try:
-        unpacked = unpacker.decompress(data, _LARGEST_VARIABLE_BYTES)
-    except zlib.error as error:
-        raise MatFileError(f"a compressed variable does not unpack ({error})") from error
-    if not unpacker.eof:
-        raise MatFileError("a compressed variable is not complete")
-    return unpacked

@@ -1,6 +1,8 @@
 """Meshes: refusals, files, digest and refinement."""
 
 import io
+import os
+import re
 import zipfile
 from dataclasses import replace
 
@@ -152,3 +154,59 @@ def test_a_file_cut_off_anywhere_is_refused_by_name(tmp_path, fingertip, save):
         cut.write_bytes(io.BytesIO(whole).read(length))
         with pytest.raises(GeometryError, match="cut"):
             load_mesh(cut)
+
+
+def test_a_changed_model_of_eidors_is_refused_by_name_or_read(tmp_path, fingertip):
+    whole = save_eidors(tmp_path / "whole.mat", fingertip).read_bytes()
+    rng = np.random.default_rng(5)
+    path = tmp_path / "changed.mat"
+    for _ in range(300):
+        changed = bytearray(whole)
+        # Most of the rest is coordinates.
+        for at in rng.integers(128, rng.choice([600, len(whole)]), rng.integers(1, 5)):
+            changed[at] = rng.choice([0, 127, 255, rng.integers(256)])
+        path.write_bytes(changed)
+        error = None
+        try:
+            load_mesh(path)
+        except GeometryError as refused:
+            error = str(refused)
+        assert error is None or str(path) in error
+
+
+@pytest.mark.parametrize(
+    ("changed", "problem"),
+    [
+        ({"elems": np.full((5, 3), np.nan)}, "the number of a node is not whole"),
+        ({"elems": np.full((5, 3), 1.5)}, "the number of a node is not whole"),
+        ({"nodes": "text"}, "could not convert string to float"),
+        ({"electrode": {"nodes": np.ones((1, 2))}}, "'z_contact'"),
+        ({"electrode": 3.0}, "expected an EIDORS forward model"),
+    ],
+)
+def test_a_model_of_eidors_with_wrong_values_is_refused(changed, problem, tmp_path, fingertip):
+    with pytest.raises(GeometryError, match=rf"bad\.mat: .*{problem}"):
+        load_mesh(save_eidors(tmp_path / "bad.mat", fingertip, **changed))
+
+
+@pytest.mark.parametrize("damage", ["deflate", "header", "method", "pipe"])
+def test_damage_of_an_npz_file_is_refused_by_name(damage, tmp_path, fingertip):
+    path = tmp_path / "bad.npz"
+    np.savez_compressed(path, **{name: getattr(fingertip, name) for name in FIELDS})
+    content = bytearray(path.read_bytes())
+    if damage == "deflate":
+        content[120:200] = bytes(range(80))
+    if damage == "header":
+        whole = io.BytesIO()
+        np.savez(whole, **{name: getattr(fingertip, name) for name in FIELDS})
+        content = bytearray(whole.getvalue().replace(b"{'descr': ", b"{'descr: [("))
+    if damage == "method":
+        for at in (one.start() for one in re.finditer(b"PK\x01\x02", content)):
+            content[at + 10] = 99
+    path.unlink()
+    if damage == "pipe":
+        os.mkfifo(path)
+    else:
+        path.write_bytes(content)
+    with pytest.raises(GeometryError, match=r"bad\.npz: .*(truncated or damaged|a device or a pipe)"):
+        load_mesh(path)

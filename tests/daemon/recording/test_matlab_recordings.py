@@ -12,14 +12,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.io import loadmat, savemat
 
+from shearloop.bank.matlab_file import MatFileError, read_variables
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.matlab import (
-    MatFileError,
     read_diameter_slices,
     read_line,
     read_stream,
     read_torque_slices,
-    read_variables,
 )
 
 # 2024-12-03 16:09:38 on MATLAB's count of days.
@@ -128,6 +127,17 @@ def test_unusable_slices_are_refused(tmp_path):
         read_torque_slices(tmp_path)
 
 
+def test_structs_are_read_with_their_fields():
+    found = read_variables(saved({"x": {"a": 1.0, "long_name": {"b": np.eye(2)}}}))["x"]
+    assert str(found) == "1 structs"
+    assert found[0]["a"] == 1.0
+    np.testing.assert_array_equal(found[0]["long_name"][0]["b"], np.eye(2))
+
+
+def nested(depth: int) -> dict:
+    return {"x": nested(depth - 1)} if depth else {"x": 1.0}
+
+
 @pytest.mark.parametrize(
     ("content", "says"),
     [
@@ -231,7 +241,6 @@ def test_narrow_numbers_in_both_byte_orders(order):
     ("value", "what"),
     [
         ("text", "1 × 4 text"),
-        ({"a": 1.0}, "1 × 1 struct"),
         (np.array([["a", 1.0]], dtype=object), "1 × 2 cell array"),
         (np.ones((2, 3)) * 1j, "2 × 3 complex numbers"),
         (np.ones((2, 3, 4)), "2 × 3 × 4 real numbers"),
@@ -255,6 +264,7 @@ def test_other_kinds_of_variables_are_described(value, what):
         (written_by_hand("<", 8, bytes(8)), "element of type 8 where numbers are expected"),
         (written_by_hand("<", 3, bytes(8), (-2, -2)), "without a proper class, shape and name"),
         (written_by_hand("<", 3, bytes(8)) + written_by_hand("<", 3, bytes(8))[128:], "the variable 'x' twice"),
+        (saved({"x": nested(25)}), "too deep"),
         (saved({})[:128] + element(9, bytes(8), "<"), "element of type 9 where a variable is expected"),
         (saved({})[:128] + element(15, b"not packed", "<"), "does not unpack"),
         (saved({})[:128] + element(15, zlib.compress(bytes(100))[:-6], "<"), "is not complete"),

@@ -7,8 +7,11 @@ import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WithJsonSchema
 
 from shearloop.daemon.config_file import ConfigModel, either, not_of_kind
+from shearloop.yaml_files import shown
 
 MOST_ANGLES = 1000
+# Larger numbers have no differences.
+_LARGEST_WRITTEN = 1e9
 
 
 def _angles(given: object) -> object:
@@ -21,9 +24,11 @@ def _angles(given: object) -> object:
     try:
         start, stop, steps = float(parts[0]), float(parts[1]), int(parts[2])
     except (ValueError, IndexError):
-        raise ValueError(f"{given!r} is not START:STOP:STEPS, for example 1.45:1.65:10") from None
+        raise ValueError(f"{shown(given)} is not START:STOP:STEPS, for example 1.45:1.65:10") from None
+    if not abs(start) + abs(stop) < _LARGEST_WRITTEN:
+        raise ValueError(f"{shown(given)} must start and stop at an angle in rad")
     if len(parts) != 3 or not 2 <= steps <= MOST_ANGLES:
-        raise ValueError(f"{given!r} must have three parts, the last a number of steps from 2 to {MOST_ANGLES}")
+        raise ValueError(f"{shown(given)} must have three parts, the last a number of steps from 2 to {MOST_ANGLES}")
     return tuple(np.linspace(start, stop, steps).tolist())
 
 

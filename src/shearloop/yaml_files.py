@@ -21,6 +21,8 @@ from shearloop.files import replace_file
 Model = TypeVar("Model")
 
 _LONGEST_VALUE = 60
+# Of Linux.
+_LONGEST_NAME, _LONGEST_PATH = 255, 4096
 # Bounds on what a file may cost: its bytes, its values with every alias written out, and its mistakes that are shown.
 _MOST_BYTES, _MOST_VALUES, _MOST_MISTAKES = 1 << 17, 20_000, 100
 
@@ -93,6 +95,8 @@ def read_yaml(path: Path, raises: type[Exception], what: str = "configuration", 
 
 def _read(path: Path, raises: type[Exception], what: str, cure: str) -> tuple[Any, yaml.Node | None]:
     """Return the content of a YAML file, and the node with its line numbers."""
+    if "\0" in str(path) or len(path.name) > _LONGEST_NAME or len(str(path)) > _LONGEST_PATH:
+        raise raises(f"{shown(str(path))}: no {what} has such a name")
     try:
         status = path.stat()
         if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
@@ -224,11 +228,11 @@ def _mistakes(
     schema = TypeAdapter(model).json_schema()
     found: dict[str, int] = {}
     every = error.errors(include_url=False)
-    shown, more = every[:_MOST_MISTAKES], every[_MOST_MISTAKES:]
-    for details in shown:
+    first, more = every[:_MOST_MISTAKES], every[_MOST_MISTAKES:]
+    for details in first:
         location = details["loc"]
         # A list counts only its valid entries, so that mistakes within it make it too short as well.
-        if details["type"] == "too_short" and any(one["loc"][:-1][: len(location)] == location for one in shown):
+        if details["type"] == "too_short" and any(one["loc"][:-1][: len(location)] == location for one in first):
             continue
         kind, key, line = details["type"], "", 1
         if kind != "invalid_key":

@@ -14,6 +14,7 @@ from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.config_file import ConfigModel, load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.errors import UserError
+from shearloop.yaml_files import read_yaml
 
 
 class Inner(ConfigModel):
@@ -187,3 +188,10 @@ def test_a_step_of_no_kind_is_told_in_a_sentence(step, said, tmp_path):
     with pytest.raises(UserError) as caught:
         load_yaml_model(path, ExperimentFile)
     assert said in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["a\0b", "x" * 300, "x/" * 5000])
+def test_a_name_that_no_file_has_is_refused_in_short(name):
+    with pytest.raises(UserError, match="no experiment has such a name") as refused:
+        read_yaml(Path(name), UserError, "experiment")
+    assert len(str(refused.value)) < 100

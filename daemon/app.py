@@ -15,7 +15,7 @@ from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.messaging.command_server import CommandServer
-from shearloop.daemon.messaging.keys import CurveAuthenticator, Refusals, load_server_keys
+from shearloop.daemon.messaging.keys import ClientAuthenticator, Refusals, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import ending_signals
@@ -63,10 +63,9 @@ class Daemon:
             keys = load_server_keys(config.curve.server_key) if config.curve is not None else None
             refusals = Refusals()
             # It must exist before a socket is bound.
-            authenticator: CurveAuthenticator | None = None
-            if config.curve is not None and config.network_addresses:
-                authenticator = CurveAuthenticator(context, config.curve.clients, refusals)
-                opened.callback(authenticator.close)
+            clients = config.curve.clients if config.curve is not None and config.network_addresses else None
+            authenticator = ClientAuthenticator(context, clients, refusals)
+            opened.callback(authenticator.close)
             self.publisher = opened.enter_context(contextlib.closing(Publisher(context, config.publish, clock, keys)))
             self.publisher.add_listener(self._summary)
             self.recorder: Recorder | None = None
@@ -91,7 +90,7 @@ class Daemon:
             **(self._rig.tasks() if self._rig is not None else {}),
             "experiment": self._experiment,
             "recording": RecordingTask(self.recorder, self._rig) if self.recorder is not None else None,
-            "keys": authenticator,
+            "clients": authenticator,
             "commands": server,
             "stop": stop_socket,
             "publish": self.publisher,

@@ -18,7 +18,7 @@ import zmq.asyncio
 
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import LARGEST_PORT, has_valid_port, is_local, network_refusal, probe
-from shearloop.daemon.messaging.keys import KeyPair, Refusals
+from shearloop.daemon.messaging.keys import ZAP_DOMAIN, KeyPair, Refusals
 
 # Clients of one socket. Each takes a descriptor and some 50 kB.
 MAX_CONNECTIONS, MIN_CONNECTIONS = 256, 16
@@ -66,6 +66,8 @@ class Connections:
         self._limit = most_connections(resource.getrlimit(resource.RLIMIT_NOFILE)[0])
         self._open: set[int] = set()
         self._full = False
+        # With a domain, libzmq asks the authenticator about each new client.
+        bound.setsockopt(zmq.ZAP_DOMAIN, ZAP_DOMAIN.encode())
         for option, value in _OPTIONS.items():
             bound.setsockopt(option, value)
         monitor = f"inproc://connections-{next(_MONITORS)}"

@@ -8,7 +8,6 @@ import asyncio
 import time
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import structlog
@@ -16,7 +15,7 @@ import zmq
 import zmq.asyncio
 
 from shearloop.daemon.messaging.bound_sockets import bind
-from shearloop.daemon.messaging.keys import KeyPair, Refusals
+from shearloop.daemon.messaging.keys import KeyPair, Refusals, TokenBucket
 from shearloop.daemon.messaging.messages import decode, encode
 
 LARGEST_REQUEST_BYTES = 64 * 1024
@@ -36,28 +35,6 @@ Handler: TypeAlias = Callable[[Request], Awaitable[Reply]]
 
 class CommandRefusedError(Exception):
     """A command is refused; the message is the reason that the operator reads."""
-
-
-@dataclass(slots=True)
-class TokenBucket:
-    """Allows `burst` requests at once and `per_s` requests per second on average."""
-
-    burst: float
-    per_s: float
-    used: float = 0.0
-    updated_ns: int = 0
-
-    def has_token(self, t_ns: int) -> bool:
-        """Return whether a token is left at monotonic time t_ns."""
-        self.used = max(0.0, self.used - self.per_s * (t_ns - self.updated_ns) / 1e9)
-        self.updated_ns = t_ns
-        return self.used <= self.burst - 1.0
-
-    def allow(self, t_ns: int) -> bool:
-        """Use one token at monotonic time t_ns; return False if no token is left."""
-        allowed = self.has_token(t_ns)
-        self.used += allowed
-        return allowed
 
 
 class RateLimit:

@@ -4,8 +4,10 @@ Key files have the format of `zmq.auth` (ZeroMQ RFC 26): `NAME.key` holds the pu
 folder of the allowed clients' `.key` files is read again for each new connection.
 """
 
+import asyncio
 import os
 import struct
+import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -24,7 +26,9 @@ from shearloop.daemon.errors import UserError
 
 # The unit's `SetCredential` gives this value until the server key exists.
 _NO_CREDENTIAL = "none"
-_DOMAIN = "shearloop"
+ZAP_DOMAIN = "shearloop"
+# New clients that are admitted at once, and then per second.
+NEW_BURST, NEW_PER_S = 50.0, 50.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +40,6 @@ class KeyPair:
 
     def apply(self, socket: "zmq.Socket[Any]") -> None:
         """Make an unbound socket a CURVE server that asks the authenticator about each client."""
-        socket.setsockopt(zmq.ZAP_DOMAIN, _DOMAIN.encode())
         # Without an authenticator, libzmq accepts every client by default.
         socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
         socket.setsockopt(zmq.CURVE_SERVER, 1)
@@ -165,35 +168,60 @@ class Refusals:
         return {"errors": dict(self.counts)}
 
 
-class CurveAuthenticator:
-    """Accepts clients with allowed keys and counts the others (ZAP, ZeroMQ RFC 27).
+@dataclass(slots=True)
+class TokenBucket:
+    """Allows `burst` requests at once and `per_s` requests per second on average."""
 
-    It must exist before a socket is bound.
+    burst: float
+    per_s: float
+    used: float = 0.0
+    updated_ns: int = 0
+
+    def has_token(self, t_ns: int) -> bool:
+        """Return whether a token is left at monotonic time t_ns."""
+        self.used = max(0.0, self.used - self.per_s * (t_ns - self.updated_ns) / 1e9)
+        self.updated_ns = t_ns
+        return self.used <= self.burst - 1.0
+
+    def allow(self, t_ns: int) -> bool:
+        """Use one token at monotonic time t_ns; return False if no token is left."""
+        allowed = self.has_token(t_ns)
+        self.used += allowed
+        return allowed
+
+
+class ClientAuthenticator:
+    """Admits new clients at a bounded rate, those of a network address by their keys (ZAP, ZeroMQ RFC 27).
+
+    libzmq makes the event loop's thread work for each new client, but asks here first. It must exist before a socket
+    is bound.
     """
 
-    def __init__(self, context: "zmq.Context[Any]", clients: Path, refusals: Refusals) -> None:
+    def __init__(self, context: "zmq.Context[Any]", clients: Path | None, refusals: Refusals) -> None:
         """Raise UserError if the folder `clients` is unreadable or empty."""
-        check_allowed_clients(clients)
         self._clients = clients
-        self.refused = refusals.counts
+        self._refusals = refusals
+        self._new = TokenBucket(NEW_BURST, NEW_PER_S)
         self._authenticator = Authenticator(context)
-        self._authenticator.configure_curve_callback(_DOMAIN, self)
+        if clients is not None:
+            check_allowed_clients(clients)
+            self._authenticator.configure_curve_callback(ZAP_DOMAIN, self)
         self._authenticator.start()
 
     def callback(self, _domain: str, key: bytes) -> bool:
         """Return whether a client with this public key may connect; pyzmq's authenticator calls it."""
         log = structlog.get_logger()
         try:
-            name = allowed_clients(self._clients).get(key)
+            name = allowed_clients(self._clients).get(key) if self._clients is not None else None
         except UserError as error:
-            self.refused["allow-list cannot be read"] += 1
+            self._refusals.counts["allow-list cannot be read"] += 1
             log.warning("client refused", reason=str(error))
             return False
         if name is not None:
             log.info("client accepted", client=name)
             return True
-        self.refused["key is not allowed"] += 1
-        if self.refused["key is not allowed"] == 1:
+        self._refusals.counts["key is not allowed"] += 1
+        if self._refusals.counts["key is not allowed"] == 1:
             log.warning("client refused: its key is not in the allow-list", key=key.decode())
         return False
 
@@ -201,7 +229,16 @@ class CurveAuthenticator:
         """Answer libzmq's authentication requests until cancelled."""
         requests = zmq.asyncio.Socket.from_socket(self._authenticator.zap_socket)
         while True:
-            await self._authenticator.handle_zap_message(await requests.recv_multipart())
+            request = await requests.recv_multipart()
+            if self._new.allow(time.monotonic_ns()):
+                await self._authenticator.handle_zap_message(request)
+            else:
+                reason = f"more than {NEW_PER_S:g} clients a second connect; others wait"
+                self._refusals.add("too many new clients", reason, frequent=True)
+                # A temporary failure: the client tries again.
+                await requests.send_multipart([b"1.0", request[1], b"300", b"", b"", b""])
+            # Requests that have already arrived do not yield to other tasks.
+            await asyncio.sleep(0)
 
     def close(self) -> None:
         """Stop; no client can connect any more."""

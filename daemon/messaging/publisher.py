@@ -1,10 +1,12 @@
 """The publisher: sends messages over ZeroMQ and passes them to listeners in this process."""
 
+import asyncio
 from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
 import zmq
+import zmq.asyncio
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.bound_sockets import bind
@@ -13,15 +15,15 @@ from shearloop.daemon.messaging.messages import TOPICS, Message, encode, wire_ma
 
 # Messages kept for a slow subscriber. It loses later ones; others are not delayed.
 HIGH_WATER_MARK = 1000
-# A subscription is a topic's beginning, after about 300 bytes of CURVE handshake. Longer ones end the connection.
-LARGEST_SUBSCRIPTION_BYTES = 512
-# A client that subscribes to more topics that do not exist is disconnected. libzmq keeps some 40 bytes of memory for
-# each byte of a subscription.
+# A subscription is a topic's beginning, after 25 bytes of handshake or 300 with CURVE. Longer ones end the connection.
+LARGEST_SUBSCRIPTION_BYTES, LARGEST_WITH_KEYS_BYTES = 64, 512
+# A client that subscribes to one more topic that does not exist is disconnected. libzmq keeps every subscription, and
+# walks through each byte of all of them for each client that disconnects.
 MAX_UNKNOWN_TOPICS = 16
 # The last messages may wait this long for their subscribers.
 LINGER_MS = 200
 # Subscriptions read at a time, so that a subscriber that keeps changing them cannot block the publisher.
-SUBSCRIPTIONS_AT_ONCE = 100
+SUBSCRIPTIONS_AT_ONCE = 8
 Listener: TypeAlias = Callable[[str, dict[str, Any]], None]
 
 
@@ -38,12 +40,13 @@ class Publisher:
         self._listeners: list[Listener] = []
         # Topic beginnings that have subscribers.
         self._prefixes: tuple[bytes, ...] = ()
-        # Unknown topics of each client, by its descriptor.
-        self._unknown: Counter[int] = Counter()
+        # Topics that do not exist and have subscribers.
+        self._unknown: set[bytes] = set()
         self._refusals = Refusals()
         # An XPUB socket is a PUB socket that also receives the subscriptions.
         self._socket: zmq.Socket[bytes] = zmq.Socket(context, zmq.XPUB)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_SUBSCRIPTION_BYTES)
+        largest = LARGEST_SUBSCRIPTION_BYTES if keys is None else LARGEST_WITH_KEYS_BYTES
+        self._socket.setsockopt(zmq.MAXMSGSIZE, largest)
         self._socket.setsockopt(zmq.SNDHWM, HIGH_WATER_MARK)
         self._socket.setsockopt(zmq.RCVHWM, SUBSCRIPTIONS_AT_ONCE)
         # Every subscription is passed on, even if another client has the same.
@@ -52,8 +55,15 @@ class Publisher:
         self._connections = bind(context, self._socket, address, "publish", self._refusals, keys)
 
     async def run(self) -> None:
-        """Bound the number of subscribers until cancelled."""
-        await self._connections.run()
+        """Bound the number of subscribers and of their topics until cancelled."""
+        arrived = zmq.asyncio.Socket.from_socket(self._socket)
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._connections.run())
+            while True:
+                await arrived.poll()
+                self._read_subscriptions()
+                # Subscriptions that have already arrived do not yield to other tasks.
+                await asyncio.sleep(0)
 
     def diagnostics(self) -> Mapping[str, Mapping[str, int]]:
         """Return the refused subscribers for `health`."""
@@ -102,17 +112,12 @@ class Publisher:
             kind, prefix = message.bytes[:1], message.bytes[1:]
             if kind == b"\x00":
                 self._prefixes = tuple(one for one in self._prefixes if one != prefix)
-            elif not any(topic.encode().startswith(prefix) for topic in TOPICS):
-                self._refuse(message.get(zmq.SRCFD))
-            elif kind == b"\x01" and prefix not in self._prefixes:
-                self._prefixes = (*self._prefixes, prefix)
-
-    def _refuse(self, client: int) -> None:
-        """Count an unknown topic of a client, and disconnect the client after too many."""
-        self._unknown[client] += 1
-        if self._unknown[client] >= MAX_UNKNOWN_TOPICS:
-            del self._unknown[client]
-            # Some of its subscriptions may still come after its end.
-            if self._connections.disconnect(client):
-                reason = f"a subscriber was disconnected: it asked for {MAX_UNKNOWN_TOPICS} topics that do not exist"
-                self._refusals.add("too many unknown topics", reason, frequent=True)
+                self._unknown.discard(prefix)
+            elif kind == b"\x01" and any(topic.encode().startswith(prefix) for topic in TOPICS):
+                self._prefixes = tuple({*self._prefixes, prefix})
+            elif kind == b"\x01":
+                self._unknown.add(prefix)
+                # Some of its subscriptions may still come after its end.
+                if len(self._unknown) > MAX_UNKNOWN_TOPICS and self._connections.disconnect(message.get(zmq.SRCFD)):
+                    reason = f"a subscriber was disconnected: there are {MAX_UNKNOWN_TOPICS} topics without messages"
+                    self._refusals.add("too many unknown topics", reason, frequent=True)

@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator
 from contextlib import ExitStack, asynccontextmanager, closing, suppress
 
 import pytest
+import zmq
 import zmq.asyncio
 from hypothesis import given
 from hypothesis import strategies as st
@@ -24,7 +25,7 @@ from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import encode
 from shearloop.daemon.messaging.stop_socket import StopSocket, send_to_stop_socket, stop_name
 from shearloop.daemon.process import MAX_DESCRIPTORS
-from tests.daemon.conftest import DEADLINE_S
+from tests.daemon.conftest import DEADLINE_S, running_daemon
 from tests.daemon.web.test_with_keys import free_port
 
 DESCRIPTORS, CONNECTIONS = 512, 1200
@@ -169,3 +170,31 @@ def send_garbage(name: bytes, flooding: threading.Event) -> None:
         while flooding.is_set():
             with suppress(OSError):
                 client.sendto(b"\x81" * 1000, name)
+
+
+async def test_clients_with_topics_that_do_not_exist_do_not_hold_the_daemon(config):
+    address, gaps_s = f"tcp://127.0.0.1:{free_port()}", []
+    async with running_daemon(config(publish=address)) as daemon:
+        code = f"from {__name__} import subscribe_and_leave; subscribe_and_leave({address!r})"
+        process = await asyncio.create_subprocess_exec(sys.executable, "-c", code)
+        attack = asyncio.create_task(process.wait())
+        while not attack.done() or daemon.publisher._unknown:
+            begun_s = time.monotonic()
+            await asyncio.sleep(0.01)
+            gaps_s.append(time.monotonic() - begun_s)
+        assert attack.result() == 0
+        assert daemon.publisher.diagnostics()["errors"]["too many unknown topics"] >= 1
+        assert daemon.health.tasks()["commands"]["errors"]["too many new clients"] >= 1
+    assert max(gaps_s) < 1.0
+
+
+def subscribe_and_leave(address: str) -> None:
+    """Connect many subscribers at once, each with some long topics that do not exist, and close them at once."""
+    with zmq.Context() as context, ExitStack() as stack:
+        for number in range(250):
+            client = stack.enter_context(context.socket(zmq.SUB))
+            client.setsockopt(zmq.LINGER, 0)
+            client.connect(address)
+            for topic in range(15):
+                client.subscribe(f"{number:03}{topic:02}" + 45 * "y")
+        time.sleep(2.0)

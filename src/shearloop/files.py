@@ -52,8 +52,8 @@ def refusing_damage(path: Path, raises: type[Exception], what: str, damage: str,
     except OSError as error:
         raise raises(f"{path}: {what} cannot be read: {error.strerror or error}{missing}") from error
     except Exception as error:
-        detail = (repr(error) if isinstance(error, KeyError) or not str(error) else str(error))[:_LONGEST_DETAIL]
-        raise raises(f"{path}: {damage.replace('{}', detail)}") from error
+        detail = " ".join((repr(error) if isinstance(error, KeyError) else str(error) or repr(error)).split())
+        raise raises(f"{path}: {damage.replace('{}', detail[:_LONGEST_DETAIL])}") from error
 
 
 def open_file(path: Path) -> BinaryIO:

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from shearloop.daemon.cli.options import add_connection, add_option, client_keys
-from shearloop.daemon.cli.terminal import loop_line, table, task_row
+from shearloop.daemon.cli.options import add_connection, add_option, check_timeout_s, client_keys
 from shearloop.daemon.messaging import addresses
 
 COMMANDS = {
@@ -50,10 +49,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Send one command and print its reply; status 1 if the daemon refused it."""
-
-    from shearloop.daemon.messaging.client import check_timeout_s, send_command
-    from shearloop.daemon.messaging.stop_socket import send_to_stop_socket
-
     arguments = {} if args.source is None else {"source": args.source}
     if args.experiment is not None:
         # The daemon may run in another folder.
@@ -63,17 +58,20 @@ def run(args: argparse.Namespace) -> int:
     if args.name in ("stop", "status") and args.key is None and not addresses.needs_keys(address):
         # These two need no key on the daemon's own machine.
         try:
-            reply = send_to_stop_socket(address, request, timeout_s)
+            reply = addresses.send_to_stop_socket(address, request, timeout_s)
         except TimeoutError:
             # The daemon may have stopped the motion by now. A second `stop` must not end the daemon.
             request["spare_daemon"] = True
     else:
         keys = client_keys(args)
-    if args.name == "unlock" and args.timeout is None:
-        # A missing daemon is reported without the long timeout.
-        send_command(address, {"command": "status"}, addresses.COMMAND_TIMEOUT_S, keys)
-        timeout_s = addresses.UNLOCK_TIMEOUT_S
     if reply is None:
+        # It imports too much for a `stop` on a busy computer.
+        from shearloop.daemon.messaging.client import send_command
+
+        if args.name == "unlock" and args.timeout is None:
+            # A missing daemon is reported without the long timeout.
+            send_command(address, {"command": "status"}, addresses.COMMAND_TIMEOUT_S, keys)
+            timeout_s = addresses.UNLOCK_TIMEOUT_S
         reply = send_command(address, request, timeout_s, keys)
     accepted = bool(reply.pop("ok", False))
     if args.json:
@@ -88,6 +86,8 @@ def run(args: argparse.Namespace) -> int:
 def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
     """Return an accepted reply as text: of `status` the experiment, and the tasks as a table."""
     if name == "status":
+        from shearloop.daemon.cli.terminal import loop_line, table, task_row
+
         rows = [task_row(task, facts) for task, facts in reply["tasks"].items()]
         loop = [loop_line("", reply["loop"]), ""] if "loop" in reply else []
         return [*loop, *table(("task", "state", "rate", "notes"), rows)]

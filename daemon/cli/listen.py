@@ -3,7 +3,7 @@
 import argparse
 import sys
 
-from shearloop.daemon.cli.options import add_connection, add_option, client_keys
+from shearloop.daemon.cli.options import add_connection, add_option, check_timeout_s, client_keys
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.process import interrupt_status
@@ -32,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print messages until Ctrl-C, or up to `--count`."""
     from shearloop.daemon.cli.terminal import message_json, message_line
-    from shearloop.daemon.messaging.client import QUIET_S, check_timeout_s, receive_messages
+    from shearloop.daemon.messaging.client import QUIET_S, receive_messages
     from shearloop.daemon.messaging.messages import TOPICS
 
     known = {*TOPICS, *(topic.partition(".")[0] for topic in TOPICS)}

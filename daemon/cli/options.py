@@ -23,6 +23,7 @@ PAPERS_RECORDINGS = (
 )
 # Longer than the 124 characters of text at the start of a MATLAB file.
 _HEAD_BYTES = 512
+LONGEST_TIMEOUT_S = 86_400
 
 
 def add_option(
@@ -77,6 +78,13 @@ def load_fingertip(path: Path | None) -> "Fingertip":
 
     with resources.as_file(resources.files("shearloop.daemon.web") / "assets" / "fingertip.yaml") as paper:
         return load_yaml_model(path or paper, FingertipGeometryConfig).fingertip()
+
+
+def check_timeout_s(timeout_s: float) -> float:
+    """Return the value of --timeout; raises UserError if it is out of range."""
+    if not 0 < timeout_s <= LONGEST_TIMEOUT_S:
+        raise UserError(f"--timeout {timeout_s:g} is out of range; give seconds above 0, up to {LONGEST_TIMEOUT_S}")
+    return timeout_s
 
 
 def user_key_folder() -> Path:

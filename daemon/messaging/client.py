@@ -13,7 +13,6 @@ from shearloop.daemon.messaging.messages import ENVELOPE, decode, encode
 
 # A running daemon sends `health` every second.
 QUIET_S = 3.0
-LONGEST_TIMEOUT_S = 86_400
 
 
 class Subscriber:
@@ -175,13 +174,6 @@ def connect(socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = N
         raise UserError(
             f"{address!r} is not an address ({error.strerror}); it looks like tcp://127.0.0.1:7761"
         ) from error
-
-
-def check_timeout_s(timeout_s: float) -> float:
-    """Return the value of --timeout; raises UserError if it is out of range."""
-    if not 0 < timeout_s <= LONGEST_TIMEOUT_S:
-        raise UserError(f"--timeout {timeout_s:g} is out of range; give seconds above 0, up to {LONGEST_TIMEOUT_S}")
-    return timeout_s
 
 
 def keys_hint(keys: ClientKeys | None) -> str:

@@ -12,20 +12,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.client import decode_reply
+from shearloop.daemon.messaging.addresses import stop_name
 from shearloop.daemon.messaging.command_server import Handler, Reply, RequestExecutor
 from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import encode
 
 LARGEST_DATAGRAM_BYTES = 1024
-# Of the path; a whole name has at most 107 bytes (unix(7)).
-_NAME_BYTES = 80
-_LARGEST_REPLY_BYTES = 1 << 18
-
-
-def stop_name(address: str) -> bytes:
-    """Return the abstract name of the stop socket of a daemon, by the port or the path of its `commands`."""
-    return b"\0shearloop-stop-" + os.fsencode(address.rpartition(":")[2])[-_NAME_BYTES:]
 
 
 class StopSocket:
@@ -69,20 +61,3 @@ class StopSocket:
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
-
-
-def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any] | None:
-    """Send `stop` or `status` to the local daemon with this command address; return its reply, None without a daemon.
-
-    Raises TimeoutError if no reply comes in time.
-    """
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
-        client.settimeout(timeout_s)
-        # The kernel chooses an abstract name.
-        client.bind("")
-        try:
-            # Without `connect`, after which only the bound socket itself could reply.
-            client.sendto(encode(content), stop_name(address))
-        except ConnectionError:
-            return None
-        return decode_reply(client.recv(_LARGEST_REPLY_BYTES), address)

@@ -18,12 +18,13 @@ from hypothesis import strategies as st
 
 from shearloop.daemon.cli import main
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.addresses import send_to_stop_socket, stop_name
 from shearloop.daemon.messaging.bound_sockets import MAX_CONNECTIONS, RESERVED_DESCRIPTORS, most_connections
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer, Reply, Request
 from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import encode
-from shearloop.daemon.messaging.stop_socket import StopSocket, send_to_stop_socket, stop_name
+from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import MAX_DESCRIPTORS
 from tests.daemon.conftest import DEADLINE_S, running_daemon
 from tests.daemon.web.test_with_keys import free_port

@@ -240,7 +240,7 @@ def _sha256(array: NDArray[Any]) -> str:
 
 
 def _cure(path: Path) -> str:
-    return f"build it with `shearloop bank build --config FILE --out {path}`"
+    return f"build it with `shearloop bank build --config FILE --out {path}`, from a FILE such as banks/paper.yaml"
 
 
 def _unusable(path: Path, why: str) -> BankFileError:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from shearloop.bank.estimation import TRUSTED, Calibration, FrameSeries, LoadTiming, Physics, adapt, fit, measure_timing
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor
+from shearloop.bank.estimation.values import Measured, distinct
 from shearloop.bank.estimator_names import EstimatorName
 from shearloop.bank.gain import GainCorrection
 from shearloop.daemon.analysis.frame_series import check_no_copies, check_paths_differ, part_of, read_series, series_of
@@ -31,12 +32,13 @@ class CalibrationOptions:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationResult:
-    """A calibration, the number of frames behind it, the load cell's timing, and named doubts about it."""
+    """A calibration, the number of frames behind it, the load cell's timing, named doubts about it, and the tools."""
 
     calibration: Calibration
     frames: int
     timing: LoadTiming = TRUSTED
     doubts: Sequence[str] = ()
+    tools: Sequence[Measured] = ()
 
     @property
     def regressor(self) -> IntervalRegressor | None:
@@ -118,7 +120,8 @@ def calibrate(
     named = [*((path.name, one) for path, one in chosen), *others]
     warned = [each for each in zip(timing.references, timing.warnings, strict=True) if each[1]]
     doubts = [f"{name}: {why}" for name, one in named for reference, why in warned if one is reference]
-    return CalibrationResult(calibration, sum(len(one.t_s) for one in parts), timing, doubts)
+    tools = distinct([one.tool_mm for one in parts if one.tool_mm is not None])
+    return CalibrationResult(calibration, sum(len(one.t_s) for one in parts), timing, doubts, tools)
 
 
 def adapt_to_recordings(

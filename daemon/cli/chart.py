@@ -46,7 +46,8 @@ def run(args: argparse.Namespace) -> int:
     parts = splits(args.recordings, args.split, scratch)
     with open_executor(args.cluster, args.jobs) as executor:
         if args.name == "scene":
-            paths = scene.chart(parts, args.out, executor)
+            # The synthetic stream's single frames are too noisy to design a bank by.
+            paths = scene.chart(parts if args.recordings else parts[:1], args.out, executor)
         else:
             mesh = mesh_of(args.mesh)
             bank = bank_of(args.bank, mesh, scratch)

@@ -15,6 +15,7 @@ from shearloop.daemon.cli import bank, init
 from shearloop.daemon.cli import run as run_command
 from shearloop.daemon.cli.options import add_option, writing
 from shearloop.daemon.errors import missing
+from shearloop.daemon.process import interrupt_status
 
 if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig
@@ -38,26 +39,30 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Prepare the folder, then run the daemon and its page."""
-    from shearloop.daemon.config import load_daemon_config
-    from shearloop.daemon.rig import robot_settings
-
     folder = args.folder / "config"
     files = init.packaged_files()
     init.write_files(folder, {path: content for path, content in files.items() if not (folder / path).exists()})
+    if args.prepare:
+        try:
+            _prepare(folder, args.folder / "run", calibrated=args.recording is None)
+        except KeyboardInterrupt as interrupt:
+            # Ctrl-C reaches the demo that started this process too, and one sentence is enough.
+            return interrupt_status(interrupt)
+        return 0
+    from shearloop.daemon.config import load_daemon_config
+    from shearloop.daemon.rig import robot_settings
+
     name = "demo.yaml" if args.recording is None else "fingertip_demo.yaml"
     played = [] if args.recording is None else ["--recording", str(args.recording)]
     config = load_daemon_config(folder / name)
-    if config.robot is not None and not args.prepare:
-        # Without the robot's library nothing needs to be built.
+    # Mistakes are found before anything is built and served.
+    if config.robot is not None:
         robot_settings(config.robot)
-    if args.recording is not None and not args.prepare:
+    if args.recording is not None:
         from shearloop.daemon.recording.matlab import read_stream
 
-        # Before anything is built and served.
         read_stream(args.recording)
-    if args.prepare:
-        _prepare(folder, args.folder / "run", calibrated=args.recording is None)
-        return 0
+    print("The demo starts …", flush=True)
     # In a process of its own: the daemon would keep the memory of the fits.
     command = [sys.executable, "-m", "shearloop", "demo", "--prepare", "--folder", str(args.folder)]
     if status := subprocess.call([*command, *played]):
@@ -75,7 +80,8 @@ def _prepare(config: Path, data: Path, *, calibrated: bool) -> None:
         data.mkdir(exist_ok=True)
     definition, signals = config / "banks" / "demo.yaml", data / "demo.bank"
     if not is_built(signals, load_bank_plan(definition).definition):
-        print(f"The first time, a bank and calibrations are made in {data}, in about half a minute.", flush=True)
+        duration = "half a minute, or a few minutes on a busy computer"
+        print(f"The first time, a bank and calibrations are made in {data}: {duration}.", flush=True)
         _call(bank, "build", "--config", str(definition), "--out", str(signals))
     if calibrated and not _is_calibrated(data, signals):
         from shearloop.daemon.cli.emulated_calibration import calibrate_rig

@@ -120,7 +120,7 @@ def _lines(columns: "Mapping[str, Figures]") -> list[str]:
     rows = [
         (name, *(_shown(group[name]) if name in group else "" for group in columns.values()), meaning)
         for name, meaning in _MEANINGS.items()
-        if any(name in group for group in columns.values())
+        if any(group.get(name) is not None for group in columns.values())
     ]
     return table(("figure", *columns, "meaning"), rows)
 

@@ -61,6 +61,8 @@ def _run(args: argparse.Namespace, out: "NonBlockingWriter", on_ready: Callable[
     from shearloop.daemon.cli import EXIT_OK, EXIT_UNFINISHED
     from shearloop.daemon.cli.emulated_devices import EmulatedDevices
     from shearloop.daemon.cli.terminal import EstimatePrinter, StatusLine
+    from shearloop.daemon.messaging.keys import Refusals
+    from shearloop.daemon.messaging.stop_socket import StopSocket
     from shearloop.daemon.process import lock_memory, raise_descriptor_limit, raise_priority
     from shearloop.daemon.run_summary import RunSummary
 
@@ -71,13 +73,23 @@ def _run(args: argparse.Namespace, out: "NonBlockingWriter", on_ready: Callable[
     if config.robot is not None:
         # Without permission the loop still detects late commands and holds the wrist.
         raise_priority()
+    if config.emulators:
+        # A second daemon is refused before its emulators find their ports taken.
+        StopSocket(config.commands, {}, Refusals()).close()
     with ExitStack() as stack:
         emulated = stack.enter_context(EmulatedDevices(config.emulators, args.config.parent, args.recording))
         listeners: list[Listener] = [emulated]
         if args.show:
             listeners.append(stack.enter_context(StatusLine(out)) if terminal else EstimatePrinter(out))
         shown = out if args.show or config.recording is not None else None
-        finished = asyncio.run(run_daemon(config, tuple(listeners), on_ready, RunSummary(shown, emulated)))
+        # If the daemon ends with its experiment, the summary comes after all that it logs.
+        at_end = shown if config.stop_when_done else None
+        summary = RunSummary(None if at_end else shown, emulated)
+        try:
+            finished = asyncio.run(run_daemon(config, tuple(listeners), on_ready, summary))
+        finally:
+            if at_end and summary.text:
+                at_end.write(f"\n{summary.text}\n\n")
     return EXIT_OK if finished else EXIT_UNFINISHED
 
 

@@ -195,14 +195,16 @@ def _shear(_: str, content: Mapping[str, Any]) -> str:
 
 
 def loop_line(_: str, content: Mapping[str, Any]) -> str:
-    """Return phase, step, activity, progress, and the reasons for holding."""
+    """Return phase, progress, the reasons for holding or the stop, step, and activity."""
     if not content["experiment"]:
         return f"{content['phase']}: {content['reasons']}" if content["reasons"] else str(content["phase"])
     step = f"step {content['step']} of {content['steps']} {content['step_name']}"
-    percent = "" if content["phase"] == "stopped" else f" {100 * content['progress']:.0f} %"
-    activity = content["activity"] or content["experiment"]
-    reasons = f": {content['reasons']}" if content["reasons"] and content["reasons"] != activity else ""
-    return f"{content['phase']}{percent}  {step}  {activity}{reasons}"
+    activity, stopped = content["activity"] or content["experiment"], content["phase"] == "stopped"
+    percent = "" if stopped else f" {100 * content['progress']:.0f} %"
+    # A narrow terminal cuts the end.
+    reasons = activity if stopped else content["reasons"]
+    parts = (f"{content['phase']}{percent}{f': {reasons}' if reasons else ''}", step, activity)
+    return "  ".join(parts[:2] if activity == reasons else parts)
 
 
 def _health(_: str, content: Mapping[str, Any]) -> str:

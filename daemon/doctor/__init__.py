@@ -131,16 +131,17 @@ def check_ports() -> Finding:
 
 def check_files(config: DaemonConfig, path: Path, geometry: Path | None) -> Iterator[Finding]:
     """Check every file of the configuration in `path`; `geometry` is the fingertip that its bank must match."""
-    for name, fingertip in config.fingertips.items():
-        yield check_bank(name, fingertip, geometry)
+    banks = [check_bank(name, fingertip, geometry) for name, fingertip in config.fingertips.items()]
+    yield from banks
     parts = check_parts(config, path)
     for name, text in parts.texts.items():
         if name != "keys":
             yield good(f"files of {name}", text)
     for name, mistake in parts.mistakes.items():
-        if name != "keys":
-            finding = from_file if "\n" in mistake else from_error
-            yield finding(f"files of {name}", mistake, "the daemon does not start")
+        kind = from_file if "\n" in mistake else from_error
+        finding = kind(f"files of {name}", mistake, "the daemon does not start")
+        if name != "keys" and finding.found not in [one.found for one in banks]:
+            yield finding
     yield check_keys(config.curve, config.network_addresses)
 
 
@@ -152,7 +153,7 @@ def check_bank(name: str, fingertip: FingertipConfig, geometry: Path | None = No
     try:
         bank = Bank.open(fingertip.bank, verify=True)
     except BankError as error:
-        return from_error(subject, error, "no frame can be matched")
+        return from_error(subject, error, "no frame can be matched, and the daemon does not start")
     found = (
         f"{fingertip.bank} is intact, {int(bank.valid.sum())} of {bank.valid.size} cells valid, channel table "
         f"{bank.table.digest[:12]} with {bank.table.n_channels} channels, geometry {bank.geometry_hash[:12]}"

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 from io import StringIO
 from pathlib import Path
 from typing import Any, NoReturn
@@ -29,7 +30,10 @@ from shearloop.daemon.cli.completion import full_parser
 from shearloop.daemon.cli.terminal import StatusLine, loop_line, message_json, message_line, table, task_row
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.loop_runner import WRENCH
+from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import EitEstimate, RobotStateMessage, decode, encode, wire_map
+from shearloop.daemon.messaging.stop_socket import StopSocket
+from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from tests.daemon.sample_messages import sample
@@ -345,7 +349,36 @@ def test_the_status_line_is_redrawn_in_place(monkeypatch):
     line("eit.estimate", {"source": "right", "timestamp": 0.0, "valid": False, "reason": "no grip"})
     assert "eit.estimate  right     no estimat…" in narrow.getvalue(), "without a robot there is no state of the loop"
     stopped = {**state, "phase": "stopped", "activity": "the operator stopped it"}
-    assert loop_line("loop.state", stopped) == "stopped  step 2 of 3 grip  the operator stopped it"
+    assert loop_line("loop.state", stopped) == "stopped: the operator stopped it  step 2 of 3 grip"
+    held = {**state, "phase": "held", "activity": "closing", "reasons": "no estimate"}
+    assert loop_line("loop.state", held) == "held 50 %: no estimate  step 2 of 3 grip  closing", (
+        "what is cut matters less"
+    )
+
+
+def test_a_second_daemon_is_refused_before_its_emulators_start(config, tmp_path, monkeypatch, mistake):
+    monkeypatch.setattr("shearloop.daemon.cli.emulated_devices.subprocess.Popen", Mock(side_effect=AssertionError))
+    path = str(config(emulators=[{"device": "hx711", "arguments": ["--link", "load"]}]))
+    with closing(StopSocket(f"ipc://{tmp_path}/commands", {}, Refusals())):
+        assert "is another daemon running? Stop it, or choose another port" in mistake("run", path)
+
+
+def test_the_summary_of_a_run_that_ends_with_its_experiment_comes_last(config, monkeypatch, capsys):
+    at_once: list[bool] = []
+
+    async def run_daemon(_config: object, _listeners: object, _on_ready: object, summary: RunSummary) -> bool:
+        summary._add("What happened: nothing.")
+        at_once.append(summary._out is not None)
+        return True
+
+    monkeypatch.setattr("shearloop.daemon.app.run_daemon", run_daemon)
+    path = config()
+    for ends in (False, True):
+        loaded = load_daemon_config(path).model_copy(update={"stop_when_done": ends})
+        monkeypatch.setattr("shearloop.daemon.cli.run._config", lambda _, loaded=loaded: loaded)
+        assert main(["run", str(path), "--show"]) == 0
+        assert capsys.readouterr().out == "\nWhat happened: nothing.\n\n"
+    assert at_once == [True, False]
 
 
 def test_invalid_emulators_and_recordings_are_refused_before_the_start(config, tmp_path, mistake):

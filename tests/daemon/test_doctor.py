@@ -139,6 +139,14 @@ def test_a_bank_of_another_geometry_is_reported(config):
     assert doctor.check_bank("right", fingertip, Path("no.yaml")).state == "trouble"
 
 
+def test_a_missing_bank_is_reported_once_for_each_fingertip(config, tmp_path):
+    path = config(fingertips={"right": {"device": {"path": "eit"}, "bank": "no.bank"}})
+    findings = list(doctor.check_files(load_daemon_config(path), path, None))
+    (wrong,) = (one for one in findings if one.state == "trouble")
+    assert wrong.subject == "bank of right"
+    assert wrong.next_step.endswith(f"--out {tmp_path}/no.bank`, from a FILE such as banks/paper.yaml")
+
+
 def test_an_experiment_that_check_refuses_is_wrong(config, tmp_path):
     steps = "[{do: hold_torque, torque_nm: 0.1}, {do: grip}]"
     (tmp_path / "one.yaml").write_text(f"name: one\nsteps: {steps}\n")

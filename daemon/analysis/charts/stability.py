@@ -1,5 +1,6 @@
 """`shearloop chart stability`: estimators under faults, checks of slices, the rim of the bank, the loop on the skin."""
 
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -71,7 +72,8 @@ def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Pa
     """Measure, draw and write a chart per recording, the checks of slices, the bank's rim, and the loop on the skin."""
     physics, written = Physics(bank, mesh), []
     names = {"raw": STREAM_NAMES, "difference": SLICE_NAMES}
-    for split in parts:
+    for number, split in enumerate(parts, start=1):
+        _report(f"{split.title} ({number} of {len(parts)})")
         curves = sweeps(split, names[split.past.kind], physics, bank, executor)
         if split.past.kind == "raw":
             curves += misaligned(split, STREAM_NAMES, physics, SHIFTS_S)
@@ -82,10 +84,16 @@ def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Pa
         written += _written(f"stability-{slug(split.title)}", split.title, curves, out)
         if split.past.kind == "difference":
             written += _of_slices(split, bank, mesh, out, executor)
+    _report("the rim of the bank")
     synthetic = next(one for one in splits([], 0.6, scratch) if one.past.kind == "difference")
     curves = list(sweep_rims(fitted(synthetic, SLICE_NAMES, physics), bank, scratch))
     written += _written("stability-rims", "the rim of the bank, on synthetic slices", curves, out)
+    _report("the loop on the skin")
     return written + skin_loop.chart(out, executor)
+
+
+def _report(part: str) -> None:
+    print(f"shearloop chart: measuring {part}, which may take minutes", file=sys.stderr, flush=True)
 
 
 def _of_slices(split: Split, bank: Bank, mesh: Mesh, out: Path, executor: Executor) -> list[Path]:

@@ -102,10 +102,10 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
         sentences.append(_misses_loads(regressor, calibration))
     if regressor is not None and result.reads_beyond is False:
         sentences.append(_range_ends(regressor))
-    known = ", ".join(f"{one.delay_s:.2f}" for one in timing.delays if one is not None)
+    known = [f"{abs(one.delay_s):.2f} s {'before' if one.delay_s < 0 else 'after'}" for one in timing.delays if one]
     if known:
         probably = "probably " if timing.uncertainty_s else ""
-        sentences.append(f"The load is {probably}stamped {known} s after the frames move.")
+        sentences.append(f"The load is {probably}stamped {', '.join(known)} the frames move.")
     sentences += [f"Warning: {doubt}." for doubt in result.doubts]
     if result.widening is not None:
         sentences.append(
@@ -119,6 +119,11 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
             sentences.append(f"The tool's diameter is {result.tool_mm:.3g} mm.")
         elif (law := calibration.tools) is not None:
             sentences.append(f"The tools' diameters are {law.low_mm:.3g} to {law.high_mm:.3g} mm.")
+        elif result.tools:
+            named = " and ".join(f"{one.value:.3g}" for one in result.tools)
+            sentences.append(f"The tools of {named} mm have the torque in common.")
+            if calibration.diameter is None:
+                sentences.append("Diameters are not estimated: that takes recordings of three.")
         else:
             unnamed = "The recordings do not name one tool's diameter, and on another tool the torque would be wrong"
             sentences.append(f"{unnamed}: name it with --tool-mm.")

@@ -12,11 +12,13 @@ from shearloop.bank.estimation import Calibration, Estimate, FrameSeries, fit
 from shearloop.bank.estimation.estimator import Estimator, OutputModel, Reading, Regression
 from shearloop.bank.estimation.interval_regressor import Ridge, fit_interval_regressor
 from shearloop.bank.estimation.load_delay import LoadDelay, LoadTiming
+from shearloop.bank.estimation.values import Measured
 from shearloop.bank.estimator_names import ESTIMATORS
 from shearloop.daemon.analysis.calibrate import CalibrationResult
 from shearloop.daemon.analysis.evaluate import EstimateTrack, InvalidReason, draw_tracks, figures_of, invalid_reasons
 from shearloop.daemon.cli import main
 from shearloop.daemon.cli.calibrate.recording import sentences_of
+from shearloop.daemon.cli.evaluate import _lines
 
 KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "interval_nm", "valid_fraction", "frames"}
 KEYS |= {"latency_ms_p50", "latency_ms_p99", "winkler_nm", "zero_rmse_nm", "loaded", "unloaded"}
@@ -267,22 +269,26 @@ def test_known_diameters_have_figures_of_their_own():
     assert figures["diameter_interval_mm"] == pytest.approx(11.5)
     without = figures_of([EstimateTrack(series, tuple(4 * refused), np.ones(4))])
     assert without["interval_nm"] is without["diameter_interval_mm"] is None
+    assert not any(line.startswith("diameter_interval_mm") for line in _lines({"all": without}))
 
 
-@pytest.mark.parametrize("unsure_s", [0.0, 0.4])
-def test_a_time_that_could_not_be_checked_is_told_as_probable(unsure_s):
+@pytest.mark.parametrize(("unsure_s", "delay_s", "told"), [(0.0, -0.16, "0.16 s before"), (0.4, 0.16, "0.16 s after")])
+def test_a_time_that_could_not_be_checked_is_told_as_probable(unsure_s, delay_s, told):
     t = np.arange(4.0)
     series = FrameSeries("raw", ("right",), t, np.zeros((4, 1, 896)), t, np.zeros(4), np.full(4, np.nan))
-    found = LoadDelay(delay_s=0.16, error_s=0.2, explained=0.5)
+    found = LoadDelay(delay_s=delay_s, error_s=0.2, explained=0.5)
     ramp = np.linspace(0.0, 1.0, 20)
     regressor = replace(fit_interval_regressor(ramp[:, None], ramp, Ridge.fit), timing_widening=1.9)
     model = OutputModel(regressor, None, np.zeros(0))
     calibration = Calibration(Regression(np.ones((1, 896))), "raw", ("right",), "ramp", "", torque=model)
     result = CalibrationResult(calibration, 4, LoadTiming([series], [found], [""], unsure_s))
     _, late, *sentences, _ = sentences_of(result)
-    assert late == f"The load is {'probably ' if unsure_s else ''}stamped 0.16 s after the frames move."
+    assert late == f"The load is {'probably ' if unsure_s else ''}stamped {told} the frames move."
     assert ("widening" in result.figures()) == bool(unsure_s) == bool(sentences)
     assert all("so the intervals are wider, for loads 1.9 times. Record more" in one for one in sentences)
+    *_, common, few = sentences_of(replace(result, tools=[Measured(15.0, 0.0), Measured(30.0, 0.0)]))
+    assert common == "The tools of 15 and 30 mm have the torque in common."
+    assert few == "Diameters are not estimated: that takes recordings of three."
 
 
 @pytest.mark.usefixtures("fonts")

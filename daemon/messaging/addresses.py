@@ -13,6 +13,8 @@ from urllib.parse import urlsplit
 
 import msgpack
 
+from shearloop.daemon.errors import UserError
+
 PUBLISH_ADDRESS = "tcp://127.0.0.1:7761"
 COMMAND_ADDRESS = "tcp://127.0.0.1:7762"
 LARGEST_PORT = 65535
@@ -83,7 +85,7 @@ def stop_name(address: str) -> bytes:
 def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any] | None:
     """Send `stop` or `status` to the local daemon with this command address; return its reply, None without a daemon.
 
-    Raises TimeoutError if no reply comes in time.
+    Raises TimeoutError if no reply comes in time, and UserError for a reply of another program.
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
         client.settimeout(timeout_s)
@@ -96,11 +98,15 @@ def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: flo
             return None
         data = client.recv(_LARGEST_REPLY_BYTES)
     try:
-        reply = msgpack.unpackb(data)
-    except ValueError:
-        reply = None
-    if isinstance(reply, dict):
-        return reply
-    from shearloop.daemon.messaging.client import decode_reply
+        # It has no arrays, for which `messages.decode` imports numpy.
+        return dict(msgpack.unpackb(data))
+    except (TypeError, ValueError) as error:
+        raise foreign_reply(address, error) from error
 
-    return decode_reply(data, address)
+
+def foreign_reply(address: str, error: Exception) -> UserError:
+    """Return the error for a reply of another program."""
+    return UserError(
+        f"the program at {address} is not a shearloop daemon ({error}); give the address of the daemon's "
+        "`commands` key with --connect"
+    )

@@ -7,7 +7,13 @@ import zmq
 import zmq.asyncio
 
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.addresses import LARGEST_PORT, PUBLISH_ADDRESS, has_valid_port, needs_keys
+from shearloop.daemon.messaging.addresses import (
+    LARGEST_PORT,
+    PUBLISH_ADDRESS,
+    foreign_reply,
+    has_valid_port,
+    needs_keys,
+)
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.messages import ENVELOPE, decode, encode
 
@@ -149,10 +155,7 @@ def decode_reply(data: bytes, address: str) -> dict[str, Any]:
     try:
         return decode(data)
     except ValueError as error:
-        raise UserError(
-            f"the program at {address} is not a shearloop daemon ({error}); give the address of the daemon's "
-            "`commands` key with --connect"
-        ) from error
+        raise foreign_reply(address, error) from error
 
 
 def connect(socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = None) -> None:

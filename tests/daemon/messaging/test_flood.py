@@ -132,6 +132,18 @@ async def test_a_client_that_reads_no_replies_does_not_keep_those_of_others(caps
     assert capsys.readouterr().out.endswith("\nstop: stopped test\n")
 
 
+@pytest.mark.parametrize("answer", [b"", b"no", b"\x01", b"\x91\x01", b"\x81\x01\x01"])
+async def test_a_foreign_reply_to_a_stop_is_one_sentence(answer):
+    address = f"tcp://127.0.0.1:{free_port()}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as foreign:
+        foreign.bind(stop_name(address))
+        asked = asyncio.create_task(asyncio.to_thread(send_to_stop_socket, address, {"command": "stop"}, DEADLINE_S))
+        _, client = await asyncio.to_thread(foreign.recvfrom, 1024)
+        foreign.sendto(answer, client)
+        with pytest.raises(UserError, match="is not a shearloop daemon"):
+            await asked
+
+
 async def test_a_stop_without_a_reply_is_sent_again_and_spares_the_daemon():
     received: list[Request] = []
 

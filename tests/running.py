@@ -5,7 +5,7 @@ from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine
 from contextlib import aclosing, asynccontextmanager
 from typing import Any, TypeVar
 
-from shearloop.drivers.connection import LinkEvent
+from shearloop.drivers.connection import LinkEvent, SerialPort
 
 # Guards against a test that hangs; none waits for so long.
 DEADLINE_S = 30
@@ -39,6 +39,15 @@ async def take(values: AsyncGenerator[ValueT], count: int) -> list[ValueT]:
     """Return the next values."""
     async with asyncio.timeout(DEADLINE_S), aclosing(values) as arriving:
         return [await anext(arriving) for _ in range(count)]
+
+
+async def read_exactly(port: SerialPort, n_bytes: int) -> bytes:
+    """Return the next bytes of a port, however they are cut."""
+    data = b""
+    while len(data) < n_bytes:
+        received = await port.read(DEADLINE_S)
+        data += received.data
+    return data
 
 
 class Changes:

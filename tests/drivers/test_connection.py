@@ -10,7 +10,7 @@ from shearloop.drivers import connection
 from shearloop.drivers.connection import LinkMonitor, SerialLink, SerialPort, TcpPort, find_port
 from shearloop.drivers.emulators.ports import PtyPort
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceUnavailableError
-from tests.running import DEADLINE_S, LinkEvents
+from tests.running import DEADLINE_S, LinkEvents, read_exactly
 
 SECOND_NS = 1_000_000_000
 
@@ -20,14 +20,6 @@ async def sent_to(peer: PtyPort, n_bytes: int) -> bytes:
     async with asyncio.timeout(DEADLINE_S):
         while len(data) < n_bytes:
             data += await peer.received.get()
-    return data
-
-
-async def read_exactly(port: SerialPort, n_bytes: int) -> bytes:
-    data = b""
-    while len(data) < n_bytes:
-        received = await port.read(DEADLINE_S)
-        data += received.data
     return data
 
 

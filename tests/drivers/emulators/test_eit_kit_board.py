@@ -6,15 +6,7 @@ import pytest
 from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.drivers.connection import SerialPort
 from shearloop.drivers.emulators.boards import EitKitBoard, format_line, parse_fault
-from tests.running import running
-
-
-async def two_lines(port: SerialPort) -> bytes:
-    data = b""
-    while data.count(b"\n") < 2:
-        received = await port.read(20)
-        data += received.data
-    return data
+from tests.running import read_exactly, running
 
 
 def test_a_line_is_what_the_board_sends_byte_for_byte():
@@ -50,6 +42,7 @@ def test_invalid_faults_are_refused(text, sentence):
 
 async def test_it_says_nothing_before_it_is_started_and_is_silent_after_its_last_frame():
     line = np.where(PAPER_TABLE.zero_slots, 0, 0.25)
+    sent = 2 * format_line(line)
     board = EitKitBoard([line, line], period_s=0.001)
     async with running(board.run()):
         with SerialPort(board.port.path) as port:
@@ -57,6 +50,6 @@ async def test_it_says_nothing_before_it_is_started_and_is_silent_after_its_last
             await port.write(b"n")
             assert await port.read(0.05) is None
             await port.write(b"y")
-            assert await two_lines(port) == 2 * format_line(line)
+            assert await read_exactly(port, len(sent)) == sent
             assert await port.read(0.05) is None
     assert board.port.appearances.qsize() == 1

@@ -9,25 +9,21 @@ from shearloop.drivers.eit_kit import FrameClock, slope_below
 PERIOD_NS = 541_200_000
 
 
-def straightened(arrivals_ns: list[int], nominal_ns: int = PERIOD_NS) -> np.ndarray:
-    clock = FrameClock(nominal_ns)
-    return np.array([clock.arrived(arrival) for arrival in arrivals_ns])
+def straightened(arrivals_ns: np.ndarray, clock: FrameClock | None = None) -> np.ndarray:
+    clock = clock or FrameClock(PERIOD_NS)
+    return np.array([clock.arrived(arrival) for arrival in arrivals_ns.tolist()])
 
 
 def sent(n: int, period_ns: int = PERIOD_NS) -> np.ndarray:
     return 7_000_000_000 + np.arange(n) * period_ns
 
 
-def delays_ns(n: int, scale_ns: float, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).exponential(scale_ns, n).astype(np.int64)
-
-
 @pytest.mark.parametrize("period_ns", [PERIOD_NS, PERIOD_NS // 100, PERIOD_NS * 4])
 def test_the_jitter_of_a_busy_reader_is_taken_out_at_any_speed(period_ns):
     truth = sent(400, period_ns)
-    late = delays_ns(400, 0.03 * period_ns)
+    late = np.random.default_rng(0).exponential(0.03 * period_ns, 400).astype(np.int64)
     clock = FrameClock(PERIOD_NS)
-    error = np.array([clock.arrived(int(arrival)) for arrival in truth + late]) - truth
+    error = straightened(truth + late, clock) - truth
     assert clock.learned
     assert clock.period_ns == pytest.approx(period_ns, rel=1e-3)
     settled = error[40:]
@@ -40,7 +36,7 @@ def test_a_reader_that_was_away_is_late_once_and_then_on_time_again():
     arrivals = truth.copy()
     # Frames 40 and 41 wait until shortly after frame 41 was sent, and are then read one after the other.
     arrivals[40:42] = truth[41] + np.array([1, 2]) * 1_000_000
-    error = straightened(arrivals.tolist()) - truth
+    error = straightened(arrivals) - truth
     assert abs(error).max() < 4_000_000
 
 
@@ -55,7 +51,7 @@ def test_a_refused_line_takes_a_period_too():
 def test_a_board_that_paused_is_followed(pause_periods):
     truth = sent(80)
     truth[40:] += int(pause_periods * PERIOD_NS)
-    error = straightened(truth.tolist()) - truth
+    error = straightened(truth) - truth
     assert abs(error[:40]).max() < 1_000_000
     assert abs(error[53:]).max() < 1_000_000
 
@@ -65,18 +61,17 @@ def test_frames_queued_before_the_first_read_do_not_spoil_the_period():
     arrivals = np.maximum(truth, truth[5] + 50_000_000 * np.arange(80))
     arrivals[6:] = truth[6:]
     clock = FrameClock(PERIOD_NS)
-    error = np.array([clock.arrived(int(t)) for t in arrivals]) - truth
+    error = straightened(arrivals, clock) - truth
     assert clock.period_ns == pytest.approx(PERIOD_NS, rel=1e-3)
     assert abs(error[30:]).max() < 4_000_000
 
 
 def test_another_speed_after_a_restart_is_learned():
     clock = FrameClock(PERIOD_NS)
-    for t in sent(50):
-        clock.arrived(int(t))
+    straightened(sent(50), clock)
     clock.restart()
     fast = 100_000_000_000 + np.arange(60) * 5_412_000
-    error = np.array([clock.arrived(int(t)) for t in fast]) - fast
+    error = straightened(fast, clock) - fast
     assert clock.period_ns == pytest.approx(5_412_000, rel=1e-3)
     assert abs(error[30:]).max() < 100_000
 
@@ -112,7 +107,7 @@ def test_the_stamps_of_a_recording_are_straightened(shared):
         arrivals = np.round((days - days[0]) * 86_400e9).astype(np.int64)
         points = [(n, int(t)) for n, t in enumerate(arrivals)]
         board = slope_below(points) * np.arange(len(points))
-        stamps = straightened(arrivals.tolist())
+        stamps = straightened(arrivals)
         before = (arrivals - board)[16:] / 1e6
         after = (stamps - board)[16:] / 1e6
         assert before.std() > 15, "as recorded: milliseconds off the board's steady pace"

@@ -17,12 +17,12 @@ from tests.slices import slices
 PERIOD_NS = eit_kit.NOMINAL_PERIOD_NS
 
 
-def some_line(seed: int) -> bytes:
-    steps = np.random.default_rng(seed).integers(1, 300, len(PAPER_TABLE.line_slots))
-    return format_line(PAPER_TABLE.line_of_channels(steps * ADC_STEP_V))
+def noisy(n: int) -> list[NDArray[np.float64]]:
+    steps = np.random.default_rng(0).integers(1, 300, (n, len(PAPER_TABLE.line_slots)))
+    return [PAPER_TABLE.line_of_channels(row * ADC_STEP_V) for row in steps]
 
 
-LINES = [some_line(seed) for seed in range(4)]
+LINES = [format_line(line) for line in noisy(4)]
 GOOD = LINES[0]
 
 
@@ -177,11 +177,6 @@ def test_the_middles_of_frames_are_in_order_and_before_their_arrival(bursts):
 def flagged(lines: list[NDArray[np.float64]]) -> list[Frame]:
     parser = FrameParser(PAPER_TABLE.zero_slots)
     return [frame for n, line in enumerate(lines) for frame in parser.feed(format_line(line), n * PERIOD_NS)]
-
-
-def noisy(n: int) -> list[NDArray[np.float64]]:
-    steps = np.random.default_rng(0).integers(1, 300, (n, len(PAPER_TABLE.line_slots)))
-    return [PAPER_TABLE.line_of_channels(row * ADC_STEP_V) for row in steps]
 
 
 def test_a_channel_above_the_largest_sine_the_adc_follows_is_saturated():

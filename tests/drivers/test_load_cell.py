@@ -108,24 +108,19 @@ def test_a_converter_that_repeats_itself_is_flagged_until_it_moves():
     assert [s.stuck for s in samples] == [False] * (STUCK_AFTER - 1) + [True] * 3 + [False]
 
 
-def test_lines_that_arrive_together_are_spread_and_time_never_goes_back():
-    parser = LoadParser(TORQUE_LINES)
-    samples = parser.feed(b"0.1\n0.1\n0.1\n", 10 * PERIOD_NS) + parser.feed(b"0.1\n", 10 * PERIOD_NS + 1)
-    assert [s.t_arrival_ns for s in samples[:3]] == [8 * PERIOD_NS, 9 * PERIOD_NS, 10 * PERIOD_NS]
-    assert all(a.t_mid_ns < b.t_mid_ns for a, b in pairwise(samples))
+@pytest.mark.parametrize("rate_hz", [[], [1.0], [80.0]])
+def test_lines_that_arrive_together_are_spread_and_found_stuck_by_the_boards_own_rate(rate_hz):
+    (real_hz,) = rate_hz or [LOAD_CELL_RATE_HZ]
+    period_ns = round(1e9 / real_hz)
+    parser = LoadParser(TORQUE_LINES, *rate_hz)
+    samples = parser.feed(b"0.1\n0.2\n0.3\n", 10 * period_ns) + parser.feed(b"0.1\n", 10 * period_ns + 1)
+    assert [s.t_arrival_ns for s in samples[:3]] == [8 * period_ns, 9 * period_ns, 10 * period_ns]
+    assert all(a.t_mid_ns < b.t_mid_ns for a, b in pairwise(samples)), "time never goes back"
     # The value is the mean of the period before its arrival, and four bytes took 0.35 ms to come.
-    assert samples[0].t_arrival_ns - samples[0].t_mid_ns == pytest.approx(PERIOD_NS / 2 + 0.35e6, abs=0.02e6)
-
-
-@pytest.mark.parametrize("rate_hz", [1.0, 80.0])
-def test_a_board_of_another_rate_is_stamped_and_found_stuck_by_its_own(rate_hz):
-    period_ns = round(1e9 / rate_hz)
-    parser = LoadParser(TORQUE_LINES, rate_hz)
-    samples = parser.feed(b"0.1\n0.2\n0.3\n", 10 * period_ns)
-    assert [s.t_arrival_ns for s in samples] == [8 * period_ns, 9 * period_ns, 10 * period_ns]
-    assert samples[-1].t_arrival_ns - samples[-1].t_mid_ns == pytest.approx(period_ns / 2 + 0.35e6, abs=0.02e6)
-    stuck = [s.stuck for s in feed_lines(LoadParser(TORQUE_LINES, rate_hz), ["0.01"] * 200)]
-    assert stuck.index(True) + 1 == max(STUCK_AFTER, round(STUCK_AFTER * rate_hz / LOAD_CELL_RATE_HZ))
+    for sample in samples[:3]:
+        assert sample.t_arrival_ns - sample.t_mid_ns == pytest.approx(period_ns / 2 + 0.35e6, abs=0.02e6)
+    stuck = [s.stuck for s in feed_lines(LoadParser(TORQUE_LINES, *rate_hz), ["0.01"] * 200)]
+    assert stuck.index(True) + 1 == max(STUCK_AFTER, round(STUCK_AFTER * real_hz / LOAD_CELL_RATE_HZ))
 
 
 torques = st.floats(-1.7, 1.7)

@@ -1,6 +1,7 @@
 """What two voltages and a source say of two gauges; every fault by its own name."""
 
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -116,19 +117,19 @@ def test_a_jump_is_a_disturbance_until_it_stays():
 
 def test_voltages_from_before_the_current_flowed_are_not_called_a_short():
     one = judge()
-    on = SourceReading(2 * 10**8, output_on=True, voltage_v=0.252, current_a=CURRENT_A)
+    on = replace(GOOD, t_ns=2 * 10**8)
     assert one.sample(voltages(0.0, 0.0, 1), on).faults == (SkinFault.SOURCE_LOST,)
     assert one.sample(voltages(0.123, 0.126, 2), on).trusted
     off = SourceReading(3 * 10**8, output_on=False)
     assert one.sample(voltages(0.0, 0.0, 3), off).faults == (SkinFault.SOURCE_OFF,)
-    on = SourceReading(5 * 10**8, output_on=True, voltage_v=0.252, current_a=CURRENT_A)
+    on = replace(GOOD, t_ns=5 * 10**8)
     assert one.sample(voltages(0.0, 0.0, 4), on).faults == (SkinFault.SOURCE_OFF,)
     assert one.sample(voltages(0.0, 0.0, 6), on).faults == (SkinFault.SHORT_1, SkinFault.SHORT_2)
 
 
 def test_a_converter_that_stands_still_is_told_by_gauge():
     one = judge()
-    sources = [SourceReading(n * 10**8, output_on=True, voltage_v=0.252, current_a=CURRENT_A) for n in range(60)]
+    sources = [replace(GOOD, t_ns=n * 10**8) for n in range(60)]
     samples = [one.sample(voltages(0.123, 0.126 + 1e-6 * (n % 2), n), source) for n, source in enumerate(sources)]
     assert samples[40].trusted
     assert list(samples[59].faults) == [SkinFault.STUCK_1]
@@ -145,12 +146,8 @@ def test_whatever_comes_a_trusted_sample_has_two_resistances_that_a_gauge_can_ha
     one, number = judge(), 0
     for v1_v, v2_v, step in story:
         number += step
-        reading = None if source is None else SourceReading(number * 10**8, *_rest(source))
+        reading = source and replace(source, t_ns=number * 10**8)
         sample = one.sample(voltages(v1_v, v2_v, number, over_1=v1_v > 1, over_2=v2_v > 1), reading)
         assert sample.trusted == (sample.r1_ohm is not None) == (sample.r2_ohm is not None)
         for ohm in (sample.r1_ohm, sample.r2_ohm):
             assert ohm is None or (ohm * 1.01 >= 15 and ohm <= 50.5 and math.isfinite(ohm))
-
-
-def _rest(source: SourceReading) -> tuple[bool, float, float, bool]:
-    return source.output_on, source.voltage_v, source.current_a, source.compliance

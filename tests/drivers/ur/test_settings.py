@@ -20,12 +20,6 @@ def changed(folder: Path, *changes: tuple[str, str]) -> Path:
     return path
 
 
-def test_delivered_settings_are_complete():
-    settings = read_settings(DELIVERED)
-    assert settings.limits.torque_nm.inner < settings.limits.torque_nm.hard
-    assert len(settings.limits.joints.lower_rad) == 6
-
-
 def test_all_mistakes_are_reported_together(tmp_path):
     path = changed(
         tmp_path,

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -10,8 +9,7 @@ from shearloop.drivers.ur import worker
 from shearloop.drivers.ur.messages import CommandReply, Disconnect, Enable, Unlock, WristSpeed
 from tests.drivers.ur.flight import Flight, flying
 from tests.drivers.ur.process import CyclingArm, fly
-
-ROOT = Path(__file__).parents[3]
+from tests.drivers.ur.robots import ROOT
 
 
 def test_unlocking_ended_by_a_disconnection_is_answered(daemon):
@@ -42,12 +40,8 @@ def test_our_program_is_ended_on_exit(daemon):
 
     arm = Ready()
     fly(daemon, arm)
-    assert [call for call in arm.calls if call != "send_heartbeat"] == [
-        "clear_command",
-        "upload",
-        "arm_watchdog",
-        "end_program",
-    ]
+    sent = [call for call in arm.calls if call != "send_heartbeat"]
+    assert sent == ["clear_command", "upload", "arm_watchdog", "end_program"]
 
 
 @pytest.mark.parametrize("runtime_state", [2, 4], ids=["playing", "paused"])

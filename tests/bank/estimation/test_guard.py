@@ -114,20 +114,13 @@ def test_too_little_is_said_to_be(recorded):
         FingertipValidator.fit("right", (frames[:2], frames[50:250], frames[:0]))
     with pytest.raises(CalibrationError, match="look like idle"):
         FingertipValidator.fit("right", (frames[:12], frames[6:34], frames[:0]))
-    n = len(recorded.torque_nm)
-    for changed, reason in (
-        ({"torque_nm": np.zeros(n)}, "is 0 at all of these frames; record twists"),
-        (
-            {"torque_t_s": recorded.torque_t_s + 1e4},
-            "no torque is known for these frames",
-        ),
-        (
-            {"t_s": np.empty(0), "channels": recorded.channels[:0], "diameter_mm": np.empty(0)},
-            "holds no frames of right and left together; record some frames",
-        ),
+    for series, reason in (
+        (replace(recorded, torque_nm=0.0 * recorded.torque_nm), "is 0 at all of these frames; record twists"),
+        (replace(recorded, torque_t_s=recorded.torque_t_s + 1e4), "no torque is known for these frames"),
+        (recorded.between(0, 0), "holds no frames of right and left together; record some frames"),
     ):
         with pytest.raises(CalibrationError, match=reason):
-            segment_grip(replace(recorded, **changed))
+            segment_grip(series)
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.4, 0.75, 0.76, 1.0]))

@@ -74,7 +74,7 @@ def test_a_curve_finds_the_value_through_drift_ten_times_the_noise():
 
 
 def test_a_curve_does_not_pull_towards_the_mean():
-    """With few frames of many noisy channels a ridge shrinks what it predicts; a curve does not."""
+    """A ridge does, with few frames of many noisy channels."""
     rng = np.random.default_rng(5)
     values = rng.uniform(-1, 2, 25)
     noisy = frames_on_a_curve(values, rng, noise=1.5, drift=0.1)

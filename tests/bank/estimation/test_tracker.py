@@ -135,9 +135,8 @@ def test_frames_that_come_again_later_are_no_motion(motion_calibration, twisting
     """Somebody sends two old frames again: what the gel has done since is not told by them."""
     other = twisting(seed=13)
     order = [*range(150), 148, 149, *range(150, 220)]
-    again = [TactileFrame.of(float(other.t_s[i]), other.channels[i]) for i in order]
     tracker = EstimatorSession(motion_calibration)
-    estimates = [tracker.estimate(one) for one in again]
+    estimates = [tracker.estimate(TactileFrame.of(float(other.t_s[i]), other.channels[i])) for i in order]
     assert estimates[149].valid
     assert not any(one.valid for one in estimates[150:162])
     assert estimates[175].valid
@@ -154,7 +153,6 @@ def test_one_fingertip_does_too_and_two_do_better(twisting):
 
 
 def test_squeezing_alone_is_no_torque(motion_calibration, twisting):
-    """A grip that tightens and loosens by a third without twisting does not read as torque."""
     other = twisting(seed=15)
     gripped = (other.t_s > 25) & (other.t_s < 135)
     idle, reference = other.channels[[5, 50]]

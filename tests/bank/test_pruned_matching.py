@@ -3,9 +3,6 @@
 No score lies above its bound, and few cells remain.
 """
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -229,19 +226,15 @@ def test_what_cannot_be_matched_is_refused_alike(slow, fast):
         type(fast)(np.zeros_like(BANK[0]), BANK[1], np.arange(22.0), np.arange(20.0))
 
 
-def recorded_differences(shared: Path) -> Iterator[np.ndarray]:
-    for path in sorted((shared / "recordings").glob("*_slices/*_*.mat")):
-        yield loadmat(path)["data_diff"].ravel()
-    for path in sorted((shared / "recordings" / "streams").glob("*/*.mat")):
+@pytest.fixture(scope="module")
+def recorded_frames(shared) -> list[np.ndarray]:
+    found = [loadmat(path)["data_diff"].ravel() for path in (shared / "recordings").glob("*_slices/*_*.mat")]
+    for path in (shared / "recordings" / "streams").glob("*/*.mat"):
         for values in loadmat(path).values():
             if getattr(values, "shape", (0, 0))[-1] == 1025:
                 channels = PAPER_TABLE.channels_of_line(values[:, 1:])
-                yield from channels[20::701] - channels[:10].mean(axis=0)
-
-
-@pytest.fixture(scope="module")
-def recorded_frames(shared) -> list[np.ndarray]:
-    return list(recorded_differences(shared))
+                found += [*(channels[20::701] - channels[:10].mean(axis=0))]
+    return found
 
 
 @both

@@ -20,18 +20,13 @@ def batch(fingertip) -> BatchForwardModel:
 
 def chained(rng: np.random.Generator, n: int, far: int, factors: int) -> Terms:
     """Return a Laplacian, each unknown linked to some that follow, each link with a factor; and 1 on the diagonal."""
-    links = [(min(i + int(step), n - 1), i) for i in range(n - 1) for step in rng.integers(1, far + 1, 2)]
-    rows, columns, values, source = [], [], [], []
-    for number, (i, j) in enumerate(links):
-        rows += [i, j, i, j]
-        columns += [i, j, j, i]
-        values += [1.0, 1.0, -1.0, -1.0]
-        source += [number % factors] * 4
+    diagonal, i = np.arange(n), np.repeat(np.arange(n - 1), 2)
+    j, factor = np.minimum(i + rng.integers(1, far + 1, len(i)), n - 1), np.arange(len(i)) % factors
     return Terms(
-        np.array(rows + list(range(n))),
-        np.array(columns + list(range(n))),
-        np.array(values + [1.0] * n),
-        np.array(source + [factors] * n),
+        np.concatenate([i, j, i, j, diagonal]),
+        np.concatenate([i, j, j, i, diagonal]),
+        np.repeat([1.0, -1.0, 1.0], [2 * len(i), 2 * len(i), n]),
+        np.concatenate([np.tile(factor, 4), np.full(n, factors)]),
     )
 
 

@@ -191,13 +191,9 @@ def test_a_choice_that_nothing_is_good_enough_for_says_so():
 
 def test_what_is_good_enough_by_luck_is_not_chosen():
     """A step falls between the nodes of one mesh as it should, and of the next finer one not."""
-    choice = DesignChoice(
-        "mesh size",
-        "cm",
-        (DesignStep(0.5, 3.0, ""), DesignStep(0.2, 0.1, ""), DesignStep(0.1, 0.5, ""), DesignStep(0.05, 0.2, "")),
-    )
-    assert choice.chosen.setting == 0.05
-    assert DesignChoice("", "", choice.steps[:3]).chosen.setting == 0.1
+    steps = tuple(DesignStep(size_cm, off, "") for size_cm, off in ((0.5, 3.0), (0.2, 0.1), (0.1, 0.5), (0.05, 0.2)))
+    assert DesignChoice("mesh size", "cm", steps).chosen.setting == 0.05
+    assert DesignChoice("mesh size", "cm", steps[:3]).chosen.setting == 0.1
 
 
 def test_too_few_frames_are_refused(clean):

@@ -15,6 +15,7 @@ from shearloop.bank.eit.models import conductivity
 from shearloop.bank.errors import GeometryError
 
 CENTRES = 0.1 + 0.4 * np.arange(8)
+SIDES = {"left": CENTRES, "top": CENTRES, "right": 3.2 - CENTRES, "bottom": 3.2 - CENTRES}
 # A square with eight electrodes on each side, in order around it from the lower left corner.
 SQUARE = RectangularFingertip(
     width_cm=3.2,
@@ -22,16 +23,7 @@ SQUARE = RectangularFingertip(
     electrode_width_cm=0.2,
     contact_impedance=0.01,
     mesh_size_cm=0.2,
-    electrodes=tuple(
-        ElectrodePlace(side, float(centre))
-        for side, centres in (
-            ("left", CENTRES),
-            ("top", CENTRES),
-            ("right", 3.2 - CENTRES),
-            ("bottom", 3.2 - CENTRES),
-        )
-        for centre in centres
-    ),
+    electrodes=tuple(ElectrodePlace(side, float(centre)) for side, centres in SIDES.items() for centre in centres),
 )
 
 

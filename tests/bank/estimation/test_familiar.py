@@ -55,8 +55,8 @@ def saturating(value):
     return np.column_stack([np.maximum(value, 0.3), np.maximum(value, 0.3) ** 2])
 
 
-def reader_of(features, values) -> IntervalRegressor:
-    return fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), fit_line=Ridge.fit)
+def reader_of(features, values, **options) -> IntervalRegressor:
+    return fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), fit_line=Ridge.fit, **options)
 
 
 def test_a_reading_at_the_end_of_what_is_told_apart_may_mean_anything_beyond_it():
@@ -86,9 +86,7 @@ def test_what_is_read_the_further_inside_the_further_it_lies_beyond_may_be_read_
     assert max(below, above) < 0.5
     value, _, above = reader.predict(np.array([0.6]))
     assert value + above == pytest.approx(values.max() + 2 * np.ptp(values)), "as far beyond as is known to pass"
-    vouched = fit_interval_regressor(
-        features, values, Ridge.fit, strengths=(1e-9,), fit_line=Ridge.fit, full_range=True
-    )
+    vouched = reader_of(features, values, full_range=True)
     assert vouched.predict(np.array([0.6]))[2] < 0.5
     assert vouched.predict(np.array([0.6]))[0] == value
 
@@ -186,16 +184,12 @@ def test_a_judgement_says_how_much_of_the_own_response_may_be_missing(sliced):
     frames = sliced().channels[:, 0]
     guard = NoveltyDetector.fit(frames, PAPER_TABLE)
     less = 0.8 * frames[35]
-    assert guard.assess(less, ALL).missing_share == pytest.approx(
-        1 - guard.response_share(less, ALL) / guard.typical_response
-    )
-    assert guard.assess(less, ALL).missing_share > 0.15 > guard.assess(frames[35], ALL).missing_share
-    assert replace(guard, typical_response=1e-3).assess(frames[35], ALL).missing_share == 0.0, (
-        "more than ever is nothing missing"
-    )
-    assert replace(guard, typical_response=9.0).assess(frames[35], ALL).missing_share == 0.5, (
-        "no frame is made larger than twice"
-    )
+    missing = 1 - guard.response_share(less, ALL) / guard.typical_response
+    assert guard.assess(less, ALL).missing_share == pytest.approx(missing)
+    assert missing > 0.15 > guard.assess(frames[35], ALL).missing_share
+    # More than ever is nothing missing, and no frame is made larger than twice.
+    for typical, share in ((1e-3, 0.0), (9.0, 0.5)):
+        assert replace(guard, typical_response=typical).assess(frames[35], ALL).missing_share == share
     # But for one in twenty of those left out none is larger; so of good ones hardly any is.
     assert np.mean([guard.response_share(one, ALL) <= guard.typical_response for one in frames]) >= 0.9
 

@@ -71,7 +71,6 @@ def test_a_drift_does_not_lead_a_regression_astray(twisting):
     calibration = fit("regression", [past], "rig")
     later = twisting(seed=36)
     moved = np.random.default_rng(0).normal(0.0, 0.05, 896) * later.channels[5]
-    found = follow(
-        calibration, replace(later, channels=later.channels + np.linspace(0, 1, len(later.t_s))[:, None, None] * moved)
-    )
+    drift = np.linspace(0, 1, len(later.t_s))[:, None, None] * moved
+    found = follow(calibration, replace(later, channels=later.channels + drift))
     assert not any(one.valid for one in found[-60:-40])

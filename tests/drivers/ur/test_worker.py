@@ -32,18 +32,6 @@ def test_commands_after_a_disconnection_are_refused(daemon):
     assert [reply.accepted for reply in replies] == [True, False, False, False]
 
 
-def test_our_program_is_ended_on_exit(daemon):
-    class Ready(CyclingArm):
-        def arm_watchdog(self) -> bool:
-            daemon.send(Disconnect())
-            return super().arm_watchdog()
-
-    arm = Ready()
-    fly(daemon, arm)
-    sent = [call for call in arm.calls if call != "send_heartbeat"]
-    assert sent == ["clear_command", "upload", "arm_watchdog", "end_program"]
-
-
 @pytest.mark.parametrize("runtime_state", [2, 4], ids=["playing", "paused"])
 def test_foreign_program_is_left_alone_on_exit(daemon, runtime_state):
     """For example the program of another daemon."""

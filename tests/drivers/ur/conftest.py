@@ -8,6 +8,7 @@ import pytest
 
 from tests.drivers.ur.process import Daemon, Timed
 from tests.emulator_process import EmulatorProcess as ControllerProcess
+from tests.running import LinkEvents
 
 
 @pytest.fixture(scope="module")
@@ -24,6 +25,12 @@ def controller(controller_process) -> Iterator[ControllerProcess]:
     """The module's controller without faults, before the test and after it."""
     yield controller_process
     asyncio.run(controller_process.fault("normal"))
+
+
+@pytest.fixture
+def link() -> LinkEvents:
+    """What a robot's link tells."""
+    return LinkEvents()
 
 
 @pytest.fixture

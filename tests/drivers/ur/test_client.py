@@ -17,7 +17,6 @@ from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, Wris
 from shearloop.drivers.ur.settings import InstalledTool
 from tests.drivers.ur.robots import ROOT, enable, pid_of, running, settings_for, until
 from tests.emulator_process import EmulatorProcess as ControllerProcess
-from tests.running import LinkEvents
 
 pytestmark = pytest.mark.real_time
 
@@ -109,8 +108,8 @@ async def test_state_comes_125_times_a_second_with_the_controllers_own_time(cont
         assert sorted(states, key=lambda state: state.timestamp_s) == states
 
 
-async def test_twist_stops_when_the_client_is_killed(controller):
-    link, end = LinkEvents(), signal.SIGSEGV
+async def test_twist_stops_when_the_client_is_killed(controller, link):
+    end = signal.SIGSEGV
     async with turning(controller, link) as robot:
         killed_ns = time.monotonic_ns()
         os.kill(pid_of(robot), end)
@@ -175,8 +174,7 @@ async def test_emergency_stop_is_reported_and_recovered_from(controller):
         await turn(robot, controller)
 
 
-async def test_lost_rtde_ends_the_worker_and_the_next_moves_nothing(controller):
-    link = LinkEvents()
+async def test_lost_rtde_ends_the_worker_and_the_next_moves_nothing(controller, link):
     async with turning(controller, link) as robot:
         dropped_ns = await controller.fault("drop-rtde")
         stopped = await controller.event("motion-stopped", dropped_ns)
@@ -190,8 +188,7 @@ async def test_lost_rtde_ends_the_worker_and_the_next_moves_nothing(controller):
         assert not controller.happened("motion-started", dropped_ns)
 
 
-async def test_hung_worker_is_replaced(controller):
-    link = LinkEvents()
+async def test_hung_worker_is_replaced(controller, link):
     async with turning(controller, link, hang_timeout_s=0.3) as robot:
         hung_ns = time.monotonic_ns()
         os.kill(pid_of(robot), signal.SIGSTOP)
@@ -205,8 +202,7 @@ async def test_hung_worker_is_replaced(controller):
         assert not controller.happened("motion-started", hung_ns)
 
 
-async def test_silent_controller_is_reported_and_the_robot_stops(controller):
-    link = LinkEvents()
+async def test_silent_controller_is_reported_and_the_robot_stops(controller, link):
     async with turning(controller, link, connect_timeout_s=1.5) as robot:
         silent_ns = await controller.fault("silence 3600")
         stopped = await controller.event("motion-stopped", silent_ns)
@@ -230,9 +226,8 @@ async def test_silent_controller_is_reported_and_the_robot_stops(controller):
         ("mute-dashboard", "silent", "while asking its dashboard server (port 29999): it is starting, hangs"),
     ],
 )
-async def test_connection_that_is_refused_is_explained(controller, fault, kind, said):
+async def test_connection_that_is_refused_is_explained(controller, link, fault, kind, said):
     await controller.fault(fault)
-    link = LinkEvents()
     async with running(settings_for(controller.host), link) as robot:
         loss = await link.down()
         assert robot.losses[kind] == 1
@@ -240,12 +235,11 @@ async def test_connection_that_is_refused_is_explained(controller, fault, kind, 
         assert said in (await robot.send(Enable())).refusal
 
 
-async def test_unsupported_controller_does_not_restart_the_worker(controller):
+async def test_unsupported_controller_does_not_restart_the_worker(controller, link):
     for version in ("5.0.0.0", "3.9.1.0", "10.7.0.0", "5.3.9.0"):
         await controller.fault(f"version {version}")
         with pytest.raises(ProbeError, match=f"has PolyScope {version}, which cannot be driven"):
             await asyncio.to_thread(probe_controller, controller.host, 5.0)
-    link = LinkEvents()
     async with running(settings_for(controller.host), link) as robot:
         await link.down()
         # The first pause of other losses is 0.2 s.
@@ -255,9 +249,8 @@ async def test_unsupported_controller_does_not_restart_the_worker(controller):
         assert robot.losses == {"version": 1}
 
 
-async def test_controller_that_is_newer_than_the_tested_ones_is_driven_with_a_warning(controller):
+async def test_controller_that_is_newer_than_the_tested_ones_is_driven_with_a_warning(controller, link):
     await controller.fault("version 5.18.0.0")
-    link = LinkEvents()
     async with running(settings_for(controller.host), link) as robot:
         await enable(robot)
         assert "PolyScope 5.18.0.0 is newer than 5.17.3" in robot.link.latest.sentence

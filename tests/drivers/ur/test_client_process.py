@@ -12,12 +12,10 @@ from shearloop.drivers.ur.client import LAST_WORDS_BYTES, LostError, UrRobot, Wo
 from shearloop.drivers.ur.messages import Failed, Stop, encode
 from tests.drivers.ur.flight import SETTINGS
 from tests.drivers.ur.robots import ROOT, running, settings_for
-from tests.running import LinkEvents
 
 
-async def test_absent_controller_is_explained():
+async def test_absent_controller_is_explained(link):
     pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
-    link = LinkEvents()
     async with running(settings_for("127.0.0.254"), link) as robot:
         loss = await link.down()
         assert robot.losses == {"unreachable": 1}
@@ -49,9 +47,8 @@ def play(tmp_path, monkeypatch) -> Callable[[str], None]:
     ],
     ids=["ended by its alarm", "long"],
 )
-async def test_error_output_of_a_worker_is_quoted_and_shortened(play, commands, kind, said, ends):
+async def test_error_output_of_a_worker_is_quoted_and_shortened(play, link, commands, kind, said, ends):
     play(commands)
-    link = LinkEvents()
     async with running(settings_for("127.0.0.254"), link) as robot:
         loss = await link.down()
     assert [*robot.losses] == [kind]

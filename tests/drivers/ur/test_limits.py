@@ -47,7 +47,6 @@ def test_wrist_command_is_within_the_limits_and_reports_clipping(asked, now):
         assert sent.rad_per_s == 0
 
 
-@settings(deadline=None)
 @given(
     st.lists(st.tuples(commands, st.integers(1, 60)), min_size=1, max_size=12),
     st.floats(-1.9, 1.9),

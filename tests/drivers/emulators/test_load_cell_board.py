@@ -17,10 +17,10 @@ CALIBRATION = LoadCalibration(tare_counts=SKETCH.tare_counts, scale_n_per_count=
 
 
 class Rig(LinkEvents):
-    def __init__(self, board: Hx711Board) -> None:
+    def __init__(self, board: Hx711Board, link: Path, calibration: LoadCalibration) -> None:
         super().__init__()
         self.board = board
-        self.cell: LoadCell
+        self.cell = LoadCell(SerialLink(path=link, monitor=LinkMonitor(self, 0.001, 0.002)), calibration)
         self.samples: list[LoadSample] = []
 
     def on_sample(self, sample: LoadSample) -> None:
@@ -43,12 +43,10 @@ async def a_rig(
 ) -> AsyncIterator[Rig]:
     link = tmp_path / "load"
     board = Hx711Board(torques_nm, sketch, period_s=0.002, link=link)
-    rig = Rig(board)
-    rig.cell = cell = LoadCell(SerialLink(path=link, monitor=LinkMonitor(rig, 0.001, 0.002)), calibration)
-
+    rig = Rig(board, link, calibration)
     async with running(board.run()):
         await board.port.appearances.get()
-        async with running(pass_on(cell.readings(), rig.on_sample)):
+        async with running(pass_on(rig.cell.readings(), rig.on_sample)):
             await rig.more(4)
             yield rig
 

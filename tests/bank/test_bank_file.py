@@ -5,6 +5,7 @@ import json
 import math
 import os
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,25 +15,15 @@ from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.errors import BankFileError, ModelError
 
 GEOMETRY = "ab" * 32
+DEFINITION = BankDefinition(GEOMETRY, "gaussian_derivative", np.linspace(1, 2, 4), np.linspace(0.5, 2.5, 3))
 CURE = "build it with `shearloop bank build"
-
-
-def definition(**changed):
-    fields = {
-        "geometry_hash": GEOMETRY,
-        "model": "gaussian_derivative",
-        "k_grid": np.linspace(1, 2, 4),
-        "sigma_grid": np.linspace(0.5, 2.5, 3),
-    }
-    return BankDefinition(**(fields | changed))
 
 
 def write(path, **changed):
     rng = np.random.default_rng(5)
     signals = rng.normal(size=(4, 3, 896)).astype(np.float32)
-    write_bank(
-        path, definition(**changed), np.arange(896.0), rng.normal(size=(4, 3)), np.eye(4, 3, dtype=bool), signals
-    )
+    defined = replace(DEFINITION, **changed)
+    write_bank(path, defined, np.arange(896.0), rng.normal(size=(4, 3)), np.eye(4, 3, dtype=bool), signals)
     return signals
 
 
@@ -72,7 +63,7 @@ def test_what_is_written_is_read_back(path):
     np.testing.assert_array_equal(bank.sigma_grid, np.linspace(0.5, 2.5, 3))
     assert bank.min_conductivity.dtype == np.float64
     assert (bank.model, bank.geometry_hash) == ("gaussian_derivative", GEOMETRY)
-    assert bank.identity == definition().identity
+    assert bank.identity == DEFINITION.identity
     assert list(path.parent.iterdir()) == [path]
 
 
@@ -87,14 +78,14 @@ def test_signals_are_mapped_from_a_page_and_nothing_can_be_written(path):
 
 
 def test_the_identity_is_of_all_that_defines_a_bank_and_of_nothing_else():
-    same = definition(k_grid=np.linspace(1, 2, 4) * (1 + 1e-15))
-    assert same.identity == definition().identity
-    assert definition().identity == "35e76cdeb12d079dcbdf6b9dae2c8ba8545557cd3e00a3a74305a9f2d7cd8915"
+    same = replace(DEFINITION, k_grid=np.linspace(1, 2, 4) * (1 + 1e-15))
+    assert same.identity == DEFINITION.identity
+    assert DEFINITION.identity == "35e76cdeb12d079dcbdf6b9dae2c8ba8545557cd3e00a3a74305a9f2d7cd8915"
     others = [
-        definition(geometry_hash="cd" * 32),
-        definition(model="modulated_gaussian"),
-        definition(k_grid=np.linspace(1, 2.001, 4)),
-        definition(sigma_grid=np.linspace(0.5, 2.5, 4)),
+        replace(DEFINITION, geometry_hash="cd" * 32),
+        replace(DEFINITION, model="modulated_gaussian"),
+        replace(DEFINITION, k_grid=np.linspace(1, 2.001, 4)),
+        replace(DEFINITION, sigma_grid=np.linspace(0.5, 2.5, 4)),
     ]
     assert len({each.identity for each in [same, *others]}) == 5
 
@@ -126,7 +117,7 @@ def test_every_flipped_byte_is_found(path):
         with pytest.raises(BankFileError, match=r"small\.bank: "):
             Bank.open(path, verify=True)
         if position >= signals_at:
-            assert Bank.open(path).identity == definition().identity
+            assert Bank.open(path).identity == DEFINITION.identity
 
 
 def test_foreign_files_other_formats_and_other_channel_tables_are_refused(path, tmp_path):
@@ -225,4 +216,4 @@ def test_a_failed_write_leaves_the_old_bank_and_no_debris(path, monkeypatch):
 )
 def test_definitions_that_make_no_bank_are_refused(changed, sentence):
     with pytest.raises(ModelError, match=sentence):
-        definition(**changed)
+        replace(DEFINITION, **changed)

@@ -18,11 +18,10 @@ def twisted(gains, seed, noise_nm=0.001):
     return features, TWISTS
 
 
-def calibrated(recordings=None, **options):
-    features, torque_nm = twisted([1.0, 1.0], 0)
-    numbers = np.zeros(len(torque_nm), dtype=int) if recordings is None else recordings
+def calibrated():
+    numbers = np.zeros(len(TWISTS), dtype=int)
     return fit_interval_regressor(
-        features, torque_nm, Ridge.fit, strengths=(1e-6,), recordings=numbers, fingertips=2, **options
+        *twisted([1.0, 1.0], 0), Ridge.fit, strengths=(1e-6,), recordings=numbers, fingertips=2
     )
 
 

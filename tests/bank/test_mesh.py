@@ -107,12 +107,9 @@ def test_what_cannot_be_solved_on_is_refused_with_the_files_name(tmp_path, finge
 
 
 def test_a_mesh_with_another_number_of_electrodes_than_its_channels_is_refused(tmp_path, fingertip):
-    changed = {
-        "electrode_edges": fingertip.electrode_edges[:31],
-        "electrode_of_edge": np.arange(31),
-        "contact_impedance": np.ones(31),
-    }
-    mesh = load_mesh(save_npz(tmp_path / "other.npz", fingertip, **changed))
+    edges = fingertip.electrode_edges[:31]
+    few = replace(fingertip, electrode_edges=edges, electrode_of_edge=np.arange(31), contact_impedance=np.ones(31))
+    mesh = load_mesh(save_npz(tmp_path / "other.npz", few))
     with pytest.raises(GeometryError, match="the mesh has 31 electrodes, but the channel table needs 32"):
         ForwardModel(mesh)
 

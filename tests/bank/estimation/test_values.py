@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -53,12 +55,8 @@ def test_nothing_measured_is_nothing():
         combine(Measured(1.0, 0.0), Measured(1.0, 1.0))
 
 
-def empty(n=3, **changed):
-    content = {
-        "kind": "raw", "sides": ("right",), "t_s": np.arange(float(n)), "channels": np.zeros((n, 1, 896)),
-        "torque_t_s": np.array([0.5, 1.5]), "torque_nm": np.array([0.0, 1.0]), "diameter_mm": np.full(n, np.nan),
-    }  # fmt: skip
-    return FrameSeries(**content | changed)
+LOAD = np.array([0.5, 1.5]), np.array([0.0, 1.0])
+EMPTY = FrameSeries("raw", ("right",), np.arange(3.0), np.zeros((3, 1, 896)), *LOAD, np.full(3, np.nan))
 
 
 def test_where_the_load_cell_was_silent_for_long_no_torque_is_made_up():
@@ -72,7 +70,7 @@ def test_where_the_load_cell_was_silent_for_long_no_torque_is_made_up():
 
 
 def test_torque_at_frames_is_interpolated_and_never_extrapolated():
-    np.testing.assert_array_equal(empty().torque_at_frames(), [np.nan, 0.5, np.nan])
+    np.testing.assert_array_equal(EMPTY.torque_at_frames(), [np.nan, 0.5, np.nan])
 
 
 @pytest.mark.parametrize(
@@ -85,12 +83,12 @@ def test_torque_at_frames_is_interpolated_and_never_extrapolated():
 )
 def test_what_does_not_belong_together_is_refused(changed, message):
     with pytest.raises(CalibrationError, match=message):
-        empty(**changed)
+        replace(EMPTY, **changed)
 
 
 def test_a_missing_side_is_named():
     with pytest.raises(CalibrationError, match="not left"):
-        empty().select_sides(("left",))
+        EMPTY.select_sides(("left",))
 
 
 def test_values_that_are_not_finite_are_not_usable():

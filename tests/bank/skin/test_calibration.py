@@ -134,10 +134,9 @@ def test_without_direction_the_interval_is_wider_and_holds_the_force(path, norma
 
 def exact_calibration() -> SkinCalibration:
     knots = (-5.0, -1.2, 1.2, 5.0)
-    angle = float(np.degrees(BELT.gauge_angle_rad))
     return SkinCalibration(
         friction=0.04,
-        gauge_angle_deg=angle,
+        gauge_angle_deg=float(np.degrees(BELT.gauge_angle_rad)),
         linear_to_n=1.2,
         tension_n=knots,
         response=tuple(map(upturn, knots)),

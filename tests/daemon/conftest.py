@@ -1,4 +1,5 @@
 import asyncio
+import json
 import signal
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -70,12 +71,32 @@ def config(tmp_path, tiny_bank, tiny_calibration) -> Callable[..., Path]:
 
 
 @pytest.fixture
-def mistake(capsys) -> Callable[..., str]:
+def ran(capsys) -> Callable[..., "pytest.CaptureResult[str]"]:
+    """Return a function that runs a command, which must end with a status, and returns all that was printed."""
+
+    def run(*arguments: object, status: int = 0) -> "pytest.CaptureResult[str]":
+        assert main([*map(str, arguments)]) == status
+        return capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def result_of(ran) -> Callable[..., Any]:
+    """Return a function that runs a command with --json, and returns what was printed."""
+
+    def run(*arguments: object, status: int = 0) -> Any:
+        return json.loads(ran(*arguments, "--json", status=status).out)
+
+    return run
+
+
+@pytest.fixture
+def mistake(ran) -> Callable[..., str]:
     """Return a function that runs a command, which must end with status 2 and a line for each mistake."""
 
     def run(*arguments: object) -> str:
-        assert main([*map(str, arguments)]) == 2
-        out, err = capsys.readouterr()
+        out, err = ran(*arguments, status=2)
         assert out == ""
         # No traceback.
         assert all(": " in line and not line.startswith(" ") for line in err.splitlines()), err

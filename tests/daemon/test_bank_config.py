@@ -35,11 +35,16 @@ sigma: {low: 0.9, high: 2, count: 2}
 """
 
 
+def write_bank_config(folder: Path) -> Path:
+    """Write the description of a small bank and of its fingertip, `tip.yaml`, and return the bank's path."""
+    (folder / "tip.yaml").write_text(FINGERTIP)
+    (folder / "bank.yaml").write_text(BANK)
+    return folder / "bank.yaml"
+
+
 @pytest.fixture
-def config(tmp_path):
-    (tmp_path / "tip.yaml").write_text(FINGERTIP)
-    (tmp_path / "bank.yaml").write_text(BANK)
-    return tmp_path / "bank.yaml"
+def config(tmp_path) -> Path:
+    return write_bank_config(tmp_path)
 
 
 def test_the_model_names_are_those_that_exist():

@@ -70,7 +70,7 @@ def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path):
 
 @pytest.mark.parametrize(("noise_v", "mixed_up"), [(1e-4, False), (5e-3, True)])
 def test_frames_that_no_model_explains_are_called_so_on_screen_and_in_the_configuration(
-    noise_v, mixed_up, tmp_path, capsys
+    noise_v, mixed_up, tmp_path, ran
 ):
     frames = step_frames()
     rng = np.random.default_rng(0)
@@ -79,8 +79,7 @@ def test_frames_that_no_model_explains_are_called_so_on_screen_and_in_the_config
     for number, frame in enumerate(frames, 1):
         savemat(tmp_path / f"Data_Slice_{number}.mat", {"data_diff": frame[None], "torque_value": 0.01 * number})
     config = tmp_path / "design.yaml"
-    assert main(["bank", "design", str(tmp_path), "--out", str(config)]) == 0
-    errors, text = capsys.readouterr().err, config.read_text()
+    errors, text = ran("bank", "design", tmp_path, "--out", config).err, config.read_text()
     for words in ("even the best model leaves ", "the noise is "):
         assert (f"shearloop bank: {words}" in errors) == (f"# NOTE: {words}" in text) == mixed_up
     assert load_bank_plan(config).definition.model in text
@@ -92,9 +91,8 @@ def test_sizes_that_overflow_are_refused_without_a_warning():
         scene_of(FrameSeries("difference", ("right",), t_s, frames, t_s, t_s, np.full(12, np.nan)))
 
 
-def test_a_recording_that_is_none_is_one_sentence(tmp_path, capsys):
-    assert main(["bank", "design", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+def test_a_recording_that_is_none_is_one_sentence(tmp_path, mistake):
+    assert mistake("bank", "design", tmp_path).count("\n") == 1
 
 
 def test_a_recording_that_begins_gripped_is_designed_for_without_the_frame_that_stands_in_for_the_idle_one():

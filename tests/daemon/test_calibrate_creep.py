@@ -1,6 +1,5 @@
 """`calibrate creep`: from recordings of held twists to the line of the configuration."""
 
-import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 from shearloop.bank.estimation import Estimate, FrameSeries
 from shearloop.daemon.analysis.creep import grips_of
 from shearloop.daemon.analysis.evaluate import EstimateTrack
-from shearloop.daemon.cli import main
 from shearloop.daemon.config import CreepConfig
 from tests.daemon.analysis.test_creep import twisted
 
@@ -47,17 +45,15 @@ def played(monkeypatch: pytest.MonkeyPatch, found: EstimateTrack) -> None:
     monkeypatch.setattr("shearloop.daemon.analysis.evaluate.estimate_series", lambda *_: found)
 
 
-def test_it_prints_the_line_of_the_configuration(monkeypatch, capsys, tmp_path):
+def test_it_prints_the_line_of_the_configuration(monkeypatch, ran, tmp_path, result_of):
     found = track()
     played(monkeypatch, found)
     arguments = ["calibrate", "creep", str(tmp_path / "held.mcap"), "--calibration", "right.cal"]
-    assert main([*arguments, "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    result = result_of(*arguments)
     assert result["share"] == pytest.approx(0.08, abs=0.02)
     assert (result["grips"], result["frames"]) == (1, 1109)
     assert result["error_after_nm"] < result["error_before_nm"]
-    assert main(arguments) == 0
-    line, followed, beside = capsys.readouterr().out.splitlines()
+    line, followed, beside = ran(*arguments).out.splitlines()
     assert f"scaled by {result['scale']:.3f} and shifted by {1e3 * result['offset_nm']:+.1f} mN·m, follow" in followed
     assert "does not correct scale and zero" in beside
     assert line == f"creep: {{share: {result['share']:g}, time_s: {result['time_s']:g}}}"

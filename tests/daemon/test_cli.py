@@ -39,19 +39,17 @@ from shearloop.daemon.sensing.skin_task import SKIN
 from tests.daemon.sample_messages import sample
 
 
-def test_check_accepts_a_valid_configuration(config, capsys):
-    assert main(["check", str(config())]) == 0
-    assert "is in order" in capsys.readouterr().out
+def test_check_accepts_a_valid_configuration(config, ran):
+    assert "is in order" in ran("check", config()).out
 
 
 @pytest.mark.usefixtures("ur_rtde")
 @pytest.mark.parametrize("command", ["run", "check"])
-def test_a_calibration_without_torques_cannot_drive_the_loop(command, config, tiny_bank, tmp_path, capsys, mistake):
+def test_a_calibration_without_torques_cannot_drive_the_loop(command, config, tiny_bank, tmp_path, ran, mistake):
     grid, path = np.linspace(0.9, 2.1, 30), tmp_path / "diameters.yaml"
     Calibration.from_matches(Bank.open(tiny_bank).identity, "synthetic", diameter=(grid, 20.0 * grid)).save(path)
     section = {"right": {"device": {"path": "eit"}, "bank": str(tiny_bank), "calibration": str(path)}}
-    assert main(["check", str(config(fingertips=section))]) == 0
-    assert "without torque: its calibration has diameters only" in capsys.readouterr().out
+    assert "without torque: its calibration has diameters only" in ran("check", config(fingertips=section)).out
     shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
     steps = {"name": "one", "torque_source": "right", "steps": [{"do": "wait", "wait_s": 1}]}
     (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(steps))
@@ -179,34 +177,34 @@ def test_a_command_line_mistake_is_one_sentence(arguments, part, mistake):
     assert part in mistake(*arguments)
 
 
+INTERRUPTED = "shearloop evaluate: interrupted before it was done\n"
+
+
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_an_interrupted_command_reports_it_except_listen(number, status, monkeypatch, capsys):
+def test_an_interrupted_command_reports_it_except_listen(number, status, monkeypatch, ran):
     def interrupted(*_: object) -> NoReturn:
         signal.raise_signal(number)
         raise AssertionError
 
     monkeypatch.setattr("shearloop.daemon.cli.evaluate.run", interrupted)
-    assert main(["evaluate", "a.cal", "b.mcap"]) == status
-    assert capsys.readouterr() == ("", "shearloop evaluate: interrupted before it was done\n")
+    assert ran("evaluate", "a.cal", "b.mcap", status=status) == ("", INTERRUPTED)
     monkeypatch.setattr("shearloop.daemon.messaging.client.receive_messages", interrupted)
-    assert main(["listen"]) == status
-    assert capsys.readouterr() == ("", "")
+    assert ran("listen", status=status) == ("", "")
 
 
-def test_a_closed_terminal_causes_no_traceback(monkeypatch, capsys):
+def test_a_closed_terminal_causes_no_traceback(monkeypatch, ran):
     def interrupted(_: object) -> NoReturn:
         monkeypatch.setattr(sys.stderr, "write", Mock(side_effect=OSError(5, "Input/output error")))
         raise KeyboardInterrupt
 
     monkeypatch.setattr("shearloop.daemon.cli.evaluate.run", interrupted)
-    assert main(["evaluate", "a.cal", "b.mcap"]) == 130
-    assert capsys.readouterr() == ("", "")
+    assert ran("evaluate", "a.cal", "b.mcap", status=130) == ("", "")
 
 
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_during_a_callback_from_compiled_code_is_not_lost(number, status, monkeypatch, capsys):
+def test_a_signal_during_a_callback_from_compiled_code_is_not_lost(number, status, monkeypatch, ran):
 
     def loads(_: object) -> int:
         ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))()
@@ -214,8 +212,7 @@ def test_a_signal_during_a_callback_from_compiled_code_is_not_lost(number, statu
         return 0
 
     monkeypatch.setattr("shearloop.daemon.cli.evaluate.run", loads)
-    assert main(["evaluate", "a.cal", "b.mcap"]) == status
-    assert capsys.readouterr() == ("", "shearloop evaluate: interrupted before it was done\n")
+    assert ran("evaluate", "a.cal", "b.mcap", status=status) == ("", INTERRUPTED)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """`shearloop bank`: files, output, and mistakes as one sentence with status 2."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,7 @@ from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.eit.models import conductivity
 from shearloop.daemon.bank_config import load_geometry
 from shearloop.daemon.cli import main
-from tests.daemon.test_bank_config import BANK, FINGERTIP
+from tests.daemon.test_bank_config import BANK, write_bank_config
 
 SOLVE = ["solve", "--mesh", "{folder}/tip.yaml", "--model", "step", "--k", "1", "--sigma", "1", "--out", "{folder}/v"]
 
@@ -20,29 +18,25 @@ SOLVE = ["solve", "--mesh", "{folder}/tip.yaml", "--model", "step", "--k", "1", 
 def folder(tmp_path_factory):
     """Return a folder with a configuration and the bank that the command built of it."""
     folder = tmp_path_factory.mktemp("bank")
-    (folder / "tip.yaml").write_text(FINGERTIP)
-    (folder / "bank.yaml").write_text(BANK)
-    assert main(["bank", "build", "--config", f"{folder}/bank.yaml", "--out", f"{folder}/a.bank", "--jobs", "1"]) == 0
+    config = write_bank_config(folder)
+    assert main(["bank", "build", "--config", f"{config}", "--out", f"{folder}/a.bank", "--jobs", "1"]) == 0
     return folder
 
 
-def test_build_writes_the_bank_and_tells_its_identity(folder, tmp_path, capsys):
+def test_build_writes_the_bank_and_tells_its_identity(folder, tmp_path, capsys, result_of):
     capsys.readouterr()
-    build = ["bank", "build", "--config", f"{folder}/bank.yaml", "--out", f"{tmp_path}/b.bank", "--jobs", "1", "--json"]
-    assert main(build) == 0
-    result = json.loads(capsys.readouterr().out)
+    build = ["bank", "build", "--config", f"{folder}/bank.yaml", "--out", f"{tmp_path}/b.bank", "--jobs", "1"]
+    result = result_of(*build)
     bank = Bank.open(tmp_path / "b.bank", verify=True)
     assert (result["identity"], result["shape"], result["model"]) == (bank.identity, [*bank.signals.shape], bank.model)
     assert result["valid_cells"] == bank.valid.sum()
 
 
-def test_info_checks_the_bank_and_says_what_it_is_of(folder, capsys):
-    assert main(["bank", "info", f"{folder}/a.bank", "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+def test_info_checks_the_bank_and_says_what_it_is_of(folder, ran, result_of):
+    result = result_of("bank", "info", f"{folder}/a.bank")
     assert result["k"] == {"low": 0.5, "high": 3.0, "count": 3, "unit": "cm"}
     assert result["valid_cells"] == 6
-    assert main(["bank", "info", f"{folder}/a.bank"]) == 0
-    assert "3 values from 0.5 to 3 (cm)" in capsys.readouterr().out
+    assert "3 values from 0.5 to 3 (cm)" in ran("bank", "info", f"{folder}/a.bank").out
 
 
 def test_info_refuses_a_damaged_bank(folder, tmp_path, mistake):
@@ -62,7 +56,7 @@ def test_solve_writes_the_absolute_voltages(folder, tmp_path):
     assert np.linalg.norm(voltages) > 1
 
 
-def test_solve_leaves_what_was_there_whole_until_the_voltages_are_written(folder, tmp_path, monkeypatch, capsys):
+def test_solve_leaves_what_was_there_whole_until_the_voltages_are_written(folder, tmp_path, monkeypatch, ran, mistake):
     out, link = tmp_path / "v.npy", tmp_path / "link.npy"
     np.save(out, np.zeros(3))
     earlier = out.read_bytes()
@@ -76,15 +70,13 @@ def test_solve_leaves_what_was_there_whole_until_the_voltages_are_written(folder
 
     with monkeypatch.context() as disk:
         disk.setattr(np, "save", full)
-        assert main(solve) == 2
-    assert "No space left on device" in capsys.readouterr().err
+        assert "No space left on device" in mistake(*solve)
     assert out.read_bytes() == earlier
     assert sorted(path.name for path in tmp_path.iterdir()) == ["link.npy", "v.npy"]
-    assert main(solve) == 0
+    ran(*solve)
     assert np.load(out).shape == (896,)
     assert link.is_symlink()
-    assert main([*solve[:-1], f"{tmp_path}"]) == 2
-    assert "Is a directory" in capsys.readouterr().err
+    assert "Is a directory" in mistake(*solve[:-1], f"{tmp_path}")
 
 
 def test_solve_on_the_papers_mesh_gives_the_voltages_of_eidors(shared, tmp_path):

@@ -1,7 +1,7 @@
 import subprocess
 from pathlib import Path
 
-from shearloop.daemon.cli import COMMANDS, main
+from shearloop.daemon.cli import COMMANDS
 from shearloop.daemon.cli.completion import full_parser
 
 
@@ -17,20 +17,18 @@ def completed(script: Path, *words: str) -> set[str]:
     return set(done.stdout.split())
 
 
-def test_bash_completes_commands_and_options(tmp_path, capsys):
-    assert main(["completion", "bash"]) == 0
+def test_bash_completes_commands_and_options(tmp_path, ran):
     script = tmp_path / "shearloop"
-    script.write_text(capsys.readouterr().out)
+    script.write_text(ran("completion", "bash").out)
     assert set(COMMANDS) <= completed(script, "shearloop", "")
     assert completed(script, "shearloop", "do") == {"doctor"}
     assert "--geometry" in completed(script, "shearloop", "doctor", "--")
     assert {"server", "client", "allow", "revoke", "list"} <= completed(script, "shearloop", "keys", "")
 
 
-def test_every_shell_has_its_script(capsys):
+def test_every_shell_has_its_script(ran):
     for shell in ("zsh", "tcsh"):
-        assert main(["completion", shell]) == 0
-        assert "doctor" in capsys.readouterr().out
+        assert "doctor" in ran("completion", shell).out
 
 
 def test_file_arguments_complete_file_names():

@@ -1,7 +1,6 @@
 """`shearloop doctor` and `ports`: every finding says what was found, what it means, and the next step."""
 
 import asyncio
-import json
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -83,13 +82,11 @@ async def test_doctor_checks_a_rig_with_and_without_its_daemon(rig_config, tiny_
             assert f" Hz measured, {SPEED / 0.5412:.3g} Hz configured" in found["rate of right"].found
 
 
-def test_doctor_stops_at_an_invalid_configuration(tmp_path, capsys):
-    assert main(["doctor", str(tmp_path / "no.yaml")]) == 1
-    said = capsys.readouterr().out
+def test_doctor_stops_at_an_invalid_configuration(tmp_path, ran, result_of):
+    said = ran("doctor", tmp_path / "no.yaml", status=1).out
     assert "WRONG configuration" in said
     assert "next: " in said
-    assert main(["doctor", str(tmp_path / "no.yaml"), "--json"]) == 1
-    assert json.loads(capsys.readouterr().out)[-1]["subject"] == "configuration"
+    assert result_of("doctor", tmp_path / "no.yaml", status=1)[-1]["subject"] == "configuration"
     assert main(["doctor", "--seconds", "nan"]) == 2
 
 
@@ -192,21 +189,18 @@ def port(**changes: Any) -> Any:
     return SimpleNamespace(**{**fields, **changes})
 
 
-def test_ports_are_listed_with_their_configuration_entry(monkeypatch, capsys):
+def test_ports_are_listed_with_their_configuration_entry(monkeypatch, ran, result_of):
     there: list[Any] = []
     monkeypatch.setattr("shearloop.daemon.serial_ports.sorted", lambda ports: ports, raising=False)
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: there)
-    assert main(["ports"]) == 0
-    assert "there is no serial port" in capsys.readouterr().out
+    assert "there is no serial port" in ran("ports").out
     there += [port(), port(serial_number=None, vid=0x1A86, pid=0x7523), port(device="/dev/ttyS0", vid=None, pid=None)]
-    assert main(["ports", "--json"]) == 0
-    first, second = json.loads(capsys.readouterr().out)
+    first, second = result_of("ports")
     assert first["named_by"] == '{serial_number: "12345670"}'
     assert (first["likely"], first["usb"], first["error"]) == ("EIT-kit (Teensy)", "16c0:0483", "")
     assert second["named_by"] == "{path: /dev/null}"
     there[:] = [port(device="/dev/gone")]
-    assert main(["ports"]) == 0
-    assert "sudo usermod -aG dialout" in capsys.readouterr().out
+    assert "sudo usermod -aG dialout" in ran("ports").out
 
 
 def test_each_denied_port_is_reported_with_its_reason(monkeypatch):

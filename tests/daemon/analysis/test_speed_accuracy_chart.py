@@ -35,7 +35,6 @@ from shearloop.daemon.analysis.charts.speed_accuracy import (
     write,
 )
 from shearloop.daemon.analysis.reproduce.banks import Grid
-from shearloop.daemon.cli import main
 from shearloop.daemon.cli.chart import NAMES
 from shearloop.daemon.executors import SerialExecutor
 
@@ -144,19 +143,17 @@ def test_the_speed_accuracy_chart_holds_every_method_with_its_ratio(scratch, tmp
     ],
 )
 @pytest.mark.parametrize("name", NAMES)
-def test_a_mistake_is_one_sentence(name, arguments, complaint, tmp_path, capsys):
-    assert main(["chart", name, *arguments, "--out", str(tmp_path / "some" / "out")]) == 2
-    said = capsys.readouterr().err
+def test_a_mistake_is_one_sentence(name, arguments, complaint, tmp_path, mistake):
+    said = mistake("chart", name, *arguments, "--out", tmp_path / "some" / "out")
     assert complaint in said
     assert said.count("\n") == 1
 
 
-def test_an_unwritable_folder_is_reported_before_anything_is_measured(monkeypatch, capsys):
+def test_an_unwritable_folder_is_reported_before_anything_is_measured(monkeypatch, mistake):
     # Were anything read, it would be what fails.
     monkeypatch.setattr("shearloop.daemon.analysis.charts.sources.splits", None)
     for name in NAMES:
-        assert main(["chart", name, "--out", "/dev/null"]) == 2
-        said = capsys.readouterr().err
+        said = mistake("chart", name, "--out", "/dev/null")
         assert said == "shearloop chart: /dev/null: the chart cannot be written: File exists; choose another --out\n"
 
 

@@ -2,11 +2,10 @@
 
 import argparse
 import importlib
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from shearloop.daemon.cli import COMMANDS, main
+from shearloop.daemon.cli import COMMANDS
 
 # What needs none, and why.
 WITHOUT = {
@@ -44,15 +43,12 @@ def test_every_command_has_a_json_option_or_a_reason_for_none():
     assert {next((known for known in WITHOUT if name.startswith(known)), name) for name in lacking} == set(WITHOUT)
 
 
-def test_keys_as_json(tmp_path, capsys):
-    def result_of(*words: str) -> dict[str, object]:
-        assert main(["keys", *words, "--json"]) == 0
-        return json.loads(capsys.readouterr().out)
-
-    server = result_of("server", "--dir", str(tmp_path / "server"))
-    client = result_of("client", "--dir", str(tmp_path / "client"))
-    assert Path(str(server["secret_file"])).stat().st_mode & 0o777 == 0o600
-    allow = ("allow", str(client["public_file"]), "--name", "ada", "--dir", str(tmp_path / "server"))
-    assert result_of(*allow) == {"allowed": "ada"}
-    assert list(result_of("list", "--dir", str(tmp_path / "server"))["clients"]) == ["ada"]
-    assert result_of("revoke", "ada", "--dir", str(tmp_path / "server")) == {"revoked": "ada"}
+def test_keys_as_json(tmp_path, result_of):
+    folder = tmp_path / "server"
+    server = result_of("keys", "server", "--dir", folder)
+    client = result_of("keys", "client", "--dir", tmp_path / "client")
+    assert Path(server["secret_file"]).stat().st_mode & 0o777 == 0o600
+    allow = ("allow", client["public_file"], "--name", "ada")
+    assert result_of("keys", *allow, "--dir", folder) == {"allowed": "ada"}
+    assert list(result_of("keys", "list", "--dir", folder)["clients"]) == ["ada"]
+    assert result_of("keys", "revoke", "ada", "--dir", folder) == {"revoked": "ada"}

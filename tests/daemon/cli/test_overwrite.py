@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from shearloop.daemon.cli import main
 from shearloop.daemon.cli.options import check_overwrite
 from shearloop.daemon.errors import UserError
 
@@ -36,13 +35,12 @@ def matlab() -> bytes:
         ("recording export no.mcap --format mat --out", "a MATLAB file"),
     ],
 )
-def test_no_command_overwrites_a_file_of_another_kind(command, kind, tmp_path, capsys):
+def test_no_command_overwrites_a_file_of_another_kind(command, kind, tmp_path, mistake):
     there = tmp_path / "precious"
     content = matlab() if kind == "a recording" else MCAP
     there.write_bytes(content)
     bank = Path(__file__).parents[3] / "config" / "banks" / "demo.yaml"
-    assert main([*command.format(bank=bank).split(), str(there)]) == 2
-    assert f"{there} exists and is not {kind}: it was not changed" in capsys.readouterr().err
+    assert f"{there} exists and is not {kind}: it was not changed" in mistake(*command.format(bank=bank).split(), there)
     assert there.read_bytes() == content
 
 

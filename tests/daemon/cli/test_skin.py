@@ -7,14 +7,12 @@ import pytest
 from shearloop.bank.skin.calibration import load_calibration
 from shearloop.bank.skin.characterisation import FigureOfMerit, loop, responses
 from shearloop.bank.skin.membrane import THICK_SECTION, UNSTRETCHED, Membrane
-from shearloop.daemon.cli import main
 from shearloop.daemon.cli.skin import _table
 
 
 @pytest.mark.usefixtures("fonts")
-def test_characterise_holds_the_models_against_the_paper_and_draws_its_figures(tmp_path, capsys):
-    assert main(["skin", "characterise", "--json", "--out", str(tmp_path / "figures")]) == 0
-    printed = capsys.readouterr()
+def test_characterise_holds_the_models_against_the_paper_and_draws_its_figures(tmp_path, ran):
+    printed = ran("skin", "characterise", "--json", "--out", tmp_path / "figures")
     rows = {row["quantity"]: row for row in json.loads(printed.out)}
     for normal_n in (0.5, 1.0, 1.5, 2.0):
         row = rows[f"sensitivity, fit through origin, Fn = {normal_n} N"]
@@ -58,22 +56,19 @@ def write_table(path: Path) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-def test_calibrate_takes_a_table_to_a_file(tmp_path, capsys):
+def test_calibrate_takes_a_table_to_a_file(tmp_path, ran, result_of):
     table, out = tmp_path / "table.csv", tmp_path / "skin.yaml"
     write_table(table)
-    assert main(["skin", "calibrate", str(table), "--out", str(out)]) == 0
+    printed = ran("skin", "calibrate", table, "--out", out).out
     calibration = load_calibration(out)
     membrane = Membrane(THICK_SECTION)
     assert calibration.friction == pytest.approx(membrane.belt.friction, abs=0.003)
     assert calibration.slope_per_n == pytest.approx(membrane.response(membrane.step(UNSTRETCHED, 1.0, 0.0)), rel=0.03)
     assert np.isfinite(calibration.prediction_half_width_n)
-    printed = capsys.readouterr().out
     assert f"friction coefficient (fitted)        {calibration.friction:.4f}" in printed
     assert f"rows fitted                          {2 * len(loop(1.1))}" in printed
-    assert main(["skin", "calibrate", str(table), "--out", str(out), "--friction", "0.04"]) == 0
-    assert "(given)" in capsys.readouterr().out
-    assert main(["skin", "calibrate", str(table), "--out", str(out), "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    assert "(given)" in ran("skin", "calibrate", table, "--out", out, "--friction", "0.04").out
+    result = result_of("skin", "calibrate", table, "--out", out)
     assert (result["path"], result["friction"], result["friction_given"]) == (str(out), calibration.friction, False)
     assert result["rows"] == calibration.rows
 

@@ -9,7 +9,7 @@ from jsonschema import Draft202012Validator
 
 from shearloop.bank.estimation import Calibration
 from shearloop.bank.skin.calibration import load_calibration
-from shearloop.daemon.cli import demo, main
+from shearloop.daemon.cli import demo
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.config_schema import MODELS
@@ -48,16 +48,14 @@ def test_the_calibrations_of_config_are_of_this_version():
     assert load_calibration(CONFIG / "calibrations" / "skin_demo.yaml").rows
 
 
-def test_schema_prints_every_kind(capsys):
+def test_schema_prints_every_kind(ran):
     for kind in MODELS:
-        assert main(["schema", kind]) == 0
-        Draft202012Validator.check_schema(json.loads(capsys.readouterr().out))
+        Draft202012Validator.check_schema(json.loads(ran("schema", kind).out))
 
 
-def test_init_writes_files_that_load_and_changes_none(tmp_path, capsys):
+def test_init_writes_files_that_load_and_changes_none(tmp_path, ran, mistake):
     folder = tmp_path / "my" / "rig"
-    assert main(["init", str(folder)]) == 0
-    assert f"shearloop check {folder / 'rig.yaml'}" in capsys.readouterr().out
+    assert f"shearloop check {folder / 'rig.yaml'}" in ran("init", folder).out
     config = load_daemon_config(folder / "rig.yaml")
     assert config.robot == folder / "ur.yaml"
     assert not config.emulators
@@ -65,12 +63,10 @@ def test_init_writes_files_that_load_and_changes_none(tmp_path, capsys):
     schema_for(folder / "banks" / "paper.yaml")
     (folder / "rig.yaml").write_text("mine")
     (folder / "ur.yaml").unlink()
-    assert main(["init", str(folder)]) == 2
-    assert "nothing was written; choose another folder" in capsys.readouterr().err
+    assert "nothing was written; choose another folder" in mistake("init", folder)
     assert (folder / "rig.yaml").read_text() == "mine"
     assert not (folder / "ur.yaml").exists()
-    assert main(["init", str(folder / "rig.yaml")]) == 2
-    assert "cannot be written: Not a directory; choose another path" in capsys.readouterr().err
+    assert "cannot be written: Not a directory; choose another path" in mistake("init", folder / "rig.yaml")
 
 
 def test_the_demos_page_lasts_as_long_as_the_demo(tmp_path, monkeypatch, capsys):
@@ -93,11 +89,9 @@ def test_the_demos_page_lasts_as_long_as_the_demo(tmp_path, monkeypatch, capsys)
         asyncio.run(status(url))
 
 
-def test_the_demo_refuses_a_recording_that_is_not_there_at_once(tmp_path, capsys):
-    assert main(["demo", "--folder", str(tmp_path), "--recording", str(tmp_path / "none.mat")]) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert "none.mat: the recording cannot be read: No such file" in err
+def test_the_demo_refuses_a_recording_that_is_not_there_at_once(tmp_path, mistake):
+    said = mistake("demo", "--folder", tmp_path, "--recording", tmp_path / "none.mat")
+    assert "none.mat: the recording cannot be read: No such file" in said
 
 
 def test_the_demo_without_aiohttp_says_what_the_page_needs(monkeypatch, capsys):

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shearloop.daemon.cli import main
 from shearloop.drivers.emulators.rig import EmulatedRig
 
 
@@ -25,9 +24,8 @@ from shearloop.drivers.emulators.rig import EmulatedRig
         (["--host", "192.0.2.1"], "the rig cannot be played on 192.0.2.1"),
     ],
 )
-def test_mistakes_are_told(arguments, sentence, bank, tmp_path, capsys):
-    assert main(["emulate", "rig", "--bank", str(bank), "--run-dir", str(tmp_path), *arguments]) == 2
-    complaint = capsys.readouterr().err
+def test_mistakes_are_told(arguments, sentence, bank, tmp_path, mistake):
+    complaint = mistake("emulate", "rig", "--bank", bank, "--run-dir", tmp_path, *arguments)
     assert sentence in complaint
     assert complaint.count("\n") == 1
 

@@ -1,6 +1,5 @@
 """Tasks and commands in turn, in processes, and on a real Dask cluster of two workers, one of which may be killed."""
 
-import json
 import os
 import signal
 import socket
@@ -17,7 +16,7 @@ from shearloop.daemon.cli import main
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.executors import LOCAL, DaskExecutor, ProcessExecutor, SerialExecutor, open_executor
 from tests.daemon.executors.conftest import STARTED_S, dask
-from tests.daemon.test_bank_config import BANK, FINGERTIP
+from tests.daemon.test_bank_config import write_bank_config
 
 # Every worker imports this module for its tasks: what takes long to import is imported by the test that needs it.
 
@@ -107,12 +106,9 @@ def test_a_large_recording_is_sent_to_a_cluster_without_a_warning(scheduler):
         assert list(cluster.map(size, None, [np.zeros(1_500_000)])) == [(0, 1_500_000)]
 
 
-def test_a_missing_scheduler_is_one_sentence(tmp_path, capsys):
-    (tmp_path / "tip.yaml").write_text(FINGERTIP)
-    (tmp_path / "bank.yaml").write_text(BANK)
-    command = ["bank", "build", "--config", str(tmp_path / "bank.yaml"), "--out", str(tmp_path / "a.bank")]
-    assert main([*command, "--cluster", "tcp://127.0.0.1:9"]) == 2
-    assert "no Dask scheduler answers at tcp://127.0.0.1:9" in capsys.readouterr().err
+def test_a_missing_scheduler_is_one_sentence(tmp_path, mistake):
+    command = ["bank", "build", "--config", write_bank_config(tmp_path), "--out", tmp_path / "a.bank"]
+    assert "no Dask scheduler answers at tcp://127.0.0.1:9" in mistake(*command, "--cluster", "tcp://127.0.0.1:9")
 
 
 def test_a_server_that_is_no_scheduler_times_out(monkeypatch):
@@ -164,9 +160,7 @@ def test_a_cluster_address_needs_the_extra(monkeypatch):
 def bank(tmp_path_factory) -> Path:
     """Return a bank built here, before any test is watched (tqdm's thread)."""
     folder = tmp_path_factory.mktemp("banks")
-    (folder / "tip.yaml").write_text(FINGERTIP)
-    (folder / "bank.yaml").write_text(BANK)
-    command = ["bank", "build", "--config", str(folder / "bank.yaml"), "--out", str(folder / "here.bank")]
+    command = ["bank", "build", "--config", str(write_bank_config(folder)), "--out", str(folder / "here.bank")]
     assert main([*command, "--jobs", "1"]) == 0
     return folder / "here.bank"
 
@@ -195,15 +189,15 @@ def killed(scheduler, monkeypatch) -> Iterator[list[int]]:
         client.wait_for_workers(2, timeout=STARTED_S)
 
 
-def test_evaluate_gives_the_same_figures_on_a_cluster_with_a_killed_worker(scheduler, shared, tmp_path, capsys, killed):
+def test_evaluate_gives_the_same_figures_on_a_cluster_with_a_killed_worker(
+    scheduler, shared, tmp_path, ran, result_of, killed
+):
     slices, cylinders = (str(shared / "recordings" / name) for name in ("torque_slices", "diameter_slices"))
     calibration = str(tmp_path / "slices.cal")
-    assert main(["calibrate", slices, "--estimator", "regression", "--time-range", "0:0.6", "--out", calibration]) == 0
+    ran("calibrate", slices, "--estimator", "regression", "--time-range", "0:0.6", "--out", calibration)
     figures = []
     for options in ([], ["--cluster", scheduler]):
-        capsys.readouterr()
-        assert main(["evaluate", calibration, slices, cylinders, "--time-range", "0.6:1", "--json", *options]) == 0
-        found = json.loads(capsys.readouterr().out)
+        found = result_of("evaluate", calibration, slices, cylinders, "--time-range", "0.6:1", *options)
         figures.append({name: value for name, value in found.items() if not name.startswith("latency")})
     assert killed
     assert figures[0] == figures[1]

@@ -1,7 +1,6 @@
 """CURVE on anything but loopback and ipc, keys by `shearloop keys`, an allow-list, and no way round them."""
 
 import asyncio
-import json
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -11,7 +10,6 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from shearloop.daemon.cli import main
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import has_valid_port, is_local, needs_keys, send_to_stop_socket
 from shearloop.daemon.messaging.bound_sockets import bind
@@ -33,13 +31,12 @@ SILENCE_MS = 300
 
 
 @pytest.fixture
-def keys(tmp_path, capsys) -> Path:
+def keys(tmp_path, ran) -> Path:
     """A server and one client who knows it, made as a user makes them."""
-    server, client = str(tmp_path / "keys"), str(tmp_path / "ada")
-    assert main(["keys", "server", "--dir", server]) == 0
-    assert main(["keys", "client", "--dir", client]) == 0
-    assert main(["keys", "allow", f"{client}/client.key", "--name", "ada", "--dir", server]) == 0
-    capsys.readouterr()
+    server, client = tmp_path / "keys", tmp_path / "ada"
+    ran("keys", "server", "--dir", server)
+    ran("keys", "client", "--dir", client)
+    ran("keys", "allow", client / "client.key", "--name", "ada", "--dir", server)
     return tmp_path
 
 
@@ -71,21 +68,20 @@ def test_valid_ports():
 
 
 @pytest.mark.parametrize("command", ["run", "check"])
-def test_a_network_address_needs_keys(command, config, capsys):
+def test_a_network_address_needs_keys(command, config, mistake):
     for key in ("publish", "commands"):
-        assert main([command, str(config(**{key: "tcp://0.0.0.0:7769"}))]) == 2
-        assert f"`{key}: tcp://0.0.0.0:7769` would open the robot to the network" in capsys.readouterr().err
+        assert f"`{key}: tcp://0.0.0.0:7769` would open the robot to the network" in mistake(
+            command, config(**{key: "tcp://0.0.0.0:7769"})
+        )
 
 
-def test_a_network_address_needs_existing_keys(config, keys, capsys):
+def test_a_network_address_needs_existing_keys(config, keys, ran, mistake):
     missing = {"server_key": str(keys / "none.key_secret"), "clients": str(keys / "keys/clients")}
     path = str(config(commands=NETWORK, curve=missing))
     for command in ("run", "check"):
-        assert main([command, path]) == 2
-        assert "make it with `shearloop keys`" in capsys.readouterr().err
-    assert main(["keys", "revoke", "ada", "--dir", str(keys / "keys")]) == 0
-    assert main(["run", str(config(commands=NETWORK, curve=curve(keys)))]) == 2
-    assert "holds no key, so no client could connect" in capsys.readouterr().err
+        assert "make it with `shearloop keys`" in mistake(command, path)
+    ran("keys", "revoke", "ada", "--dir", keys / "keys")
+    assert "holds no key, so no client could connect" in mistake("run", config(commands=NETWORK, curve=curve(keys)))
 
 
 @pytest.fixture
@@ -143,22 +139,19 @@ async def test_only_allowed_clients_connect_and_only_encrypted(config, keys, con
         await daemon._stop.wait()
 
 
-def test_a_client_needs_keys_for_another_machine(tmp_path, monkeypatch, capsys):
+def test_a_client_needs_keys_for_another_machine(tmp_path, monkeypatch, ran, mistake):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     for command in (["listen"], ["command", "stop"]):
-        assert main([*command, "--connect", "tcp://192.0.2.1:7761"]) == 2
-        assert "make one with `shearloop keys client`" in capsys.readouterr().err
-    assert main(["keys", "client"]) == 0
-    assert main(["listen", "--connect", "tcp://192.0.2.1:7761"]) == 2
-    assert "copy the daemon's server.key there" in capsys.readouterr().err
+        assert "make one with `shearloop keys client`" in mistake(*command, "--connect", "tcp://192.0.2.1:7761")
+    ran("keys", "client")
+    assert "copy the daemon's server.key there" in mistake("listen", "--connect", "tcp://192.0.2.1:7761")
 
 
-def test_keys_are_made_listed_and_revoked(keys, capsys):
+def test_keys_are_made_listed_and_revoked(keys, ran, mistake, result_of):
     folder = keys / "keys"
     assert (folder / "server.key_secret").stat().st_mode & 0o777 == 0o600
     assert (folder / "clients/ada.key").stat().st_mode & 0o777 == 0o644
-    assert main(["keys", "list", "--dir", str(folder), "--json"]) == 0
-    shown = json.loads(capsys.readouterr().out)
+    shown = result_of("keys", "list", "--dir", folder)
     assert shown["clients"] == {"ada": load_public_key(keys / "ada/client.key").decode()}
     for arguments, why in (
         (["server"], "exists already"),
@@ -166,11 +159,9 @@ def test_keys_are_made_listed_and_revoked(keys, capsys):
         (["allow", str(folder / "server.key"), "--name", "../eve"], "is not a client's name"),
         (["revoke", "eve"], "there is no client 'eve'; the allowed clients are ada"),
     ):
-        assert main(["keys", *arguments, "--dir", str(folder)]) == 2
-        assert why in capsys.readouterr().err
-    assert main(["keys", "revoke", "ada", "--dir", str(folder)]) == 0
-    assert main(["keys", "list", "--dir", str(folder)]) == 0
-    assert "no client may connect yet" in capsys.readouterr().out
+        assert why in mistake("keys", *arguments, "--dir", folder)
+    ran("keys", "revoke", "ada", "--dir", folder)
+    assert "no client may connect yet" in ran("keys", "list", "--dir", folder).out
 
 
 def test_a_damaged_key_is_an_error(keys):

@@ -1,37 +1,40 @@
-import json
-
 import pytest
-
-from shearloop.daemon.cli import main
 
 
 @pytest.fixture
-def grips(shared, tmp_path):
-    """Two recorded grips of one cylinder, whose gains differ by a third."""
-    folder = shared / "recordings" / "streams" / "cylinders"
-    for number in (1, 2):
-        files = [str(folder / f"30mm_{number}_{name}.mat") for name in ("right", "truth")]
-        assert main(["import", "mat", *files, "--out", str(tmp_path / f"{number}.mcap")]) == 0
-    known = ["--load-cell-delay-s", "0"]
-    assert main(["calibrate", str(tmp_path / "1.mcap"), *known, "--out", str(tmp_path / "1.cal")]) == 0
-    return tmp_path
+def cylinder(shared, tmp_path, ran):
+    """Return a function that imports the recorded grip of a cylinder, and returns its path."""
+
+    def imported(name):
+        files = [shared / "recordings" / "streams" / "cylinders" / f"{name}_{what}.mat" for what in ("right", "truth")]
+        ran("import", "mat", *files, "--out", tmp_path / f"{name}.mcap")
+        return tmp_path / f"{name}.mcap"
+
+    return imported
 
 
-def loaded(calibration, recording, capsys):
-    capsys.readouterr()
-    assert main(["evaluate", str(calibration), str(recording), "--time-range", "0.38:1", "--json"]) == 0
-    return json.loads(capsys.readouterr().out)["loaded"]
+@pytest.fixture
+def calibration(cylinder, tmp_path, ran):
+    """A calibration on a grip of one cylinder; the gain of the other recorded grip differs by a third."""
+    ran("calibrate", cylinder("30mm_1"), "--load-cell-delay-s", "0", "--out", tmp_path / "1.cal")
+    return tmp_path / "1.cal"
 
 
-def test_two_twists_of_a_grip_correct_the_calibration_of_another(grips, capsys):
-    recording, new = grips / "2.mcap", grips / "new.cal"
-    before = loaded(grips / "1.cal", recording, capsys)
-    arguments = ["adapt", str(grips / "1.cal"), str(recording), "--time-range", "0:0.38", "--out", str(new), "--json"]
-    assert main(arguments) == 0
-    said = json.loads(capsys.readouterr().out)
+@pytest.fixture
+def loaded(result_of):
+    """Return a function that evaluates a calibration on the later part of a recording, where it is loaded."""
+    return lambda calibration, recording: result_of("evaluate", calibration, recording, "--time-range", "0.38:1")[
+        "loaded"
+    ]
+
+
+def test_two_twists_of_a_grip_correct_the_calibration_of_another(calibration, cylinder, loaded, tmp_path, result_of):
+    recording, new = cylinder("30mm_2"), tmp_path / "new.cal"
+    before = loaded(calibration, recording)
+    said = result_of("adapt", calibration, recording, "--time-range", "0:0.38", "--out", new)
     assert said["gains"]["right"]["gain"] == pytest.approx(1.4, abs=0.15)
     assert said["twists"] == 2
-    after = loaded(new, recording, capsys)
+    after = loaded(new, recording)
     assert before["gain"] < 0.8
     assert 0.9 < after["gain"] < 1.1
     assert after["rmse_nm"] < 0.6 * before["rmse_nm"]
@@ -39,33 +42,27 @@ def test_two_twists_of_a_grip_correct_the_calibration_of_another(grips, capsys):
     assert after["winkler_nm"] < before["winkler_nm"]
 
 
-def test_what_cannot_be_adapted_is_refused(grips, slices_folder, capsys):
-    out = ["--out", str(grips / "new.cal")]
-    assert main(["adapt", str(grips / "1.cal"), str(grips / "2.mcap"), "--time-range", "0:0.15", *out]) == 2
-    assert "twist" in capsys.readouterr().err
-    assert main(["calibrate", str(slices_folder), "--estimator", "regression", "--out", str(grips / "s.cal")]) == 0
-    assert main(["adapt", str(grips / "s.cal"), str(grips / "2.mcap"), *out]) == 2
-    assert "raw" in capsys.readouterr().err
+def test_what_cannot_be_adapted_is_refused(calibration, cylinder, slices_folder, tmp_path, ran, mistake):
+    recording, out, of_slices = cylinder("30mm_2"), ["--out", tmp_path / "new.cal"], tmp_path / "s.cal"
+    assert "twist" in mistake("adapt", calibration, recording, "--time-range", "0:0.15", *out)
+    ran("calibrate", slices_folder, "--estimator", "regression", "--out", of_slices)
+    assert "raw" in mistake("adapt", of_slices, recording, *out)
 
 
 @pytest.mark.parametrize(
     ("tool", "others"), [("20mm_1", "10mm_1 30mm_1 30mm_2 40mm_1"), ("40mm_1", "10mm_1 20mm_1 30mm_1 30mm_2")]
 )
-def test_other_diameters_and_two_twists_estimate_the_torque_on_a_tool(shared, tmp_path, capsys, tool, others):
-    folder = shared / "recordings" / "streams" / "cylinders"
-    for name in [tool, *others.split()]:
-        files = [str(folder / f"{name}_{what}.mat") for what in ("right", "truth")]
-        assert main(["import", "mat", *files, "--out", str(tmp_path / f"{name}.mcap")]) == 0
-    recordings = [str(tmp_path / f"{name}.mcap") for name in others.split()]
-    out, new, tested = (str(tmp_path / name) for name in ("tools.cal", "new.cal", f"{tool}.mcap"))
-    assert main(["calibrate", *recordings, "--load-cell-delay-s", "0", "--out", out]) == 0
-    assert "The tools' diameters are 10 to " in capsys.readouterr().out
-    before = loaded(out, tested, capsys)
+def test_other_diameters_and_two_twists_estimate_the_torque_on_a_tool(
+    tool, others, cylinder, loaded, tmp_path, ran, result_of
+):
+    tested, recordings = cylinder(tool), map(cylinder, others.split())
+    out, new = tmp_path / "tools.cal", tmp_path / "new.cal"
+    printed = ran("calibrate", *recordings, "--load-cell-delay-s", "0", "--out", out).out
+    assert "The tools' diameters are 10 to " in printed
+    before = loaded(out, tested)
     assert before["coverage_95"] > 0.9, "a tool that was not calibrated"
-    assert main(["adapt", out, tested, "--time-range", "0:0.28", "--out", new]) == 0
-    capsys.readouterr()
-    assert main(["evaluate", new, tested, "--time-range", "0.28:1", "--json"]) == 0
-    after = json.loads(capsys.readouterr().out)
+    ran("adapt", out, tested, "--time-range", "0:0.28", "--out", new)
+    after = result_of("evaluate", new, tested, "--time-range", "0.28:1")
     # A plateau is nearly the loaded frames' root mean square.
     assert after["rmse_nm"] < 0.2 * after["loaded"]["zero_rmse_nm"]
     assert after["coverage_95"] >= 0.9

@@ -1,5 +1,4 @@
 import csv
-import json
 import sys
 from pathlib import Path
 
@@ -9,7 +8,6 @@ from scipy.io import loadmat
 
 import shearloop
 from shearloop.bank.eit.channels import PAPER_TABLE
-from shearloop.daemon.cli import main
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.tables import arrays
@@ -28,38 +26,32 @@ def recording(tmp_path) -> Path:
     return path
 
 
-def test_info_shows_the_content(recording, capsys):
-    assert main(["recording", "info", str(recording)]) == 0
-    printed = capsys.readouterr().out
+def test_info_shows_the_content(recording, ran, result_of):
+    printed = ran("recording", "info", recording).out
     assert "a bench" in printed
     assert "eit.frame.right               4 messages     1.85 Hz" in printed
     assert "the same code as here" in printed
-    assert main(["recording", "info", "--json", str(recording)]) == 0
-    printed = json.loads(capsys.readouterr().out)
+    printed = result_of("recording", "info", recording)
     assert printed["topics"]["load.torque"]["messages"] == 4
     assert (printed["closed"], printed["same_code"], printed["size_bytes"]) == (True, True, recording.stat().st_size)
 
 
-def test_a_torn_recording_is_refused_and_repaired(recording, tmp_path, capsys):
+def test_a_torn_recording_is_refused_and_repaired(recording, tmp_path, ran, mistake):
     whole = recording.read_bytes()
     torn = tmp_path / "torn.mcap.partial"
     torn.write_bytes(whole[: len(whole) - 400])
-    assert main(["evaluate", "x.cal", str(torn)]) == 2
-    assert main(["recording", "export", str(torn)]) == 2
-    assert f"shearloop recording repair {torn}" in capsys.readouterr().err
-    assert main(["recording", "info", str(torn)]) == 0
-    assert "It was not closed" in capsys.readouterr().out
-    assert main(["recording", "repair", str(torn)]) == 0
-    assert "torn.mcap: 8 messages are saved" in capsys.readouterr().out
+    mistake("evaluate", "x.cal", torn)
+    assert f"shearloop recording repair {torn}" in mistake("recording", "export", torn)
+    assert "It was not closed" in ran("recording", "info", torn).out
+    assert "torn.mcap: 8 messages are saved" in ran("recording", "repair", torn).out
     assert torn.exists(), "the original stays"
     found = read_recording(tmp_path / "torn.mcap")
     np.testing.assert_array_equal(found.sides["right"].lines, LINES)
     assert found.source == "a bench"
-    assert main(["recording", "repair", str(torn)]) == 2
-    assert "exists already" in capsys.readouterr().err
+    assert "exists already" in mistake("recording", "repair", torn)
 
 
-def test_a_damaged_chunk_is_left_out_and_counted(tmp_path, capsys, monkeypatch):
+def test_a_damaged_chunk_is_left_out_and_counted(tmp_path, result_of, monkeypatch):
     monkeypatch.setattr("shearloop.daemon.recording.writer._FLUSH_EVERY", 1)
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, "a bench") as writer:
@@ -69,19 +61,18 @@ def test_a_damaged_chunk_is_left_out_and_counted(tmp_path, capsys, monkeypatch):
     at = content.index(b'{"torque_nm":0.5}') if b'{"torque_nm":0.5}' in content else len(content) // 4
     content[at : at + 4] = bytes(255 - byte for byte in content[at : at + 4])
     path.write_bytes(content)
-    assert main(["recording", "repair", str(path), "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
+    printed = result_of("recording", "repair", path)
     assert (printed["path"], printed["damaged_chunks"]) == (str(tmp_path / "a.repaired.mcap"), 1)
     kept = read_recording(tmp_path / "a.repaired.mcap").torque_nm
     assert set(np.round(kept, 2)) < set(np.round(0.01 * np.arange(100), 2))
     assert len(kept) == printed["messages"] >= 24
 
 
-def test_csv_parquet_and_matlab_exports_agree(recording, tmp_path, capsys):
+def test_csv_parquet_and_matlab_exports_agree(recording, tmp_path, result_of):
     pyarrow_parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
     for form in ("csv", "parquet", "mat"):
-        assert main(["recording", "export", str(recording), "--format", form, "--json"]) == 0
-        assert all(Path(file).stat().st_size for file in json.loads(capsys.readouterr().out)["files"])
+        files = result_of("recording", "export", recording, "--format", form)["files"]
+        assert all(Path(file).stat().st_size for file in files)
     with (tmp_path / "twist_csv" / "eit.frame.right.csv").open(newline="") as file:
         rows = list(csv.reader(file))
     assert rows[0][:3] == ["log_time_ns", "arrival_unix_ns", "line_0"]
@@ -146,22 +137,20 @@ def test_arrays_have_the_types_of_their_values(values, kind, expected):
         ),
     ],
 )
-def test_mistakes_end_in_one_sentence(arguments, message, recording, tmp_path, capsys):
+def test_mistakes_end_in_one_sentence(arguments, message, recording, tmp_path, mistake):
     (tmp_path / "text.mcap").write_text("not a recording at all")
     given = [one.format(folder=tmp_path, recording=recording) for one in arguments]
-    assert main(["recording", *given]) == 2
-    assert message in capsys.readouterr().err
+    assert message in mistake("recording", *given)
     assert not list(tmp_path.glob("*.tmp"))
 
 
-def test_a_topic_of_another_version_is_named(tmp_path, capsys, monkeypatch):
+def test_a_topic_of_another_version_is_named(tmp_path, mistake, monkeypatch):
     path = tmp_path / "new.mcap"
     with monkeypatch.context() as newer:
         newer.setattr("shearloop.daemon.recording.schema.schema_name", lambda _: "load.torque")
         newer.setattr("shearloop.daemon.recording.schema.software_version", lambda: "99.1")
         with RecordingWriter(path, "a bench") as writer:
             writer._add("arm.temperature", 10**18, {"torque_nm": 0.5})
-    assert main(["recording", "export", str(path)]) == 2
-    said = capsys.readouterr().err
+    said = mistake("recording", "export", path)
     assert "has no topic 'arm.temperature'; version 99.1 wrote this recording" in said
     assert "KeyError" not in said

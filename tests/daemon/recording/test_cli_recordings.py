@@ -1,4 +1,3 @@
-import json
 import re
 from dataclasses import dataclass, replace
 from shutil import copytree
@@ -25,17 +24,15 @@ KEYS |= {"latency_ms_p50", "latency_ms_p99", "winkler_nm", "zero_rmse_nm", "load
 
 
 @pytest.mark.usefixtures("fonts")
-def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_path, capsys):
+def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_path, ran, result_of):
     first, second = tmp_path / "a.cal", tmp_path / "b.cal"
-    for out, form in ((first, []), (second, ["--json"])):
-        capsys.readouterr()
-        assert main(["calibrate", str(slices_folder), "--time-range", "0:0.6", "--out", str(out), *form]) == 0
+    calibrate = ["calibrate", slices_folder, "--time-range", "0:0.6", "--out"]
+    ran(*calibrate, first)
+    result = result_of(*calibrate, second)
     assert first.read_bytes() == second.read_bytes()
-    result = json.loads(capsys.readouterr().out)
     assert (result["path"], result["estimator"]) == (str(second), "motion_regression")
     assert result["quantities"] == ["torque", "diameter"]
-    assert main(["evaluate", str(first), str(slices_folder), "--time-range", "0.6:1", "--json", "--plot"]) == 0
-    figures = json.loads(capsys.readouterr().out)
+    figures = result_of("evaluate", first, slices_folder, "--time-range", "0.6:1", "--plot")
     assert set(figures) == KEYS | {"diameter_rmse_mm", "diameter_coverage_95", "diameter_interval_mm"}
     assert 0 < figures["interval_nm"] < 0.1
     assert 0 < figures["diameter_interval_mm"] < 40
@@ -46,26 +43,23 @@ def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_p
     assert figures["loaded"]["n"] + figures["unloaded"]["n"] == 20 + 6
     assert figures["winkler_nm"] >= figures["interval_nm"] / 2
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
-    assert main(["evaluate", str(first), str(slices_folder), "--out", str(tmp_path / "named.svg")]) == 0
-    capsys.readouterr()
+    ran("evaluate", first, slices_folder, "--out", tmp_path / "named.svg")
     assert (tmp_path / "named.svg").read_text().count(f"<!-- {slices_folder.name}, right") == 2
-    assert main(["evaluate", str(first), str(slices_folder / "torque_slices")]) == 0
-    text = capsys.readouterr().out
+    text = ran("evaluate", first, slices_folder / "torque_slices").out
     assert re.search(r"^figure +loaded +unloaded +all +meaning$", text, re.MULTILINE)
     assert re.search(r"^interval_nm +0\.\d+ .* 0\.\d+ +median width of these intervals", text, re.MULTILINE)
     assert "diameter" not in text
 
 
-def test_a_part_of_the_slices_has_the_rows_of_the_whole(slices_folder, tmp_path, capsys):
+def test_a_part_of_the_slices_has_the_rows_of_the_whole(slices_folder, tmp_path, ran, result_of):
     slices, whole, judged = str(slices_folder / "torque_slices"), tmp_path / "all.cal", []
     for out, part in ((whole, []), (tmp_path / "part.cal", ["--time-range", "0:1"])):
-        assert main(["calibrate", slices, "--estimator", "regression", "--out", str(out), *part]) == 0
+        ran("calibrate", slices, "--estimator", "regression", "--out", out, *part)
     assert whole.read_bytes() == (tmp_path / "part.cal").read_bytes()
-    capsys.readouterr()
-    for n, part in enumerate(([], ["--time-range", "0:1"], ["--time-range", "0.6:1"], ["--loaded-nm", "9"])):
-        table = tmp_path / f"{n}.csv"
-        assert main(["evaluate", str(whole), slices, *part, "--estimates", str(table), "--json"]) == 0
-        judged.append((table.read_text(), json.loads(capsys.readouterr().out)))
+    table = tmp_path / "estimates.csv"
+    for part in ([], ["--time-range", "0:1"], ["--time-range", "0.6:1"], ["--loaded-nm", "9"]):
+        found = result_of("evaluate", whole, slices, *part, "--estimates", table)
+        judged.append((table.read_text(), found))
     (rows, figures), (same_rows, same), (later, _), (_, unloaded) = judged
     assert same_rows == rows
     assert same["loaded"] == figures["loaded"]
@@ -85,21 +79,20 @@ class BandMeans(Estimator):
         return reading.frame.difference.reshape(self.bands, -1).mean(axis=1), None
 
 
-def test_an_estimator_is_one_class_and_one_line(slices_folder, tmp_path, capsys, monkeypatch):
+def test_an_estimator_is_one_class_and_one_line(slices_folder, tmp_path, ran, monkeypatch, result_of):
     monkeypatch.setitem(ESTIMATORS, "bands", f"{__name__}:BandMeans")
     calibration, slices = str(tmp_path / "a.cal"), str(slices_folder / "torque_slices")
-    assert main(["calibrate", slices, "--estimator", "bands", "--time-range", "0:0.6", "--out", calibration]) == 0
-    assert "Estimator bands, torque from" in capsys.readouterr().out
+    calibrate = ["calibrate", slices, "--estimator", "bands", "--time-range", "0:0.6", "--out", calibration]
+    assert "Estimator bands, torque from" in ran(*calibrate).out
     assert Calibration.load(calibration).estimator.bands == 8
-    assert main(["evaluate", calibration, slices, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["r"] > 0.9
+    assert result_of("evaluate", calibration, slices)["r"] > 0.9
     monkeypatch.undo()
     with pytest.raises(CalibrationError, match="the estimator is 'bands', which this version does not know"):
         Calibration.load(calibration)
 
 
 @pytest.mark.parametrize("misses_loads", [True, False])
-def test_calibrate_says_where_loads_are_not_seen(misses_loads, slices_folder, tmp_path, capsys, monkeypatch):
+def test_calibrate_says_where_loads_are_not_seen(misses_loads, slices_folder, tmp_path, ran, monkeypatch, result_of):
     def blind(*arguments, **options):
         found = fit(*arguments, **options)
         reader = replace(found.torque.regressor, misses_loads=misses_loads)
@@ -108,53 +101,48 @@ def test_calibrate_says_where_loads_are_not_seen(misses_loads, slices_folder, tm
     monkeypatch.setattr("shearloop.daemon.analysis.calibrate.fit", blind)
     calibrate = ["calibrate", str(slices_folder / "torque_slices"), "--estimator", "regression"]
     calibrate += ["--out", str(tmp_path / "a.cal")]
-    assert main(calibrate) == 0
-    printed = capsys.readouterr().out
+    printed = ran(*calibrate).out
     assert ("It does not see the load: " in printed) == misses_loads
     useless = "every interval spans all calibrated torques, 0.01 to 0.14 N·m, and the torque is useless"
     assert (useless in printed) == misses_loads
     cure = "Calibrate with --estimator motion_regression or on both fingertips, or record a grip in which the tool"
     assert (cure in printed) == misses_loads
-    assert main([*calibrate, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["sees_loads"] is not misses_loads
+    assert result_of(*calibrate)["sees_loads"] is not misses_loads
 
 
 @pytest.mark.parametrize("slices_folder", [0.5], indirect=True)
-def test_calibrate_says_which_torques_may_be_of_something_beyond(slices_folder, tmp_path, capsys, monkeypatch):
+def test_calibrate_says_which_torques_may_be_of_something_beyond(slices_folder, tmp_path, ran, monkeypatch, result_of):
     fitted = []
     monkeypatch.setattr(
         "shearloop.daemon.analysis.calibrate.fit", lambda *a, **options: fitted.append(fit(*a, **options)) or fitted[-1]
     )
     calibrate = ["calibrate", str(slices_folder / "torque_slices"), "--out", str(tmp_path / "a.cal")]
-    assert main(calibrate) == 0
+    printed = ran(*calibrate).out
     span = fitted[-1].torque.regressor.range
     assert np.isinf(span.low_end)
     ends = f": intervals of estimates above {span.high_end:.3g} N·m reach to {span.highest:.3g} N·m at least. Calibrate"
-    assert ends in capsys.readouterr().out
-    assert main([*calibrate, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["reads_beyond"] is False
-    assert main(["evaluate", str(tmp_path / "a.cal"), str(slices_folder / "torque_slices")]) == 0
-    assert "assumes that" not in capsys.readouterr().err
-    assert main([*calibrate, "--assume-full-range"]) == 0
-    assert "beyond" not in capsys.readouterr().out
+    assert ends in printed
+    assert result_of(*calibrate)["reads_beyond"] is False
+    evaluate = ["evaluate", tmp_path / "a.cal", slices_folder / "torque_slices"]
+    assert "assumes that" not in ran(*evaluate).err
+    assert "beyond" not in ran(*calibrate, "--assume-full-range").out
     assert np.isinf(fitted[-1].torque.regressor.range.high_end)
-    assert main(["evaluate", str(tmp_path / "a.cal"), str(slices_folder / "torque_slices")]) == 0
-    assert "a.cal assumes that no torque exceeds" in capsys.readouterr().err
-    assert main([*calibrate, "--assume-full-range", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["assumptions"] == ["full range"]
+    assert "a.cal assumes that no torque exceeds" in ran(*evaluate).err
+    assert result_of(*calibrate, "--assume-full-range")["assumptions"] == ["full range"]
 
 
-def test_a_stream_is_imported_and_cannot_be_judged_by_slices(mat_folder, slices_folder, tmp_path, capsys):
+def test_a_stream_is_imported_and_cannot_be_judged_by_slices(mat_folder, slices_folder, tmp_path, ran, mistake):
     recording, calibration = tmp_path / "a.mcap", tmp_path / "a.cal"
-    assert main(["import", "mat", str(mat_folder()), "--out", str(recording)]) == 0
-    assert "60 frames of the right side, 60 frames of the left side, 355 torques" in capsys.readouterr().out
-    assert main(["calibrate", str(slices_folder / "torque_slices"), "--out", str(calibration)]) == 0
-    assert main(["evaluate", str(calibration), str(recording)]) == 2
-    assert "made from slices, and cannot judge raw frames" in capsys.readouterr().err
-    assert main(["calibrate", str(recording), "--assume-full-range", "--out", str(calibration)]) == 2
-    assert "--assume-full-range is for slices" in capsys.readouterr().err
-    assert main(["calibrate", "creep", str(recording), "--calibration", str(calibration)]) == 2
-    assert "made from slices, and cannot judge raw frames" in capsys.readouterr().err
+    printed = ran("import", "mat", mat_folder(), "--out", recording).out
+    assert "60 frames of the right side, 60 frames of the left side, 355 torques" in printed
+    ran("calibrate", slices_folder / "torque_slices", "--out", calibration)
+    assert "made from slices, and cannot judge raw frames" in mistake("evaluate", calibration, recording)
+    assert "--assume-full-range is for slices" in mistake(
+        "calibrate", recording, "--assume-full-range", "--out", calibration
+    )
+    assert "made from slices, and cannot judge raw frames" in mistake(
+        "calibrate", "creep", recording, "--calibration", calibration
+    )
 
 
 def test_reasons_are_told_by_a_true_example_with_all_that_differ_in_numbers_alone():
@@ -176,7 +164,7 @@ def test_reasons_are_told_by_a_true_example_with_all_that_differ_in_numbers_alon
     ]
 
 
-def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, tmp_path, capsys):
+def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, tmp_path, ran):
     calibration, slices = tmp_path / "a.cal", str(slices_folder / "torque_slices")
     assert main(["calibrate", slices, "--out", str(calibration)]) == 0
     reasons = [
@@ -184,8 +172,7 @@ def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, 
         InvalidReason(1, "no grip", differ=False),
     ]
     monkeypatch.setattr("shearloop.daemon.analysis.evaluate.invalid_reasons", lambda _: reasons)
-    assert main(["evaluate", str(calibration), slices]) == 0
-    said = capsys.readouterr().out
+    said = ran("evaluate", calibration, slices).out
     assert "12 frames not valid, e.g.: gripped too recently: 12 more frames are needed" in said
     assert "1 frame not valid: no grip" in said
 
@@ -211,18 +198,17 @@ def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, 
         (["evaluate", "nowhere.cal", "{slices}", "--loaded-nm", "-1"], "--loaded-nm must be 0 N·m or more, not -1"),
     ],
 )
-def test_mistakes_end_in_one_sentence(arguments, message, slices_folder, capsys, tmp_path, monkeypatch):
+def test_mistakes_end_in_one_sentence(arguments, message, slices_folder, mistake, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main([one.format(slices=slices_folder) for one in arguments]) == 2
-    assert message in capsys.readouterr().err
+    assert message in mistake(*[one.format(slices=slices_folder) for one in arguments])
     assert not (tmp_path / "x").exists()
 
 
-def test_what_is_given_twice_is_refused_by_its_name(slices_folder, mat_folder, tmp_path, capsys):
+def test_what_is_given_twice_is_refused_by_its_name(slices_folder, mat_folder, tmp_path, ran, mistake):
     def refused(*paths):
-        assert main(["calibrate", *map(str, paths), "--out", str(tmp_path / "x.cal")]) == 2
+        said = mistake("calibrate", *paths, "--out", tmp_path / "x.cal")
         assert not (tmp_path / "x.cal").exists()
-        return capsys.readouterr().err
+        return said
 
     link, copy = tmp_path / "link", tmp_path / "copy"
     link.symlink_to(slices_folder)
@@ -239,22 +225,18 @@ def test_what_is_given_twice_is_refused_by_its_name(slices_folder, mat_folder, t
     assert "slice 5 of 20 mm equals" in refusal
     assert "slice 2 of 20 mm, and 1 more are such copies; leave copies out" in refusal
     first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"
-    assert main(["import", "mat", str(mat_folder()), "--out", str(first)]) == 0
+    ran("import", "mat", mat_folder(), "--out", first)
     second.write_bytes(first.read_bytes())
     assert f"{second} equals {first}; leave copies out" in refused(first, second)
 
 
-def test_what_is_judged_twice_is_refused_as_what_is_fitted_twice_is(slices_folder, tmp_path, capsys):
+def test_what_is_judged_twice_is_refused_as_what_is_fitted_twice_is(slices_folder, tmp_path, ran, mistake):
     slices, copy, calibration = slices_folder / "torque_slices", tmp_path / "copy", tmp_path / "a.cal"
-    assert main(["calibrate", str(slices), "--estimator", "regression", "--out", str(calibration)]) == 0
+    ran("calibrate", slices, "--estimator", "regression", "--out", calibration)
     copytree(slices, copy)
-    capsys.readouterr()
-    assert main(["evaluate", str(calibration), str(slices), str(slices)]) == 2
     refusal = f"shearloop evaluate: {slices} is given twice; name it once: a copy adds nothing\n"
-    assert capsys.readouterr() == ("", refusal)
-    assert main(["evaluate", str(calibration), str(slices), str(copy), "--time-range", "0.6:1"]) == 2
-    out, refusal = capsys.readouterr()
-    assert out == ""
+    assert mistake("evaluate", calibration, slices, slices) == refusal
+    refusal = mistake("evaluate", calibration, slices, copy, "--time-range", "0.6:1")
     assert f"{copy}: Data_Slice_30.mat equals {slices}: Data_Slice_30.mat, and 19 more are" in refusal
 
 

@@ -135,23 +135,21 @@ def spoilt(content: bytes, what: str) -> bytes:
         (["calibrate", "{path}", "--out", "{out}"], ["chunk", "cut", "short"]),
     ],
 )
-def test_each_command_exits_with_status_2(arguments, damages, content, tmp_path, capsys):
+def test_each_command_exits_with_status_2(arguments, damages, content, tmp_path, mistake):
     path = tmp_path / "x.mcap"
     places = {"path": path, "address": f"ipc://{tmp_path}/replay", "out": tmp_path / "out.cal"}
     for what in damages:
         path.write_bytes(spoilt(content, what))
-        assert main([one.format(**places) for one in arguments]) == 2
-        said = capsys.readouterr().err
+        said = mistake(*[one.format(**places) for one in arguments])
         assert f"{path}: the recording was not closed, or is damaged (" in said, what
         cure = "it holds no intact message" if what == "short" else f"`shearloop recording repair {path}`"
         assert cure in said, what
         assert "Traceback" not in said
 
 
-def test_a_check_without_a_comparison_fails(config, imported, tmp_path, capsys):
+def test_a_check_without_a_comparison_fails(config, imported, tmp_path, ran):
     arguments = ["--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--config", str(config())]
-    assert main(["replay", str(imported), *arguments]) == 0
-    assert "Nothing was compared" in capsys.readouterr().err
+    assert "Nothing was compared" in ran("replay", imported, *arguments).err
     assert main(["replay", str(imported), *arguments, "--check"]) == 1
 
 
@@ -203,13 +201,12 @@ BARE = json.dumps(CONFIGURATION).encode()
         (REPLAY, [TORQUE], {"attachments": [("a\0b", b""), (schema.CONFIGURATION, BARE)]}, "it has the attachment"),
     ],
 )
-def test_a_sound_file_with_wrong_content_is_refused(arguments, messages, others, problem, tmp_path, capsys):
+def test_a_sound_file_with_wrong_content_is_refused(arguments, messages, others, problem, tmp_path, mistake):
     if arguments is LEROBOT:
         pytest.importorskip("pyarrow")
     path = recorded(tmp_path / "x.mcap", *messages, **others)
     places = {"path": path, "address": f"ipc://{tmp_path}/replay", "out": tmp_path / "out"}
-    assert main([one.format(**places) for one in arguments]) == 2
-    said = capsys.readouterr().err
+    said = mistake(*[one.format(**places) for one in arguments])
     assert re.search(problem, said), said
     assert str(path) in said
 

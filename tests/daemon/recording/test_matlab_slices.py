@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shearloop.daemon.cli import main
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.matlab import read_diameter_slices, read_line, read_torque_slices
@@ -161,13 +160,12 @@ def test_a_hold_with_a_safety_interruption_is_one_slice(tmp_path):
     ],
     ids=["no tare", "short hold", "repeated frames", "invalid load"],
 )
-def test_a_missed_slice_is_reported_with_its_reason(tmp_path, tared, for_s, frames, reason, capsys):
+def test_a_missed_slice_is_reported_with_its_reason(tmp_path, tared, for_s, frames, reason, ran):
     sweep = Sweep(tmp_path, tared=tared)
     sweep.hold(1, 0.1, for_s, **frames)
     assert not sweep.export(tmp_path)[0]
     arguments = ("--format", "slices", "--out", str(tmp_path / "out"))
-    assert main(["recording", "export", str(sweep.path), *arguments]) == 0
-    assert f"{sweep.path}: 1 holds without a slice:" in (said := capsys.readouterr().err)
+    assert f"{sweep.path}: 1 holds without a slice:" in (said := ran("recording", "export", sweep.path, *arguments).err)
     assert reason in said
 
 
@@ -179,11 +177,12 @@ def test_slices_need_a_request_of_the_experiment(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_an_unwritable_folder_is_reported(tmp_path, capsys):
+def test_an_unwritable_folder_is_reported(tmp_path, mistake):
     sweep, out = Sweep(tmp_path), tmp_path / "out"
     sweep.hold(1, 0.1)
     sweep.export(tmp_path)
     out.mkdir()
     (out / "torque_slices").write_text("")
-    assert main(["recording", "export", str(sweep.path), "--format", "slices", "--out", str(out)]) == 2
-    assert f"{out}: the export cannot be written: " in capsys.readouterr().err
+    assert f"{out}: the export cannot be written: " in mistake(
+        "recording", "export", sweep.path, "--format", "slices", "--out", out
+    )

@@ -16,7 +16,6 @@ import zmq.asyncio
 
 from shearloop.bank.estimation import EstimatorSession, Measured
 from shearloop.daemon.app import Daemon
-from shearloop.daemon.cli import main
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.messaging.client import send_command
@@ -105,13 +104,13 @@ async def record(config: Path) -> Messages:
     return published
 
 
-def test_a_replay_equals_the_recording_at_any_speed(config, tmp_path, tiny_calibration, capsys):
+def test_a_replay_equals_the_recording_at_any_speed(config, tmp_path, tiny_calibration, ran):
     live = asyncio.run(record(config(recording={"folder": "recordings"})))
     (path,) = (tmp_path / "recordings").iterdir()
     # The recording holds the calibration that was used, whatever becomes of it.
     kept = tiny_calibration.rename(tmp_path / "kept.yaml")
     try:
-        _same_at_any_speed(path, live, tmp_path, capsys)
+        _same_at_any_speed(path, live, tmp_path, ran)
     finally:
         kept.rename(tiny_calibration)
     # And what changed is found out.
@@ -119,12 +118,10 @@ def test_a_replay_equals_the_recording_at_any_speed(config, tmp_path, tiny_calib
     changed["fingertips"]["right"]["average_frames"] = 2
     (tmp_path / "changed.yaml").write_text(yaml.safe_dump(changed))
     arguments = ["replay", str(path), "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check"]
-    assert main([*arguments, "--config", str(tmp_path / "changed.yaml")]) == 1
-    assert "eit.estimate of right, number" in capsys.readouterr().err
+    assert "eit.estimate of right, number" in ran(*arguments, "--config", tmp_path / "changed.yaml", status=1).err
 
 
-def _same_at_any_speed(path: Path, live: list[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    address = f"ipc://{tmp_path}/replay"
+def _same_at_any_speed(path: Path, live: list[Any], tmp_path: Path, ran: Callable[..., Any]) -> None:
     fast, comparison = asyncio.run(replayed(path, math.inf))
     assert comparison.compared["eit.frame"] > 50
     assert comparison.compared["eit.estimate"] > 50
@@ -139,8 +136,7 @@ def _same_at_any_speed(path: Path, live: list[Any], tmp_path: Path, capsys: pyte
         assert again[: len(then)] == then
     zeros = [c for t, c in fast if t == "eit.estimate" and c["reason"].startswith("taking the idle frame, 1 of")]
     assert len(zeros) == 2, "the operator's tare is replayed"
-    assert main(["replay", str(path), "--speed", "max", "--publish", address, "--check"]) == 0
-    errors = capsys.readouterr().err
+    errors = ran("replay", path, "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check").err
     assert f"eit.estimate: {comparison.compared['eit.estimate']} of {comparison.compared['eit.estimate']}" in errors
 
 
@@ -186,9 +182,8 @@ def test_a_real_recording_gives_the_stored_estimates(shared, config, tmp_path):
         (["{imported}", "--speed", "fast"], "--speed must be a number above 0, or max, not 'fast'"),
     ],
 )
-def test_mistakes_end_in_one_sentence(arguments, message, imported, capsys):
-    assert main(["replay", *(one.format(imported=imported) for one in arguments)]) == 2
-    assert message in capsys.readouterr().err
+def test_mistakes_end_in_one_sentence(arguments, message, imported, mistake):
+    assert message in mistake("replay", *(one.format(imported=imported) for one in arguments))
 
 
 def test_nan_is_restored():

@@ -4,7 +4,6 @@ The bounds are what was asked for; where the data at hand does not carry that fa
 and the reason stands in docs/decisions/0042-default-estimator.md.
 """
 
-import json
 import pickle
 import re
 from collections.abc import Callable
@@ -26,7 +25,6 @@ from shearloop.daemon.analysis.charts.fault_sweeps import balanced, judge_level
 from shearloop.daemon.analysis.charts.stability import select_rows
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.frame_series import part_of, read_series, series_of
-from shearloop.daemon.cli import main
 from shearloop.daemon.recording.matlab import find_streams, import_mat, read_stream
 from shearloop.daemon.recording.reader import read_recording
 
@@ -240,12 +238,10 @@ def test_the_load_goes_with_the_frames_and_a_quarter_of_a_second_beside_is_refus
             fit("motion_regression", [replace(part, torque_t_s=part.torque_t_s + late_s)], "shifted")
 
 
-def test_calibrate_says_how_late_the_load_is_unless_somebody_vouches_for_it(twists_file, tmp_path, capsys):
+def test_calibrate_says_how_late_the_load_is_unless_somebody_vouches_for_it(twists_file, tmp_path, ran, result_of):
     calibrate = ["calibrate", str(twists_file), "--time-range", "0:0.5", "--out", str(tmp_path / "a.cal")]
-    assert main(calibrate) == 0
-    assert "The load is stamped 0.27 s after the frames move." in capsys.readouterr().out
-    assert main([*calibrate, "--load-cell-delay-s", "0.1", "--json"]) == 0
-    assert "load_cell_delay_s" not in json.loads(capsys.readouterr().out)
+    assert "The load is stamped 0.27 s after the frames move." in ran(*calibrate).out
+    assert "load_cell_delay_s" not in result_of(*calibrate, "--load-cell-delay-s", "0.1")
 
 
 # A third holds three twists: no shift stands out on either fingertip.
@@ -275,18 +271,15 @@ def test_a_fingertip_that_the_lever_hardly_moves_has_its_times_from_the_other_on
         measure_timing([late.select_sides(("left",))], [late])
 
 
-def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twists_file, tmp_path, capsys):
+def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twists_file, tmp_path, ran, result_of):
     calibrate = ["calibrate", str(twists_file), "--time-range", f"0:{THIRD}", "--out", str(tmp_path / "a.cal")]
-    assert main(calibrate) == 0
-    printed = capsys.readouterr().out
+    printed = ran(*calibrate).out
     assert (
         "Could not verify the load cell's timestamps: the load changed too few times. They may be 0.75 s off" in printed
     )
     assert re.search(r"intervals are wider, for loads \d\.\d times\. Record more changes of load", printed)
-    assert main([*calibrate, "--load-cell-delay-s", "0"]) == 0
-    assert "Could not verify" not in capsys.readouterr().out
-    assert main(["calibrate", str(twists_file), "--sides", "left", "--out", str(tmp_path / "a.cal"), "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
+    assert "Could not verify" not in ran(*calibrate, "--load-cell-delay-s", "0").out
+    printed = result_of("calibrate", twists_file, "--sides", "left", "--out", tmp_path / "a.cal")
     assert printed["timing_uncertainty_s"] == 0
     assert printed["load_cell_delay_s"] == [pytest.approx(0.25, abs=0.03)]
 
@@ -331,12 +324,13 @@ def _streams_of(path: Path) -> tuple[str, ...]:
     return find_streams(path) if path.suffix == ".mat" else ()
 
 
-def test_evaluate_warns_of_times_that_nothing_shows(shared, twists_file, of_all_twists, tmp_path, capsys):
+def test_evaluate_warns_of_times_that_nothing_shows(shared, twists_file, of_all_twists, tmp_path, ran):
     glitch, calibration = tmp_path / "glitch.mcap", tmp_path / "a.cal"
     import_mat([shared / "recordings/streams/glitch_20241202_173837"], glitch)
     of_all_twists.save(calibration)
-    assert main(["evaluate", str(calibration), str(glitch), str(twists_file)]) == 0
-    assert re.findall(r"Warning: (\S+): the load's values waited", capsys.readouterr().err) == ["glitch.mcap"]
+    assert re.findall(
+        r"Warning: (\S+): the load's values waited", ran("evaluate", calibration, glitch, twists_file).err
+    ) == ["glitch.mcap"]
 
 
 def test_no_good_recording_is_doubted(twists, cylinders):

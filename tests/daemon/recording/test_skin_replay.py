@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from shearloop.daemon.cli import main
 from shearloop.daemon.recording.tables import RecordedTopics
 from tests.daemon.recording.test_replay import measured, replayed
 from tests.daemon.skin.test_skin_run import played
@@ -45,7 +44,7 @@ async def recorded(folder: Path, *, socket: bool, average_s: float) -> list[tupl
 
 
 @pytest.mark.parametrize(("socket", "average_s"), [(False, 0.02), (True, 0.0)])
-def test_a_skin_replay_gives_equal_forces(tmp_path, socket, average_s, capsys):
+def test_a_skin_replay_gives_equal_forces(tmp_path, socket, average_s, ran):
     live = asyncio.run(recorded(tmp_path, socket=socket, average_s=average_s))
     times_ns = [content["t_mono_ns"] for topic, content in live if topic == "skin.shear" and content["valid"]]
     assert median(after - before for before, after in pairwise(times_ns)) > 0.6e9 * average_s
@@ -60,6 +59,6 @@ def test_a_skin_replay_gives_equal_forces(tmp_path, socket, average_s, capsys):
     reasons = {content["reason"].split(",")[0] for _, content in now}
     assert {"", "taking the zero"} <= reasons
     assert any("gauge 1 is open" in why for why in reasons)
-    assert main(["replay", str(path), "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check"]) == 0
+    said = ran("replay", path, "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check").err
     count = comparison.compared["skin.shear"]
-    assert f"skin.shear: {count} of {count} equal the recorded ones" in capsys.readouterr().err
+    assert f"skin.shear: {count} of {count} equal the recorded ones" in said

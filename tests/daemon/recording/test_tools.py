@@ -7,7 +7,6 @@ import pytest
 
 from shearloop.bank.estimation import Measured
 from shearloop.daemon.analysis.frame_series import read_series, series_of
-from shearloop.daemon.cli import main
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.experiment_schema import ExperimentFile, WaitStep
 from shearloop.daemon.errors import UserError
@@ -52,15 +51,14 @@ def recorded(folder: Path, *held: tuple[int, Measured | None], named_mm: float |
     return recorder.finished[0]
 
 
-def test_the_experiment_names_its_tool(tmp_path, capsys):
+def test_the_experiment_names_its_tool(tmp_path, ran):
     path = recorded(tmp_path, (5, Measured(20.4, 1.2)), (35, None), named_mm=20.0)
     (series,) = read_series(path)
     assert series.tool_mm == Measured(20.0, 0.0), "and the gripper, which is not as exact, agrees"
     assert series.gripper_mm is None
     assert read_series(path, tool_mm=30.0)[0].tool_mm == Measured(20.0, 0.0), "a recording that names it knows better"
     assert summarise(path).tool_mm == "20"
-    assert main(["recording", "info", str(path)]) == 0
-    assert "  tool     20 mm\n" in capsys.readouterr().out
+    assert "  tool     20 mm\n" in ran("recording", "info", path).out
 
 
 def test_the_gripper_says_which_tool_it_held(tmp_path):

@@ -152,25 +152,24 @@ def test_a_dataset_holds_what_was_known_and_names_its_origin(tmp_path):
     assert task == {"task_index": 0, "task": "hold"}
 
 
-def test_absent_topics_are_left_out_of_a_dataset_and_none_is_refused(tmp_path, capsys):
+def test_absent_topics_are_left_out_of_a_dataset_and_none_is_refused(tmp_path, ran, mistake):
     pytest.importorskip("pyarrow", reason="needs the extra `export`")
     recording = write(tmp_path / "a.mcap", ("eit.frame", "health"))
-    assert main(["recording", "export", str(recording), "--format", "lerobot"]) == 0
+    ran("recording", "export", recording, "--format", "lerobot")
     info = json.loads((tmp_path / "a_lerobot/meta/info.json").read_text())
     named = {name for name in info["features"] if name.startswith("observation.")}
     assert named == {"observation.channels.right", "observation.age_s"}
-    assert main(["recording", "export", str(recording), "--format", "lerobot", "--topic", "health"]) == 2
-    assert "a dataset needs one of the topics robot.state, eit.estimate" in capsys.readouterr().err
+    assert "a dataset needs one of the topics robot.state, eit.estimate" in mistake(
+        "recording", "export", recording, "--format", "lerobot", "--topic", "health"
+    )
 
 
 @pytest.mark.parametrize(("form", "extra"), [("rrd", "rerun"), ("lerobot", "export"), ("parquet", "export")])
-def test_a_missing_extra_is_named(form, extra, tmp_path, capsys, monkeypatch):
+def test_a_missing_extra_is_named(form, extra, tmp_path, mistake, monkeypatch):
     recording = write(tmp_path / "a.mcap", ("eit.frame",))
     monkeypatch.setattr("shearloop.daemon.errors.find_spec", lambda _: None)
-    assert main(["recording", "export", str(recording), "--format", form]) == 2
-    assert f"pip install 'shearloop[{extra}]'" in capsys.readouterr().err
-    assert main(["view", "--foxglove", "0"]) == 2
-    assert "pip install 'shearloop[foxglove]'" in capsys.readouterr().err
+    assert f"pip install 'shearloop[{extra}]'" in mistake("recording", "export", recording, "--format", form)
+    assert "pip install 'shearloop[foxglove]'" in mistake("view", "--foxglove", "0")
 
 
 @pytest.mark.usefixtures("foxglove_runtime")

@@ -9,7 +9,6 @@ from scipy.io import savemat
 from shearloop.daemon.analysis.charts import bank_figures
 from shearloop.daemon.analysis.reproduce import banks, report
 from shearloop.daemon.analysis.reproduce.report import PAPER_MODEL_SCORES
-from shearloop.daemon.cli import main
 
 pytestmark = pytest.mark.usefixtures("small_grids")
 
@@ -31,13 +30,12 @@ OF_ANY = {"figure_4_models", "figure_6_bank"}
 FIGURES = OF_ANY | {"figure_3_dataset", "figure_5_models", "figure_7_heatmap", "figure_8_torque", "figure_9_diameter"}
 
 
-def test_numbers_and_figures_are_made(make_recordings, coarse_fingertip, tmp_path, capsys, monkeypatch):
+def test_numbers_and_figures_are_made(make_recordings, coarse_fingertip, tmp_path, ran, monkeypatch):
     # A few of a bank's signals show what all would.
     monkeypatch.setattr(bank_figures, "_PANELS", 3)
     out = tmp_path / "out"
     command = ["reproduce", str(make_recordings()), "--out", str(out), "--mesh", str(coarse_fingertip), "--jobs", "1"]
-    assert main([*command, "--json"]) == 0
-    said = capsys.readouterr()
+    said = ran(*command, "--json")
     found = json.loads(said.out)
     assert list(found) == KEYS
     assert json.loads((out / "reproduce.json").read_text()) == found
@@ -63,8 +61,7 @@ def test_numbers_and_figures_are_made(make_recordings, coarse_fingertip, tmp_pat
     monkeypatch.setattr(
         "shearloop.daemon.analysis.reproduce.report.draw_all", lambda *_: []
     )  # they take most of the time
-    assert main(command) == 0
-    said = capsys.readouterr()
+    said = ran(*command)
     assert focused.stat().st_mtime_ns == before
     assert "truncated" in said.err
     assert f"{found['torque_sigma_r_focused']:.5f}" in said.out
@@ -75,19 +72,18 @@ def test_numbers_and_figures_are_made(make_recordings, coarse_fingertip, tmp_pat
 
 
 @pytest.mark.parametrize("present", ["torque", "diameter"])
-def test_one_kind_of_slice_is_enough(make_recordings, coarse_fingertip, tmp_path, capsys, monkeypatch, present):
+def test_one_kind_of_slice_is_enough(make_recordings, coarse_fingertip, tmp_path, ran, monkeypatch, present):
     # The figures are made and named, and not rendered: the test before has looked at the files.
     monkeypatch.setattr(report, "lay_out", lambda _: None)
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: path.touch())
     recordings = make_recordings(torque=present == "torque", diameter=present == "diameter", raw=False)
     out = tmp_path / "out"
-    assert main(["reproduce", str(recordings), "--out", str(out), "--mesh", str(coarse_fingertip), "--jobs", "1"]) == 0
+    printed = ran("reproduce", recordings, "--out", out, "--mesh", coarse_fingertip, "--jobs", "1").out
     found = json.loads((out / "reproduce.json").read_text())
     absent = "diameter" if present == "torque" else "torque"
     assert found[f"{present}_{'sigma_r_wide' if present == 'torque' else 'k_r_single'}"] < -0.9
     assert all(value is None for key, value in found.items() if key.startswith(absent))
     assert (found["model_scores"]["step"] is None) == (present == "diameter")
-    printed = capsys.readouterr().out
     assert f"nothing about {absent}" in printed
     assert ("needs TorqueSlice.mat and TorqueSliceHom.mat" in printed) == (present == "torque")
     drawn = {path.stem for path in out.glob("*.png")}
@@ -105,13 +101,11 @@ def test_the_papers_mesh_is_taken_where_it_is_beside_the_recordings(make_recordi
     assert len(mesh.triangles) == 4882
 
 
-def test_mistakes_end_in_one_sentence(make_recordings, tmp_path, capsys):
+def test_mistakes_end_in_one_sentence(make_recordings, tmp_path, mistake):
     def refused(recordings: Path, *options: str) -> str:
-        assert main(["reproduce", str(recordings), "--out", str(tmp_path / "out"), *options]) == 2
-        said = capsys.readouterr()
-        assert said.out == ""
-        assert len(said.err.strip().splitlines()) == 1
-        return said.err
+        said = mistake("reproduce", recordings, "--out", tmp_path / "out", *options)
+        assert said.count("\n") == 1
+        return said
 
     assert "has neither a folder torque_slices nor a folder diameter_slices" in refused(tmp_path)
     recordings = make_recordings(diameter=False)
@@ -126,4 +120,4 @@ def test_mistakes_end_in_one_sentence(make_recordings, tmp_path, capsys):
     (folder / "Data_Slice_99.mat").write_bytes(b"MATLAB 5.0 cut")
     assert "Data_Slice_99.mat: the recording is truncated or damaged" in refused(recordings)
     (tmp_path / "file").write_text("")
-    assert main(["reproduce", str(recordings), "--out", str(tmp_path / "file" / "out")]) == 2
+    mistake("reproduce", recordings, "--out", tmp_path / "file" / "out")

@@ -10,7 +10,6 @@ import pytest
 import yaml
 
 from shearloop.daemon.app import Daemon
-from shearloop.daemon.cli import main
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.synthetic_skin import SyntheticSkin
 from shearloop.daemon.taring import tare_all
@@ -207,7 +206,7 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
 
 
 @pytest.mark.parametrize(
-    ("content", "mistake"),
+    ("content", "sentence"),
     [
         ({}, "nothing is measured: give `fingertips`, a `skin`, or both"),
         ({"skin": section({**ADC, **SCANNER})}, "skin.daq: give either scanner or adc, and not both"),
@@ -262,12 +261,11 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
         ({"skin": section(ADC, calibration=ROBOT)}, "is not a calibration as `shearloop skin calibrate` writes it: it"),
     ],
 )
-def test_a_mistake_in_the_skin_s_section_is_one_sentence_and_status_2(tmp_path, content, mistake, capsys, request):
+def test_a_mistake_in_the_skin_s_section_is_one_sentence_and_status_2(tmp_path, content, sentence, mistake, request):
     if "experiment" in content:
         request.getfixturevalue("ur_rtde")
     path = written(tmp_path, content)
     for command in ("check", "run"):
-        assert main([command, str(path)]) == 2
-        said = capsys.readouterr().err
-        assert mistake.replace("FOLDER", str(tmp_path)) in said
+        said = mistake(command, path)
+        assert sentence.replace("FOLDER", str(tmp_path)) in said
         assert said.count("\n") == 1, "one line"

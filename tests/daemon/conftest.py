@@ -2,9 +2,10 @@ import asyncio
 import json
 import signal
 import sys
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import main
 from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.messaging.client import send_command
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import ADC_STEP_V
 
@@ -48,9 +50,9 @@ def ur_rtde() -> None:
 
 @pytest.fixture
 def config(tmp_path, tiny_bank, tiny_calibration) -> Callable[..., Path]:
-    """Write a configuration of one fingertip, with changes to it, and return its path."""
+    """Write a configuration of one fingertip, with changes to it and to the fingertip, and return its path."""
 
-    def write(**changes: Any) -> Path:
+    def write(*, right: Mapping[str, Any] = MappingProxyType({}), **changes: Any) -> Path:
         content = {
             "publish": f"ipc://{tmp_path}/publish",
             "commands": f"ipc://{tmp_path}/commands",
@@ -60,6 +62,7 @@ def config(tmp_path, tiny_bank, tiny_calibration) -> Callable[..., Path]:
                     "bank": str(tiny_bank),
                     "calibration": str(tiny_calibration),
                     "matching": "zero_lag",
+                    **right,
                 }
             },
         }
@@ -89,6 +92,16 @@ def result_of(ran) -> Callable[..., Any]:
         return json.loads(ran(*arguments, "--json", status=status).out)
 
     return run
+
+
+@pytest.fixture
+def keys(tmp_path, ran) -> Path:
+    """A server and one client who knows it, made as a user makes them."""
+    server, client = tmp_path / "keys", tmp_path / "ada"
+    ran("keys", "server", "--dir", server)
+    ran("keys", "client", "--dir", client)
+    ran("keys", "allow", client / "client.key", "--name", "ada", "--dir", server)
+    return tmp_path
 
 
 @pytest.fixture
@@ -174,6 +187,12 @@ async def running_daemon(path: Path) -> AsyncIterator[Daemon]:
                 yield daemon
             finally:
                 daemon.stop()
+
+
+async def ask(daemon: Daemon, command: str, **arguments: Any) -> dict[str, Any]:
+    """Send a command to a daemon of this process, as a client does, and return the reply."""
+    request = {"command": command, **arguments}
+    return await asyncio.to_thread(send_command, daemon._tasks["commands"].address, request, DEADLINE_S)
 
 
 def collector(daemon: Daemon, topic: str) -> "asyncio.Queue[dict[str, Any]]":

@@ -5,6 +5,7 @@ import math
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import replace
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,8 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli.emulated_calibration import calibrate, record
-from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.run_summary import RunSummary
-from tests.daemon.conftest import DEADLINE_S, robot_at, running_daemon, shearloop
+from tests.daemon.conftest import ask, robot_at, running_daemon, shearloop
 from tests.daemon.emulate_rig.rig import write_rig_bank
 from tests.daemon.recording.test_replay import replayed
 from tests.emulator_process import own_address
@@ -47,15 +47,7 @@ def rig_config(config, tiny_bank, tmp_path) -> Path:
     )
     robot_at(HOST, tmp_path)
     return config(
-        fingertips={
-            "right": {
-                "device": {"path": "eit-right"},
-                "bank": str(tiny_bank),
-                "calibration": str(calibration),
-                "matching": "zero_lag",
-                "frame_period_s": 0.5412 / SPEED,
-            }
-        },
+        right={"calibration": str(calibration), "frame_period_s": 0.5412 / SPEED},
         load_cell={"device": {"path": "load-cell"}, "rate_hz": 10.9 * SPEED},
         robot="ur.yaml",
         gripper={"socket": {"host": HOST}},
@@ -109,23 +101,17 @@ class Watcher:
 async def running_rig(
     path: Path, bank: Path, speed: int = SPEED
 ) -> AsyncIterator[tuple[Daemon, Watcher, Callable[[str], None], Callable[..., Any]]]:
-    run_dir = path.parent
     async with shearloop(
-        *("emulate", "rig", "--bank", str(bank), "--run-dir", str(run_dir), "--host", HOST),
+        *("emulate", "rig", "--bank", str(bank), "--run-dir", str(path.parent), "--host", HOST),
         *("--speed", str(speed), "--paper-sketch", "--unlock-wait-s", "0.2", "--power-on-s", "0.1"),
         stdin=asyncio.subprocess.PIPE,
     ) as rig:
         assert (await rig.stdout.readline()).startswith(b"rig ready")
         async with running_daemon(path) as daemon:
             watcher = Watcher(daemon)
-
-            async def command(name: str, **arguments: Any) -> dict[str, Any]:
-                address = f"ipc://{run_dir}/commands"
-                return await asyncio.to_thread(send_command, address, {"command": name, **arguments}, DEADLINE_S)
-
             await watcher.until("robot.state", lambda _: True)
             await watcher.until("gripper.state", lambda _: True)
-            yield daemon, watcher, lambda line: rig.stdin.write(f"{line}\n".encode()), command
+            yield daemon, watcher, lambda line: rig.stdin.write(f"{line}\n".encode()), partial(ask, daemon)
 
 
 async def started(command: Callable[..., Any], path: str) -> None:

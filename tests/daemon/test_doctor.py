@@ -1,7 +1,6 @@
 """`shearloop doctor` and `ports`: every finding says what was found, what it means, and the next step."""
 
 import asyncio
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,7 +17,6 @@ from shearloop.daemon.serial_ports import SerialPortInfo
 from tests.daemon.conftest import DEADLINE_S, robot_at, shearloop
 from tests.emulator_process import own_address
 
-Write = Callable[..., Path]
 HOST = own_address(5)
 SPEED = 8
 

@@ -56,17 +56,7 @@ async def test_a_fingertip_of_another_kind_gives_its_torque(estimator, bank, twi
     calibration = tmp_path / "right.cal"
     fit(estimator, [series], "emulated twists", Physics(bank=Bank.open(bank))).save(calibration)
     lines = list(read_recording(twists).sides["right"].lines)
-    path = config(
-        fingertips={
-            "right": {
-                "device": {"path": "eit-right"},
-                "bank": str(bank),
-                "calibration": str(calibration),
-                "matching": "zero_lag",
-                "frame_period_s": FRAME_PERIOD_S / SPEED,
-            }
-        }
-    )
+    path = config(right={"bank": str(bank), "calibration": str(calibration), "frame_period_s": FRAME_PERIOD_S / SPEED})
     board = EitKitBoard(cycle(lines), period_s=FRAME_PERIOD_S / SPEED, link=tmp_path / "eit-right")
     truth_nm, errors_nm = series.torque_at_frames(), []
     async with running(board.run()), running_daemon(path) as daemon:

@@ -3,7 +3,6 @@ import os
 import pty
 import signal
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.sensing.frame_estimator import FrameEstimator
 from tests.daemon.conftest import (
     DEADLINE_S,
+    ask,
     collector,
     emulated_kit,
     recording,
@@ -25,8 +25,6 @@ from tests.daemon.conftest import (
     shearloop,
 )
 from tests.emulator_process import own_address
-
-Write = Callable[..., Path]
 
 
 def next_message(socket: "zmq.Socket[bytes]") -> dict[str, Any]:
@@ -82,22 +80,20 @@ async def test_the_daemon_and_its_emulators_stop_cleanly_and_say_so(config, tmp_
 
 
 async def test_tare_status_and_stop_commands(config, tmp_path):
-    address = f"ipc://{tmp_path}/commands"
     async with running_daemon(config()) as daemon:
         estimates = collector(daemon, "eit.estimate")
         async with emulated_kit(tmp_path, 60):
             while not (await estimates.get())["valid"]:
                 continue
-            reply = await asyncio.to_thread(send_command, address, {"command": "tare"}, DEADLINE_S)
-            assert reply == {"ok": True, "tared": ["right"]}
+            assert await ask(daemon, "tare") == {"ok": True, "tared": ["right"]}
             while "taking the idle frame, 1 of 10" not in (await estimates.get())["reason"]:
                 continue
-            reply = await asyncio.to_thread(send_command, address, {"command": "tare", "source": "left"}, DEADLINE_S)
+            reply = await ask(daemon, "tare", source="left")
             assert reply == {"ok": False, "reason": "there is no sensor 'left' to tare; there are right"}
-            status = await asyncio.to_thread(send_command, address, {"command": "status"}, DEADLINE_S)
+            status = await ask(daemon, "status")
             assert status["tasks"]["right"]["connected"]
             assert status["tasks"]["commands"]["errors"] == {"tare refused": 1}
-        assert (await asyncio.to_thread(send_command, address, {"command": "stop"}, DEADLINE_S))["ok"]
+        assert (await ask(daemon, "stop"))["ok"]
         await daemon._stop.wait()
 
 
@@ -131,18 +127,16 @@ def robotless(ur_rtde, config, tmp_path) -> Path:  # noqa: ARG001 - it skips
     return config(**rig, experiment=str(Path("config/experiments/loosen.yaml").resolve()))
 
 
-async def test_stop_cancels_a_waiting_experiment_and_keeps_the_daemon(robotless, tmp_path):
+async def test_stop_cancels_a_waiting_experiment_and_keeps_the_daemon(robotless):
     async with running_daemon(robotless) as daemon:
         health = collector(daemon, "health")
         while not (await health.get())["tasks"]["experiment"]["alive"]:
             continue
-        stop = {"command": "stop", "spare_daemon": True}
-        reply = await asyncio.to_thread(send_command, f"ipc://{tmp_path}/commands", stop, DEADLINE_S)
+        reply = await ask(daemon, "stop", spare_daemon=True)
         assert reply == {"ok": True, "stopped": "the start of loosen.yaml"}
         while not (await health.get())["tasks"]["experiment"]["done"]:
             continue
-        reply = await asyncio.to_thread(send_command, f"ipc://{tmp_path}/commands", stop, DEADLINE_S)
-        assert reply == {"ok": True, "stopped": ""}
+        assert await ask(daemon, "stop", spare_daemon=True) == {"ok": True, "stopped": ""}
 
 
 async def test_a_crashed_estimator_restarts_and_is_reported(config, tmp_path, monkeypatch):
@@ -201,12 +195,7 @@ async def test_a_load_cell_works_without_a_robot(config, tmp_path):
             stdin=asyncio.subprocess.PIPE,
         ):
             assert (await torques.get())["torque_nm"] == pytest.approx(0.08, abs=0.005)
-            address = f"ipc://{tmp_path}/commands"
-            reply = await asyncio.to_thread(
-                send_command, address, {"command": "tare", "source": "load_cell"}, DEADLINE_S
-            )
-            assert reply == {"ok": True, "tared": ["load_cell"]}
+            assert await ask(daemon, "tare", source="load_cell") == {"ok": True, "tared": ["load_cell"]}
             while abs((await torques.get())["torque_nm"]) > 0.005:
                 continue
-            status = await asyncio.to_thread(send_command, address, {"command": "status"}, DEADLINE_S)
-            assert status["tasks"]["load_cell"]["alive"]
+            assert (await ask(daemon, "status"))["tasks"]["load_cell"]["alive"]

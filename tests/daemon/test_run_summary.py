@@ -81,12 +81,9 @@ def test_without_a_truth_nothing_is_said_of_it():
     assert "true" not in summary_of_hold(None, [])
 
 
-def test_a_disturbance_that_is_not_overcome_is_said_to_be_none():
-    assert "not back by the end" in summary_of_hold(truth_that_falls_at(26.0, 100.0), [(26 * S, "kick")])
-
-
-def test_a_last_moment_in_the_band_is_no_way_back():
-    assert "not back by the end" in summary_of_hold(truth_that_falls_at(26.0, 17.5), [(26 * S, "kick")])
+@pytest.mark.parametrize("for_s", [100.0, 17.5], ids=["never back", "back at the last moment"])
+def test_a_disturbance_that_is_not_overcome_is_said_to_be_none(for_s):
+    assert "not back by the end" in summary_of_hold(truth_that_falls_at(26.0, for_s), [(26 * S, "kick")])
 
 
 @pytest.mark.parametrize(

@@ -12,10 +12,10 @@ import yaml
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.experiment import TrackTorque
 from shearloop.daemon.control.experiment_schema import IdentifyStep
-from shearloop.daemon.control.identification import ToolModel
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
 from shearloop.daemon.control.wrist_controller import WristController, controller_settings
 from shearloop.daemon.rig import make_loop
+from tests.daemon.control.test_margins import FOUND
 
 PACKAGE = Path(__file__).parents[2]
 # Simulated devices and plants have properties of their own.
@@ -124,11 +124,7 @@ def test_the_wrists_acceleration_reaches_controller_identification_and_robot(whe
     source = TorqueSource(name="right", period_s=0.5)
     loop = make_loop(DaemonConfig.model_construct(robot=tmp_path / "ur.yaml", loop=loop_config), {"right": source})
     assert loop.config.wrist_acceleration_rad_per_s2 == 1.5, "sent to the robot"
-    found = ToolModel(
-        stiffness_nm_per_rad=0.25, stiffness_std=0.01, lag_s=0.0, lag_std_s=0.1, age_s=0.3, actuation_s=0.02,
-        noise_nm=0.012, sample_period_s=0.5, angle_rad=0.0, torque_nm=0.0, torque_std_nm=0.003,
-    )  # fmt: skip
-    tuned = controller_settings(loop.config, found, source, TrackTorque(0.1, 0.05), 0.5)
+    tuned = controller_settings(loop.config, FOUND, source, TrackTorque(0.1, 0.05), 0.5)
     assert tuned.acceleration_limit_rad_per_s2 == 0.75
     wrist = WristController(source, loop.config)
     wrist.begin_identification(IdentifyStep(do="identify"), 0.5)

@@ -231,6 +231,10 @@ class Cell:
                 return
         raise AssertionError("the experiment goes on and on")
 
+    async def until_done(self) -> None:
+        await self.until_ended()
+        assert self.phase is ExperimentPhase.DONE, self.why
+
     @property
     def phase(self) -> ExperimentPhase:
         return self.control_loop.experiment.phase

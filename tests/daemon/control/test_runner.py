@@ -62,8 +62,7 @@ async def test_a_straight_move_that_is_paused_brakes_and_goes_on_to_its_end():
         assert cell.phase is ExperimentPhase.PAUSED
         assert sum(isinstance(command, Stop) for command in cell.robot.commands[-20:]) == 1
         assert cell.control_loop.resume() is None
-        await cell.until_ended()
-        assert cell.phase is ExperimentPhase.DONE, cell.why
+        await cell.until_done()
         assert cell.robot.z_m == pytest.approx(end_m), "where it was to go from the start"
 
 
@@ -85,8 +84,7 @@ async def test_a_straight_move_is_not_begun_while_the_experiment_is_paused():
         await cell.cycles(50)
         assert not any(isinstance(command, MoveLinear) for command in cell.robot.commands)
         cell.control_loop.resume()
-        await cell.until_ended()
-        assert cell.phase is ExperimentPhase.DONE, cell.why
+        await cell.until_done()
 
 
 async def test_who_waits_for_an_experiments_end_is_told_of_that_one():
@@ -212,8 +210,7 @@ async def test_each_state_is_decided_upon_and_every_fifth_published(monkeypatch,
 async def test_a_zero_is_taken_after_a_turn():
     """A wrist that turned is the robot's to move until its last speed, zero, has run out."""
     async with driven({"do": "turn_to", "angle_rad": 0.2}, {"do": "tare"}) as cell:
-        await cell.until_ended()
-        assert cell.phase is ExperimentPhase.DONE, cell.why
+        await cell.until_done()
 
 
 @pytest.mark.parametrize("cycles", [1, 2, 3])
@@ -224,8 +221,7 @@ async def test_a_straight_move_goes_on_though_the_pause_was_shorter_than_its_bra
         assert cell.control_loop.pause() is None
         await cell.cycles(cycles)
         assert cell.control_loop.resume() is None
-        await cell.until_ended()
-        assert cell.phase is ExperimentPhase.DONE, cell.why
+        await cell.until_done()
         assert cell.robot.z_m == pytest.approx(end_m)
 
 

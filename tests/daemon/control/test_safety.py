@@ -43,13 +43,16 @@ def test_a_hold_that_lasts_too_long_becomes_a_stop(event):
 TICK_S = 0.008
 
 
-def flapping(event: FaultCode, held: int, gone: int, for_s: float = 60.0) -> float | None:
-    """Judge an event that is there for some ticks and gone for some; return when it became a stop, None where never."""
+def taking_turns(*turns: tuple[FaultCode | None, float]) -> tuple[float, SafetyMonitor] | None:
+    """Judge events, or none, that follow each other, each for so long, for a minute.
+
+    Return when they became a stop, None where never.
+    """
     gate = SafetyMonitor()
-    for tick in range(round(for_s / TICK_S)):
-        active = [trouble(event)] if tick % (held + gone) < held else []
-        if gate.judge(active, round(tick * TICK_S * SECOND)).response in STOPS:
-            return tick * TICK_S
+    cycle = [[] if event is None else [trouble(event)] for event, for_s in turns for _ in range(round(for_s / TICK_S))]
+    for tick in range(round(60.0 / TICK_S)):
+        if gate.judge(cycle[tick % len(cycle)], round(tick * TICK_S * SECOND)).response in STOPS:
+            return tick * TICK_S, gate
     return None
 
 
@@ -61,7 +64,7 @@ OF_THE_MOMENT = [(event, longest_s) for event, longest_s in HOLDS if not TABLE[e
 @pytest.mark.parametrize(("held", "gone"), [(1, 1), (50, 50), (125, 125), (125, 12)])
 def test_a_hold_that_flaps_becomes_a_stop(event, longest_s, held, gone):
     """Of each cycle's time so much is held and half of the rest forgotten, until it is as long as it may be."""
-    stopped_s = flapping(event, held, gone)
+    stopped_s, _ = taking_turns((event, held * TICK_S), (None, gone * TICK_S))
     cycle_s, gained_s = (held + gone) * TICK_S, (held - 0.5 * gone) * TICK_S
     cycles_before = (longest_s - held * TICK_S) / gained_s
     assert stopped_s == pytest.approx(cycle_s * cycles_before, abs=cycle_s + held * TICK_S + 4 * TICK_S)
@@ -71,16 +74,7 @@ def test_a_hold_that_flaps_becomes_a_stop(event, longest_s, held, gone):
 @pytest.mark.parametrize(("held", "gone"), [(1, 3), (12, 36), (125, 260)])
 def test_a_hold_that_is_gone_for_more_than_two_thirds_of_the_time_stays_one(event, longest_s, held, gone):
     assert held * TICK_S < longest_s
-    assert flapping(event, held, gone) is None
-
-
-def taking_turns(*turns: tuple[FaultCode, float], for_s: float = 60.0) -> tuple[float, SafetyMonitor] | None:
-    """Judge events that follow each other, each for so long; return when they became a stop, None where never."""
-    gate, cycle = SafetyMonitor(), [event for event, for_s in turns for _ in range(round(for_s / TICK_S))]
-    for tick in range(round(for_s / TICK_S)):
-        if gate.judge([trouble(cycle[tick % len(cycle)])], round(tick * TICK_S * SECOND)).response in STOPS:
-            return tick * TICK_S, gate
-    return None
+    assert taking_turns((event, held * TICK_S), (None, gone * TICK_S)) is None
 
 
 @pytest.mark.parametrize("each_s", [0.008, 0.1, 1.0])

@@ -1,7 +1,6 @@
 """The emulated rig as a process, and the real clients on its ports, for the tests beside."""
 
 import asyncio
-import contextlib
 import dataclasses
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable
@@ -25,6 +24,7 @@ from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, RobotState, Stop, WristSpeed
 from shearloop.drivers.ur.settings import read_settings
 from tests.emulator_process import EmulatorProcess, Event
+from tests.running import running
 
 # Of gel, fingers and boards.
 SPEED = 10
@@ -88,15 +88,10 @@ async def arm_at(rig: RigProcess) -> AsyncIterator[UrRobot]:
     pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
     settings = read_settings(Path(__file__).parents[3] / "config" / "ur.yaml")
     arm = UrRobot(dataclasses.replace(settings, host=rig.host), LinkMonitor())
-    task = asyncio.create_task(arm.run())
-    try:
+    async with running(arm.run()):
         await until(arm, lambda state: state.program_running and not state.recovering)
         assert (await arm.send(Enable())).accepted
         yield arm
-    finally:
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
 
 
 async def until(arm: UrRobot, condition: Callable[[RobotState], bool]) -> RobotState:

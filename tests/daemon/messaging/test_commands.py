@@ -3,6 +3,7 @@ import os
 import socket
 import threading
 from collections.abc import Mapping
+from contextlib import closing
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -26,6 +27,7 @@ from shearloop.daemon.messaging.command_server import (
 from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
+from tests.running import running
 
 
 def handlers() -> Mapping[str, Any]:
@@ -66,18 +68,17 @@ async def test_each_request_gets_one_reply():
 
 
 async def test_req_and_dealer_clients_are_answered():
-    with zmq.asyncio.Context() as context:
-        server = CommandServer(context, "tcp://127.0.0.1:*", handlers(), Refusals())
-        address = server.address
-        serving = asyncio.create_task(server.run())
-        assert (await asyncio.to_thread(send_command, address, {"command": "tare"}, 5.0))["tared"] == ["right"]
-        with context.socket(zmq.REQ) as client:
-            client.connect(address)
-            await client.send(b"\xc1 not msgpack")
-            assert not decode(await client.recv())["ok"]
-        serving.cancel()
-        await asyncio.gather(serving, return_exceptions=True)
-        server.close()
+    with (
+        zmq.asyncio.Context() as context,
+        closing(CommandServer(context, "tcp://127.0.0.1:*", handlers(), Refusals())) as server,
+    ):
+        async with running(server.run()):
+            reply = await asyncio.to_thread(send_command, server.address, {"command": "tare"}, 5.0)
+            assert reply["tared"] == ["right"]
+            with context.socket(zmq.REQ) as client:
+                client.connect(server.address)
+                await client.send(b"\xc1 not msgpack")
+                assert not decode(await client.recv())["ok"]
 
 
 def test_an_address_in_use_is_an_error():

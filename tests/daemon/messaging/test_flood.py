@@ -28,6 +28,7 @@ from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import MAX_DESCRIPTORS
 from tests.daemon.conftest import DEADLINE_S, running_daemon
 from tests.daemon.web.test_with_keys import free_port
+from tests.running import running
 
 DESCRIPTORS, CONNECTIONS = 512, 1200
 
@@ -84,14 +85,9 @@ async def stop_socket(address: str, refusals: Refusals) -> AsyncIterator[None]:
     async def refuse(_request: Request) -> Reply:
         raise CommandRefusedError("not here")
 
-    stop = StopSocket(address, {"stop": handle, "start": refuse}, refusals)
-    serving = asyncio.create_task(stop.run())
-    try:
-        yield
-    finally:
-        serving.cancel()
-        await asyncio.gather(serving, return_exceptions=True)
-        stop.close()
+    with closing(StopSocket(address, {"stop": handle, "start": refuse}, refusals)) as stop:
+        async with running(stop.run()):
+            yield
 
 
 async def test_the_stop_socket_answers_in_a_flood_of_datagrams():
@@ -151,16 +147,14 @@ async def test_a_stop_without_a_reply_is_sent_again_and_spares_the_daemon():
         received.append(request)
         return {}
 
-    with zmq.asyncio.Context() as context, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as silent:
-        server = CommandServer(context, "tcp://127.0.0.1:*", {"stop": stop}, Refusals())
+    with (
+        zmq.asyncio.Context() as context,
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as silent,
+        closing(CommandServer(context, "tcp://127.0.0.1:*", {"stop": stop}, Refusals())) as server,
+    ):
         silent.bind(stop_name(server.address))
-        serving = asyncio.create_task(server.run())
-        try:
+        async with running(server.run()):
             assert await asyncio.to_thread(main, ["command", "stop", "--connect", server.address]) == 0
-        finally:
-            serving.cancel()
-            await asyncio.gather(serving, return_exceptions=True)
-            server.close()
     assert received == [{"command": "stop", "spare_daemon": True}]
 
 

@@ -30,16 +30,6 @@ NETWORK = "tcp://0.0.0.0:*"
 SILENCE_MS = 300
 
 
-@pytest.fixture
-def keys(tmp_path, ran) -> Path:
-    """A server and one client who knows it, made as a user makes them."""
-    server, client = tmp_path / "keys", tmp_path / "ada"
-    ran("keys", "server", "--dir", server)
-    ran("keys", "client", "--dir", client)
-    ran("keys", "allow", client / "client.key", "--name", "ada", "--dir", server)
-    return tmp_path
-
-
 def curve(folder: Path) -> dict[str, str]:
     return {"server_key": str(folder / "keys/server.key_secret"), "clients": str(folder / "keys/clients")}
 

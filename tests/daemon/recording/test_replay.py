@@ -18,7 +18,6 @@ from shearloop.bank.estimation import EstimatorSession, Measured
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
-from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import EitEstimate, wire_map
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.matlab import import_mat
@@ -32,7 +31,7 @@ from shearloop.daemon.recording.replay import (
 )
 from shearloop.daemon.recording.schema import message_json, with_missing_keys
 from shearloop.daemon.sensing.fingertip_task import FingertipPipeline
-from tests.daemon.conftest import DEADLINE_S, emulated_kit, running_daemon
+from tests.daemon.conftest import ask, emulated_kit, running_daemon
 from tests.daemon.sample_messages import sample
 
 Messages = list[tuple[str, dict[str, Any]]]
@@ -94,12 +93,11 @@ async def recording_daemon(
 
 async def record(config: Path) -> Messages:
     """Record a board with faults and a tare on the way; return what the daemon published."""
-    async with recording_daemon(config) as (_, board, published, until):
+    async with recording_daemon(config) as (daemon, board, published, until):
         await until(5)
         board.stdin.write(b"wrong-count\nunplug 0.3\n")
         await until(25)
-        address = f"ipc://{config.parent}/commands"
-        assert (await asyncio.to_thread(send_command, address, {"command": "tare"}, DEADLINE_S))["ok"]
+        assert (await ask(daemon, "tare"))["ok"]
         await until(50)
     return published
 

@@ -4,6 +4,7 @@ import resource
 import signal
 import socket
 from collections.abc import Iterator
+from contextlib import closing
 from types import SimpleNamespace
 
 import pytest
@@ -17,6 +18,7 @@ from shearloop.daemon.process import lock_memory
 from shearloop.daemon.service import notify
 from shearloop.daemon.supervisor import Supervisor, TaskRecord
 from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.running import running
 
 
 @pytest.fixture
@@ -68,20 +70,15 @@ async def test_the_daemon_notifies_ready_alive_and_stopping(manager, config):
 async def test_the_watchdog_is_fed_only_while_all_tasks_are_alive(manager, tmp_path, monkeypatch):
     monkeypatch.setattr(supervision, "HEALTH_PERIOD_S", 0.0)
     supervisor = Supervisor({"right": TaskRecord(alive=True), "experiment": TaskRecord(done=True)})
-    with zmq.Context() as context:
-        publisher = Publisher(context, f"ipc://{tmp_path}/publish", Clock())
-        reporter = supervision.HealthReporter(publisher, supervisor, Clock())
-        running = asyncio.create_task(reporter.run())
-        said = await asyncio.to_thread(manager.recv, 4096)
-        assert said == b"WATCHDOG=1\nSTATUS=2 tasks are alive", "an experiment that has ended is not dead"
-        supervisor.dead["right"] = "ValueError: no number"
-        while said.startswith(b"WATCHDOG=1"):
+    with zmq.Context() as context, closing(Publisher(context, f"ipc://{tmp_path}/publish", Clock())) as publisher:
+        async with running(supervision.HealthReporter(publisher, supervisor, Clock()).run()):
             said = await asyncio.to_thread(manager.recv, 4096)
-        assert said == b"STATUS=dead, restarting: right"
-        assert await asyncio.to_thread(manager.recv, 4096) == said, "and it stays hungry"
-        running.cancel()
-        await asyncio.gather(running, return_exceptions=True)
-        publisher.close()
+            assert said == b"WATCHDOG=1\nSTATUS=2 tasks are alive", "an experiment that has ended is not dead"
+            supervisor.dead["right"] = "ValueError: no number"
+            while said.startswith(b"WATCHDOG=1"):
+                said = await asyncio.to_thread(manager.recv, 4096)
+            assert said == b"STATUS=dead, restarting: right"
+            assert await asyncio.to_thread(manager.recv, 4096) == said, "and it stays hungry"
 
 
 async def test_a_finished_task_is_not_dead():

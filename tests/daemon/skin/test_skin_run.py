@@ -10,11 +10,11 @@ import pytest
 import yaml
 
 from shearloop.daemon.app import Daemon
-from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.synthetic_skin import SyntheticSkin
 from shearloop.daemon.taring import tare_all
 from shearloop.drivers.emulators.skin import SkinInstruments
-from tests.daemon.conftest import DEADLINE_S, collector, running_daemon
+from tests.daemon.conftest import ask, collector, running_daemon
+from tests.running import running
 
 CALIBRATION = Path(__file__).parents[3] / "config" / "calibrations" / "skin_demo.yaml"
 RATE_HZ = 200.0
@@ -23,8 +23,8 @@ RATE_HZ = 200.0
 class Played:
     """The skin, its instruments, and the daemon that reads them."""
 
-    def __init__(self, daemon: Daemon, skin: SyntheticSkin, instruments: SkinInstruments, address: str) -> None:
-        self.daemon, self.skin, self.instruments, self.address = daemon, skin, instruments, address
+    def __init__(self, daemon: Daemon, skin: SyntheticSkin, instruments: SkinInstruments) -> None:
+        self.daemon, self.skin, self.instruments = daemon, skin, instruments
         self.shear = collector(daemon, "skin.shear")
 
     @property
@@ -51,7 +51,7 @@ class Played:
         return await self.until(lambda content: content["valid"])
 
     async def command(self, name: str, **arguments: Any) -> dict[str, Any]:
-        return await asyncio.to_thread(send_command, self.address, {"command": name, **arguments}, DEADLINE_S)
+        return await ask(self.daemon, name, **arguments)
 
     def fresh(self) -> None:
         while not self.shear.empty():
@@ -94,20 +94,16 @@ async def played(
         ("127.0.0.1", 0) if socket else folder / "skin-daq",
         speed=RATE_HZ / 10,
     )
-    playing = asyncio.create_task(instruments.run())
-    await instruments.source_port.get()
-    place = await instruments.daq_port.get()
-    daq = ADC
-    if socket:
-        host, port = place.split(":")
-        daq = {"scanner": {"socket": {"host": host, "port": int(port)}}}
-    try:
+    async with running(instruments.run()):
+        await instruments.source_port.get()
+        place = await instruments.daq_port.get()
+        daq = ADC
+        if socket:
+            host, port = place.split(":")
+            daq = {"scanner": {"socket": {"host": host, "port": int(port)}}}
         skin_section = section({**daq, "average_s": average_s}, **changes)
         async with running_daemon(written(folder, {**(daemon or {}), "skin": skin_section})) as run:
-            yield Played(run, skin, instruments, f"ipc://{folder}/commands")
-    finally:
-        playing.cancel()
-        await asyncio.wait([playing])
+            yield Played(run, skin, instruments)
 
 
 @pytest.mark.parametrize("socket", [False, True])

@@ -12,7 +12,6 @@ from typing import Any
 import aiohttp
 import pytest
 
-from shearloop.daemon.cli import main
 from tests.daemon.conftest import running_daemon, shearloop
 
 
@@ -46,14 +45,9 @@ def free_port() -> int:
 
 
 @pytest.fixture
-def places(tmp_path, capsys) -> dict[str, str]:
+def places(keys, ran) -> dict[str, str]:
     """A daemon's addresses, on the network; its keys, and those of ada, who is allowed, and of eve, who is not."""
-    for who in ("ada", "eve"):
-        assert main(["keys", "client", "--dir", str(tmp_path / who)]) == 0
-    assert main(["keys", "server", "--dir", str(tmp_path / "keys")]) == 0
-    allow = ["keys", "allow", str(tmp_path / "ada" / "client.key"), "--name", "ada"]
-    assert main([*allow, "--dir", str(tmp_path / "keys")]) == 0
-    capsys.readouterr()
+    ran("keys", "client", "--dir", keys / "eve")
     return {key: f"tcp://0.0.0.0:{free_port()}" for key in ("publish", "commands")}
 
 

@@ -22,14 +22,14 @@ def relative(found: NDArray, expected: NDArray) -> float:
     return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
 
 
-def small_fingertip(impedance: float = 0.01) -> Mesh:
+def small_fingertip() -> Mesh:
     """Return a square of 16 × 16 cells: the electrodes are every second edge around it."""
     nodes, triangles = rectangle(16, 16, 3.2, 3.2)
     n = 17
     ring = np.concatenate(
         [np.arange(16), 16 + n * np.arange(16), n * n - 1 - np.arange(16), n * (n - 1) - n * np.arange(16)]
     )
-    return Mesh(nodes, triangles, np.column_stack([ring, np.roll(ring, -1)])[::2], np.arange(32), [impedance] * 32)
+    return Mesh(nodes, triangles, np.column_stack([ring, np.roll(ring, -1)])[::2], np.arange(32), [0.01] * 32)
 
 
 @pytest.fixture(scope="session")

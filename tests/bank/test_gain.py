@@ -11,10 +11,10 @@ from shearloop.bank.gain import PRIOR_SPREAD, GainSpread, ToolLaw, find_twists, 
 TWISTS = np.tile([0.0, 0.0, 0.0, 0.03, 0.05, 0.04, 0.0, 0.0], 10)
 
 
-def twisted(gains, seed, noise_nm=0.001):
+def twisted(gains, seed):
     """Return (n, 2) features of two fingertips whose torques are these factors too small, and (n,) torques."""
     rng = np.random.default_rng(seed)
-    features = TWISTS[:, None] / gains + rng.normal(0.0, noise_nm, (len(TWISTS), 2))
+    features = TWISTS[:, None] / gains + rng.normal(0.0, 0.001, (len(TWISTS), 2))
     return features, TWISTS
 
 

@@ -43,9 +43,9 @@ def smooth_bank() -> tuple[np.ndarray, np.ndarray]:
     return signals.astype(np.float32), valid
 
 
-def bank_of_noise(*, n_live: int = PAPER_TABLE.n_channels, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def bank_of_noise(*, n_live: int = PAPER_TABLE.n_channels) -> tuple[np.ndarray, np.ndarray]:
     signals = np.zeros((*SHAPE, PAPER_TABLE.n_channels), dtype=np.float32)
-    signals[..., :n_live] = np.random.default_rng(seed).random((*SHAPE, n_live))
+    signals[..., :n_live] = np.random.default_rng(0).random((*SHAPE, n_live))
     return signals, np.ones(SHAPE, dtype=np.bool_)
 
 

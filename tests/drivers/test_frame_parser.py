@@ -26,8 +26,8 @@ LINES = [format_line(line) for line in noisy(4)]
 GOOD = LINES[0]
 
 
-def with_value(position: int, value: bytes, line: bytes = GOOD) -> bytes:
-    values = line.split(b", ")
+def with_value(position: int, value: bytes) -> bytes:
+    values = GOOD.split(b", ")
     values[position] = value
     return b", ".join(values)
 

@@ -294,17 +294,17 @@ NOISE, NORMAL_N = 1.4e-4, 1.0
 HOLD_N = BELT.friction * NORMAL_N
 
 
-def followed(path: list[float], seed: int = 0, noise: float = NOISE) -> list[tuple[Direction, float, float, float]]:
+def followed(path: list[float], seed: int = 0) -> list[tuple[Direction, float, float, float]]:
     """Return direction, force and band at each step of a path of shear forces, ten a second."""
     random, state = np.random.default_rng(seed), UNSTRETCHED
-    finder = DirectionFinder(noise)
+    finder = DirectionFinder(NOISE)
     follower = ForceFollower(CALIBRATION, finder.threshold)
     found = []
     for number, shear_n in enumerate(path):
         # A force that stays changes nothing.
         if number == 0 or shear_n != path[number - 1]:
             state, exact = loaded(state, shear_n, NORMAL_N, straight)
-        response = exact + random.normal(0.0, noise)
+        response = exact + random.normal(0.0, NOISE)
         direction = finder.update(number / 10, response)
         found.append((direction, *follower.update(response, NORMAL_N, direction)))
     return found

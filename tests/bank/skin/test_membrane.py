@@ -103,14 +103,13 @@ def test_a_step_taken_in_parts_ends_where_the_whole_one_does(path, parts):
         assert one.gauge_tension_2_n == pytest.approx(other.gauge_tension_2_n, abs=2e-4)
 
 
-def belt_of_sliders(
-    friction: float, angle_rad: float, pulls: list[float], sliders: int = 16
-) -> list[tuple[float, float]]:
+def belt_of_sliders(friction: float, angle_rad: float, pulls: list[float]) -> list[tuple[float, float]]:
     """Tension at the load and at the clamp of a chain of springs over sliders, pulled through the given movements.
 
     Slow and with no notion of a play: each slider moves until friction, μ Δφ times the mean tension beside it,
     holds the difference, and so on round the chain until nothing moves.
     """
+    sliders = 16
     hold = friction * angle_rad / sliders / 2
     x, found = [0.0] * (sliders + 2), []
     for pull in pulls:

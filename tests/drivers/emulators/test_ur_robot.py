@@ -51,10 +51,10 @@ def turn(robot: Robot, speed: float, acceleration: float = 2.0) -> None:
     send(robot, SPEED_J, 0, 0, 0, 0, 0, speed, acceleration, 0)
 
 
-def down(robot: Robot, metres: float = 0.2) -> list[float]:
+def down(robot: Robot) -> list[float]:
     """Return the arguments of a linear move downwards: pose, speed, acceleration."""
     x, y, z, *turn = robot.arm.pose
-    return [x, y, z - metres, *turn, 0.1, 0.5]
+    return [x, y, z - 0.2, *turn, 0.1, 0.5]
 
 
 def started(**spec: float) -> Robot:

@@ -28,7 +28,7 @@ from shearloop.drivers.defaults import (
 # Names of other tasks, sources and recordings; a fingertip needs a different one.
 TAKEN_NAMES = {
     *("load_cell", "wrench", "skin", "combined", "robot", "gripper", "loop", "experiment", "recording"),
-    *("commands", "stop", "publish", "keys", "health", "daemon", "clock"),
+    *("commands", "stop", "publish", "clients", "health", "daemon", "clock"),
 }
 
 

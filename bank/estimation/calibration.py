@@ -25,11 +25,10 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatcher
 from shearloop.bank.estimation.estimator import Estimator, OutputModel, PaperEstimator, Quantity
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
-from shearloop.bank.estimation.interval_regressor import IntervalRegressor, PolynomialRegressor
+from shearloop.bank.estimation.interval_regressor import IntervalRegressor
 from shearloop.bank.estimation.values import INLINE, Kind, Measured
 from shearloop.bank.estimator_names import estimator_class
 from shearloop.bank.gain import GainCorrection, ToolLaw
-from shearloop.bank.polynomial import Polynomial
 from shearloop.files import open_file, refusing_damage, replace_file
 from shearloop.yaml_files import parse_yaml, shown
 
@@ -47,7 +46,6 @@ _ASSUMPTION_TEXTS: dict[Assumption, str] = {
     "full range": "no torque exceeds its slices (--assume-full-range)",
     "load timing": "the load cell's delay is as given (--load-cell-delay-s)",
 }
-TORQUE_DEGREE, DIAMETER_DEGREE = 2, 1
 # Tools differ if their diameters differ by a larger share.
 LARGEST_TOOL_SHARE = 0.15
 
@@ -56,9 +54,9 @@ LARGEST_TOOL_SHARE = 0.15
 class Calibration:
     """An estimator with its fingertips and the models of its outputs; `source` describes the data in words.
 
-    sides is empty where nothing is known of the fingertip but the paper's curves over k and sigma. validators are for
-    raw frames. bank_identity is empty for an estimator without a bank. tool_mm is the diameter of the only tool in the
-    recordings, else NaN. With `tools` the torque is in units of their gain (`for_tool`).
+    sides is empty where nothing is known of the fingertip (`uncalibrated`). validators are for raw frames.
+    bank_identity is empty for an estimator without a bank. tool_mm is the diameter of the only tool in the recordings,
+    else NaN. With `tools` the torque is in units of their gain (`for_tool`).
     """
 
     estimator: Estimator = field(metadata=INLINE)
@@ -80,7 +78,7 @@ class Calibration:
         as on one of 20 mm.
         """
         law, own_mm = self.tools, self.tool_mm
-        if law is None or self.torque is None or not isinstance(self.torque.regressor, IntervalRegressor):
+        if law is None or self.torque is None:
             if tool is None or not abs(tool.value - own_mm) > LARGEST_TOOL_SHARE * own_mm + tool.half_width:
                 return self
             raise CalibrationError(
@@ -99,7 +97,7 @@ class Calibration:
 
     def gain_regressor(self) -> IntervalRegressor:
         """Return the torque's regressor, for a correction of its gain; raises CalibrationError without one."""
-        if self.kind == "raw" and self.torque is not None and isinstance(self.torque.regressor, IntervalRegressor):
+        if self.kind == "raw" and self.torque is not None:
             return self.torque.regressor
         raise CalibrationError("only the torque of raw frames has a gain to correct; calibrate on raw recordings")
 
@@ -116,37 +114,7 @@ class Calibration:
     @classmethod
     def uncalibrated(cls, bank_identity: str, table: ChannelTable = PAPER_TABLE) -> Self:
         """Return the paper's estimator on a bank without any fit: it gives k and sigma alone."""
-        return cls(_paper_estimator(table), "raw", (), "", bank_identity)
-
-    @classmethod
-    def from_matches(
-        cls,
-        bank_identity: str,
-        source: str,
-        table: ChannelTable = PAPER_TABLE,
-        *,
-        torque: tuple[FloatArray, FloatArray] | None = None,
-        diameter: tuple[FloatArray, FloatArray] | None = None,
-    ) -> Self:
-        """Fit the paper's curves: torque = (σ (n,) in cm, torque_nm (n,)), diameter = (k (n,) in cm, diameter_mm (n,)).
-
-        Torque is a parabola over sigma and diameter a line over k (Trehan et al. 2025, figures 8 and 9). Raises
-        CalibrationError where both are missing or do not determine their curves.
-        """
-        if torque is None and diameter is None:
-            raise CalibrationError("a calibration needs measurements of torque, of diameter, or of both")
-
-        def model(
-            symbol: Literal["sigma", "k"], degree: int, points: tuple[FloatArray, FloatArray] | None
-        ) -> OutputModel | None:
-            if points is None:
-                return None
-            return OutputModel(PolynomialRegressor(symbol, Polynomial.fit(*points, degree)), None, np.zeros(0))
-
-        return cls(
-            _paper_estimator(table), "raw", (), source, bank_identity,
-            torque=model("sigma", TORQUE_DEGREE, torque), diameter=model("k", DIAMETER_DEGREE, diameter),
-        )  # fmt: skip
+        return cls(PaperEstimator(np.ones((1, table.n_channels)), table), "raw", (), "", bank_identity)
 
     @property
     def outputs(self) -> dict[Quantity, OutputModel]:
@@ -228,9 +196,8 @@ class Calibration:
             if model.novelty is not None:
                 model.novelty.assess(np.ones(c), np.ones(c, dtype=np.bool_))
             regressor = model.regressor
-            features = regressor.mean_feature if isinstance(regressor, IntervalRegressor) else np.zeros(1)
-            value, below, above = regressor.predict(features)
-            regressor.range_reasons(value, features, "torque", "")
+            value, below, above = regressor.predict(regressor.mean_feature)
+            regressor.range_reasons(value, regressor.mean_feature, "torque", "")
             if not math.isfinite(value) or math.isnan(below + above):
                 raise ValueError("its coefficients give no finite value")
 
@@ -248,10 +215,6 @@ class Calibration:
     def matcher(self, bank: Bank | None) -> BankMatcher | None:
         """Return the matcher of an estimator that needs a bank, None for others; raises as `check_bank` does."""
         return self.estimator.matcher(self.check_bank(bank)) if self.estimator.needs == "bank" else None
-
-
-def _paper_estimator(table: ChannelTable) -> PaperEstimator:
-    return PaperEstimator(np.ones((1, table.n_channels)), table)
 
 
 def _read_members(path: Path) -> tuple[Any, dict[str, NDArray[Any]]]:

@@ -28,7 +28,6 @@ from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.interval_regressor import (
     STRENGTHS,
     IntervalRegressor,
-    PolynomialRegressor,
     RegressorFit,
     Ridge,
     fit_interval_regressor,
@@ -67,7 +66,7 @@ class OutputModel:
     k_range holds the least and largest matched k in cm, or nothing without a bank.
     """
 
-    regressor: IntervalRegressor | PolynomialRegressor
+    regressor: IntervalRegressor
     novelty: NoveltyDetector | None
     k_range: FloatArray
 
@@ -196,7 +195,7 @@ class Estimator(ABC):
         imputed = np.nan if self.ignores_nan else novelty.impute(difference[0], usable[0])
         return np.where(usable, difference, imputed), NO_ERRORS
 
-    def position_noise_mm(self, _regressor: IntervalRegressor | PolynomialRegressor) -> float:
+    def position_noise_mm(self, _regressor: IntervalRegressor) -> float:
         """Return the diameter's 95 % error from the noise of one frame."""
         return 0.0
 

@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import ClassVar, Literal, Self, TypeAlias
+from typing import Self, TypeAlias
 
 import numpy as np
 from scipy.special import stdtrit
@@ -23,7 +23,7 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.regressors import InverseCalibration, later_splits, left_out_blocks, left_out_groups
 from shearloop.bank.estimation.values import INLINE
 from shearloop.bank.gain import LOADED_SHARE, GainCorrection, GainSpread, find_twists, loaded_gain
-from shearloop.bank.polynomial import TWO_SIDED_95, Polynomial
+from shearloop.bank.polynomial import TWO_SIDED_95
 
 LEVEL = 0.95
 # Readings below this share of the largest torque mean that the lever does not touch.
@@ -320,32 +320,6 @@ class IntervalRegressor:
         if len(limits) and (np.abs(features - self.mean_feature) > limits).any():
             return ("the frame moves further or faster than any at calibration",)
         return ()
-
-
-@dataclass(frozen=True, slots=True)
-class PolynomialRegressor:
-    """The paper's curve over the first feature, sigma or k in cm, with its prediction interval."""
-
-    gain: ClassVar[GainSpread] = GainSpread()
-
-    symbol: Literal["sigma", "k"]
-    polynomial: Polynomial
-    misses_loads: bool = False
-
-    def predict(self, features: FloatArray, *_: object) -> tuple[float, float, float]:
-        """Return the value of (d,) features and how far its 95 % interval extends below and above it."""
-        found = self.polynomial.interval(float(features[0]))
-        return found.value, found.value - found.low, found.high - found.value
-
-    def range_reasons(self, _value: float, features: FloatArray, quantity: str, _unit: str) -> tuple[str, ...]:
-        """Return the reason against a feature beyond the calibration, if there is one; the limits are inside."""
-        low, high = self.polynomial.x_low, self.polynomial.x_high
-        if low <= features[0] <= high:
-            return ()
-        return (
-            f"{self.symbol} = {features[0]:.4g} cm is outside of {low:.4g} to {high:.4g} cm, where {quantity} was "
-            "calibrated",
-        )
 
 
 def _reported(point: Regressor, raw: FloatArray) -> FloatArray:

@@ -33,7 +33,6 @@ from shearloop.bank.estimation.interval_regressor import (
     CensoredRidge,
     IntervalRegressor,
     Intervals,
-    PolynomialRegressor,
     RegressorFit,
     Ridge,
     ValueRange,
@@ -166,13 +165,13 @@ class MotionRegression(Estimator):
             return np.asarray((reading.frame.mean_difference / self.scale).ravel())
         return features
 
-    def position_noise_mm(self, regressor: IntervalRegressor | PolynomialRegressor) -> float:
+    def position_noise_mm(self, regressor: IntervalRegressor) -> float:
         """Return the diameter's 95 % error from the noise of one frame, where each feature has a noise of 1.
 
         A mean of n frames has a root of n less. The calibrated interval lacks this noise: it comes from means of whole
         grips, which have little noise left.
         """
-        if not isinstance(regressor, IntervalRegressor) or not isinstance(regressor.point, Ridge):
+        if not isinstance(regressor.point, Ridge):
             return 0.0
         weights = regressor.point.weights
         return TWO_SIDED_95 * math.sqrt(weights @ weights)

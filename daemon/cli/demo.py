@@ -29,7 +29,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     text = "folder for configuration, bank and calibrations, kept for later runs (default: %(default)s)"
     add_option(parser, "--folder", Path, "DIR", text, default=Path("shearloop-demo"))
     parser.add_argument("--prepare", action="store_true", help="only write the files; do not run")
-    text = "play this .mat recording on one fingertip, without a robot"
+    text = "play this .mat recording on one fingertip, without a robot: k, sigma and the heatmap"
     add_option(parser, "--recording", Path, "FILE", text)
     parser.epilog = (
         "Builds a bank and calibrations, emulates the whole rig, grips a tool, identifies it, holds 0.10 N·m on it and "

@@ -18,7 +18,6 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, TactileFrame
 from shearloop.bank.estimation.bank_match import PaperMatcher
 from shearloop.bank.estimation.estimator import PaperEstimator
-from shearloop.bank.estimation.interval_regressor import IntervalRegressor
 from shearloop.bank.estimation.session import REPEATED_FRAME
 from shearloop.daemon.config import CombinedConfig, DaemonConfig, FingertipConfig
 from shearloop.daemon.control.loop_inputs import TorqueSource
@@ -75,12 +74,6 @@ class FrameEstimator:
     def measures_torque(self) -> bool:
         """Whether it gives torques, and not only diameters or the bank match."""
         return self.calibration.torque is not None
-
-    @property
-    def has_gain(self) -> bool:
-        """Whether twists of known torque can correct its gain."""
-        torque = self.calibration.torque
-        return torque is not None and isinstance(torque.regressor, IntervalRegressor)
 
     @property
     def warm_up_frames(self) -> int:
@@ -211,7 +204,7 @@ def torque_sources(
             window_s=own.frame_period_s * own.average_frames,
             measures_torque=estimator.measures_torque,
             warm_up_s=_WARM_UP_SHARE * estimator.warm_up_frames * own.frame_period_s,
-            has_gain=estimator.has_gain,
+            has_gain=estimator.measures_torque,
         )
         for name, estimator in estimators.items()
     }
@@ -223,7 +216,7 @@ def torque_sources(
             window_s=period_s,
             measures_torque=combined.measures_torque,
             warm_up_s=_WARM_UP_SHARE * combined.warm_up_frames * period_s,
-            has_gain=combined.has_gain,
+            has_gain=combined.measures_torque,
         )
     if config.skin is not None and (skin := skin_source(config.skin)) is not None:
         sources[skin.name] = skin

@@ -18,13 +18,13 @@ from scipy.io import savemat
 
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import PAPER_TABLE
-from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import main
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.client import send_command
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import ADC_STEP_V
+from tests.paper_curve import paper_curve
 
 # Guards against a test that hangs; none waits for so long.
 DEADLINE_S = 60
@@ -36,9 +36,7 @@ def tiny_calibration(tiny_bank) -> Path:
     grid = np.linspace(0.9, 2.1, 30)
     path = tiny_bank.with_name("tiny.cal")
     identity = Bank.open(tiny_bank).identity
-    Calibration.from_matches(identity, "synthetic", torque=(grid, 0.3 - 0.1 * grid), diameter=(grid, 20.0 * grid)).save(
-        path
-    )
+    paper_curve(identity, torque=(grid, 0.3 - 0.1 * grid), diameter=(grid, 20.0 * grid)).save(path)
     return path
 
 

@@ -22,7 +22,6 @@ import zmq.asyncio
 
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.models import MODELS
-from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import COMMANDS, main
 from shearloop.daemon.cli.bank import MODEL_NAMES
@@ -37,6 +36,7 @@ from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from tests.daemon.sample_messages import sample
+from tests.paper_curve import paper_curve
 
 
 def test_check_accepts_a_valid_configuration(config, ran):
@@ -47,7 +47,7 @@ def test_check_accepts_a_valid_configuration(config, ran):
 @pytest.mark.parametrize("command", ["run", "check"])
 def test_a_calibration_without_torques_cannot_drive_the_loop(command, config, tiny_bank, tmp_path, ran, mistake):
     grid, path = np.linspace(0.9, 2.1, 30), tmp_path / "diameters.yaml"
-    Calibration.from_matches(Bank.open(tiny_bank).identity, "synthetic", diameter=(grid, 20.0 * grid)).save(path)
+    paper_curve(Bank.open(tiny_bank).identity, diameter=(grid, 20.0 * grid)).save(path)
     section = {"right": {"device": {"path": "eit"}, "bank": str(tiny_bank), "calibration": str(path)}}
     assert "without torque: its calibration has diameters only" in ran("check", config(fingertips=section)).out
     shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
@@ -143,7 +143,7 @@ def test_a_fingertip_mistake_is_named(section, parts, config, mistake):
 def test_a_calibration_of_another_bank_is_refused(config, tiny_bank, tmp_path, mistake):
     foreign = tmp_path / "foreign.yaml"
     grid = np.linspace(1, 2, 9)
-    Calibration.from_matches("cd" * 32, "synthetic", torque=(grid, grid)).save(foreign)
+    paper_curve("cd" * 32, torque=(grid, grid)).save(foreign)
     section = fingertip(bank=str(tiny_bank), calibration=str(foreign))
     said = mistake("check", str(config(fingertips=section)))
     for part in (str(foreign), "made with the bank cdcdcd", "calibrate again"):

@@ -15,7 +15,6 @@ import pytest
 import yaml
 
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli.emulated_calibration import calibrate, record
 from shearloop.daemon.run_summary import RunSummary
@@ -23,6 +22,7 @@ from tests.daemon.conftest import ask, robot_at, running_daemon, shearloop
 from tests.daemon.emulate_rig.rig import write_rig_bank
 from tests.daemon.recording.test_replay import replayed
 from tests.emulator_process import own_address
+from tests.paper_curve import paper_curve
 
 pytestmark = pytest.mark.real_time
 
@@ -42,9 +42,7 @@ def rig_config(config, tiny_bank, tmp_path) -> Path:
     """Write the configuration of a whole rig whose boards are SPEED times as fast."""
     sigma = np.linspace(0.95, 2.05, 40)
     calibration = tmp_path / "rig.cal"
-    Calibration.from_matches(Bank.open(tiny_bank).identity, "synthetic", torque=(sigma, torque_of(sigma))).save(
-        calibration
-    )
+    paper_curve(Bank.open(tiny_bank).identity, torque=(sigma, torque_of(sigma))).save(calibration)
     robot_at(HOST, tmp_path)
     return config(
         right={"calibration": str(calibration), "frame_period_s": 0.5412 / SPEED},

@@ -24,7 +24,6 @@ from shearloop.bank.eit.matching import Match, ReferenceMatcher, best_match
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import CalibrationError, MatchingError
-from shearloop.bank.estimation.calibration import DIAMETER_DEGREE, TORQUE_DEGREE
 from shearloop.bank.polynomial import Polynomial
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.matlab import (
@@ -38,6 +37,9 @@ from shearloop.daemon.recording.matlab import (
     read_torque_slices,
 )
 from shearloop.daemon.recording.reader import Progress
+
+# Torque is a parabola over σ and diameter a line over k (Trehan et al. 2025, figures 8 and 9).
+_TORQUE_DEGREE, _DIAMETER_DEGREE = 2, 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,7 +223,7 @@ def analyse_torque(slices: Slices, on_focused: Matches, on_wide: Matches) -> Tor
     group_sigma, group_torque = group_means(sigma, groups), group_means(torque, groups)
     r_clustered = correlation(group_sigma, group_torque)
     notes: list[str] = []
-    fit = _fit_or_note(group_sigma, group_torque, TORQUE_DEGREE, "torque over sigma", notes)
+    fit = _fit_or_note(group_sigma, group_torque, _TORQUE_DEGREE, "torque over sigma", notes)
     rmse_nm = _cross_validated_rmse(sigma, torque, parts, notes)
     if r_clustered is None:
         notes.append("the groups of torque slices are too few or too alike for a correlation")
@@ -263,7 +265,7 @@ def analyse_diameter(slices: Slices, wide: Bank, progress: Progress) -> Diameter
         r_accumulated=r_accumulated,
         running_k=running_k,
         r_running_sum=correlation(running_k, slices.diameter_mm),
-        fit=_fit_or_note(accumulated.k, diameters, DIAMETER_DEGREE, "diameter over k", notes),
+        fit=_fit_or_note(accumulated.k, diameters, _DIAMETER_DEGREE, "diameter over k", notes),
         notes=tuple(notes),
     )
 
@@ -339,7 +341,7 @@ def _cross_validated_rmse(sigma: FloatArray, torque: FloatArray, parts: IntArray
     errors = np.empty_like(torque)
     for part in np.unique(parts):
         out = parts == part
-        fit = _fit_or_note(sigma[~out], torque[~out], TORQUE_DEGREE, "torque over sigma with a part left out", notes)
+        fit = _fit_or_note(sigma[~out], torque[~out], _TORQUE_DEGREE, "torque over sigma with a part left out", notes)
         if fit is None:
             return None
         errors[out] = [fit(value) for value in sigma[out]] - torque[out]

@@ -8,12 +8,13 @@ from shearloop.bank.eit.matching import Match, best_match
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, TactileFrame
 from shearloop.bank.estimation.bank_match import PaperMatcher
 from shearloop.bank.estimation.session_state import PaperState
+from tests.paper_curve import paper_curve
 
 K_GRID, SIGMA_GRID = np.linspace(3.0, 4.0, 11), np.linspace(1.0, 2.0, 11)
 RANDOM = np.random.default_rng(4)
 HOMOGENEOUS = RANDOM.uniform(0.05, 0.3, 896)
 PATTERN = RANDOM.normal(0.0, 0.01, 896)
-SIGMA, K = np.linspace(1.2, 1.9, 20), np.linspace(3.2, 3.8, 20)
+SIGMA, K = np.linspace(1.3, 1.9, 20), np.linspace(3.3, 3.8, 20)
 TORQUE, DIAMETER = (SIGMA, 0.4 - 0.2 * SIGMA), (K, 100.0 - 20.0 * K)
 
 
@@ -42,7 +43,7 @@ def estimated(session: EstimatorSession, number: int, channels: NDArray[np.float
 def tared(matcher: OneCell, calibration: Calibration | None = None, average: int = 1) -> EstimatorSession:
     """Return a session that has its idle frame."""
     session = EstimatorSession(
-        calibration or Calibration.from_matches("bank", "synthetic", torque=TORQUE, diameter=DIAMETER),
+        calibration or paper_curve("bank", torque=TORQUE, diameter=DIAMETER),
         matcher=PaperMatcher(matcher),
         average_frames=average,
     )
@@ -73,8 +74,11 @@ def test_a_signal_becomes_torque_and_diameter_with_their_intervals():
     matcher = OneCell()
     estimate = estimated(tared(matcher), 10, noisy(PATTERN))
     assert estimate.valid
-    assert estimate.torque_nm == pytest.approx(0.4 - 0.2 * 1.5)
+    assert estimate.torque_nm == pytest.approx(0.4 - 0.2 * 1.5, abs=1e-5)
     assert estimate.diameter_mm == pytest.approx(100 - 20 * 3.5)
+    # At the least an interval is a thousandth of the calibrated range to either side.
+    assert (estimate.torque_low_nm, estimate.torque_high_nm) == pytest.approx((0.09988, 0.10012), abs=1e-5)
+    assert (estimate.diameter_low_mm, estimate.diameter_high_mm) == pytest.approx((29.99, 30.01))
     assert (estimate.k, estimate.sigma) == pytest.approx((3.5, 1.5))
     np.testing.assert_allclose(matcher.asked[0], PATTERN, atol=0.02)
 
@@ -99,7 +103,7 @@ def test_a_match_outside_of_the_calibration_is_shown_without_an_estimate():
     ("calibration", "reason"),
     [
         (Calibration.uncalibrated("bank"), "no calibration is configured"),
-        (Calibration.from_matches("bank", "x", diameter=DIAMETER), "made without torques"),
+        (paper_curve("bank", diameter=DIAMETER), "made without torques"),
     ],
 )
 def test_without_a_torque_curve_the_match_alone_is_shown(calibration, reason):

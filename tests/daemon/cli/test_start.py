@@ -7,7 +7,6 @@ import pytest
 import yaml
 from jsonschema import Draft202012Validator
 
-from shearloop.bank.estimation import Calibration
 from shearloop.bank.skin.calibration import load_calibration
 from shearloop.daemon.cli import demo
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
@@ -43,8 +42,7 @@ def test_an_editor_accepts_angles_as_the_program_does(angles, accepted):
     assert schema.is_valid({"name": "twists", "steps": [step]}) == accepted
 
 
-def test_the_calibrations_of_config_are_of_this_version():
-    assert Calibration.load(CONFIG / "calibrations" / "demo.cal").torque is not None
+def test_the_calibration_of_config_is_of_this_version():
     assert load_calibration(CONFIG / "calibrations" / "skin_demo.yaml").rows
 
 

@@ -176,7 +176,7 @@ def recorded(path, *messages, attachments=(), end=None, **options):
     return path
 
 
-EVALUATE = ["evaluate", "config/calibrations/demo.cal", "{path}"]
+EVALUATE = ["evaluate", "{calibration}", "{path}"]
 CSV, LEROBOT = (["recording", "export", "{path}", "--format", form, "--out", "{out}"] for form in ("csv", "lerobot"))
 REPLAY = ["replay", "{path}", "--speed", "max", "--publish", "{address}"]
 INFO = ["recording", "info", "{path}"]
@@ -201,11 +201,14 @@ BARE = json.dumps(CONFIGURATION).encode()
         (REPLAY, [TORQUE], {"attachments": [("a\0b", b""), (schema.CONFIGURATION, BARE)]}, "it has the attachment"),
     ],
 )
-def test_a_sound_file_with_wrong_content_is_refused(arguments, messages, others, problem, tmp_path, mistake):
+def test_a_sound_file_with_wrong_content_is_refused(
+    arguments, messages, others, problem, tmp_path, tiny_calibration, mistake
+):
     if arguments is LEROBOT:
         pytest.importorskip("pyarrow")
     path = recorded(tmp_path / "x.mcap", *messages, **others)
     places = {"path": path, "address": f"ipc://{tmp_path}/replay", "out": tmp_path / "out"}
+    places["calibration"] = tiny_calibration
     said = mistake(*[one.format(**places) for one in arguments])
     assert re.search(problem, said), said
     assert str(path) in said

@@ -18,7 +18,10 @@ from shearloop.daemon.messaging.bound_sockets import bind
 from shearloop.daemon.messaging.keys import KeyPair, Refusals, TokenBucket
 from shearloop.daemon.messaging.messages import decode, encode
 
-LARGEST_REQUEST_BYTES = 64 * 1024
+# Of each frame. libzmq has no limit for the number of frames; more than one are refused.
+LARGEST_REQUEST_BYTES = 4096
+# Requests of each client that wait in memory; others wait in its own.
+MAX_WAITING = 16
 MAX_CONCURRENT = 16
 STOP, STATUS = "stop", "status"
 
@@ -129,6 +132,7 @@ class CommandServer:
         self._socket = context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 100)
         self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_REQUEST_BYTES)
+        self._socket.setsockopt(zmq.RCVHWM, MAX_WAITING)
         self._connections = bind(context, self._socket, address, "commands", refusals, keys)
 
     async def run(self) -> None:

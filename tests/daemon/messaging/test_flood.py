@@ -21,11 +21,18 @@ from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import send_to_stop_socket, stop_name
 from shearloop.daemon.messaging.bound_sockets import MAX_CONNECTIONS, RESERVED_DESCRIPTORS, most_connections
 from shearloop.daemon.messaging.client import receive_messages
-from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer, Reply, Request
+from shearloop.daemon.messaging.command_server import (
+    LARGEST_REQUEST_BYTES,
+    CommandRefusedError,
+    CommandServer,
+    Reply,
+    Request,
+)
 from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import encode
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import MAX_DESCRIPTORS
+from shearloop.daemon.supervisor import resident_memory_mb
 from tests.daemon.conftest import DEADLINE_S, running_daemon
 from tests.daemon.web.test_with_keys import free_port
 from tests.running import running
@@ -205,3 +212,26 @@ def subscribe_and_leave(address: str) -> None:
             for topic in range(15):
                 client.subscribe(f"{number:03}{topic:02}" + 45 * "y")
         time.sleep(2.0)
+
+
+async def test_requests_of_many_frames_do_not_fill_the_memory():
+    frames = [b"x" * LARGEST_REQUEST_BYTES] * 8
+    refusals = Refusals()
+    with zmq.asyncio.Context() as context, zmq.Context() as theirs, theirs.socket(zmq.DEALER) as client:
+        server = CommandServer(context, "tcp://127.0.0.1:*", {}, refusals)
+        client.setsockopt(zmq.LINGER, 0)
+        client.setsockopt(zmq.SNDHWM, 1)
+        client.setsockopt(zmq.SNDTIMEO, 500)
+        client.connect(server.address)
+        before_mb, sent = resident_memory_mb(), 0
+        # Nothing reads yet.
+        with suppress(zmq.Again):
+            for sent in range(4000):  # noqa: B007 - the number of those before the last
+                client.send_multipart(frames)
+        assert resident_memory_mb() - before_mb < 50
+        serving = asyncio.create_task(server.run())
+        while sum(refusals.counts.values()) < sent:  # noqa: ASYNC110 - nobody tells it to an event loop
+            await asyncio.sleep(0.01)
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+        server.close()

@@ -11,7 +11,7 @@ until_so() {
 }
 systemctl start shearloop
 echo "started: $?"
-until_so alive StatusText "5 tasks are alive"
+until_so alive StatusText "6 tasks are alive"
 echo "user: $(of User)"
 # Other daemons may run on this machine.
 ls -l "/proc/$(of MainPID)/fd" >/run/files
@@ -26,11 +26,11 @@ if [ -e /run/exchange/start_only ]; then
 fi
 kill -KILL "$(of MainPID)"
 until_so killed NRestarts 1
-until_so again StatusText "5 tasks are alive"
+until_so again StatusText "6 tasks are alive"
 # A daemon that hangs does not feed the watchdog.
 kill -STOP "$(of MainPID)"
 until_so hung NRestarts 2
-until_so again StatusText "5 tasks are alive"
+until_so again StatusText "6 tasks are alive"
 systemctl stop shearloop
 echo "stopped: $(of Result) $(of ExecMainStatus)"
 echo "fingertipz: 1" >>/etc/shearloop/shearloop.yaml

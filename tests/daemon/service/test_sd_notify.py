@@ -60,7 +60,7 @@ async def test_the_daemon_notifies_ready_alive_and_stopping(manager, config):
     async with shearloop("run", str(config())) as daemon:
         assert await asyncio.to_thread(manager.recv, 4096) == b"READY=1"
         said = await asyncio.to_thread(manager.recv, 4096)
-        assert said.startswith(b"WATCHDOG=1\nSTATUS=5 tasks are alive")
+        assert said.startswith(b"WATCHDOG=1\nSTATUS=6 tasks are alive")
         daemon.send_signal(signal.SIGTERM)
         assert await daemon.wait() == 0
     while said != b"STOPPING=1":

@@ -56,12 +56,12 @@ def booted(folder: Path, bank: Path, *options: str) -> dict[str, list[str]]:
 def test_the_service_starts_and_restarts_after_kill_and_hang_but_not_after_a_mistake(tmp_path, tiny_bank):
     seen = booted(tmp_path, tiny_bank)
     assert seen["started"] == ["0"], "READY=1 came, and ZeroMQ could make its threads and sockets"
-    assert seen["alive"] == ["5 tasks are alive"]
+    assert seen["alive"] == ["6 tasks are alive"]
     assert (seen["user"], seen["capabilities"]) == (["shearloop"], ["0" * 16])
     assert seen["stop socket"] == ["1"]
     assert seen["policy"] == ["SCHED_OTHER"]
     assert (seen["killed"], seen["hung"]) == (["1"], ["2"])
-    assert seen["again"] == ["5 tasks are alive"] * 2
+    assert seen["again"] == ["6 tasks are alive"] * 2
     assert seen["stopped"] == ["success 0"]
     assert seen["mistake"] == ["status 2, 0 restarts"]
 
@@ -69,6 +69,6 @@ def test_the_service_starts_and_restarts_after_kill_and_hang_but_not_after_a_mis
 def test_the_service_starts_with_the_real_time_options(tmp_path, tiny_bank):
     (tmp_path / "start_only").touch()
     seen = booted(tmp_path, tiny_bank, "--real-time")
-    assert (seen["started"], seen["alive"]) == (["0"], ["5 tasks are alive"])
+    assert (seen["started"], seen["alive"]) == (["0"], ["6 tasks are alive"])
     assert seen["policy"] == ["SCHED_FIFO"]
     assert seen["stopped"] == ["success 0"]

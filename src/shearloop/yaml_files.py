@@ -138,7 +138,8 @@ def load_model(
     content, root = _read(path, raises, what, cure)
     if not isinstance(content, dict):
         example = next(iter(TypeAdapter(model).json_schema()["properties"]), "key")
-        raise raises(f"{path}: expected keys and values such as `{example}: …`, found {shown(content)}")
+        # The content stays unsaid: `start` takes any path, and its reply would show a file with a secret.
+        raise raises(f"{path}: expected keys and values such as `{example}: …`")
     try:
         return _validated(content, model, path.resolve().parent)
     except ValidationError as error:

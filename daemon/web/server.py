@@ -53,6 +53,8 @@ HEARTBEAT_S = 0.25
 # A page that accepts nothing for this long is disconnected.
 SEND_TIMEOUT_S = 5.0
 MAX_PAGES = 16
+# At this number of connections, the oldest that waits for a request is closed for a new one.
+MAX_CONNECTIONS, ACCEPTED_AT_ONCE = 128, 16
 MAX_BODY_BYTES = 4096
 # The largest message is a heatmap of 200 × 200 float32.
 MAX_MESSAGE_BYTES = 1 << 20
@@ -193,19 +195,20 @@ async def serve(
     with zmq.asyncio.Context() as context:
         bridge = Bridge(context, address, MessageStore(fingertip.height_cm))
         app = make_app(bridge, token, asdict(fingertip.outline()), address.publish)
-        runner = web.AppRunner(app, access_log=None, shutdown_timeout=SHUTDOWN_S)
+        runner = web.AppRunner(app, access_log=None, shutdown_timeout=SHUTDOWN_S, lingering_time=0.0)
         receiving = asyncio.create_task(bridge.run(), name="messages")
+        listener: asyncio.Server | None = None
         try:
             await runner.setup()
             try:
-                await web.TCPSite(runner, HOST, port).start()
+                listener = await listen(runner, port)
             except OSError as error:
                 raise UserError(
                     f"the page cannot be served on {HOST}:{port} ({error.strerror}); give another --port"
                 ) from error
             for number in signals:
                 loop.add_signal_handler(number, partial(loop.call_later, LAST_MESSAGES_S, receiving.cancel))
-            on_ready(runner.addresses[0][1])
+            on_ready(listener.sockets[0].getsockname()[1])
             # Without its subscription the page would show stale data: an error there ends the server.
             with contextlib.suppress(asyncio.CancelledError):
                 await receiving
@@ -214,14 +217,32 @@ async def serve(
                 loop.remove_signal_handler(number)
             receiving.cancel()
             await asyncio.gather(receiving, return_exceptions=True)
+            if listener is not None:
+                listener.close()
             await runner.cleanup()
             await bridge.close()
+
+
+async def listen(runner: web.AppRunner, port: int) -> asyncio.Server:
+    """Listen on a port with a bounded number of connections; raises OSError."""
+    server = runner.server
+    if server is None:
+        raise RuntimeError("the runner is not set up")
+
+    def accept() -> web.RequestHandler:
+        idle = [one for one in server.connections if one not in runner.app[_BUSY]]
+        for one in idle[: max(0, len(server.connections) - MAX_CONNECTIONS + 1)]:
+            one.force_close()
+        return server()
+
+    return await asyncio.get_running_loop().create_server(accept, HOST, port, backlog=ACCEPTED_AT_ONCE)
 
 
 def make_app(bridge: Bridge, token: str, fingertip: dict[str, Any], publish: str) -> web.Application:
     """Return the web application; the page draws the fingertip's outline and shows the address `publish`."""
     page = _Page(bridge, token, fingertip, publish)
     app = web.Application(middlewares=[page.check_access], client_max_size=MAX_BODY_BYTES)
+    app[_BUSY] = page.busy
     app.router.add_get("/", page.file)
     app.router.add_get("/assets/{name}", page.file)
     app.router.add_get("/settings.json", page.settings)
@@ -249,6 +270,10 @@ class TokenCheck:
         return 403, f"{name} needs the token: open the address that `shearloop view` printed"
 
 
+# Connections with a request in progress.
+_BUSY = web.AppKey("_BUSY", set[web.RequestHandler])
+
+
 class _Page:
     def __init__(self, bridge: Bridge, token: str, fingertip: dict[str, Any], publish: str) -> None:
         self._bridge = bridge
@@ -263,6 +288,7 @@ class _Page:
             "stale_after_s": {topic: max(messages.stale_after_s(topic), MIN_STALE_S) for topic in regular},
         }
         self._open: set[web.WebSocketResponse] = set()
+        self.busy: set[web.RequestHandler] = set()
         # Only these files are ever sent: no name from a request becomes a path.
         self._files = {
             item.name: (item.read_bytes(), _TYPES[item.name.rsplit(".", 1)[-1]])
@@ -280,10 +306,13 @@ class _Page:
             return self._refuse(421, f"{host!r} is not this computer's loopback; open http://127.0.0.1:PORT/")
         if not origin_allowed(request.headers.get("Origin"), host):
             return self._refuse(403, "requests from other sites are not answered")
+        self.busy.add(request.protocol)
         try:
             response = await handler(request)
         except web.HTTPException as error:
             response = self._refuse(error.status, error.reason)
+        finally:
+            self.busy.discard(request.protocol)
         if not response.prepared:
             response.headers.update(HEADERS)
         return response

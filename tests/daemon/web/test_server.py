@@ -3,10 +3,11 @@
 import asyncio
 import hashlib
 import json
+import os
 import signal
 import socket
 from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -28,7 +29,7 @@ from shearloop.daemon.messaging.messages import EitHeatmap, LoadTorque
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.web import server as server_module
 from shearloop.daemon.web.message_store import MessageStore
-from shearloop.daemon.web.server import HEADERS, NEEDS_TOKEN, Bridge, DaemonAddress, make_app, serve
+from shearloop.daemon.web.server import HEADERS, NEEDS_TOKEN, Bridge, DaemonAddress, listen, make_app, serve
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.sample_messages import sample
 
@@ -68,13 +69,14 @@ async def served(tmp_path: Path, **other: Any) -> AsyncIterator[Served]:
         daemon = CommandServer(context, commands, handlers, Refusals())
         bridge = Bridge(context, DaemonAddress(publish, commands), MessageStore(3.6))
         tasks = [asyncio.create_task(run()) for run in (daemon.run, bridge.run)]
-        runner = web.AppRunner(make_app(bridge, TOKEN, {"width_cm": 4.4}, publish), access_log=None)
+        runner = web.AppRunner(make_app(bridge, TOKEN, {"width_cm": 4.4}, publish), access_log=None, lingering_time=0.0)
         await runner.setup()
-        await web.TCPSite(runner, "127.0.0.1", 0).start()
+        listener = await listen(runner, 0)
         try:
             async with asyncio.timeout(DEADLINE_S), aiohttp.ClientSession() as http:
-                yield Served(publisher, bridge, asked, f"http://127.0.0.1:{runner.addresses[0][1]}", http)
+                yield Served(publisher, bridge, asked, f"http://127.0.0.1:{listener.sockets[0].getsockname()[1]}", http)
         finally:
+            listener.close()
             await runner.cleanup()
             for task in tasks:
                 task.cancel()
@@ -233,6 +235,23 @@ async def test_a_stop_without_a_daemon_is_reported(tmp_path, monkeypatch):
         status, reply = await post(page, "/stop")
         assert (status, reply["ok"]) == (503, False)
         assert "no daemon answered" in reply["reason"]
+
+
+async def test_half_open_requests_do_not_keep_a_stop(tmp_path):
+    async with served(tmp_path) as page, AsyncExitStack() as stack:
+        port = int(page.base.rpartition(":")[2])
+        stream = await stack.enter_async_context(page.http.ws_connect(f"{page.base}/stream"))
+        without_body = b"POST /stop HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 9\r\n\r\n"
+        for text, times in ((b"GET / HT", 4), (without_body, 1)):
+            for _ in range(times * server_module.MAX_CONNECTIONS):
+                _, writer = await asyncio.open_connection("127.0.0.1", port)
+                stack.callback(writer.close)
+                writer.write(text)
+        async with asyncio.timeout(5.0):
+            assert (await post(page, "/stop"))[0] == 200
+        # The clients' own, and those of the server.
+        assert len(os.listdir("/proc/self/fd")) < 6.5 * server_module.MAX_CONNECTIONS, "the oldest are closed"
+        assert (await stream.receive()).type is aiohttp.WSMsgType.TEXT
 
 
 async def test_pages_and_their_messages_are_limited(tmp_path, monkeypatch):

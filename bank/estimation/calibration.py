@@ -294,7 +294,9 @@ def _from_plain(kind: Any, plain: Any, path: str, arrays: dict[str, NDArray[Any]
 
 def _checked(array: NDArray[Any], kind: Any, name: str) -> NDArray[Any]:
     """Return the array, read-only; raises ValueError where its numbers are not those of the type `kind`."""
-    expected = get_args(get_args(kind)[1])[0]
+    expected = kind
+    while arguments := get_args(expected):  # NDArray, and its dtype before NumPy 2.5
+        expected = arguments[-1]
     if array.dtype != expected or np.isnan(array).any():
         raise ValueError(f"{name} holds {array.dtype}, expected {expected.__name__} without NaN")
     array.setflags(write=False)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from shearloop.daemon.cli.options import add_connection, add_option, check_timeout_s, client_keys
-from shearloop.daemon.messaging import addresses
+from shearloop.daemon.messaging import addresses, stop_client
 
 COMMANDS = {
     "tare": "set the zero of the torque sensors, with nothing gripped and no experiment running",
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     if args.name in ("stop", "status") and args.key is None and not addresses.needs_keys(address):
         # These two need no key on the daemon's own machine.
         try:
-            reply = addresses.send_to_stop_socket(address, request, timeout_s)
+            reply = stop_client.send_to_stop_socket(address, request, timeout_s)
         except TimeoutError:
             # The daemon may have stopped the motion by now. A second `stop` must not end the daemon.
             request["spare_daemon"] = True

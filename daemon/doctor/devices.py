@@ -17,8 +17,8 @@ import numpy as np
 from shearloop.daemon.cli.terminal import task_row
 from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.addresses import send_to_stop_socket
 from shearloop.daemon.messaging.client import receive_messages, send_command
+from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.rig import make_gripper_client
 from shearloop.daemon.sensing.frame_estimator import fingertip_table
 from shearloop.daemon.serial_ports import access_error

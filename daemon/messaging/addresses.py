@@ -1,19 +1,9 @@
-"""Default addresses and timeouts, which addresses need CURVE keys, and the client of the stop socket.
-
-It imports little, so that `shearloop command stop` is quick on a busy computer.
-"""
+"""Default ZeroMQ addresses and timeouts, and which addresses need CURVE keys."""
 
 import errno
 import ipaddress
-import os
 import socket
-from collections.abc import Mapping
-from typing import Any
 from urllib.parse import urlsplit
-
-import msgpack
-
-from shearloop.daemon.errors import UserError
 
 PUBLISH_ADDRESS = "tcp://127.0.0.1:7761"
 COMMAND_ADDRESS = "tcp://127.0.0.1:7762"
@@ -22,9 +12,6 @@ LARGEST_PORT = 65535
 COMMAND_TIMEOUT_S = 2.0
 # The robot may have to power up, release its brakes and start its program, and the gripper to activate.
 UNLOCK_TIMEOUT_S = 60.0
-# Of the stop socket's name; a whole name has at most 107 bytes (unix(7)).
-_NAME_BYTES = 80
-_LARGEST_REPLY_BYTES = 1 << 18
 
 
 def is_local(address: str) -> bool:
@@ -74,39 +61,4 @@ def network_refusal(address: str, key: str) -> str:
     return (
         f"`{key}: {address}` would open the robot to the network: use ipc or a loopback address such as "
         "tcp://127.0.0.1:7761, or add `curve` with keys from `shearloop keys`"
-    )
-
-
-def stop_name(address: str) -> bytes:
-    """Return the abstract name of the stop socket of a daemon, by the port or the path of its `commands`."""
-    return b"\0shearloop-stop-" + os.fsencode(address.rpartition(":")[2])[-_NAME_BYTES:]
-
-
-def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any] | None:
-    """Send `stop` or `status` to the local daemon with this command address; return its reply, None without a daemon.
-
-    Raises TimeoutError if no reply comes in time, and UserError for a reply of another program.
-    """
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
-        client.settimeout(timeout_s)
-        # The kernel chooses an abstract name.
-        client.bind("")
-        try:
-            # Without `connect`, after which only the bound socket itself could reply.
-            client.sendto(msgpack.packb(content), stop_name(address))
-        except ConnectionError:
-            return None
-        data = client.recv(_LARGEST_REPLY_BYTES)
-    try:
-        # It has no arrays, for which `messages.decode` imports numpy.
-        return dict(msgpack.unpackb(data))
-    except (TypeError, ValueError) as error:
-        raise foreign_reply(address, error) from error
-
-
-def foreign_reply(address: str, error: Exception) -> UserError:
-    """Return the error for a reply of another program."""
-    return UserError(
-        f"the program at {address} is not a shearloop daemon ({error}); give the address of the daemon's "
-        "`commands` key with --connect"
     )

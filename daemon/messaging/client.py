@@ -7,15 +7,10 @@ import zmq
 import zmq.asyncio
 
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.addresses import (
-    LARGEST_PORT,
-    PUBLISH_ADDRESS,
-    foreign_reply,
-    has_valid_port,
-    needs_keys,
-)
+from shearloop.daemon.messaging.addresses import LARGEST_PORT, PUBLISH_ADDRESS, has_valid_port, needs_keys
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.messages import ENVELOPE, decode, encode
+from shearloop.daemon.messaging.stop_client import foreign_reply
 
 # A running daemon sends `health` every second.
 QUIET_S = 3.0

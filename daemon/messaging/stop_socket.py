@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.addresses import stop_name
 from shearloop.daemon.messaging.command_server import Handler, Reply, RequestExecutor
 from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import encode
+from shearloop.daemon.messaging.stop_client import stop_name
 
 LARGEST_DATAGRAM_BYTES = 1024
 
@@ -52,7 +52,7 @@ class StopSocket:
 
     def _reply(self, client: Any, reply: Reply) -> None:
         try:
-            # Unread replies of a shared socket would fill its send buffer, and then nobody could get one.
+            # Unread replies of a shared socket would fill its send buffer, and then no client could get one.
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as own:
                 own.sendto(encode(reply), client)
         except OSError:

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 
 from shearloop.daemon.cli import main
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.addresses import send_to_stop_socket, stop_name
 from shearloop.daemon.messaging.bound_sockets import MAX_CONNECTIONS, RESERVED_DESCRIPTORS, most_connections
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.command_server import (
@@ -30,6 +29,7 @@ from shearloop.daemon.messaging.command_server import (
 )
 from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import encode
+from shearloop.daemon.messaging.stop_client import send_to_stop_socket, stop_name
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import MAX_DESCRIPTORS
 from shearloop.daemon.supervisor import resident_memory_mb
@@ -230,7 +230,7 @@ async def test_requests_of_many_frames_do_not_fill_the_memory():
                 client.send_multipart(frames)
         assert resident_memory_mb() - before_mb < 50
         serving = asyncio.create_task(server.run())
-        while sum(refusals.counts.values()) < sent:  # noqa: ASYNC110 - nobody tells it to an event loop
+        while sum(refusals.counts.values()) < sent:  # noqa: ASYNC110 - counts have no event
             await asyncio.sleep(0.01)
         serving.cancel()
         await asyncio.gather(serving, return_exceptions=True)

@@ -11,7 +11,7 @@ import zmq
 import zmq.asyncio
 
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.addresses import has_valid_port, is_local, needs_keys, send_to_stop_socket
+from shearloop.daemon.messaging.addresses import has_valid_port, is_local, needs_keys
 from shearloop.daemon.messaging.bound_sockets import bind
 from shearloop.daemon.messaging.client import Subscriber
 from shearloop.daemon.messaging.keys import (
@@ -23,6 +23,7 @@ from shearloop.daemon.messaging.keys import (
     load_server_keys,
 )
 from shearloop.daemon.messaging.messages import decode, encode
+from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from tests.daemon.conftest import DEADLINE_S, running_daemon
 
 NETWORK = "tcp://0.0.0.0:*"

@@ -267,10 +267,8 @@ def _unadaptable(
 
 
 def _why_not_driving(drive: str, config: DaemonConfig) -> str:
-    if drive in config.fingertips and config.fingertips[drive].calibration is None:
+    if drive in config.fingertips:
         return "is a fingertip without a calibration, which has no torque: add `calibration`, or choose another"
-    if drive in config.fingertips or (drive == COMBINED and config.combined is not None):
-        return "has a calibration without torques: calibrate with the load cell and one tool, or choose another"
     if drive == SKIN and config.skin is not None:
         return "has no torque without a radius: add `skin.tool_radius_mm`, or choose another"
     return "is not a measured torque: choose another, or configure its device"

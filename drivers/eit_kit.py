@@ -107,7 +107,7 @@ def read_line(line: bytes, zero_slots: NDArray[np.bool_]) -> NDArray[np.float64]
     if (digits > 9).any() or (cells[:, _OTHERS] != _PUNCTUATION).any():
         return _find_error(line, zero_slots.size)
     # The quotient of whole numbers is the float nearest to the decimal.
-    values = digits @ _STEPS / 10_000
+    values: NDArray[np.float64] = digits @ _STEPS / 10_000
     zeros = values == 0.0
     for kind, bad in (
         (FrameErrorKind.OUT_OF_RANGE, values > ADC_REFERENCE_V),

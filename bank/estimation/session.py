@@ -30,6 +30,7 @@ from shearloop.bank.polynomial import TWO_SIDED_95
 REPEATED_FRAME = ("the board sent the same frame again",)
 _UNITS: dict[Quantity, str] = {"torque": "N·m", "diameter": "mm"}
 _UNKNOWN = (None, None, None)
+_UNCALIBRATED = ("no calibration is configured: k and sigma have no torque",)
 _AMBIGUOUS = ("two positions of the bank far apart fit the frame equally well",)
 
 # Frames of a grip that can correct its gain: ten minutes.
@@ -178,7 +179,7 @@ class EstimatorSession:
         # Noise makes every side of a new frame differ.
         repeats = (frame.channels == self._latest).all(axis=1).any()
         self._latest = frame.channels
-        if self._state.refuses_repeats and repeats:
+        if repeats and self.calibration.kind == "raw":
             return Estimate(valid=False, reasons=REPEATED_FRAME)
         processed = self._state.process(frame)
         if not processed.held_frames:
@@ -190,9 +191,9 @@ class EstimatorSession:
         return replace(estimate, lag_s=processed.lag_s) if processed.lag_s else estimate
 
     def _predict(self, frame: ProcessedFrame, t_s: float) -> Estimate:
-        calibration, curves_only = self.calibration, self._state.curves_only
+        calibration = self.calibration
         outputs, reasons = self._select_outputs(frame)
-        if not outputs and not curves_only:
+        if not outputs and calibration.outputs:
             return Estimate(valid=False, reasons=tuple(reasons))
         errors = NO_ERRORS
         if not frame.usable.all():
@@ -214,7 +215,7 @@ class EstimatorSession:
         # Tools of several diameters have a diameter where they have no torque.
         several = calibration.tools is not None and bool(self._tool_reasons)
         torque_missing = calibration.torque is not None and "torque" not in values and not several
-        if calibration.kind == "raw" and (torque_missing or (curves_only and reasons)):
+        if calibration.kind == "raw" and torque_missing:
             # A frame beyond the calibrated torques is beyond the calibrated diameters too.
             values.clear()
         return _estimate(values, reasons, match)
@@ -223,13 +224,8 @@ class EstimatorSession:
         self, frame: ProcessedFrame
     ) -> tuple[dict[Quantity, tuple[OutputModel, Novelty]], dict[str, None]]:
         """Return the models to apply to a frame with its novelty, and the reasons against the others, in order."""
-        calibration = self.calibration
-        if self._state.curves_only and calibration.torque is None:
-            if calibration.diameter is not None:
-                return {}, {"the calibration was made without torques: sigma has no torque": None}
-            return {}, {"no calibration is configured: k and sigma have no torque": None}
         outputs: dict[Quantity, tuple[OutputModel, Novelty]] = {}
-        reasons: dict[str, None] = {}
+        reasons: dict[str, None] = dict.fromkeys(() if self.calibration.outputs else _UNCALIBRATED)
         for quantity, model in (self._calibration.outputs | self._grip.adapted).items():
             novelty = FAMILIAR
             if model.novelty is not None:
@@ -237,8 +233,6 @@ class EstimatorSession:
             against = (*novelty.reasons, *(self._tool_reasons if quantity == "torque" else ()))
             if quantity == "diameter" and not frame.has_baseline:
                 # The gel's position means nothing without its idle position.
-                if calibration.torque is None:
-                    reasons["the fingertip was gripped from the first frame on: its idle frame is not known"] = None
                 continue
             reasons |= dict.fromkeys(against)
             if not against:

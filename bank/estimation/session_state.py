@@ -250,8 +250,6 @@ class GripMemory:
 class SessionState:
     """State of one session of raw frames; every frame goes through `process` in order."""
 
-    curves_only, refuses_repeats = False, True
-
     def __init__(
         self,
         validators: tuple[FingertipValidator, ...],
@@ -392,8 +390,6 @@ class PaperState:
     of the fingertip but its first frames.
     """
 
-    curves_only, refuses_repeats = True, False
-
     def __init__(self, baseline_frames: int, average_frames: int, max_gap_s: float) -> None:
         """Begin a session with `baseline_frames` untouched frames; a longer gap restarts the average."""
         self._baseline_frames = baseline_frames
@@ -453,7 +449,7 @@ class PaperState:
 class SliceState:
     """State of slices, which are differences already: none."""
 
-    curves_only, refuses_repeats, taring = False, False, False
+    taring = False
 
     def process(self, frame: TactileFrame) -> ProcessedFrame:
         """Take the next slice and return its magnitudes."""

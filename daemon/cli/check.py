@@ -91,14 +91,14 @@ def check_parts(config: "DaemonConfig", path: Path) -> Parts:
     for name, fingertip in config.fingertips.items():
         with parts.of(name):
             estimator = estimators[name] = open_estimator(fingertip, name)
-            grids, torque = estimator.grids, _torque(estimator, calibrated=fingertip.calibration is not None)
+            grids, torque = estimator.grids, _torque(estimator)
             bank = "no bank" if grids is None else f"bank {fingertip.bank} of {grids[0].size} × {grids[1].size} cells"
             parts.texts[name] = f"{bank}, {torque}"
     if config.combined is not None:
         with parts.of(COMBINED):
             combined = open_combined(config.combined, config.fingertips)
             sides = " and ".join(combined.calibration.sides)
-            parts.texts[COMBINED] = f"{sides} together, {_torque(combined, calibrated=True)}"
+            parts.texts[COMBINED] = f"{sides} together, {_torque(combined)}"
     if config.skin is not None:
         with parts.of("skin"):
             parts.texts["skin"] = _skin(config.skin)
@@ -121,11 +121,10 @@ def check_parts(config: "DaemonConfig", path: Path) -> Parts:
     return parts
 
 
-def _torque(estimator: "FrameEstimator", *, calibrated: bool) -> str:
+def _torque(estimator: "FrameEstimator") -> str:
     if estimator.measures_torque:
         return f"with torque{estimator.assumptions}"
-    reason = "its calibration has diameters only" if calibrated else "no calibration is configured"
-    return f"without torque: {reason}"
+    return "without torque: no calibration is configured"
 
 
 def _check_rig(config: "DaemonConfig", parts: Parts) -> None:

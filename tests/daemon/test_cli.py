@@ -17,10 +17,8 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-import yaml
 import zmq.asyncio
 
-from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.models import MODELS
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import COMMANDS, main
@@ -41,20 +39,6 @@ from tests.paper_curve import paper_curve
 
 def test_check_accepts_a_valid_configuration(config, ran):
     assert "is in order" in ran("check", config()).out
-
-
-@pytest.mark.usefixtures("ur_rtde")
-@pytest.mark.parametrize("command", ["run", "check"])
-def test_a_calibration_without_torques_cannot_drive_the_loop(command, config, tiny_bank, tmp_path, ran, mistake):
-    grid, path = np.linspace(0.9, 2.1, 30), tmp_path / "diameters.yaml"
-    paper_curve(Bank.open(tiny_bank).identity, diameter=(grid, 20.0 * grid)).save(path)
-    section = {"right": {"device": {"path": "eit"}, "bank": str(tiny_bank), "calibration": str(path)}}
-    assert "without torque: its calibration has diameters only" in ran("check", config(fingertips=section)).out
-    shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
-    steps = {"name": "one", "torque_source": "right", "steps": [{"do": "wait", "wait_s": 1}]}
-    (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(steps))
-    said = mistake(command, str(config(fingertips=section, robot="ur.yaml", experiment="experiment.yaml")))
-    assert "torque_source: `right` has a calibration without torques" in said
 
 
 def test_a_file_that_is_not_there_hides_no_other_mistake(config, tmp_path, mistake):

@@ -129,7 +129,7 @@ def test_check_shows_the_assumptions(calibration, files, tmp_path):
     replace(calibration, assumptions=("load timing",)).save(path)
     ends = ", assuming that the load cell's delay is as given (--load-cell-delay-s)"
     for file, said in ((path, f"with torque{ends}"), (files["combined"], "with torque")):
-        assert _torque(open_combined(CombinedConfig(calibration=file), tips), calibrated=True) == said
+        assert _torque(open_combined(CombinedConfig(calibration=file), tips)) == said
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from shearloop.daemon.control.experiment import (
-    ACTIVE,
     Action,
     Experiment,
     ExperimentPhase,
@@ -26,7 +25,7 @@ from shearloop.daemon.control.experiment_schema import (
     first_turn_before_grip,
 )
 from shearloop.daemon.control.fault_detection import (
-    Grip,
+    Grasp,
     LatestInputs,
     Watched,
     compared_for_s,
@@ -53,12 +52,12 @@ ADAPTED_OVER_S = 600.0
 class ControlOutput:
     """Commands to the devices; `action` and `release` are set for one tick.
 
-    `hold` interrupts a motion, which continues afterwards; `stop` ends it.
+    A straight move that is interrupted continues afterwards.
     """
 
     wrist_rad_per_s: float = 0.0
-    stop: bool = False
-    hold: bool = False
+    ends_motion: bool = False
+    interrupts_motion: bool = False
     action: Action | None = None
     release: bool = False
 
@@ -74,7 +73,7 @@ class LoopStatus:
 
 
 @dataclass(slots=True)
-class _Grip:
+class _GrippedTool:
     """What the loop knows of the tool between the fingers."""
 
     # The wrist's angle at the grip.
@@ -122,7 +121,7 @@ class ControlLoop:
             limits=ExperimentLimits(),
             required=required,
         )
-        self._grip = _Grip()
+        self._gripped = _GrippedTool()
         # Faults that were reported since the latest tick.
         self._reported: list[Fault] = []
 
@@ -166,7 +165,7 @@ class ControlLoop:
 
     def on_action_ended(self, error: str = "") -> None:
         """Take the end of the present action, with its error if it failed."""
-        experiment, arm, grip = self.experiment, self.inputs.arm, self._grip
+        experiment, arm, gripped = self.experiment, self.inputs.arm, self._gripped
         action = experiment.command.action if experiment is not None else None
         if experiment is None or not experiment.end_action(error) or error:
             return
@@ -177,16 +176,16 @@ class ControlLoop:
             return
         # The tool was identified with another zero, or in another grip.
         self._forget_tool()
-        grip.unmeasured_since_ns = arm.t_ns if arm is not None else None
+        gripped.unmeasured_since_ns = arm.t_ns if arm is not None else None
         if isinstance(action, GripStep):
             gripper = self.inputs.gripper
-            grip.origin_rad = arm.wrist_rad if arm is not None else None
+            gripped.origin_rad = arm.wrist_rad if arm is not None else None
             # An unexpected object is watched as well.
-            grip.expected = action.expect_object or (gripper is not None and gripper.holding)
+            gripped.expected = action.expect_object or (gripper is not None and gripper.holding)
 
     def on_release_ended(self, error: str = "") -> None:
         """Take the end of the release after a stop, with its error if the gripper did not open."""
-        self._grip.release_error = error
+        self._gripped.release_error = error
 
     def start(self, file: ExperimentFile, t_ns: int) -> str | None:
         """Begin an experiment; return None, or why it cannot begin."""
@@ -213,7 +212,9 @@ class ControlLoop:
         # Without a gripper of ours the tool is held by other means; with one, it may hold a tool already.
         gripper = self.inputs.gripper
         expected = "gripper" not in watched.required or (gripper is not None and gripper.holding)
-        self._grip = _Grip(unmeasured_since_ns=t_ns, expected=expected, release_error=self._grip.release_error)
+        self._gripped = _GrippedTool(
+            unmeasured_since_ns=t_ns, expected=expected, release_error=self._gripped.release_error
+        )
         return None
 
     def pause(self) -> str | None:
@@ -231,34 +232,34 @@ class ControlLoop:
 
     def acknowledge(self) -> None:
         """Clear a stop on the operator's command."""
-        self._grip.release_error = ""
+        self._gripped.release_error = ""
         self.safety.acknowledge()
 
     def tick(self, t_ns: int, late_s: float = 0.0, died: Mapping[str, str] = MappingProxyType({})) -> ControlOutput:
         """Return the commands for now; the loop is `late_s` late, and `died` has the error of each dead task."""
-        experiment, arm, grip = self.experiment, self.inputs.arm, self._grip
-        active = experiment is not None and experiment.phase in ACTIVE
+        experiment, arm, gripped = self.experiment, self.inputs.arm, self._gripped
+        active = experiment is not None and experiment.running
         watched = replace(self._watched, late_s=late_s, died=died)
         if experiment is not None:
             watched = replace(watched, limits=experiment.limits)
         if experiment is not None and active:
             command, controller = experiment.command, self.wrist.controller
-            state = Grip.HELD if grip.expected else Grip.NONE
-            state = Grip.CHANGING if isinstance(command.action, GripStep) else state
-            needed = state is Grip.HELD and _turns(command) and not self._awaited_torques(experiment, t_ns)
+            grasp = Grasp.HELD if gripped.expected else Grasp.NONE
+            grasp = Grasp.CHANGING if isinstance(command.action, GripStep) else grasp
+            needed = grasp is Grasp.HELD and _turns(command) and not self._awaited_torques(experiment, t_ns)
             watched = replace(
                 watched,
-                grip=state,
+                grasp=grasp,
                 torque_needed=needed and experiment.phase is ExperimentPhase.RUNNING,
-                twisted_rad=0.0 if arm is None or grip.origin_rad is None else arm.wrist_rad - grip.origin_rad,
+                twisted_rad=0.0 if arm is None or gripped.origin_rad is None else arm.wrist_rad - gripped.origin_rad,
                 expected_nm=controller.torque_nm if controller is not None else None,
                 overdue=experiment.overdue,
             )
         found = [*detect_faults(self.inputs, watched, self.config, t_ns), *self._reported]
         self._reported.clear()
         self.inputs.unjudged.clear()
-        if grip.release_error:
-            found.append(Fault(FaultCode.NOT_RELEASED, grip.release_error))
+        if gripped.release_error:
+            found.append(Fault(FaultCode.NOT_RELEASED, gripped.release_error))
         if experiment is None or not active:
             # Nothing moves: faults are reported, and only a stop of an experiment waits for the operator.
             if arm is not None and arm.enabled_by_start:
@@ -284,16 +285,15 @@ class ControlLoop:
 
     def _run_step(self, experiment: Experiment, decision: SafetyDecision, wrist_rad: float, t_ns: int) -> ControlOutput:
         """Let the experiment choose its command, and the wrist's controller a speed."""
-        wrist, grip, held = self.wrist, self._grip, decision.response is Response.HOLD
-        if grip.origin_rad is None:
-            grip.origin_rad = wrist_rad
+        wrist, gripped, held = self.wrist, self._gripped, decision.response is Response.HOLD
+        origin_rad = gripped.origin_rad = wrist_rad if gripped.origin_rad is None else gripped.origin_rad
         latest = self.inputs.torques.get(experiment.file.torque_source)
         torque_nm = latest.torque_nm if latest is not None and not held else None
         stands = held or bool(self._awaited_torques(experiment, t_ns))
-        experiment.update(t_ns, wrist_rad - grip.origin_rad, torque_nm, gripped_at_rad=grip.origin_rad, held=stands)
+        experiment.update(t_ns, wrist_rad - origin_rad, torque_nm, gripped_at_rad=origin_rad, held=stands)
         command = experiment.command
         # A tool that the gripper holds is watched. After a stop, the gripper's doubt may arrive only now.
-        if _turns(command) and not grip.expected and (uncertain := self._why_uncertain()):
+        if _turns(command) and not gripped.expected and (uncertain := self._why_uncertain()):
             experiment.fail(f"{uncertain}; put a `grip` or a `release` before it")
         awaited = self._awaited_torques(experiment, t_ns)
         still = held or bool(awaited) or experiment.phase is ExperimentPhase.PAUSED
@@ -301,7 +301,7 @@ class ControlLoop:
             reason = wrist.close_loop(command.wrist, t_ns, wrist_rad, experiment.limits.torque_nm)
             if reason:
                 experiment.fail(reason)
-        if experiment.phase not in ACTIVE:
+        if not experiment.running:
             return self._ended(decision)
         action = command.action if command.action is not None and not still and experiment.begin_action() else None
         if isinstance(action, IdentifyStep):
@@ -313,21 +313,21 @@ class ControlLoop:
             velocity, ended = wrist.identify(wrist.excitation, t_ns, wrist_rad)
             if ended is not None:
                 self.on_action_ended(ended)
-                if experiment.phase not in ACTIVE:
+                if not experiment.running:
                     return self._ended(decision)
         else:
-            velocity = wrist.turn(command.wrist, t_ns, wrist_rad, grip.origin_rad)
+            velocity = wrist.turn(command.wrist, t_ns, wrist_rad, origin_rad)
         phase = "held" if held else experiment.phase.value
         self.status = LoopStatus(phase, awaited or command.activity, velocity, decision)
-        return ControlOutput(velocity.speed_rad_per_s, hold=still, action=action)
+        return ControlOutput(velocity.speed_rad_per_s, interrupts_motion=still, action=action)
 
     def _awaited_torques(self, experiment: Experiment, t_ns: int) -> str:
         """Return which torques a step that turns the tool waits for after a grip or a tare, or an empty string.
 
         An estimator needs some frames of the new grip; a source without a torque after its `warm_up_s` is a fault.
         """
-        since_ns = self._grip.unmeasured_since_ns
-        if since_ns is None or not (self._grip.expected and _turns(experiment.command)):
+        since_ns = self._gripped.unmeasured_since_ns
+        if since_ns is None or not (self._gripped.expected and _turns(experiment.command)):
             return ""
         awaited, reason = [], ""
         for name, source in self._sources.items():
@@ -338,7 +338,7 @@ class ControlLoop:
                 awaited.append(name)
                 reason = latest.reason if latest is not None else ""
         if not awaited:
-            self._grip.unmeasured_since_ns = None
+            self._gripped.unmeasured_since_ns = None
             return ""
         return f"waiting for the first torque of {', '.join(awaited)}{f': {reason}' if reason else ''}"
 
@@ -352,9 +352,9 @@ class ControlLoop:
         phase = experiment.phase.value if experiment is not None else "idle"
         reason = experiment.stop_reason if experiment is not None else ""
         self.status = LoopStatus(phase, reason, WristCommand(), decision)
-        release = decision.response is Response.STOP_AND_RELEASE and not self._grip.released
-        self._grip.released |= release
-        return ControlOutput(stop=True, release=release)
+        release = decision.response is Response.STOP_AND_RELEASE and not self._gripped.released
+        self._gripped.released |= release
+        return ControlOutput(ends_motion=True, release=release)
 
 
 def _turns(command: StepCommand) -> bool:

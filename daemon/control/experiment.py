@@ -90,10 +90,6 @@ class ExperimentPhase(Enum):
     STOPPED = "stopped"  # before its end: by the operator, by safety, or by a step that failed
 
 
-# Phases in which the experiment may still move something.
-ACTIVE = (ExperimentPhase.RUNNING, ExperimentPhase.PAUSED)
-
-
 StepProgram: TypeAlias = Generator[StepCommand, StepContext, None]
 
 
@@ -121,7 +117,7 @@ class Experiment:
     @property
     def running(self) -> bool:
         """Whether it may still move something."""
-        return self.phase in ACTIVE
+        return self.phase in (ExperimentPhase.RUNNING, ExperimentPhase.PAUSED)
 
     @property
     def step(self) -> Step:
@@ -152,7 +148,7 @@ class Experiment:
         """
         passed_s = max(0, t_ns - self._t_ns) / 1e9
         self._t_ns = max(t_ns, self._t_ns)
-        if self.phase not in ACTIVE:
+        if not self.running:
             return StepCommand()
         if self.phase is ExperimentPhase.PAUSED or held:
             return replace(self.command, wrist=Hold())

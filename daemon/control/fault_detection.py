@@ -25,7 +25,7 @@ AWAY_S = 1.0
 MOST_UNJUDGED = 256
 
 
-class Grip(Enum):
+class Grasp(Enum):
     """What the fingers do with the tool."""
 
     NONE = "none"
@@ -82,7 +82,7 @@ class Watched:
     required: tuple[str, ...] = ()
     # The wrist is driven by the torque, or twists under its limit.
     torque_needed: bool = False
-    grip: Grip = Grip.NONE
+    grasp: Grasp = Grasp.NONE
     twisted_rad: float = 0.0
     expected_nm: float | None = None
     overdue: str = ""
@@ -111,12 +111,12 @@ def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_
         torque = _largest(inputs, source)
         if torque is None or torque.torque_nm is None or abs(torque.torque_nm) <= limit_nm:
             continue
-        if watched.grip is Grip.CHANGING and source.warm_up_s:
+        if watched.grasp is Grasp.CHANGING and source.warm_up_s:
             continue
         if t_ns - torque.t_ns <= watched.fresh_s[source.name] * 1e9:
             beyond = f"{source.name} measured {torque.torque_nm:+.3f} N·m, the limit is {limit_nm:g} N·m"
             found.append(Fault(FaultCode.TORQUE_LIMIT, beyond, t_ns=torque.t_mid_ns))
-    if watched.grip is Grip.HELD and abs(watched.twisted_rad) > limit_rad:
+    if watched.grasp is Grasp.HELD and abs(watched.twisted_rad) > limit_rad:
         turned = f"turned by {watched.twisted_rad:+.3f} rad since the grip, the limit is {limit_rad:g} rad"
         found.append(Fault(FaultCode.ANGLE_LIMIT, turned, t_ns=inputs.arm.t_ns if inputs.arm is not None else None))
     found += _device_faults(inputs, watched, t_ns)
@@ -141,16 +141,12 @@ def _largest(inputs: LatestInputs, source: TorqueSource) -> TorqueSample | None:
 
 def _torque_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_ns: int) -> list[Fault]:
     source = watched.driving
-    found: list[Fault] = []
-    driving: Fault | None = None
-    for one in (*watched.supervising, source):
-        driving = (
-            None if one.from_robot and one is not source else _unusable(inputs, one, watched.fresh_s[one.name], t_ns)
-        )
-        if driving is not None:
-            found.append(driving)
+    # The age of a robot's torque is checked with its state.
+    judged = (*(one for one in watched.supervising if not one.from_robot), source)
+    faults = [_unusable(inputs, one, watched.fresh_s[one.name], t_ns) for one in judged]
+    found = [fault for fault in faults if fault is not None]
     latest = inputs.torques.get(source.name)
-    if driving is not None or latest is None or latest.torque_nm is None:
+    if faults[-1] is not None or latest is None or latest.torque_nm is None:
         return found
     if watched.expected_nm is not None and abs(latest.torque_nm - watched.expected_nm) > config.max_innovation_nm:
         jumped = f"{source.name} measured {latest.torque_nm:+.3f} N·m where {watched.expected_nm:+.3f} N·m was expected"
@@ -245,7 +241,7 @@ def _device_faults(inputs: LatestInputs, watched: Watched, t_ns: int) -> list[Fa
             found.append(Fault(FaultCode.STATE_STALE, silent, t_ns=gripper.t_ns))
         elif gripper.fault:
             found.append(Fault(FaultCode.GRIPPER_FAULT, gripper.fault, t_ns=gripper.t_ns))
-        elif watched.grip is Grip.HELD and not gripper.holding:
+        elif watched.grasp is Grasp.HELD and not gripper.holding:
             empty = f"its fingers are {gripper.width_mm:.1f} mm apart with nothing between them"
             found.append(Fault(FaultCode.GRIP_LOST, empty, t_ns=gripper.t_ns))
     for name, reason in lost.items():

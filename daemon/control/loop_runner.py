@@ -89,8 +89,8 @@ class ControlLoopRunner:
         self._dead_tasks = dead_tasks
         self._acceleration_rad_per_s2 = control_loop.config.wrist_acceleration_rad_per_s2
         self._stops = StopTimeline()
-        self._velocity = CommandSender(robot, control_loop, self._stops, clock)
-        self._actions = ActionExecutor(robot, gripper, sensors, self._velocity, control_loop)
+        self._sender = CommandSender(robot, control_loop, self._stops, clock)
+        self._actions = ActionExecutor(robot, gripper, sensors, self._sender, control_loop)
         self._states = StatePublisher(publisher, control_loop)
         self._running = False
         self._stopped = True
@@ -223,19 +223,19 @@ class ControlLoopRunner:
         late_s = (now_ns - self._decided_ns) / 1e9 - (LONGEST_REST_S if self._stopped else LONGEST_TICK_S)
         self._decided_ns = now_ns
         output = self._control_loop.tick(now_ns, max(0.0, late_s), self._dead_tasks)
-        if output.stop:
+        if output.ends_motion:
             self._stop(output, now_ns)
         else:
             self._stopped = False
-            if not output.hold:
+            if not output.interrupts_motion:
                 self._actions.may_move.set()
             elif self._actions.interrupt():
-                self._velocity.send(Stop(self._acceleration_rad_per_s2))
+                self._sender.send(Stop(self._acceleration_rad_per_s2))
             if output.action is not None:
                 self._actions.begin(output.action)
-            self._velocity.send(WristSpeed(output.wrist_rad_per_s, self._acceleration_rad_per_s2, now_ns))
+            self._sender.send(WristSpeed(output.wrist_rad_per_s, self._acceleration_rad_per_s2, now_ns))
             self._robot.keep_moving()
-        self._states.publish_loop(self._velocity.sent_rad_per_s, now_ns)
+        self._states.publish_loop(self._sender.sent_rad_per_s, now_ns)
         self._states.publish_stop(self._stops.update(self._robot.state, now_ns))
 
     def _stop(self, output: ControlOutput, now_ns: int) -> None:
@@ -245,7 +245,7 @@ class ControlLoopRunner:
             if experiment is not None and experiment.phase is ExperimentPhase.STOPPED:
                 self._stops.begin(experiment.file.name, status.activity, status.decision, now_ns)
             self._actions.cancel()
-            self._velocity.send(Stop(self._acceleration_rad_per_s2))
+            self._sender.send(Stop(self._acceleration_rad_per_s2))
         if output.release:
             self._actions.release()
 
@@ -313,7 +313,7 @@ class ActionExecutor:
     robot: UrRobot
     gripper: GripperTask | None
     sensors: Mapping[str, Tareable]
-    velocity: CommandSender
+    sender: CommandSender
     control_loop: ControlLoop
     # The fingers may be on their way; cleared by a stop of the fingers.
     fingers_move: bool = False
@@ -463,11 +463,11 @@ class ActionExecutor:
 
         Resting joints are not enough: after a stop the robot's process is busy a little longer, and refuses a move.
         """
-        velocity = self.velocity
+        sender = self.sender
         try:
             async with asyncio.timeout(COMES_TO_REST_S):
                 state = await self.robot.next_state()
-                while velocity.sent_rad_per_s or velocity.unanswered or state.motion != "idle" or not state.rests:
+                while sender.sent_rad_per_s or sender.unanswered or state.motion != "idle" or not state.rests:
                     state = await self.robot.next_state()
         except TimeoutError:
             return f"the arm did not come to rest within {COMES_TO_REST_S:g} s; check what moves it"

@@ -136,7 +136,7 @@ class SkinLoop:
                 self.brain.on_action_ended()
         self.brain.on_arm(ArmStatus(self._angle_rad, self.t_ns))
         orders = self.brain.tick(self.t_ns)
-        speed = 0.0 if orders.stop else orders.wrist_rad_per_s
+        speed = 0.0 if orders.ends_motion else orders.wrist_rad_per_s
         self.brain.on_speed_sent(speed)
         self._speeds.append(speed)
         if isinstance(orders.action, TareStep):

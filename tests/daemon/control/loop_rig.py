@@ -64,7 +64,7 @@ class Rig:
                 self.pending.remove((due, action))
                 self._finish(action)
         orders = self.orders = self.control_loop.tick(self.t_ns, 0.0, self.died)
-        self.speed = 0.0 if orders.stop else orders.wrist_rad_per_s
+        self.speed = 0.0 if orders.ends_motion else orders.wrist_rad_per_s
         self.control_loop.on_speed_sent(self.speed)
         if orders.release:
             self.force_n = 0.0

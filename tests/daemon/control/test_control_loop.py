@@ -226,7 +226,7 @@ def test_a_silent_board_holds_the_wrist_and_then_stops_it():
     assert "Check the sensor's cable" in rig.control_loop.status.decision.reasons[0]
     rig.run(6)
     assert phase(rig) is ExperimentPhase.STOPPED
-    assert rig.orders.stop
+    assert rig.orders.ends_motion
     assert not rig.orders.release, "the grip is kept"
 
 
@@ -282,7 +282,7 @@ def test_what_a_device_reports_ends_a_running_experiment_at_once(device, sense, 
     rig.run(2)
     setattr(rig, device, replace(getattr(rig, device), **sense))
     rig.step()
-    assert rig.orders.stop
+    assert rig.orders.ends_motion
     assert rig.speed == 0.0
     assert event in {trouble.code for trouble in rig.control_loop.status.decision.faults}
 

@@ -5,7 +5,7 @@ import pytest
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.fault_detection import (
     ARM_STALE_S,
-    Grip,
+    Grasp,
     LatestInputs,
     Watched,
     compared_for_s,
@@ -45,7 +45,7 @@ def watched(driving: TorqueSource, supervising: tuple[TorqueSource, ...]) -> Wat
         fresh_s=fresh_for_s((driving, *supervising), LoopConfig()),
         limits=ExperimentLimits(),
         torque_needed=True,
-        grip=Grip.HELD,
+        grasp=Grasp.HELD,
         twisted_rad=0.0,
     )
 
@@ -137,7 +137,7 @@ def devices(
 ) -> list[tuple[FaultCode, str]]:
     """Return what is said of the devices while nothing moves."""
     senses = LatestInputs(10.0, arm=arm, gripper=hand, lost=lost)
-    idle = replace(watched(EIT, ()), torque_needed=False, grip=Grip.NONE, required=("robot", "gripper"))
+    idle = replace(watched(EIT, ()), torque_needed=False, grasp=Grasp.NONE, required=("robot", "gripper"))
     return [(each.code, each.detail) for each in detect_faults(senses, idle, LoopConfig(), NOW_NS)]
 
 

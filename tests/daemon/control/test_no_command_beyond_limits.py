@@ -114,7 +114,7 @@ class WholeRig:
         if self.action is not None and self.number >= self.action[0]:
             self._finish(self.action[1])
         orders = self.control_loop.tick(self.now_ns)
-        if orders.stop:
+        if orders.ends_motion:
             if not self.stopped:
                 self._ask(Stop(4.0))
             self.stopped, self.action = True, None

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pydantic import Field
 
 from shearloop.daemon.config_file import ConfigModel
-from shearloop.daemon.errors import UserError
 
 
 class LoopConfig(ConfigModel):
@@ -69,11 +68,6 @@ class Creep:
     crept_nm: float = 0.0
     _t_ns: int | None = None
     _shear_nm: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Raise UserError for parameters that no gel has."""
-        if not (0.0 <= self.share < 1.0 and 0.0 < self.time_s < math.inf):
-            raise UserError(f"creep: share {self.share:g} and time_s {self.time_s:g} are out of range; see docs/rig.md")
 
     def torque_nm(self, shear_nm: float, t_ns: int) -> float:
         """Return the torque of a reading at t_ns (monotonic clock)."""

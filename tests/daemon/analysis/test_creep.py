@@ -83,5 +83,3 @@ def test_what_is_no_creep_is_refused():
         fit_creep([Stretch(times, torques, shears)])
     with pytest.raises(UserError, match="at the end of the recording"):
         fit_creep([Stretch(times, shears, shears - 0.01 * np.cumsum(shears) / shears.size)])
-    with pytest.raises(UserError, match="out of range"):
-        Creep(1.5, 20.0)

@@ -15,7 +15,7 @@ from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, wren
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.logs import LinkLog
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.recording.recorder import AttachedFile, Recorder, experiment_notes
+from shearloop.daemon.recording.recorder import AttachedFile, Recorder
 from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
@@ -159,7 +159,7 @@ class Rig:
             self.runner.stop("the operator stopped it")
             return "it was stopped during its start"
         if reason is None and self._recorder is not None:
-            self._recorder.record_experiment(file.name, attached, experiment_notes(file))
+            self._recorder.record_experiment(file.name, attached, file.tool_mm)
         return reason
 
     async def unlock(self) -> str | None:

@@ -331,20 +331,14 @@ class TopicSummary:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FileCondition:
-    """Whether a file was closed, its size, and how much of it is damaged."""
+class RecordingSummary:
+    """The content of a recording in numbers, times in Unix ns; the keys of `recording info --json`."""
 
     path: str
     size_bytes: int
     closed: bool
     torn_bytes: int
     damaged_chunks: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecordingSummary(FileCondition):
-    """The content of a recording in numbers, times in Unix ns; the keys of `recording info --json`."""
-
     dropped: int | None
     first_unix_ns: int | None
     duration_s: float

@@ -18,7 +18,6 @@ from functools import partial
 from io import FileIO
 from itertools import count
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,6 @@ from pydantic_core import PydanticSerializationError
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import LoopState, Scalar
 from shearloop.daemon.recording import schema
@@ -103,11 +101,6 @@ def daemon_identity(config: DaemonConfig) -> Identity:
                 attached[file.name] = file
                 metadata[f"sha256 {path}"] = hashlib.sha256(file.data).hexdigest()
     return Identity(metadata, tuple(attached.values()))
-
-
-def experiment_notes(experiment: ExperimentFile) -> dict[str, str]:
-    """Return the metadata of an experiment: its tool's diameter, if it names one."""
-    return {} if experiment.tool_mm is None else {schema.DIAMETER_NOTE: f"{experiment.tool_mm:g}"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,10 +192,11 @@ class Recorder:
         self._enqueue(_OVERHEAD_BYTES + len(event.data), add)
 
     def record_experiment(
-        self, name: str, attached: tuple[AttachedFile, ...] = (), notes: Mapping[str, str] = MappingProxyType({})
+        self, name: str, attached: tuple[AttachedFile, ...] = (), tool_mm: float | None = None
     ) -> None:
         """Record the start of an experiment: a new file begins, unless the current one has no experiment yet."""
         t_unix_ns = self._clock.now_ns() + self._clock.offset_ns
+        notes = {} if tool_mm is None else {schema.DIAMETER_NOTE: f"{tool_mm:g}"}
         add = partial(self._add_experiment, name, attached, notes, t_unix_ns)
         self._enqueue(_OVERHEAD_BYTES, add, begins_experiment=True)
 

@@ -8,11 +8,10 @@ import pytest
 from shearloop.bank.estimation import Measured
 from shearloop.daemon.analysis.frame_series import read_series, series_of
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.control.experiment_schema import ExperimentFile, WaitStep
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import EitFrame, wire_map
 from shearloop.daemon.recording.reader import read_recording, summarise
-from shearloop.daemon.recording.recorder import Identity, Recorder, experiment_notes
+from shearloop.daemon.recording.recorder import Identity, Recorder
 from shearloop.daemon.recording.schema import basic_identity
 from shearloop.daemon.sensing.tool_diameter import tool_as_bytes
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
@@ -34,9 +33,8 @@ class Held(Clock):
 def recorded(folder: Path, *held: tuple[int, Measured | None], named_mm: float | None = None) -> Path:
     """Record 40 frames as a daemon does; from the frame with each number on the gripper holds another tool, or none."""
     clock, values = Held(), dict(held)
-    file = ExperimentFile(name="twist", tool_mm=named_mm, steps=(WaitStep(do="wait", wait_s=1.0),))
     recorder = Recorder(folder, Identity(basic_identity("a test")), clock)
-    recorder.record_experiment(file.name, notes=experiment_notes(file))
+    recorder.record_experiment("twist", tool_mm=named_mm)
     for number in range(40):
         clock.t_ns += PERIOD_NS
         recorder.input_recorder("right").record(RawEvent(InputKind.DATA, clock.t_ns, b'"kind":"tool", said the board'))

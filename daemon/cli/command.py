@@ -89,7 +89,7 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
         from shearloop.daemon.cli.terminal import loop_line, table, task_row
 
         rows = [task_row(task, facts) for task, facts in reply["tasks"].items()]
-        loop = [loop_line("", reply["loop"]), ""] if "loop" in reply else []
+        loop = [loop_line(reply["loop"]), ""] if "loop" in reply else []
         return [*loop, *table(("task", "state", "rate", "notes"), rows)]
     values = {key: ", ".join(value) if isinstance(value, list) else value for key, value in reply.items()}
     return [f"{name}: {', '.join(f'{key} {value}' for key, value in values.items() if value) or 'done'}"]

@@ -5,6 +5,7 @@ import asyncio
 import math
 import sys
 from contextlib import ExitStack, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -70,7 +71,7 @@ async def _replay(
 ) -> "ReplayComparison":
     import zmq.asyncio
 
-    from shearloop.daemon.cli.terminal import EstimatePrinter, progress_bar
+    from shearloop.daemon.cli.terminal import print_estimate, progress_bar
     from shearloop.daemon.messaging.publisher import Publisher
     from shearloop.daemon.recording.replay import Replay, ReplayClock
 
@@ -80,7 +81,7 @@ async def _replay(
         opened.callback(publisher.close)
         replay = Replay(run, config, publisher, clock)
         if args.show:
-            publisher.add_listener(EstimatePrinter(sys.stdout))
+            publisher.add_listener(partial(print_estimate, sys.stdout))
         while args.wait and not publisher.has_subscribers():  # noqa: ASYNC110 - the publisher has no event
             await asyncio.sleep(0.05)
         progress = opened.enter_context(progress_bar(run.path.name, sum(run.counts.values()), "message"))

@@ -6,6 +6,7 @@ import signal
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack, closing
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -60,7 +61,7 @@ def _run(args: argparse.Namespace, out: "NonBlockingWriter", on_ready: Callable[
     from shearloop.daemon.app import run_daemon
     from shearloop.daemon.cli import EXIT_OK, EXIT_UNFINISHED
     from shearloop.daemon.cli.emulated_devices import EmulatedDevices
-    from shearloop.daemon.cli.terminal import EstimatePrinter, StatusLine
+    from shearloop.daemon.cli.terminal import StatusLine, print_estimate
     from shearloop.daemon.messaging.keys import Refusals
     from shearloop.daemon.messaging.stop_socket import StopSocket
     from shearloop.daemon.process import lock_memory, raise_descriptor_limit, raise_priority
@@ -80,7 +81,7 @@ def _run(args: argparse.Namespace, out: "NonBlockingWriter", on_ready: Callable[
         emulated = stack.enter_context(EmulatedDevices(config.emulators, args.config.parent, args.recording))
         listeners: list[Listener] = [emulated]
         if args.show:
-            listeners.append(stack.enter_context(StatusLine(out)) if terminal else EstimatePrinter(out))
+            listeners.append(stack.enter_context(StatusLine(out)) if terminal else partial(print_estimate, out))
         shown = out if args.show or config.recording is not None else None
         # If the daemon ends with its experiment, the summary comes after all that it logs.
         at_end = shown if config.stop_when_done else None

@@ -47,17 +47,11 @@ def progress_bar(name: str, total: int, unit: str) -> Iterator[Callable[[int], N
         yield show
 
 
-class EstimatePrinter:
-    """Prints every estimate that is published."""
-
-    def __init__(self, out: "TextIO | NonBlockingWriter") -> None:
-        self._out = out
-
-    def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
-        """Print one message."""
-        if topic in ("eit.estimate", "skin.shear"):
-            self._out.write(message_line(topic, content) + "\n")
-            self._out.flush()
+def print_estimate(out: "TextIO | NonBlockingWriter", topic: str, content: Mapping[str, Any]) -> None:
+    """Print a message that is an estimate."""
+    if topic in ("eit.estimate", "skin.shear"):
+        out.write(message_line(topic, content) + "\n")
+        out.flush()
 
 
 class StatusLine:
@@ -81,7 +75,7 @@ class StatusLine:
     def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
         """Take one message; redraw after those that it shows."""
         if topic == "loop.state":
-            self._state = loop_line(topic, content)
+            self._state = loop_line(content)
             self._driving = content["torque_source"]
         elif topic in ("eit.estimate", "load.torque", "skin.shear") and content["source"] == self._driving:
             torque_nm = content["torque_nm"] if content["valid"] else None
@@ -166,7 +160,7 @@ class Operator:
 def message_line(topic: str, content: Mapping[str, Any]) -> str:
     """Return one line of text: time, topic, source, and the values with their units."""
     clock = datetime.fromtimestamp(content["timestamp"]).astimezone().strftime("%H:%M:%S.%f")[:-3]
-    body = _BODIES.get(topic, _columns)(topic, content)
+    body = _BODIES[topic](content) if topic in _BODIES else _columns(topic, content)
     return f"{clock}  {topic:<13} {content['source']:<9} {body}"
 
 
@@ -175,7 +169,7 @@ def message_json(topic: str, content: Mapping[str, Any]) -> str:
     return json.dumps({"topic": topic, **content}, default=lambda array: array.tolist(), ensure_ascii=False)
 
 
-def _estimate(_: str, content: Mapping[str, Any]) -> str:
+def _estimate(content: Mapping[str, Any]) -> str:
     if not content["valid"]:
         return f"no estimate: {content['reason']}"
     diameter = "" if content["diameter_mm"] is None else f"   diameter {content['diameter_mm']:5.1f} mm"
@@ -185,7 +179,7 @@ def _estimate(_: str, content: Mapping[str, Any]) -> str:
     return f"torque {content['torque_nm']:+.4f} N·m {interval}{diameter}{cell}{score}"
 
 
-def _shear(_: str, content: Mapping[str, Any]) -> str:
+def _shear(content: Mapping[str, Any]) -> str:
     if not content["valid"]:
         return f"no force: {content['reason']}"
     interval = f"[{content['shear_low_n']:+.3f}, {content['shear_high_n']:+.3f}]"
@@ -194,7 +188,7 @@ def _shear(_: str, content: Mapping[str, Any]) -> str:
     return f"shear {content['shear_n']:+.3f} N {interval}{torque}   response {content['response']:+.5f}   {direction}"
 
 
-def loop_line(_: str, content: Mapping[str, Any]) -> str:
+def loop_line(content: Mapping[str, Any]) -> str:
     """Return phase, progress, the reasons for holding or the stop, step, and activity."""
     if not content["experiment"]:
         return f"{content['phase']}: {content['reasons']}" if content["reasons"] else str(content["phase"])
@@ -266,4 +260,9 @@ def _value(value: object) -> str:
     return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
-_BODIES = {"eit.estimate": _estimate, "skin.shear": _shear, "loop.state": loop_line, "health": _health}
+_BODIES: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+    "eit.estimate": _estimate,
+    "skin.shear": _shear,
+    "loop.state": loop_line,
+    "health": _health,
+}

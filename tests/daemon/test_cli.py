@@ -330,11 +330,9 @@ def test_the_status_line_is_redrawn_in_place(monkeypatch):
     line("eit.estimate", {"source": "right", "timestamp": 0.0, "valid": False, "reason": "no grip"})
     assert "eit.estimate  right     no estimat…" in narrow.getvalue(), "without a robot there is no state of the loop"
     stopped = {**state, "phase": "stopped", "activity": "the operator stopped it"}
-    assert loop_line("loop.state", stopped) == "stopped: the operator stopped it  step 2 of 3 grip"
+    assert loop_line(stopped) == "stopped: the operator stopped it  step 2 of 3 grip"
     held = {**state, "phase": "held", "activity": "closing", "reasons": "no estimate"}
-    assert loop_line("loop.state", held) == "held 50 %: no estimate  step 2 of 3 grip  closing", (
-        "what is cut matters less"
-    )
+    assert loop_line(held) == "held 50 %: no estimate  step 2 of 3 grip  closing", "what is cut matters less"
 
 
 def test_a_second_daemon_is_refused_before_its_emulators_start(config, tmp_path, monkeypatch, mistake):

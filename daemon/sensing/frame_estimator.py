@@ -51,6 +51,8 @@ class FrameEstimator:
         self.calibration = calibration
         self.model = bank.model if bank is not None else ""
         self._matcher = _shared_matcher(bank, config.matching) if bank is not None else None
+        # Only the paper's estimator averages; its calibration is of no side.
+        self._averaged_frames = 1 if calibration.sides else config.average_frames
         matcher = None
         if not calibration.sides and self._matcher is not None:
             calibration.check_bank(bank)
@@ -76,11 +78,6 @@ class FrameEstimator:
         return self.calibration.torque is not None
 
     @property
-    def warm_up_frames(self) -> int:
-        """The gripped frames that the first torque after a grip needs."""
-        return self.calibration.estimator.motion.n_lags + 1
-
-    @property
     def assumptions(self) -> str:
         """The user's guarantees behind the calibration as the end of a sentence, empty without any."""
         text = self.calibration.assumption_text
@@ -90,6 +87,18 @@ class FrameEstimator:
     def grids(self) -> tuple[FloatArray, FloatArray] | None:
         """The k and the sigma of the bank's cells, None without a bank."""
         return (self._matcher.k_grid, self._matcher.sigma_grid) if self._matcher is not None else None
+
+    def torque_source(self, name: str, period_s: float) -> TorqueSource:
+        """Return what the control loop knows of its torques; `period_s` is the frame period."""
+        return TorqueSource(
+            name=name,
+            period_s=period_s,
+            window_s=period_s * self._averaged_frames,
+            measures_torque=self.measures_torque,
+            # The first torque after a grip needs the lagged frames too.
+            warm_up_s=_WARM_UP_SHARE * (self.calibration.estimator.motion.n_lags + 1) * period_s,
+            has_gain=self.measures_torque,
+        )
 
     async def estimate(self, *frames: Frame) -> Estimate:
         """Return the estimate of frames of one time, one for each side.
@@ -197,27 +206,10 @@ def torque_sources(
     config: DaemonConfig, estimators: Mapping[str, FrameEstimator], combined: FrameEstimator | None
 ) -> dict[str, TorqueSource]:
     """Return the period of each sensor's torque, and the time that it averages over."""
-    sources = {
-        name: TorqueSource(
-            name=name,
-            period_s=(own := config.fingertips[name]).frame_period_s,
-            window_s=own.frame_period_s * own.average_frames,
-            measures_torque=estimator.measures_torque,
-            warm_up_s=_WARM_UP_SHARE * estimator.warm_up_frames * own.frame_period_s,
-            has_gain=estimator.measures_torque,
-        )
-        for name, estimator in estimators.items()
-    }
+    periods_s = {name: own.frame_period_s for name, own in config.fingertips.items()}
+    sources = {name: estimator.torque_source(name, periods_s[name]) for name, estimator in estimators.items()}
     if combined is not None:
-        period_s = max(own.frame_period_s for own in config.fingertips.values())
-        sources[COMBINED] = TorqueSource(
-            name=COMBINED,
-            period_s=period_s,
-            window_s=period_s,
-            measures_torque=combined.measures_torque,
-            warm_up_s=_WARM_UP_SHARE * combined.warm_up_frames * period_s,
-            has_gain=combined.measures_torque,
-        )
+        sources[COMBINED] = combined.torque_source(COMBINED, max(periods_s.values()))
     if config.skin is not None and (skin := skin_source(config.skin)) is not None:
         sources[skin.name] = skin
     if config.load_cell is not None:

@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
-from shearloop.bank.polynomial import TWO_SIDED_95
+from shearloop.bank.confidence import TWO_SIDED_95
 
 # Standard deviation of the logarithm of one fingertip's gain between recordings, and the recordings that it counts as.
 # Cylinders and days recorded twice differ by factors of 0.44 to 1.4.

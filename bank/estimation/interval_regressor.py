@@ -19,13 +19,12 @@ import numpy as np
 from scipy.special import stdtrit
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.confidence import LEVEL, TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.regressors import InverseCalibration, later_splits, left_out_blocks, left_out_groups
 from shearloop.bank.estimation.values import INLINE
 from shearloop.bank.gain import LOADED_SHARE, GainCorrection, GainSpread, find_twists, loaded_gain
-from shearloop.bank.polynomial import TWO_SIDED_95
 
-LEVEL = 0.95
 # Readings below this share of the largest torque mean that the lever does not touch.
 CENSORED_SHARE = 0.02
 # Their bound lies this share of it below zero. Of 0 to 0.3 this has the least error on recorded twists left out.

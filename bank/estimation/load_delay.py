@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
+from shearloop.bank.confidence import TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.fingertip_validator import channel_noise, segment_grip
 from shearloop.bank.estimation.regressors import left_out_blocks
 from shearloop.bank.estimation.values import FrameSeries, check_finite
-from shearloop.bank.polynomial import TWO_SIDED_95
 
 _STEP_S = 0.06
 _SHIFTS_S = np.round(np.arange(-6.0, 6.01, _STEP_S), 2)

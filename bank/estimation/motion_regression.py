@@ -13,6 +13,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.confidence import TWO_SIDED_95
 from shearloop.bank.defaults import BASELINE_FRAMES
 from shearloop.bank.eit.channels import ChannelTable, smoothed_along_channels
 from shearloop.bank.errors import CalibrationError
@@ -43,7 +44,6 @@ from shearloop.bank.estimation.interval_regressor import (
 from shearloop.bank.estimation.novelty import fitted_parts
 from shearloop.bank.estimation.regressors import InverseCalibration, left_out_blocks
 from shearloop.bank.estimation.session_state import Motion
-from shearloop.bank.polynomial import TWO_SIDED_95
 
 # Directions of motion per fingertip, and frames back: 13 frames are 7 s, about twice the gel's creep.
 _N_DIRECTIONS, _N_LAGS = 4, 12

@@ -12,10 +12,10 @@ from typing import Self
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.confidence import LEVEL
 from shearloop.bank.eit.channels import ChannelTable
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.fingertip_validator import LARGEST_UNUSABLE_SHARE
-from shearloop.bank.estimation.interval_regressor import LEVEL
 from shearloop.bank.estimation.regressors import later_origins, left_out_blocks
 
 # Margins beyond the largest Q and T² of blocks left out. Later recorded slices stay within 1.37 and 1.5 times of them

@@ -9,6 +9,7 @@ from typing import Self
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.bank.confidence import TWO_SIDED_95
 from shearloop.bank.defaults import BASELINE_FRAMES, MAX_GAP_S
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.errors import CalibrationError
@@ -25,7 +26,6 @@ from shearloop.bank.estimation.session_state import (
 )
 from shearloop.bank.estimation.values import Estimate, Measured, TactileFrame
 from shearloop.bank.gain import GainCorrection, find_twists
-from shearloop.bank.polynomial import TWO_SIDED_95
 
 REPEATED_FRAME = ("the board sent the same frame again",)
 _UNITS: dict[Quantity, str] = {"torque": "N·m", "diameter": "mm"}

@@ -7,9 +7,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import stdtrit
+from scipy.stats import linregress
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.polynomial import Polynomial
+from shearloop.bank.confidence import LEVEL
 from shearloop.bank.skin.finite_strain import FiniteStrainSkin
 from shearloop.bank.skin.membrane import (
     EXCITATION_A,
@@ -48,30 +50,25 @@ def origin_slope(shear_n: FloatArray, response: FloatArray) -> float:
     return float(shear_n @ response) / float(shear_n @ shear_n)
 
 
-class LineFit(Polynomial):
-    """A straight calibration line: response (y) over shear force (x)."""
+@dataclass(frozen=True, slots=True)
+class LineFit:
+    """A straight calibration line, response over shear force: its slope, and the force where it crosses zero.
 
-    __slots__ = ()
+    prediction_half_width_n is ± the 95 % interval of a new single force read off the line near zero.
+    """
 
-    @property
-    def slope_per_n(self) -> float:
-        """The slope in 1/N."""
-        return self.coefficients[1]
-
-    @property
-    def kink_n(self) -> float:
-        """The force where the line crosses zero."""
-        return self.centre - self.coefficients[0] / self.slope_per_n
-
-    def prediction_half_width_n(self, shear_n: float) -> float:
-        """Return ± the 95 % interval (N) of a new single force read off the line near `shear_n`."""
-        found = self.interval(shear_n)
-        return (found.high - found.value) / abs(self.slope_per_n)
+    slope_per_n: float
+    kink_n: float
+    prediction_half_width_n: float
 
 
 def fit_line(shear_n: FloatArray, response: FloatArray) -> LineFit:
-    """Return the least-squares line of at least three responses; raises CalibrationError for fewer."""
-    return LineFit.fit(shear_n, response, 1)
+    """Return the least-squares line of at least three responses."""
+    line, freedom = linregress(shear_n, response), len(shear_n) - 2
+    residuals = response - line.intercept - line.slope * shear_n
+    scatter = np.hypot(np.sqrt(residuals @ residuals / freedom), line.intercept_stderr)
+    half_width = stdtrit(freedom, (1 + LEVEL) / 2) * scatter / abs(line.slope)
+    return LineFit(float(line.slope), float(-line.intercept / line.slope), float(half_width))
 
 
 def loading(up_to_n: float, step_n: float = 0.1) -> FloatArray:
@@ -221,7 +218,7 @@ def _prediction_rows(models: _Models) -> list[FigureOfMerit]:
     up, around = loading(1.0), loop(1.0)
 
     def half_width(shear_n: FloatArray, response: FloatArray) -> float:
-        return fit_line(shear_n, response).prediction_half_width_n(0.0)
+        return fit_line(shear_n, response).prediction_half_width_n
 
     both_ways = np.concatenate([-up, up])
     loaded = [half_width(both_ways, np.concatenate([-y, y])) for y in models.both(up, 1.0)]

@@ -5,8 +5,8 @@ import contextlib
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 
+from shearloop.bank.confidence import TWO_SIDED_95
 from shearloop.bank.estimation import Measured, combine
-from shearloop.bank.polynomial import TWO_SIDED_95
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment_schema import GripStep, opening
 from shearloop.daemon.control.fault_detection import HAND_STALE_S

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from scipy.optimize import linear_sum_assignment
 
 from shearloop.bank.arrays import FloatArray, IntArray
@@ -23,8 +24,7 @@ from shearloop.bank.eit.forward import BatchForwardModel
 from shearloop.bank.eit.matching import Match, ReferenceMatcher, best_match
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS
-from shearloop.bank.errors import CalibrationError, MatchingError
-from shearloop.bank.polynomial import Polynomial
+from shearloop.bank.errors import MatchingError
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.matlab import (
     DIAMETER_FOLDER,
@@ -344,16 +344,19 @@ def _cross_validated_rmse(sigma: FloatArray, torque: FloatArray, parts: IntArray
         fit = _fit_or_note(sigma[~out], torque[~out], _TORQUE_DEGREE, "torque over sigma with a part left out", notes)
         if fit is None:
             return None
-        errors[out] = [fit(value) for value in sigma[out]] - torque[out]
+        errors[out] = fit(sigma[out]) - torque[out]
     return float(np.sqrt(np.mean(errors**2)))
 
 
 def _fit_or_note(x: FloatArray, y: FloatArray, degree: int, what: str, notes: list[str]) -> Polynomial | None:
-    try:
+    distinct = len(np.unique(x))
+    if distinct > degree and len(x) > degree + 1:
         return Polynomial.fit(x, y, degree)
-    except CalibrationError as error:
-        notes.append(f"no fit of {what}: {error}")
-        return None
+    notes.append(
+        f"no fit of {what}: {len(x)} measurements at {distinct} distinct places do not determine a curve of degree "
+        f"{degree}: at least {degree + 2} at {degree + 1} places are needed"
+    )
+    return None
 
 
 def place_in_series(values: FloatArray) -> tuple[IntArray, IntArray] | None:

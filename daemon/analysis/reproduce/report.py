@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
+from numpy.polynomial import Polynomial
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
@@ -18,7 +19,6 @@ from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.matching import Match
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS
-from shearloop.bank.polynomial import Polynomial
 from shearloop.daemon.analysis.charts.bank_figures import models_figure, signal_figure
 from shearloop.daemon.analysis.charts.drawing import figure, lay_out
 from shearloop.daemon.analysis.reproduce.analysis import DiameterResult, Matches, ModelScores, TorqueResult
@@ -353,13 +353,12 @@ def _relation_figure(
     (x, y), ends = slices, [min(*slices[1], *means[1]), max(*slices[1], *means[1])]
     axes.plot(ends, ends, color=_ORANGE, linewidth=1, label="predicted = measured")
     if fit is not None:
-        predicted, inside = np.array([fit(value) for value in x]), (x >= fit.x_low) & (x <= fit.x_high)
+        predicted, inside = fit(x), (x >= fit.domain[0]) & (x <= fit.domain[1])
         axes.plot(y[inside], predicted[inside], "o", **_SLICES)
         if not inside.all():
             beyond = "slices beyond the fit"
             axes.plot(y[~inside], predicted[~inside], "o", color=_GREY, markerfacecolor="none", label=beyond)
-        fitted = [fit(value) for value in means[0]]
-        axes.plot(means[1], fitted, "x", color=_BLACK, markersize=9, label="fitted points")
+        axes.plot(means[1], fit(means[0]), "x", color=_BLACK, markersize=9, label="fitted points")
     _label(axes, title, xlabel=f"measured {quantity}", ylabel=f"predicted {quantity}")
     return made, scatter, grid[1]
 

@@ -18,7 +18,8 @@ def test_a_line_by_hand():
     line = fit_line(np.array([0.0, 1.0, 2.0, 3.0]), np.array([1.0, 1.0, 3.0, 3.0]))
     assert (line.slope_per_n, line.kink_n) == pytest.approx((0.8, -1.0))
     # t(0.975, 2) = 4.3027
-    assert line.prediction_half_width_n(1.5) == pytest.approx(4.3027 * math.sqrt(0.4) / 0.8 * math.sqrt(1.25), rel=1e-4)
+    half_width = 4.3027 * math.sqrt(0.4) / 0.8 * math.sqrt(1 + 1 / 4 + 1.5**2 / 5)
+    assert line.prediction_half_width_n == pytest.approx(half_width, rel=1e-4)
 
 
 def test_friction_alone_makes_a_prediction_interval_of_the_paper_s_size():
@@ -29,7 +30,7 @@ def test_friction_alone_makes_a_prediction_interval_of_the_paper_s_size():
     there = fit_line(np.concatenate([-up, up]), np.concatenate([-rising, rising]))
     path = loop(1.0)
     round_trip = fit_line(path, responses(membrane, path, 1.0))
-    assert there.prediction_half_width_n(0.0) < 0.0802 < round_trip.prediction_half_width_n(0.0)
+    assert there.prediction_half_width_n < 0.0802 < round_trip.prediction_half_width_n
 
 
 def test_the_paths_of_the_paper():

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from shearloop.bank.polynomial import TWO_SIDED_95
+from shearloop.bank.confidence import TWO_SIDED_95
 from shearloop.daemon.control import gripper_task
 from shearloop.daemon.control.experiment_schema import GripStep
 from shearloop.daemon.control.fault_detection import HAND_STALE_S

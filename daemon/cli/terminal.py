@@ -201,7 +201,7 @@ def loop_line(content: Mapping[str, Any]) -> str:
     return "  ".join(parts[:2] if activity == reasons else parts)
 
 
-def _health(_: str, content: Mapping[str, Any]) -> str:
+def _health(content: Mapping[str, Any]) -> str:
     rows = [task_row(name, facts) for name, facts in content["tasks"].items()]
     tasks = (f"{name} {', '.join(filter(None, cells))}" for name, *cells in rows)
     return f"{content['memory_mb']:.0f} MB  {content['cpu_percent']:.1f} % CPU  " + "; ".join(tasks)

@@ -1,6 +1,6 @@
 """Simulates the twist loop: a tool in a soft grip on a turning wrist, and a torque sensor that reads it late.
 
-    wrist speed → actuation delay → angle → relaxing spring that may slip → torque → sensor that averages, lags and errs
+    wrist speed → actuation delay → angle → relaxing spring → torque → sensor that averages, lags and errs
 
 Simulated time only, in s from 0. Angle and true torque are 0 at the start. All randomness comes from the generator.
 """
@@ -37,7 +37,6 @@ class SimulatedTool:
     stiffness_nm_per_rad: float = 0.25
     relaxing_share: float = 0.06
     relaxing_s: float = 5.0
-    slip_nm: float = np.inf
     actuation_s: float = 0.02
 
 
@@ -73,12 +72,6 @@ class PlantSample:
 
 
 @dataclass(slots=True)
-class _Grip:
-    relaxed_nm: float = 0.0
-    slipped_rad: float = 0.0
-
-
-@dataclass(slots=True)
 class _Reading:
     # With play, before relaxation.
     torque_nm: float = 0.0
@@ -101,7 +94,7 @@ class Plant:
     angle_rad: float = 0.0
     torque_nm: float = 0.0
     _speeds: list[float] = field(default_factory=list)
-    _grip: _Grip = field(default_factory=_Grip)
+    _relaxed_nm: float = 0.0
     _reading: _Reading = field(default_factory=_Reading)
     _samples: list[PlantSample] = field(default_factory=list)
 
@@ -126,15 +119,10 @@ class Plant:
         return known
 
     def _update_torque(self) -> None:
-        tool, grip = self.tool, self._grip
-        elastic = tool.stiffness_nm_per_rad * (self.angle_rad - grip.slipped_rad)
-        grip.relaxed_nm += (tool.relaxing_share * elastic - grip.relaxed_nm) * self.period_s / tool.relaxing_s
-        torque = elastic - grip.relaxed_nm
-        if abs(torque) > tool.slip_nm:
-            excess = float(torque - np.sign(torque) * tool.slip_nm)
-            grip.slipped_rad += excess / tool.stiffness_nm_per_rad
-            torque -= excess
-        self.torque_nm = torque + self.disturbance_nm
+        tool = self.tool
+        elastic_nm = tool.stiffness_nm_per_rad * self.angle_rad
+        self._relaxed_nm += (tool.relaxing_share * elastic_nm - self._relaxed_nm) * self.period_s / tool.relaxing_s
+        self.torque_nm = elastic_nm - self._relaxed_nm + self.disturbance_nm
 
     def _update_reading(self) -> None:
         """Apply the sensor's play and relaxation to the present torque."""
@@ -212,11 +200,10 @@ class UncompensatedController:
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """A run, one row per command period: time, true torque, wrist angle (n,)."""
+    """A run: time and true torque (n,) after each command period."""
 
     t_s: FloatArray
     torque_nm: FloatArray
-    angle_rad: FloatArray
 
 
 def back_after_s(trace: Trace, target_nm: float) -> float:
@@ -243,7 +230,7 @@ def run(
     bound_nm: float = np.inf,
 ) -> Trace:
     """Close the loop for a time, or until the torque leaves the bound; `keep` drops measurements by their number."""
-    rows = []
+    rows: list[tuple[float, float]] = []
     end_s, count = plant.t_s + duration_s, 0
     while plant.t_s < end_s and abs(plant.torque_nm) <= bound_nm:
         now_ns = nanoseconds(plant.t_s)
@@ -253,9 +240,8 @@ def run(
             count += 1
         command = controller.command(now_ns, plant.angle_rad)
         plant.step(command.speed_rad_per_s)
-        rows.append((plant.t_s, plant.torque_nm, plant.angle_rad))
-    table = np.array(rows, dtype=float)
-    return Trace(table[:, 0], table[:, 1], table[:, 2])
+        rows.append((plant.t_s, plant.torque_nm))
+    return Trace(*np.array(rows).T)
 
 
 @dataclass(frozen=True, slots=True)

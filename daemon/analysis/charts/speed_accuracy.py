@@ -10,9 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
-from shearloop.bank.arrays import FloatArray
+from shearloop.bank.arrays import Float32Array, FloatArray, IntArray
 from shearloop.bank.defaults import LOADED_NM
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatcher
@@ -20,7 +19,8 @@ from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import Calibration, FrameSeries, Physics, fit, measure_timing
-from shearloop.bank.estimation.bank_match import NOT_TURNED, RefinedMatcher
+from shearloop.bank.estimation.bank_match import NOT_TURNED, BankMatcher, RefinedMatcher
+from shearloop.bank.estimation.estimator import PaperEstimator
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor, Ridge, fit_interval_regressor
 from shearloop.bank.estimation.regressors import ranked_channels
 from shearloop.bank.estimator_names import EstimatorName
@@ -31,12 +31,9 @@ from shearloop.daemon.analysis.charts.simulated_loop import GAIN, LOOPS, Trackin
 from shearloop.daemon.analysis.charts.sources import Split
 from shearloop.daemon.analysis.evaluate import estimate_series, values_of
 
-Single = NDArray[np.float32]
 _ESTIMATORS: tuple[EstimatorName, ...] = ("bank", "regression", "reconstruction", "motion_regression")
 RANKS = (4, 8, 16, 32, 64, 128)
 CHANNEL_COUNTS = (8, 16, 32, 64, 128, 272, 512)
-# The paper's polynomial needs no regularisation.
-_POLYNOMIAL = (1e-9,)
 _CHUNK = 512
 # The number of cells that determine the directions of a low-rank bank.
 _ENOUGH_CELLS = 2000
@@ -115,77 +112,76 @@ def _run_estimator(calibration: Calibration, future: FrameSeries, bank: Bank | N
 
 def matchers(split: Split, bank: Bank) -> Iterator[TorqueMethod]:
     """Yield every way to find σ in the bank; the paper's parabola then turns σ into torque."""
-    sigma = bank.sigma_grid
+
+    def method(name: str, family: str, sigma_of: Callable[[FloatArray], float]) -> TorqueMethod:
+        return TorqueMethod(name, family, _timed(split, parabola(split, sigma_of)))
+
     for name, family, kind in (
         ("paper: all lags, reference", "all lags", ReferenceMatcher),
         ("all lags, fast and exact", "all lags", PrunedMatcher),
         ("zero lag, reference", "zero lag", ZeroLagMatcher),
         ("zero lag, fast and exact", "zero lag", PrunedZeroLagMatcher),
     ):
-        yield _read_by(split, name, family, partial(_best_sigma, kind.from_bank(bank)))
+        yield method(name, family, partial(matched_sigma, kind.from_bank(bank)))
     nearest = RefinedMatcher(bank, NOT_TURNED)
-    yield _read_by(split, "zero lag, smoothed, sub-grid", "zero lag", lambda x: nearest.match(x).sigma)
+    yield method("zero lag, smoothed, sub-grid", "zero lag", partial(matched_sigma, nearest))
     cells = np.flatnonzero(bank.valid)
     shapes = np.abs(bank.signals.reshape(-1, bank.signals.shape[-1])[cells])
     shapes /= np.linalg.norm(shapes, axis=1, keepdims=True)
-    column = sigma[cells % len(sigma)]
+    column = bank.sigma_grid[cells % len(bank.sigma_grid)]
 
-    def best_of(scores: Callable[[Single], Single]) -> Callable[[FloatArray], float]:
+    def best_of(scores: Callable[[Float32Array], Float32Array]) -> Callable[[FloatArray], float]:
         return lambda x: float(column[np.argmax(scores((x / np.linalg.norm(x)).astype(np.float32)))])
 
     half = shapes.astype(np.float16)
 
-    def half_scores(frame: Single) -> Single:
+    def half_scores(frame: Float32Array) -> Float32Array:
         # The products are float32, for BLAS.
         parts = [half[i : i + _CHUNK].astype(np.float32) @ frame for i in range(0, len(half), _CHUNK)]
         return np.concatenate(parts)
 
-    yield _read_by(split, "zero lag, float32", "precision", best_of(partial(np.matmul, shapes)))
-    yield _read_by(split, "zero lag, float16", "precision", best_of(half_scores))
+    def compressed_scores(directions: Float32Array, numbers: Float32Array, frame: Float32Array) -> Float32Array:
+        return numbers @ (directions @ frame)
+
+    yield method("zero lag, float32", "precision", best_of(partial(np.matmul, shapes)))
+    yield method("zero lag, float16", "precision", best_of(half_scores))
     basis = np.linalg.svd(shapes[:: max(1, len(shapes) // _ENOUGH_CELLS)], full_matrices=False)[2]
     for rank in RANKS:
         directions = np.ascontiguousarray(basis[:rank])
-        scores = partial(_compressed_scores, directions, np.ascontiguousarray(shapes @ directions.T))
-        yield _read_by(split, f"rank {rank}", "zero lag, bank of rank r", best_of(scores))
+        scores = partial(compressed_scores, directions, np.ascontiguousarray(shapes @ directions.T))
+        yield method(f"rank {rank}", "zero lag, bank of rank r", best_of(scores))
 
 
-def _best_sigma(matcher: Matcher, frame: FloatArray) -> float:
-    return matcher.match(frame).sigma
-
-
-def _compressed_scores(directions: Single, numbers: Single, frame: Single) -> Single:
-    return numbers @ (directions @ frame)
+def matched_sigma(matcher: Matcher | BankMatcher, difference: FloatArray) -> float:
+    """Return the σ in cm of a difference's match."""
+    return matcher.match(difference).sigma
 
 
 def fewer_channels(split: Split) -> Iterator[TorqueMethod]:
     """Yield regressions on the channels that correlate best with the past torque."""
     differences, torque = np.abs(split.past.channels[:, 0]), split.past.torque_at_frames()
     order = ranked_channels(differences, torque)
+
+    def read(reader: IntervalRegressor, channels: IntArray, difference: FloatArray) -> float:
+        return reader.predict(difference[channels])[0]
+
     for count in CHANNEL_COUNTS:
         best = order[:count]
         reader = fit_interval_regressor(differences[:, best], torque, Ridge.fit)
-        run = _timed(split, partial(_read_some, reader, best))
+        run = _timed(split, partial(read, reader, best))
         yield TorqueMethod(f"{count} channels", "regression on the best n channels", run)
-
-
-def _read_some(reader: IntervalRegressor, channels: NDArray[np.int64], difference: FloatArray) -> float:
-    return reader.predict(difference[channels])[0]
-
-
-def _read_by(split: Split, name: str, family: str, sigma_of: Callable[[FloatArray], float]) -> TorqueMethod:
-    return TorqueMethod(name, family, _timed(split, parabola(split, sigma_of)))
 
 
 def parabola(split: Split, sigma_of: Callable[[FloatArray], float]) -> Callable[[FloatArray], float]:
     """Return the torque in N·m of a difference, by the paper's parabola of its σ, fitted to the past slices."""
 
     def features(difference: FloatArray) -> FloatArray:
-        sigma = float(sigma_of(difference))
+        sigma = sigma_of(difference)
         return np.array([sigma, sigma**2])
 
     past = np.array([features(frame) for frame in np.abs(split.past.channels[:, 0])])
-    reader = fit_interval_regressor(past, split.past.torque_at_frames(), Ridge.fit_scaled, strengths=_POLYNOMIAL)
-    return lambda difference: reader.predict(features(difference))[0]
+    curve = Ridge.fit_scaled(past, split.past.torque_at_frames(), *PaperEstimator.strengths)
+    return lambda difference: float(curve.predict(features(difference)))
 
 
 def _timed(split: Split, read: Callable[[FloatArray], float]) -> Callable[[], tuple[FloatArray, FloatArray]]:
@@ -212,16 +208,8 @@ _FILLS: tuple[Literal["none", "left", "full"], ...] = ("none", "left", "full")
 _JOINED = {"zero lag, bank of rank r": "rank", "regression on the best n channels": "channels"}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MethodComparison:
-    """All methods on one split."""
-
-    split: Split
-    methods: list[MeasuredMethod]
-
-
-def compare_methods(split: Split, bank: Bank, mesh: Mesh, rounds: int) -> MethodComparison:
-    """Return every method's time and error on a split."""
+def compare_methods(split: Split, bank: Bank, mesh: Mesh, rounds: int) -> list[MeasuredMethod]:
+    """Return every method's time and error on a split; print where none can be judged."""
     physics, sides = Physics(bank, mesh), split.past.sides
     if split.past.kind == "difference":
         methods = [*matchers(split, bank), *fewer_channels(split), *estimators(split, physics, sides[:1])]
@@ -231,7 +219,7 @@ def compare_methods(split: Split, bank: Bank, mesh: Mesh, rounds: int) -> Method
     measured = measure(methods, loaded_truth(split.future), rounds)
     if not measured:
         print(f"{split.title} is left out: no method has two valid estimates of the later loaded frames")
-    return MethodComparison(split, measured)
+    return measured
 
 
 def loaded_truth(series: FrameSeries) -> FloatArray:
@@ -242,15 +230,15 @@ def loaded_truth(series: FrameSeries) -> FloatArray:
 
 def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, own_mesh: Mesh | None, out: Path, rounds: int) -> list[Path]:
     """Measure, draw and write the chart; the forward methods are timed on the user's `own_mesh` too."""
-    compared = [one for one in (compare_methods(split, bank, mesh, rounds) for split in parts) if one.methods]
-    best = [min(method.rmse_nm for method in one.methods) for one in compared]
+    compared = [(split, found) for split in parts if (found := compare_methods(split, bank, mesh, rounds))]
+    best = [min(method.rmse_nm for method in methods) for _, methods in compared]
     noises = sorted({round(min(rmse, _LARGEST_LOOP_NOISE_NM), 4) for rmse in [*best, _LARGEST_LOOP_NOISE_NM]})
     loop = tracking_errors(noises[:1] + noises[1:][-2:], max(rounds // 2, 1))
     return write(compared, forward_methods(rounds, own_mesh), loop, bank, out)
 
 
 def write(
-    compared: Sequence[MethodComparison],
+    compared: Sequence[tuple[Split, list[MeasuredMethod]]],
     solved: Sequence[SolvedForward],
     loop: Sequence[TrackingError],
     bank: Bank,
@@ -260,7 +248,7 @@ def write(
     content = {
         "machine": f"{platform.machine()}, one thread",
         "bank": {"model": bank.model, "shape": list(bank.signals.shape), "identity": bank.identity},
-        "methods": {one.split.title: _rows(one.methods) for one in compared},
+        "methods": {split.title: _rows(methods) for split, methods in compared},
         "forward": [asdict(one) for one in solved],
         "loop": {"gain": GAIN, "runs": [asdict(one) for one in loop]},
     }
@@ -268,19 +256,18 @@ def write(
     rows = (panels + 1) // 2
     made = drawing.figure(15, 6.3 * rows)
     axes = made.subplots(rows, 2, squeeze=False).ravel()
-    for one, panel in zip(compared, axes, strict=False):
-        _draw_methods(panel, one)
+    for (split, methods), panel in zip(compared, axes, strict=False):
+        _draw_methods(panel, split, methods)
     _draw_forward(axes[len(compared)], solved)
     _draw_loop(axes[len(compared) + 1], loop)
     for panel in axes[panels:]:
         panel.set_axis_off()
     made.suptitle("Speed against accuracy: below and to the left is better", fontsize=14)
     drawing.lay_out(made)
-    for one, panel in zip(compared, axes, strict=False):
-        often = often_valid(one.methods)
-        names = [_short(method, i in often) for i, method in enumerate(one.methods)]
-        points = zip(one.methods, names, strict=True)
-        drawing.write_names(panel, [(method.latency_ms, method.rmse_nm, name) for method, name in points])
+    for (_, methods), panel in zip(compared, axes, strict=False):
+        often = often_valid(methods)
+        points = [(one.latency_ms, one.rmse_nm, _short(one, i in often)) for i, one in enumerate(methods)]
+        drawing.write_names(panel, points)
     named = [(one.cell_ms, one.error, f"{one.name}\n{one.triangles} triangles") for one in solved if one.error]
     drawing.write_names(axes[len(compared)], named)
     return drawing.save(made, content, out, "speed-accuracy")
@@ -292,33 +279,27 @@ def _rows(methods: Sequence[MeasuredMethod]) -> list[dict[str, Any]]:
     return [asdict(one) | {"latency_ratio": one.latency_ms / first} for one in methods]
 
 
-def _draw_methods(axes: Axes, compared: MethodComparison) -> None:
-    methods = compared.methods
+def _draw_methods(axes: Axes, split: Split, methods: Sequence[MeasuredMethod]) -> None:
     drawing.plain_log(axes)
     often = often_valid(methods)
     costs, errors = ([getattr(methods[i], name) for i in often] for name in ("latency_ms", "rmse_nm"))
     best = [often[i] for i in drawing.draw_frontier(axes, costs, errors, max(one.latency_ms for one in methods))]
-    families = list(dict.fromkeys(one.family for one in methods))
-    for number, family in enumerate(families):
-        shade, mark = SHADES[number % len(SHADES)], MARKS[number % len(MARKS)]
+    for number, family in enumerate(dict.fromkeys(one.family for one in methods)):
+        style = drawing.look(number)
         members = [i for i, one in enumerate(methods) if one.family == family]
         if family in _JOINED:
-            axes.plot(
-                [methods[i].latency_ms for i in members], [methods[i].rmse_nm for i in members],
-                color=shade, linestyle=LINES[number % len(LINES)], linewidth=1, zorder=1,
-            )  # fmt: skip
+            joined = style | {"marker": "", "linewidth": 1, "zorder": 1}
+            axes.plot([methods[i].latency_ms for i in members], [methods[i].rmse_nm for i in members], **joined)
         for i in members:
             one = methods[i]
             spread = [[one.latency_ms - one.latency_low_ms], [one.latency_high_ms - one.latency_ms]]
-            axes.errorbar(
-                one.latency_ms, one.rmse_nm, xerr=spread, marker=mark, markersize=8, color=shade, elinewidth=1,
-                markerfacecolor=shade if i in best else "white", linestyle="none", zorder=2 + (i in best),
-                label=family if i == members[0] else None,
-            )  # fmt: skip
-    future = compared.split.future
-    loaded = np.count_nonzero(np.isfinite(loaded_truth(future)))
+            fill = style["color"] if i in best else "white"
+            points = style | {"linestyle": "none", "markersize": 8, "elinewidth": 1, "markerfacecolor": fill}
+            label = family if i == members[0] else None
+            axes.errorbar(one.latency_ms, one.rmse_nm, xerr=spread, zorder=2 + (i in best), label=label, **points)
+    loaded = np.count_nonzero(np.isfinite(loaded_truth(split.future)))
     axes.set(
-        title=f"{compared.split.title}; {loaded} loaded of {len(future.t_s)} later frames",
+        title=f"{split.title}; {loaded} loaded of {len(split.future.t_s)} later frames",
         xlabel="latency of one frame, ms (one thread; bars: slowest and fastest round)",
         ylabel=f"torque error on loaded frames (≥ {LOADED_NM:g} N·m), RMS, N·m",
     )
@@ -347,22 +328,19 @@ def _draw_forward(axes: Axes, solved: Sequence[SolvedForward]) -> None:
     known = [(one.cell_ms, one.error) for one in solved if one.error is not None]
     costs = [cost for cost, _ in known]
     drawing.draw_frontier(axes, costs, [error for _, error in known], max(costs))
-    families = list(dict.fromkeys(one.family for one in solved))
     axes.margins(x=0.12, y=0.12)
-    for number, family in enumerate(families):
-        shade = SHADES[number % len(SHADES)]
+    for number, family in enumerate(dict.fromkeys(one.family for one in solved)):
+        style = drawing.look(number)
         members = [one for one in solved if one.family == family]
-        placed = [(one.cell_ms, one.error) for one in members if one.error is not None]
+        placed = sorted((one.cell_ms, one.error) for one in members if one.error is not None)
         if placed:
-            axes.plot(
-                *zip(*sorted(placed), strict=True), marker=MARKS[number], color=shade,
-                linestyle=LINES[number % len(LINES)], linewidth=1, markersize=8, label=family,
-                markerfacecolor="white" if members[0].cited else shade,
-            )  # fmt: skip
+            fill = "white" if members[0].cited else style["color"]
+            points = style | {"linewidth": 1, "markersize": 8, "markerfacecolor": fill}
+            axes.plot(*zip(*placed, strict=True), label=family, **points)
         for one in members:
             if one.error is None:
                 label = f"{one.name}, {one.triangles} triangles"
-                axes.axvline(one.cell_ms, color=shade, linestyle=LINES[number % len(LINES)], label=label)
+                axes.axvline(one.cell_ms, label=label, **style | {"marker": ""})
     axes.set(
         title=f"Forward methods, {len(CELLS)} cells of the Gaussian derivative",
         xlabel="time per cell, ms (one thread; cited ones from elsewhere)",

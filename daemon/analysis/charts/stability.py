@@ -56,7 +56,7 @@ from shearloop.daemon.analysis.charts.sources import (
     splits,
     torque_of,
 )
-from shearloop.daemon.analysis.charts.speed_accuracy import parabola
+from shearloop.daemon.analysis.charts.speed_accuracy import matched_sigma, parabola
 from shearloop.daemon.analysis.evaluate import values_of
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.executors import Executor, in_order
@@ -152,7 +152,7 @@ def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[Con
     }
     found = []
     for name, locator in locators.items():
-        torque_nm_of = parabola(split, partial(_sigma, locator))
+        torque_nm_of = parabola(split, partial(matched_sigma, locator))
         found.append(ContinuityWalk(name, np.array([torque_nm_of(one) for one in path]), share_nm))
     for calibration in calibrations:
         if not calibration.estimator.needs:
@@ -160,10 +160,6 @@ def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[Con
             estimates = [tracker.estimate(TactileFrame.of(0.0, one[None])) for one in path]
             found.append(ContinuityWalk(calibration.estimator.name, values_of(estimates)[0], share_nm))
     return found
-
-
-def _sigma(locator: bank_match.BankMatcher, frame: FloatArray) -> float:
-    return locator.match(frame).sigma
 
 
 Rows = NDArray[np.int64]

@@ -24,7 +24,6 @@ from shearloop.daemon.analysis.charts.simulated_loop import tracking_errors
 from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits, synthetic_stream
 from shearloop.daemon.analysis.charts.speed_accuracy import (
     MeasuredMethod,
-    MethodComparison,
     TorqueMethod,
     _draw_methods,
     _short,
@@ -60,7 +59,7 @@ def test_a_method_with_few_valid_frames_is_not_on_the_frontier(scratch):
         )
     ]
     axes = figure(5, 5).add_subplot()
-    _draw_methods(axes, MethodComparison(split, methods))
+    _draw_methods(axes, split, methods)
     filled = [mark.lines[0].get_markerfacecolor() != "white" for mark in axes.containers]
     assert filled == [False, True, True]
     assert [_short(one, i in often_valid(methods)) for i, one in enumerate(methods)] == [
@@ -110,7 +109,7 @@ def test_errors_fall_with_the_mesh_size_towards_the_extrapolated_signals():
 def test_the_speed_accuracy_chart_holds_every_method_with_its_ratio(scratch, tmp_path):
     mesh = own_fingertip(0.4).mesh()
     bank = bank_of(None, mesh, scratch, Grid(np.linspace(3.0, 3.6, 7), np.linspace(1.0, 2.1, 12)))
-    compared = [compare_methods(split, bank, mesh, 1) for split in splits([], 0.6, scratch)]
+    compared = [(split, compare_methods(split, bank, mesh, 1)) for split in splits([], 0.6, scratch)]
     solved, loop = forward_methods(1, None, (0.4, 0.2), (0.2, 0.1)), tracking_errors((0.004,), 1, (1, 3))
     written = write(compared, solved, loop, bank, tmp_path)
     assert [path.suffix for path in written] == [".json", ".svg", ".png"]

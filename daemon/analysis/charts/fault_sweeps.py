@@ -2,36 +2,25 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from shearloop.bank.arrays import FloatArray
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import PAPER_TABLE
-from shearloop.bank.errors import BankError
-from shearloop.bank.estimation import (
-    Calibration,
-    Estimate,
-    EstimatorSession,
-    FrameSeries,
-    Physics,
-    TactileFrame,
-    fit,
-)
+from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, Physics, TactileFrame
 from shearloop.bank.estimation.bank_match import ElectrodeNumbering
 from shearloop.bank.estimation.fingertip_validator import channel_noise
 from shearloop.bank.estimator_names import EstimatorName
 from shearloop.daemon.analysis.bank_design import residual_noise
 from shearloop.daemon.analysis.charts.drawing import figure, look
-from shearloop.daemon.analysis.charts.sources import Split
+from shearloop.daemon.analysis.charts.sources import Split, fitted
 from shearloop.daemon.analysis.evaluate import values_of
 from shearloop.daemon.executors import Executor, in_order
 from shearloop.drivers.eit_kit import ADC_STEP_V
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,14 +31,6 @@ class FaultScene:
     idle: FloatArray
     noise_v: float
     foreign: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FaultyFrames:
-    """Frames with a fault; `usable` (n, m, 896) is False where the board reports a dead channel, or None."""
-
-    series: FrameSeries
-    usable: Mask | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +46,15 @@ class FrameFault:
     change: Callable[[FaultScene, float, np.random.Generator], FloatArray]
     reported: bool = False
 
-    def apply(self, scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
-        """Return the faulty frames; differences are magnitudes."""
+    def apply(self, scene: FaultScene, level: float, rng: np.random.Generator) -> tuple[FrameSeries, BoolArray | None]:
+        """Return the faulty frames, and which channels (n, m, 896) a board that reports them calls usable.
+
+        Differences are magnitudes.
+        """
         series, channels = scene.series, self.change(scene, level, rng)
         usable = channels == series.channels if self.reported else None
         magnitudes = np.abs(channels) if series.kind == "difference" else channels
-        return FaultyFrames(replace(series, channels=magnitudes), usable)
+        return replace(series, channels=magnitudes), usable
 
 
 def _noise(scene: FaultScene, level: float, rng: np.random.Generator) -> FloatArray:
@@ -78,7 +62,7 @@ def _noise(scene: FaultScene, level: float, rng: np.random.Generator) -> FloatAr
     return channels + rng.normal(0.0, 1.0, channels.shape) * level * scene.noise_v
 
 
-def lost_channels(electrodes: NDArray[np.int64]) -> Mask:
+def lost_channels(electrodes: IntArray) -> BoolArray:
     """Return the (896,) channels that inject or measure at one of these electrodes."""
     return np.asarray(np.isin(PAPER_TABLE.electrodes, electrodes).any(axis=1))
 
@@ -172,14 +156,15 @@ _LOADED_SHARE = 0.1
 class FaultLevel:
     """Errors at one level of a fault: bias and spread of valid estimates in N·m, and shares of all frames.
 
-    `false_valid` is the share of frames called valid although the truth is outside the 95 % interval.
+    `false_valid` is the share of frames called valid although the truth is outside the 95 % interval. Without more, no
+    estimate is valid.
     """
 
     level: float
-    bias_nm: float | None
-    spread_nm: float | None
-    valid: float
-    false_valid: float
+    bias_nm: float | None = None
+    spread_nm: float | None = None
+    valid: float = 0.0
+    false_valid: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,20 +195,18 @@ def judge_level(estimates: Sequence[Estimate], truth_nm: FloatArray, level: floa
     known = np.isfinite(truth_nm)
     judged = known & np.isfinite(torque_nm)
     if not judged.any():
-        return FaultLevel(level, None, None, 0.0, 0.0)
+        return FaultLevel(level)
     error, missed = (torque_nm - truth_nm)[judged], judged & ~((low_nm <= truth_nm) & (truth_nm <= high_nm))
     valid, false_valid = (float(some.sum() / known.sum()) for some in (judged, missed))
     return FaultLevel(level, float(error.mean()), float(error.std()), valid, false_valid)
 
 
-def estimate_frames(tracker: EstimatorSession, faulty: FaultyFrames) -> list[Estimate]:
-    """Return the estimates of faulty frames in order, as in a live session that starts with them."""
+def estimate_frames(tracker: EstimatorSession, series: FrameSeries, usable: BoolArray | None = None) -> list[Estimate]:
+    """Return the estimates of frames with usable channels (n, m, 896), as in a live session that starts with them."""
     tracker.reset()
-    found = []
-    for i, (t_s, channels) in enumerate(zip(faulty.series.t_s, faulty.series.channels, strict=True)):
-        usable = None if faulty.usable is None else faulty.usable[i]
-        found.append(tracker.estimate(TactileFrame.of(float(t_s), channels, usable)))
-    return found
+    masks = repeat(None) if usable is None else usable
+    frames = zip(series.t_s.tolist(), series.channels, masks, strict=False)
+    return [tracker.estimate(TactileFrame.of(*one)) for one in frames]
 
 
 def true_torques(series: FrameSeries) -> FloatArray:
@@ -251,21 +234,9 @@ def sweep(tracker: EstimatorSession, scene: FaultScene, fault: FrameFault) -> Fa
         estimates: list[Estimate] = []
         draws = _DRAWS if level > fault.levels[0] and scene.series.kind == "difference" else 1
         for draw in range(draws):
-            faulty = fault.apply(scene, level, np.random.default_rng((5, draw)))
-            estimates += estimate_frames(tracker, faulty)
+            estimates += estimate_frames(tracker, *fault.apply(scene, level, np.random.default_rng((5, draw))))
         levels.append(judge_level(estimates, np.tile(truth, draws), level))
     return fault_curve(fault.name, fault.unit, tracker.calibration.estimator.name, levels)
-
-
-def fitted(split: Split, names: Sequence[EstimatorName], physics: Physics) -> list[Calibration]:
-    """Return the calibrations that the past allows; print the reason for each missing one."""
-    found = []
-    for name in names:
-        try:
-            found.append(fit(name, [split.past], split.title, physics))
-        except BankError as error:
-            print(f"{split.title}: {name} is left out: {error}")
-    return found
 
 
 def misaligned(
@@ -282,10 +253,10 @@ def misaligned(
         calibrated = {one.estimator.name: one for one in fitted(replace(split, past=late), names, physics)}
         for name, found in levels.items():
             if name in calibrated:
-                estimates = estimate_frames(EstimatorSession(calibrated[name], physics.bank), FaultyFrames(judged))
+                estimates = estimate_frames(EstimatorSession(calibrated[name], physics.bank), judged)
                 found.append(judge_level(estimates, true_torques(judged), shift))
             else:
-                found.append(FaultLevel(shift, None, None, 0.0, 0.0))
+                found.append(FaultLevel(shift))
     return [fault_curve("calibrated on misaligned times", "s", name, found) for name, found in levels.items()]
 
 
@@ -366,7 +337,7 @@ def label_panel(panel: Axes, unit: str, heading: str) -> None:
     panel.grid(alpha=0.25)
 
 
-def offset_places(count: int, number: int, of: int) -> NDArray[np.float64]:
+def offset_places(count: int, number: int, of: int) -> FloatArray:
     """Return the x places of one curve's marks, offset so that curves do not cover each other."""
     return np.arange(float(count)) + 0.12 * (number - (of - 1) / 2)
 

@@ -11,7 +11,9 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.bank.eit.mesh import Mesh
-from shearloop.bank.estimation import FrameSeries
+from shearloop.bank.errors import BankError
+from shearloop.bank.estimation import Calibration, FrameSeries, Physics, fit, measure_timing
+from shearloop.bank.estimator_names import EstimatorName
 from shearloop.daemon.analysis.frame_series import part_of, read_series
 from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP, Grid, cached_bank
 from shearloop.daemon.bank_config import FingertipGeometryConfig, load_geometry
@@ -26,7 +28,7 @@ GRID = Grid(np.linspace(2.9, 4.1, 50), np.linspace(0.9, 2.3, 50))
 MESH_SIZE_CM = 0.2
 # Synthetic frames come from a finer mesh than the bank they are matched with, from cells between that bank's.
 _PLAYED_GRID = Grid(np.linspace(3.07, 3.47, 5), np.linspace(1.03, 1.99, 17))
-PLAYED_MESH_SIZE_CM = 0.14
+_PLAYED_MESH_SIZE_CM = 0.14
 _LARGEST_NM = 0.14
 _AVERAGED_FRAMES = 9
 _REST_S = 8.0
@@ -76,6 +78,21 @@ def splits(paths: Sequence[Path], share: float, scratch: Path) -> list[Split]:
     return found
 
 
+def fitted(
+    split: Split, names: Sequence[EstimatorName], physics: Physics, sides: tuple[str, ...] | None = None
+) -> list[Calibration]:
+    """Return the calibrations that the past allows, by default of all sides; print the reason for each missing one."""
+    past, of = (split.past, "") if sides is None else (split.past.select_sides(sides), f", {' and '.join(sides)}")
+    found = []
+    for name in names:
+        try:
+            timing = measure_timing([past], [split.past])
+            found.append(fit(name, [past], split.title, physics, timing=timing))
+        except BankError as error:
+            print(f"{split.title}: {name}{of} is left out: {error}")
+    return found
+
+
 def sigma_of(torque_nm: float) -> float:
     """Return the σ in cm of a torque in synthetic frames: it falls with rising torque, as measured."""
     return 1.9 - 0.7 * torque_nm / _LARGEST_NM
@@ -86,9 +103,9 @@ def torque_of(sigma: float) -> float:
     return _LARGEST_NM * (1.9 - sigma) / 0.7
 
 
-def played_bank(scratch: Path) -> Bank:
-    """Return the bank of the synthetic frames."""
-    return cached_bank("played", _PLAYED_GRID, own_fingertip(PLAYED_MESH_SIZE_CM).mesh(), scratch)
+def played_bank(scratch: Path, grid: Grid = _PLAYED_GRID) -> Bank:
+    """Return the bank of the synthetic frames, or one of other cells."""
+    return cached_bank("played", grid, own_fingertip(_PLAYED_MESH_SIZE_CM).mesh(), scratch)
 
 
 def mean_frame(synthesiser: Synthesiser, k: float, sigma: float, grip: float) -> FloatArray:

@@ -17,8 +17,7 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatcher
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
-from shearloop.bank.errors import BankError
-from shearloop.bank.estimation import Calibration, FrameSeries, Physics, fit, measure_timing
+from shearloop.bank.estimation import Calibration, FrameSeries, Physics
 from shearloop.bank.estimation.bank_match import NOT_TURNED, BankMatcher, RefinedMatcher
 from shearloop.bank.estimation.estimator import PaperEstimator
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor, Ridge, fit_interval_regressor
@@ -28,7 +27,7 @@ from shearloop.daemon.analysis.charts import drawing
 from shearloop.daemon.analysis.charts.drawing import LINES, MARKS, SHADES
 from shearloop.daemon.analysis.charts.forward_methods import CELLS, SolvedForward, forward_methods
 from shearloop.daemon.analysis.charts.simulated_loop import GAIN, LOOPS, TrackingError, tracking_errors
-from shearloop.daemon.analysis.charts.sources import Split
+from shearloop.daemon.analysis.charts.sources import Split, fitted
 from shearloop.daemon.analysis.evaluate import estimate_series, values_of
 
 _ESTIMATORS: tuple[EstimatorName, ...] = ("bank", "regression", "reconstruction", "motion_regression")
@@ -92,22 +91,15 @@ def measure(methods: list[TorqueMethod], truth_nm: FloatArray, rounds: int) -> l
 
 def estimators(split: Split, physics: Physics, sides: tuple[str, ...]) -> Iterator[TorqueMethod]:
     """Yield the package's estimators on these sides as they run live; print why one cannot be fitted."""
-    past, future = split.past.select_sides(sides), split.future.select_sides(sides)
-    count = f", {sides[0] if len(sides) == 1 else 'both'}" if past.kind == "raw" else ""
-    for name in _ESTIMATORS:
-        try:
-            calibration = fit(name, [past], split.title, physics, timing=measure_timing([past], [split.past]))
-        except BankError as error:
-            print(f"{split.title}: {name}{count} is left out: {error}")
-            continue
+    count = f", {sides[0] if len(sides) == 1 else 'both'}" if split.past.kind == "raw" else ""
+    family = "estimator, two fingertips" if len(sides) > 1 else "estimator"
 
-        family = "estimator, two fingertips" if len(sides) > 1 else "estimator"
-        yield TorqueMethod(f"{name}{count}", family, partial(_run_estimator, calibration, future, physics.bank))
+    def run(calibration: Calibration) -> tuple[FloatArray, FloatArray]:
+        track = estimate_series(calibration, split.future, physics.bank)
+        return values_of(track.estimates)[0], track.latency_ms
 
-
-def _run_estimator(calibration: Calibration, future: FrameSeries, bank: Bank | None) -> tuple[FloatArray, FloatArray]:
-    track = estimate_series(calibration, future, bank)
-    return values_of(track.estimates)[0], track.latency_ms
+    for calibration in fitted(split, _ESTIMATORS, physics, sides):
+        yield TorqueMethod(f"{calibration.estimator.name}{count}", family, partial(run, calibration))
 
 
 def matchers(split: Split, bank: Bank) -> Iterator[TorqueMethod]:

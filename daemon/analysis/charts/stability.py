@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import Mesh
-from shearloop.bank.eit.models import conductivity
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import (
     Calibration,
@@ -34,11 +32,9 @@ from shearloop.daemon.analysis.charts.fault_sweeps import (
     BROKEN_SHARE,
     FaultCurve,
     FaultLevel,
-    FaultyFrames,
     draw_fault,
     estimate_frames,
     fault_curve,
-    fitted,
     judge_level,
     label_panel,
     misaligned,
@@ -47,17 +43,17 @@ from shearloop.daemon.analysis.charts.fault_sweeps import (
     sweeps_figure,
 )
 from shearloop.daemon.analysis.charts.sources import (
-    PLAYED_MESH_SIZE_CM,
     Split,
+    fitted,
     homogeneous_of,
     mean_frame,
-    own_fingertip,
     played_bank,
     splits,
     torque_of,
 )
 from shearloop.daemon.analysis.charts.speed_accuracy import matched_sigma, parabola
 from shearloop.daemon.analysis.evaluate import values_of
+from shearloop.daemon.analysis.reproduce.banks import Grid
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.executors import Executor, in_order
 from shearloop.daemon.synthetic_frames import Synthesiser
@@ -258,37 +254,18 @@ def judge_others(
     try:
         calibration = fit(name, [select_rows(series, part.fitted)], "some torques", Physics(bank, mesh))
     except BankError as error:
-        return FaultLevel(part.limit_nm, None, None, 0.0, 0.0), None, str(error)
+        return FaultLevel(part.limit_nm), None, str(error)
     others = select_rows(series, part.others)
-    estimates = estimate_frames(EstimatorSession(calibration, bank), FaultyFrames(others))
+    estimates = estimate_frames(EstimatorSession(calibration, bank), others)
     _, low_nm, high_nm = values_of([one for one in estimates if one.valid])
     width_nm = float(np.median(high_nm - low_nm)) if len(low_nm) else None
     return judge_level(estimates, others.torque_nm, part.limit_nm), width_nm, ""
 
 
-MODEL = "gaussian_derivative"
 _K, _SIGMA = 3.2, 1.5
 _FRAMES = 6
 # The steepest fall of the Gaussian derivative is this over σ, below 1.
 _STEEPEST = float(np.exp(-0.5))
-
-
-class _SolvedFrames(Synthesiser):
-    """Makes frames of any k and σ by solving for them, inside and outside of the grid."""
-
-    def __init__(self, bank: Bank, seed: int) -> None:
-        super().__init__(bank, seed=seed)
-        self._forward = ForwardModel(own_fingertip(PLAYED_MESH_SIZE_CM).mesh())
-        self._homogeneous = self._forward.homogeneous()
-        self._solved: dict[tuple[float, float], FloatArray] = {}
-
-    def signal(self, k: float, sigma: float | FloatArray) -> FloatArray:
-        """Return the (896,) difference signal of one k and σ, solved once."""
-        place = k, float(np.mean(sigma))
-        if place not in self._solved:
-            cell = conductivity(self._forward.mesh, MODEL, *place)
-            self._solved[place] = self._forward.voltages(cell) - self._homogeneous
-        return self._solved[place]
 
 
 def sweep_rims(calibrations: Sequence[Calibration], bank: Bank, scratch: Path) -> Iterable[FaultCurve]:
@@ -303,15 +280,16 @@ def sweep_rims(calibrations: Sequence[Calibration], bank: Bank, scratch: Path) -
         (f"k at the rim of the grid ({k_end:g} cm) and beyond", "k, cm", ks, [(k, _SIGMA) for k in ks]),
         (f"σ at the rim of the grid ({sigma_end:g} cm) and beyond", "σ, cm", sigmas, [(_K, sigma) for sigma in sigmas]),
     )  # fmt: skip
+    k_grid, sigma_grid = (np.unique(each) for each in np.array([place for *_, places in rims for place in places]).T)
     # The same idle frame as the slices': its noise is in every difference.
-    synthesiser = _SolvedFrames(played_bank(scratch), 0)
+    synthesiser = Synthesiser(played_bank(scratch, Grid(k_grid, sigma_grid)))
     homogeneous = homogeneous_of(synthesiser)
     trackers = [EstimatorSession(calibration, bank) for calibration in calibrations]
     for name, unit, settings, places in rims:
         series = [_series(synthesiser, homogeneous, k, sigma) for k, sigma in places]
         for tracker in trackers:
             levels = [
-                judge_level(estimate_frames(tracker, FaultyFrames(one)), one.torque_nm, level)
+                judge_level(estimate_frames(tracker, one), one.torque_nm, level)
                 for level, one in zip(settings, series, strict=True)
             ]
             yield fault_curve(name, unit, tracker.calibration.estimator.name, levels)

@@ -10,7 +10,7 @@ import pytest
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.estimation import Estimate, EstimatorSession, FrameSeries, Physics, fit
 from shearloop.daemon.analysis.charts import fault_sweeps, stability
-from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits
+from shearloop.daemon.analysis.charts.sources import Split, bank_of, fitted, own_fingertip, splits
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.reproduce.banks import Grid
 from shearloop.daemon.errors import UserError
@@ -72,11 +72,11 @@ def test_a_stream_is_judged_by_as_many_loaded_frames_as_free_ones():
 @pytest.mark.parametrize("kind", ["difference", "raw"])
 def test_every_sweep_begins_with_no_fault_and_then_changes_the_frames(fault, kind, parts, bank):
     scene = fault_sweeps.scene_for(next(one for one in parts if one.past.kind == kind), bank)
-    none, most = (fault.apply(scene, level, np.random.default_rng(1)) for level in (fault.levels[0], fault.levels[-1]))
-    np.testing.assert_array_equal(none.series.channels, scene.series.channels)
-    assert not np.array_equal(most.series.channels, scene.series.channels)
+    none, most = (fault.apply(scene, one, np.random.default_rng(1))[0] for one in (fault.levels[0], fault.levels[-1]))
+    np.testing.assert_array_equal(none.channels, scene.series.channels)
+    assert not np.array_equal(most.channels, scene.series.channels)
     if kind == "difference":
-        assert (most.series.channels >= 0).all()
+        assert (most.channels >= 0).all()
 
 
 def test_an_electrode_touches_its_own_injections_and_pairs():
@@ -85,7 +85,7 @@ def test_an_electrode_touches_its_own_injections_and_pairs():
 
 def test_unreported_lost_electrodes_never_pass_silently(parts, bank):
     stream = next(one for one in parts if one.past.kind == "raw")
-    (calibration,) = fault_sweeps.fitted(stream, ("regression",), Physics(bank, None))
+    (calibration,) = fitted(stream, ("regression",), Physics(bank, None))
     scene = fault_sweeps.scene_for(stream, bank)
     lost = next(fault for fault in fault_sweeps.FAULTS if fault.name == "lost electrodes, unreported")
     found = fault_sweeps.sweep(EstimatorSession(calibration, bank), scene, lost)
@@ -97,7 +97,7 @@ def test_unreported_lost_electrodes_never_pass_silently(parts, bank):
 @pytest.mark.usefixtures("fonts")
 def test_the_mean_of_similar_cells_does_not_hop_and_the_rims_are_swept(parts, bank, scratch):
     slices = parts[0]
-    calibrations = fault_sweeps.fitted(slices, ("bank", "motion_regression"), Physics(bank, None))
+    calibrations = fitted(slices, ("bank", "motion_regression"), Physics(bank, None))
     found = stability.walks(slices, bank, calibrations)
     paper, alone, mean = (one.largest_hop_nm for one in found[:3])
     assert mean < 0.5 * min(paper, alone)
@@ -174,7 +174,7 @@ def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(sli
             widths = [each.torque_high_nm - each.torque_low_nm for each in track.estimates if each.valid]
             assert width_nm == pytest.approx(np.median(widths))
         assert one.times_good[:2] == (1.0, one.width_nm[1] / one.width_nm[0])
-        assert one.curve.levels[2] == fault_sweeps.FaultLevel(one.curve.levels[2].level, None, None, 0.0, 0.0)
+        assert one.curve.levels[2] == fault_sweeps.FaultLevel(one.curve.levels[2].level)
         assert one.width_nm[2] is one.times_good[2] is None
 
 

@@ -1,4 +1,4 @@
-"""Exports topics of a recording as tables: CSV or Parquet, one file per topic, or one MATLAB file."""
+"""Exports topics of a recording as tables: CSV or Parquet, a file per topic, or MATLAB, all topics in a file."""
 
 import csv
 from contextlib import ExitStack
@@ -16,26 +16,49 @@ from shearloop.daemon.recording.tables import Rows, arrays, columns_of, read_row
 
 # Numbers of a Parquet table that are written at once.
 _BATCH = 200_000
+# Size of the messages in one MATLAB file, in numbers of eight bytes, where each key takes the memory of some. It bounds
+# the memory and keeps each variable below the format's 2 GB.
+_MAT_SIZE, _KEY_SIZE = 12_000_000, 10
 
 
 def export(path: Path, form: str, out: Path, topics: list[str], progress: Progress = lambda _: None) -> list[Path]:
     """Write topics as `form` (csv, parquet or mat) and return the files.
 
-    For csv and parquet `out` is a folder, for mat a file, which is made in memory. `progress` receives the number of
-    messages so far. Raises UserError for a recording that cannot be read and for files that cannot be written.
+    For csv and parquet `out` is a folder. For mat it is a file; a large recording continues in NAME_2.mat, NAME_3.mat,
+    and so on, which must not exist. `progress` receives the number of messages so far. Raises UserError for a recording
+    that cannot be read and for files that cannot be written.
     """
     try:
         if form == "mat":
-            rows = read_rows(path, topics, progress)
-            structs = {topic.replace(".", "_").replace("-", "_"): arrays(rows.pop(topic)) for topic in topics}
-            # savemat changes names and hides the reason if it opens the file itself.
-            with out.open("wb") as file:
-                # The stubs allow only names.
-                savemat(file, structs, long_field_names=True, oned_as="column", do_compression=True)  # type: ignore[arg-type]
-            return [out]
+            return _export_mat(path, out, topics, progress)
         return _export_tables(path, form, out, topics, progress)
     except OSError as error:
-        raise UserError(f"{out}: the export cannot be written: {error.strerror or error}") from error
+        raise UserError(f"{error.filename or out}: the export cannot be written: {error.strerror or error}") from error
+
+
+def _export_mat(path: Path, out: Path, topics: list[str], progress: Progress) -> list[Path]:
+    written: list[Path] = []
+    waiting: dict[str, Rows] = {topic: [] for topic in topics}
+    size = 0
+
+    def write() -> None:
+        structs = {topic.replace(".", "_").replace("-", "_"): arrays(rows) for topic, rows in waiting.items() if rows}
+        target = out.with_name(f"{out.stem}_{len(written) + 1}{out.suffix}") if written else out
+        # savemat changes names and hides the reason if it opens the file itself.
+        with target.open("xb" if written else "wb") as file:
+            # The stubs allow only names.
+            savemat(file, structs, long_field_names=True, oned_as="column")  # type: ignore[arg-type]
+        written.append(target)
+
+    for topic, row in read_rows(path, topics, progress):
+        waiting[topic].append(row)
+        size += sum(value.size if isinstance(value, np.ndarray) else _KEY_SIZE for value in row.values())
+        if size >= _MAT_SIZE:
+            write()
+            waiting, size = {topic: [] for topic in topics}, 0
+    if size or not written:
+        write()
+    return written
 
 
 def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress: Progress) -> list[Path]:

@@ -38,7 +38,7 @@ class RecordedTopics(Mapping[str, dict[str, NDArray[Any]]]):
         if topic not in self._topics:
             if topic not in self.counts:
                 raise KeyError(f"{self.path} has no topic {topic!r}; it has {', '.join(self)}")
-            self._topics[topic] = arrays(read_rows(self.path, [topic])[topic])
+            self._topics[topic] = arrays([row for _, row in read_rows(self.path, [topic])])
         return self._topics[topic]
 
     def __iter__(self) -> Iterator[str]:
@@ -73,14 +73,14 @@ def read(path: str | Path) -> RecordedTopics:
     return RecordedTopics(path)
 
 
-def read_rows(path: Path, topics: Iterable[str], progress: Progress = lambda _: None) -> dict[str, Rows]:
-    """Return the messages of topics by time; `progress` receives the number of messages so far."""
-    rows: dict[str, Rows] = {topic: [] for topic in topics}
-    for topic, content, message in read_messages(path, rows, progress):
+def read_rows(
+    path: Path, topics: Iterable[str], progress: Progress = lambda _: None
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the messages of topics by time, as topic and row; `progress` receives the number of messages so far."""
+    for topic, content, message in read_messages(path, topics, progress):
         # As arrays, heatmaps take a quarter of the memory.
         held = {key: np.array(value, float) if isinstance(value, list) else value for key, value in content.items()}
-        rows[topic].append(row_of(held, message.log_time))
-    return rows
+        yield topic, row_of(held, message.log_time)
 
 
 def row_of(content: Mapping[str, Any], log_time_ns: int) -> dict[str, Any]:

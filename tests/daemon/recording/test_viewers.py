@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
 from shearloop.bank.eit.channels import PAPER_TABLE
@@ -117,6 +118,19 @@ def test_tables_hold_every_score_of_a_heatmap(tmp_path, monkeypatch):
     assert [row["model"] for row in rows] == ["linear"] * 4
     table = parquet.read_table(tmp_path / "a_parquet/eit.heatmap.right.parquet").to_pydict()
     np.testing.assert_array_equal(np.array(table["scores"], dtype=float), found)
+
+
+def test_a_large_recording_continues_in_further_matlab_files(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("shearloop.daemon.recording.export._MAT_SIZE", 10_000)
+    arguments = ["recording", "export", str(write(tmp_path / "a.mcap", RIG)), "--format", "mat"]
+    assert main(arguments) == 0
+    files = list(map(Path, capsys.readouterr().out.splitlines()))
+    assert files == [tmp_path / "a.mat", tmp_path / "a_2.mat"]
+    structs = [loadmat(file, simplify_cells=True) for file in files]
+    scores = np.concatenate([np.atleast_2d(one["eit_heatmap_right"]["scores"]) for one in structs])
+    np.testing.assert_array_equal(scores, [SCORES.ravel()] * 4)
+    assert main(arguments) == 2
+    assert "a_2.mat: the export cannot be written: File exists" in capsys.readouterr().err
 
 
 def test_a_dataset_holds_what_was_known_and_names_its_origin(tmp_path):

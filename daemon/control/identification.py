@@ -39,13 +39,12 @@ class NotYetKnownError(IdentifyError):
 class Record:
     """Wrist angles, commanded speeds and tool torques; times in s from one origin, ascending.
 
-    angle_t_s, angle_rad (n,). sent_t_s, sent_rad_per_s (s,), may be empty. t_mid_s, t_s, torque_nm (m,): middle of each
-    acquisition, its arrival, and its torque.
+    angle_t_s, angle_rad, sent_rad_per_s (n,): each angle, and the speed that was sent at it. t_mid_s, t_s, torque_nm
+    (m,): middle of each acquisition, its arrival, and its torque.
     """
 
     angle_t_s: FloatArray
     angle_rad: FloatArray
-    sent_t_s: FloatArray
     sent_rad_per_s: FloatArray
     t_mid_s: FloatArray
     t_s: FloatArray
@@ -57,8 +56,8 @@ class ToolModel:
     """The tool in the grip and the delays of its torque, with standard deviations.
 
     lag_s: lag of the torque behind its stamps. age_s: from the middle of an acquisition to its arrival (95th
-    percentile). actuation_s: from sending a speed until the wrist has it; nan without recorded speeds. torque_nm: at
-    angle_rad, the record's last angle.
+    percentile). actuation_s: from sending a speed until the wrist has it. torque_nm: at angle_rad, the record's last
+    angle.
     """
 
     stiffness_nm_per_rad: float
@@ -222,18 +221,14 @@ def _lag(fits: list[_Fit], noise_nm: float) -> tuple[float, float]:
 
 
 def _actuation(record: Record) -> float:
-    """Return the delay that best aligns the integral of the sent speeds with the angle; nan without speeds."""
-    if record.sent_t_s.size < 2:
-        return math.nan
-    steps = np.diff(record.sent_t_s)
-    travelled = np.concatenate([[0.0], np.cumsum(record.sent_rad_per_s[:-1] * steps)])
-
+    """Return the delay that best aligns the integral of the sent speeds with the angle."""
+    travelled = np.concatenate([[0.0], np.cumsum(record.sent_rad_per_s[:-1] * np.diff(record.angle_t_s))])
     # A thousand samples are enough, and the loop waits for the result.
     some = slice(None, None, max(1, record.angle_t_s.size // 1000))
     at_s, angle_rad = record.angle_t_s[some], record.angle_rad[some]
 
     def misfit(delay_s: float) -> float:
-        difference = angle_rad - np.interp(at_s - delay_s, record.sent_t_s, travelled)
+        difference = angle_rad - np.interp(at_s - delay_s, record.angle_t_s, travelled)
         return float(np.var(difference))
 
     return float(min(_ACTUATION_GRID_S, key=misfit))
@@ -271,7 +266,8 @@ class StiffnessExcitation:
         self.failure: str | None = None
         self._origin_ns = 0
         self._angles: list[tuple[float, float]] = []
-        self._sent: list[tuple[float, float]] = []
+        # The speed that was sent at each angle.
+        self._speeds: list[float] = []
         self._torques: list[tuple[float, float, float]] = []
         self._latest: deque[float] = deque(maxlen=3)
         self._leg = 0  # even: at the first angle; odd: away
@@ -312,15 +308,16 @@ class StiffnessExcitation:
         if self._angles and elapsed_s <= 0.0:
             return self._speed
         self._angles.append((now_s, wrist_angle_rad))
+        # A leg that ends now identifies from the record with this angle, at which the wrist rests.
+        self._speeds.append(0.0)
         self._speed = self._towards(self._goal_rad() - wrist_angle_rad, now_s, min(elapsed_s, 0.05))
-        self._sent.append((now_s, self._speed))
+        self._speeds[-1] = self._speed
         return self._speed
 
     def sent(self, speed_rad_per_s: float) -> None:
         """Correct the speed that was sent for the last command, after clipping."""
-        if self._sent and math.isfinite(speed_rad_per_s):
-            self._speed = speed_rad_per_s
-            self._sent[-1] = (self._sent[-1][0], speed_rad_per_s)
+        if self._speeds and math.isfinite(speed_rad_per_s):
+            self._speed = self._speeds[-1] = speed_rad_per_s
 
     def _goal_rad(self) -> float:
         first = self._angles[0][1]
@@ -360,9 +357,8 @@ class StiffnessExcitation:
     def record(self) -> Record:
         """Return the record so far."""
         angle_t_s, angle_rad = np.array(self._angles).reshape(-1, 2).T
-        sent_t_s, sent_rad_per_s = np.array(self._sent).reshape(-1, 2).T
         t_mid_s, t_s, torque_nm = np.array(self._torques).reshape(-1, 3).T
         return Record(
-            angle_t_s=angle_t_s, angle_rad=angle_rad, sent_t_s=sent_t_s, sent_rad_per_s=sent_rad_per_s,
+            angle_t_s=angle_t_s, angle_rad=angle_rad, sent_rad_per_s=np.array(self._speeds),
             t_mid_s=t_mid_s, t_s=t_s, torque_nm=torque_nm,
         )  # fmt: skip

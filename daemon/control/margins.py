@@ -237,15 +237,14 @@ def gain_for_noise(noise_nm: float, allowed_nm: float) -> float:
 def loop_model(settings: ControllerSettings, found: ToolModel) -> LoopModel:
     """Return the loop that these settings close around an identified tool.
 
-    An unknown actuation delay counts as 8 ms. A negative lag is limited by the torque's age: no torque is known before
-    its acquisition has ended.
+    A negative lag is limited by the torque's age: no torque is known before its acquisition has ended.
     """
     earliest_s = 0.5 * settings.window_s - found.age_s
     return LoopModel(
         sample_period_s=found.sample_period_s,
         window_s=settings.window_s,
         age_s=found.age_s,
-        actuation_s=found.actuation_s if math.isfinite(found.actuation_s) else 0.008,
+        actuation_s=found.actuation_s,
         wrist_bandwidth_per_s=settings.wrist_bandwidth_per_s,
         kp=settings.kp,
         ki=settings.ki,

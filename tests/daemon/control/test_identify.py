@@ -40,8 +40,7 @@ def record_of(
     values: dict[str, Any] = {
         "angle_t_s": angle_t_s,
         "angle_rad": angle_rad,
-        "sent_t_s": np.empty(0),
-        "sent_rad_per_s": np.empty(0),
+        "sent_rad_per_s": np.zeros_like(angle_rad),
         "t_mid_s": t_mid_s,
         "t_s": t_mid_s + 0.33,
         "torque_nm": torque,
@@ -94,7 +93,7 @@ def test_the_actuation_delay_is_seen_from_what_was_sent(delay_s):
     record = record_of()
     rate = 2.0 * math.pi / 7.0
     sent = 0.2 * rate * np.sin(rate * (record.angle_t_s + 0.004 + delay_s))
-    found = identify(record_of(sent_t_s=record.angle_t_s, sent_rad_per_s=sent), WINDOW_S)
+    found = identify(record_of(sent_rad_per_s=sent), WINDOW_S)
     assert found.actuation_s == pytest.approx(delay_s, abs=0.003)
 
 

@@ -157,11 +157,11 @@ class ReplayPipeline:
         self._estimators: dict[str, FrameEstimator] = {
             name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()
         }
-        self._pairing: FramePairing[Frame] | None = None
+        self._pairing: FramePairing | None = None
         if config.combined is not None:
             self._estimators[COMBINED] = combined = open_combined(config.combined, config.fingertips)
             sides = combined.calibration.sides
-            self._pairing = FramePairing(sides, round(config.fingertips[sides[0]].frame_period_s * 1e9))
+            self._pairing = FramePairing(sides, config.fingertips[sides[0]].frame_period_s)
         self._frame_parsers = {
             name: FrameParser(
                 self._estimators[name].table.zero_slots, nominal_period_ns=round(fingertip.frame_period_s * 1e9)
@@ -185,7 +185,7 @@ class ReplayPipeline:
             for frame in self._renumbered(source, self._frame_parsers[source].handle(event)):
                 self._publisher.publish(frame_message(source, frame))
                 await self._estimate(source, frame)
-                pair = self._pairing.add(source, frame.t_mid_ns, frame) if self._pairing is not None else None
+                pair = self._pairing.add(source, frame) if self._pairing is not None else None
                 if pair is not None:
                     await self._estimate(COMBINED, *pair)
         elif source == LOAD_CELL and self._load_parser is not None:

@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from operator import attrgetter
-from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -25,40 +24,39 @@ from shearloop.daemon.supervisor import TaskFacts
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 
-Item = TypeVar("Item")
-
 # Largest distance in time of a pair of frames, as a share of the frame period.
 _MAX_APART_PERIODS = 0.75
 # A correction of the gain begins with a frame.
 _LONGEST_WAIT_S = 5.0
 
 
-class FramePairing(Generic[Item]):
+class FramePairing:
     """Makes sets of one frame per side, each used at most once, as soon as they are complete.
 
     The result depends only on the frames' own times and their order.
     """
 
-    def __init__(self, sides: tuple[str, ...], period_ns: int) -> None:
+    def __init__(self, sides: tuple[str, ...], period_s: float) -> None:
         """Take the sides in the order of a set, and the frame period."""
         self._sides = sides
-        self._apart_ns = round(_MAX_APART_PERIODS * period_ns)
-        self._latest: dict[str, tuple[int, Item]] = {}
+        self._apart_ns = round(_MAX_APART_PERIODS * period_s * 1e9)
+        self._latest: dict[str, Frame] = {}
 
-    def add(self, side: str, t_ns: int, item: Item) -> tuple[Item, ...] | None:
+    def add(self, side: str, frame: Frame) -> tuple[Frame, ...] | None:
         """Return the frames of the set that this one completes, or None."""
         if side not in self._sides:
             return None
-        self._latest[side] = (t_ns, item)
+        self._latest[side] = frame
+        oldest_ns, newest_ns = frame.t_mid_ns - self._apart_ns, frame.t_mid_ns + self._apart_ns
         # Frames too old for this one are too old for all later ones.
-        self._latest = {name: kept for name, kept in self._latest.items() if t_ns - kept[0] <= self._apart_ns}
+        self._latest = {name: kept for name, kept in self._latest.items() if kept.t_mid_ns >= oldest_ns}
         # A frame that was delayed is too old for those already here.
-        if any(kept_ns - t_ns > self._apart_ns for kept_ns, _ in self._latest.values()):
+        if any(kept.t_mid_ns > newest_ns for kept in self._latest.values()):
             del self._latest[side]
             return None
         if len(self._latest) < len(self._sides):
             return None
-        found = tuple(self._latest[name][1] for name in self._sides)
+        found = tuple(self._latest[name] for name in self._sides)
         self._latest.clear()
         return found
 
@@ -209,14 +207,14 @@ class CombinedFingertips:
         self.pipeline = pipeline
         self.sides = pipeline.estimator.calibration.sides
         self._period_s = period_s
-        self._pairing: FramePairing[Frame] = FramePairing(self.sides, round(period_s * 1e9))
+        self._pairing = FramePairing(self.sides, period_s)
         self._pairs: deque[tuple[Frame, ...]] = deque()
         self._in_order = asyncio.Lock()
 
     def add(self, side: str, frames: Sequence[Frame]) -> None:
         """Take the frames of one read; call this at once, because the order of arrival decides the pairs."""
         for frame in frames:
-            if (pair := self._pairing.add(side, frame.t_mid_ns, frame)) is not None:
+            if (pair := self._pairing.add(side, frame)) is not None:
                 self._pairs.append(pair)
 
     async def process_pairs(self) -> None:

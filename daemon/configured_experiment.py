@@ -23,9 +23,10 @@ class ConfiguredExperiment:
         self.done = False
         self._rig = rig
         self._stop = stop
-        self._awaited = self._called_off = False
         self.has_begun = asyncio.Event()
         self._crash_marker = CrashMarker()
+        # Until any experiment has begun, or this one is called off. After a crash only the operator starts it.
+        self._awaited = not self._crash_marker.left_behind
 
     @property
     def finished(self) -> bool:
@@ -45,14 +46,11 @@ class ConfiguredExperiment:
 
     async def _start_once(self) -> None:
         log, logged = structlog.get_logger().bind(experiment=str(self.path)), ""
-        if self._crash_marker.left_behind and not self._called_off:
+        if self._crash_marker.left_behind and not self.has_begun.is_set():
             log.warning(
                 "the previous daemon crashed after it had started an experiment: this one waits for "
                 "`shearloop command start`"
             )
-            self._called_off = True
-        # After a crash of this task, an experiment that has begun or was called off is not started again.
-        self._awaited = not (self.has_begun.is_set() or self._called_off)
         while self._awaited:
             reason = await self._rig.start(self.path)
             if reason is None:
@@ -76,14 +74,13 @@ class ConfiguredExperiment:
     def on_begun(self, path: Path) -> None:
         """Note that an experiment has begun; no other starts automatically afterwards."""
         self._crash_marker.set()
-        self._awaited, self._called_off = False, True
+        self._awaited = False
         if path.resolve() == self.path.resolve():
             self.has_begun.set()
 
     def call_off(self) -> Path | None:
         """Cancel the automatic start; return the experiment, or None if it was not awaited."""
         awaited, self._awaited = self._awaited, False
-        self._called_off |= awaited
         return self.path if awaited else None
 
     def close(self) -> None:

@@ -21,7 +21,7 @@ from shearloop.daemon.analysis.charts.drawing import (
 )
 from shearloop.daemon.analysis.charts.forward_methods import converged, direct, error_of, forward_methods
 from shearloop.daemon.analysis.charts.simulated_loop import tracking_errors
-from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits, synthetic_stream
+from shearloop.daemon.analysis.charts.sources import Split, own_fingertip, splits, synthetic_stream
 from shearloop.daemon.analysis.charts.speed_accuracy import (
     MeasuredMethod,
     TorqueMethod,
@@ -33,14 +33,8 @@ from shearloop.daemon.analysis.charts.speed_accuracy import (
     often_valid,
     write,
 )
-from shearloop.daemon.analysis.reproduce.banks import Grid
 from shearloop.daemon.cli.chart import NAMES
 from shearloop.daemon.executors import SerialExecutor
-
-
-@pytest.fixture(scope="module")
-def scratch(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("charts")
 
 
 def test_the_frontier_is_what_nothing_beats_in_both():
@@ -48,8 +42,7 @@ def test_the_frontier_is_what_nothing_beats_in_both():
     assert frontier([1.0, 1.0], [2.0, 1.0]) == [1], "of equally fast ones the more accurate"
 
 
-def test_a_method_with_few_valid_frames_is_not_on_the_frontier(scratch):
-    split = splits([], 0.6, scratch)[0]
+def test_a_method_with_few_valid_frames_is_not_on_the_frontier(slices):
     methods = [
         MeasuredMethod(name, name, cost, cost, cost, error, valid)
         for name, cost, error, valid in (
@@ -59,7 +52,7 @@ def test_a_method_with_few_valid_frames_is_not_on_the_frontier(scratch):
         )
     ]
     axes = figure(5, 5).add_subplot()
-    _draw_methods(axes, split, methods)
+    _draw_methods(axes, slices, methods)
     filled = [mark.lines[0].get_markerfacecolor() != "white" for mark in axes.containers]
     assert filled == [False, True, True]
     assert [_short(one, i in often_valid(methods)) for i, one in enumerate(methods)] == [
@@ -77,10 +70,9 @@ def test_frames_without_load_do_not_flatter_a_method_that_says_0():
     assert (found.rmse_nm, found.valid_fraction) == (pytest.approx(0.1), 0.75)
 
 
-def test_a_recording_of_a_known_tool_is_judged_and_one_without_torques_is_named(scratch, monkeypatch, capsys):
-    stream = synthetic_stream(scratch)
-    known = replace(stream, diameter_mm=np.full(len(stream.t_s), 20.0))
-    empty = replace(stream, torque_t_s=np.zeros(0), torque_nm=np.zeros(0))
+def test_a_recording_of_a_known_tool_is_judged_and_one_without_torques_is_named(scratch, stream, monkeypatch, capsys):
+    known = replace(stream.whole, diameter_mm=np.full(len(stream.whole.t_s), 20.0))
+    empty = replace(stream.whole, torque_t_s=np.zeros(0), torque_nm=np.zeros(0))
     recorded = {"known.mcap": [known], "empty.mcap": [empty]}
     monkeypatch.setattr("shearloop.daemon.analysis.charts.sources.read_series", lambda path: recorded[str(path)])
     [split] = splits([Path(name) for name in recorded], 0.6, scratch)
@@ -88,8 +80,7 @@ def test_a_recording_of_a_known_tool_is_judged_and_one_without_torques_is_named(
     assert capsys.readouterr().out == "empty.mcap is left out: it holds no torques of a load cell\n"
 
 
-def test_synthetic_frames_are_split_in_time_and_the_same_each_time(scratch):
-    slices, stream = splits([], 0.6, scratch)
+def test_synthetic_frames_are_split_in_time_and_the_same_each_time(scratch, slices, stream):
     assert slices.past.t_s[-1] < slices.future.t_s[0]
     assert len(slices.past.t_s) + len(slices.future.t_s) == 49
     # The judged part of a stream begins with frames that only fill the memory.
@@ -106,10 +97,8 @@ def test_errors_fall_with_the_mesh_size_towards_the_extrapolated_signals():
 
 
 @pytest.mark.usefixtures("fonts")
-def test_the_speed_accuracy_chart_holds_every_method_with_its_ratio(scratch, tmp_path):
-    mesh = own_fingertip(0.4).mesh()
-    bank = bank_of(None, mesh, scratch, Grid(np.linspace(3.0, 3.6, 7), np.linspace(1.0, 2.1, 12)))
-    compared = [(split, compare_methods(split, bank, mesh, 1)) for split in splits([], 0.6, scratch)]
+def test_the_speed_accuracy_chart_holds_every_method_with_its_ratio(parts, bank, coarse_mesh, tmp_path):
+    compared = [(split, compare_methods(split, bank, coarse_mesh, 1)) for split in parts]
     solved, loop = forward_methods(1, None, (0.4, 0.2), (0.2, 0.1)), tracking_errors((0.004,), 1, (1, 3))
     written = write(compared, solved, loop, bank, tmp_path)
     assert [path.suffix for path in written] == [".json", ".svg", ".png"]

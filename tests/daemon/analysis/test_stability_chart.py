@@ -2,35 +2,16 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.estimation import Estimate, EstimatorSession, FrameSeries, Physics, fit
+from shearloop.bank.estimation import Estimate, EstimatorSession, Physics, fit
 from shearloop.daemon.analysis.charts import fault_sweeps, stability
-from shearloop.daemon.analysis.charts.sources import Split, bank_of, fitted, own_fingertip, splits
+from shearloop.daemon.analysis.charts.sources import Split, fitted
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
-from shearloop.daemon.analysis.reproduce.banks import Grid
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.executors import SerialExecutor
-
-
-@pytest.fixture(scope="module")
-def scratch(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("stability")
-
-
-@pytest.fixture(scope="module")
-def parts(scratch) -> list[Split]:
-    return splits([], 0.6, scratch)
-
-
-@pytest.fixture(scope="module")
-def bank(scratch) -> Bank:
-    grid = Grid(np.linspace(3.0, 3.6, 13), np.linspace(1.0, 2.1, 30))
-    return bank_of(None, own_fingertip(0.4).mesh(), scratch, grid)
 
 
 def estimate(torque: float, half: float = 0.01) -> Estimate:
@@ -45,12 +26,8 @@ def test_figures_count_what_is_valid_and_wrong():
     assert found.valid == 0.75
     assert found.false_valid == 0.25
     assert found.bias_nm == pytest.approx(0.05 / 3)
-    assert (
-        fault_sweeps.fault_curve(
-            "fault", "unit", "motion_regression", [fault_sweeps.judge_level([estimate(0.1)], truth[:1], 0.0), found]
-        ).breaks_at
-        == 2.0
-    )
+    curve = fault_sweeps.fault_curve("fault", "unit", "motion_regression", [fault_sweeps.FaultLevel(0.0), found])
+    assert curve.breaks_at == 2.0
 
 
 @pytest.mark.parametrize(
@@ -69,13 +46,13 @@ def test_a_stream_is_judged_by_as_many_loaded_frames_as_free_ones():
 
 
 @pytest.mark.parametrize("fault", fault_sweeps.FAULTS, ids=lambda fault: fault.name)
-@pytest.mark.parametrize("kind", ["difference", "raw"])
-def test_every_sweep_begins_with_no_fault_and_then_changes_the_frames(fault, kind, parts, bank):
-    scene = fault_sweeps.scene_for(next(one for one in parts if one.past.kind == kind), bank)
+@pytest.mark.parametrize("kind", ["slices", "stream"])
+def test_every_sweep_begins_with_no_fault_and_then_changes_the_frames(fault, kind, bank, request):
+    scene = fault_sweeps.scene_for(request.getfixturevalue(kind), bank)
     none, most = (fault.apply(scene, one, np.random.default_rng(1))[0] for one in (fault.levels[0], fault.levels[-1]))
     np.testing.assert_array_equal(none.channels, scene.series.channels)
     assert not np.array_equal(most.channels, scene.series.channels)
-    if kind == "difference":
+    if kind == "slices":
         assert (most.channels >= 0).all()
 
 
@@ -83,8 +60,7 @@ def test_an_electrode_touches_its_own_injections_and_pairs():
     assert 28 * 2 < fault_sweeps.lost_channels(np.array([3])).sum() < 28 * 5
 
 
-def test_unreported_lost_electrodes_never_pass_silently(parts, bank):
-    stream = next(one for one in parts if one.past.kind == "raw")
+def test_unreported_lost_electrodes_never_pass_silently(stream, bank):
     (calibration,) = fitted(stream, ("regression",), Physics(bank, None))
     scene = fault_sweeps.scene_for(stream, bank)
     lost = next(fault for fault in fault_sweeps.FAULTS if fault.name == "lost electrodes, unreported")
@@ -95,8 +71,7 @@ def test_unreported_lost_electrodes_never_pass_silently(parts, bank):
 
 
 @pytest.mark.usefixtures("fonts")
-def test_the_mean_of_similar_cells_does_not_hop_and_the_rims_are_swept(parts, bank, scratch):
-    slices = parts[0]
+def test_the_mean_of_similar_cells_does_not_hop_and_the_rims_are_swept(slices, bank, scratch):
     calibrations = fitted(slices, ("bank", "motion_regression"), Physics(bank, None))
     found = stability.walks(slices, bank, calibrations)
     paper, alone, mean = (one.largest_hop_nm for one in found[:3])
@@ -109,17 +84,13 @@ def test_the_mean_of_similar_cells_does_not_hop_and_the_rims_are_swept(parts, ba
     assert json.dumps([one.hops for one in found])
 
 
-def test_a_recording_that_no_estimator_can_be_calibrated_on_is_one_sentence(bank, tmp_path, capsys):
-    slices = next(one for one in splits([], 0.6, tmp_path) if one.past.kind == "difference")
-    one = Split(slices.title, slices.past.between(0, 1), slices.future, slices.whole)
+def test_a_recording_that_no_estimator_can_be_calibrated_on_is_one_sentence(
+    slices, bank, coarse_mesh, tmp_path, capsys
+):
+    one = replace(slices, past=slices.past.between(0, 1))
     with pytest.raises(UserError, match="no estimator can be calibrated on it"):
-        stability.chart([one], bank, own_fingertip(0.4).mesh(), tmp_path, tmp_path, SerialExecutor())
+        stability.chart([one], bank, coarse_mesh, tmp_path, tmp_path, SerialExecutor())
     assert "motion_regression is left out" in capsys.readouterr().out
-
-
-@pytest.fixture(scope="module")
-def slices(parts) -> FrameSeries:
-    return next(one.whole for one in parts if one.past.kind == "difference")
 
 
 def test_limits_are_quantiles_and_each_slice_is_either_calibrated_on_or_judged():
@@ -143,7 +114,7 @@ def test_of_few_torques_each_limit_is_there_once_and_none_leaves_nothing_to_judg
 def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(slices, bank, monkeypatch, capsys):
     # A twentieth is too few for an estimator.
     monkeypatch.setattr(stability, "CALIBRATED_SHARES", (0.5, 0.05))
-    some = slices.between(0, 40)
+    some = slices.whole.between(0, 40)
     # A slice of unknown torque is in neither part.
     torque_nm = some.torque_nm.copy()
     torque_nm[3] = np.nan
@@ -164,8 +135,8 @@ def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(sli
             (one.curve.levels[1], one.width_nm[1], known[inside], known[~inside]),
         ):
             track = estimate_series(
-                fit("regression", [stability.select_rows(slices, past)], "", Physics()),
-                stability.select_rows(slices, future),
+                fit("regression", [stability.select_rows(some, past)], "", Physics()),
+                stability.select_rows(some, future),
             )
             figures = figures_of([track])
             assert level.valid == figures["valid_fraction"]

@@ -20,8 +20,6 @@ import zmq
 from shearloop.drivers.eit_kit import TRANSFER_NS
 
 READY_S = 30.0
-# Between frames: long enough for the daemon to be idle again.
-PAUSE_S = 0.03
 USB_PACKET_BYTES = 512
 # Idle frames to skip, and the number of frames until the default estimator is valid in the grip.
 FIRST_FRAME, FIRST_VALID_FRAME = 12, 28

@@ -32,8 +32,8 @@ from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.emulators.boards import format_line
 
 REPEATS = 5
-# Timed frames of a latency.
-FRAMES = 240
+# Timed frames of a latency, at the board's rate.
+FRAMES = 80
 FLOOD_HZ, FLOOD_FRAMES = 500.0, 2400
 RATED_S = 30.0
 # Before processor time counts: until everything is connected.
@@ -92,24 +92,25 @@ def played(config: dict[str, Any], period_s: float) -> Iterator[tuple[dict[str, 
         yield boards, daemon.pid, ready_s, estimates
 
 
-def latency(config: dict[str, Any], rig: Path, n_frames: int, period_s: float) -> dict[str, dict[str, float]]:
+def latency(config: dict[str, Any], rig: Path) -> dict[str, dict[str, float]]:
     """Return by source the milliseconds from a frame's last byte to its estimate.
 
     The combined estimate counts from the last byte of the later frame. The first frames, until the default estimator is
     valid, are not timed; an estimate that does not come within a second is missed.
     """
     sides = list(config["fingertips"])
-    lines = {side: recorded_lines(rig, side, common.FIRST_VALID_FRAME + n_frames) for side in sides}
+    n_frames = common.FIRST_VALID_FRAME + FRAMES
+    lines = {side: recorded_lines(rig, side, n_frames) for side in sides}
     last_sources = {sides[-1], COMBINED} if len(sides) > 1 else {sides[-1]}
     taken: dict[str, list[float]] = {source: [] for source in (*sides, *last_sources)}
     missed, latest = dict.fromkeys(taken, 0), dict.fromkeys(taken, -1)
-    with played(config, period_s) as (boards, _, ready_s, estimates):
+    with played(config, FRAME_PERIOD_S) as (boards, _, ready_s, estimates):
         estimates.setsockopt(zmq.RCVTIMEO, 1000)
-        for number in range(common.FIRST_VALID_FRAME + n_frames):
-            time.sleep(0.5 * period_s)
+        for number in range(n_frames):
+            time.sleep(0.5 * FRAME_PERIOD_S)
             for side, board in boards.items():
                 # Two boards do not keep step.
-                time.sleep(0.5 * period_s / len(sides))
+                time.sleep(0.5 * FRAME_PERIOD_S / len(sides))
                 sent_ns = board.send_in_packets(lines[side][number])
                 awaited = set(last_sources) if side == sides[-1] else {side}
                 while awaited:
@@ -221,13 +222,7 @@ def measure(bank: Path, rig: Path) -> dict[str, Any]:
         "default_one_fingertip": by_default(rig, ("right",)),
         "default_both": by_default(rig, ("right", "left")),
     }
-    found["latency"] = {
-        name: {
-            "every_30_ms": latency(config, rig, FRAMES, common.PAUSE_S),
-            "at_the_boards_rate": latency(config, rig, FRAMES // 3, FRAME_PERIOD_S),
-        }
-        for name, config in configs.items()
-    }
+    found["latency"] = {name: latency(config, rig) for name, config in configs.items()}
     found["flood"] = flood(configs["zero_lag"], rig)
     found["rated"] = rated(bank, rig / "demo.bank")
     return found

@@ -15,9 +15,9 @@ _PANELS = 10
 _BLUE, _GREY = "#1f5f99", "#8a8a8a"
 
 
-def _spread(count: int) -> IntArray:
-    """Return up to ten places, evenly spread over `count`, first and last included."""
-    return np.unique(np.rint(np.linspace(0, count - 1, min(_PANELS, count))).astype(np.int64))
+def evenly_spread(count: int, most: int) -> IntArray:
+    """Return up to `most` places, evenly spread over `count`, first and last included."""
+    return np.unique(np.rint(np.linspace(0, count - 1, min(most, count))).astype(np.int64))
 
 
 def signal_figure(bank: Bank) -> Figure:
@@ -26,7 +26,7 @@ def signal_figure(bank: Bank) -> Figure:
     Signals differ a hundredfold in size, so every panel is scaled to its peak and shows it.
     """
     model = MODELS[bank.model]
-    of_k, of_sigma = _spread(len(bank.k_grid)), _spread(len(bank.sigma_grid))
+    of_k, of_sigma = (evenly_spread(len(grid), _PANELS) for grid in (bank.k_grid, bank.sigma_grid))
     rows, columns = len(of_sigma), len(of_k)
     figure = Figure(figsize=(1.35 * columns + 1.2, 0.85 * rows + 1.4), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, gridspec_kw={"wspace": 0.08, "hspace": 0.12})

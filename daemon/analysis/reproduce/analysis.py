@@ -120,8 +120,9 @@ class Matches:
 class TorqueResult:
     """The torque slices' results. Correlations are Pearson's, between torque and the best match's sigma.
 
-    `groups` (n,) are levels of torque. `r_clustered` is between the means of these, and `fit` is the parabola through
-    the means. `parts` (n,) are parts of the recording.
+    `groups` (n,) are levels of torque, with the means `group_torque_nm` and `group_sigma` on the focused bank.
+    `r_clustered` is between these means, and `fit` is the parabola through them. `parts` (n,) are parts of the
+    recording.
     `rmse_nm` is of single slices, each predicted by a parabola that was fitted without its part. `grouping` and
     `held_out` describe the groups and the parts.
     """
@@ -130,7 +131,10 @@ class TorqueResult:
     focused: Matches
     wide: Matches
     r_focused: float | None
+    r_wide: float | None
     groups: IntArray
+    group_torque_nm: FloatArray
+    group_sigma: FloatArray
     grouping: str
     r_clustered: float | None
     parts: IntArray
@@ -138,21 +142,6 @@ class TorqueResult:
     rmse_nm: float | None
     held_out: str
     notes: tuple[str, ...]
-
-    @property
-    def r_wide(self) -> float | None:
-        """The correlation on the wide bank."""
-        return correlation(self.wide.sigma, self.slices.torque_nm)
-
-    @property
-    def group_torque_nm(self) -> FloatArray:
-        """The mean torque of each group."""
-        return group_means(self.slices.torque_nm, self.groups)
-
-    @property
-    def group_sigma(self) -> FloatArray:
-        """The mean sigma of each group, on the focused bank."""
-        return group_means(self.focused.sigma, self.groups)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,7 +221,10 @@ def analyse_torque(slices: Slices, on_focused: Matches, on_wide: Matches) -> Tor
         focused=on_focused,
         wide=on_wide,
         r_focused=correlation(sigma, torque),
+        r_wide=correlation(on_wide.sigma, torque),
         groups=groups,
+        group_torque_nm=group_torque,
+        group_sigma=group_sigma,
         grouping=grouping,
         r_clustered=r_clustered,
         parts=parts,
@@ -388,16 +380,15 @@ def kmeans_groups(values: FloatArray, n_groups: int) -> IntArray:
     `n_groups` may be at most the number of distinct values.
     """
     distinct, of_value, weight = np.unique(values, return_inverse=True, return_counts=True)
-    centred = distinct - distinct.mean()
-    total = [np.concatenate([[0.0], np.cumsum(weight * centred**power)]) for power in (0, 1, 2)]
-    n = len(distinct)
+    centred, n = distinct - distinct.mean(), len(distinct)
+    sums = (np.append(0.0, np.cumsum(weight * centred**power)) for power in (0, 1, 2))
+    count, total, squares = (each[:, None] - each for each in sums)
+    # squared[j, i]: the sum of squares around the mean of the values from i to before j.
+    squared = np.where(count > 0, squares - total**2 / np.maximum(count, 1), np.inf)
     # least[j]: the least sum of squares of the first j values in the groups so far; begin[g][j] begins the last group.
     least, begin = np.where(np.arange(n + 1) == 0, 0.0, np.inf), []
     for _ in range(n_groups):
-        cost = np.full((n + 1, n + 1), np.inf)
-        for j in range(1, n + 1):
-            m, s, q = (each[j] - each[:j] for each in total)
-            cost[j, :j] = least[:j] + q - s**2 / m
+        cost = least + squared
         begin.append(cost.argmin(axis=1))
         least = cost.min(axis=1)
     groups, end = np.empty(n, dtype=np.int64), n

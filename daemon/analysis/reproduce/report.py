@@ -19,7 +19,7 @@ from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.matching import Match
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS
-from shearloop.daemon.analysis.charts.bank_figures import models_figure, signal_figure
+from shearloop.daemon.analysis.charts.bank_figures import evenly_spread, models_figure, signal_figure
 from shearloop.daemon.analysis.charts.drawing import figure, lay_out
 from shearloop.daemon.analysis.reproduce.analysis import DiameterResult, Matches, ModelScores, TorqueResult
 from shearloop.daemon.analysis.reproduce.dataset import (
@@ -59,11 +59,6 @@ class Reproduction:
     twists: Twists | None
     notes: tuple[str, ...]
 
-    @property
-    def bank_valid_cells(self) -> int:
-        """The number of valid cells of the wide bank."""
-        return int(self.wide.valid.sum())
-
     def region_agreement(self) -> dict[str, float]:
         """Return the share of the wide bank's cells whose validity agrees with the paper's region, by its reading."""
         in_k, in_sigma = (self.wide.k_grid > PAPER_REGION_CM[0])[:, None], self.wide.sigma_grid > PAPER_REGION_CM[1]
@@ -76,20 +71,19 @@ class Reproduction:
 def json_text(found: Reproduction) -> str:
     """Return the numbers by name as JSON text; null where the recordings do not determine them."""
     torque, diameter, models = found.torque, found.diameter, found.models
+    regression = next(iter(found.regressions), None)
     numbers = {
-        "torque_sigma_r_focused": torque.r_focused if torque else None,
-        "torque_sigma_r_wide": torque.r_wide if torque else None,
-        "torque_sigma_r_clustered": torque.r_clustered if torque else None,
-        "diameter_k_r_single": diameter.r_single if diameter else None,
-        "diameter_k_r_accumulated": diameter.r_accumulated if diameter else None,
-        "diameter_k_r_running_sum": diameter.r_running_sum if diameter else None,
+        "torque_sigma_r_focused": torque and torque.r_focused,
+        "torque_sigma_r_wide": torque and torque.r_wide,
+        "torque_sigma_r_clustered": torque and torque.r_clustered,
+        "diameter_k_r_single": diameter and diameter.r_single,
+        "diameter_k_r_accumulated": diameter and diameter.r_accumulated,
+        "diameter_k_r_running_sum": diameter and diameter.r_running_sum,
         "model_scores": models.chosen if models else dict.fromkeys(MODELS),
-        "torque_rmse_nm_cross_validated": torque.rmse_nm if torque else None,
-        "torque_regression_r_share": found.regressions[0].r_share_at(PAPER_CHANNELS) if found.regressions else None,
-        "torque_regression_channels_for_80_percent_of_r2": (
-            found.regressions[0].counts_reaching(PAPER_SHARE) if found.regressions else None
-        ),
-        "bank_valid_cells": found.bank_valid_cells,
+        "torque_rmse_nm_cross_validated": torque and torque.rmse_nm,
+        "torque_regression_r_share": regression and regression.r_share_at(PAPER_CHANNELS),
+        "torque_regression_channels_for_80_percent_of_r2": regression and regression.counts_reaching(PAPER_SHARE),
+        "bank_valid_cells": int(found.wide.valid.sum()),
         "paper_region_agreement": found.region_agreement(),
     }
     return json.dumps(numbers, indent=2, allow_nan=False)
@@ -98,8 +92,7 @@ def json_text(found: Reproduction) -> str:
 def table(found: Reproduction) -> str:
     """Return the comparison with the paper, and the explanations."""
     rows = [("", "paper", "here")]
-    if found.torque:
-        torque = found.torque
+    if torque := found.torque:
         rows += [
             ("torque and sigma, r, single slices, focused bank", f"{PAPER_TORQUE_R:.4f}", _number(torque.r_focused)),
             ("torque and sigma, r, single slices, wide bank", "", _number(torque.r_wide)),
@@ -107,38 +100,31 @@ def table(found: Reproduction) -> str:
             ("torque of a single slice, RMSE cross-validated, N·m", "", _number(torque.rmse_nm)),
             ("   beside the torques' standard deviation, N·m", "", _number(float(torque.slices.torque_nm.std()))),
         ]
-    if found.regressions:
-        share, needed = (
-            found.regressions[0].r_share_at(PAPER_CHANNELS),
-            found.regressions[0].counts_reaching(PAPER_SHARE),
-        )
+    for one in found.regressions[:1]:
+        share, needed = _number(one.r_share_at(PAPER_CHANNELS)), _count_range(one.counts_reaching(PAPER_SHARE))
         rows += [
-            (f"linear regression: r of {PAPER_CHANNELS} channels over r of all", f"{PAPER_SHARE:.4f}", _number(share)),
-            ("linear regression: channels for 80 % of R²", str(PAPER_CHANNELS), _count_range(needed)),
+            (f"linear regression: r of {PAPER_CHANNELS} channels over r of all", f"{PAPER_SHARE:.4f}", share),
+            ("linear regression: channels for 80 % of R²", str(PAPER_CHANNELS), needed),
         ]
-    if found.diameter:
-        diameter = found.diameter
+    if diameter := found.diameter:
+        paper = f"{PAPER_DIAMETER_R:.4f}"
         rows += [
             ("diameter and k, r, single slices", "", _number(diameter.r_single)),
-            ("diameter and k, r, one point per cylinder", f"{PAPER_DIAMETER_R:.4f}", _number(diameter.r_accumulated)),
-            (
-                "diameter and k, r, running sums, one per slice",
-                f"{PAPER_DIAMETER_R:.4f}",
-                _number(diameter.r_running_sum),
-            ),
+            ("diameter and k, r, one point per cylinder", paper, _number(diameter.r_accumulated)),
+            ("diameter and k, r, running sums, one per slice", paper, _number(diameter.r_running_sum)),
         ]
-    if found.models:
-        what = "matching" if found.models.envelope is None else "envelope"
+    if models := found.models:
+        what = "matching" if models.envelope is None else "envelope"
         rows += [
             (f"{MODELS[name].title}: {what} score", f"{PAPER_MODEL_SCORES[name]:.4f}", _number(score))
-            for name, score in found.models.chosen.items()
+            for name, score in models.chosen.items()
         ]
-        if found.models.envelope is not None:
+        if models.envelope is not None:
             rows += [
                 (f"{MODELS[name].title}: matching score, mean over slices", "", _number(score))
-                for name, score in found.models.matching.items()
+                for name, score in models.matching.items()
             ]
-    rows.append(("cells of the wide bank that are valid", "", str(found.bank_valid_cells)))
+    rows.append(("cells of the wide bank that are valid", "", str(found.wide.valid.sum())))
     rows += [
         (f"cells where that is the paper's region, k > 3.5 {word} σ > 0.6", "", f"{share:.1%}")
         for word, share in found.region_agreement().items()
@@ -189,19 +175,16 @@ def _model_explanations(models: ModelScores) -> list[str]:
     )
     if models.envelope is None:
         return [f"{matching} The paper's own measure needs TorqueSlice.mat and TorqueSliceHom.mat in torque_slices."]
+    first = ", ".join(f"{MODELS[name].title} {count}×" for name, count in models.n_envelopes.items() if count)
     gaps = [abs(score - PAPER_MODEL_SCORES[name]) for name, score in models.envelope.items() if score is not None]
     return [
         "Envelope score: the paper's measure, Spearman's correlation of the envelopes of one raw difference and the "
         "simulated signal at the best circular shift, averaged over settings of a centred model; first is "
         f"{_first(models.envelope)}, and the largest difference from the paper's is {max(gaps, default=0.0):.3f}.",
         f"The ranking depends on the envelope's settings: by {sum(models.n_envelopes.values())} pairs of peak distance "
-        f"and moving average around the paper's, first is {_first_counts(models.n_envelopes)}.",
+        f"and moving average around the paper's, first is {first}.",
         matching,
     ]
-
-
-def _first_counts(counts: dict[str, int]) -> str:
-    return ", ".join(f"{MODELS[name].title} {count}×" for name, count in counts.items() if count)
 
 
 def _count_range(counts: tuple[int, int] | None) -> str:
@@ -402,9 +385,8 @@ def _heatmap(
 
 def _spread_over(values: FloatArray) -> list[int]:
     """Return the indices of up to four values, evenly spread from the smallest to the largest."""
-    order = np.argsort(values, kind="stable")
-    places = np.rint(np.linspace(0, len(values) - 1, min(_HEATMAPS_SHOWN, len(values)))).astype(int)
-    return [int(order[place]) for place in places]
+    shown: list[int] = np.argsort(values, kind="stable")[evenly_spread(len(values), _HEATMAPS_SHOWN)].tolist()
+    return shown
 
 
 def _plain(axes: Axes) -> None:

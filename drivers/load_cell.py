@@ -92,27 +92,6 @@ class LoadSample:
         return not (self.saturated or self.spike or self.stuck or self.partial)
 
 
-class SpikeFilter:
-    """Flags values beyond the cell's capacity, and further from the last good value than the rig can move."""
-
-    def __init__(self, period_ns: int = PERIOD_NS) -> None:
-        """Trust the first value within the capacity; the board sends one every `period_ns`."""
-        self._period_ns = period_ns
-        self._steps = serial_sensor.StepFilter[tuple[float, int]]()
-
-    def is_spike(self, torque_nm: float, t_ns: int) -> bool:
-        """Judge the next value; calls are in order of time."""
-        if abs(torque_nm) > CAPACITY_NM:
-            self._steps.restart_step()
-            return True
-        return self._steps.is_spike((torque_nm, t_ns), self._is_reachable)
-
-    def _is_reachable(self, before: tuple[float, int], after: tuple[float, int]) -> bool:
-        # Arrival stamps bunch on a busy host: no interval counts as shorter than a period.
-        elapsed_s = max(after[1] - before[1], self._period_ns) * 1e-9
-        return abs(after[0] - before[0]) <= SLEW_NM_PER_S * elapsed_s
-
-
 class LoadParser(serial_sensor.LineParser[LoadSample]):
     """Turns the board's bytes into samples."""
 
@@ -127,7 +106,7 @@ class LoadParser(serial_sensor.LineParser[LoadSample]):
         """Process a live or recorded event; return the samples that it completes."""
         if event.kind is serial_sensor.InputKind.TARE:
             self.calibration = self.calibration.tared(float(event.data))
-            self._spikes = SpikeFilter(self._period_ns)
+            self._levels = serial_sensor.StepFilter[tuple[float, int]]()
         return super().handle(event)
 
     def restart(self) -> None:
@@ -135,16 +114,20 @@ class LoadParser(serial_sensor.LineParser[LoadSample]):
         super().restart()
         self._last_raw: float | None = None
         self._repeats = 0
-        self._spikes = SpikeFilter(self._period_ns)
+        self._levels = serial_sensor.StepFilter[tuple[float, int]]()
 
     def _value(self, line: serial_sensor.TimedLine) -> LoadSample:
         raw = float(line.text)
         torque_nm = self.calibration.torque_nm(raw)
         self._repeats = self._repeats + 1 if raw == self._last_raw else 1
         self._last_raw = raw
-        saturated = raw in (COUNTS_MAX, COUNTS_MIN)
+        saturated, spike = raw in (COUNTS_MAX, COUNTS_MIN), abs(torque_nm) > CAPACITY_NM
         # An unreliable value is not a level to judge the next one by.
-        unreliable = saturated or line.partial
+        if not (saturated or line.partial):
+            if spike:
+                self._levels.restart_step()
+            else:
+                spike = self._levels.is_spike((torque_nm, line.t_mid_ns), self._is_reachable)
         sample = LoadSample(
             raw=raw,
             torque_nm=torque_nm,
@@ -152,12 +135,17 @@ class LoadParser(serial_sensor.LineParser[LoadSample]):
             t_arrival_ns=line.t_arrival_ns,
             seq=self.count,
             saturated=saturated,
-            spike=abs(torque_nm) > CAPACITY_NM if unreliable else self._spikes.is_spike(torque_nm, line.t_mid_ns),
+            spike=spike,
             stuck=self._repeats >= self._stuck_after,
             partial=line.partial,
         )
         self.flagged += not sample.trusted
         return sample
+
+    def _is_reachable(self, before: tuple[float, int], after: tuple[float, int]) -> bool:
+        # Arrival stamps bunch on a busy host: no interval counts as shorter than a period.
+        elapsed_s = max(after[1] - before[1], self._period_ns) * 1e-9
+        return abs(after[0] - before[0]) <= SLEW_NM_PER_S * elapsed_s
 
 
 class LoadCell(serial_sensor.SerialSensor[LoadSample]):

@@ -19,7 +19,6 @@ from shearloop.drivers.load_cell import (
     STUCK_AFTER,
     LoadCalibration,
     LoadParser,
-    SpikeFilter,
 )
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.slices import slices
@@ -31,6 +30,13 @@ STREAMS = {
     "2024-12-03_16-09/device3.mat": "Load_Data",
     **{f"cylinders/{mm}mm_1_truth.mat": "plotthis_truth" for mm in (10, 20, 30, 40)},
 }
+
+
+def spikes(torques_nm: list[float]) -> list[bool]:
+    """Return which of the values, one a period, are flagged as spikes."""
+    # The first line after opening is no level. Lines of one length are a period apart.
+    lines = [f"{one:+026.12f}" for one in (0.0, *torques_nm)]
+    return [one.spike for one in feed_lines(LoadParser(TORQUE_LINES), lines)][1:]
 
 
 def feed_lines(parser: LoadParser, lines: list[str]) -> list[load_cell.LoadSample]:
@@ -128,11 +134,11 @@ torques = st.floats(-1.7, 1.7)
 
 @given(torques, torques, st.integers(3, 10))
 def test_a_real_step_is_believed_after_three_agreeing_values(before, after, n):
-    spikes = SpikeFilter()
-    assert not any(spikes.is_spike(before, k * PERIOD_NS) for k in range(5))
-    flags = [spikes.is_spike(after, (5 + k) * PERIOD_NS) for k in range(n)]
-    assert flags[0] == (abs(after - before) > 2.0 * PERIOD_NS * 1e-9)
-    assert not any(flags[2:])
+    flags = spikes([before] * 5 + [after] * n)
+    assert not any(flags[:5])
+    step_nm = abs(after - before)
+    assert flags[5] == (step_nm > 2.0 * PERIOD_NS * 1e-9) or step_nm == pytest.approx(2.0 * PERIOD_NS * 1e-9)
+    assert not any(flags[7:])
 
 
 @given(st.lists(st.floats(-0.15, 0.15), min_size=3, max_size=60), st.data())
@@ -143,14 +149,12 @@ def test_one_corrupted_value_in_a_moving_signal_is_flagged_alone(steps, data):
         values.append(level)
     where = data.draw(st.integers(1, len(values) - 1))
     values[where] = values[where - 1] + data.draw(st.sampled_from([-1, 1])) * data.draw(st.floats(0.2, 1e9))
-    spikes = SpikeFilter()
-    assert [k for k, v in enumerate(values) if spikes.is_spike(v, k * PERIOD_NS)] == [where]
+    assert [k for k, spike in enumerate(spikes(values)) if spike] == [where]
 
 
 def test_after_a_gap_the_rig_may_have_moved_further():
-    spikes = SpikeFilter()
-    assert not spikes.is_spike(0.0, 0)
-    assert not spikes.is_spike(1.5, 10**9)
+    parser = LoadParser(TORQUE_LINES)
+    assert not any(one.spike for one in [*feed_lines(parser, ["0.0", "0.0"]), *parser.feed(b"1.5\n", 10**9)])
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 10.9, 80.0])

@@ -86,20 +86,16 @@ class OutputModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """What an estimator reads: a frame after the session's checks, at t_s.
-
-    matcher is for estimators that search a bank.
-    """
+    """What an estimator reads: a frame after the session's checks, at t_s, and each side's match in its bank."""
 
     frame: ProcessedFrame
     t_s: float
-    matcher: BankMatcher | None
+    matches: tuple[BankMatch, ...]
 
-    def match(self, layer: int = 0) -> BankMatch:
-        """Return the match of one side in the bank."""
-        if self.matcher is None:
-            raise ValueError("an estimator on a bank needs its matcher")
-        return self.matcher.match(self.frame.difference[layer])
+    @classmethod
+    def of(cls, frame: ProcessedFrame, t_s: float, matcher: BankMatcher | None) -> Self:
+        """Return the reading of a frame; the matcher is that of the estimator's bank, None without one."""
+        return cls(frame, t_s, () if matcher is None else tuple(map(matcher.match, frame.difference)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,8 +173,8 @@ class Estimator(ABC):
         return None
 
     @abstractmethod
-    def features(self, reading: Reading) -> tuple[FloatArray, BankMatch | None]:
-        """Return the (d,) features of a reading, and the bank match if there is one."""
+    def features(self, reading: Reading) -> FloatArray:
+        """Return the (d,) features of a reading."""
 
     def inputs(self, quantity: Quantity, features: FloatArray, _reading: Reading) -> FloatArray:
         """Return the (d,) inputs of a quantity's regressor."""
@@ -264,9 +260,9 @@ class Regression(Estimator):
 
     name: ClassVar[str] = "regression"
 
-    def features(self, reading: Reading) -> tuple[FloatArray, BankMatch | None]:
+    def features(self, reading: Reading) -> FloatArray:
         """Return the channels' differences."""
-        return (reading.frame.difference / self.scale).ravel(), None
+        return (reading.frame.difference / self.scale).ravel()
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,9 +281,9 @@ class Reconstruction(Estimator):
             raise ValueError("a reconstruction needs a mesh")
         return cls(material.scale, material.table, image=image_matrix(material.physics.mesh, material.table))
 
-    def features(self, reading: Reading) -> tuple[FloatArray, BankMatch | None]:
+    def features(self, reading: Reading) -> FloatArray:
         """Return the pixels of each side."""
-        return (reading.frame.difference @ self.image.T).ravel(), None
+        return (reading.frame.difference @ self.image.T).ravel()
 
 
 class _OnBank(Estimator):
@@ -323,10 +319,9 @@ class BankEstimator(_OnBank):
         """Return the refined match on the bank."""
         return RefinedMatcher(bank, self.numbering)
 
-    def features(self, reading: Reading) -> tuple[FloatArray, BankMatch | None]:
-        """Return each side's match, and the first one."""
-        matches = [reading.match(layer) for layer in range(len(reading.frame.difference))]
-        return np.concatenate([one.features for one in matches]), matches[0]
+    def features(self, reading: Reading) -> FloatArray:
+        """Return those of each side's match."""
+        return np.concatenate([one.features for one in reading.matches])
 
 
 class PaperEstimator(_OnBank):
@@ -341,7 +336,6 @@ class PaperEstimator(_OnBank):
         """Return the paper's match on the bank."""
         return PaperMatcher(bank)
 
-    def features(self, reading: Reading) -> tuple[FloatArray, BankMatch | None]:
-        """Return k, σ and σ² of the first side, and its match."""
-        match = reading.match()
-        return np.array([match.k, match.sigma, match.sigma**2]), match
+    def features(self, reading: Reading) -> FloatArray:
+        """Return k, σ and σ² of the first side."""
+        return reading.matches[0].features[:3]

@@ -237,7 +237,7 @@ def _replay(
         processed = state.process(TactileFrame.of(t_s, channels))
         if processed.reasons or not np.isfinite(torque):
             continue
-        features, _ = estimator.features(Reading(processed, t_s, matcher))
+        features = estimator.features(Reading.of(processed, t_s, matcher))
         position, mean_position = (
             (one / estimator.scale).ravel() for one in (processed.difference, processed.mean_difference)
         )
@@ -288,10 +288,10 @@ def _fit_slices(
         novelty = NoveltyDetector.fit(differences, estimator.table)
         every = np.ones((1, differences.shape[1]), dtype=np.bool_)
         readings = (
-            Reading(ProcessedFrame(one[None], (), every), t_s, matcher)
+            Reading.of(ProcessedFrame(one[None], (), every), t_s, matcher)
             for one, t_s in zip(differences, times[known].tolist(), strict=True)
         )
-        features = np.array([estimator.features(one)[0] for one in readings])
+        features = np.array([estimator.features(one) for one in readings])
         regressor = fit_interval_regressor(
             features[:, estimator.columns[quantity]],
             values[known],

@@ -17,7 +17,6 @@ from shearloop.bank.confidence import TWO_SIDED_95
 from shearloop.bank.defaults import BASELINE_FRAMES
 from shearloop.bank.eit.channels import ChannelTable, smoothed_along_channels
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.bank_match import BankMatch
 from shearloop.bank.estimation.estimator import (
     LEAST_LEFT,
     Bounds,
@@ -153,11 +152,11 @@ class MotionRegression(Estimator):
         """Return the estimator itself: its session imputes channels along the motion."""
         return self
 
-    def features(self, reading: Reading) -> tuple[FloatArray, BankMatch | None]:
+    def features(self, reading: Reading) -> FloatArray:
         """Return the features of motion. A slice has its time as a feature, because the gel drifts."""
         if self.temporal is not None:
-            return reading.frame.motion, None
-        return np.append((reading.frame.difference / self.scale).ravel(), reading.t_s), None
+            return reading.frame.motion
+        return np.append((reading.frame.difference / self.scale).ravel(), reading.t_s)
 
     def inputs(self, quantity: Quantity, features: FloatArray, reading: Reading) -> FloatArray:
         """Return the inputs of a quantity's regressor; the diameter's are the gel's mean position in this grip."""

@@ -200,15 +200,15 @@ class EstimatorSession:
             novelty = next((one.novelty for one, _ in outputs.values() if one.novelty is not None), None)
             difference, errors = calibration.estimator.impute(frame.difference, frame.usable, novelty)
             self.difference, frame = difference, replace(frame, difference=difference)
-        reading = Reading(frame, t_s, self._matcher)
-        features, match = calibration.estimator.features(reading)
+        reading = Reading.of(frame, t_s, self._matcher)
+        features, match = calibration.estimator.features(reading), next(iter(reading.matches), None)
         if match is not None and match.ambiguous:
             return _estimate({}, _AMBIGUOUS, match)
         if "torque" in outputs:
             self._grip.frames.append((t_s, features[calibration.estimator.columns["torque"]]))
         values: dict[Quantity, _Interval] = {}
         for quantity, (model, novelty_result) in outputs.items():
-            value, against = self._predict_quantity(quantity, model, novelty_result, reading, features, match, errors)
+            value, against = self._predict_quantity(quantity, model, novelty_result, reading, features, errors)
             reasons |= dict.fromkeys(against)
             if not against:
                 values[quantity] = value[0], value[0] - value[1], value[0] + value[2]
@@ -241,7 +241,7 @@ class EstimatorSession:
 
     def _predict_quantity(
         self, quantity: Quantity, model: OutputModel, novelty: Novelty, reading: Reading, features: FloatArray,
-        match: BankMatch | None, errors: FloatArray,
+        errors: FloatArray,
     ) -> tuple[_Interval, tuple[str, ...]]:  # fmt: skip
         """Return one quantity with its interval, and the reasons against it.
 
@@ -267,14 +267,14 @@ class EstimatorSession:
         if quantity == "diameter":
             error = self._position_noise_mm / math.sqrt(frame.held_frames)
             value = value[0], math.hypot(value[1], error), math.hypot(value[2], error)
-        against = dead or (model.match_reasons(match) if match is not None else ())
+        against = dead or tuple(why for match in reading.matches[:1] for why in model.match_reasons(match))
         return value, against or model.regressor.range_reasons(value[0], features, quantity, _UNITS[quantity])
 
     def _regressor_inputs(self, quantity: Quantity, reading: Reading, difference: FloatArray) -> FloatArray:
         """Return the regressor's inputs if this were the frame's difference."""
-        changed = replace(reading, frame=replace(reading.frame, difference=difference))
+        changed = Reading.of(replace(reading.frame, difference=difference), reading.t_s, self._matcher)
         estimator = self.calibration.estimator
-        return estimator.inputs(quantity, estimator.features(changed)[0], changed)
+        return estimator.inputs(quantity, estimator.features(changed), changed)
 
 
 def _dead_channel_reasons(validators: tuple[FingertipValidator, ...], usable: BoolArray) -> tuple[str, ...]:

@@ -75,8 +75,8 @@ class BandMeans(Estimator):
 
     bands: int = 8
 
-    def features(self, reading: Reading) -> tuple[FloatArray, None]:
-        return reading.frame.difference.reshape(self.bands, -1).mean(axis=1), None
+    def features(self, reading: Reading) -> FloatArray:
+        return reading.frame.difference.reshape(self.bands, -1).mean(axis=1)
 
 
 def test_an_estimator_is_one_class_and_one_line(slices_folder, tmp_path, ran, monkeypatch, result_of):

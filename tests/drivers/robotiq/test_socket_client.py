@@ -19,8 +19,6 @@ class Peer:
     def __init__(self, answer: Callable[[str], bytes | None]) -> None:
         self.answer = answer
         self.lines: list[str] = []
-        # Sent without a request, together with the next answer.
-        self.unasked = b""
         self.serving: list[asyncio.Task[None]] = []
 
     def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -33,8 +31,7 @@ class Peer:
                 answer = self.answer(line)
                 if answer is None:
                     return
-                writer.write(answer + self.unasked)
-                self.unasked = b""
+                writer.write(answer)
         except ConnectionError:
             return
         finally:
@@ -86,15 +83,6 @@ async def test_invalid_answer_ends_the_connection(answer, error, says):
         with pytest.raises(DeviceLostError, match="no connection"):
             await client.read()
         await client.connect()
-
-
-async def test_unrequested_bytes_are_not_taken_as_an_answer():
-    peer = Peer(usual)
-    async with connected(peer) as client:
-        peer.unasked = b"ack"
-        await client.write(GripperMove(1, 2, 3))
-        with pytest.raises(ProtocolError, match="without a request"):
-            await client.read()
 
 
 async def test_cancelled_request_leaves_no_answer_behind():

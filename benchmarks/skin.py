@@ -52,7 +52,7 @@ from shearloop.bank.skin.plane_strain import (
     states_along,
     unloaded,
 )
-from shearloop.bank.skin.sheet import PLATE_MM, SHEET_520, SheetSize, SheetSkin
+from shearloop.bank.skin.sheet import PLATE_MM, SheetSkin
 
 NORMAL_N, AMPLITUDE_N = 1.0, 1.0
 MESHES = {56: MeshSize(3, 4, 6, 2, 2), 112: MESH_112, 448: MESH_112.refined(2)}
@@ -78,9 +78,9 @@ def at_finite_strain(section: Section, normal_n: float, path: FloatArray) -> Flo
     return found
 
 
-def sheet(size: SheetSize, plate_mm: float) -> Model:
+def sheet(finer: int, plate_mm: float) -> Model:
     """Return the sheet under a plate; a plate of the skin's width has held edges, as plane strain does."""
-    skin = SheetSkin(PAPER_SECTION, plate_mm, size, held_edges=plate_mm == PAPER_SECTION.width_mm)
+    skin = SheetSkin(PAPER_SECTION, plate_mm, finer, held_edges=plate_mm == PAPER_SECTION.width_mm)
     return lambda path: np.array([skin.response(NORMAL_N, shear_n) for shear_n in path.tolist()])
 
 
@@ -88,7 +88,7 @@ def models() -> dict[str, Callable[[float], Model]]:
     """Return the models by name, each as a function of the plate's width in mm; only the sheet depends on it."""
     return {
         "1-D, finite strain": lambda _: partial(responses, Membrane(PAPER_SECTION), normal_n=NORMAL_N),
-        "sheet, 520 elements": partial(sheet, SHEET_520),
+        "sheet, 520 elements": partial(sheet, 1),
         **{f"2-D, linear, {elements} elements": partial(two_dimensional, mesh) for elements, mesh in MESHES.items()},
     }
 
@@ -111,8 +111,7 @@ def compare_models() -> list[Measured]:
     true_loop = at_finite_strain(PAPER_SECTION, NORMAL_N, there_and_back)
     finite_us = 1e6 * (time.process_time() - begin) / len(there_and_back)
     true_up = true_loop[: len(up)]
-    finest = SHEET_520.refined(3)
-    under_plate = true_up * sheet(finest, PLATE_MM)(up)[-1] / sheet(finest, whole_mm)(up)[-1]
+    under_plate = true_up * sheet(3, PLATE_MM)(up)[-1] / sheet(3, whole_mm)(up)[-1]
     found = []
     print(table_head("model", "set-up, ms", "µs per step", "loading", "whole loop", "14 mm plate"))
     for name, make in models().items():

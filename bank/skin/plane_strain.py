@@ -253,32 +253,23 @@ def unloaded(skin: CondensedSkin) -> ContactState:
     return ContactState(0.0, 0.0, np.zeros(2 * n), np.zeros(n))
 
 
-def apply_load(
-    skin: CondensedSkin, before: ContactState, normal_n: float, shear_n: float, *, friction: float | None = None
-) -> ContactState:
-    """Return the state after one increment of load (N) from `before`; friction is the section's unless given.
-
-    Raises ContactError where the contact conditions cannot be met.
-    """
-    friction = skin.section.friction if friction is None else friction
+def apply_load(skin: CondensedSkin, before: ContactState, normal_n: float, shear_n: float) -> ContactState:
+    """Return the state after one increment of load (N); ContactError where the contact conditions cannot be met."""
     free = skin.load_displacement @ (normal_n, shear_n)
-    found = solve_contact(skin.compliance, free, before.along_mm, friction, before.contact_force_n)
+    found = solve_contact(skin.compliance, free, before.along_mm, skin.section.friction, before.contact_force_n)
     n = len(before.along_mm)
     along_mm = skin.compliance[n:] @ found.force_n + free[n:]
     return ContactState(normal_n, shear_n, found.force_n, along_mm, found.steps, found.pivoted)
 
 
-def states_along(
-    skin: CondensedSkin, normal_n: float, shear_n: Iterable[float], *, friction: float | None = None
-) -> list[ContactState]:
+def states_along(skin: CondensedSkin, normal_n: float, shear_n: Iterable[float]) -> list[ContactState]:
     """Return one state per shear force along a path; the normal force is applied first, to the unloaded skin.
 
     Friction depends on the path: the paper's steps are 0.1 N.
     """
-    state = apply_load(skin, unloaded(skin), normal_n, 0.0, friction=friction)
-    states = []
+    state, states = apply_load(skin, unloaded(skin), normal_n, 0.0), []
     for shear in shear_n:
-        state = apply_load(skin, state, normal_n, float(shear), friction=friction)
+        state = apply_load(skin, state, normal_n, float(shear))
         states.append(state)
     return states
 

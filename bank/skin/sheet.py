@@ -7,7 +7,6 @@ share of the stiffness that `SLACK_STIFFNESS` gives. The sheet is loaded from re
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import skfem
@@ -21,36 +20,24 @@ from shearloop.bank.skin.membrane import GAUGE_FACTOR, SLACK_STIFFNESS, Section
 PLATE_MM, GAUGE_WIDTH_MM = 14.0, 7.0
 
 
-@dataclass(frozen=True, slots=True)
-class SheetSize:
-    """Elements along the arc from bracket to gauge, of the gauge, to the load and to its middle; and across.
-
-    Those go from the middle to the gauge's edge, to the plate's edge and to the skin's edge.
-    """
-
-    along: tuple[int, int, int, int] = (3, 3, 6, 1)
-    across: tuple[int, int, int] = (4, 3, 3)
-
-    def refined(self, times: int) -> "SheetSize":
-        """Return the size with every element cut into times × times."""
-        bracket, gauge, flank, load = (times * n for n in self.along)
-        middle, plate, edge = (times * n for n in self.across)
-        return SheetSize((bracket, gauge, flank, load), (middle, plate, edge))
-
-
-SHEET_520 = SheetSize()
+# Elements along the arc from bracket to gauge, of the gauge, to the load and to its middle; and across from the middle
+# to the gauge's edge, to the plate's edge and to the skin's edge. They make 520.
+ALONG, ACROSS = (3, 3, 6, 1), (4, 3, 3)
 
 
 class SheetSkin:
     """A section's sheet under a plate; `held_edges` keeps the sheet from narrowing, as plane strain does."""
 
     def __init__(
-        self, section: Section, plate_mm: float = PLATE_MM, size: SheetSize = SHEET_520, *, held_edges: bool = False
+        self, section: Section, plate_mm: float = PLATE_MM, finer: int = 1, *, held_edges: bool = False
     ) -> None:
-        """Solve for both directions, for a plate that is wider than the gauges and no wider than the skin."""
+        """Solve for both directions, for a plate that is wider than the gauges and no wider than the skin.
+
+        Every element is cut into finer × finer.
+        """
         self.section = section
         self._plate_mm = plate_mm
-        self._basis = skfem.Basis(self._mesh(size), skfem.ElementVector(skfem.ElementQuad2()), intorder=4)
+        self._basis = skfem.Basis(self._mesh(finer), skfem.ElementVector(skfem.ElementQuad2()), intorder=4)
         stiffness = csc_matrix(skfem.BilinearForm(self._work).assemble(self._basis))
         gauges = np.array([self._mean_strain(side) for side in (0, 1)])
         x, z = self._basis.doflocs
@@ -93,11 +80,11 @@ class SheetSkin:
     def _slack_share(self) -> float:
         return SLACK_STIFFNESS * (self.section.thickness_mm / self.section.mid_radius_mm) ** 2
 
-    def _mesh(self, size: SheetSize) -> skfem.MeshQuad2:
+    def _mesh(self, finer: int) -> skfem.MeshQuad2:
         section = self.section
         ends = [0.0, section.gauge_from_deg, section.gauge_to_deg, 90 - section.load_arc_deg / 2, 90.0]
-        along = section.mid_radius_mm * np.radians(_stretches(ends, size.along))
-        across = _stretches([0.0, GAUGE_WIDTH_MM / 2, self._plate_mm / 2, section.width_mm / 2], size.across)
+        along = section.mid_radius_mm * np.radians(_stretches(ends, ALONG, finer))
+        across = _stretches([0.0, GAUGE_WIDTH_MM / 2, self._plate_mm / 2, section.width_mm / 2], ACROSS, finer)
         x = np.append(along, 2 * self._half_mm - along[-2::-1])
         return skfem.MeshQuad2.from_mesh(skfem.MeshQuad.init_tensor(x, np.append(-across[:0:-1], across)))
 
@@ -134,7 +121,7 @@ class SheetSkin:
         return weights
 
 
-def _stretches(ends: list[float], counts: tuple[int, ...]) -> FloatArray:
+def _stretches(ends: list[float], counts: tuple[int, ...], finer: int) -> FloatArray:
     """Return the points that cut each stretch between neighbouring ends into so many parts; empty stretches vanish."""
-    parts = [np.linspace(a, b, n + 1) for a, b, n in zip(ends[:-1], ends[1:], counts, strict=True)]
+    parts = [np.linspace(a, b, finer * n + 1) for a, b, n in zip(ends[:-1], ends[1:], counts, strict=True)]
     return np.unique(np.concatenate(parts))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.skin.membrane import PAPER_SECTION, SLACK_STIFFNESS, THICK_SECTION, sensitivity_per_n
-from shearloop.bank.skin.sheet import SHEET_520, SheetSkin
+from shearloop.bank.skin.sheet import SheetSkin
 
 WIDTH_MM = PAPER_SECTION.width_mm
 
@@ -28,7 +28,7 @@ def test_a_plate_of_the_skin_s_width_on_held_edges_is_the_closed_form(section):
 
 
 def test_three_meshes_agree_within_half_a_percent():
-    coarse, middle, fine = (SheetSkin(PAPER_SECTION, size=SHEET_520.refined(n)).response(0.0, 1.0) for n in (1, 2, 3))
+    coarse, middle, fine = (SheetSkin(PAPER_SECTION, finer=n).response(0.0, 1.0) for n in (1, 2, 3))
     assert abs(middle - fine) < 0.5 * abs(coarse - middle)
     assert coarse == pytest.approx(fine, rel=0.005)
 

@@ -136,7 +136,7 @@ def _find_error(line: bytes, n_values: int) -> FrameError:
 class Frame:
     """One frame of the board; its arrays are read-only.
 
-    `channels` (c,) and `raw` (v,) are in volts and line order; `line` is the received line without its end.
+    `channels` (c,) and `raw` (v,) are in volts and line order.
     `t_mid_ns` is the middle of the acquisition, `t_arrival_ns` the arrival of the last byte (monotonic clock).
     `seq` counts frames from 0 across reconnections. `saturated` (c,): the signal exceeds the ADC's range; `dead`
     (c,): unchanged for DEAD_AFTER_FRAMES, so nothing is connected; `repeated`: the same line as
@@ -145,7 +145,6 @@ class Frame:
 
     channels: NDArray[np.float64]
     raw: NDArray[np.float64]
-    line: bytes
     t_begin_ns: int
     t_mid_ns: int
     t_arrival_ns: int
@@ -279,27 +278,27 @@ class FrameParser:
         """Return the frames that `data` completes, in order; all of it had arrived at `t_arrival_ns`."""
         complete = []
         for line in self._lines.feed(data):
-            found = self._read(line)
+            values = self._read(line)
             self._first_line = False
-            if found is not None:
-                complete.append((*found, self._rejected_since_frame))
+            if values is not None:
+                complete.append((values, self._rejected_since_frame))
                 self._rejected_since_frame = False
         frames = []
-        for number, (line, values, missed) in enumerate(complete, 1):
+        for number, (values, missed) in enumerate(complete, 1):
             # Frames that waited together were sent one period apart, the last one by now.
             waited_ns = (len(complete) - number) * self.clock.period_ns if self.clock.learned else 0
             sent_ns = self.clock.arrived(t_arrival_ns - waited_ns, missed)
-            frames.append(self._frame(line, values, sent_ns, t_arrival_ns))
+            frames.append(self._frame(values, sent_ns, t_arrival_ns))
         return frames
 
-    def _read(self, line: bytes | None) -> tuple[bytes, NDArray[np.float64]] | None:
+    def _read(self, line: bytes | None) -> NDArray[np.float64] | None:
         if line is None:
             self._reject(FrameError(FrameErrorKind.TOO_LONG, self._lines.too_long_start))
             return None
         line = line.removesuffix(b"\r")
         values = read_line(line, self._zero_slots)
         if not isinstance(values, FrameError):
-            return line, values
+            return values
         whole = len(line) >= self._zero_slots.size * CELL_BYTES
         if whole or not self._first_line or values.kind not in _PARTIAL_ERRORS:
             self._reject(values)
@@ -310,7 +309,7 @@ class FrameParser:
         self.last_error = error
         self._rejected_since_frame = True
 
-    def _frame(self, line: bytes, values: NDArray[np.float64], sent_ns: int, t_arrival_ns: int) -> Frame:
+    def _frame(self, values: NDArray[np.float64], sent_ns: int, t_arrival_ns: int) -> Frame:
         channels = values[~self._zero_slots]
         repeated = np.array_equal(channels, self._last_channels)
         if not repeated:
@@ -326,7 +325,6 @@ class FrameParser:
         return Frame(
             channels=channels,
             raw=values,
-            line=line,
             t_begin_ns=self._last_mid_ns - self.clock.period_ns // 2,
             t_mid_ns=self._last_mid_ns,
             t_arrival_ns=t_arrival_ns,

@@ -49,7 +49,7 @@ def frame(
 ) -> Frame:
     t_ns = round(number * PERIOD_S * 1e9)
     return Frame(
-        channels=channels, raw=np.zeros(1024), line=b"", t_begin_ns=t_ns - 270_000_000, t_mid_ns=t_ns,
+        channels=channels, raw=np.zeros(1024), t_begin_ns=t_ns - 270_000_000, t_mid_ns=t_ns,
         t_arrival_ns=t_ns + 270_000_000,
         seq=number, saturated=NO_CHANNEL, dead=dead, repeated=repeated,
     )  # fmt: skip

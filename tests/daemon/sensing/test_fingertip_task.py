@@ -107,7 +107,7 @@ def frame(number: int, arrives_ns: int | None = None) -> Frame:
     mid_ns = arrival_ns - 80 * MS - PERIOD_NS // 2
     times = {"t_begin_ns": mid_ns - PERIOD_NS // 2, "t_mid_ns": mid_ns, "t_arrival_ns": arrival_ns}
     flags = {"saturated": NONE, "dead": NONE, "repeated": False}
-    return Frame(channels=np.full(896, 0.1), raw=np.zeros(1024), line=b"", seq=number, **times, **flags)
+    return Frame(channels=np.full(896, 0.1), raw=np.zeros(1024), seq=number, **times, **flags)
 
 
 def estimates(

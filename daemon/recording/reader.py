@@ -331,14 +331,20 @@ class TopicSummary:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RecordingSummary:
-    """The content of a recording in numbers, times in Unix ns; the keys of `recording info --json`."""
+class FileCondition:
+    """Whether a file was closed, its size, and how much of it is damaged."""
 
     path: str
     size_bytes: int
     closed: bool
     torn_bytes: int
     damaged_chunks: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingSummary(FileCondition):
+    """The content of a recording in numbers, times in Unix ns; the keys of `recording info --json`."""
+
     dropped: int | None
     first_unix_ns: int | None
     duration_s: float

@@ -23,7 +23,6 @@ from shearloop.daemon.recording.recorder import Recorder, daemon_identity
 from shearloop.daemon.rig import Rig, check_experiment, make_gripper, make_loop
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.frame_estimator import COMBINED, open_combined, open_estimator, torque_sources
-from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.sensors import Sensors, build_sensors
 from shearloop.daemon.service import notify
 from shearloop.daemon.supervisor import HealthReporter, Reporter, Supervisor, Task, TaskFacts
@@ -168,9 +167,8 @@ def _build_rig(
     sources = torque_sources(config, estimators, combined)
     check_experiment(config, sources)
     loop = make_loop(config, sources)
-    diameters = FingertipDiameters(COMBINED) if loop is not None else None
-    gripper = make_gripper(config, loop, publisher, diameters) if loop is not None else None
-    sensors = build_sensors(config, publisher, clock, recorder, loop, estimators, combined, gripper, diameters)
+    gripper = make_gripper(config, loop, publisher) if loop is not None else None
+    sensors = build_sensors(config, publisher, clock, recorder, loop, estimators, combined, gripper)
     if loop is None:
         return sensors, None
     return sensors, Rig(config, loop, gripper, sensors.tareable(), publisher, clock, supervisor, recorder)

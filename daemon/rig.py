@@ -105,16 +105,14 @@ def make_loop(config: DaemonConfig, sources: Mapping[str, TorqueSource]) -> Cont
     return ControlLoop(loop, sources, required, gels)
 
 
-def make_gripper(
-    config: DaemonConfig, loop: ControlLoop, publisher: Publisher, diameters: FingertipDiameters | None
-) -> GripperTask | None:
-    """Return the gripper's task, if a gripper is configured; `diameters` are the fingertips'."""
+def make_gripper(config: DaemonConfig, loop: ControlLoop, publisher: Publisher) -> GripperTask | None:
+    """Return the gripper's task, if a gripper is configured."""
     if config.gripper is None:
         return None
     client, calibration = make_gripper_client(config.gripper), gripper_calibration(config.gripper)
     hand = RobotiqGripper(client, calibration, monitor=LinkMonitor(DeviceLink("gripper", loop)))
     measures = config.gripper.calibration is not None
-    return GripperTask(hand, publisher, loop, diameters=diameters, measures_diameters=measures)
+    return GripperTask(hand, publisher, loop, FingertipDiameters(COMBINED), measures_diameters=measures)
 
 
 class Rig:

@@ -14,7 +14,6 @@ from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, Fingerti
 from shearloop.daemon.sensing.frame_estimator import COMBINED, FrameEstimator
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
 from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, RecordedSkin, SkinTask
-from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.supervisor import Task
 from shearloop.daemon.taring import Tareable
 from shearloop.drivers.connection import LinkMonitor, SerialLink
@@ -61,11 +60,10 @@ def build_sensors(
     estimators: Mapping[str, FrameEstimator],
     combined: FrameEstimator | None,
     gripper: GripperTask | None,
-    diameters: FingertipDiameters | None,
 ) -> Sensors:
     """Return all sensors, which publish, are recorded, and drive the control loop, where there is one.
 
-    `diameters` receives the fingertips' estimates, and the gripper gives the held tool.
+    The gripper gives the held tool, and receives the fingertips' diameters.
     """
 
     def inputs(source: str) -> InputRecorder | None:
@@ -75,7 +73,7 @@ def build_sensors(
         return SerialLink(**device.model_dump(), monitor=LinkMonitor(DeviceLink(name, loop)))
 
     def pipeline(name: str, estimator: FrameEstimator) -> FingertipPipeline:
-        return FingertipPipeline(name, estimator, publisher, clock, loop, gripper, diameters, inputs(name))
+        return FingertipPipeline(name, estimator, publisher, clock, loop, gripper, inputs(name))
 
     pairs: CombinedFingertips | None = None
     if combined is not None:

@@ -35,7 +35,7 @@ class GripperTask:
     gripper: RobotiqGripper
     publisher: Publisher
     control_loop: ControlLoop
-    diameters: FingertipDiameters | None = None
+    diameters: FingertipDiameters
     measures_diameters: bool = True
 
     async def run(self) -> None:
@@ -104,7 +104,7 @@ class GripperTask:
         return self.gripper.diagnostics()
 
     def _publish(self, state: GripperState) -> None:
-        tool = tool_diameter(state, self.diameters.latest(state.t_ns) if self.diameters is not None else None)
+        tool = tool_diameter(state, self.diameters.latest(state.t_ns))
         self.publisher.publish(
             GripperStateMessage(
                 source="gripper",

@@ -19,7 +19,7 @@ from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFrame, EitHeatmap
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.frame_estimator import FrameEstimator
-from shearloop.daemon.sensing.tool_diameter import FingertipDiameters, tool_as_bytes
+from shearloop.daemon.sensing.tool_diameter import tool_as_bytes
 from shearloop.daemon.supervisor import TaskFacts
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
@@ -108,7 +108,8 @@ class _Tare:
 class FingertipPipeline:
     """Estimates from the frames of one fingertip, or of several together, for the control loop and for subscribers.
 
-    The gripper gives the held tool. `inputs` keeps the moments of tares and of changes of the tool.
+    The gripper gives the held tool, and receives the diameters. `inputs` keeps the moments of tares and of changes of
+    the tool.
     """
 
     name: str
@@ -117,7 +118,6 @@ class FingertipPipeline:
     clock: Clock
     loop: ControlLoop | None = None
     gripper: GripperTask | None = None
-    diameters: FingertipDiameters | None = None
     inputs: InputRecorder | None = None
     count: int = 0
     _tare: _Tare = field(default_factory=_Tare)
@@ -147,8 +147,8 @@ class FingertipPipeline:
         if self.loop is not None:
             t_mid_ns = message.t_mono_ns - round(1e9 * estimate.lag_s)
             self.loop.on_torque(TorqueSample(self.name, estimate.torque_nm, message.reason, t_mid_ns, now_ns))
-        if self.diameters is not None:
-            self.diameters.update(self.name, estimate, now_ns)
+        if self.gripper is not None:
+            self.gripper.diameters.update(self.name, estimate, now_ns)
         self.publisher.publish(message)
         self.count += 1
         self._tare.add(message.reason, taring=self.estimator.session.taring)

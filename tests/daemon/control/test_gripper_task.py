@@ -14,6 +14,7 @@ from shearloop.daemon.control.experiment_schema import GripStep
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import GripperStatus
+from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from tests.daemon.conftest import DEADLINE_S
 from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
 
@@ -28,7 +29,8 @@ class Felt(list[GripperStatus]):
 
 def task_of(rig: Rig, felt: Felt | None = None, *, measures_diameters: bool = True) -> GripperTask:
     silent = SimpleNamespace(publish=lambda _: None)
-    return GripperTask(rig.driver, silent, Felt() if felt is None else felt, measures_diameters=measures_diameters)
+    diameters = FingertipDiameters("combined")
+    return GripperTask(rig.driver, silent, Felt() if felt is None else felt, diameters, measures_diameters)
 
 
 @asynccontextmanager

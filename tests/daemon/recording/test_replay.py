@@ -31,6 +31,7 @@ from shearloop.daemon.recording.replay import (
 )
 from shearloop.daemon.recording.schema import message_json, with_missing_keys
 from shearloop.daemon.sensing.fingertip_task import FingertipPipeline
+from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from tests.daemon.conftest import ask, emulated_kit, running_daemon
 from tests.daemon.sample_messages import sample
 
@@ -45,6 +46,7 @@ class Gripper:
 
     def __init__(self, estimates: FingertipPipeline, tool: Measured, held: range) -> None:
         self._estimates, self._tool, self._held = estimates, tool, held
+        self.diameters = FingertipDiameters("combined")
 
     def held_tool(self, _t_ns: int) -> Measured | None:
         return self._tool if self._estimates.count in self._held else None

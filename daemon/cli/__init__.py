@@ -12,7 +12,7 @@ import re
 import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.process import raise_ending_signals, report_interrupt
@@ -69,7 +69,21 @@ With your own: `shearloop init DIR` writes a configuration, `shearloop ports` sh
 
 
 class Parser(argparse.ArgumentParser):
-    """Reports a mistake in one sentence and names the help."""
+    """Reports a mistake in one sentence and names the help; takes a list's values from between options too."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """Return the arguments and what is left over, as argparse does, with a list's later values in the list.
+
+        argparse ends a list of positional arguments at the first option: in `NAME --out DIR REC`, REC is left over.
+        """
+        found, extras = super().parse_known_args(args, namespace)
+        lists = [action for action in self._actions if not action.option_strings and action.nargs in ("*", "+")]
+        # A word after an unknown option may be its value.
+        if lists and not any(text.startswith("-") for text in extras):
+            more = [self._get_value(lists[-1], text) for text in extras]
+            setattr(found, lists[-1].dest, [*getattr(found, lists[-1].dest), *more])
+            return found, []
+        return found, extras
 
     def error(self, message: str) -> NoReturn:
         """Print the sentence and exit with status 2."""

@@ -2,6 +2,7 @@
 
 import argparse
 import ctypes
+import importlib
 import os
 import shutil
 import signal
@@ -161,12 +162,44 @@ def test_a_command_line_mistake_is_one_sentence(arguments, part, mistake):
     assert part in mistake(*arguments)
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "chart scene --out DIR a.mcap b.mcap",
+        "chart --out DIR scene a.mcap b.mcap",
+        "chart scene a.mcap --out DIR b.mcap",
+        "evaluate a.cal --json a.mcap --out DIR b.mcap",
+        "calibrate a.mcap --out DIR b.mcap",
+        "calibrate recording --out DIR a.mcap b.mcap",
+        "recording info a.mcap --json b.mcap",
+    ],
+)
+def test_options_may_stand_between_recordings(arguments, monkeypatch):
+    name, *words = arguments.split()
+    module = importlib.import_module(COMMANDS[name].module)
+    parsed = Mock(return_value=0)
+    for where in ("shearloop.daemon.cli.calibrate.recording.run", "shearloop.daemon.cli.recording._info"):
+        monkeypatch.setattr(where, parsed)
+    if name in ("chart", "evaluate"):
+        monkeypatch.setattr(module, "run", parsed)
+    assert main([name, *words]) == 0
+    [args] = parsed.call_args.args
+    assert [str(path) for path in args.recordings] == ["a.mcap", "b.mcap"]
+    assert getattr(args, "name", "scene") == "scene"
+
+
+def test_a_word_after_an_unknown_option_is_no_recording(capsys):
+    with pytest.raises(SystemExit):
+        main(["chart", "scene", "--out", "DIR", "--bnak", "my.bank"])
+    assert "unrecognized arguments: --bnak my.bank; did you mean --bank?" in capsys.readouterr().err
+
+
 INTERRUPTED = "shearloop evaluate: interrupted before it was done\n"
 
 
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_an_interrupted_command_reports_it_except_listen(number, status, monkeypatch, ran):
+def test_an_interrupted_command_reports_it_except_listen_and_view(number, status, monkeypatch, tmp_path, ran):
     def interrupted(*_: object) -> NoReturn:
         signal.raise_signal(number)
         raise AssertionError

@@ -35,8 +35,14 @@ def run(args: argparse.Namespace) -> int:
     """Serve the page until SIGINT, SIGTERM or SIGHUP."""
     if not 0 <= (port := args.port if args.foxglove is None else args.foxglove) <= 65535:
         raise UserError(f"{port} is not a port; give one from 1 to 65535, or 0 for any free one")
-    if args.foxglove is not None:
-        return _serve_foxglove(args)
+    try:
+        return _serve_page(args) if args.foxglove is None else _serve_foxglove(args)
+    except KeyboardInterrupt as interrupt:
+        # It ends by Ctrl-C, and nothing is left undone. At a demo's start the demo itself says that it was interrupted.
+        return interrupt_status(interrupt)
+
+
+def _serve_page(args: argparse.Namespace) -> int:
     require("aiohttp", "view", "the live view")
     from shearloop.daemon.logs import logging_to_stderr
     from shearloop.daemon.web.server import DaemonAddress, default_token_path, load_token, serve
@@ -64,13 +70,10 @@ def _serve_foxglove(args: argparse.Namespace) -> int:
     from shearloop.daemon.messaging.client import receive_messages
     from shearloop.daemon.web.foxglove import FoxgloveServer
 
-    try:
-        with FoxgloveServer(args.foxglove) as server:
-            url = f"ws://127.0.0.1:{server.port}"
-            sentence = f"{url}: open this connection in Foxglove, with the layout foxglove.json of `shearloop init`"
-            print_result({"url": url}, [sentence], as_json=args.json)
-            for topic, content in receive_messages(args.connect, (), keys=client_keys(args)):
-                server.publish(topic, content)
-    except KeyboardInterrupt as interrupt:
-        return interrupt_status(interrupt)
+    with FoxgloveServer(args.foxglove) as server:
+        url = f"ws://127.0.0.1:{server.port}"
+        sentence = f"{url}: open this connection in Foxglove, with the layout foxglove.json of `shearloop init`"
+        print_result({"url": url}, [sentence], as_json=args.json)
+        for topic, content in receive_messages(args.connect, (), keys=client_keys(args)):
+            server.publish(topic, content)
     return 0

@@ -208,6 +208,9 @@ def test_an_interrupted_command_reports_it_except_listen_and_view(number, status
     assert ran("evaluate", "a.cal", "b.mcap", status=status) == ("", INTERRUPTED)
     monkeypatch.setattr("shearloop.daemon.messaging.client.receive_messages", interrupted)
     assert ran("listen", status=status) == ("", "")
+    # The demo that starts it says that it was interrupted.
+    monkeypatch.setattr("shearloop.daemon.cli.view.load_fingertip", interrupted)
+    assert ran("view", "--token-file", tmp_path / "token", status=status) == ("", "")
 
 
 def test_a_closed_terminal_causes_no_traceback(monkeypatch, ran):

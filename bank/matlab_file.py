@@ -12,6 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
+from shearloop.words import counted
 
 _HEADER_BYTES = 128
 _COMPRESSED, _MATRIX, _INT8, _INT32, _UINT32 = 15, 14, 1, 5, 6
@@ -31,7 +32,7 @@ class Struct(list[dict[str, "Variable"]]):
 
     def __str__(self) -> str:
         """Return the number of elements in words."""
-        return f"{len(self)} structs"
+        return counted(len(self), "struct")
 
 
 # A matrix of real numbers, structs, or the description of something else.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
-from shearloop.drivers.errors import times
+from shearloop.words import counted, times
 
 if TYPE_CHECKING:
     from shearloop.daemon.logs import NonBlockingWriter
@@ -177,7 +177,7 @@ def _lines(run: _Run, truth: TorqueSeries | None, events: _Events) -> Iterator[s
         yield f"  {run.last['activity']}"
     for step in run.steps:
         took_s = (step.to_ns - step.from_ns) / 1e9
-        details = {"identify": run.identified, "twist": f"   {step.holds} angles held"}.get(step.name, "")
+        details = {"identify": run.identified, "twist": f"   {counted(step.holds, 'angle')} held"}.get(step.name, "")
         yield f"  step {step.number} of {run.first['steps']}  {step.name:<12} {took_s:6.1f} s{details}"
         if step.set_point_nm is not None and step.held_from_ns is not None:
             here = [event for event in events if step.from_ns <= event[0] <= step.to_ns]
@@ -263,4 +263,5 @@ def _counted(run: _Run) -> Iterator[str]:
         if source in run.torques:
             count, ((most, _),) = reasons_of.total(), reasons_of.most_common(1)
             every = count + len(run.torques[source])
-            yield f"  {count} of {every} torques of {source} were not valid and not used, most often: {most}"
+            unused = f"{count} of {counted(every, 'torque')} of {source} {'was' if count == 1 else 'were'}"
+            yield f"  {unused} not valid and not used, most often: {most}"

@@ -14,6 +14,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import DaemonEnd, Health, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.service import notify
+from shearloop.words import counted
 
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 30.0
@@ -134,7 +135,7 @@ class HealthReporter:
             if dead := self.supervisor.dead:
                 notify(f"STATUS=dead, restarting: {', '.join(dead)}")
             else:
-                notify("WATCHDOG=1", f"STATUS={len(self.supervisor.records)} tasks are alive")
+                notify("WATCHDOG=1", f"STATUS={counted(len(self.supervisor.records), 'task is', 'tasks are')} alive")
             health = Health(
                 source="daemon",
                 t_mono_ns=self.clock.now_ns(),

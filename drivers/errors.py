@@ -3,11 +3,6 @@
 import os
 
 
-def times(count: int) -> str:
-    """Return how often something happened: once, twice, 3 times."""
-    return {1: "once", 2: "twice"}.get(count, f"{count} times")
-
-
 def system_reason(error: OSError) -> str:
     """Return the system's words for an error, such as `Connection refused`, or our own; a timeout has none."""
     if error.errno is not None and error.errno > 0:

@@ -163,7 +163,7 @@ class MeasuredFrames:
         """Refuse too few frames, and frames that no board sends."""
         if len(self.differences) < _MIN_FRAMES:
             raise CalibrationError(
-                f"{len(self.differences)} gripped frames are too few to judge a model by; record {_MIN_FRAMES}"
+                f"too few gripped frames to judge a model by: {len(self.differences)}; record {_MIN_FRAMES}"
             )
         # Sizes that overflow as a square, or vanish, give no number.
         with np.errstate(all="ignore"):

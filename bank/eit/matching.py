@@ -17,6 +17,7 @@ from scipy.special import chdtri
 from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.errors import MatchingError
+from shearloop.words import counted
 
 # Scores closer than this are equal up to rounding: the first cell in (k, σ) order wins.
 TIE = 1e-12
@@ -151,7 +152,8 @@ def unit_magnitudes(differences: ArrayLike, n_channels: int) -> FloatArray:
     # Scaled by the largest first, so that squares neither overflow nor vanish.
     largest = magnitudes.max(axis=1, keepdims=True, initial=0.0)
     if not np.isfinite(largest).all():
-        raise MatchingError(f"{int((~np.isfinite(values)).sum())} channels of the difference are not finite")
+        wrong = int((~np.isfinite(values)).sum())
+        raise MatchingError(f"the difference has {counted(wrong, 'channel that is', 'channels that are')} not finite")
     if not (largest > 0).all():
         raise MatchingError("the difference is zero in all channels: there is nothing to match")
     magnitudes /= largest

@@ -14,6 +14,7 @@ from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import GeometryError
 from shearloop.bank.matlab_file import Struct, read_variables
 from shearloop.files import open_file, refusing_damage
+from shearloop.words import counted
 
 # A triangle with a smaller area over its longest edge squared is an error of the mesh.
 _THINNEST = 1e-8
@@ -210,11 +211,8 @@ def _check_triangles(mesh: Mesh) -> None:
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     thin = np.abs(doubled_areas(mesh.nodes, mesh.triangles)) <= 2 * _THINNEST * longest**2
     if thin.any():
-        which = int(np.flatnonzero(thin)[0])
-        raise GeometryError(
-            f"{int(thin.sum())} degenerate triangles: triangle {which} with nodes {mesh.triangles[which].tolist()} "
-            "has no area"
-        )
+        which, count = int(np.flatnonzero(thin)[0]), counted(int(thin.sum()), "degenerate triangle")
+        raise GeometryError(f"{count}: triangle {which} with nodes {mesh.triangles[which].tolist()} has no area")
     links = sp.coo_array(
         (np.ones(mesh.triangles.size), (mesh.triangles.ravel(), np.roll(mesh.triangles, 1, axis=1).ravel())),
         shape=(len(mesh.nodes), len(mesh.nodes)),

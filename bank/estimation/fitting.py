@@ -280,7 +280,7 @@ def _fit_slices(
         n = int(known.sum())
         if quantity == "torque" and n < estimator.least_slices:
             raise CalibrationError(
-                f"{n} slices with a torque are too few for the estimator {estimator.name}; record "
+                f"too few slices with a torque for the estimator {estimator.name}: {n}; record "
                 f"{estimator.least_slices} or more"
             )
         differences = np.abs(frames[known, 0])

@@ -24,6 +24,7 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.regressors import InverseCalibration, later_splits, left_out_blocks, left_out_groups
 from shearloop.bank.estimation.values import INLINE
 from shearloop.bank.gain import LOADED_SHARE, GainCorrection, GainSpread, find_twists, loaded_gain
+from shearloop.words import counted
 
 # Readings below this share of the largest torque mean that the lever does not touch.
 CENSORED_SHARE = 0.02
@@ -151,7 +152,7 @@ class Intervals:
         """
         if len(residuals) < _LEAST_RESIDUALS:
             raise CalibrationError(
-                f"{len(residuals)} frames left out of the fit are too few to determine the error; record more repeats"
+                f"too few frames left out of the fit to determine the error: {len(residuals)}; record more repeats"
             )
         kept: list[float] = []
         for edge in sorted(edges):
@@ -392,8 +393,8 @@ def fit_interval_regressor(
 def _check_values(values: FloatArray) -> None:
     if len(values) < _LEAST_FRAMES or np.ptp(values) == 0:
         raise CalibrationError(
-            f"{len(values)} frames with values between {np.min(values, initial=np.inf):.3g} and "
-            f"{np.max(values, initial=-np.inf):.3g} determine no calibration; record more, at different loads"
+            f"{counted(len(values), 'frame')} with values between {np.min(values, initial=np.inf):.3g} and "
+            f"{np.max(values, initial=-np.inf):.3g} cannot determine a calibration; record more, at different loads"
         )
 
 

@@ -111,7 +111,7 @@ class NoveltyDetector:
         """Fit to (n, c) differences in time order; the limits come from blocks of time left out in turn."""
         n, every = len(differences), np.ones(table.n_channels, dtype=np.bool_)
         if n < _LEAST_DIFFERENCES:
-            raise CalibrationError(f"{n} slices are too few to calibrate on; record {_LEAST_DIFFERENCES}")
+            raise CalibrationError(f"too few slices to calibrate on: {n}; record {_LEAST_DIFFERENCES}")
         _check_slices(differences)
         q_and_outlying, t2, responses = [], [], []
         for rest, block in left_out_blocks(n):

@@ -14,6 +14,7 @@ from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.values import INLINE
+from shearloop.words import counted
 
 N_BLOCKS = 5
 FIRST_ORIGIN, N_ORIGINS, LEAST_BEFORE_ORIGIN = 0.6, 20, 12
@@ -75,9 +76,9 @@ class InverseCalibration:
         least_values, least_frames = degree + 1, degree + n_trend + n_drift + 3
         if n_distinct < least_values or n < least_frames or scale == 0:
             raise CalibrationError(
-                f"{n} frames at {n_distinct} distinct values do not determine a curve of degree {degree} and its "
-                f"noise; record more, at more values: {least_values} values and {least_frames} frames must remain "
-                "where some are left out for validation"
+                f"{counted(n, 'frame')} at {counted(n_distinct, 'distinct value')} cannot determine a curve of "
+                f"degree {degree} and its noise; record more, at more values: {least_values} values and {least_frames} "
+                "frames must remain where some are left out for validation"
             )
         z = (values - centre) / scale
         spread = _spread_about_parabola(frames, z)

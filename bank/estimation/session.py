@@ -26,6 +26,7 @@ from shearloop.bank.estimation.session_state import (
 )
 from shearloop.bank.estimation.values import Estimate, Measured, TactileFrame
 from shearloop.bank.gain import GainCorrection, find_twists
+from shearloop.words import counted
 
 REPEATED_FRAME = ("the board sent the same frame again",)
 _UNITS: dict[Quantity, str] = {"torque": "N·m", "diameter": "mm"}
@@ -279,10 +280,11 @@ class EstimatorSession:
 
 def _dead_channel_reasons(validators: tuple[FingertipValidator, ...], usable: BoolArray) -> tuple[str, ...]:
     """Return which fingertips lack channels that worked at calibration, as reasons against an estimate."""
-    missing = [np.count_nonzero(~mask & np.isfinite(one.noise)) for one, mask in zip(validators, usable, strict=True)]
+    missing = [int(np.sum(~mask & np.isfinite(one.noise))) for one, mask in zip(validators, usable, strict=True)]
     return tuple(
-        f"{one.side} fingertip: {n} channels that worked at calibration are dead or saturated, and the estimate "
-        "depends on them; check the ribbon cable, calibrate again, or use the estimator motion_regression"
+        f"{one.side} fingertip: the estimate depends on every channel that worked at calibration, and "
+        f"{counted(n, 'is', 'are')} dead or saturated; check the ribbon cable, calibrate again, or use the "
+        "estimator motion_regression"
         for one, n in zip(validators, missing, strict=True)
         if n
     )

@@ -24,6 +24,7 @@ from shearloop.bank.estimation.fingertip_validator import (
     mask_saturated,
 )
 from shearloop.bank.estimation.values import TactileFrame
+from shearloop.words import counted
 
 # Frames (half a minute) in the mean difference of a grip: twists come and go within it.
 _HELD_FRAMES = 60
@@ -232,7 +233,7 @@ class GripMemory:
         self.positions.append(position)
         self._bridged.append(False)
         if wanted := self._motion.n_lags + 1 - len(self.positions):
-            return f"gripped too recently: {wanted} more {'frames are' if wanted > 1 else 'frame is'} needed"
+            return f"gripped too recently: {counted(wanted, 'more frame is', 'more frames are')} needed"
         if sum(self._bridged) > _LARGEST_BRIDGED:
             return "too many of the last frames were disturbed or are missing"
         self.held_frames = min(self.held_frames + 1, _HELD_FRAMES)

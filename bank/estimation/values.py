@@ -11,6 +11,7 @@ from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.confidence import TWO_SIDED_95
 from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.errors import CalibrationError
+from shearloop.words import counted
 
 # "raw": volts as the board sends them. "difference": slices, |frame − idle frame| smoothed over time.
 Kind = Literal["raw", "difference"]
@@ -171,7 +172,8 @@ def check_finite(recordings: Sequence[FrameSeries]) -> None:
         torque = one.torque_nm if one.kind == "raw" else np.zeros(0)
         wrong = sum(int(np.count_nonzero(~np.isfinite(values))) for values in (one.t_s, one.channels, torque))
         if wrong:
-            raise CalibrationError(f"{which} holds {wrong} values that are not finite numbers; leave those frames out")
+            found = counted(wrong, "value that is not a finite number", "values that are not finite numbers")
+            raise CalibrationError(f"{which} holds {found}; leave those frames out")
 
 
 def winkler_scores(truth: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:

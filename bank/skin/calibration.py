@@ -33,6 +33,7 @@ from shearloop.bank.skin.membrane import (
     ShearInterval,
     direction_of,
 )
+from shearloop.words import counted
 from shearloop.yaml_files import read_yaml, save_yaml, validated
 
 FORMAT = "shearloop skin calibration 3"
@@ -236,7 +237,8 @@ def fit_calibration(table: CalibrationTable, *, friction: float | None = None) -
     curve = _CurveFit(forces, kept, response[loaded][kept], upper, lower)
     if curve.freedom < 3:
         raise CalibrationError(
-            f"{len(curve.response)} rows under load cannot carry {1 + len(upper) + len(lower)} pieces of curve and an "
+            f"{counted(len(curve.response), 'row')} under load cannot carry "
+            f"{counted(1 + len(upper) + len(lower), 'piece')} of curve and an "
             "interval; record more."
         )
     # The response must go with the tension, not against it.

@@ -64,7 +64,7 @@ def fit_creep(grips: Sequence[Stretch], *, scale_is_right: bool = False) -> Fitt
     """
     if sum(grip.t_s.size for grip in grips) < _FEWEST:
         count = sum(grip.t_s.size for grip in grips)
-        raise UserError(f"creep: {count} readings are too few for a fit; hold a twist for a minute")
+        raise UserError(f"creep: too few readings for a fit: {count}; hold a twist for a minute")
     shear, torque = (np.concatenate([getattr(grip, name) for grip in grips]) for name in ("shear_nm", "torque_nm"))
     wanted = shear - torque if scale_is_right else shear
     plain = np.column_stack([np.ones_like(torque), *([] if scale_is_right else [torque])])

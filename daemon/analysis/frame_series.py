@@ -19,6 +19,7 @@ from shearloop.daemon.recording.matlab import (
 )
 from shearloop.daemon.recording.reader import Recording, read_recording
 from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, LOAD_DOUBT_NOTE, SIDES
+from shearloop.words import counted
 
 # Slices do not name their side.
 SLICE_SIDE = "right"
@@ -195,7 +196,8 @@ def check_no_copies(series: Sequence[tuple[str, FrameSeries]]) -> None:
             if first is not part:
                 copies.append((part, first))
     if copies:
-        more = f", and {len(copies) - 1} more are such copies" if len(copies) > 1 else ""
+        others = counted(len(copies) - 1, "more is such a copy", "more are such copies")
+        more = f", and {others}" if len(copies) > 1 else ""
         raise UserError("{} equals {}{}; leave copies out: they add nothing".format(*copies[0], more))
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_option
 from shearloop.daemon.errors import UserError
+from shearloop.words import counted
 
 if TYPE_CHECKING:
     from shearloop.daemon.config import CurveConfig, DaemonConfig, SkinConfig
@@ -114,7 +115,9 @@ def check_parts(config: "DaemonConfig", path: Path) -> Parts:
     with parts.of("experiment"):
         experiment = check_experiment(config, sources)
         if experiment is not None:
-            text = f"{experiment.name!r}, {len(experiment.steps)} steps, driven by {experiment.torque_source}"
+            text = (
+                f"{experiment.name!r}, {counted(len(experiment.steps), 'step')}, driven by {experiment.torque_source}"
+            )
             if warm_up_s := max((one.warm_up_s for one in sources.values() if one.measures_torque), default=0.0):
                 text += f"; after a grip it waits up to {warm_up_s:.0f} s for the first torques"
             parts.texts["experiment"] = text

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from shearloop.daemon.cli.options import add_option
 from shearloop.daemon.errors import UserError
+from shearloop.words import counted
 
 MARKS = {"good": "ok   ", "note": "note ", "trouble": "WRONG"}
 
@@ -47,5 +48,5 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps([asdict(finding) for finding in findings], ensure_ascii=False))
     else:
         notes = sum(finding.state == "note" for finding in findings)
-        print(f"{len(findings)} checks: {wrong} wrong, {notes} to note")
+        print(f"{counted(len(findings), 'check')}: {wrong} wrong, {notes} to note")
     return 1 if wrong else 0

@@ -11,6 +11,7 @@ from shearloop.bank.defaults import LOADED_NM
 from shearloop.daemon.cli.options import add_cluster, add_json, add_option, writing
 from shearloop.daemon.cli.terminal import table
 from shearloop.daemon.errors import UserError, missing
+from shearloop.words import counted
 
 if TYPE_CHECKING:
     from shearloop.bank.estimation import Calibration
@@ -110,8 +111,7 @@ def run(args: argparse.Namespace) -> int:
     print(f"Loaded frames have a known torque of {args.loaded_nm:g} N·m or more, unloaded frames less.")
     print(*_lines({**by_load, "all": figures}), sep="\n")
     for reason in invalid_reasons(tracks):
-        frames = "frame" if reason.frames == 1 else "frames"
-        print(f"{reason.frames:>6} {frames} not valid{', e.g.' if reason.differ else ''}: {reason.sentence}")
+        print(f"{counted(reason.frames, 'frame'):>13} not valid{', e.g.' if reason.differ else ''}: {reason.sentence}")
     return 0
 
 

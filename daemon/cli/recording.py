@@ -21,6 +21,7 @@ from shearloop.daemon.cli.options import (
 )
 from shearloop.daemon.cli.terminal import print_result, progress_bar
 from shearloop.daemon.errors import UserError
+from shearloop.words import counted
 
 if TYPE_CHECKING:
     from shearloop.daemon.recording.reader import RecordingSummary
@@ -90,11 +91,13 @@ def _summary_text(found: "RecordingSummary") -> str:
     lines += [f"  attached {name}" for name in found.attachments]
     if not found.closed:
         cure = f"`shearloop recording repair {found.path}` makes an indexed copy" if found.topics else "None is intact"
-        lines.append(f"  It was not closed, or is being written; {found.torn_bytes} bytes are incomplete. {cure}.")
+        torn = counted(found.torn_bytes, "byte is", "bytes are")
+        lines.append(f"  It was not closed, or is being written; {torn} incomplete. {cure}.")
     if found.damaged_chunks:
-        lines.append(f"  {found.damaged_chunks} chunks are damaged and left out.")
+        lines.append(f"  {counted(found.damaged_chunks, 'chunk is', 'chunks are')} damaged and left out.")
     if found.dropped:
-        lines.append(f"  {found.dropped} messages were dropped because the disk was too slow.")
+        dropped = counted(found.dropped, "message was", "messages were")
+        lines.append(f"  {dropped} dropped because the disk was too slow.")
     return "\n".join(lines)
 
 
@@ -104,9 +107,10 @@ def _repair(args: argparse.Namespace) -> int:
     path = args.recording
     with progress_bar(path.name, path.stat().st_size if path.is_file() else 0, "B") as progress:
         result = repair(path, args.out, progress)
-    lost = [f"{result.torn_bytes} incomplete bytes at the end"] if result.torn_bytes else []
-    lost += [f"{result.damaged_chunks} damaged chunks"] if result.damaged_chunks else []
-    sentence = f"{result.path}: {result.messages} messages are saved; left out: {' and '.join(lost) or 'nothing'}."
+    lost = [f"{counted(result.torn_bytes, 'incomplete byte')} at the end"] if result.torn_bytes else []
+    lost += [counted(result.damaged_chunks, "damaged chunk")] if result.damaged_chunks else []
+    saved = counted(result.messages, "message is", "messages are")
+    sentence = f"{result.path}: {saved} saved; left out: {' and '.join(lost) or 'nothing'}."
     return print_result({**asdict(result), "path": str(result.path)}, [sentence], as_json=args.json)
 
 
@@ -141,7 +145,7 @@ def _export(args: argparse.Namespace) -> int:
 
             written, missed = export_slices(path, out, topics, progress)
             for reason, count in missed.items():
-                print(f"{path}: {count} holds without a slice: {reason}", file=sys.stderr)
+                print(f"{path}: {counted(count, 'hold')} without a slice: {reason}", file=sys.stderr)
         else:
             written = export(path, form, out, topics, progress)
     return print_result({"files": [str(path) for path in written]}, map(str, written), as_json=args.json)
@@ -154,6 +158,6 @@ def _import(args: argparse.Namespace) -> int:
 
     check_overwrite(args.out, "a recording", MCAP0_MAGIC)
     imported = import_mat(args.sources, args.out)
-    counts = [f"{count} frames of the {side} side" for side, count in imported.frames.items()]
-    sentence = f"{args.out}: {', '.join(counts)}, {imported.torques} torques."
+    counts = [f"{counted(count, 'frame')} of the {side} side" for side, count in imported.frames.items()]
+    sentence = f"{args.out}: {', '.join(counts)}, {counted(imported.torques, 'torque')}."
     return print_result({"path": str(args.out), **asdict(imported)}, [sentence, *imported.remarks], as_json=args.json)

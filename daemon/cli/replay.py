@@ -13,6 +13,7 @@ from shearloop.daemon.cli.options import add_json, add_option
 from shearloop.daemon.cli.terminal import print_result
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
+from shearloop.words import counted
 
 if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig
@@ -100,7 +101,8 @@ def _comparison_text(comparison: "ReplayComparison", same_code: bool) -> list[st
         lines.append(f"{topic}: {count - different} of {count} equal the recorded ones, bit for bit")
     lines += comparison.examples
     if comparison.unrecorded:
-        lines.append(f"{comparison.unrecorded} computed messages are not in the recording.")
+        computed = counted(comparison.unrecorded, "computed message is", "computed messages are")
+        lines.append(f"{computed} not in the recording.")
     if comparison.different and not same_code:
         lines.append("The recording was made by different code, so its results may differ.")
     return lines

@@ -12,7 +12,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Any, Self, TextIO
 
 from shearloop.daemon.errors import UserError
-from shearloop.drivers.errors import times
+from shearloop.words import times
 
 if TYPE_CHECKING:
     from shearloop.daemon.logs import NonBlockingWriter

@@ -20,6 +20,7 @@ from shearloop.daemon.recording.writer import RecordingWriter
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import slope_below
 from shearloop.files import open_file
+from shearloop.words import counted
 
 # The recording scripts changed these names over time.
 _STREAMS = {
@@ -89,8 +90,7 @@ def read_stream(path: Path, name: str | None = None) -> Stream:
     names = _STREAMS[name] if name is not None else (*_STREAMS["right"], *_STREAMS["left"])
     table, width = _one_of(path, _load(path), names), 1 if name == "load" else PAPER_TABLE.n_line_values
     if table.shape[1] != width + 1 or len(table) == 0:
-        value = "value" if width == 1 else "values"
-        raise UserError(f"{path}: expected rows of one time and {width} {value}, found {_size(table)}")
+        raise UserError(f"{path}: expected rows of one time and {counted(width, 'value')}, found {_size(table)}")
     return Stream((table[:, 0] - _DATENUM_OF_UNIX_EPOCH) * _SECONDS_PER_DAY, np.ascontiguousarray(table[:, 1:]))
 
 
@@ -160,7 +160,9 @@ def _one_of(path: Path, variables: dict[str, Variable], names: Sequence[str]) ->
     if not isinstance(values, np.ndarray):
         raise UserError(f"{path}: {present[0]} is {values}, expected a matrix of real numbers")
     if not np.isfinite(values).all():
-        raise UserError(f"{path}: {int((~np.isfinite(values)).sum())} values of {present[0]} are not finite numbers")
+        wrong = int((~np.isfinite(values)).sum())
+        found = counted(wrong, "value that is not a finite number", "values that are not finite numbers")
+        raise UserError(f"{path}: {present[0]} has {found}")
     return values
 
 
@@ -299,7 +301,7 @@ def _valid_load(load: Stream, remarks: list[str]) -> Stream:
     valid = np.abs(load.values[:, 0]) <= LARGEST_TORQUE_NM
     if not valid.all():
         remarks.append(
-            f"{np.count_nonzero(~valid)} load values beyond {LARGEST_TORQUE_NM:g} N·m are damaged and were left out."
+            f"{counted(int(np.count_nonzero(~valid)), 'damaged load value')} beyond {LARGEST_TORQUE_NM:g} N·m left out."
         )
     order = np.flatnonzero(valid)[np.argsort(load.unix_s[valid], kind="stable")]
     return Stream(load.unix_s[order], load.values[order])

@@ -23,6 +23,7 @@ from shearloop.daemon.sensing.tool_diameter import tool_as_bytes
 from shearloop.daemon.supervisor import TaskFacts
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
+from shearloop.words import counted
 
 # Largest distance in time of a pair of frames, as a share of the frame period.
 _MAX_APART_PERIODS = 0.75
@@ -101,7 +102,7 @@ class _Tare:
     def reasons(self) -> str:
         """The reasons with their counts, the most frequent first."""
         often = sorted(self._refused.values(), reverse=True)
-        return ", ".join(f"{count} {'frame' if count == 1 else 'frames'}: {reason}" for count, reason in often)
+        return ", ".join(f"{counted(count, 'frame')}: {reason}" for count, reason in often)
 
 
 @dataclass(slots=True)

@@ -17,6 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from shearloop.files import replace_file
+from shearloop.words import counted
 
 Model = TypeVar("Model")
 
@@ -242,7 +243,9 @@ def _mistakes(
             key += "." + details["ctx"]["discriminator"].strip("'")
         subject = f"{key}: " if key else ""
         found[f"{where}{f':{line}' if root is not None else ''}: {subject}{_sentence(details, schema)}"] = line
-    return sorted(found, key=lambda text: found[text]) + ([f"{where}: {len(more)} more mistakes"] if more else [])
+    return sorted(found, key=lambda text: found[text]) + (
+        [f"{where}: {counted(len(more), 'more mistake')}"] if more else []
+    )
 
 
 def _place(location: Sequence[int | str], content: object, node: yaml.Node | None, *, missing: bool) -> tuple[str, int]:

@@ -197,7 +197,7 @@ def test_what_is_good_enough_by_luck_is_not_chosen():
 
 
 def test_too_few_frames_are_refused(clean):
-    with pytest.raises(CalibrationError, match="too few to judge a model by"):
+    with pytest.raises(CalibrationError, match="too few gripped frames to judge a model by"):
         MeasuredFrames(clean[:5], 1e-4, None)
 
 

@@ -213,8 +213,8 @@ def test_hard_scenes(kind, scene):
 def test_what_cannot_be_matched_is_refused_alike(slow, fast):
     for frame, says in (
         (np.zeros(PAPER_TABLE.n_channels), "zero in all channels"),
-        (np.full(PAPER_TABLE.n_channels, np.nan), "896 channels of the difference are not finite"),
-        (np.append(np.ones(PAPER_TABLE.n_channels - 1), np.inf), "1 channels of the difference are not finite"),
+        (np.full(PAPER_TABLE.n_channels, np.nan), "has 896 channels that are not finite"),
+        (np.append(np.ones(PAPER_TABLE.n_channels - 1), np.inf), "has 1 channel that is not finite"),
         (np.ones(1024), "896 channels; the array has shape"),
         (np.ones((1, PAPER_TABLE.n_channels)), "has shape"),
         (np.ones((PAPER_TABLE.n_channels, 1)), "has shape"),

@@ -64,7 +64,7 @@ def test_a_recording_without_held_twists_is_refused(monkeypatch, mistake):
     found = track(np.arange(1109) < 10)
     played(monkeypatch, found)
     said = mistake("calibrate", "creep", "held.mcap", "--calibration", "right.cal")
-    assert "10 readings are too few for a fit; hold a twist for a minute" in said
+    assert "too few readings for a fit: 10; hold a twist for a minute" in said
 
 
 def test_twists_that_are_given_twice_are_refused(monkeypatch, mistake):

@@ -73,7 +73,7 @@ def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturban
     assert "true torque +0.0945 N·m on average, standard deviation 0.0116, within ± 10% for 82% of the time" in text
     assert "within ± 10% 3.0 s after the set point changed, by true torque" in text
     assert "disturbed after 12.0 s (kick -0.03): 0.030 N·m off, back within ± 10% after 5.5 s" in text
-    assert "1 of 61 torques of right were not valid and not used, most often: no grip" in text
+    assert "1 of 61 torques of right was not valid and not used, most often: no grip" in text
     assert "the wrist was never held" in text
 
 

@@ -37,6 +37,7 @@ from shearloop.daemon.recording.matlab import (
     read_torque_slices,
 )
 from shearloop.daemon.recording.reader import Progress
+from shearloop.words import counted
 
 # Torque is a parabola over σ and diameter a line over k (Trehan et al. 2025, figures 8 and 9).
 _TORQUE_DEGREE, _DIAMETER_DEGREE = 2, 1
@@ -65,9 +66,8 @@ def read_inputs(recordings: Path) -> Inputs:
     if torque_folder.is_dir():
         torque = read_torque_slices(torque_folder)
         if len(torque.torque_nm) < FEWEST_SLICES:
-            raise UserError(
-                f"{torque_folder} has {len(torque.torque_nm)} slices; a correlation needs at least {FEWEST_SLICES}"
-            )
+            found = counted(len(torque.torque_nm), "slice")
+            raise UserError(f"{torque_folder} has {found}; a correlation needs at least {FEWEST_SLICES}")
         raw = _raw_difference(torque_folder, notes)
     else:
         notes.append(f"{torque_folder} does not exist: nothing about torque, and no scores of the models.")
@@ -247,7 +247,7 @@ def analyse_diameter(slices: Slices, wide: Bank, progress: Progress) -> Diameter
     running_k = _best_matches(np.concatenate(sums), wide).k
     notes: list[str] = []
     if r_accumulated is None:
-        notes.append(f"{len(diameters)} diameters, or too few distinct k, do not make a correlation of k with diameter")
+        notes.append(f"{counted(len(diameters), 'diameter')}, or too few distinct k: no correlation of k with diameter")
     return DiameterResult(
         slices=slices,
         single=single,

@@ -29,6 +29,7 @@ from shearloop.daemon.analysis.reproduce.dataset import (
     Twists,
     dataset_figure,
 )
+from shearloop.words import counted
 
 PAPER = "Trehan, Hardman and Iida 2025, Sensors 25, 5159"
 # As published, without signs: sigma falls with rising torque, and k with rising diameter.
@@ -139,7 +140,7 @@ def explanations(found: Reproduction) -> list[str]:
     sentences = [f"Paper: {PAPER}; it gives magnitudes, and torque from 99 slices.", f"Mesh: {found.mesh_origin}."]
     if found.torque:
         sentences += [
-            f"Torque: {len(found.torque.slices.torque_nm)} slices, grouped {found.torque.grouping}.",
+            f"Torque: {counted(len(found.torque.slices.torque_nm), 'slice')}, grouped {found.torque.grouping}.",
             f"RMSE: a parabola for single slices, {found.torque.held_out}; no other recording is tried.",
         ]
     if found.regressions:
@@ -147,8 +148,8 @@ def explanations(found: Reproduction) -> list[str]:
     if found.diameter:
         n_slices, n_diameters = len(found.diameter.slices.diameter_mm), len(found.diameter.diameters_mm)
         sentences.append(
-            f"Diameter: {n_slices} slices of {n_diameters} diameters, smoothed along the channels. The heatmaps of a "
-            "cylinder are added up to one point, or up to each slice in turn (running sums)."
+            f"Diameter: {counted(n_slices, 'slice')} of {counted(n_diameters, 'diameter')}, smoothed along channels. "
+            "The heatmaps of a cylinder are added up to one point, or up to each slice in turn (running sums)."
         )
     if found.models:
         sentences += _model_explanations(found.models)
@@ -313,9 +314,8 @@ def diameter_figure(diameter: DiameterResult, bank: Bank) -> Figure:
     _label(scatter, title, xlabel="k of the best match (cm)", ylabel="diameter (mm)")
     titles = [f"{diameters_mm[index]:g} mm, k = {means_k[index]:.2f} cm" for index in shown]
     _heatmap_row(made, lower, diameter.accumulated, shown, titles, bank)
-    made.suptitle(
-        f"Diameter from k (figure 9): {len(measured)} slices of {len(diameters_mm)} diameters, wide bank", fontsize=11
-    )
+    slices = f"{counted(len(measured), 'slice')} of {counted(len(diameters_mm), 'diameter')}"
+    made.suptitle(f"Diameter from k (figure 9): {slices}, wide bank", fontsize=11)
     return made
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from shearloop.daemon.cli.options import add_json, add_option
 from shearloop.daemon.cli.terminal import print_result
+from shearloop.words import counted
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -47,9 +48,9 @@ def run(args: argparse.Namespace) -> int:
     }
     sentences = [
         f"creep: {{share: {share:g}, time_s: {time_s:g}}}",
-        f"From {result['frames']} frames of {len(grips)} grips: the estimates, scaled by {found.scale:.3f} and shifted "
-        f"by {1e3 * found.offset_nm:+.1f} mN·m, follow the load cell within {1e3 * found.after_nm:.1f} mN·m instead of "
-        f"{1e3 * found.before_nm:.1f} (standard deviation).",
+        f"From {result['frames']} frames of {counted(len(grips), 'grip')}: the estimates, scaled by {found.scale:.3f} "
+        f"and shifted by {1e3 * found.offset_nm:+.1f} mN·m, follow the load cell within {1e3 * found.after_nm:.1f} "
+        f"mN·m instead of {1e3 * found.before_nm:.1f} (standard deviation).",
         "The line above does not correct scale and zero. If the scale is far from 1, calibrate the estimator again; if "
         "the shift is far from 0, tare untouched.",
     ]

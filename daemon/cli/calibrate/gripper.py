@@ -10,6 +10,7 @@ from shearloop.daemon.cli.options import add_json, add_option, check_calibration
 from shearloop.daemon.cli.terminal import Operator, print_result
 from shearloop.daemon.errors import UserError
 from shearloop.drivers.defaults import URCAP_PORT
+from shearloop.words import counted
 
 if TYPE_CHECKING:
     from shearloop.drivers.robotiq.gripper import RobotiqGripper
@@ -83,7 +84,7 @@ async def _grip(gripper: "RobotiqGripper", diameters_mm: list[float], operator: 
                 if counts is None:
                     print("Refused: the fingers closed without meeting anything.", file=sys.stderr, flush=True)
                 else:
-                    operator.say(f"  {diameter_mm:g} mm: {counts} counts.")
+                    operator.say(f"  {diameter_mm:g} mm: {counted(counts, 'count')}.")
                     gauges.append((counts, diameter_mm))
             return gauges
         finally:

@@ -83,8 +83,8 @@ def test_torques_that_the_dead_channels_alone_told_of_are_refused(twisting, monk
     assert len(refused) > 100
     for one in refused:
         assert one.reasons == (
-            "right fingertip: 112 channels that worked at calibration are dead or saturated, and the estimate depends "
-            "on them; check the ribbon cable, calibrate again, or use the estimator motion_regression",
+            "right fingertip: the estimate depends on every channel that worked at calibration, and 112 are dead or "
+            "saturated; check the ribbon cable, calibrate again, or use the estimator motion_regression",
         )
     # Other channels told nothing of it, and some of those that did leave a guess: the interval holds it (else 11 %).
     for dead in (DEAD["a fifth"] & ~ELECTRODE, DEAD["an electrode that measures"]):

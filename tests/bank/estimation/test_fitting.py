@@ -18,14 +18,14 @@ def with_a_nan(values):
 @pytest.mark.parametrize("name", ["t_s", "channels", "torque_nm"])
 def test_values_that_are_no_numbers_are_told(recorded, name):
     spoilt = replace(recorded, **{name: with_a_nan(getattr(recorded, name))})
-    with pytest.raises(CalibrationError, match="recording 2 of 2 holds 1 values that are not finite numbers"):
+    with pytest.raises(CalibrationError, match="recording 2 of 2 holds 1 value that is not a finite number"):
         fit("motion_regression", [recorded, spoilt], "rig", timing=TRUSTED)
 
 
 def test_a_recording_or_slice_without_frames_or_numbers_is_told(recorded, sliced):
     slices = sliced()
     for series, message in (
-        ([replace(slices, channels=with_a_nan(slices.channels))], "holds 1 values that are not finite"),
+        ([replace(slices, channels=with_a_nan(slices.channels))], "holds 1 value that is not a finite"),
         ([recorded.between(0, 0)], "recording 1 of 1 has no frames"),
         ([slices, slices.between(0, 0)], "recording 2 of 2 has no frames"),
         ([slices, recorded], "do not fit into one calibration"),

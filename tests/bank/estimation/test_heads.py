@@ -118,7 +118,7 @@ def test_a_response_that_shrinks_with_age_is_followed_beyond_what_was_fitted():
 
 def test_a_curve_needs_enough_frames():
     rng = np.random.default_rng(7)
-    with pytest.raises(CalibrationError, match="4 frames at 2 distinct values do not determine"):
+    with pytest.raises(CalibrationError, match="4 frames at 2 distinct values cannot determine"):
         InverseCalibration.fit(rng.normal(size=(4, 9)), np.array([1.0, 1.0, 2.0, 2.0]), 2, 1)
 
 

@@ -51,7 +51,7 @@ def test_a_torn_recording_is_refused_and_repaired(recording, tmp_path, ran, mist
     assert "exists already" in mistake("recording", "repair", torn)
 
 
-def test_a_damaged_chunk_is_left_out_and_counted(tmp_path, result_of, monkeypatch):
+def test_a_damaged_chunk_is_left_out_and_counted(tmp_path, ran, result_of, monkeypatch):
     monkeypatch.setattr("shearloop.daemon.recording.writer._FLUSH_EVERY", 1)
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, "a bench") as writer:
@@ -61,6 +61,7 @@ def test_a_damaged_chunk_is_left_out_and_counted(tmp_path, result_of, monkeypatc
     at = content.index(b'{"torque_nm":0.5}') if b'{"torque_nm":0.5}' in content else len(content) // 4
     content[at : at + 4] = bytes(255 - byte for byte in content[at : at + 4])
     path.write_bytes(content)
+    assert "  1 chunk is damaged and left out.\n" in ran("recording", "info", path).out
     printed = result_of("recording", "repair", path)
     assert (printed["path"], printed["damaged_chunks"]) == (str(tmp_path / "a.repaired.mcap"), 1)
     kept = read_recording(tmp_path / "a.repaired.mcap").torque_nm

@@ -223,7 +223,7 @@ def test_what_is_given_twice_is_refused_by_its_name(slices_folder, mat_folder, t
         (cylinders / f"20mm_Data_{number}.mat").write_bytes((cylinders / "20mm_Data_2.mat").read_bytes())
     refusal = refused(cylinders)
     assert "slice 5 of 20 mm equals" in refusal
-    assert "slice 2 of 20 mm, and 1 more are such copies; leave copies out" in refusal
+    assert "slice 2 of 20 mm, and 1 more is such a copy; leave copies out" in refusal
     first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"
     ran("import", "mat", mat_folder(), "--out", first)
     second.write_bytes(first.read_bytes())

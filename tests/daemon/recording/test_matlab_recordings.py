@@ -99,7 +99,7 @@ def test_a_raw_line_is_read(tmp_path, name):
         (read_stream, {"Right_Data": np.ones((4, 1024))}, "one time and 1024 values, found 4 × 1024"),
         (read_stream, {"Right_Data": np.ones((0, 1025))}, "found 0 × "),
         (read_stream, {"Right_Data": "text"}, "Right_Data is 1 × 4 text, expected a matrix"),
-        (read_stream, {"Right_Data": np.full((2, 1025), np.nan)}, "2050 values of Right_Data are not finite"),
+        (read_stream, {"Right_Data": np.full((2, 1025), np.nan)}, "Right_Data has 2050 values that are not finite"),
         (read_load_stream, {"Load_Data": np.ones((4, 3))}, "one time and 1 value, found 4 × 3"),
         (read_line, {"clipped_data": np.ones((1, 896))}, "expected 1 × 1024 values, found 1 × 896"),
     ],
@@ -129,7 +129,7 @@ def test_unusable_slices_are_refused(tmp_path):
 
 def test_structs_are_read_with_their_fields():
     found = read_variables(saved({"x": {"a": 1.0, "long_name": {"b": np.eye(2)}}}))["x"]
-    assert str(found) == "1 structs"
+    assert str(found) == "1 struct"
     assert found[0]["a"] == 1.0
     np.testing.assert_array_equal(found[0]["long_name"][0]["b"], np.eye(2))
 

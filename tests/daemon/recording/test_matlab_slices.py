@@ -165,7 +165,7 @@ def test_a_missed_slice_is_reported_with_its_reason(tmp_path, tared, for_s, fram
     sweep.hold(1, 0.1, for_s, **frames)
     assert not sweep.export(tmp_path)[0]
     arguments = ("--format", "slices", "--out", str(tmp_path / "out"))
-    assert f"{sweep.path}: 1 holds without a slice:" in (said := ran("recording", "export", sweep.path, *arguments).err)
+    assert f"{sweep.path}: 1 hold without a slice:" in (said := ran("recording", "export", sweep.path, *arguments).err)
     assert reason in said
 
 

@@ -150,7 +150,7 @@ def test_damaged_load_values_are_counted_and_left_out(mat_folder, tmp_path):
     found = read_recording(tmp_path / "a.mcap")
     assert imported.torques == len(found.torque_nm) == 353
     assert np.abs(found.torque_nm).max() < 0.06
-    assert "2 load values beyond 20 N·m" in imported.remarks[0]
+    assert "2 damaged load values beyond 20 N·m" in imported.remarks[0]
 
 
 def test_the_diameter_in_the_files_names_is_noted(mat_folder, tmp_path):

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
+from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
 from shearloop.words import counted, times
 
@@ -27,7 +28,18 @@ TORQUES = ("eit.estimate", "load.torque", "skin.shear")
 # The name of the emulated tool's torque, which no sensor measures.
 TRUE = "true torque"
 _ENDS = ("done", "stopped")
-_EMULATED_STOP = "  The rig is emulated. Unless you stopped it, this computer was too busy: close other programs."
+# Emulated devices have these faults only if they are told to, or if their computer is too busy for them.
+_LATE_FAULTS = (
+    FaultCode.ESTIMATE_STALE,
+    FaultCode.STATE_STALE,
+    FaultCode.DEVICE_LOST,
+    FaultCode.ROBOT_LOST,
+    FaultCode.ROBOT_BLOCKED,
+    FaultCode.DAEMON_PAUSED,
+    FaultCode.LOOP_LATE,
+    FaultCode.STEP_OVERDUE,
+)
+_TOO_BUSY = "  The rig is emulated, and this computer was too busy for it: close other programs and run it again."
 # The time of each disturbance in ns, and its description.
 _Events: TypeAlias = Sequence[tuple[int, str]]
 
@@ -112,8 +124,8 @@ class RunSummary:
             self._run = None
             rig = self._emulated
             lines = list(_lines(run, None, ()) if rig is None else _lines(run, rig.torques(), rig.sent))
-            if rig is not None and phase != "done":
-                lines.append(_EMULATED_STOP)
+            if rig is not None and phase != "done" and _came_late(content["activity"]):
+                lines.append(_TOO_BUSY)
             self.text = ""
             self._add("\n".join(lines))
 
@@ -121,6 +133,13 @@ class RunSummary:
         self.text = f"{self.text}\n{text}".lstrip("\n")
         if self._out is not None:
             self._out.write(f"\n{text}\n\n")
+
+
+def _came_late(reason: str) -> bool:
+    """Return whether the reason of a stop has a fault that a busy computer causes on an emulated rig."""
+    sentences = (fault.value.sentence.partition(":")[0] for fault in _LATE_FAULTS)
+    # The fault of a wrist that was held for too long lists the others by their names.
+    return any(text in reason for text in (*sentences, *(fault.text for fault in _LATE_FAULTS)))
 
 
 def stop_sentence(content: Mapping[str, Any]) -> str:

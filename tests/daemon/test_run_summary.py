@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.run_summary import RunSummary, TorqueSeries
 
 S = 1_000_000_000
@@ -139,13 +140,29 @@ def test_where_a_screw_ended_and_what_it_took_is_told():
     assert "    load_cell   -0.1210 N·m at the end, -0.1760 at most" in text
 
 
-@pytest.mark.parametrize(("phase", "shown"), [("stopped", 1), ("done", 0)])
-def test_a_stop_of_an_emulated_rig_names_the_busy_computer(phase, shown):
-    assert summary_of(loop_state(0), loop_state(5, phase=phase)).count("The rig is emulated.") == shown
+@pytest.mark.parametrize(
+    ("code", "detail", "shown"),
+    [
+        (FaultCode.STATE_STALE, "the robot last reported its state 0.31 s ago", True),
+        (FaultCode.ESTIMATE_STALE, "the last torque of right came 3.4 s ago", True),
+        (FaultCode.ROBOT_BLOCKED, "The control program on the robot does not run.", True),
+        (FaultCode.HELD_TOO_LONG, "state stale for 3.1 s, estimate stale for 2.2 s", True),
+        (FaultCode.HELD_TOO_LONG, "torques disagree for 2.8 s, estimate jumped for 2.5 s", False),
+        (FaultCode.TORQUE_LIMIT, "right measured +0.300 N·m, the limit is 0.25 N·m", False),
+    ],
+)
+def test_a_late_stop_of_an_emulated_rig_names_the_busy_computer(code, detail, shown):
+    messages = loop_state(0), loop_state(5, phase="stopped", activity=Fault(code, detail).sentence)
+    assert ("this computer was too busy" in summary_of(*messages)) == shown
     on_a_rig = RunSummary(out := StringIO())
-    for content in (loop_state(0), loop_state(5, phase=phase)):
+    for content in messages:
         on_a_rig("loop.state", content)
-    assert "emulated" not in out.getvalue()
+    assert "too busy" not in out.getvalue()
+
+
+@pytest.mark.parametrize("reason", ["the daemon ended: the wrist is stopped", "the operator said stop"])
+def test_a_stop_that_was_asked_for_blames_no_computer(reason):
+    assert "busy" not in summary_of(loop_state(0), loop_state(5, phase="stopped", activity=reason))
 
 
 def test_the_times_of_a_stop_follow_the_summary():

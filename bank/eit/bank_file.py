@@ -240,7 +240,12 @@ def _sha256(array: NDArray[Any]) -> str:
 
 
 def _cure(path: Path) -> str:
-    return f"build it with `shearloop bank build --config FILE --out {path}`, from a FILE such as banks/paper.yaml"
+    """Return the command that builds a bank, from the definition with its name where there is one."""
+    folders = path.parent / "banks", path.parent, path.parent.parent / "config" / "banks"
+    definitions = [folder / f"{path.stem}.yaml" for folder in folders]
+    named = next((one for one in definitions if one.is_file()), None)
+    example = ", from a FILE such as banks/paper.yaml" if named is None else ""
+    return f"build it with `shearloop bank build --config {named or 'FILE'} --out {path}`{example}"
 
 
 def _unusable(path: Path, why: str) -> BankFileError:

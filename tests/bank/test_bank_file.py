@@ -120,6 +120,17 @@ def test_every_flipped_byte_is_found(path):
             assert Bank.open(path).identity == DEFINITION.identity
 
 
+@pytest.mark.parametrize("definition", ["banks/mine.yaml", "mine.yaml", "../config/banks/mine.yaml"])
+def test_a_missing_bank_names_its_definition(definition, tmp_path):
+    named = tmp_path / "run" / definition
+    named.parent.resolve().mkdir(parents=True, exist_ok=True)
+    named.resolve().write_text("")
+    bank = tmp_path / "run" / "mine.bank"
+    build = f"shearloop bank build --config {named.resolve()} --out {bank}`"
+    with pytest.raises(BankFileError, match=f"{re.escape(build)}$"):
+        Bank.open(bank)
+
+
 def test_foreign_files_other_formats_and_other_channel_tables_are_refused(path, tmp_path):
     with pytest.raises(BankFileError, match=r"none\.bank: the bank cannot be read: No such file.*shearloop bank build"):
         Bank.open(tmp_path / "none.bank")

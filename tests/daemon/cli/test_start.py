@@ -58,6 +58,8 @@ def test_init_writes_files_that_load_and_changes_none(tmp_path, ran, mistake):
     assert config.robot == folder / "ur.yaml"
     assert not config.emulators
     assert load_yaml_model(folder / "experiments" / "tighten.yaml", ExperimentFile).steps
+    build = f"shearloop bank build --config {folder / 'banks' / 'paper.yaml'} --out {folder / 'paper.bank'}"
+    assert f"build it with `{build}`" in mistake("check", folder / "rig.yaml")
     schema_for(folder / "banks" / "paper.yaml")
     (folder / "rig.yaml").write_text("mine")
     (folder / "ur.yaml").unlink()

@@ -85,17 +85,26 @@ class ToolModel:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Least squares of torque = stiffness·angle + offset + drift·time (0 at the end), residuals (m,), covariance."""
+    """Least squares of torque = stiffness·angle + offset + drift·time (0 at the end), residuals (m,).
 
-    lag_s: float
+    `equations` are their left sides, (m + 1, 3): the last one bounds the drift.
+    """
+
     coefficients: FloatArray
-    covariance: FloatArray
+    equations: FloatArray
     residuals: FloatArray
-    angle_rad: FloatArray
+
+    @property
+    def angle_rad(self) -> FloatArray:
+        return self.equations[:-1, 0]
 
     @property
     def squares(self) -> float:
         return float(self.residuals @ self.residuals)
+
+    def covariance(self) -> FloatArray:
+        degrees = self.residuals.size - self.coefficients.size
+        return np.asarray(self.squares / degrees * np.linalg.pinv(self.equations.T @ self.equations), np.float64)
 
 
 def identify(record: Record, window_s: float, stiffness_share: float = _WORST_STIFFNESS_SHARE) -> ToolModel:
@@ -113,15 +122,18 @@ def identify(record: Record, window_s: float, stiffness_share: float = _WORST_ST
             f"record for longer, and check why torques are missing"
         )
     t_mid_s, torque_nm = record.t_mid_s[used], record.torque_nm[used]
-    fits = [_fit(record, t_mid_s, torque_nm, window_s, float(lag)) for lag in _LAG_GRID_S]
+    # The wrist rests before the first motion and after the last. All lags at once, because the loop waits.
+    lagged_s = (t_mid_s - _LAG_GRID_S[:, np.newaxis]).ravel()
+    angles = window_means(record.angle_t_s, record.angle_rad, lagged_s, window_s).reshape(-1, t_mid_s.size)
+    fits = [_fit(angle_rad, t_mid_s, torque_nm) for angle_rad in angles]
     best = min(fits, key=lambda fit: fit.squares)
     noise_nm = _noise(best.residuals)
     _refuse_bad(best, torque_nm, noise_nm, stiffness_share)
     lag_s, lag_std_s = _lag(fits, noise_nm)
-    now = np.array([record.angle_rad[-1], 1.0, 0.0])
+    now, covariance = np.array([record.angle_rad[-1], 1.0, 0.0]), best.covariance()
     return ToolModel(
         stiffness_nm_per_rad=float(best.coefficients[0]),
-        stiffness_std=math.sqrt(best.covariance[0, 0]),
+        stiffness_std=math.sqrt(covariance[0, 0]),
         lag_s=lag_s,
         lag_std_s=lag_std_s,
         age_s=float(np.quantile(record.t_s[used] - t_mid_s, 0.95)),
@@ -130,25 +142,21 @@ def identify(record: Record, window_s: float, stiffness_share: float = _WORST_ST
         sample_period_s=float(np.median(np.diff(record.t_mid_s))),
         angle_rad=float(record.angle_rad[-1]),
         torque_nm=float(now @ best.coefficients),
-        torque_std_nm=math.sqrt(now @ best.covariance @ now),
+        torque_std_nm=math.sqrt(now @ covariance @ now),
     )
 
 
-def _fit(record: Record, t_mid_s: FloatArray, torque_nm: FloatArray, window_s: float, lag_s: float) -> _Fit:
-    # The wrist rests before the first motion and after the last.
-    angle = window_means(record.angle_t_s, record.angle_rad, t_mid_s - lag_s, window_s)
+def _fit(angle_rad: FloatArray, t_mid_s: FloatArray, torque_nm: FloatArray) -> _Fit:
     since = (t_mid_s - t_mid_s[-1]) / (t_mid_s[-1] - t_mid_s[0])
-    design = np.column_stack([angle, np.ones_like(angle), since])
+    design = np.column_stack([angle_rad, np.ones_like(angle_rad), since])
     degrees = torque_nm.size - design.shape[1]
     free = np.linalg.lstsq(design, torque_nm, rcond=None)[0]
     std = float(np.linalg.norm(torque_nm - design @ free)) / math.sqrt(degrees)
     # The expected size of the drift as one more equation: else noise passes for drift, and spoils the last torque.
-    drift_nm = max(_DRIFT_SHARE * abs(float(free[0])) * float(np.ptp(angle)), 1e-9)
+    drift_nm = max(_DRIFT_SHARE * abs(float(free[0])) * float(np.ptp(angle_rad)), 1e-9)
     bounded = np.vstack([design, [0.0, 0.0, std / drift_nm]])
     coefficients = np.linalg.lstsq(bounded, np.append(torque_nm, 0.0), rcond=None)[0]
-    residuals = torque_nm - design @ coefficients
-    covariance = float(residuals @ residuals) / degrees * np.linalg.pinv(bounded.T @ bounded)
-    return _Fit(lag_s, coefficients, covariance, residuals, angle)
+    return _Fit(coefficients, bounded, torque_nm - design @ coefficients)
 
 
 def window_means(t_s: FloatArray, values: FloatArray, middle_s: FloatArray, window_s: float) -> FloatArray:
@@ -170,7 +178,7 @@ def _noise(residuals: FloatArray) -> float:
 
 
 def _refuse_bad(fit: _Fit, torque_nm: FloatArray, noise_nm: float, stiffness_share: float) -> None:
-    stiffness, std = float(fit.coefficients[0]), math.sqrt(fit.covariance[0, 0])
+    stiffness, std = float(fit.coefficients[0]), math.sqrt(fit.covariance()[0, 0])
     turned = float(np.ptp(fit.angle_rad))
     if turned < _NO_TURN_RAD:
         raise IdentifyError("identify: the wrist did not turn, so the stiffness is unknown")

@@ -1,4 +1,4 @@
-"""Connections to devices: serial ports and TCP sockets in an asyncio loop, reopened after a loss. No threads.
+"""Connections to devices: serial ports and TCP sockets in an asyncio loop, reopened after a loss.
 
 Pseudo-terminals work like any other port. Protocols belong to the device's own module.
 """
@@ -6,11 +6,16 @@ Pseudo-terminals work like any other port. Protocols belong to the device's own 
 import asyncio
 import contextlib
 import errno
+import fcntl
 import os
+import select
+import termios
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from queue import SimpleQueue
 from typing import Protocol, Self, TypeAlias
 
 import serial
@@ -21,11 +26,13 @@ from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, Devic
 DEFAULT_BAUD = 115_200
 # The kernel keeps 4 kB for a pseudo-terminal and up to 64 kB for a USB port.
 READ_BYTES = 65_536
-# Then other tasks have their turn; the rest waits in the kernel.
+# Then the loop has them; the rest waits in the kernel.
 READS_PER_TURN = 8
 # A read shorter than one kernel buffer has emptied the port.
 SHORT_READ_BYTES = 4_000
 WRITE_TIMEOUT_S, WRITE_PAUSE_S = 1.0, 0.01
+# Bytes that lie in the kernel at a read's deadline get this long again and again.
+LATE_S = 0.02
 CONNECT_TIMEOUT_S = 2.0
 
 # The values that a device reports in `health`, by name.
@@ -38,6 +45,10 @@ class Received:
 
     data: bytes
     t_arrival_ns: int
+
+
+# What a read of a port will bring.
+_Arrival: TypeAlias = "asyncio.Future[Received | DeviceLostError]"
 
 
 def find_port(*, serial_number: str | None = None, path: str | None = None) -> str:
@@ -68,7 +79,10 @@ def _available_ports() -> str:
 
 
 class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
-    """An open serial port: non-blocking, exclusive, eight bits, no parity, no flow control.
+    """An open serial port: exclusive, eight bits, no parity, no flow control.
+
+    A thread reads it. Even a non-blocking read of a terminal waits until a worker of the kernel has delivered its
+    bytes, and on a busy computer that worker can wait for tenths of a second.
 
     Raises DeviceNotFoundError or DeviceUnavailableError if it cannot be opened.
     """
@@ -81,7 +95,13 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
         except serial.SerialException as error:
             raise _open_error(path, error) from error
         self._descriptor: int = self._serial.fileno()
-        self._result: Received | DeviceLostError | None = None
+        # Readable once the port is to be closed.
+        self._closing = os.eventfd(0)
+        self._arrival: _Arrival | None = None
+        # Each arrival that a loop waits for; None ends the thread.
+        self._awaited: SimpleQueue[tuple[asyncio.AbstractEventLoop, _Arrival] | None] = SimpleQueue()
+        self._reader = threading.Thread(target=self._receive, name=f"read {path}", daemon=True)
+        self._reader.start()
 
     def __exit__(self, *_: object) -> None:
         """Close the port."""
@@ -89,6 +109,13 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
 
     def close(self) -> None:
         """Close the port, also if it is gone already."""
+        if not self._reader.is_alive():
+            return
+        self._awaited.put(None)
+        # Joined first: the number of a closed descriptor may soon be another file's.
+        os.eventfd_write(self._closing, 1)
+        self._reader.join()
+        os.close(self._closing)
         with contextlib.suppress(OSError):
             self._serial.close()
 
@@ -97,29 +124,46 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
 
         Raises DeviceLostError if the port is gone.
         """
-        loop = asyncio.get_running_loop()
-        done: asyncio.Future[None] = loop.create_future()
-        if self._result is None:
-            # Reading in the callback, before the task runs, gives the earliest time stamp.
-            loop.add_reader(self._descriptor, self._drain, done)
-            timer = loop.call_later(timeout_s, _finish, done)
-            try:
-                await done
-            finally:
-                timer.cancel()
-                loop.remove_reader(self._descriptor)
-        if self._result is None:
-            # The loop itself may have been late.
-            self._drain(done)
-        result, self._result = self._result, None
+        if self._arrival is None:
+            loop = asyncio.get_running_loop()
+            self._arrival = loop.create_future()
+            self._awaited.put((loop, self._arrival))
+        await asyncio.wait({self._arrival}, timeout=timeout_s)
+        # Loop or thread may have been late.
+        while not self._arrival.done() and self._holds_bytes():
+            await asyncio.wait({self._arrival}, timeout=LATE_S)
+        if not self._arrival.done():
+            return None
+        result, self._arrival = self._arrival.result(), None
         if isinstance(result, DeviceLostError):
             raise result
         return result
 
-    def _drain(self, done: asyncio.Future[None]) -> None:
-        """Take what has arrived, unless an earlier call took something."""
-        if self._result is not None:
-            return
+    def _holds_bytes(self) -> bool:
+        try:
+            count = fcntl.ioctl(self._descriptor, termios.FIONREAD, bytes(4))
+        except OSError:
+            return False
+        return any(count)
+
+    def _receive(self) -> None:
+        """Read in the thread, each time that a loop waits for it, until the port is to be closed."""
+        ready = select.poll()
+        ready.register(self._descriptor, select.POLLIN)
+        ready.register(self._closing, select.POLLIN)
+        while (awaited := self._awaited.get()) is not None:
+            result = None
+            while result is None:
+                if any(descriptor == self._closing for descriptor, _ in ready.poll()):
+                    return
+                result = self._drain()
+            loop, arrival = awaited
+            # The loop may have ended.
+            with contextlib.suppress(RuntimeError):
+                loop.call_soon_threadsafe(_finish, arrival, result)
+
+    def _drain(self) -> "Received | DeviceLostError | None":
+        """Return what has arrived, or the loss; None for neither."""
         parts: list[bytes] = []
         lost: DeviceLostError | None = None
         for _ in range(READS_PER_TURN):
@@ -137,9 +181,7 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
             if len(part) < SHORT_READ_BYTES:
                 break
         # Bytes before a hang-up come first; the next read meets the hang-up again.
-        self._result = Received(b"".join(parts), time.monotonic_ns()) if parts else lost
-        if self._result is not None and not done.done():
-            done.set_result(None)
+        return Received(b"".join(parts), time.monotonic_ns()) if parts else lost
 
     async def write(self, data: bytes) -> None:
         """Write all of `data`; DeviceLostError if the port is gone or accepts nothing for a second."""
@@ -159,9 +201,9 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
         return DeviceLostError(f"{self.path} has gone ({reason}): unplugged, or without power.")
 
 
-def _finish(future: asyncio.Future[None]) -> None:
-    if not future.done():
-        future.set_result(None)
+def _finish(arrival: _Arrival, result: Received | DeviceLostError) -> None:
+    if not arrival.done():
+        arrival.set_result(result)
 
 
 def _open_error(path: str, error: serial.SerialException) -> DriverError:

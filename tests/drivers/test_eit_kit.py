@@ -107,7 +107,7 @@ async def test_a_board_that_fell_silent_is_opened_and_started_again(tmp_path, mo
 
 async def test_a_board_that_is_unplugged_is_found_again_and_started(tmp_path):
     lines = some_lines(12)
-    kit, frames, events = await play(lines, 12, tmp_path, "unplug 0.05", period_s=0.03)
+    kit, frames, events = await play(lines, 12, tmp_path, "unplug 0.05", period_s=0.1)
     assert_same(frames, lines)
     facts = kit.diagnostics()
     assert facts["connections"] == 2

@@ -66,13 +66,15 @@ class RecordedEvent:
 class ReplayEvents:
     """Events that the frames do not contain, by source and frame number: tares, tools, and known torques of the grip.
 
-    `frame_numbers` holds the frames' numbers by source and arrival; they continue from file to file.
+    `frame_numbers` holds the frames' numbers by source and arrival, `sample_numbers` those of the skin's samples by
+    their time; they continue from file to file.
     """
 
     tares: dict[str, set[int]]
     tools: dict[str, dict[int, Measured | None]]
     adaptations: dict[str, dict[int, tuple[str, FloatArray]]]
     frame_numbers: dict[str, dict[int, int]]
+    sample_numbers: dict[int, int]
 
 
 class RecordedRun:
@@ -126,13 +128,15 @@ class RecordedRun:
 
     def replay_events(self) -> ReplayEvents:
         """Return the events that the frames do not contain."""
-        found = ReplayEvents(defaultdict(set), defaultdict(dict), defaultdict(dict), defaultdict(dict))
+        found = ReplayEvents(defaultdict(set), defaultdict(dict), defaultdict(dict), defaultdict(dict), {})
         for event in self.events() if self.has_inputs else ():
             raw, source = event.raw, event.source
             with reading(self.path):
                 if event.topic == EitFrame.topic:
                     arrival_ns = event.content["t_mono_ns"] + round(event.content["age_s"] * 1e9)
                     found.frame_numbers[source][arrival_ns] = event.content["frame"]
+                elif event.topic == SkinShear.topic:
+                    found.sample_numbers[event.t_mono_ns] = event.content["sample"]
                 elif raw is not None and raw.kind is InputKind.TARE and raw.data.isdigit():
                     found.tares[source].add(int(raw.data))
                 elif raw is not None and raw.kind is InputKind.TOOL:
@@ -154,6 +158,7 @@ class ReplayPipeline:
         # Per source: the difference between recorded and replayed frame numbers, and the latest frame.
         self._number_offset: dict[str, int] = {}
         self._latest_frame: dict[str, int] = {}
+        self._sample_offset: int | None = None
         self._estimators: dict[str, FrameEstimator] = {
             name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()
         }
@@ -193,7 +198,7 @@ class ReplayPipeline:
                 self._publisher.publish(load_message(sample))
         elif self._skin is not None and source in self._skin.sources:
             for message in self._skin.handle(source, event):
-                self._publisher.publish(message)
+                self._publisher.publish(self._continued(message))
 
     def _renumbered(self, source: str, frames: list[Frame]) -> list[Frame]:
         """Return frames with their recorded numbers: a later file of a run continues to count."""
@@ -203,6 +208,14 @@ class ReplayPipeline:
             self._number_offset[source] = numbers.get(last.t_arrival_ns, last.seq) - last.seq
         offset = self._number_offset.get(source, 0)
         return [replace(frame, seq=frame.seq + offset) for frame in frames] if offset else frames
+
+    def _continued(self, message: SkinShear) -> SkinShear:
+        """Return a message with the number of its sample in the run; the first one takes that of the nearest time."""
+        if self._sample_offset is None:
+            numbers = self._events.sample_numbers
+            nearest = min(numbers, key=lambda t_ns: abs(t_ns - message.t_mono_ns), default=None)
+            self._sample_offset = 0 if nearest is None else numbers[nearest] - message.sample
+        return replace(message, sample=message.sample + self._sample_offset)
 
     async def _estimate(self, source: str, *frames: Frame) -> None:
         estimator, number = self._estimators[source], frames[0].seq

@@ -3,6 +3,7 @@
 import asyncio
 import math
 from collections import Counter
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -15,13 +16,20 @@ from tests.daemon.recording.test_replay import measured, replayed
 from tests.daemon.skin.test_skin_run import played
 
 
-async def recorded(folder: Path, *, socket: bool, average_s: float) -> list[tuple[str, dict[str, Any]]]:
+async def recorded(
+    folder: Path, *, socket: bool, average_s: float, experiments: Sequence[str] = ()
+) -> list[tuple[str, dict[str, Any]]]:
     """Return what a daemon published while a skin was loaded, tared and ill-treated, all of it recorded."""
     published: list[tuple[str, dict[str, Any]]] = []
     recording = {"recording": {"folder": "recordings"}}
     async with played(folder, socket=socket, average_s=average_s, daemon=recording) as bench:
         bench.daemon.publisher.add_listener(lambda topic, content: published.append((topic, content)))
         await bench.valid()
+        for name in experiments:
+            # A file begins with an experiment, unless the current one has none.
+            bench.daemon.recorder.record_experiment(name)
+            bench.fresh()
+            await bench.valid()
         for number in range(20):
             bench.skin.push(0.8 * number / 19)
             await bench.shear.get()
@@ -41,6 +49,19 @@ async def recorded(folder: Path, *, socket: bool, average_s: float) -> list[tupl
         bench.fresh()
         await bench.valid()
     return published
+
+
+def test_a_later_file_continues_to_count_samples(tmp_path):
+    live = asyncio.run(recorded(tmp_path, socket=True, average_s=0.0, experiments=("first", "second")))
+    (later,) = (path for path in (tmp_path / "recordings").iterdir() if "second" in path.name)
+    again, _ = asyncio.run(replayed(later, math.inf))
+    then, now = (
+        {content["t_mono_ns"]: content["sample"] for topic, content in run if topic == "skin.shear"}
+        for run in (live, again)
+    )
+    assert min(now.values()) > 0
+    assert len(now.keys() & then.keys()) > 20
+    assert [now[t_ns] for t_ns in now if t_ns in then] == [then[t_ns] for t_ns in now if t_ns in then]
 
 
 @pytest.mark.parametrize(("socket", "average_s"), [(False, 0.02), (True, 0.0)])

@@ -344,9 +344,10 @@ def _fit_or_note(x: FloatArray, y: FloatArray, degree: int, what: str, notes: li
     distinct = len(np.unique(x))
     if distinct > degree and len(x) > degree + 1:
         return Polynomial.fit(x, y, degree)
+    found = f"{counted(len(x), 'measurement')} at {counted(distinct, 'distinct place')}"
     notes.append(
-        f"no fit of {what}: {len(x)} measurements at {distinct} distinct places do not determine a curve of degree "
-        f"{degree}: at least {degree + 2} at {degree + 1} places are needed"
+        f"no fit of {what}: {found} cannot determine a curve of degree {degree}: at least {degree + 2} at "
+        f"{degree + 1} places are needed"
     )
     return None
 

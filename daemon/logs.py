@@ -10,11 +10,15 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from typing import TextIO, cast
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TextIO, cast
 
 import structlog
 
 from shearloop.drivers.connection import LinkEvent
+
+if TYPE_CHECKING:
+    from shearloop.daemon.control.control_loop import ControlLoop
 
 # Texts beyond this number are dropped.
 MOST_WAITING = 10_000
@@ -117,13 +121,16 @@ def logging_to_stderr(
             structlog.configure(logger_factory=structlog.WriteLoggerFactory(sys.stderr))
 
 
-class LinkLog:
-    """Logs the link events of a device: a return as info, a loss as warning, a repeated loss as debug."""
+@dataclass(frozen=True, slots=True)
+class DeviceLink:
+    """Logs the losses and returns of one device, and hands them to the control loop, where there is one."""
 
-    def __init__(self, device: str) -> None:
-        self.device = device
+    device: str
+    loop: "ControlLoop | None" = None
 
     def on_link_event(self, event: LinkEvent) -> None:
-        """Log an event."""
+        """Log a return as info, a loss as warning, a repeated loss as debug."""
         log = structlog.get_logger().bind(device=self.device)
         (log.info if event.up else log.debug if event.repeated else log.warning)(event.sentence)
+        if self.loop is not None:
+            self.loop.on_link(self.device, event.sentence, up=event.up)

@@ -13,7 +13,7 @@ from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import Creep, TorqueSource
 from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, wrench_source
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.logs import LinkLog
+from shearloop.daemon.logs import DeviceLink
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.recorder import AttachedFile, Recorder
 from shearloop.daemon.sensing.frame_estimator import COMBINED
@@ -22,7 +22,7 @@ from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.supervisor import Supervisor, Task
 from shearloop.daemon.taring import Tareable
 from shearloop.drivers.calibration_files import load_calibration
-from shearloop.drivers.connection import LinkEvent, LinkMonitor
+from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.load_cell import LoadCalibration
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
@@ -60,20 +60,6 @@ def gripper_calibration(config: GripperConfig) -> WidthCalibration:
     if config.calibration is None:
         return WidthCalibration.nominal()
     return load_calibration(config.calibration, WidthCalibration)
-
-
-class DeviceLink(LinkLog):
-    """Logs the losses and returns of one device, and hands them to the control loop, where there is one."""
-
-    def __init__(self, device: str, loop: ControlLoop | None) -> None:
-        super().__init__(device)
-        self._loop = loop
-
-    def on_link_event(self, event: LinkEvent) -> None:
-        """Take a loss or a return."""
-        super().on_link_event(event)
-        if self._loop is not None:
-            self._loop.on_link(self.device, event.sentence, up=event.up)
 
 
 def robot_settings(path: Path) -> UrSettings:

@@ -7,9 +7,10 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, SerialDevice
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.gripper_task import GripperTask
+from shearloop.daemon.logs import DeviceLink
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.recorder import Recorder
-from shearloop.daemon.rig import DeviceLink, load_cell_calibration
+from shearloop.daemon.rig import load_cell_calibration
 from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipPipeline, FingertipTask
 from shearloop.daemon.sensing.frame_estimator import COMBINED, FrameEstimator
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask

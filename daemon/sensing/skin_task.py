@@ -13,7 +13,7 @@ from shearloop.daemon.config import InstrumentSocket, SerialDevice, SkinConfig
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.logs import LinkLog
+from shearloop.daemon.logs import DeviceLink
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
@@ -276,13 +276,13 @@ def _estimator(config: SkinConfig, calibration: SkinCalibration) -> SkinEstimato
 
 def _current_source(config: SkinConfig, inputs: InputRecorder | None) -> Keithley6430:
     source = config.source
-    link = _link(source.socket, source.serial, source.baud, LinkMonitor(LinkLog("skin source")))
+    link = _link(source.socket, source.serial, source.baud, LinkMonitor(DeviceLink("skin source")))
     return Keithley6430(link, source.current_ma * 1e-3, source.compliance_v, SOURCE_PERIOD_S, inputs=inputs)
 
 
 def _daq(config: SkinConfig, inputs: InputRecorder | None) -> Daq:
     rate_hz, scanner, adc = config.daq.rate_hz, config.daq.scanner, config.daq.adc
-    monitor = LinkMonitor(LinkLog("skin daq"))
+    monitor = LinkMonitor(DeviceLink("skin daq"))
     if scanner is not None:
         link = _link(scanner.socket, None, DEFAULT_BAUD, monitor)
         return ScpiScanner(link, scanner.channels, rate_hz, scanner.range_v, inputs=inputs)

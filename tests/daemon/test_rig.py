@@ -5,7 +5,8 @@ from shearloop.daemon import rig as rig_module
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
-from shearloop.daemon.rig import DeviceLink, Rig
+from shearloop.daemon.logs import DeviceLink
+from shearloop.daemon.rig import Rig
 from shearloop.daemon.supervisor import Supervisor
 from shearloop.drivers.connection import LinkEvent
 from tests.drivers.ur.flight import SETTINGS

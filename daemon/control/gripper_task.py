@@ -70,14 +70,7 @@ class GripperTask:
 
     async def halt(self) -> str:
         """Stop the fingers; return an error, or an empty string."""
-        return await _tried(self._halt)
-
-    async def _halt(self) -> str:
-        try:
-            await self.gripper.halt()
-        except DriverError as error:
-            return str(error)
-        return ""
+        return await _tried(self.gripper.halt)
 
     async def unlock(self) -> str:
         """Activate again after a fault, once the operator says that the fingers are clear."""
@@ -122,14 +115,17 @@ class GripperTask:
         )
 
 
-async def _tried(act: Callable[[], Awaitable[str]]) -> str:
+async def _tried(act: Callable[[], Awaitable[str | None]]) -> str:
     """Repeat an action until it succeeds; return its last error after a while, or an empty string."""
     tries_until_s = asyncio.get_running_loop().time() + TRIED_FOR_S
-    while error := await act():
-        if asyncio.get_running_loop().time() > tries_until_s:
-            return error
+    while True:
+        try:
+            error = await act()
+        except DriverError as raised:
+            error = str(raised)
+        if not error or asyncio.get_running_loop().time() > tries_until_s:
+            return error or ""
         await asyncio.sleep(TRIED_AGAIN_S)
-    return ""
 
 
 def tool_diameter(state: GripperState, fingertips: Measured | None) -> Measured | None:

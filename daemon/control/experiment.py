@@ -5,7 +5,7 @@ clock stands while it is paused or held.
 """
 
 from collections.abc import Generator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from typing import TypeAlias
 
@@ -141,28 +141,25 @@ class Experiment:
 
     def update(
         self, t_ns: int, wrist_rad: float, torque_nm: float | None, *, gripped_at_rad: float = 0.0, held: bool = False
-    ) -> StepCommand:
-        """Return the command for now; while paused or held the wrist and the experiment's clock stand still.
+    ) -> None:
+        """Choose the command for now; while paused or held the experiment's clock stands still.
 
         `wrist_rad` counts from the angle at the grip, `gripped_at_rad`.
         """
         passed_s = max(0, t_ns - self._t_ns) / 1e9
         self._t_ns = max(t_ns, self._t_ns)
-        if not self.running:
-            return StepCommand()
-        if self.phase is ExperimentPhase.PAUSED or held:
-            return replace(self.command, wrist=Hold())
+        if held or self.phase is not ExperimentPhase.RUNNING:
+            return
         self._elapsed_s += passed_s
         view = StepContext(wrist_rad, torque_nm, gripped_at_rad, self._elapsed_s)
         try:
             self.command = self._program.send(view)
         except StopIteration:
             self._begin_next()
-        longest_s, spent_s = self.file.steps[self.step_number - 1].timeout_s, self._elapsed_s - self._step_began_s
+        longest_s, spent_s = self.step.timeout_s, self._elapsed_s - self._step_began_s
         if longest_s is not None and spent_s > longest_s:
             step = f"step {self.step_number} ({self.step.do})"
             self.overdue = f"{step} has taken {spent_s:.1f} s of at most {longest_s:g} s"
-        return self.command
 
     def begin_action(self) -> bool:
         """Return whether the command's action has to begin now; it counts as begun."""

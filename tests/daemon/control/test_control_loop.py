@@ -83,12 +83,15 @@ def test_a_set_point_without_identification_at_its_gain_is_refused_with_the_cure
     assert "put an `identify` step before" in rig.control_loop.experiment.stop_reason
 
 
-def test_a_pause_is_refused_with_the_reason():
-    rig = started(Rig(new_loop()), {"do": "wait", "wait_s": 60})
-    rig.step()
+def test_a_pause_holds_the_wrist_and_is_refused_with_the_reason():
+    rig = twisting()
     assert rig.control_loop.pause() is None
+    rig.step()
+    assert rig.speed == 0.0
     assert "paused already" in (rig.control_loop.pause() or "")
     assert rig.control_loop.resume() is None
+    rig.step()
+    assert rig.speed > 0.0
     rig.control_loop.stop("the operator said so")
     assert rig.control_loop.pause() == "no experiment is running"
 

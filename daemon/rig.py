@@ -102,7 +102,7 @@ def make_gripper(config: DaemonConfig, loop: ControlLoop, publisher: Publisher) 
 
 
 class Rig:
-    """Robot, gripper and the control loop between them, for the operator's experiments."""
+    """Robot, gripper and the control loop between them, for the operator's experiments; sensors are in `sensors.py`."""
 
     def __init__(
         self,

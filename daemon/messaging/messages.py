@@ -65,7 +65,7 @@ class EitFrame(Message):
 
     channels: NDArray[np.floating] = column("V", "the channels in the order of the channel table")
     line: NDArray[np.floating] = column("V", "the values of the raw line")
-    frame: int = column("", "number of the frame since the board was connected")
+    frame: int = column("", "number of the frame since the daemon began")
     age_s: float = column("s", "from the middle of the acquisition to the arrival of the last byte")
     saturated: int = column("", "channels at the converter's full scale")
     dead: int = column("", "channels unchanged for many frames")

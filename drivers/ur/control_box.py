@@ -1,4 +1,4 @@
-"""What the controller reports: a probe, a query of its mode, and RTDE samples with their age.
+"""The robot's control box without ur-rtde: probe, mode, dashboard commands, RTDE samples with their age, deadlines.
 
 RTDE: UR's RTDE guide, protocol 2. Dashboard: UR's "Dashboard Server e-Series" page, one line each way. ur-rtde does not
 check the answer to its protocol request and waits without a limit for a silent peer, so that this module asks first.

@@ -1,4 +1,4 @@
-"""`shearloop calibrate THING`: measure a known quantity step by step and write a calibration file.
+"""`shearloop calibrate THING`: fit recordings, or measure a known quantity step by step; write a calibration file.
 
 `shearloop calibrate REC… --out CAL` is short for `shearloop calibrate recording REC…`. Write a recording that is named
 like a THING with its folder: `./load`.

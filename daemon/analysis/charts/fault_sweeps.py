@@ -246,18 +246,18 @@ def misaligned(
 
     A refused calibration gives no valid estimate.
     """
-    levels: dict[str, list[FaultLevel]] = {name: [] for name in names}
     judged = shortened(split.future)
-    for shift in shifts_s:
-        late = replace(split.past, torque_t_s=split.past.torque_t_s + shift)
-        calibrated = {one.estimator.name: one for one in fitted(replace(split, past=late), names, physics)}
-        for name, found in levels.items():
-            if name in calibrated:
-                estimates = estimate_frames(EstimatorSession(calibrated[name], physics.bank), judged)
-                found.append(judge_level(estimates, true_torques(judged), shift))
-            else:
-                found.append(FaultLevel(shift))
-    return [fault_curve("calibrated on misaligned times", "s", name, found) for name, found in levels.items()]
+
+    def level(name: EstimatorName, shift_s: float) -> FaultLevel:
+        late = replace(split.past, torque_t_s=split.past.torque_t_s + shift_s)
+        calibrations = fitted(replace(split, past=late), [name], physics)
+        if not calibrations:
+            return FaultLevel(shift_s)
+        estimates = estimate_frames(EstimatorSession(calibrations[0], physics.bank), judged)
+        return judge_level(estimates, true_torques(judged), shift_s)
+
+    fault = "calibrated on misaligned times"
+    return [fault_curve(fault, "s", name, [level(name, shift_s) for shift_s in shifts_s]) for name in names]
 
 
 def shortened(series: FrameSeries) -> FrameSeries:

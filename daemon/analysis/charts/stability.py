@@ -6,12 +6,12 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import groupby, pairwise
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from shearloop.bank.arrays import FloatArray
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.errors import BankError
@@ -151,28 +151,19 @@ def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[Con
         torque_nm_of = parabola(split, partial(matched_sigma, locator))
         found.append(ContinuityWalk(name, np.array([torque_nm_of(one) for one in path]), share_nm))
     for calibration in calibrations:
-        if not calibration.estimator.needs:
-            tracker = EstimatorSession(calibration, bank)
-            estimates = [tracker.estimate(TactileFrame.of(0.0, one[None])) for one in path]
-            found.append(ContinuityWalk(calibration.estimator.name, values_of(estimates)[0], share_nm))
+        tracker = EstimatorSession(calibration, bank)
+        estimates = [tracker.estimate(TactileFrame.of(0.0, one[None])) for one in path]
+        found.append(ContinuityWalk(calibration.estimator.name, values_of(estimates)[0], share_nm))
     return found
 
 
-Rows = NDArray[np.int64]
 # Shares of the slices to calibrate on, from the smallest torques or from the largest.
 CALIBRATED_SHARES = (0.8, 0.65, 0.5, 0.4, 0.3)
 SMALLER = "calibrated on the smaller torques alone"
 LARGER = "calibrated on the larger torques alone"
 UNITS = {SMALLER: "largest torque calibrated on, N·m", LARGER: "smallest torque calibrated on, N·m"}
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CalibrationPart:
-    """The slices to calibrate on, up to a torque or from one on, and the others to judge."""
-
-    limit_nm: float
-    fitted: Rows
-    others: Rows
+# The torque in N·m up to which, or from which on, slices are calibrated on, and whether each (n,) is judged instead.
+CalibrationPart: TypeAlias = tuple[float, BoolArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,10 +193,8 @@ def calibration_parts(torque_nm: FloatArray) -> dict[str, list[CalibrationPart]]
     for which, beyond in ((SMALLER, np.greater), (LARGER, np.less)):
         quantiles = np.array(CALIBRATED_SHARES) if which == SMALLER else 1.0 - np.array(CALIBRATED_SHARES)
         limits = np.quantile(torque_nm, quantiles, method="nearest").tolist()
-        masks = [(limit, beyond(torque_nm, limit)) for limit in dict.fromkeys(limits)]
-        found[which] = [
-            CalibrationPart(limit, np.flatnonzero(~mask), np.flatnonzero(mask)) for limit, mask in masks if mask.any()
-        ]
+        parts = [(limit, beyond(torque_nm, limit)) for limit in dict.fromkeys(limits)]
+        found[which] = [(limit, judged) for limit, judged in parts if judged.any()]
     return found
 
 
@@ -216,32 +205,32 @@ def extrapolate(
 
     A refused calibration gives no valid estimate; its reason is printed.
     """
-    known = select_rows(split.whole, np.flatnonzero(np.isfinite(split.whole.torque_at_frames())))
-    rows, n_earlier = np.arange(len(known.t_s)), int((known.t_s <= split.past.t_s[-1]).sum())
-    beyond = calibration_parts(known.torque_nm)
+    known = select_rows(split.whole, np.isfinite(split.whole.torque_at_frames()))
+    later, beyond = known.t_s > split.past.t_s[-1], calibration_parts(known.torque_nm)
     for which, extreme in ((SMALLER, np.max), (LARGER, np.min)):
-        limit_nm = float(extreme(known.torque_nm[:n_earlier]))
-        beyond[which].insert(0, CalibrationPart(limit_nm, rows[:n_earlier], rows[n_earlier:]))
+        beyond[which].insert(0, (float(extreme(known.torque_nm[~later])), later))
     tasks = [(which, name, part) for which, parts in beyond.items() for name in names for part in parts]
-    judged = in_order(executor.map(judge_others, (known, str(bank.path.resolve()), mesh), tasks))
+    outcomes = in_order(executor.map(judge_others, (known, str(bank.path.resolve()), mesh), tasks))
     found = []
-    for (which, name), some in groupby(zip(tasks, judged, strict=True), key=lambda one: one[0][:2]):
-        steps = [(part, *outcome) for (_, _, part), outcome in some]
-        for part, _, _, refusal in steps:
+    for (which, name), steps in groupby(zip(tasks, outcomes, strict=True), key=lambda one: one[0][:2]):
+        levels, slices, widths = [], [], []
+        for (_, _, (limit_nm, judged)), (level, width_nm, refusal) in steps:
+            levels.append(level)
+            slices.append(int(np.count_nonzero(~judged)))
+            widths.append(width_nm)
             if refusal:
-                print(f"{split.title}: {name}, {which} ({part.limit_nm:.3f} N·m), is left out: {refusal}")
-        curve = fault_curve(which, UNITS[which], name, [level for _, level, _, _ in steps])
-        slices, widths = tuple(len(part.fitted) for part, *_ in steps), tuple(width for _, _, width, _ in steps)
-        found.append(Extrapolation(curve, slices, widths))
+                print(f"{split.title}: {name}, {which} ({limit_nm:.3f} N·m), is left out: {refusal}")
+        curve = fault_curve(which, UNITS[which], name, levels)
+        found.append(Extrapolation(curve, tuple(slices), tuple(widths)))
     return found
 
 
-def select_rows(series: FrameSeries, rows: Rows) -> FrameSeries:
-    """Return these frames of a series with their own torques only."""
-    t_s = series.t_s[rows]
+def select_rows(series: FrameSeries, chosen: BoolArray) -> FrameSeries:
+    """Return the chosen (n,) frames of a series with their own torques only."""
+    t_s = series.t_s[chosen]
     return replace(
-        series, t_s=t_s, channels=series.channels[rows], torque_t_s=t_s, torque_nm=series.torque_at_frames()[rows],
-        diameter_mm=series.diameter_mm[rows],
+        series, t_s=t_s, channels=series.channels[chosen], torque_t_s=t_s, torque_nm=series.torque_at_frames()[chosen],
+        diameter_mm=series.diameter_mm[chosen],
     )  # fmt: skip
 
 
@@ -249,17 +238,17 @@ def judge_others(
     shared: tuple[FrameSeries, str, Mesh | None], task: tuple[str, EstimatorName, CalibrationPart]
 ) -> tuple[FaultLevel, float | None, str]:
     """Return the figures and the median width of a part's judged slices, and the reason of a refused calibration."""
-    (series, path, mesh), (_, name, part) = shared, task
+    (series, path, mesh), (_, name, (limit_nm, judged)) = shared, task
     bank = Bank.open(path)
     try:
-        calibration = fit(name, [select_rows(series, part.fitted)], "some torques", Physics(bank, mesh))
+        calibration = fit(name, [select_rows(series, ~judged)], "some torques", Physics(bank, mesh))
     except BankError as error:
-        return FaultLevel(part.limit_nm), None, str(error)
-    others = select_rows(series, part.others)
+        return FaultLevel(limit_nm), None, str(error)
+    others = select_rows(series, judged)
     estimates = estimate_frames(EstimatorSession(calibration, bank), others)
     _, low_nm, high_nm = values_of([one for one in estimates if one.valid])
     width_nm = float(np.median(high_nm - low_nm)) if len(low_nm) else None
-    return judge_level(estimates, others.torque_nm, part.limit_nm), width_nm, ""
+    return judge_level(estimates, others.torque_nm, limit_nm), width_nm, ""
 
 
 _K, _SIGMA = 3.2, 1.5

@@ -96,19 +96,18 @@ def test_a_recording_that_no_estimator_can_be_calibrated_on_is_one_sentence(
 def test_limits_are_quantiles_and_each_slice_is_either_calibrated_on_or_judged():
     torque_nm = np.random.default_rng(3).permutation(np.linspace(0.0, 0.1, 101))
     found = stability.calibration_parts(torque_nm)
-    assert [part.limit_nm for part in found[stability.SMALLER]] == pytest.approx([0.08, 0.065, 0.05, 0.04, 0.03])
-    assert [part.limit_nm for part in found[stability.LARGER]] == pytest.approx([0.02, 0.035, 0.05, 0.06, 0.07])
+    assert [limit_nm for limit_nm, _ in found[stability.SMALLER]] == pytest.approx([0.08, 0.065, 0.05, 0.04, 0.03])
+    assert [limit_nm for limit_nm, _ in found[stability.LARGER]] == pytest.approx([0.02, 0.035, 0.05, 0.06, 0.07])
     for which, sign in ((stability.SMALLER, 1), (stability.LARGER, -1)):
-        for part in found[which]:
-            assert sorted([*part.fitted, *part.others]) == list(range(101))
-            assert (sign * torque_nm[part.fitted]).max() == sign * part.limit_nm
-            assert (sign * torque_nm[part.others] > sign * part.limit_nm).all()
+        for limit_nm, judged in found[which]:
+            assert (sign * torque_nm[~judged]).max() == sign * limit_nm
+            assert (sign * torque_nm[judged] > sign * limit_nm).all()
 
 
 def test_of_few_torques_each_limit_is_there_once_and_none_leaves_nothing_to_judge():
     found = stability.calibration_parts(np.repeat([0.02, 0.06, 0.1], [20, 2, 40]))
-    assert [part.limit_nm for part in found[stability.SMALLER]] == [0.02]
-    assert [part.limit_nm for part in found[stability.LARGER]] == [0.06, 0.1]
+    assert [limit_nm for limit_nm, _ in found[stability.SMALLER]] == [0.02]
+    assert [limit_nm for limit_nm, _ in found[stability.LARGER]] == [0.06, 0.1]
 
 
 def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(slices, bank, monkeypatch, capsys):

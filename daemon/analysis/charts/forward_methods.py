@@ -63,28 +63,24 @@ def forward_methods(
     """
     coarse, fine = (own_fingertip(size).mesh() for size in converged_cm)
     truth = converged(coarse, fine, converged_cm[0] / converged_cm[1])
-    solvers = []
-    for size in sizes_cm:
-        own = own_fingertip(size).mesh()
-        solvers.append(_Solver(f"direct, {size:g} cm", "direct", own, direct(own), truth))
-        solvers.append(_Solver(f"batch, {size:g} cm", BATCH, own, batch(own), truth, BATCHES))
+    meshes = [(f"{size:g} cm", "", own_fingertip(size).mesh(), truth) for size in sizes_cm]
     if mesh is not None:
         once = mesh.refined()
-        given = converged(once, once.refined(), 2.0)
-        solvers.append(_Solver("direct, --mesh", "direct, the given mesh", mesh, direct(mesh), given))
-        solvers.append(_Solver("batch, --mesh", f"{BATCH}, the given mesh", mesh, batch(mesh), given, BATCHES))
-    times: dict[str, list[float]] = {one.name: [] for one in solvers}
-    signals: dict[str, FloatArray] = {}
-    for _ in range(rounds):
-        for one in solvers:
+        meshes.append(("--mesh", ", the given mesh", mesh, converged(once, once.refined(), 2.0)))
+    solvers = []
+    for name, given, own, true in meshes:
+        solvers.append(_Solver(f"direct, {name}", f"direct{given}", own, direct(own), true))
+        solvers.append(_Solver(f"batch, {name}", f"{BATCH}{given}", own, batch(own), true, BATCHES))
+    times_ms = np.empty((rounds, len(solvers)))
+    for row in times_ms:
+        for i, one in enumerate(solvers):
             begun = time.perf_counter()
-            signals[one.name] = one.solve()
-            times[one.name].append(1e3 * (time.perf_counter() - begun) / (len(CELLS) * one.repeats))
-    found = []
-    for one in solvers:
-        ms, triangles = times[one.name], len(one.mesh.triangles)
-        error = error_of(signals[one.name], one.truth)
-        found.append(SolvedForward(one.name, one.family, triangles, float(np.median(ms)), error))
+            one.solve()
+            row[i] = 1e3 * (time.perf_counter() - begun) / (len(CELLS) * one.repeats)
+    found = [
+        SolvedForward(one.name, one.family, len(one.mesh.triangles), float(ms), error_of(one.solve(), one.truth))
+        for one, ms in zip(solvers, np.median(times_ms, axis=0), strict=True)
+    ]
     # EIDORS solves the same model: its error is known where the paper's mesh is given. pyEIT's electrodes are points.
     paper = next((one.error for one in found if one.triangles == PAPER_TRIANGLES), None)
     return [*found, _cited("EIDORS 3.10", "EIDORS", EIDORS_CELL_S, paper), _cited("pyEIT", "pyEIT", PYEIT_CELL_S, None)]

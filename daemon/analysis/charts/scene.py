@@ -27,18 +27,17 @@ def chart(parts: Sequence[Split], out: Path, executor: Executor) -> list[Path]:
 
     Recordings are of the paper's fingertip. On the others the same grip is simulated with the same share of noise.
     """
+    titles = [split.title.split(",", maxsplit=1)[0] for split in parts]
     scenes = [scene_of(split.whole) for split in parts]
     found = in_order(executor.map(designed_on, own_fingertip(_MESH_SIZE_CM), scenes))
     written = []
-    for split, design in zip(parts, found, strict=True):
-        title = split.title.split(",", maxsplit=1)[0]
+    for title, design in zip(titles, found, strict=True):
         for sentence in doubts(design):
             print(f"shearloop chart: {title}: {sentence}", file=sys.stderr)
         written += write(title, design, out)
     for name, fingertip in other_fingertips().items():
         elsewhere = in_order(executor.map(designed_elsewhere, fingertip, found))
-        for split, design in zip(parts, elsewhere, strict=True):
-            title = split.title.split(",", maxsplit=1)[0]
+        for title, design in zip(titles, elsewhere, strict=True):
             written += write(f"{title} {name}, simulated", design, out)
     return written
 
@@ -134,11 +133,11 @@ def _draw_table(axes: Axes, choices: Sequence[DesignChoice]) -> None:
     rows = []
     for one in choices:
         step, after = one.chosen, one.next_step
-        buys = "–" if after is None else f"{np.sqrt(1 + step.added**2) - np.sqrt(1 + after.added**2):.1%} less error"
-        rows.append([
-            one.name, f"{step.setting:g}", f"{step.added:.2f}", "–" if after is None else f"{after.setting:g}", buys,
-            "–" if after is None else after.cost.split(";", maxsplit=1)[0],
-        ])  # fmt: skip
+        row = [one.name, f"{step.setting:g}", f"{step.added:.2f}", "–", "–", "–"]
+        if after is not None:
+            buys = np.sqrt(1 + step.added**2) - np.sqrt(1 + after.added**2)
+            row[3:] = f"{after.setting:g}", f"{buys:.1%} less error", after.cost.split(";", maxsplit=1)[0]
+        rows.append(row)
     axes.set_axis_off()
     table = axes.table(
         rows, colLabels=["", "chosen", "adds (noise = 1)", "next step", "benefit", "cost"],

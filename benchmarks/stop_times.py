@@ -89,12 +89,12 @@ CAUSES = (
 )
 
 
-def write_rig_bank(path: Path) -> None:
+def write_random_bank(path: Path) -> None:
     """Write a small bank of random signals: the emulated fingertips only need frames."""
     random, grid, cells = np.random.default_rng(1), np.linspace(1.0, 2.0, 8), np.ones((8, 8))
     definition = BankDefinition("ab" * 32, "gaussian_derivative", grid, grid)
-    signals = random.normal(0.0, 0.05, (8, 8, 896)).astype(np.float32)
-    write_bank(path, definition, random.normal(0.0, 0.3, 896), cells, cells > 0, signals)
+    homogeneous, signals = random.normal(0.0, 0.3, 896), random.normal(0.0, 0.05, (8, 8, 896))
+    write_bank(path, definition, homogeneous, cells, cells > 0, signals.astype(np.float32))
 
 
 class RunningRig:
@@ -102,7 +102,7 @@ class RunningRig:
 
     def __init__(self, folder: Path, stack: ExitStack, speed: int = 1, **content: Any) -> None:
         """Start both; boards, gel and fingers are `speed` times as fast. `content` has further configuration keys."""
-        write_rig_bank(folder / "rig.bank")
+        write_random_bank(folder / "rig.bank")
         os.mkfifo(folder / "cause")
         self._causes = stack.enter_context((folder / "cause").open("r+b", buffering=0))
         options = f"--paper-sketch --unlock-wait-s 0.5 --power-on-s 0.2 --gel-stiffness 0.02 --speed {speed}"

@@ -67,21 +67,10 @@ def fonts() -> None:
 @pytest.fixture(scope="session")
 def tiny_bank(tmp_path_factory) -> Path:
     """A bank of 8 × 8 random signals: scored in a millisecond."""
-    import numpy as np
+    from benchmarks.stop_times import write_random_bank
 
-    from shearloop.bank.eit.bank_file import BankDefinition, write_bank
-
-    path = tmp_path_factory.mktemp("bank") / "tiny.bank"
-    random = np.random.default_rng(1)
-    grid = np.linspace(1.0, 2.0, 8)
-    write_bank(
-        path,
-        BankDefinition("ab" * 32, "gaussian_derivative", grid, grid),
-        random.normal(0.0, 0.3, 896),
-        np.ones((8, 8)),
-        np.ones((8, 8), bool),
-        random.normal(0.0, 0.05, (8, 8, 896)).astype(np.float32),
-    )
+    path: Path = tmp_path_factory.mktemp("bank") / "tiny.bank"
+    write_random_bank(path)
     return path
 
 

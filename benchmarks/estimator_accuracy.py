@@ -25,7 +25,7 @@ from shearloop.bank.estimator_names import DEFAULT, EstimatorName
 from shearloop.daemon.analysis.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of
 from shearloop.daemon.analysis.frame_series import part_of, read_series, series_of
 from shearloop.daemon.cli.emulated_calibration import calibrate, record
-from shearloop.daemon.recording.matlab import import_mat
+from shearloop.daemon.recording.matlab_import import import_mat
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.drivers.emulators.rig import SIDES
 

@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks.common import parser_of, table_head, table_row, write_figures
 from shearloop.daemon.analysis.charts import simulated_loop
 from shearloop.daemon.control.margins import LoopModel, gain_limit
-from shearloop.daemon.control.twist_controller import ControllerSettings, TwistController
+from shearloop.daemon.control.torque_controller import ControllerSettings, TorqueController
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 
 COMMAND_S = 0.016
@@ -62,7 +62,7 @@ class LoopCase:
         if not self.compensated:
             return simulated_loop.UncompensatedController(settings)
         # Enough known measurements for a gain of kp from the start.
-        controller = TwistController(settings, 0, 0.0, 0.0, 1e9)
+        controller = TorqueController(settings, 0, 0.0, 0.0, 1e9)
         controller.set_point(0.0)
         return controller
 

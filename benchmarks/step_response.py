@@ -25,7 +25,7 @@ from shearloop.daemon.analysis.creep import Stretch, fit_creep
 from shearloop.daemon.cli.emulated_calibration import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
 from shearloop.daemon.control.loop_inputs import Creep, LoopConfig
 from shearloop.daemon.control.margins import margin_refusal
-from shearloop.daemon.control.twist_controller import TwistController
+from shearloop.daemon.control.torque_controller import TorqueController
 from shearloop.daemon.run_summary import BAND
 from shearloop.daemon.synthetic_frames import RigFrames
 from shearloop.drivers.defaults import FRAME_PERIOD_S
@@ -133,7 +133,7 @@ class RigPlant(sim.Plant):
         self.outside_interval += not estimate.torque_low_nm <= true_nm <= estimate.torque_high_nm
         self._samples.append(sim.PlantSample(estimate.torque_nm, t_mid_s, self.t_s + self.sensor.transfer_s))
 
-    def disturb(self, controller: TwistController) -> tuple[list[float], float]:
+    def disturb(self, controller: TorqueController) -> tuple[list[float], float]:
         """Kick the held torque, then let the tool slip; return how long each took to come back, and to be found, in s.
 
         Infinite where that did not happen. The kicks come at different times within a frame.
@@ -145,12 +145,12 @@ class RigPlant(sim.Plant):
             back_s.append(sim.back_after_s(sim.run(self, controller, KICKED_S), TARGET_NM))
         self.scene.slip(SLIPS_TO_NM)
         slipped_s = self.t_s
-        while not controller.filter.lost and self.t_s < slipped_s + KICKED_S:
+        while not controller.filter.slipped and self.t_s < slipped_s + KICKED_S:
             sim.run(self, controller, self.period_s)
-        return back_s, self.t_s - slipped_s if controller.filter.lost else np.inf
+        return back_s, self.t_s - slipped_s if controller.filter.slipped else np.inf
 
 
-def step(plant: sim.Plant, scenario: sim.LoopScenario) -> tuple[FloatArray, bool, TwistController]:
+def step(plant: sim.Plant, scenario: sim.LoopScenario) -> tuple[FloatArray, bool, TorqueController]:
     """Identify the tool and step to TARGET_NM; return the true torques, whether the margins refuse, the controller."""
     found = sim.identified(plant, scenario)
     settings = sim.settings_for(found, scenario)

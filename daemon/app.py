@@ -57,7 +57,7 @@ class Daemon:
         clock = Clock()
         self.supervisor = Supervisor()
         self._summary = summary or RunSummary()
-        self._stop = asyncio.Event()
+        self._end = asyncio.Event()
         with contextlib.ExitStack() as opened:
             keys = load_server_keys(config.curve.server_key) if config.curve is not None else None
             refusals = Refusals()
@@ -76,12 +76,12 @@ class Daemon:
             self.sensors, self._rig = _build_rig(config, self.publisher, clock, self.recorder, self.supervisor)
             self._experiment: ConfiguredExperiment | None = None
             if config.experiment is not None and self._rig is not None:
-                stop = self._stop if config.stop_when_done else None
+                stop = self._end if config.stop_when_done else None
                 self._experiment = ConfiguredExperiment(config.experiment, self._rig, stop)
-            self.commands = Commands(self._rig, self.sensors, self._experiment, self.health, self._stop)
+            self.commands = Commands(self._rig, self.sensors, self._experiment, self.health, self._end)
             server = CommandServer(context, config.commands, self.commands.handlers(), refusals, keys)
             opened.callback(server.close)
-            stop_socket = StopSocket(server.address, self.commands.open_handlers(), refusals)
+            stop_socket = StopSocket(server.address, self.commands.keyless_handlers(), refusals)
             opened.callback(stop_socket.close)
             self._close = opened.pop_all().close
         tasks: dict[str, Task | None] = {
@@ -127,7 +127,7 @@ class Daemon:
             structlog.get_logger().info("running", fingertips=list(self.sensors.fingertips))
             on_ready()
             notify("READY=1")
-            await self._stop.wait()
+            await self._end.wait()
             notify("STOPPING=1")
             if self._rig is not None:
                 self._rig.close()
@@ -139,12 +139,12 @@ class Daemon:
 
     def stop(self) -> None:
         """End `run` as soon as the tasks have ended."""
-        self._stop.set()
+        self._end.set()
 
     def _log_recordings(self) -> None:
         if self.recorder is None:
             return
-        for path in self.recorder.finished:
+        for path in self.recorder.closed_files:
             if path.exists():
                 structlog.get_logger().info("recorded", file=str(path))
             else:

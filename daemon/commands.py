@@ -22,21 +22,21 @@ LOOP_KEYS = ("phase", "experiment", "step", "steps", "step_name", "activity", "p
 class Commands:
     """Executes the commands of the command socket.
 
-    `experiment` is the configured one; setting `stop` ends the daemon.
+    `experiment` is the configured one; setting `daemon_end` ends the daemon.
     """
 
     rig: Rig | None
     sensors: Sensors
     experiment: ConfiguredExperiment | None
     health: HealthReporter
-    stop: asyncio.Event
+    daemon_end: asyncio.Event
 
     def handlers(self) -> Mapping[str, Handler]:
         """Return the handler of every command."""
         named = {"tare": self._tare, STATUS: self._status, STOP: self._stop, "start": self._start}
         return {**named, "pause": self._pause, "resume": self._resume, "unlock": self._unlock}
 
-    def open_handlers(self) -> Mapping[str, Handler]:
+    def keyless_handlers(self) -> Mapping[str, Handler]:
         """Return the handlers for users of this machine without a key: only `stop` and `status` work."""
 
         async def refuse(_request: Request) -> Reply:
@@ -101,7 +101,7 @@ class Commands:
             # The live page's stop button stops motion, but not the daemon.
             return {"stopped": f"the start of {waiting.name}" if waiting is not None else ""}
         # Nothing moves, so the daemon itself stops, once the reply is sent.
-        asyncio.get_running_loop().call_later(STOP_DELAY_S, self.stop.set)
+        asyncio.get_running_loop().call_later(STOP_DELAY_S, self.daemon_end.set)
         return {}
 
 

@@ -17,12 +17,12 @@ START_RETRY_S = 0.5
 class ConfiguredExperiment:
     """Starts one experiment automatically and waits for its end."""
 
-    def __init__(self, path: Path, rig: Rig, stop: asyncio.Event | None = None) -> None:
-        """Take the experiment's file; its end sets `stop`."""
+    def __init__(self, path: Path, rig: Rig, daemon_end: asyncio.Event | None = None) -> None:
+        """Take the experiment's file; its end sets `daemon_end`."""
         self.path = path
         self.done = False
         self._rig = rig
-        self._stop = stop
+        self._daemon_end = daemon_end
         self.has_begun = asyncio.Event()
         self._crash_marker = CrashMarker()
         # Until any experiment has begun, or this one is called off. After a crash only the operator starts it.
@@ -31,7 +31,7 @@ class ConfiguredExperiment:
     @property
     def finished(self) -> bool:
         """Whether it is done, if the daemon ends with it."""
-        return self.done or self._stop is None
+        return self.done or self._daemon_end is None
 
     async def run(self) -> None:
         """Start the experiment once, and return at its end.
@@ -39,10 +39,10 @@ class ConfiguredExperiment:
         If only the operator may start it, return at once, or at its end where the daemon ends with it.
         """
         await self._start_once()
-        if self.has_begun.is_set() or self._stop is not None:
+        if self.has_begun.is_set() or self._daemon_end is not None:
             await self.wait_for_end()
-        if self._stop is not None:
-            self._stop.set()
+        if self._daemon_end is not None:
+            self._daemon_end.set()
 
     async def _start_once(self) -> None:
         log, logged = structlog.get_logger().bind(experiment=str(self.path)), ""

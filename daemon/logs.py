@@ -122,7 +122,7 @@ def logging_to_stderr(
 
 
 @dataclass(frozen=True, slots=True)
-class DeviceLink:
+class LinkReporter:
     """Logs the losses and returns of one device, and hands them to the control loop, where there is one."""
 
     device: str

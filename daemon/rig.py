@@ -13,20 +13,20 @@ from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import Creep, TorqueSource
 from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, wrench_source
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.logs import DeviceLink
+from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.recorder import AttachedFile, Recorder
+from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
-from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
+from shearloop.daemon.sensor_protocols import Tareable
 from shearloop.daemon.supervisor import Supervisor, Task
-from shearloop.daemon.taring import Tareable
 from shearloop.drivers.calibration_files import load_calibration
 from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.load_cell import LoadCalibration
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
-from shearloop.drivers.robotiq.messages import GripperClient
+from shearloop.drivers.robotiq.messages import RobotiqConnection
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
@@ -42,7 +42,7 @@ def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
     return load_calibration(config.calibration, LoadCalibration)
 
 
-def make_gripper_client(config: GripperConfig) -> GripperClient:
+def make_gripper_client(config: GripperConfig) -> RobotiqConnection:
     """Return the gripper's client, not connected yet."""
     if config.socket is not None:
         return SocketClient(config.socket.host, config.socket.port)
@@ -96,7 +96,7 @@ def make_gripper(config: DaemonConfig, loop: ControlLoop, publisher: Publisher) 
     if config.gripper is None:
         return None
     client, calibration = make_gripper_client(config.gripper), gripper_calibration(config.gripper)
-    hand = RobotiqGripper(client, calibration, monitor=LinkMonitor(DeviceLink("gripper", loop)))
+    hand = RobotiqGripper(client, calibration, monitor=LinkMonitor(LinkReporter("gripper", loop)))
     measures = config.gripper.calibration is not None
     return GripperTask(hand, publisher, loop, FingertipDiameters(COMBINED), measures_diameters=measures)
 
@@ -120,11 +120,11 @@ class Rig:
             raise ValueError("a rig needs a robot")
         self.control_loop = loop
         self.gripper = gripper
-        self.robot = UrRobot(robot_settings(config.robot), LinkMonitor(DeviceLink("robot", loop)))
+        self.robot = UrRobot(robot_settings(config.robot), LinkMonitor(LinkReporter("robot", loop)))
         self.runner = ControlLoopRunner(loop, self.robot, gripper, sensors, publisher, clock, supervisor.dead)
         self._recorder = recorder
         # Counts the stops, also while an experiment starts.
-        self._stops = 0
+        self._stop_count = 0
         self._closed = False
 
     def tasks(self) -> dict[str, Task]:
@@ -137,9 +137,9 @@ class Rig:
         if self._closed:
             return ENDING
         attached = AttachedFile.read(path) if self._recorder is not None else ()
-        stops_before, file = self._stops, read_experiment(path)
+        stops_before, file = self._stop_count, read_experiment(path)
         reason = await self.runner.start(file)
-        if reason is None and self._stops != stops_before:
+        if reason is None and self._stop_count != stops_before:
             self.runner.stop("the operator stopped it")
             return "it was stopped during its start"
         if reason is None and self._recorder is not None:
@@ -152,7 +152,7 @@ class Rig:
 
     def stop(self) -> str:
         """End the experiment, also during its start, or the unlocking; return its name, or an empty string."""
-        self._stops += 1
+        self._stop_count += 1
         experiment = self.control_loop.experiment
         if experiment is None or not experiment.running:
             return "unlock" if self.runner.stop_unlocking() else ""
@@ -161,7 +161,7 @@ class Rig:
 
     def close(self) -> None:
         """Stop the running experiment at the daemon's end, and start nothing more."""
-        self._stops, self._closed = self._stops + 1, True
+        self._stop_count, self._closed = self._stop_count + 1, True
         experiment = self.control_loop.experiment
         if experiment is not None and experiment.running:
             self.runner.stop("the daemon ended: the wrist is stopped, a gripped tool stays gripped")

@@ -71,7 +71,7 @@ class _StepSummary:
     wrist_to_rad: float | None = None
 
 
-class EmulatedRig(Protocol):
+class EmulatedTruth(Protocol):
     """An emulated rig; `sent` holds the disturbances, with their times in ns."""
 
     sent: list[tuple[int, str]]
@@ -97,7 +97,7 @@ class _Run:
 class RunSummary:
     """Collects every message of a daemon; `text` is the summary of the last experiment that ended, or empty."""
 
-    def __init__(self, out: "TextIO | NonBlockingWriter | None" = None, emulated: EmulatedRig | None = None) -> None:
+    def __init__(self, out: "TextIO | NonBlockingWriter | None" = None, emulated: EmulatedTruth | None = None) -> None:
         """Take the output for each summary, if any, and an emulated rig, which adds its true torque."""
         self.text = ""
         self._out = out

@@ -7,16 +7,16 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, SerialDevice
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.gripper_task import GripperTask
-from shearloop.daemon.logs import DeviceLink
+from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.rig import load_cell_calibration
 from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipPipeline, FingertipTask
 from shearloop.daemon.sensing.frame_estimator import COMBINED, FrameEstimator
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
-from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, RecordedSkin, SkinTask
+from shearloop.daemon.sensing.skin_task import SKIN, SKIN_CURRENT, ReplayedSkin, SkinTask
+from shearloop.daemon.sensor_protocols import Tareable
 from shearloop.daemon.supervisor import Task
-from shearloop.daemon.taring import Tareable
 from shearloop.drivers.connection import LinkMonitor, SerialLink
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.load_cell import LoadCell
@@ -46,7 +46,7 @@ class Sensors:
         """Return the tasks to run, by their names in `health`."""
         tasks: dict[str, Task] = dict(self.fingertips)
         if self.skin is not None:
-            tasks |= {SKIN: self.skin, SKIN_SOURCE: self.skin.source}
+            tasks |= {SKIN: self.skin, SKIN_CURRENT: self.skin.source}
         if self.load_cell is not None:
             tasks[LOAD_CELL] = self.load_cell
         return tasks
@@ -71,7 +71,7 @@ def build_sensors(
         return recorder.input_recorder(source) if recorder is not None else None
 
     def link(name: str, device: SerialDevice) -> SerialLink:
-        return SerialLink(**device.model_dump(), monitor=LinkMonitor(DeviceLink(name, loop)))
+        return SerialLink(**device.model_dump(), monitor=LinkMonitor(LinkReporter(name, loop)))
 
     def pipeline(name: str, estimator: FrameEstimator) -> FingertipPipeline:
         return FingertipPipeline(name, estimator, publisher, clock, loop, gripper, inputs(name))
@@ -88,7 +88,7 @@ def build_sensors(
         fingertips[name] = FingertipTask(board, pipeline(name, estimator), publisher, pairs, always)
     skin = load_cell = None
     if config.skin is not None:
-        sources = {name: inputs(name) for name in RecordedSkin.sources}
+        sources = {name: inputs(name) for name in ReplayedSkin.sources}
         skin = SkinTask(config.skin, publisher, clock, loop, sources)
     if (cell := config.load_cell) is not None:
         calibration = load_cell_calibration(cell)

@@ -10,7 +10,7 @@ from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.estimation import FrameSeries, Measured
 from shearloop.bank.estimation.calibration import LARGEST_TOOL_SHARE
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.matlab import (
+from shearloop.daemon.recording.matlab_import import (
     DIAMETER_FOLDER,
     TORQUE_FOLDER,
     Slices,

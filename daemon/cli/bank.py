@@ -60,7 +60,7 @@ def _build(args: argparse.Namespace) -> int:
     from shearloop.bank.eit.bank_file import BANK_MAGIC, Bank
     from shearloop.bank.eit.build import build_bank, solve_row
     from shearloop.daemon.bank_config import load_bank_plan
-    from shearloop.daemon.executors import open_executor
+    from shearloop.daemon.parallel import open_executor
 
     jobs = checked_jobs(args.jobs)
     plan = load_bank_plan(args.config)

@@ -34,9 +34,9 @@ def run(args: argparse.Namespace) -> int:
     _check_arguments(args)
     require("matplotlib", "plot", "a chart")
     from shearloop.daemon.analysis.charts import scene, simulated_loop, speed_accuracy, stability
+    from shearloop.daemon.analysis.charts.chart_data import bank_of, mesh_of, splits
     from shearloop.daemon.analysis.charts.drawing import check_takes_pictures
-    from shearloop.daemon.analysis.charts.sources import bank_of, mesh_of, splits
-    from shearloop.daemon.executors import open_executor
+    from shearloop.daemon.parallel import open_executor
 
     check_takes_pictures(args.out)
     if args.name == "loop":

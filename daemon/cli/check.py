@@ -78,7 +78,7 @@ def _check_experiment_alone(path: Path) -> None:
 
 def check_parts(config: "DaemonConfig", path: Path) -> Parts:
     """Return what each part of the configuration in this file is; opens every file that it names."""
-    from shearloop.daemon.cli.emulated_devices import check_emulators
+    from shearloop.daemon.cli.emulator_processes import check_emulators
     from shearloop.daemon.control.loop_inputs import TorqueSource
     from shearloop.daemon.rig import check_experiment
     from shearloop.daemon.sensing.frame_estimator import COMBINED, open_combined, open_estimator, torque_sources

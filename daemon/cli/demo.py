@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     if config.robot is not None:
         robot_settings(config.robot)
     if args.recording is not None:
-        from shearloop.daemon.recording.matlab import read_stream
+        from shearloop.daemon.recording.matlab_import import read_stream
 
         read_stream(args.recording)
     print("The demo starts …", flush=True)

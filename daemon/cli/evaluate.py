@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     )
     from shearloop.daemon.analysis.frame_series import check_no_copies, check_paths_differ, part_of, read_series
     from shearloop.daemon.cli.options import check_kind, check_overwrite, load_calibration, parse_time_range
-    from shearloop.daemon.executors import in_order, open_executor
+    from shearloop.daemon.parallel import in_order, open_executor
 
     if args.out is not None and args.out.suffix not in _FIGURES:
         raise UserError(f"--out {args.out} is not the name of a figure; give one that ends in {', '.join(_FIGURES)}")

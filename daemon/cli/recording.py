@@ -154,7 +154,7 @@ def _export(args: argparse.Namespace) -> int:
 def _import(args: argparse.Namespace) -> int:
     from mcap.writer import MCAP0_MAGIC
 
-    from shearloop.daemon.recording.matlab import import_mat
+    from shearloop.daemon.recording.matlab_import import import_mat
 
     check_overwrite(args.out, "a recording", MCAP0_MAGIC)
     imported = import_mat(args.sources, args.out)

@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
 def _run(args: argparse.Namespace, out: "NonBlockingWriter", on_ready: Callable[[], None], *, terminal: bool) -> int:
     from shearloop.daemon.app import run_daemon
     from shearloop.daemon.cli import EXIT_OK, EXIT_UNFINISHED
-    from shearloop.daemon.cli.emulated_devices import EmulatedDevices
+    from shearloop.daemon.cli.emulator_processes import EmulatedDevices
     from shearloop.daemon.cli.terminal import StatusLine, print_estimate
     from shearloop.daemon.messaging.keys import Refusals
     from shearloop.daemon.messaging.stop_socket import StopSocket
@@ -96,13 +96,13 @@ def _run(args: argparse.Namespace, out: "NonBlockingWriter", on_ready: Callable[
 
 def _config(args: argparse.Namespace) -> "DaemonConfig":
     """Return the configuration with the arguments' changes, after checking its emulators."""
-    from shearloop.daemon.cli.emulated_devices import check_emulators
+    from shearloop.daemon.cli.emulator_processes import check_emulators
     from shearloop.daemon.config import RecordingConfig, load_daemon_config
 
     config = load_daemon_config(args.config)
     options = check_emulators(config.emulators, args.config)
     if args.recording is not None:
-        from shearloop.daemon.recording.matlab import read_stream
+        from shearloop.daemon.recording.matlab_import import read_stream
 
         boards = [given for given in options if given.device == "eit-kit"]
         if not boards:

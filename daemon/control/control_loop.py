@@ -41,7 +41,7 @@ from shearloop.daemon.control.loop_inputs import (
     TorqueSource,
 )
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDecision, SafetyMonitor
-from shearloop.daemon.control.twist_controller import WristCommand
+from shearloop.daemon.control.torque_controller import WristCommand
 from shearloop.daemon.control.wrist_controller import WristController
 
 # An `adapt` step compares the fingertip with the torques of this time.

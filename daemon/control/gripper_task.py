@@ -13,7 +13,7 @@ from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.loop_inputs import GripperStatus
 from shearloop.daemon.messaging.messages import GripperStateMessage, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
+from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperCommand, GripperState, ObjectStatus

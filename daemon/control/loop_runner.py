@@ -26,8 +26,8 @@ from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateMessage
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.sensor_protocols import LONGEST_TARE_S, Adaptable, Tareable, tare_all
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH
-from shearloop.daemon.taring import LONGEST_TARE_S, Adaptable, Tareable, tare_all
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import (
     ARRIVED,
@@ -88,8 +88,8 @@ class ControlLoopRunner:
         self._clock = clock
         self._dead_tasks = dead_tasks
         self._acceleration_rad_per_s2 = control_loop.config.wrist_acceleration_rad_per_s2
-        self._stops = StopTimeline()
-        self._sender = CommandSender(robot, control_loop, self._stops, clock)
+        self._timeline = StopTimeline()
+        self._sender = CommandSender(robot, control_loop, self._timeline, clock)
         self._actions = ActionExecutor(robot, gripper, sensors, self._sender, control_loop)
         self._states = StatePublisher(publisher, control_loop)
         self._running = False
@@ -123,12 +123,12 @@ class ControlLoopRunner:
             raise
         finally:
             self._running = False
-            self._states.publish_stop(self._stops.end())
+            self._states.publish_stop(self._timeline.end())
             await self._actions.close()
 
     def stop(self, reason: str) -> None:
         """End the experiment on request, at the next decision."""
-        self._stops.request(self._clock.now_ns())
+        self._timeline.request(self._clock.now_ns())
         self._control_loop.stop(reason)
 
     def decide_now(self) -> None:
@@ -164,7 +164,7 @@ class ControlLoopRunner:
             await self._states.changed.wait()
         # An action's failure ends it between two decisions.
         while experiment is self._control_loop.experiment and (
-            experiment is not self._states.ended or self._stops.pending
+            experiment is not self._states.ended or self._timeline.pending
         ):
             await self._states.changed.wait()
         return experiment
@@ -174,10 +174,10 @@ class ControlLoopRunner:
         self.stop_unlocking()
         if self._actions.fingers_move:
             self._actions.cancel()
-        await self._actions.halt_and_wait()
+        await self._actions.wait_for_final_action()
         with suppress(TimeoutError):
             async with asyncio.timeout(BRAKE_S):
-                while self._running and self._stops.pending:
+                while self._running and self._timeline.pending:
                     await self._states.changed.wait()
 
     async def unlock(self) -> str | None:
@@ -236,14 +236,14 @@ class ControlLoopRunner:
             self._sender.send(WristSpeed(output.wrist_rad_per_s, self._acceleration_rad_per_s2, now_ns))
             self._robot.keep_moving()
         self._states.publish_loop(self._sender.sent_rad_per_s, now_ns)
-        self._states.publish_stop(self._stops.update(self._robot.state, now_ns))
+        self._states.publish_stop(self._timeline.update(self._robot.state, now_ns))
 
     def _stop(self, output: ControlOutput, now_ns: int) -> None:
         if not self._stopped:
             self._stopped = True
             experiment, status = self._control_loop.experiment, self._control_loop.status
             if experiment is not None and experiment.phase is ExperimentPhase.STOPPED:
-                self._stops.begin(experiment.file.name, status.activity, status.decision, now_ns)
+                self._timeline.begin(experiment.file.name, status.activity, status.decision, now_ns)
             self._actions.cancel()
             self._sender.send(Stop(self._acceleration_rad_per_s2))
         if output.release:
@@ -384,7 +384,7 @@ class ActionExecutor:
         if self._task is not self._final_task:
             self.cancel()
 
-    async def halt_and_wait(self) -> None:
+    async def wait_for_final_action(self) -> None:
         """Wait for the end of the last release or halt."""
         if self._final_task is not None:
             await asyncio.wait({self._final_task}, timeout=RELEASED_WITHIN_S)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.identification import ToolModel, window_means
 from shearloop.daemon.control.loop_inputs import LoopConfig
-from shearloop.daemon.control.twist_controller import ControllerSettings
+from shearloop.daemon.control.torque_controller import ControllerSettings
 
 ComplexArray = NDArray[np.complex128]
 

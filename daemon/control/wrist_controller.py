@@ -14,7 +14,12 @@ from shearloop.daemon.control.experiment_schema import IdentifyStep
 from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.margins import gain_for_noise, integral_gain, margin_refusal
-from shearloop.daemon.control.twist_controller import LONGEST_STEP_NS, ControllerSettings, TwistController, WristCommand
+from shearloop.daemon.control.torque_controller import (
+    LONGEST_STEP_NS,
+    ControllerSettings,
+    TorqueController,
+    WristCommand,
+)
 
 # Torques that wait for the next wrist angle.
 MOST_PENDING = 64
@@ -32,7 +37,7 @@ class WristController:
     def __init__(self, source: TorqueSource, config: LoopConfig) -> None:
         self.source = source
         self.tool: ToolModel | None = None
-        self.controller: TwistController | None = None
+        self.controller: TorqueController | None = None
         # The torque set point of the closed loop.
         self.tracked: TrackTorque | None = None
         self._config = config
@@ -94,7 +99,7 @@ class WristController:
             return refusal
         if self.controller is None:
             here_nm = tool.torque_nm + tool.stiffness_nm_per_rad * (wrist_rad - tool.angle_rad)
-            self.controller = TwistController(settings, t_ns, wrist_rad, here_nm, tool.known_measurements)
+            self.controller = TorqueController(settings, t_ns, wrist_rad, here_nm, tool.known_measurements)
         self.controller.set_point(setpoint.torque_nm, settings)
         self.tracked = setpoint
         return None

@@ -57,11 +57,11 @@ class Connections:
     """
 
     def __init__(
-        self, context: "zmq.Context[Any]", bound: "zmq.Socket[Any]", address: str, key: str, refusals: Refusals
+        self, context: "zmq.Context[Any]", bound: "zmq.Socket[Any]", address: str, setting: str, refusals: Refusals
     ) -> None:
-        """Bind the socket, named `key` in the log; raises zmq.ZMQError."""
+        """Bind the socket, named `setting` in the log; raises zmq.ZMQError."""
         self._bound = bound
-        self._key = key
+        self._setting = setting
         self._refusals = refusals
         self._limit = most_connections(resource.getrlimit(resource.RLIMIT_NOFILE)[0])
         self._open: set[int] = set()
@@ -105,7 +105,7 @@ class Connections:
         if not self._full and len(self._open) >= self._limit:
             self._full = True
             self._listener.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, _FILTER)
-            reason = f"{self._limit} clients are connected to `{self._key}`; others wait until one has disconnected"
+            reason = f"{self._limit} clients are connected to `{self._setting}`; others wait until one has disconnected"
             self._refusals.add("too many connections", reason, frequent=True)
         elif self._full and len(self._open) <= self._limit * 3 // 4:
             self._full = False
@@ -148,36 +148,36 @@ def bind(
     context: "zmq.Context[Any]",
     bound: "zmq.Socket[Any]",
     address: str,
-    key: str,
+    setting: str,
     refusals: Refusals,
     keys: KeyPair | None = None,
 ) -> Connections:
-    """Bind a socket; a network address needs `keys`. Raises UserError that names `key` of the configuration."""
+    """Bind a socket; a network address needs `keys`. Raises UserError that names `setting` of the configuration."""
     try:
         if "://" in address and not is_local(address):
             if keys is None:
-                raise UserError(network_refusal(address, key))
+                raise UserError(network_refusal(address, setting))
             keys.apply(bound)
         if not has_valid_port(address):
             raise UserError(
-                f"`{key}: {address}` has no valid port (a whole number up to {LARGEST_PORT}); "
+                f"`{setting}: {address}` has no valid port (a whole number up to {LARGEST_PORT}); "
                 "use e.g. tcp://127.0.0.1:7761"
             )
-        _check_ipc_path(address, key)
-        return Connections(context, bound, address, key, refusals)
+        _check_ipc_path(address, setting)
+        return Connections(context, bound, address, setting, refusals)
     except UserError:
         bound.close()
         raise
     except zmq.ZMQError as error:
         bound.close()
         if error.errno == zmq.EADDRINUSE:
-            raise _in_use(address, key) from error
+            raise _in_use(address, setting) from error
         raise UserError(
-            f"`{key}: {address}` cannot be bound ({error.strerror}); use e.g. tcp://127.0.0.1:7761"
+            f"`{setting}: {address}` cannot be bound ({error.strerror}); use e.g. tcp://127.0.0.1:7761"
         ) from error
 
 
-def _check_ipc_path(address: str, key: str) -> None:
+def _check_ipc_path(address: str, setting: str) -> None:
     """Raise UserError if an ipc path is in use or is another kind of file: libzmq would delete it and bind."""
     path = address.removeprefix("ipc://")
     if path == address or path.startswith(("@", "*")):
@@ -187,15 +187,17 @@ def _check_ipc_path(address: str, key: str) -> None:
     except OSError:
         return
     if not stat.S_ISSOCK(mode):
-        raise UserError(f"`{key}: {address}` cannot be bound: {path} exists and is no socket; choose another address")
+        raise UserError(
+            f"`{setting}: {address}` cannot be bound: {path} exists and is no socket; choose another address"
+        )
     if (error := probe(path)) == 0:
-        raise _in_use(address, key)
+        raise _in_use(address, setting)
     # A killed daemon leaves the socket behind.
     if error != errno.ECONNREFUSED:
-        raise UserError(f"`{key}: {address}` cannot be bound ({os.strerror(error)}); choose another address")
+        raise UserError(f"`{setting}: {address}` cannot be bound ({os.strerror(error)}); choose another address")
 
 
-def _in_use(address: str, key: str) -> UserError:
+def _in_use(address: str, setting: str) -> UserError:
     return UserError(
-        f"`{key}: {address}` is already in use; is another daemon running? Stop it, or choose another address"
+        f"`{setting}: {address}` is already in use; is another daemon running? Stop it, or choose another address"
     )

@@ -32,7 +32,7 @@ from shearloop.bank.estimation import Measured
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.writer import PARTIAL, new_writer
-from shearloop.daemon.sensing.tool_diameter import tool_from_bytes
+from shearloop.daemon.sensing.fingertip_diameters import tool_from_bytes
 from shearloop.drivers.serial_sensor import InputKind
 from shearloop.files import open_file, replace_file
 

@@ -148,7 +148,7 @@ class _CurrentFile:
 class Recorder:
     """Writes files in a folder. `record_message`, `input_recorder` and `record_experiment` never block.
 
-    `failure` is the error of the last flush, empty without one. `finished` lists the closed files.
+    `failure` is the error of the last flush, empty without one. `closed_files` are complete.
     """
 
     def __init__(self, folder: Path, identity: Identity, clock: Clock) -> None:
@@ -164,7 +164,7 @@ class Recorder:
         # A flush may still run in its thread when the recorder is closed.
         self._lock = threading.Lock()
         self.failure = ""
-        self.finished: list[Path] = []
+        self.closed_files: list[Path] = []
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._current = self._new_file(lost_before=0)
@@ -215,7 +215,7 @@ class Recorder:
         counts, file = self._counts, self._current.file
         return {
             "file": str(self.path),
-            "files": len(self.finished) + 1,
+            "files": len(self.closed_files) + 1,
             "file_messages": file.messages,
             "file_bytes": file.bytes_written,
             "waiting_bytes": self._waiting_bytes,
@@ -342,7 +342,7 @@ class Recorder:
         except OSError as error:
             self.failure = f"{file.partial}: {error.strerror}"
         else:
-            self.finished.append(path)
+            self.closed_files.append(path)
 
     def _add_message(self, topic: str, content: Mapping[str, Any], now_ns: int, offset_ns: int) -> None:
         if topic == LoopState.topic:

@@ -28,6 +28,7 @@ from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.reader import open_recording, reading
 from shearloop.daemon.rig import load_cell_calibration
+from shearloop.daemon.sensing.fingertip_diameters import tool_from_bytes
 from shearloop.daemon.sensing.fingertip_task import (
     FramePairing,
     adapted_message,
@@ -37,8 +38,7 @@ from shearloop.daemon.sensing.fingertip_task import (
 )
 from shearloop.daemon.sensing.frame_estimator import COMBINED, FrameEstimator, open_combined, open_estimator
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
-from shearloop.daemon.sensing.skin_task import SKIN, RecordedSkin
-from shearloop.daemon.sensing.tool_diameter import tool_from_bytes
+from shearloop.daemon.sensing.skin_task import SKIN, ReplayedSkin
 from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.load_cell import LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
@@ -176,7 +176,7 @@ class ReplayPipeline:
         self._load_parser: LoadParser | None = None
         if config.load_cell is not None:
             self._load_parser = LoadParser(load_cell_calibration(config.load_cell), config.load_cell.rate_hz)
-        self._skin = RecordedSkin(config.skin) if config.skin is not None else None
+        self._skin = ReplayedSkin(config.skin) if config.skin is not None else None
 
     @property
     def sources(self) -> tuple[str, ...]:

@@ -18,8 +18,8 @@ from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFrame, EitHeatmap
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.sensing.fingertip_diameters import tool_as_bytes
 from shearloop.daemon.sensing.frame_estimator import FrameEstimator
-from shearloop.daemon.sensing.tool_diameter import tool_as_bytes
 from shearloop.daemon.supervisor import TaskFacts
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent

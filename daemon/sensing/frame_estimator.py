@@ -24,7 +24,7 @@ from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
-from shearloop.daemon.sensing.skin_task import skin_source
+from shearloop.daemon.sensing.skin_task import skin_torque_source
 from shearloop.drivers.eit_kit import Frame
 
 # Source of the estimate from several fingertips together.
@@ -210,7 +210,7 @@ def torque_sources(
     sources = {name: estimator.torque_source(name, periods_s[name]) for name, estimator in estimators.items()}
     if combined is not None:
         sources[COMBINED] = combined.torque_source(COMBINED, max(periods_s.values()))
-    if config.skin is not None and (skin := skin_source(config.skin)) is not None:
+    if config.skin is not None and (skin := skin_torque_source(config.skin)) is not None:
         sources[skin.name] = skin
     if config.load_cell is not None:
         sources[LOAD_CELL] = TorqueSource(name=LOAD_CELL, period_s=1.0 / config.load_cell.rate_hz)

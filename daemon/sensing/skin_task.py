@@ -13,7 +13,7 @@ from shearloop.daemon.config import InstrumentSocket, SerialDevice, SkinConfig
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.logs import DeviceLink
+from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
@@ -28,7 +28,7 @@ from shearloop.drivers.shear_skin.instruments import (
     Daq,
     Keithley6430,
     PairParser,
-    RecordedInstrument,
+    ReplayedInstrument,
     ScpiScanner,
     SourceReading,
     Voltages,
@@ -40,7 +40,7 @@ from shearloop.drivers.shear_skin.skin import SampleAverager, SampleValidator, S
 
 SKIN = "skin"
 # The instruments' names in health and in recordings.
-SKIN_SOURCE, SKIN_DAQ = f"{SKIN}.source", f"{SKIN}.daq"
+SKIN_CURRENT, SKIN_DAQ = f"{SKIN}.source", f"{SKIN}.daq"
 # A zero takes two seconds, and longer from averaged samples.
 ZERO_TIMEOUT_S = 15.0
 # The paper's bound.
@@ -48,7 +48,7 @@ MAX_WARMING_K = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class SkinSourceTask:
+class SkinCurrentTask:
     """Keeps the current source set up and read."""
 
     skin: ShearSkin
@@ -80,12 +80,12 @@ class SkinTask:
         calibration = load_calibration(config.calibration)
         check_circuit(config, calibration)
         self._skin = ShearSkin(
-            _current_source(config, inputs.get(SKIN_SOURCE)),
+            _current_source(config, inputs.get(SKIN_CURRENT)),
             _daq(config, inputs.get(SKIN_DAQ)),
             _gauge_ohm(calibration),
             config.daq.averaged,
         )
-        self.source = SkinSourceTask(self._skin)
+        self.source = SkinCurrentTask(self._skin)
         self._estimator = _estimator(config, calibration)
         self._publisher = publisher
         self._clock = clock
@@ -149,10 +149,10 @@ class SkinTask:
         self._publisher.publish(message)
 
 
-class RecordedSkin:
+class ReplayedSkin:
     """The skin's parsers, validator and estimator, for the replay of recorded events."""
 
-    sources = (SKIN, SKIN_SOURCE, SKIN_DAQ)
+    sources = (SKIN, SKIN_CURRENT, SKIN_DAQ)
 
     def __init__(self, config: SkinConfig) -> None:
         """Raises BankError for an unusable calibration."""
@@ -163,16 +163,16 @@ class RecordedSkin:
         self._validator = SampleValidator(current_a, SOURCE_PERIOD_S, daq_period_s, _gauge_ohm(calibration))
         self._averager = SampleAverager(config.daq.averaged)
         self._radius_m = _radius_m(config)
-        self._source = RecordedInstrument({READ: read_elements, OUTPUT: read_output})
+        self._source = ReplayedInstrument({READ: read_elements, OUTPUT: read_output})
         adc = config.daq.adc
-        self._daq: RecordedInstrument[Voltages] | PairParser = (
-            RecordedInstrument({SCAN: read_scan}) if adc is None else PairParser(config.daq.rate_hz, adc.full_scale_v)
+        self._daq: ReplayedInstrument[Voltages] | PairParser = (
+            ReplayedInstrument({SCAN: read_scan}) if adc is None else PairParser(config.daq.rate_hz, adc.full_scale_v)
         )
         self._latest: SourceReading | None = None
 
     def handle(self, source: str, event: RawEvent) -> list[SkinShear]:
         """Return the messages that a source's event leads to, without processing time."""
-        if source == SKIN_SOURCE:
+        if source == SKIN_CURRENT:
             readings = self._source.handle(event)
             self._latest = readings[-1] if readings else self._latest
         elif source == SKIN_DAQ:
@@ -222,7 +222,7 @@ def skin_torque(reading: SkinReading, radius_m: float, t_mid_ns: int, now_ns: in
     return TorqueSample(SKIN, force_nm, "", t_mid_ns, now_ns, low_nm, high_nm)
 
 
-def skin_source(config: SkinConfig) -> TorqueSource | None:
+def skin_torque_source(config: SkinConfig) -> TorqueSource | None:
     """Return the skin as a source of torque; None without a radius."""
     if config.tool_radius_mm is None:
         return None
@@ -276,13 +276,13 @@ def _estimator(config: SkinConfig, calibration: SkinCalibration) -> SkinEstimato
 
 def _current_source(config: SkinConfig, inputs: InputRecorder | None) -> Keithley6430:
     source = config.source
-    link = _link(source.socket, source.serial, source.baud, LinkMonitor(DeviceLink("skin source")))
+    link = _link(source.socket, source.serial, source.baud, LinkMonitor(LinkReporter("skin source")))
     return Keithley6430(link, source.current_ma * 1e-3, source.compliance_v, SOURCE_PERIOD_S, inputs=inputs)
 
 
 def _daq(config: SkinConfig, inputs: InputRecorder | None) -> Daq:
     rate_hz, scanner, adc = config.daq.rate_hz, config.daq.scanner, config.daq.adc
-    monitor = LinkMonitor(DeviceLink("skin daq"))
+    monitor = LinkMonitor(LinkReporter("skin daq"))
     if scanner is not None:
         link = _link(scanner.socket, None, DEFAULT_BAUD, monitor)
         return ScpiScanner(link, scanner.channels, rate_hz, scanner.range_v, inputs=inputs)

@@ -116,7 +116,7 @@ class RobotiqGripper:
 
     def __init__(
         self,
-        client: messages.GripperClient,
+        client: messages.RobotiqConnection,
         calibration: WidthCalibration,
         *,
         poll_s: float = POLL_S,

@@ -118,7 +118,7 @@ class GripperMove:
 Request = GripperAction | GripperMove
 
 
-class GripperClient(Protocol):
+class RobotiqConnection(Protocol):
     """A connection to the gripper. Each call has a deadline; DeviceLostError closes the connection."""
 
     @property

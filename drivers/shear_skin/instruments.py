@@ -219,7 +219,7 @@ class SourceReading:
     compliance: bool = False
 
 
-class RecordedInstrument(Generic[ReadingT]):
+class ReplayedInstrument(Generic[ReadingT]):
     """Parses an instrument's recorded replies. No I/O."""
 
     def __init__(self, parsers: Mapping[str, Callable[[Reply], ReadingT | None]]) -> None:

@@ -67,7 +67,7 @@ class UrRobot:
     def __init__(self, settings: UrSettings, monitor: LinkMonitor | None = None) -> None:
         self.settings = settings
         self.state: messages.RobotState | None = None
-        self.link = monitor or LinkMonitor()
+        self.monitor = monitor or LinkMonitor()
         self.losses: Counter[str] = Counter()
         # How many states have come.
         self.states = 0
@@ -83,7 +83,7 @@ class UrRobot:
             "connected": self.state is not None,
             "states": self.states,
             "errors": dict(self.losses),
-            "error": "" if self.link.latest.up else self.link.latest.sentence,
+            "error": "" if self.monitor.latest.up else self.monitor.latest.sentence,
         }
 
     async def next_state(self) -> messages.RobotState:
@@ -96,7 +96,7 @@ class UrRobot:
         """Send a command at once and return its reply; when the worker dies first, the reply is a refusal."""
         replied: asyncio.Future[messages.CommandReply] = asyncio.get_running_loop().create_future()
         if self._connection is None or self.state is None:
-            replied.set_result(messages.CommandReply(f"The robot is not connected. {self.link.latest.sentence}"))
+            replied.set_result(messages.CommandReply(f"The robot is not connected. {self.monitor.latest.sentence}"))
         else:
             self._number += 1
             self._replies[self._number] = replied
@@ -115,7 +115,7 @@ class UrRobot:
                 await self._run_worker()
             except LostError as loss:
                 self.losses[loss.kind] += 1
-                pause_s = self.link.failed(loss, time.monotonic_ns())
+                pause_s = self.monitor.failed(loss, time.monotonic_ns())
                 # Only an update of the controller changes its version.
                 await asyncio.sleep(math.inf if loss.kind == "version" else pause_s)
 
@@ -149,7 +149,7 @@ class UrRobot:
                     untested = untested_sentence(self._version) if self._version else ""
                     connected = f"The robot at {self.settings.host} is connected."
                     said = (connected, untested, self.settings.warning, message.blocked)
-                    self.link.connected(" ".join(filter(None, said)), time.monotonic_ns())
+                    self.monitor.connected(" ".join(filter(None, said)), time.monotonic_ns())
                 if self._next is not None:
                     self._next.set_result(message)
                     self._next = None

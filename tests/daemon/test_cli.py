@@ -372,7 +372,7 @@ def test_the_status_line_is_redrawn_in_place(monkeypatch):
 
 
 def test_a_second_daemon_is_refused_before_its_emulators_start(config, tmp_path, monkeypatch, mistake):
-    monkeypatch.setattr("shearloop.daemon.cli.emulated_devices.subprocess.Popen", Mock(side_effect=AssertionError))
+    monkeypatch.setattr("shearloop.daemon.cli.emulator_processes.subprocess.Popen", Mock(side_effect=AssertionError))
     path = str(config(emulators=[{"device": "hx711", "arguments": ["--link", "load"]}]))
     with closing(StopSocket(f"ipc://{tmp_path}/commands", {}, Refusals())):
         assert "is another daemon running? Stop it, or choose another port" in mistake("run", path)

@@ -237,7 +237,7 @@ async def test_a_daemon_that_is_ended_in_mid_experiment_tells_of_it_as_of_every_
         daemon.publisher.add_listener(RunSummary(out))
         await watcher.until("robot.state", lambda state: abs(state["wrist_speed_rad_per_s"]) > 0.1)
         daemon.stop()
-        await daemon._stop.wait()
+        await daemon._end.wait()
     why = "the daemon ended: the wrist is stopped, a gripped tool stays gripped"
     assert not daemon.finished
     assert (watcher.seen["loop.state"][-1]["phase"], watcher.seen["loop.state"][-1]["activity"]) == ("stopped", why)
@@ -251,7 +251,7 @@ async def test_a_daemon_that_ends_with_its_experiment_lets_the_tool_go_first(rig
     twist = {"do": "twist", "angles_rad": [0.3], "speed_rad_per_s": 0.1, "limits": {"torque_nm": 0.02}}
     path = ending_with(rig_config, {"do": "grip", "width_mm": 5, "force_n": 60}, twist)
     async with running_rig(path, tiny_bank) as (daemon, watcher, _cause, _command):
-        await daemon._stop.wait()
+        await daemon._end.wait()
     assert not daemon.finished
     states = watcher.seen["gripper.state"]
     assert "the torque is beyond its limit" in watcher.seen["loop.state"][-1]["reasons"]

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from shearloop.daemon.cli.emulated_devices import EmulatedDevices
+from shearloop.daemon.cli.emulator_processes import EmulatedDevices
 from shearloop.daemon.config import EmulatorConfig
 from shearloop.daemon.config_file import load_yaml_model
 

@@ -78,7 +78,7 @@ async def test_a_manual_start_cancels_the_waiting_experiment(own, finished, wait
         if not own:
             await log.says(LEFT_TO_OPERATOR)
             daemon.stop()
-        await daemon._stop.wait()
+        await daemon._end.wait()
     assert begun == [path]
     assert daemon.finished is finished
 

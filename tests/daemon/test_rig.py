@@ -5,7 +5,7 @@ from shearloop.daemon import rig as rig_module
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
-from shearloop.daemon.logs import DeviceLink
+from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.rig import Rig
 from shearloop.daemon.supervisor import Supervisor
 from shearloop.drivers.connection import LinkEvent
@@ -14,7 +14,7 @@ from tests.drivers.ur.flight import SETTINGS
 
 def test_the_control_loop_hears_of_a_lost_device_until_it_returns():
     loop = ControlLoop(LoopConfig(), {"right": TorqueSource(name="right", period_s=0.5)}, ("robot",))
-    link = DeviceLink("robot", loop)
+    link = LinkReporter("robot", loop)
     link.on_link_event(LinkEvent(up=False, sentence="the robot's process died", repeated=False))
     assert "the robot's process died" in " ".join(loop_reasons(loop))
     link.on_link_event(LinkEvent(up=True, sentence="it is back", repeated=False))

@@ -94,7 +94,7 @@ async def test_tare_status_and_stop_commands(config, tmp_path):
             assert status["tasks"]["right"]["connected"]
             assert status["tasks"]["commands"]["errors"] == {"tare refused": 1}
         assert (await ask(daemon, "stop"))["ok"]
-        await daemon._stop.wait()
+        await daemon._end.wait()
 
 
 async def test_a_heatmap_is_computed_only_with_a_subscriber(config, tmp_path, subscriber):

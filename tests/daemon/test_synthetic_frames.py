@@ -10,7 +10,7 @@ from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.eit.models import conductivity
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.matlab import read_torque_slices
+from shearloop.daemon.recording.matlab_import import read_torque_slices
 from shearloop.daemon.synthetic_frames import Synthesiser, TwistProgramme
 from shearloop.drivers.eit_kit import FrameParser
 from shearloop.drivers.emulators.boards import format_line

@@ -16,10 +16,10 @@ from shearloop.bank.estimation.bank_match import ElectrodeNumbering
 from shearloop.bank.estimation.fingertip_validator import channel_noise
 from shearloop.bank.estimator_names import EstimatorName
 from shearloop.daemon.analysis.bank_design import residual_noise
+from shearloop.daemon.analysis.charts.chart_data import Split, fitted
 from shearloop.daemon.analysis.charts.drawing import figure, look
-from shearloop.daemon.analysis.charts.sources import Split, fitted
 from shearloop.daemon.analysis.evaluate import values_of
-from shearloop.daemon.executors import Executor, in_order
+from shearloop.daemon.parallel import Executor, in_order
 from shearloop.drivers.eit_kit import ADC_STEP_V
 
 

@@ -10,7 +10,7 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.forward import BatchForwardModel, ForwardModel
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import ConductivityModel, conductivity
-from shearloop.daemon.analysis.charts.sources import own_fingertip
+from shearloop.daemon.analysis.charts.chart_data import own_fingertip
 
 MODEL = "gaussian_derivative"
 # Cells all over the valid part of the paper's grid.

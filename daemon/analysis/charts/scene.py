@@ -11,12 +11,12 @@ from matplotlib.axes import Axes
 from shearloop.bank.eit.design import ALLOWED, Design, DesignChoice, MeasuredFrames, design_bank, simulated_frames
 from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.daemon.analysis.bank_design import doubts, scene_of
+from shearloop.daemon.analysis.charts.chart_data import Split, own_fingertip
 from shearloop.daemon.analysis.charts.drawing import SHADES, figure, save, slug
-from shearloop.daemon.analysis.charts.sources import Split, own_fingertip
 from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP
 from shearloop.daemon.bank_config import FingertipGeometryConfig
 from shearloop.daemon.config_file import load_yaml_model
-from shearloop.daemon.executors import Executor, in_order
+from shearloop.daemon.parallel import Executor, in_order
 
 _MESH_SIZE_CM = 0.07
 _LEAST_SHOWN, _MOST_TICKS = 1e-3, 12

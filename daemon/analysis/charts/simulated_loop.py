@@ -20,7 +20,7 @@ from shearloop.daemon.control.experiment import TrackTorque
 from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
 from shearloop.daemon.control.margins import integral_gain
-from shearloop.daemon.control.twist_controller import ControllerSettings, TwistController, WristCommand
+from shearloop.daemon.control.torque_controller import ControllerSettings, TorqueController, WristCommand
 from shearloop.daemon.control.wrist_controller import controller_settings
 from shearloop.daemon.run_summary import BAND, STAYS_S
 from shearloop.drivers.defaults import FRAME_PERIOD_S
@@ -298,10 +298,10 @@ def settings_for(found: ToolModel, scenario: LoopScenario) -> ControllerSettings
     return controller_settings(config, found, source, TrackTorque(0.0, scenario.ramp_nm_per_s), torque_limit_nm=0.2)
 
 
-def started_controller(plant: Plant, found: ToolModel, settings: ControllerSettings) -> TwistController:
+def started_controller(plant: Plant, found: ToolModel, settings: ControllerSettings) -> TorqueController:
     """Return a twist controller that starts at the plant's present angle."""
     torque = found.torque_nm + found.stiffness_nm_per_rad * (plant.angle_rad - found.angle_rad)
-    return TwistController(settings, nanoseconds(plant.t_s), plant.angle_rad, torque, found.known_measurements)
+    return TorqueController(settings, nanoseconds(plant.t_s), plant.angle_rad, torque, found.known_measurements)
 
 
 # The chart's loop panel: how closely the torque follows over how many frames are averaged.
@@ -333,7 +333,7 @@ class TrackingError:
 class _AveragedLoop:
     """A controller fed with the mean of the latest frames, stamped with the mean of their times."""
 
-    controller: TwistController | UncompensatedController
+    controller: TorqueController | UncompensatedController
     latest: deque[tuple[float, int]]
 
     def measure(self, torque_nm: float, t_mid_ns: int, t_ns: int) -> None:
@@ -425,7 +425,7 @@ def held_loops(seeds: int) -> dict[str, list[tuple[Trace, Trace]]]:
         steady = replace(settings, noise_nm=0.0)
         for name in HELD_LOOPS:
             plant = copy.deepcopy(gripped)
-            loop: TwistController | UncompensatedController = UncompensatedController(settings)
+            loop: TorqueController | UncompensatedController = UncompensatedController(settings)
             if name != HELD_LOOPS[2]:
                 loop = started_controller(plant, found, settings if name == HELD_LOOPS[0] else steady)
             loop.set_point(_TARGET_NM)

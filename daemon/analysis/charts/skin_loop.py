@@ -22,7 +22,7 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
 from shearloop.daemon.control.loop_inputs import ArmStatus, LoopConfig, TorqueSample, TorqueSource
-from shearloop.daemon.executors import Executor, in_order
+from shearloop.daemon.parallel import Executor, in_order
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
 from shearloop.daemon.synthetic_skin import SyntheticSkin

@@ -24,10 +24,10 @@ from shearloop.bank.estimation.interval_regressor import IntervalRegressor, Ridg
 from shearloop.bank.estimation.regressors import ranked_channels
 from shearloop.bank.estimator_names import EstimatorName
 from shearloop.daemon.analysis.charts import drawing
+from shearloop.daemon.analysis.charts.chart_data import Split, fitted
 from shearloop.daemon.analysis.charts.drawing import LINES, MARKS, SHADES
 from shearloop.daemon.analysis.charts.forward_methods import CELLS, SolvedForward, forward_methods
 from shearloop.daemon.analysis.charts.simulated_loop import GAIN, LOOPS, TrackingError, tracking_errors
-from shearloop.daemon.analysis.charts.sources import Split, fitted
 from shearloop.daemon.analysis.evaluate import estimate_series, values_of
 
 _ESTIMATORS: tuple[EstimatorName, ...] = ("bank", "regression", "reconstruction", "motion_regression")

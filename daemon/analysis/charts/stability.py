@@ -27,6 +27,15 @@ from shearloop.bank.estimation import (
 from shearloop.bank.estimation.bank_match import NOT_TURNED
 from shearloop.bank.estimator_names import EstimatorName
 from shearloop.daemon.analysis.charts import skin_loop
+from shearloop.daemon.analysis.charts.chart_data import (
+    Split,
+    fitted,
+    homogeneous_of,
+    mean_frame,
+    played_bank,
+    splits,
+    torque_of,
+)
 from shearloop.daemon.analysis.charts.drawing import figure, look, save, slug
 from shearloop.daemon.analysis.charts.fault_sweeps import (
     BROKEN_SHARE,
@@ -42,20 +51,11 @@ from shearloop.daemon.analysis.charts.fault_sweeps import (
     sweeps,
     sweeps_figure,
 )
-from shearloop.daemon.analysis.charts.sources import (
-    Split,
-    fitted,
-    homogeneous_of,
-    mean_frame,
-    played_bank,
-    splits,
-    torque_of,
-)
 from shearloop.daemon.analysis.charts.speed_accuracy import matched_sigma, parabola
 from shearloop.daemon.analysis.evaluate import values_of
 from shearloop.daemon.analysis.reproduce.banks import Grid
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.executors import Executor, in_order
+from shearloop.daemon.parallel import Executor, in_order
 from shearloop.daemon.synthetic_frames import Synthesiser
 
 STEPS = 25

@@ -26,7 +26,7 @@ from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import MatchingError
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.matlab import (
+from shearloop.daemon.recording.matlab_import import (
     DIAMETER_FOLDER,
     RAW_FRAME,
     RAW_HOMOGENEOUS,

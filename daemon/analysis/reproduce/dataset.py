@@ -16,7 +16,7 @@ from shearloop.bank.estimation.regressors import ranked_channels
 from shearloop.daemon.analysis.charts.drawing import figure
 from shearloop.daemon.analysis.frame_series import series_of
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.matlab import Slices, find_streams, import_mat
+from shearloop.daemon.recording.matlab_import import Slices, find_streams, import_mat
 from shearloop.daemon.recording.reader import read_recording
 
 # "Using 272 of the 896 channels achieves 80% accuracy", relative to all channels.

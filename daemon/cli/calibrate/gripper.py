@@ -38,14 +38,14 @@ def run(args: argparse.Namespace) -> int:
     """Grip each object and write the calibration."""
     from shearloop.drivers.calibration_files import save_calibration
     from shearloop.drivers.robotiq.gripper import STROKE_MM, RobotiqGripper, WidthCalibration
-    from shearloop.drivers.robotiq.messages import GripperClient
+    from shearloop.drivers.robotiq.messages import RobotiqConnection
     from shearloop.drivers.robotiq.modbus_client import ModbusClient
     from shearloop.drivers.robotiq.socket_client import SocketClient
 
     if any(not 0 < diameter < STROKE_MM for diameter in args.diameter_mm) or len(set(args.diameter_mm)) < 2:
         raise UserError(f"give at least two different --diameter-mm between 0 and {STROKE_MM:g}")
     check_calibration_file(args.out)
-    client: GripperClient
+    client: RobotiqConnection
     if args.host is not None:
         client = SocketClient(args.host, args.socket_port)
     else:

@@ -70,7 +70,7 @@ def _frames(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.f
         if args.once:
             raise UserError("--once is for a recording; synthetic frames have no end")
         return _synthetic(args, period_s)
-    from shearloop.daemon.recording.matlab import read_stream
+    from shearloop.daemon.recording.matlab_import import read_stream
 
     lines = read_stream(args.recording, args.side).values
     return iter(lines) if args.once else cycle(lines)

@@ -7,7 +7,7 @@ import pytest
 
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.mesh import Mesh
-from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits
+from shearloop.daemon.analysis.charts.chart_data import Split, bank_of, own_fingertip, splits
 from shearloop.daemon.analysis.reproduce.banks import Grid
 
 

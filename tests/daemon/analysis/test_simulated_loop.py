@@ -18,7 +18,7 @@ from shearloop.daemon.analysis.charts.simulated_loop import (
     nanoseconds,
     run,
 )
-from shearloop.daemon.control.twist_controller import WristCommand
+from shearloop.daemon.control.torque_controller import WristCommand
 
 
 class FixedSpeed:

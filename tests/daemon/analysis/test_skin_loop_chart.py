@@ -13,7 +13,7 @@ from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, HoldTorqueStep
-from shearloop.daemon.executors import SerialExecutor
+from shearloop.daemon.parallel import SerialExecutor
 
 CONFIG = Path(__file__).parents[3] / "config"
 # The section's 0.04, at the outer radius.

@@ -12,6 +12,7 @@ from matplotlib.text import Annotation, Text
 from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import FrameSeries
 from shearloop.daemon.analysis.charts import scene
+from shearloop.daemon.analysis.charts.chart_data import Split, own_fingertip, splits, synthetic_stream
 from shearloop.daemon.analysis.charts.drawing import (
     figure,
     frontier,
@@ -21,7 +22,6 @@ from shearloop.daemon.analysis.charts.drawing import (
 )
 from shearloop.daemon.analysis.charts.forward_methods import converged, direct, error_of, forward_methods
 from shearloop.daemon.analysis.charts.simulated_loop import tracking_errors
-from shearloop.daemon.analysis.charts.sources import Split, own_fingertip, splits, synthetic_stream
 from shearloop.daemon.analysis.charts.speed_accuracy import (
     MeasuredMethod,
     TorqueMethod,
@@ -34,7 +34,7 @@ from shearloop.daemon.analysis.charts.speed_accuracy import (
     write,
 )
 from shearloop.daemon.cli.chart import NAMES
-from shearloop.daemon.executors import SerialExecutor
+from shearloop.daemon.parallel import SerialExecutor
 
 
 def test_the_frontier_is_what_nothing_beats_in_both():
@@ -74,7 +74,7 @@ def test_a_recording_of_a_known_tool_is_judged_and_one_without_torques_is_named(
     known = replace(stream.whole, diameter_mm=np.full(len(stream.whole.t_s), 20.0))
     empty = replace(stream.whole, torque_t_s=np.zeros(0), torque_nm=np.zeros(0))
     recorded = {"known.mcap": [known], "empty.mcap": [empty]}
-    monkeypatch.setattr("shearloop.daemon.analysis.charts.sources.read_series", lambda path: recorded[str(path)])
+    monkeypatch.setattr("shearloop.daemon.analysis.charts.chart_data.read_series", lambda path: recorded[str(path)])
     [split] = splits([Path(name) for name in recorded], 0.6, scratch)
     assert split.title.startswith("known.mcap, stream")
     assert capsys.readouterr().out == "empty.mcap is left out: it holds no torques of a load cell\n"
@@ -139,7 +139,7 @@ def test_a_mistake_is_one_sentence(name, arguments, complaint, tmp_path, mistake
 
 def test_an_unwritable_folder_is_reported_before_anything_is_measured(monkeypatch, mistake):
     # Were anything read, it would be what fails.
-    monkeypatch.setattr("shearloop.daemon.analysis.charts.sources.splits", None)
+    monkeypatch.setattr("shearloop.daemon.analysis.charts.chart_data.splits", None)
     for name in NAMES:
         said = mistake("chart", name, "--out", "/dev/null")
         assert said == "shearloop chart: /dev/null: the chart cannot be written: File exists; choose another --out\n"

@@ -8,10 +8,10 @@ import pytest
 
 from shearloop.bank.estimation import Estimate, EstimatorSession, Physics, fit
 from shearloop.daemon.analysis.charts import fault_sweeps, stability
-from shearloop.daemon.analysis.charts.sources import Split, fitted
+from shearloop.daemon.analysis.charts.chart_data import Split, fitted
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.executors import SerialExecutor
+from shearloop.daemon.parallel import SerialExecutor
 
 
 def estimate(torque: float, half: float = 0.01) -> Estimate:

@@ -3,7 +3,7 @@ from typing import Any
 
 import pytest
 
-from shearloop.daemon.control.twist_controller import ControllerSettings, TwistController
+from shearloop.daemon.control.torque_controller import ControllerSettings, TorqueController
 
 DEFAULTS: dict[str, Any] = {
     "stiffness_nm_per_rad": 0.25,
@@ -33,7 +33,7 @@ class Bench:
     def __init__(self, **changes: Any) -> None:
         self.settings = ControllerSettings(**(DEFAULTS | changes))
         self.t_ns, self.angle, self.speed = 10**12, 0.3, 0.0
-        self.controller = TwistController(self.settings, self.t_ns, self.angle, 0.0, 100.0)
+        self.controller = TorqueController(self.settings, self.t_ns, self.angle, 0.0, 100.0)
 
     def advance(self, seconds: float) -> list[float]:
         speeds = []

@@ -14,7 +14,7 @@ from shearloop.daemon.control.experiment_schema import GripStep
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import GripperStatus
-from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
+from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
 from tests.daemon.conftest import DEADLINE_S
 from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
 

@@ -26,7 +26,7 @@ from shearloop.daemon.control.margins import (
     with_gain,
     wrist_response,
 )
-from shearloop.daemon.control.twist_controller import ControllerSettings
+from shearloop.daemon.control.torque_controller import ControllerSettings
 
 from .conftest import DEFAULTS
 

@@ -135,7 +135,7 @@ def test_foreign_messages_are_an_error(tmp_path):
 
 def test_every_command_has_a_handler_and_a_description_and_the_page_knows_it():
     server = pytest.importorskip("shearloop.daemon.web.server", reason="the live page needs the extra `view`")
-    handled = Commands(rig=None, sensors=None, experiment=None, health=None, stop=None).handlers()
+    handled = Commands(rig=None, sensors=None, experiment=None, health=None, daemon_end=None).handlers()
     assert set(COMMANDS) == set(handled) == {*server.NEEDS_TOKEN, STATUS, STOP}
 
 
@@ -148,7 +148,7 @@ async def test_tare_is_refused_during_an_experiment():
         sensors=SimpleNamespace(tareable=lambda: sensors),
         experiment=None,
         health=None,
-        stop=asyncio.Event(),
+        daemon_end=asyncio.Event(),
     )
     tare = commands.handlers()["tare"]
     for request_ in ({}, {"source": "load_cell"}):

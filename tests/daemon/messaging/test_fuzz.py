@@ -124,7 +124,7 @@ async def test_a_flood_of_malformed_frames_and_requests(config, tiny_bank, monke
         assert len(asyncio.all_tasks()) <= tasks + command_server.MAX_CONCURRENT
         status = await asyncio.to_thread(exchange, address, iter([[encode({"command": "stop"})]]))
         assert status == {True: 1}, "stop is heard in the middle of it all"
-        await daemon._stop.wait()
+        await daemon._end.wait()
     os.close(port)
     os.close(board)
 

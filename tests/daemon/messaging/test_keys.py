@@ -127,7 +127,7 @@ async def test_only_allowed_clients_connect_and_only_encrypted(config, keys, con
         for name in ("start", "resume", "unlock", "tare", "pause"):
             assert "this command needs a key" in (await anyone({"command": name}, DEADLINE_S))["reason"]
         assert (await anyone({"command": "stop"}, DEADLINE_S))["ok"]
-        await daemon._stop.wait()
+        await daemon._end.wait()
 
 
 def test_a_client_needs_keys_for_another_machine(tmp_path, monkeypatch, ran, mistake):

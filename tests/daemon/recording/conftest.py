@@ -7,7 +7,7 @@ import pytest
 from scipy.io import savemat
 
 from shearloop.bank.eit.channels import PAPER_TABLE
-from shearloop.daemon.recording.matlab import import_mat
+from shearloop.daemon.recording.matlab_import import import_mat
 
 PERIOD_S = 0.5408
 # 2024-12-03 16:09 as MATLAB counts days.

@@ -44,7 +44,7 @@ def content(tmp_path_factory) -> bytes:
         if number == 1:
             recorder.write()
     recorder.close()
-    (path,) = recorder.finished
+    (path,) = recorder.closed_files
     return path.read_bytes()
 
 

@@ -93,7 +93,7 @@ def test_no_data_is_missing_when_the_disk_has_room_again(tmp_path, disks):
     recorder.write()
     assert recorder.failure == ""
     recorder.close()
-    (path,) = recorder.finished
+    (path,) = recorder.closed_files
     assert [one["frame"] for one in topics(path)["eit.frame.right"]] == list(range(20))
     assert RecordedTopics(path).counts["eit.frame.right"] == 20, "the checksums are those of one write"
 
@@ -115,7 +115,7 @@ def test_a_file_that_cannot_be_started_is_removed(tmp_path, monkeypatch, disks):
     recorder.write()
     assert recorder.failure == ""
     recorder.close()
-    assert [[one["seq"] for one in topics(path)["load.torque"]] for path in recorder.finished] == [[0, 1, 2], [3]]
+    assert [[one["seq"] for one in topics(path)["load.torque"]] for path in recorder.closed_files] == [[0, 1, 2], [3]]
 
 
 def test_the_queue_is_bounded_and_drops_are_counted_in_their_own_file(tmp_path, monkeypatch):
@@ -137,8 +137,8 @@ def test_the_queue_is_bounded_and_drops_are_counted_in_their_own_file(tmp_path, 
     recorder.close()
     assert 0 < dropped < 20
     assert later > 0
-    assert [summarise(path).dropped for path in recorder.finished] == [dropped, later, 0]
-    kept = topics(recorder.finished[0])["eit.frame.right"]
+    assert [summarise(path).dropped for path in recorder.closed_files] == [dropped, later, 0]
+    kept = topics(recorder.closed_files[0])["eit.frame.right"]
     assert [one["frame"] for one in kept] == list(range(20 - dropped))
 
 
@@ -174,8 +174,8 @@ def test_a_removed_file_is_a_failure_and_a_new_one_begins(removed, tmp_path):
     recorder.write()
     assert recorder.failure == ""
     recorder.close()
-    assert [[one["seq"] for one in topics(path)["load.torque"]] for path in recorder.finished] == [[1, 2]]
-    assert summarise(recorder.finished[0]).dropped == 0
+    assert [[one["seq"] for one in topics(path)["load.torque"]] for path in recorder.closed_files] == [[1, 2]]
+    assert summarise(recorder.closed_files[0]).dropped == 0
     assert not replaced.exists() or replaced.read_text() == "another's file"
 
 
@@ -185,8 +185,8 @@ async def test_a_removed_recording_is_not_logged_as_recorded(config):
         daemon.recorder.record_experiment("one")
         daemon.recorder.record_experiment("two")
         daemon.recorder.write()
-        daemon.recorder.finished[0].unlink()
+        daemon.recorder.closed_files[0].unlink()
         daemon.stop()
         await daemon.run()
-    events = [one["event"] for one in logs if one.get("file") in map(str, daemon.recorder.finished)]
+    events = [one["event"] for one in logs if one.get("file") in map(str, daemon.recorder.closed_files)]
     assert events == ["the recorded file was removed", "recorded"]

@@ -14,7 +14,7 @@ from scipy.io import loadmat, savemat
 
 from shearloop.bank.matlab_file import MatFileError, read_variables
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.matlab import (
+from shearloop.daemon.recording.matlab_import import (
     read_diameter_slices,
     read_line,
     read_stream,

@@ -8,7 +8,7 @@ import pytest
 
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.matlab import read_diameter_slices, read_line, read_torque_slices
+from shearloop.daemon.recording.matlab_import import read_diameter_slices, read_line, read_torque_slices
 from shearloop.daemon.recording.slice_export import export_slices
 from shearloop.daemon.recording.tables import RecordedTopics
 from shearloop.daemon.recording.writer import McapFile

@@ -64,7 +64,7 @@ def test_messages_are_recorded_with_schema_and_time(tmp_path):
     recorder.record_message("load.torque", torque(0, float("nan")))
     recorder.close()
     assert recorder.failure == ""
-    (path,) = recorder.finished
+    (path,) = recorder.closed_files
     found = topics(path)
     assert found["input.right"][0] == {"t_mono_ns": 5, "kind": "opened", "data": ""}
     assert found["input.right"][1]["data"].encode("latin-1") == bytes(range(256))
@@ -91,7 +91,7 @@ def test_a_live_recording_is_read_like_an_import(tmp_path):
         recorder.record_message("load.torque", torque(n))
     recorder.record_message("load.torque", {**torque(3, 9.0), "valid": False})
     recorder.close()
-    found = read_recording(recorder.finished[0])
+    found = read_recording(recorder.closed_files[0])
     wanted = np.round(np.array([np.frombuffer(one["line"], "<f4") for one in frames], dtype=np.float64), 4)
     np.testing.assert_array_equal(found.sides["right"].lines, wanted)
     np.testing.assert_allclose(found.sides["right"].arrival_ns - found.sides["right"].t_mid_ns, 300_000_000)
@@ -105,7 +105,7 @@ def test_a_repeated_frame_is_read_once(tmp_path):
     for one in (frames[0], frames[1], {**frames[1], "t_mono_ns": frames[1]["t_mono_ns"] + 10, "repeated": True}):
         recorder.record_message("eit.frame", one)
     recorder.close()
-    found = read_recording(recorder.finished[0]).sides["right"]
+    found = read_recording(recorder.closed_files[0]).sides["right"]
     assert found.t_mid_ns.tolist() == [one["t_mono_ns"] + clock.offset_ns for one in frames]
 
 
@@ -118,7 +118,7 @@ def test_each_experiment_has_a_file_with_its_name(tmp_path):
     recorder.record_experiment("again")
     recorder.record_message("load.torque", torque(2))
     recorder.close()
-    first, second = recorder.finished
+    first, second = recorder.closed_files
     assert first.name.endswith("_hold-0.10-n-m.mcap")
     assert second.name.endswith("_again.mcap")
     assert [one["seq"] for one in topics(first)["load.torque"]] == [0, 1], "what led to it is with it"
@@ -151,7 +151,7 @@ def test_a_new_file_begins_after_an_hour_without_experiment(tmp_path, monkeypatc
         recorder.record_message("loop.state", wire_map(message, Clock().unix_s(message.t_mono_ns), number))
         recorder.record_message("load.torque", torque(number))
     recorder.close()
-    assert [[one["seq"] for one in topics(path)["load.torque"]] for path in recorder.finished] == [[0, 1], [2]]
+    assert [[one["seq"] for one in topics(path)["load.torque"]] for path in recorder.closed_files] == [[0, 1], [2]]
 
 
 def test_a_daemon_without_a_message_leaves_no_file(tmp_path):
@@ -226,7 +226,7 @@ def test_a_message_without_a_json_form_is_counted(raw, why, tmp_path):
     recorder.record_experiment("second")
     recorder.record_message("load.torque", torque(3))
     recorder.close()
-    first, second = recorder.finished
+    first, second = recorder.closed_files
     assert [one["seq"] for one in topics(first)["load.torque"]] == [0, 2]
     assert [summarise(path).dropped for path in (first, second)] == [1, 0]
 

@@ -11,7 +11,7 @@ from shearloop.daemon.analysis.frame_series import part_of, read_series, series_
 from shearloop.daemon.config import RecordingConfig, load_daemon_config
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.matlab import import_mat
+from shearloop.daemon.recording.matlab_import import import_mat
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.recorder import daemon_identity
 from shearloop.daemon.recording.replay import RecordedRun

@@ -20,7 +20,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.messaging.messages import EitEstimate, wire_map
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.recording.matlab import import_mat
+from shearloop.daemon.recording.matlab_import import import_mat
 from shearloop.daemon.recording.replay import (
     RecordedEvent,
     RecordedRun,
@@ -30,8 +30,8 @@ from shearloop.daemon.recording.replay import (
     restored_wire_map,
 )
 from shearloop.daemon.recording.schema import message_json, with_missing_keys
+from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.sensing.fingertip_task import FingertipPipeline
-from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from tests.daemon.conftest import ask, emulated_kit, running_daemon
 from tests.daemon.sample_messages import sample
 

@@ -25,7 +25,7 @@ from shearloop.daemon.analysis.charts.fault_sweeps import balanced, judge_level
 from shearloop.daemon.analysis.charts.stability import select_rows
 from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.frame_series import part_of, read_series, series_of
-from shearloop.daemon.recording.matlab import find_streams, import_mat, read_stream
+from shearloop.daemon.recording.matlab_import import find_streams, import_mat, read_stream
 from shearloop.daemon.recording.reader import read_recording
 
 # Five of the ten twists come before this share of the recording.

@@ -13,7 +13,7 @@ from shearloop.daemon.messaging.messages import EitFrame, wire_map
 from shearloop.daemon.recording.reader import read_recording, summarise
 from shearloop.daemon.recording.recorder import Identity, Recorder
 from shearloop.daemon.recording.schema import basic_identity
-from shearloop.daemon.sensing.tool_diameter import tool_as_bytes
+from shearloop.daemon.sensing.fingertip_diameters import tool_as_bytes
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.sample_messages import sample
 
@@ -46,7 +46,7 @@ def recorded(folder: Path, *held: tuple[int, Measured | None], named_mm: float |
         message = sample(EitFrame, source="right", t_mono_ns=t_ns, line=line, frame=number, age_s=0.3)
         recorder.record_message("eit.frame", wire_map(message, 0.0, number))
     recorder.close()
-    return recorder.finished[0]
+    return recorder.closed_files[0]
 
 
 def test_the_experiment_names_its_tool(tmp_path, ran):

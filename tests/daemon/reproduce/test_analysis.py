@@ -23,7 +23,7 @@ from shearloop.daemon.analysis.reproduce.analysis import (
     score_models,
 )
 from shearloop.daemon.analysis.reproduce.banks import GRIDS, Grid, cached_bank, focused_grid
-from shearloop.daemon.recording.matlab import Slices, read_torque_slices
+from shearloop.daemon.recording.matlab_import import Slices, read_torque_slices
 from tests.daemon.reproduce.conftest import SIGMA, K
 
 

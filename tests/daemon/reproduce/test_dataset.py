@@ -5,7 +5,7 @@ import pytest
 
 from shearloop.daemon.analysis.reproduce.analysis import place_in_series
 from shearloop.daemon.analysis.reproduce.dataset import ChannelRegression, read_twists, regress_on_channels
-from shearloop.daemon.recording.matlab import Slices, read_torque_slices
+from shearloop.daemon.recording.matlab_import import Slices, read_torque_slices
 
 
 def test_the_channels_that_follow_the_torque_come_first_and_are_enough():

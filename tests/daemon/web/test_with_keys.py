@@ -83,4 +83,4 @@ async def test_over_the_network_motion_needs_key_and_token_and_stop_neither(conf
                 assert (status, reply["ok"]) == (503, False), who
                 assert await page.post("stop") == (200, {"ok": True, "stopped": ""}), who
         assert daemon.health.tasks()["commands"]["errors"]["key is not allowed"] >= 1
-        assert not daemon._stop.is_set(), "a stop from a page ends what moves, and not the daemon"
+        assert not daemon._end.is_set(), "a stop from a page ends what moves, and not the daemon"

@@ -17,7 +17,7 @@ from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.emulators.gripper import Gripper, GripperMechanics, ModbusSlave, UrcapSession
 from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
-from shearloop.drivers.robotiq.messages import GripperClient
+from shearloop.drivers.robotiq.messages import RobotiqConnection
 from shearloop.drivers.robotiq.modbus_client import ModbusClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from tests.running import LinkEvents
@@ -52,7 +52,7 @@ class Rig:
 async def a_rig(way: str, tmp_path: Path, *, connected: bool = False, active: bool = False) -> AsyncIterator[Rig]:
     model = Gripper(MECHANICS)
     server: Server
-    client: GripperClient
+    client: RobotiqConnection
     if way == "socket":
         socket = server = SocketServer(UrcapSession(model))
         await socket.restore()

@@ -58,7 +58,7 @@ async def until(robot: UrRobot, condition: Callable[[RobotState], bool], within_
                 state = await robot.next_state()
                 robot.keep_moving()
     except TimeoutError:
-        raise AssertionError(f"never came about; link {robot.link}, state {state}") from None
+        raise AssertionError(f"never came about; link {robot.monitor}, state {state}") from None
     return state
 
 

@@ -253,7 +253,7 @@ async def test_controller_that_is_newer_than_the_tested_ones_is_driven_with_a_wa
     await controller.fault("version 5.18.0.0")
     async with running(settings_for(controller.host), link) as robot:
         await enable(robot)
-        assert "PolyScope 5.18.0.0 is newer than 5.17.3" in robot.link.latest.sentence
+        assert "PolyScope 5.18.0.0 is newer than 5.17.3" in robot.monitor.latest.sentence
 
 
 async def test_another_payload_than_the_configured_one_refuses_motion(controller):

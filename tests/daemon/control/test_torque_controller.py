@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.daemon.control.twist_controller import (
+from shearloop.daemon.control.torque_controller import (
     AngleHistory,
     ControllerReason,
     JumpDetector,
-    TwistController,
+    TorqueController,
 )
 from shearloop.daemon.errors import UserError
 
@@ -311,7 +311,7 @@ def test_a_set_point_beyond_the_limit_and_a_start_without_an_angle_are_refused(b
     with pytest.raises(UserError, match="not within"):
         bench.controller.set_point(math.nan)
     with pytest.raises(UserError, match="numbers"):
-        TwistController(bench.settings, 0, math.nan, 0.0)
+        TorqueController(bench.settings, 0, math.nan, 0.0)
 
 
 STEP_NS = 8_000_000

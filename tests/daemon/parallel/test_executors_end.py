@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 import pytest
 
-from shearloop.daemon.executors import ProcessExecutor
+from shearloop.daemon.parallel import ProcessExecutor
 from shearloop.daemon.process import raise_ending_signals
 
 # From a signal and what it interrupts to the process in which a task was.

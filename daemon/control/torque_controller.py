@@ -186,7 +186,7 @@ class TorqueFilter:
         # The arrival of the latest measurement.
         self.fresh_ns: int | None = None
         # The torque at a fixed angle has moved too far since the reference.
-        self.lost = False
+        self.slipped = False
         span_s = settings.age_limit_s + settings.window_s + settings.lag_s
         self.angles = AngleHistory(int(1e9 * (span_s + 1.0)))
         self.angles.add(t_ns, angle_rad)
@@ -210,7 +210,7 @@ class TorqueFilter:
 
     def restart(self) -> None:
         """Take the present offset as the reference: a grip that slipped may slip as far again before the next hold."""
-        self._reference_nm, self.lost = self.offset_nm, False
+        self._reference_nm, self.slipped = self.offset_nm, False
 
     def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int, *, integrates: bool = True) -> bool:
         """Use a torque of the time t_mid_ns that arrived at t_ns; return whether it can be used.
@@ -231,7 +231,7 @@ class TorqueFilter:
         if self.fresh_ns is not None and missed > 0:
             self.offset_nm += self.creep_nm * missed
         self._correct(torque_nm - self.expected_nm(angle), angle, integrates=integrates)
-        self.lost |= abs(self.offset_nm - self._reference_nm) > own.offset_limit_nm
+        self.slipped |= abs(self.offset_nm - self._reference_nm) > own.offset_limit_nm
         self._t_mid_ns, self.fresh_ns = t_mid_ns, t_ns
         return True
 
@@ -265,7 +265,7 @@ class TorqueFilter:
         self.offset_nm, self._mean = fmean(offsets_nm[-count:]), (1.0 / count, angle_rad)
 
 
-class TwistController:
+class TorqueController:
     """Drives the wrist so that the tool's torque reaches and keeps a set point. Times are CLOCK_MONOTONIC ns."""
 
     def __init__(
@@ -353,7 +353,7 @@ class TwistController:
             reasons.append(ControllerReason.NOT_MEASURED)
         elif t_ns - tool.fresh_ns > own.stale_periods * own.sample_period_s * 1e9:
             reasons.append(ControllerReason.STALE)
-        if tool.lost:
+        if tool.slipped:
             reasons.append(ControllerReason.NOT_FOLLOWING)
         if reasons or self.set_point_nm is None:
             self._rest()

@@ -14,8 +14,8 @@ import pytest
 
 from shearloop.daemon.cli import main
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.executors import LOCAL, DaskExecutor, ProcessExecutor, SerialExecutor, open_executor
-from tests.daemon.executors.conftest import STARTED_S, dask
+from shearloop.daemon.parallel import LOCAL, DaskExecutor, ProcessExecutor, SerialExecutor, open_executor
+from tests.daemon.parallel.conftest import STARTED_S, dask
 from tests.daemon.test_bank_config import write_bank_config
 
 # Every worker imports this module for its tasks: what takes long to import is imported by the test that needs it.
@@ -112,7 +112,7 @@ def test_a_missing_scheduler_is_one_sentence(tmp_path, mistake):
 
 
 def test_a_server_that_is_no_scheduler_times_out(monkeypatch):
-    monkeypatch.setattr("shearloop.daemon.executors.CONNECT_S", 0.5)
+    monkeypatch.setattr("shearloop.daemon.parallel.CONNECT_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as deaf:
         address = f"tcp://127.0.0.1:{deaf.getsockname()[1]}"
         with (
@@ -133,7 +133,7 @@ def test_a_scheduler_without_workers_or_a_lost_one_is_one_sentence(lonely, monke
     import distributed
 
     address, (process,) = lonely
-    monkeypatch.setattr("shearloop.daemon.executors.FIRST_WORKER_S", 0.5)
+    monkeypatch.setattr("shearloop.daemon.parallel.FIRST_WORKER_S", 0.5)
     with (
         pytest.raises(UserError, match=f"at {address} has no worker; start some with `dask worker"),
         open_executor(address),
@@ -212,8 +212,8 @@ def test_a_bank_has_the_same_bytes_after_a_killed_worker(bank, scheduler, killed
 
 def test_a_chart_has_the_same_numbers_after_a_killed_worker(scheduler, killed, tmp_path):
     from shearloop.bank.estimation import Physics
+    from shearloop.daemon.analysis.charts.chart_data import Split, bank_of, own_fingertip, synthetic_slices
     from shearloop.daemon.analysis.charts.fault_sweeps import FAULTS, sweeps
-    from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, synthetic_slices
     from shearloop.daemon.analysis.reproduce.banks import Grid
 
     bank = bank_of(None, own_fingertip(0.4).mesh(), tmp_path, Grid(np.linspace(3.0, 3.6, 5), np.linspace(1.0, 2.1, 8)))

@@ -20,6 +20,9 @@ FIRST_MAJOR_FAULT = 10
 ACTIVATION_NOT_FINISHED, NOT_ACTIVATED, OVER_TEMPERATURE = 5, 7, 8
 SPEED_MM_S, FORCE_N = (30.0, 250.0), (10.0, 125.0)
 ACTIVATION_SPEED_MM_S = 150.0
+# The ends of the fingers' range.
+OPEN_COUNTS, CLOSED_COUNTS = 3.0, 230.0
+MM_PER_COUNT = 140.0 / (CLOSED_COUNTS - OPEN_COUNTS)
 
 _COMMANDS = {"ACT": "act", "GTO": "gto", "POS": "pos", "SPE": "spe", "FOR": "force"}
 
@@ -30,28 +33,6 @@ READ, WRITE = 3, 16
 READ_BYTES, WRITE_BYTES = 8, 15
 
 STEP_S = 0.008
-
-
-@dataclass(frozen=True, slots=True)
-class GripperMechanics:
-    """The ends of the fingers' range."""
-
-    open_counts: float = 3.0
-    open_mm: float = 140.0
-    closed_counts: float = 230.0
-
-    @property
-    def mm_per_count(self) -> float:
-        """The width per count, mm."""
-        return self.open_mm / (self.closed_counts - self.open_counts)
-
-    def counts(self, width_mm: float) -> float:
-        """Return the position at a width."""
-        return self.closed_counts - width_mm / self.mm_per_count
-
-    def width_mm(self, counts: float) -> float:
-        """Return the width at a position, mm."""
-        return (self.closed_counts - counts) * self.mm_per_count
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +53,8 @@ class Gripper:
     belongs to the motion before, as on the real gripper.
     """
 
-    def __init__(self, mechanics: GripperMechanics | None = None, object_mm: float | None = None) -> None:
+    def __init__(self, object_mm: float | None = None) -> None:
         """Start as after power-on: reset, half open."""
-        self.mechanics = mechanics or GripperMechanics()
         self.object_mm = object_mm
         self.widest_mm: float | None = None
         self.powered = True
@@ -100,7 +80,7 @@ class Gripper:
     @property
     def width_mm(self) -> float:
         """The true width between the fingers, mm."""
-        return self.mechanics.width_mm(self._position)
+        return (CLOSED_COUNTS - self._position) * MM_PER_COUNT
 
     @property
     def grip_force_n(self) -> float:
@@ -145,23 +125,22 @@ class Gripper:
             if wanted.gto and not before.gto:
                 self.flt = NOT_ACTIVATED
         elif not before.act:
-            opened, closed = self.mechanics.open_counts, self.mechanics.closed_counts
-            self._to_reach, self.flt = [opened, closed, opened], ACTIVATION_NOT_FINISHED
+            self._to_reach, self.flt = [OPEN_COUNTS, CLOSED_COUNTS, OPEN_COUNTS], ACTIVATION_NOT_FINISHED
 
     def _approach(self, target: float, speed_mm_s: float, dt_s: float) -> bool:
         """Move towards a position; return whether the fingers have stopped, there or at an object."""
-        travel = speed_mm_s * dt_s / self.mechanics.mm_per_count
+        travel = speed_mm_s * dt_s / MM_PER_COUNT
         closing = target > self._position
         # The fingers' own stops count as the target: a real gripper that closes on air reports no object.
-        stop = target = min(max(target, self.mechanics.open_counts), self.mechanics.closed_counts)
+        stop = target = min(max(target, OPEN_COUNTS), CLOSED_COUNTS)
         if closing:
             if self.object_mm is not None:
-                stop = min(target, self.mechanics.counts(self.object_mm))
+                stop = min(target, CLOSED_COUNTS - self.object_mm / MM_PER_COUNT)
             # An object wider than the opening pushes the fingers apart.
             self._position = min(self._position + travel, stop)
         else:
             if self.widest_mm is not None:
-                stop = max(target, self.mechanics.counts(self.widest_mm))
+                stop = max(target, CLOSED_COUNTS - self.widest_mm / MM_PER_COUNT)
             self._position = max(self._position - travel, stop)
         if self._position != stop:
             self.obj, self.current = 0, 15

@@ -5,6 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.emulators.gripper import (
+    CLOSED_COUNTS,
+    MM_PER_COUNT,
     Gripper,
     GripperRegisters,
     ModbusSlave,
@@ -112,7 +114,7 @@ def test_frames_are_the_manuals_byte_for_byte():
     gripper = active_gripper()
     face = ModbusSlave(gripper)
     assert face.feed(bytes.fromhex("0910 03E8 0003 06 0900 00FF FFFF 4229")) == framed(bytes.fromhex("0910 03E8 0003"))
-    gripper.object_mm = gripper.mechanics.width_mm(189)
+    gripper.object_mm = (CLOSED_COUNTS - 189) * MM_PER_COUNT
     steps(gripper, 1.0)
     reply = face.feed(framed(READ_STATUS))
     assert reply[:7] == bytes.fromhex("0903 06 B900 00FF")

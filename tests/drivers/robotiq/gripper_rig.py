@@ -14,7 +14,7 @@ from unittest.mock import patch
 import pytest
 
 from shearloop.drivers.connection import LinkMonitor
-from shearloop.drivers.emulators.gripper import Gripper, GripperMechanics, ModbusSlave, UrcapSession
+from shearloop.drivers.emulators.gripper import Gripper, ModbusSlave, UrcapSession
 from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.messages import RobotiqConnection
@@ -25,8 +25,7 @@ from tests.running import LinkEvents
 STEP_S = 0.01
 # Between two looks of the driver at its clock.
 MOST_STEPS = 20
-MECHANICS = GripperMechanics(open_counts=4.0, closed_counts=224.0)
-CALIBRATION = WidthCalibration(open_counts=4.0, open_mm=140.0, closed_counts=224.0, std_mm=0.4)
+CALIBRATION = WidthCalibration(open_counts=3.0, open_mm=140.0, closed_counts=230.0, std_mm=0.4)
 WAYS = pytest.mark.parametrize("way", ["socket", "modbus"])
 
 
@@ -50,7 +49,7 @@ class Rig:
 
 @contextlib.asynccontextmanager
 async def a_rig(way: str, tmp_path: Path, *, connected: bool = False, active: bool = False) -> AsyncIterator[Rig]:
-    model = Gripper(MECHANICS)
+    model = Gripper()
     server: Server
     client: RobotiqConnection
     if way == "socket":

@@ -5,7 +5,7 @@ An estimator is a subclass of `Estimator`, and a line in `bank/estimator_names.p
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
@@ -114,20 +114,25 @@ class Material:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CalibrationRow:
-    """One calibration frame: its recording, number and age there, its features and the truth.
+class CalibrationRows:
+    """Calibration frames: the recording (n,), number and age (n,) of each there, its features (n, d) and the truth.
 
-    position and mean_position (d,) are the difference to the idle frame and its mean over the grip, in units of noise.
+    position and mean_position (n, m·c) are the difference to the idle frame and its mean over the grip, in units of
+    noise.
     """
 
-    recording: int
-    frame: int
-    age_s: float
+    recording: IntArray
+    frame: IntArray
+    age_s: FloatArray
     features: FloatArray
     position: FloatArray
     mean_position: FloatArray
-    torque_nm: float
-    diameter_mm: float
+    torque_nm: FloatArray
+    diameter_mm: FloatArray
+
+    def where(self, rows: IntArray | BoolArray) -> Self:
+        """Return some of the frames."""
+        return type(self)(*(getattr(self, one.name)[rows] for one in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,22 +242,21 @@ class Estimator(ABC):
         """Return the side (d,) that each of the torque's features comes from: one number where they have no side."""
         return np.zeros(n_features, dtype=np.int64)
 
-    def fit_diameter(self, rows: list[CalibrationRow]) -> OutputModel:
+    def fit_diameter(self, rows: CalibrationRows) -> OutputModel:
         """Return the diameter's model from rows of known diameters, by age."""
-        rows = rows[:: 1 + len(rows) // _MOST_FOR_DIAMETER]
-        diameters = np.array([row.diameter_mm for row in rows])
-        features = np.array([row.features for row in rows])
+        n = len(rows.age_s)
+        rows = rows.where(np.arange(0, n, 1 + n // _MOST_FOR_DIAMETER))
         # A new grip is another recording, not a later part of this one.
-        recordings = left_out_groups(np.array([row.recording for row in rows]))
-        left_out = [pair for pair in recordings if len(np.unique(diameters[pair[0]])) >= LEAST_LEFT]
+        recordings = left_out_groups(rows.recording)
+        left_out = [pair for pair in recordings if len(np.unique(rows.diameter_mm[pair[0]])) >= LEAST_LEFT]
         regressor = fit_interval_regressor(
-            features[:, self.columns["diameter"]],
-            diameters,
+            rows.features[:, self.columns["diameter"]],
+            rows.diameter_mm,
             self.ridge,
             strengths=self.strengths,
             left_out=left_out,
         )
-        return OutputModel(regressor, None, self.k_range(features))
+        return OutputModel(regressor, None, self.k_range(rows.features))
 
 
 class Regression(Estimator):

@@ -15,7 +15,7 @@ from shearloop.bank.estimation.bank_match import BankMatcher
 from shearloop.bank.estimation.calibration import Assumption, Calibration
 from shearloop.bank.estimation.estimator import (
     LEAST_DIAMETERS,
-    CalibrationRow,
+    CalibrationRows,
     Estimator,
     Material,
     OutputModel,
@@ -129,26 +129,26 @@ def _fit_raw(
 ) -> Calibration:
     """Return the calibration with its outputs; the torques may be off by the uncertainty in time."""
     matcher = calibration.matcher(physics.bank)
-    rows = [row for i, one in enumerate(recordings) for row in _replay(calibration, matcher, i, one)]
-    if not rows:
+    rows = _replay(calibration, matcher, recordings)
+    if rows is None:
         raise CalibrationError("no frame of the recordings is gripped and undisturbed for long enough to calibrate on")
     bounds = None
     if timing_uncertainty_s:
         each = [torque_bounds(one, timing_uncertainty_s) for one in recordings]
-        least_nm, largest_nm = np.array([[end[row.frame] for end in each[row.recording]] for row in rows]).T
+        places = zip(rows.recording.tolist(), rows.frame.tolist(), strict=True)
+        least_nm, largest_nm = np.array([[end[frame] for end in each[recording]] for recording, frame in places]).T
         bounds = least_nm, largest_nm
-    estimator = calibration.estimator.with_imputer(np.array([row.position for row in rows]), calibration.validators)
-    features, torque_nm = np.array([row.features for row in rows]), np.array([row.torque_nm for row in rows])
-    recording = np.array([row.recording for row in rows])
-    estimator, regressor, unexplained = estimator.fit_torque(features, torque_nm, bounds, recording)
+    estimator = calibration.estimator.with_imputer(rows.position, calibration.validators)
+    estimator, regressor, unexplained = estimator.fit_torque(rows.features, rows.torque_nm, bounds, rows.recording)
     # By age within the recordings, so that every part has all tools.
-    known = sorted((row for row in rows if np.isfinite(row.diameter_mm)), key=lambda row: row.age_s)
-    enough = len({row.diameter_mm for row in known}) >= LEAST_DIAMETERS
+    order = np.argsort(rows.age_s, kind="stable")
+    known = rows.where(order[np.isfinite(rows.diameter_mm[order])])
+    enough = len(np.unique(known.diameter_mm)) >= LEAST_DIAMETERS
     diameter = estimator.fit_diameter(known) if enough else None
     law = None
     if len(tools := _tools_of(recordings)) > 1:
         diameters_mm = np.array([np.nan if one.tool_mm is None else one.tool_mm.value for one in recordings])
-        fitted = _fit_tools(estimator, features, torque_nm, recording, diameters_mm) if enough else None
+        fitted = _fit_tools(estimator, rows, diameters_mm) if enough else None
         if fitted is not None:
             estimator, regressor, law = fitted
         elif unexplained > _TOOLS_MAY_LEAVE:
@@ -156,26 +156,26 @@ def _fit_raw(
                 f"the tools of {' and '.join(f'{one.value:.3g}' for one in tools)} mm turn so differently that they "
                 "have no torque in common; calibrate on each alone, or on three diameters"
             )
-    torque = OutputModel(regressor, None, estimator.k_range(features))
+    torque = OutputModel(regressor, None, estimator.k_range(rows.features))
     return replace(calibration, estimator=estimator, torque=torque, diameter=diameter, tools=law)
 
 
 def _fit_tools(
-    estimator: Estimator, features: FloatArray, torque_nm: FloatArray, recording: IntArray, diameters_mm: FloatArray
+    estimator: Estimator, rows: CalibrationRows, diameters_mm: FloatArray
 ) -> tuple[Estimator, IntervalRegressor, ToolLaw] | None:
     """Return the regressor of torques in units of each tool's gain, and the law of these gains.
 
     None where the tools have the torque in common, or were twisted both ways. Motion shows how torque changes after
     the grip, so a recording counts from its least torque on.
     """
-    known = np.isfinite(diameters_mm)[recording]
-    diameters_mm = diameters_mm[np.unique(recording[known])]
-    features, torque_nm = features[known], torque_nm[known].copy()
-    recording = np.unique(recording[known], return_inverse=True)[1]
-    for rows in (np.flatnonzero(recording == one) for one in range(len(diameters_mm))):
-        if torque_nm[rows].min() < -LOADED_SHARE * torque_nm[rows].max():
+    rows = rows.where(np.isfinite(diameters_mm)[rows.recording])
+    features, torque_nm = rows.features, rows.torque_nm.copy()
+    tools, recording = np.unique(rows.recording, return_inverse=True)
+    diameters_mm = diameters_mm[tools]
+    for own in (recording == one for one in range(len(tools))):
+        if torque_nm[own].min() < -LOADED_SHARE * torque_nm[own].max():
             return None
-        torque_nm[rows] -= np.quantile(torque_nm[rows], _RELEASED)
+        torque_nm[own] -= np.quantile(torque_nm[own], _RELEASED)
 
     def predict(kept: IntArray, out: IntArray, values: FloatArray) -> FloatArray:
         return np.maximum(CensoredRidge.fit(features[kept], values[kept], _TOOLS_STRENGTH).predict(features[out]), 0.0)
@@ -207,47 +207,35 @@ def adapt(
     calibration.gain_regressor()
     matcher = calibration.matcher((physics or Physics()).bank)
     check_finite(recordings)
-    rows = [
-        row
-        for i, one in enumerate(recordings)
-        for row in _replay(calibration, matcher, i, one.select_sides(calibration.sides))
-        if not first_frames or row.frame >= first_frames[i]
-    ]
-    if not rows:
+    rows = _replay(calibration, matcher, [one.select_sides(calibration.sides) for one in recordings])
+    if rows is not None and first_frames:
+        rows = rows.where(rows.frame >= np.array(first_frames)[rows.recording])
+    if rows is None or not len(rows.frame):
         raise CalibrationError(
             "no frame is gripped and undisturbed for long enough; `shearloop evaluate` lists the reasons; "
             "twist the gripped tool again"
         )
-    adapted, correction = calibration.correct_gain(
-        np.array([row.features[calibration.estimator.columns["torque"]] for row in rows]),
-        np.array([row.torque_nm for row in rows]),
-    )
+    features = rows.features[:, calibration.estimator.columns["torque"]]
+    adapted, correction = calibration.correct_gain(features, rows.torque_nm)
     return replace(adapted, source=f"{calibration.source}, adapted on {source}"), correction
 
 
 def _replay(
-    calibration: Calibration, matcher: BankMatcher | None, recording: int, series: FrameSeries
-) -> list[CalibrationRow]:
-    """Return the frames that an estimate would be made of, processed as in a session."""
+    calibration: Calibration, matcher: BankMatcher | None, recordings: Sequence[FrameSeries]
+) -> CalibrationRows | None:
+    """Return the frames that an estimate would be made of, processed as in a session; None without any."""
     estimator, rows = calibration.estimator, []
-    state = SessionState(calibration.validators, estimator.motion)
-    for i, (t_s, channels, torque, diameter) in enumerate(
-        zip(series.t_s.tolist(), series.channels, series.torque_at_frames(), series.diameter_mm, strict=True)
-    ):
-        processed = state.process(TactileFrame.of(t_s, channels))
-        if processed.reasons or not np.isfinite(torque):
-            continue
-        features = estimator.features(Reading.of(processed, t_s, matcher))
-        position, mean_position = (
-            (one / estimator.scale).ravel() for one in (processed.difference, processed.mean_difference)
-        )
-        rows.append(
-            CalibrationRow(
-                recording, i, t_s - float(series.t_s[0]), features, position, mean_position,
-                float(torque), float(diameter),
-            )
-        )  # fmt: skip
-    return rows
+    for recording, series in enumerate(recordings):
+        state = SessionState(calibration.validators, estimator.motion)
+        truths = zip(series.torque_at_frames(), series.diameter_mm, strict=True)
+        for i, (t_s, channels, truth) in enumerate(zip(series.t_s.tolist(), series.channels, truths, strict=True)):
+            processed = state.process(TactileFrame.of(t_s, channels))
+            if processed.reasons or not np.isfinite(truth[0]):
+                continue
+            features = estimator.features(Reading.of(processed, t_s, matcher))
+            places = ((one / estimator.scale).ravel() for one in (processed.difference, processed.mean_difference))
+            rows.append((recording, i, t_s - float(series.t_s[0]), features, *places, *truth))
+    return CalibrationRows(*map(np.array, zip(*rows, strict=True))) if rows else None
 
 
 def _fit_slices(

@@ -20,7 +20,7 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.estimator import (
     LEAST_LEFT,
     Bounds,
-    CalibrationRow,
+    CalibrationRows,
     Estimator,
     Material,
     OutputModel,
@@ -203,9 +203,13 @@ class MotionRegression(Estimator):
         m, p, _ = self.temporal.directions.shape if self.temporal is not None else (1, 1, 0)
         return np.tile(np.repeat(np.arange(m), p), n_features // (m * p))
 
-    def fit_diameter(self, rows: list[CalibrationRow]) -> OutputModel:
+    def fit_diameter(self, rows: CalibrationRows) -> OutputModel:
         """Return the diameter's model from rows of known diameters, by age."""
-        return OutputModel(fit_cylinders(_cylinder_grips(rows), self.table), None, np.zeros(0))
+        grips = [
+            CylinderGrip(float(own.diameter_mm[0]), own.position, own.mean_position)
+            for own in (rows.where(rows.recording == one) for one in np.unique(rows.recording))
+        ]
+        return OutputModel(fit_cylinders(grips, self.table), None, np.zeros(0))
 
     def slices_fit(self, quantity: Quantity, values: FloatArray) -> RegressorFit:
         """Return the fit of a curve; raises CalibrationError where a part of (n,) values has too few distinct ones."""
@@ -298,13 +302,3 @@ def _noise_reduction(n_sides: int, table: ChannelTable) -> FloatArray:
     """Return the (m·c, m·c/2) matrix that smooths m sides' channels and averages channels of one voltage."""
     smoothed = smoothed_along_channels(np.eye(table.n_channels))
     return np.asarray(np.kron(np.eye(n_sides), table.twin_means(smoothed)))
-
-
-def _cylinder_grips(rows: list[CalibrationRow]) -> list[CylinderGrip]:
-    """Return each recording's grip of its tool."""
-    grips = []
-    for number in sorted({row.recording for row in rows}):
-        own = [row for row in rows if row.recording == number]
-        frames, means = (np.array([getattr(row, name) for row in own]) for name in ("position", "mean_position"))
-        grips.append(CylinderGrip(own[0].diameter_mm, frames, means))
-    return grips

@@ -2,35 +2,47 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from shearloop.drivers.connection import LinkMonitor, SerialLink, TcpLink
-from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
-from shearloop.drivers.emulators.skin import Circuit, EmulatedAdcBoard, EmulatedKeithley6430, EmulatedScanner
+from shearloop.drivers.connection import Link, LinkMonitor, SerialLink, TcpLink
+from shearloop.drivers.emulators.ports import SocketServer
+from shearloop.drivers.emulators.skin import (
+    DAQ_PERIOD_S,
+    Circuit,
+    EmulatedKeithley6430,
+    EmulatedScanner,
+    SkinInstruments,
+)
 from shearloop.drivers.shear_skin.instruments import AdcBoard, Keithley6430, ScpiScanner
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
 from tests.running import DEADLINE_S, LinkEvents, pass_on, running
 
 R1, R2 = 24.6, 25.3
-RATE_HZ = 500.0
+SPEED = 50.0
+RATE_HZ = SPEED / DAQ_PERIOD_S
+ANY_PORT = ("127.0.0.1", 0)
 
 
 class Bench(LinkEvents):
-    def __init__(
-        self, circuit: Circuit, played: EmulatedKeithley6430, source: Server, reader: Callable[[str], None]
-    ) -> None:
+    def __init__(self, played: SkinInstruments) -> None:
         super().__init__()
-        self.circuit, self.played, self.source, self.reader = circuit, played, source, reader
+        self.command, self.circuit = played.command, played.circuit
         self.skin: ShearSkin
         self.samples: list[SkinSample] = []
 
     def on_sample(self, sample: SkinSample) -> None:
         self.samples.append(sample)
         self.note()
+
+    def link(self, address: str) -> Link:
+        """Return a link to an instrument, at `host:port` or at the path of its port."""
+        host, _, port = address.rpartition(":")
+        monitor = LinkMonitor(self, 0.001, 0.005)
+        return TcpLink(host, int(port), monitor=monitor) if host else SerialLink(path=address, monitor=monitor)
 
     @property
     def source_errors(self) -> Mapping[str, int]:
@@ -50,40 +62,15 @@ class Unstrained:
         return R1, R2
 
 
-class Replaceable:
-    """A source that a test can replace while it is connected."""
-
-    def __init__(self, played: EmulatedKeithley6430) -> None:
-        self._played = played
-
-    def feed(self, data: bytes) -> bytes:
-        return self._played.feed(data)
-
-
 @contextlib.asynccontextmanager
 async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: float = 2.0) -> AsyncIterator[Bench]:
-    circuit = Circuit(Unstrained())
-    played = EmulatedKeithley6430(circuit)
-    socket = SocketServer(Replaceable(played))
-    source_server = PtyServer(Replaceable(played), folder / "source") if serial_source else socket
-    scanner = SocketServer(EmulatedScanner(circuit))
-    board = EmulatedAdcBoard(circuit, period_s=1 / RATE_HZ, link=folder / "adc")
-    reader = board if adc else scanner
-    bench = Bench(circuit, played, source_server, reader.command)
-    source_monitor, daq_monitor = LinkMonitor(bench, 0.001, 0.005), LinkMonitor(bench, 0.001, 0.005)
-    async with running(source_server.run(), reader.run()):
-        await source_server.appearances.get()
-        await (board.port if adc else scanner).appearances.get()
-        if serial_source:
-            source_link = SerialLink(path=folder / "source", baud=9600, monitor=source_monitor)
-        else:
-            source_link = TcpLink("127.0.0.1", socket.port, monitor=source_monitor)
-        if adc:
-            daq = AdcBoard(SerialLink(path=folder / "adc", monitor=daq_monitor), RATE_HZ)
-        else:
-            daq = ScpiScanner(
-                TcpLink("127.0.0.1", scanner.port, monitor=daq_monitor), rate_hz=RATE_HZ, timeout_s=deadline_s
-            )
+    source_at, daq_at = folder / "source" if serial_source else ANY_PORT, folder / "adc" if adc else ANY_PORT
+    played = SkinInstruments(Unstrained(), source_at, daq_at, speed=SPEED)
+    bench = Bench(played)
+    async with running(played.run()):
+        source_link = bench.link(await played.source_port.get())
+        daq_link = bench.link(await played.daq_port.get())
+        daq = AdcBoard(daq_link, RATE_HZ) if adc else ScpiScanner(daq_link, rate_hz=RATE_HZ, timeout_s=deadline_s)
         bench.skin = ShearSkin(Keithley6430(source_link, period_s=0.01, timeout_s=deadline_s), daq)
         async with running(bench.skin.watch_source(), pass_on(bench.skin.samples(), bench.on_sample)):
             await bench.next_says()
@@ -115,7 +102,7 @@ async def test_resistances_come_through_over_every_way_in(tmp_path, serial_sourc
 @pytest.mark.parametrize("outage", ["silence", "unplug"])
 async def test_a_source_that_cannot_be_switched_off_is_told(tmp_path, serial_source, outage):
     async with a_bench(tmp_path, serial_source=serial_source, adc=True, deadline_s=0.1) as bench:
-        bench.source.command(outage)
+        bench.command(f"source {outage}")
         await bench.next_says(SkinFault.SOURCE_LOST)
     assert bench.source_errors["not switched off"] == 1
     assert any("has not confirmed that its output is off" in event.sentence for event in bench.events)
@@ -137,9 +124,9 @@ FAULTS = [
 async def test_each_fault_of_the_circuit_is_named_and_goes_away_with_its_cause(tmp_path, adc):
     async with a_bench(tmp_path, serial_source=False, adc=adc) as bench:
         for text, faults in FAULTS:
-            bench.circuit.command(text)
+            bench.command(text)
             await bench.next_says(*faults)
-            bench.circuit.command("mend")
+            bench.command("mend")
             await bench.next_says()
         errors = bench.skin.diagnostics()["errors"]
         assert {"compliance", "open_1", "open_2", "short_1", "reversed_2", "sum"} <= set(errors)
@@ -150,12 +137,12 @@ async def test_a_source_that_is_silent_or_gone_is_named_and_set_up_again_without
     async with a_bench(tmp_path, serial_source=serial_source, adc=True, deadline_s=0.1) as bench:
         for outage in ("silence", "unplug"):
             losses = len(bench.losses)
-            bench.source.command(outage)
+            bench.command(f"source {outage}")
             # A late reading of the source looks like a lost one for a while; the outage itself is what is awaited.
             await bench.until(lambda n=losses: len(bench.losses) > n)
             await bench.next_says(SkinFault.SOURCE_LOST)
             assert bench.circuit.output_on, "the current flows on while the cable is out"
-            bench.source.command("normal")
+            bench.command("source normal")
             await bench.next_says()
         openings = bench.skin.source_diagnostics()["connections"]
         assert openings >= 3
@@ -170,31 +157,32 @@ async def test_a_source_that_is_switched_off_by_hand_stays_off_and_says_so(tmp_p
         await bench.next_says()
 
 
-async def test_a_source_that_is_switched_off_between_two_questions_stays_off_too(tmp_path):
+async def test_a_source_that_is_switched_off_between_two_questions_stays_off_too(tmp_path, monkeypatch):
     async with a_bench(tmp_path, serial_source=False, adc=False, deadline_s=1.0) as bench:
         openings = bench.skin.source_diagnostics()["connections"]
-        sound = bench.played.feed
+        sound = EmulatedKeithley6430.feed
 
-        def switched_off_after_it_said_that_it_is_on(data: bytes) -> bytes:
-            reply = sound(data)
+        def switched_off_after_it_said_that_it_is_on(played: EmulatedKeithley6430, data: bytes) -> bytes:
+            reply = sound(played, data)
             if b"OUTP?" in data:
                 bench.circuit.output_on = False
-                bench.played.feed = sound
+                monkeypatch.undo()
             return reply
 
-        bench.played.feed = switched_off_after_it_said_that_it_is_on
+        monkeypatch.setattr(EmulatedKeithley6430, "feed", switched_off_after_it_said_that_it_is_on)
         await bench.next_says(SkinFault.SOURCE_OFF)
         assert not bench.circuit.output_on
         assert bench.skin.source_diagnostics()["connections"] == openings
 
 
-async def test_a_source_that_says_nonsense_is_not_believed(tmp_path):
+async def test_a_source_that_says_nonsense_is_not_believed(tmp_path, monkeypatch):
     async with a_bench(tmp_path, serial_source=False, adc=False, deadline_s=0.1) as bench:
-        sound = bench.played.feed
-        bench.played.feed = lambda data: sound(data) and b"%%%\n"  # a bad cable
+        sound = EmulatedKeithley6430.feed
+        # A bad cable.
+        monkeypatch.setattr(EmulatedKeithley6430, "feed", lambda *heard: sound(*heard) and b"%%%\n")
         await bench.until(lambda: bench.source_errors.get("not understood", 0) >= 3)
         await bench.next_says(SkinFault.SOURCE_LOST)
-        bench.played.feed = sound
+        monkeypatch.undo()
         await bench.next_says()
 
 
@@ -204,9 +192,9 @@ async def test_voltages_that_stop_coming_are_awaited(tmp_path, adc):
         for outage in ("unplug", "silence"):
             await bench.next_says()
             losses = len(bench.losses)
-            bench.reader(outage)
+            bench.command(f"daq {outage}")
             await bench.until(lambda n=losses: len(bench.losses) > n)
-            bench.reader("normal")
+            bench.command("daq normal")
         await bench.next_says()
         assert any(sample.missed for sample in bench.samples), "the gap is counted"
 
@@ -214,12 +202,12 @@ async def test_voltages_that_stop_coming_are_awaited(tmp_path, adc):
 async def test_lines_of_the_board_that_are_missing_torn_or_garbage_are_counted(tmp_path):
     async with a_bench(tmp_path, serial_source=False, adc=True) as bench:
         for fault in ("garbage", "missing", "torn", "missing"):
-            bench.reader(fault)
+            bench.command(f"daq {fault}")
         count = len(bench.samples)
         await bench.until(lambda: len(bench.samples) > count + 10)
         facts = bench.skin.diagnostics()
         assert facts["errors"]["not a number"] == 2
-        bench.reader("stuck")
+        bench.command("daq stuck")
         await bench.next_says(SkinFault.STUCK_1, SkinFault.STUCK_2)
 
 

@@ -11,7 +11,7 @@ from functools import partial
 import pytest
 
 from shearloop.daemon import process
-from shearloop.daemon.cli import emulated_devices, main
+from shearloop.daemon.cli import emulator_processes, main
 from shearloop.daemon.process import ending_signals
 from tests.daemon.conftest import DEADLINE_S
 
@@ -37,7 +37,7 @@ def test_a_second_signal_does_not_kill_the_daemon(number, config, monkeypatch):
         signal.raise_signal(number)
         came.append("again")
 
-    monkeypatch.setattr(emulated_devices, "EmulatedDevices", emulators)
+    monkeypatch.setattr(emulator_processes, "EmulatedDevices", emulators)
     monkeypatch.setattr(process, "without_long_collections", lambda: nullcontext(partial(os.kill, os.getpid(), number)))
     assert main(["run", str(config())]) == 0
     assert came == ["again"]

@@ -49,10 +49,9 @@ _IDENTITY_KEYS = ("format_version", "channel_table_hash", "electrodes", "injecti
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SideFrames:
-    """One side's frames by rising time: t_mid_ns and arrival_ns (n,) in Unix nanoseconds, lines (n, v) in volts."""
+    """One side's frames by rising time: t_mid_ns (n,) in Unix nanoseconds, lines (n, v) in volts."""
 
     t_mid_ns: NDArray[np.int64]
-    arrival_ns: NDArray[np.int64]
     lines: NDArray[np.float64]
 
 
@@ -182,7 +181,7 @@ def _checked_identity(path: Path, identity: dict[str, str] | None) -> tuple[dict
 def read_recording(path: str | Path) -> Recording:
     """Read the frames, torques and tools of a recording; raises UserError for a file that cannot be used."""
     path = Path(path)
-    frames: dict[str, list[tuple[int, int, list[float]]]] = {}
+    frames: dict[str, list[tuple[int, list[float]]]] = {}
     torques: list[tuple[int, float]] = []
     tools: list[tuple[int, Measured | None]] = []
     with open_recording(path) as recording:
@@ -204,8 +203,8 @@ def read_recording(path: str | Path) -> Recording:
                         raise ValueError(f"a line of {len(line)} values")
                     rows = frames.setdefault(sides[topic], [])
                     # The board repeated an old frame.
-                    if not rows or rows[-1][2] != line:
-                        rows.append((t_ns, int(content["arrival_unix_ns"]), line))
+                    if not rows or rows[-1][1] != line:
+                        rows.append((t_ns, line))
                 elif content["kind"] == InputKind.TOOL.value:
                     tools.append((t_ns, tool_from_bytes(schema.input_event(content).data)[1]))
             except (KeyError, TypeError, ValueError) as error:
@@ -229,9 +228,9 @@ def read_recording(path: str | Path) -> Recording:
     )
 
 
-def _side_frames(rows: list[tuple[int, int, list[float]]]) -> SideFrames:
-    t_mid_ns, arrival_ns, lines = zip(*rows, strict=True)
-    return SideFrames(np.array(t_mid_ns, np.int64), np.array(arrival_ns, np.int64), np.array(lines, np.float64))
+def _side_frames(rows: list[tuple[int, list[float]]]) -> SideFrames:
+    t_mid_ns, lines = zip(*rows, strict=True)
+    return SideFrames(np.array(t_mid_ns, np.int64), np.array(lines, np.float64))
 
 
 def _check_checksums(file: IO[bytes]) -> None:

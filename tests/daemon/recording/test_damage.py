@@ -186,7 +186,6 @@ BARE = json.dumps(CONFIGURATION).encode()
 @pytest.mark.parametrize(
     ("arguments", "messages", "others", "problem"),
     [
-        (EVALUATE, [(FRAME[0], {**FRAME[1], "arrival_unix_ns": 10**30})], {}, "too large"),
         (EVALUATE, [(FRAME[0], {**FRAME[1], "line": ["x"] * len(LINE)})], {}, "could not convert"),
         (INFO, [TORQUE], {"end": {"dropped": "abc"}}, "invalid literal"),
         (CSV, [("eit.frame.a\0b", FRAME[1])], {}, r"it has the topic 'eit.frame.a\\x00b'"),

@@ -93,12 +93,12 @@ def result_of(ran) -> Callable[..., Any]:
 
 
 @pytest.fixture
-def keys(tmp_path, ran) -> Path:
-    """A server and one client who knows it, made as a user makes them."""
+def keys(tmp_path, result_of) -> Path:
+    """A server and one client who knows it, made as a script makes them."""
     server, client = tmp_path / "keys", tmp_path / "ada"
-    ran("keys", "server", "--dir", server)
-    ran("keys", "client", "--dir", client)
-    ran("keys", "allow", client / "client.key", "--name", "ada", "--dir", server)
+    assert result_of("keys", "server", "--dir", server)["secret_file"] == str(server / "server.key_secret")
+    public = result_of("keys", "client", "--dir", client)["public_file"]
+    assert result_of("keys", "allow", public, "--name", "ada", "--dir", server) == {"allowed": "ada"}
     return tmp_path
 
 

@@ -3,7 +3,6 @@
 import argparse
 import importlib
 from collections.abc import Iterator
-from pathlib import Path
 
 from shearloop.daemon.cli import COMMANDS
 
@@ -41,14 +40,3 @@ def test_every_command_has_a_json_option_or_a_reason_for_none():
     having = {name: "--json" in parser._option_string_actions for name, parser in every_parser()}
     lacking = {name for name, has_it in having.items() if not has_it}
     assert {next((known for known in WITHOUT if name.startswith(known)), name) for name in lacking} == set(WITHOUT)
-
-
-def test_keys_as_json(tmp_path, result_of):
-    folder = tmp_path / "server"
-    server = result_of("keys", "server", "--dir", folder)
-    client = result_of("keys", "client", "--dir", tmp_path / "client")
-    assert Path(server["secret_file"]).stat().st_mode & 0o777 == 0o600
-    allow = ("allow", client["public_file"], "--name", "ada")
-    assert result_of("keys", *allow, "--dir", folder) == {"allowed": "ada"}
-    assert list(result_of("keys", "list", "--dir", folder)["clients"]) == ["ada"]
-    assert result_of("keys", "revoke", "ada", "--dir", folder) == {"revoked": "ada"}

@@ -151,7 +151,7 @@ def test_keys_are_made_listed_and_revoked(keys, ran, mistake, result_of):
         (["revoke", "eve"], "there is no client 'eve'; the allowed clients are ada"),
     ):
         assert why in mistake("keys", *arguments, "--dir", folder)
-    ran("keys", "revoke", "ada", "--dir", folder)
+    assert result_of("keys", "revoke", "ada", "--dir", folder) == {"revoked": "ada"}
     assert "no client may connect yet" in ran("keys", "list", "--dir", folder).out
 
 

@@ -1,5 +1,6 @@
 """Clients of a daemon: receive its messages, send it a command."""
 
+import asyncio
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Self
 
@@ -123,34 +124,33 @@ def receive_messages(
 def send_command(
     address: str, content: Mapping[str, Any], timeout_s: float, keys: ClientKeys | None = None
 ) -> dict[str, Any]:
+    """Send one command and return the daemon's reply; raises as `ask`, which an event loop calls instead."""
+
+    async def ask_once() -> dict[str, Any]:
+        with zmq.asyncio.Context() as context:
+            return await ask(context, address, content, timeout_s, keys)
+
+    return asyncio.run(ask_once())
+
+
+async def ask(
+    context: zmq.asyncio.Context, address: str, content: Mapping[str, Any], timeout_s: float, keys: ClientKeys | None
+) -> dict[str, Any]:
     """Send one command and return the daemon's reply; raises UserError if no reply comes in time."""
-    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
+    with context.socket(zmq.DEALER) as socket:
         socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.SNDTIMEO, int(timeout_s * 1000))
-        socket.setsockopt(zmq.RCVTIMEO, int(timeout_s * 1000))
         connect(socket, address, keys)
         try:
-            socket.send(encode(content))
-            reply = socket.recv()
-        except zmq.Again as error:
-            raise no_reply(address, timeout_s, keys) from error
-        return decode_reply(reply, address)
-
-
-def no_reply(address: str, timeout_s: float, keys: ClientKeys | None) -> UserError:
-    """Return the error for a command without a reply."""
-    return UserError(
-        f"no daemon answered at {address} within {timeout_s:g} s; start it with `shearloop run CONFIG`, "
-        f"or give the address of its `commands` key with --connect{keys_hint(keys)}"
-    )
-
-
-def decode_reply(data: bytes, address: str) -> dict[str, Any]:
-    """Return a reply; raises UserError if it is not a daemon's."""
-    try:
-        return decode(data)
-    except ValueError as error:
-        raise foreign_reply(address, error) from error
+            async with asyncio.timeout(timeout_s):
+                await socket.send(encode(content))
+                return decode(await socket.recv())
+        except TimeoutError as error:
+            raise UserError(
+                f"no daemon answered at {address} within {timeout_s:g} s; start it with `shearloop run CONFIG`, "
+                f"or give the address of its `commands` key with --connect{keys_hint(keys)}"
+            ) from error
+        except ValueError as error:
+            raise foreign_reply(address, error) from error
 
 
 def connect(socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = None) -> None:

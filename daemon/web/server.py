@@ -29,7 +29,7 @@ from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S, needs_keys
-from shearloop.daemon.messaging.client import connect, decode_reply, no_reply
+from shearloop.daemon.messaging.client import ask, connect
 from shearloop.daemon.messaging.keys import ClientKeys, Refusals, TokenBucket
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.process import ending_signals
@@ -104,8 +104,8 @@ class Bridge:
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
         try:
             connect(self._socket, address.publish, address.keys)
-            with self._command_socket():
-                pass
+            with context.socket(zmq.DEALER) as commands:
+                connect(commands, address.commands, address.keys)
         except UserError:
             self._socket.close()
             raise
@@ -160,22 +160,7 @@ class Bridge:
         return reply or await self._request(content, COMMAND_TIMEOUT_S)
 
     async def _request(self, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
-        address = self._address.commands
-        with self._command_socket() as socket:
-            try:
-                async with asyncio.timeout(timeout_s):
-                    await socket.send(messages.encode(content))
-                    data = await socket.recv()
-            except TimeoutError as error:
-                raise no_reply(address, timeout_s, self._address.keys) from error
-        return decode_reply(data, address)
-
-    @contextlib.contextmanager
-    def _command_socket(self) -> "Iterator[zmq.asyncio.Socket]":
-        with self._context.socket(zmq.DEALER) as socket:
-            socket.setsockopt(zmq.LINGER, 0)
-            connect(socket, self._address.commands, self._address.keys)
-            yield socket
+        return await ask(self._context, self._address.commands, content, timeout_s, self._address.keys)
 
     async def close(self) -> None:
         """Close the socket; wait for a stop that is on its way."""

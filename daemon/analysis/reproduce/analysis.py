@@ -120,9 +120,8 @@ class Matches:
 class TorqueResult:
     """The torque slices' results. Correlations are Pearson's, between torque and the best match's sigma.
 
-    `groups` (n,) are levels of torque, with the means `group_torque_nm` and `group_sigma` on the focused bank.
-    `r_clustered` is between these means, and `fit` is the parabola through them. `parts` (n,) are parts of the
-    recording.
+    `groups` (n,) are levels of torque. `r_clustered` is between the means of these, and `fit` is the parabola through
+    the means. `parts` (n,) are parts of the recording.
     `rmse_nm` is of single slices, each predicted by a parabola that was fitted without its part. `grouping` and
     `held_out` describe the groups and the parts.
     """
@@ -131,10 +130,7 @@ class TorqueResult:
     focused: Matches
     wide: Matches
     r_focused: float | None
-    r_wide: float | None
     groups: IntArray
-    group_torque_nm: FloatArray
-    group_sigma: FloatArray
     grouping: str
     r_clustered: float | None
     parts: IntArray
@@ -142,6 +138,21 @@ class TorqueResult:
     rmse_nm: float | None
     held_out: str
     notes: tuple[str, ...]
+
+    @property
+    def r_wide(self) -> float | None:
+        """The correlation on the wide bank."""
+        return correlation(self.wide.sigma, self.slices.torque_nm)
+
+    @property
+    def group_torque_nm(self) -> FloatArray:
+        """The mean torque of each group."""
+        return group_means(self.slices.torque_nm, self.groups)
+
+    @property
+    def group_sigma(self) -> FloatArray:
+        """The mean sigma of each group, on the focused bank."""
+        return group_means(self.focused.sigma, self.groups)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,10 +232,7 @@ def analyse_torque(slices: Slices, on_focused: Matches, on_wide: Matches) -> Tor
         focused=on_focused,
         wide=on_wide,
         r_focused=correlation(sigma, torque),
-        r_wide=correlation(on_wide.sigma, torque),
         groups=groups,
-        group_torque_nm=group_torque,
-        group_sigma=group_sigma,
         grouping=grouping,
         r_clustered=r_clustered,
         parts=parts,

@@ -73,8 +73,8 @@ def by_default(rig: Path, sides: Sequence[str]) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def played(config: dict[str, Any], period_s: float) -> Iterator[tuple[dict[str, common.PlayedBoard], int, float, Any]]:
-    """Run a daemon on boards that the benchmark plays; yield them, its process id, ready time, and estimates."""
+def played(config: dict[str, Any], period_s: float) -> Iterator[tuple[dict[str, common.PlayedBoard], int, Any]]:
+    """Run a daemon on boards that the benchmark plays; yield them, its process id, and estimates."""
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as opened:
         folder = Path(name)
         boards = {side: common.PlayedBoard(folder / side) for side in config["fingertips"]}
@@ -85,11 +85,11 @@ def played(config: dict[str, Any], period_s: float) -> Iterator[tuple[dict[str, 
             for side, fingertip in config["fingertips"].items()
         }
         path = common.write_config(folder, **{**config, "fingertips": fingertips})
-        daemon, ready_s = opened.enter_context(common.running_daemon(path))
+        daemon, _ = opened.enter_context(common.running_daemon(path))
         estimates = opened.enter_context(common.subscription(folder, "eit.estimate"))
         for board in boards.values():
             board.wait_for_start()
-        yield boards, daemon.pid, ready_s, estimates
+        yield boards, daemon.pid, estimates
 
 
 def latency(config: dict[str, Any], rig: Path) -> dict[str, dict[str, float]]:
@@ -104,7 +104,7 @@ def latency(config: dict[str, Any], rig: Path) -> dict[str, dict[str, float]]:
     last_sources = {sides[-1], COMBINED} if len(sides) > 1 else {sides[-1]}
     taken: dict[str, list[float]] = {source: [] for source in (*sides, *last_sources)}
     missed, latest = dict.fromkeys(taken, 0), dict.fromkeys(taken, -1)
-    with played(config, FRAME_PERIOD_S) as (boards, _, ready_s, estimates):
+    with played(config, FRAME_PERIOD_S) as (boards, _, estimates):
         estimates.setsockopt(zmq.RCVTIMEO, 1000)
         for number in range(n_frames):
             time.sleep(0.5 * FRAME_PERIOD_S)
@@ -128,17 +128,19 @@ def latency(config: dict[str, Any], rig: Path) -> dict[str, dict[str, float]]:
                             taken[source].append((arrived_ns - sent_ns) / 1e6)
     return {
         source: {
-            **dict(zip(("p50_ms", "p99_ms"), np.percentile(found, [50, 99]).tolist(), strict=True)),
-            "n": len(found), "missed": missed[source], "ready_s": ready_s,
+            "p50_ms": float(np.percentile(found, 50)),
+            "p99_ms": float(np.percentile(found, 99)),
+            "n": len(found),
+            "missed": missed[source],
         }
         for source, found in taken.items()
-    }  # fmt: skip
+    }
 
 
 def flood(config: dict[str, Any], rig: Path) -> dict[str, Any]:
     """Return the losses and the load at five hundred frames a second."""
     lines = recorded_lines(rig, "right", FLOOD_FRAMES)
-    with played(config, 1 / FLOOD_HZ) as (boards, pid, _, estimates):
+    with played(config, 1 / FLOOD_HZ) as (boards, pid, estimates):
         process = psutil.Process(pid)
         before, begun = cpu_s(process), time.monotonic()
 

@@ -10,7 +10,7 @@ estimators.json.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -54,16 +54,6 @@ CYLINDERS_MM = [tuple(np.linspace(10.0, 40.0, n).tolist()) for n in (3, 4, 5, 7)
 TOOLS_MM = (12.0, 18.0, 22.0, 28.0, 38.0)
 
 
-@dataclass(frozen=True, slots=True)
-class AccuracySplit:
-    """The earlier and the later part of a recording; `timed_by` holds all sides of the earlier part."""
-
-    title: str
-    past: FrameSeries
-    future: FrameSeries
-    timed_by: tuple[FrameSeries, ...] = ()
-
-
 def imported_stream(recordings: Path, name: str, scratch: Path) -> Path:
     """Import one of the paper's streams and return the recording's path."""
     path = scratch / f"{STREAMS[name]}.mcap"
@@ -71,43 +61,39 @@ def imported_stream(recordings: Path, name: str, scratch: Path) -> Path:
     return path
 
 
-def splits(recordings: Path, scratch: Path) -> Iterator[AccuracySplit]:
-    """Yield the time-ordered splits of the paper's recordings."""
+def splits(recordings: Path, scratch: Path) -> Iterator[tuple[str, FrameSeries, FrameSeries, list[FrameSeries]]]:
+    """Yield the title, the earlier and the later part of the paper's recordings, and what shows the first one's timing.
+
+    That is the earlier part with all sides.
+    """
     (torque,) = read_series(recordings / "torque_slices")
     for share in SLICE_SHARES:
-        yield AccuracySplit(f"torque slices, first {share:.0%}", part_of(torque, 0, share), part_of(torque, share, 1))
+        yield f"torque slices, first {share:.0%}", part_of(torque, 0, share), part_of(torque, share, 1), []
     (cylinders,) = read_series(recordings / "diameter_slices")
     past, future = part_of(cylinders, 0, CYLINDER_SHARE), part_of(cylinders, CYLINDER_SHARE, 1)
-    yield AccuracySplit(f"cylinders, first {CYLINDER_SHARE:.0%}", past, future)
+    yield f"cylinders, first {CYLINDER_SHARE:.0%}", past, future, []
     recording = read_recording(imported_stream(recordings, "3 December", scratch))
-    whole = series_of(recording, None)
+    timed_by = [part_of(series_of(recording, None), 0, TWIST_SHARE)]
     for sides in FINGERTIPS:
         twists = series_of(recording, sides)
-        yield AccuracySplit(
-            f"stream, {' and '.join(sides)}, first {TWIST_SHARE:.0%}",
-            part_of(twists, 0, TWIST_SHARE),
-            part_of(twists, TWIST_SHARE - _WARM_UP, 1),
-            (part_of(whole, 0, TWIST_SHARE),),
-        )
+        past, future = part_of(twists, 0, TWIST_SHARE), part_of(twists, TWIST_SHARE - _WARM_UP, 1)
+        yield f"stream, {' and '.join(sides)}, first {TWIST_SHARE:.0%}", past, future, timed_by
 
 
 def later_frames(
     recordings: Path, scratch: Path, names: list[EstimatorName], physics: Physics
 ) -> Iterator[tuple[str, EstimatorName, EstimateTrack]]:
     """Yield the estimates of every estimator on every split; print why one cannot be fitted."""
-    for split in splits(recordings, scratch):
-        for name in names:
-            # A heatmap over all lags takes most of a second: the paper's method is judged on slices alone.
-            if name == "paper" and split.past.kind == "raw":
-                continue
-            try:
-                calibration = fit(
-                    name, [split.past], split.title, physics, timing=measure_timing([split.past], split.timed_by)
-                )
-            except BankError as error:
-                print(f"{split.title}, {name}: {error}")
-                continue
-            yield split.title, name, estimate_series(calibration, split.future, physics.bank)
+    for (title, past, future, timed_by), name in product(splits(recordings, scratch), names):
+        # A heatmap over all lags takes most of a second: the paper's method is judged on slices alone.
+        if name == "paper" and past.kind == "raw":
+            continue
+        try:
+            calibration = fit(name, [past], title, physics, timing=measure_timing([past], timed_by))
+        except BankError as error:
+            print(f"{title}, {name}: {error}")
+            continue
+        yield title, name, estimate_series(calibration, future, physics.bank)
 
 
 def other_recordings(recordings: Path, scratch: Path) -> Iterator[tuple[str, dict[str, Figures] | str]]:

@@ -12,10 +12,11 @@ to 1.2 N. The contact solver follows random load paths on random skins and meshe
 import time
 import timeit
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -93,19 +94,8 @@ def models() -> dict[str, Callable[[float], Model]]:
     }
 
 
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """One model: set-up in ms, time per load step in µs, errors relative to the largest response."""
-
-    name: str
-    set_up_ms: float
-    step_us: float
-    loading: float
-    plate: float
-
-
-def compare_models() -> list[Measured]:
-    """Print and return each model's times and errors."""
+def compare_models() -> list[dict[str, Any]]:
+    """Print and return each model's set-up in ms, time per load step in µs, and errors over the largest response."""
     up, there_and_back, whole_mm = loading(AMPLITUDE_N), loop(AMPLITUDE_N), PAPER_SECTION.width_mm
     begin = time.process_time()
     true_loop = at_finite_strain(PAPER_SECTION, NORMAL_N, there_and_back)
@@ -118,10 +108,10 @@ def compare_models() -> list[Measured]:
         set_up_ms = 1e3 * min(timeit.repeat(partial(make, PLATE_MM), number=1, repeat=3))
         model = make(whole_mm)
         step_us = 1e6 * min(timeit.repeat(partial(model, up), number=1)) / len(up)
-        errors = [_error(model(up), true_up), _error(make(PLATE_MM)(up), under_plate)]
-        found.append(Measured(name, set_up_ms, step_us, *errors))
+        even, plate = _error(model(up), true_up), _error(make(PLATE_MM)(up), under_plate)
+        found.append({"name": name, "set_up_ms": set_up_ms, "step_us": step_us, "loading": even, "plate": plate})
         around = "–" if "sheet" in name else f"{_error(model(there_and_back), true_loop):.1%}"
-        print(table_row(name, set_up_ms, step_us, f"{errors[0]:.1%}", around, f"{errors[1]:.1%}"), flush=True)
+        print(table_row(name, set_up_ms, step_us, f"{even:.1%}", around, f"{plate:.1%}"), flush=True)
     ignored = f"{_error(true_up, under_plate):.1%}"
     print(table_row("2-D, finite strain, 112 elements", "–", finite_us, "–", "–", ignored), flush=True)
     return found
@@ -131,23 +121,18 @@ def _error(found: FloatArray, true: FloatArray) -> float:
     return float(abs(found - true).max() / abs(true).max())
 
 
-def draw(found: Sequence[Measured], out: Path) -> None:
+def draw(found: Sequence[dict[str, Any]], out: Path) -> None:
     """Draw each model's error over its time per step, for an even load and for the plate, and write both."""
     from shearloop.daemon.analysis.charts import drawing
 
     made = drawing.figure(8.0, 4.6)
     axes = made.subplots()
     drawing.plain_log(axes)
-    points = []
-    for number, (scene, errors) in enumerate(
-        {
-            "even load over 20 mm": [each.loading for each in found],
-            "plate of 14 mm": [each.plate for each in found],
-        }.items()
-    ):
-        style = drawing.look(number) | {"linestyle": "none"}
-        axes.plot([each.step_us for each in found], [100 * error for error in errors], label=scene, **style)
-        points += [(each.step_us, 100 * error, each.name) for each, error in zip(found, errors, strict=True)]
+    points: list[tuple[float, float, str]] = []
+    for number, (scene, key) in enumerate((("even load over 20 mm", "loading"), ("plate of 14 mm", "plate"))):
+        times_us, errors = [each["step_us"] for each in found], [100 * each[key] for each in found]
+        axes.plot(times_us, errors, label=scene, **drawing.look(number) | {"linestyle": "none"})
+        points += zip(times_us, errors, (each["name"] for each in found), strict=True)
     axes.set(xlabel="time per load step, µs", ylabel="largest error while loading, %")
     axes.set_title("The skin's models: speed against accuracy, Fn = 1 N")
     axes.grid(alpha=0.25)
@@ -155,7 +140,7 @@ def draw(found: Sequence[Measured], out: Path) -> None:
     axes.margins(0.25, 0.15)
     drawing.lay_out(made)
     drawing.write_names(axes, points)
-    drawing.save(made, {"models": [asdict(each) for each in found]}, out, "skin-speed-accuracy")
+    drawing.save(made, {"models": found}, out, "skin-speed-accuracy")
 
 
 def compare_scenes() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.common import parser_of, table_head, table_row, write_figures
 from shearloop.daemon.analysis.charts import simulated_loop
-from shearloop.daemon.control.margins import LoopModel, gain_limit
+from shearloop.daemon.control.margins import LoopModel, gain_limit, integral_gain
 from shearloop.daemon.control.torque_controller import ControllerSettings, TorqueController
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 
@@ -22,8 +22,6 @@ COMMAND_S = 0.016
 ACTUATION_S = 0.02
 BANDWIDTH_PER_S = 4.0
 STIFFNESS = 0.25
-# The integral gain is this share of kp², as in the controller.
-KI_SHARE = 0.1
 EIT_AGE_S = 0.5 * FRAME_PERIOD_S + 0.06
 AGES_S = tuple(np.round(np.geomspace(EIT_AGE_S, 3.0, 9), 3))
 CYCLE = 8
@@ -46,13 +44,13 @@ class LoopCase:
         """Return the model for the computed boundary."""
         return LoopModel(
             sample_period_s=FRAME_PERIOD_S, window_s=FRAME_PERIOD_S, age_s=age_s, actuation_s=ACTUATION_S,
-            wrist_bandwidth_per_s=BANDWIDTH_PER_S, kp=0.1, ki=KI_SHARE * 0.01, command_period_s=COMMAND_S,
+            wrist_bandwidth_per_s=BANDWIDTH_PER_S, kp=0.1, ki=integral_gain(0.1), command_period_s=COMMAND_S,
             stiffness_ratio=self.stiffness_ratio, compensated=self.compensated,
         )  # fmt: skip
 
     def controller(self, kp: float) -> simulated_loop.LoopController:
         """Return the real controller, without limits."""
-        believed, ki = STIFFNESS / self.stiffness_ratio, KI_SHARE * kp * kp
+        believed, ki = STIFFNESS / self.stiffness_ratio, integral_gain(kp)
         settings = ControllerSettings(
             stiffness_nm_per_rad=believed, sample_period_s=FRAME_PERIOD_S, window_s=FRAME_PERIOD_S, kp=kp, ki=ki,
             wrist_bandwidth_per_s=BANDWIDTH_PER_S, ramp_nm_per_s=1e3, deadband_nm=0.0, torque_limit_nm=1e3,
@@ -117,8 +115,7 @@ def worst_disagreement(rows: Iterable[Mapping[str, float | None]]) -> float:
 
 def main() -> None:
     """Measure, write the numbers, draw the chart."""
-    parser = parser_of(__doc__)
-    args = parser.parse_args()
+    args = parser_of(__doc__).parse_args()
     points = [(age, 0) for age in AGES_S] + [(EIT_AGE_S, lost) for lost in LOST[1:]]
     found = {case.name: [boundary(case, *point) for point in points] for case in CASES}
     print(table_head("loop", "age, s", "lost of 8", "computed gain", "simulated gain"))

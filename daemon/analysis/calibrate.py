@@ -43,8 +43,7 @@ class CalibrationResult:
     @property
     def regressor(self) -> IntervalRegressor | None:
         """The torque's regressor, None without a torque."""
-        regressor = self.calibration.torque.regressor if self.calibration.torque is not None else None
-        return regressor if isinstance(regressor, IntervalRegressor) else None
+        return None if self.calibration.torque is None else self.calibration.torque.regressor
 
     @property
     def reads_beyond(self) -> bool | None:
@@ -114,9 +113,8 @@ def calibrate(
     if all_live:
         # One clock stamped frames and torques as they arrived, whatever the motion shows.
         timing = replace(timing, uncertainty_s=0.0)
-    calibration = fit(
-        estimator, parts, _source(paths, options), physics, timing=timing, full_range=options.assume_full_range
-    )
+    source = _source(paths, options.time_range, delay_s)
+    calibration = fit(estimator, parts, source, physics, timing=timing, full_range=options.assume_full_range)
     named = [*((path.name, one) for path, one in chosen), *others]
     warned = [each for each in zip(timing.references, timing.warnings, strict=True) if each[1]]
     doubts = [f"{name}: {why}" for name, one in named for reference, why in warned if one is reference]
@@ -143,8 +141,7 @@ def adapt_to_recordings(
     # Earlier frames show the session the idle fingertip.
     until = [part_of(replace(one, torque_t_s=one.torque_t_s - load_cell_delay_s), 0.0, stop) for one in series]
     first = [part_of(one, start, stop).first_frame for one in series]
-    options = CalibrationOptions(time_range=time_range, load_cell_delay_s=load_cell_delay_s)
-    return adapt(calibration, until, _source(paths, options), physics, first_frames=first)
+    return adapt(calibration, until, _source(paths, time_range, load_cell_delay_s), physics, first_frames=first)
 
 
 def _read(path: Path, options: CalibrationOptions) -> tuple[list[FrameSeries], list[FrameSeries], bool]:
@@ -162,9 +159,8 @@ def _read(path: Path, options: CalibrationOptions) -> tuple[list[FrameSeries], l
     return [own], [series_of(recording, (side,), options.tool_mm) for side in others], recording.live
 
 
-def _source(paths: Sequence[Path], options: CalibrationOptions) -> str:
+def _source(paths: Sequence[Path], time_range: tuple[float, float], delay_s: float | None) -> str:
     source = ", ".join(path.name for path in paths)
-    start, stop = options.time_range
-    if (start, stop) != (0.0, 1.0):
-        source += f" from {start:g} to {stop:g}"
-    return source + (f", load cell {options.load_cell_delay_s:g} s late" if options.load_cell_delay_s else "")
+    if time_range != (0.0, 1.0):
+        source += " from {:g} to {:g}".format(*time_range)
+    return source + (f", load cell {delay_s:g} s late" if delay_s else "")

@@ -10,6 +10,7 @@ from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS, conductivity
+from shearloop.daemon.analysis.charts.drawing import figure
 
 _PANELS = 10
 _BLUE, _GREY = "#1f5f99", "#8a8a8a"
@@ -28,8 +29,8 @@ def signal_figure(bank: Bank) -> Figure:
     model = MODELS[bank.model]
     of_k, of_sigma = (evenly_spread(len(grid), _PANELS) for grid in (bank.k_grid, bank.sigma_grid))
     rows, columns = len(of_sigma), len(of_k)
-    figure = Figure(figsize=(1.35 * columns + 1.2, 0.85 * rows + 1.4), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, gridspec_kw={"wspace": 0.08, "hspace": 0.12})
+    made = figure(1.35 * columns + 1.2, 0.85 * rows + 1.4)
+    axes = made.subplots(rows, columns, squeeze=False, gridspec_kw={"wspace": 0.08, "hspace": 0.12})
     for row, s in enumerate(reversed(of_sigma)):
         for column, k in enumerate(of_k):
             panel = axes[row, column]
@@ -48,14 +49,14 @@ def signal_figure(bank: Bank) -> Figure:
                 panel.set_xlabel(f"{bank.k_grid[k]:.3g}", fontsize=8)
             if column == 0:
                 panel.set_ylabel(f"{bank.sigma_grid[s]:.3g}", fontsize=8, rotation=0, ha="right", va="center")
-    figure.supxlabel(f"k ({model.k_unit})", fontsize=10)
-    figure.supylabel(f"σ ({model.sigma_unit})", fontsize=10)
-    figure.suptitle(
+    made.supxlabel(f"k ({model.k_unit})", fontsize=10)
+    made.supylabel(f"σ ({model.sigma_unit})", fontsize=10)
+    made.suptitle(
         f"Signals of the model “{model.title}”: v(k, σ) − v(homogeneous) over 896 channels, each panel scaled to "
         "its peak (model's voltage, upper right)",
         fontsize=10,
     )
-    return figure
+    return made
 
 
 def models_figure(mesh: Mesh) -> Figure:
@@ -75,8 +76,8 @@ def models_figure(mesh: Mesh) -> Figure:
         "gaussian_derivative": (height / 2, max(0.9, 0.2 * height)),
         "modulated_gaussian": (3.0, 0.25 * height),
     }
-    figure = Figure(figsize=(13.5, 2.25 * len(examples) + 0.9), layout="constrained")
-    axes = figure.subplots(len(examples), 3, gridspec_kw={"width_ratios": [1.1, 1.5, 3]})
+    made = figure(13.5, 2.25 * len(examples) + 0.9)
+    axes = made.subplots(len(examples), 3, gridspec_kw={"width_ratios": [1.1, 1.5, 3]})
     norm = TwoSlopeNorm(1.0, 0.0, 2.0)
     for (curve, plane, signal), (name, (k, sigma)) in zip(axes, examples.items(), strict=True):
         basis = MODELS[name]
@@ -94,13 +95,13 @@ def models_figure(mesh: Mesh) -> Figure:
         for edge in mesh.electrode_edges:
             plane.plot(*mesh.nodes[edge].T, color="black", linewidth=2.5, solid_capstyle="butt", clip_on=False)
         plane.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]), ylabel="y (cm)")
-        figure.colorbar(drawn, ax=plane, label="conductivity\n(homogeneous = 1)", ticks=[0, 0.5, 1, 1.5, 2])
+        made.colorbar(drawn, ax=plane, label="conductivity\n(homogeneous = 1)", ticks=[0, 0.5, 1, 1.5, 2])
         signal.plot(forward.voltages(values) - homogeneous, color=_BLUE, linewidth=0.5)
         signal.set(xlim=(0, PAPER_TABLE.n_channels), ylabel="v − v(homog.)\n(model's voltage)")
     axes[-1, 0].set_xlabel("basis function f")
     axes[-1, 1].set_xlabel("x (cm)")
     axes[-1, 2].set_xlabel("channel")
-    figure.suptitle(
+    made.suptitle(
         "The five basis models: f, conductivity 1 + f with the electrodes, and the signal it makes", fontsize=11
     )
-    return figure
+    return made

@@ -18,7 +18,7 @@ from shearloop.daemon.analysis.frame_series import part_of, read_series
 from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP, Grid, cached_bank
 from shearloop.daemon.bank_config import FingertipGeometryConfig, load_geometry
 from shearloop.daemon.config_file import load_yaml_model
-from shearloop.daemon.synthetic_frames import Synthesiser, TwistProgramme
+from shearloop.daemon.synthetic_frames import LARGEST_TORQUE_NM, Synthesiser, TwistProgramme
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 
 # Frames before the judged part of a stream that fill an estimator's memory.
@@ -29,7 +29,6 @@ MESH_SIZE_CM = 0.2
 # Synthetic frames come from a finer mesh than the bank they are matched with, from cells between that bank's.
 _PLAYED_GRID = Grid(np.linspace(3.07, 3.47, 5), np.linspace(1.03, 1.99, 17))
 _PLAYED_MESH_SIZE_CM = 0.14
-_LARGEST_NM = 0.14
 _AVERAGED_FRAMES = 9
 _REST_S = 8.0
 
@@ -95,12 +94,12 @@ def fitted(
 
 def sigma_of(torque_nm: float) -> float:
     """Return the σ in cm of a torque in synthetic frames: it falls with rising torque, as measured."""
-    return 1.9 - 0.7 * torque_nm / _LARGEST_NM
+    return 1.9 - 0.7 * torque_nm / LARGEST_TORQUE_NM
 
 
 def torque_of(sigma: float) -> float:
     """Return the torque in N·m of a σ in cm in synthetic frames."""
-    return _LARGEST_NM * (1.9 - sigma) / 0.7
+    return LARGEST_TORQUE_NM * (1.9 - sigma) / 0.7
 
 
 def played_bank(scratch: Path, grid: Grid = _PLAYED_GRID) -> Bank:
@@ -123,8 +122,8 @@ def synthetic_slices(scratch: Path) -> FrameSeries:
     """Return 49 differences like the paper's slices: five repeats of ten torques, means of nine frames."""
     synthesiser, rng = Synthesiser(played_bank(scratch)), np.random.default_rng((0, 1))
     homogeneous = homogeneous_of(synthesiser)
-    levels = np.tile(np.linspace(0.01, _LARGEST_NM, 10), 5)[1:]
-    torque = np.clip(levels + rng.normal(0.0, 0.003, len(levels)), 0.0, _LARGEST_NM)
+    levels = np.tile(np.linspace(0.01, LARGEST_TORQUE_NM, 10), 5)[1:]
+    torque = np.clip(levels + rng.normal(0.0, 0.003, len(levels)), 0.0, LARGEST_TORQUE_NM)
     # In every repeat the tool sits a little elsewhere in the grip, a little more firmly.
     repeat = np.arange(1, 50) // 10
     frames = [

@@ -20,6 +20,7 @@ from shearloop.daemon.analysis.charts.chart_data import Split, fitted
 from shearloop.daemon.analysis.charts.drawing import figure, look
 from shearloop.daemon.analysis.evaluate import values_of
 from shearloop.daemon.parallel import Executor, in_order
+from shearloop.daemon.synthetic_frames import MEAN_V
 from shearloop.drivers.eit_kit import ADC_STEP_V
 
 
@@ -147,8 +148,6 @@ BROKEN_SHARE = 0.2
 # Judged frames of a stream: enough for a twist and a half.
 _MOST_FRAMES = 180
 _DRAWS = 3
-# The board's mean voltage.
-_MEAN_V = 0.13
 _LOADED_SHARE = 0.1
 
 
@@ -275,7 +274,7 @@ def scene_for(split: Split, bank: Bank) -> FaultScene:
     rng = np.random.default_rng(7)
     foreign = np.array([layer[rng.permutation(PAPER_TABLE.n_channels)] for layer in series.channels.mean(axis=0)])
     if series.kind == "difference":
-        idle = np.abs(bank.homogeneous) * (_MEAN_V / float(np.abs(bank.homogeneous).mean()))
+        idle = np.abs(bank.homogeneous) * (MEAN_V / float(np.abs(bank.homogeneous).mean()))
         noise = residual_noise(split.past.channels[:, 0])
         return FaultScene(series, np.tile(idle, (len(series.sides), 1)), noise, foreign)
     idle = np.median(split.past.channels[:5], axis=0)

@@ -258,7 +258,7 @@ def _outlined(content: object) -> Step:
 
 
 def check_steps(file: ExperimentFile) -> list[Mistake]:
-    """Return each step that exceeds its limits, and the first that closes the loop on an unidentified tool."""
+    """Return each step that exceeds its limits or its timeout, and the first `hold_torque` on an unidentified tool."""
     found: list[Mistake] = []
     for number, step in enumerate(file.steps):
         limits, (torque_nm, angle_rad) = file.limits_of(step), _reach(step)
@@ -267,6 +267,9 @@ def check_steps(file: ExperimentFile) -> list[Mistake]:
             if value >= limit:
                 asks = f"{step.do} asks for {value:g} {unit}, and its limit is {limit:g} {unit}"
                 found.append((("steps", number), f"{asks}; raise limits.{key}, or ask for less"))
+        if step.timeout_s is not None and (least_s := _least_s(step)) >= step.timeout_s:
+            asks = f"{step.do} stands still for {least_s:g} s in all, and its timeout is {step.timeout_s:g} s"
+            found.append((("steps", number), f"{asks}; raise timeout_s"))
     if (unidentified := _holds_unidentified(file)) is not None:
         cure = "put an `identify` step before it, after the last `tare`, `grip`, `release` or `adapt`"
         found.append((("steps", unidentified), f"hold_torque needs an identified tool; {cure}"))
@@ -290,6 +293,18 @@ def _holds_unidentified(file: ExperimentFile) -> int | None:
             case HoldTorqueStep() if not identified:
                 return number
     return None
+
+
+def _least_s(step: Step) -> float:
+    """Return how long a step stands still in all; 0 if unknown, as in an outline."""
+    match step:
+        case HoldTorqueStep(hold_s=hold_s):
+            return hold_s
+        case TwistStep(hold_s=hold_s, angles_rad=angles_rad, repeats=repeats):
+            return hold_s * len(angles_rad) * repeats
+        case WaitStep(wait_s=wait_s):
+            return wait_s
+    return 0.0
 
 
 def _reach(step: Step) -> tuple[float, float]:

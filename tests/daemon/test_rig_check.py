@@ -83,6 +83,15 @@ LIMITS = {"torque_nm": 0.2, "angle_rad": 1.0}
         ),
         ({"do": "tighten", "until_torque_nm": 0.1, "until_angle_rad": 2}, "asks for 2 rad, and its limit is 1 rad"),
         (
+            {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 20, "timeout_s": 20},
+            "stands still for 20 s in all, and its timeout is 20 s; raise timeout_s",
+        ),
+        (
+            {"do": "twist", "angles_rad": [0.1, 0.2], "hold_s": 5, "repeats": 3, "timeout_s": 25},
+            "stands still for 30 s in all, and its timeout is 25 s",
+        ),
+        ({"do": "wait", "wait_s": 3, "timeout_s": 2}, "stands still for 3 s in all, and its timeout is 2 s"),
+        (
             {"do": "twist", "angles_rad": "0.1:1.2:5"},
             "asks for 1.2 rad, and its limit is 1 rad; raise limits.angle_rad",
         ),

@@ -4,7 +4,7 @@ import argparse
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,7 +20,7 @@ from shearloop.daemon.process import interrupt_status
 if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig
 
-# The page's process needs some of it to close its sockets.
+# A process needs some of it to close its sockets, or to end its workers.
 STOP_S = 2.0
 
 
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         try:
             _prepare(folder, args.folder / "run", calibrated=args.recording is None)
         except KeyboardInterrupt as interrupt:
-            # Ctrl-C reaches the demo that started this process too, and one sentence is enough.
+            # The demo that has started and ended this process says so.
             return interrupt_status(interrupt)
         return 0
     from shearloop.daemon.config import load_daemon_config
@@ -65,7 +65,9 @@ def run(args: argparse.Namespace) -> int:
     print("The demo starts …", flush=True)
     # In a process of its own: the daemon would keep the memory of the fits.
     command = [sys.executable, "-m", "shearloop", "demo", "--prepare", "--folder", str(args.folder)]
-    if status := subprocess.call([*command, *played]):
+    with _running([*command, *played]) as process:
+        status = process.wait()
+    if status:
         return status
     with page(config):
         return _call(run_command, str(folder / name), "--show", *played)
@@ -112,21 +114,25 @@ def page(config: "DaemonConfig") -> Iterator[None]:
         yield
         return
     options = ("--connect", config.publish, "--commands", config.commands, "--port", "0", "--json")
-    process = subprocess.Popen([sys.executable, "-m", "shearloop", "view", *options], stdout=subprocess.PIPE)
-    try:
+    with _running([sys.executable, "-m", "shearloop", "view", *options], subprocess.PIPE) as process:
         # Empty where the page has ended; its own sentence says why.
         if process.stdout is not None and (line := process.stdout.readline()):
             print(f"The live page, for a browser of this computer: {json.loads(line)['url_with_token']}", flush=True)
         yield
-    finally:
-        process.terminate()
+
+
+@contextmanager
+def _running(command: Sequence[str], stdout: int | None = None) -> "Iterator[subprocess.Popen[bytes]]":
+    """Run a command in a process group of its own, which Ctrl-C does not reach, and end it."""
+    with subprocess.Popen(command, stdout=stdout, process_group=0) as process:
         try:
-            process.wait(STOP_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        if process.stdout is not None:
-            process.stdout.close()
+            yield process
+        finally:
+            process.terminate()
+            try:
+                process.wait(STOP_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
 
 
 def _call(command: ModuleType, *arguments: str) -> int:

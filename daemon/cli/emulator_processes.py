@@ -69,9 +69,10 @@ class EmulatedDevices:
             stack.callback(_stop, devices)
             for emulator in self._emulators:
                 output = stack.enter_context(tempfile.TemporaryFile())
-                # An emulator ends when its standard input is closed.
+                # An emulator ends when its standard input is closed. Ctrl-C does not reach a group of its own, so the
+                # robot answers until the daemon has stopped it.
                 process = subprocess.Popen(
-                    self._command(emulator), cwd=self._folder, stdin=subprocess.PIPE, stdout=output
+                    self._command(emulator), cwd=self._folder, stdin=subprocess.PIPE, stdout=output, process_group=0
                 )
                 devices.append((process, output))
                 self._waiting += [(event, process) for event in emulator.events]

@@ -199,7 +199,7 @@ INTERRUPTED = "shearloop evaluate: interrupted before it was done\n"
 
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_an_interrupted_command_reports_it_except_listen_and_view(number, status, monkeypatch, tmp_path, ran):
+def test_an_interrupted_command_reports_it_unless_it_only_waits(number, status, monkeypatch, tmp_path, ran):
     def interrupted(*_: object) -> NoReturn:
         signal.raise_signal(number)
         raise AssertionError
@@ -208,9 +208,11 @@ def test_an_interrupted_command_reports_it_except_listen_and_view(number, status
     assert ran("evaluate", "a.cal", "b.mcap", status=status) == ("", INTERRUPTED)
     monkeypatch.setattr("shearloop.daemon.messaging.client.receive_messages", interrupted)
     assert ran("listen", status=status) == ("", "")
-    # The demo that starts it says that it was interrupted.
+    # What has started them says that it was interrupted.
     monkeypatch.setattr("shearloop.daemon.cli.view.load_fingertip", interrupted)
     assert ran("view", "--token-file", tmp_path / "token", status=status) == ("", "")
+    monkeypatch.setattr("shearloop.daemon.cli.emulate.console.check_positive", interrupted)
+    assert ran("emulate", "rig", "--bank", "my.bank", "--run-dir", tmp_path, status=status) == ("", "")
 
 
 def test_a_closed_terminal_causes_no_traceback(monkeypatch, ran):

@@ -68,6 +68,12 @@ def test_devices_are_awaited_until_they_are_ready_or_have_ended(played, tmp_path
         assert (tmp_path / "late").exists()
 
 
+def test_ctrl_c_reaches_no_device(played, tmp_path):
+    os.mkfifo(tmp_path / "group")
+    with played((emulator(),), "import os; print(os.getpgrp(), file=open('group', 'w')); input()"):
+        assert int((tmp_path / "group").read_text()) != os.getpgrp()
+
+
 def test_the_truth_is_read_up_to_its_last_complete_line(played):
     rows = [{"t_mono_ns": 1, "torque_nm": 0.1}, {"t_mono_ns": 2, "torque_nm": 0.2}]
     with played((emulator(),), "input()") as devices:

@@ -8,8 +8,8 @@ from typing import NoReturn
 from shearloop.daemon.cli.emulate import devices, rig
 from shearloop.daemon.cli.options import add_action, run_action
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.process import interrupt_status
 
-run = run_action
 DEVICES = {**devices.DEVICES, **rig.DEVICES}
 
 
@@ -18,6 +18,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parsers = parser.add_subparsers(dest="device", metavar="DEVICE", required=True)
     for name, device in DEVICES.items():
         device.configure(add_action(parsers, name, device.summary, device.run))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play the device until Ctrl-C, SIGTERM, SIGHUP or the end of standard input."""
+    try:
+        return run_action(args)
+    except KeyboardInterrupt as interrupt:
+        # While it starts: nothing is left undone.
+        return interrupt_status(interrupt)
 
 
 class _RaisingParser(argparse.ArgumentParser):

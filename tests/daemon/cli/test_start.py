@@ -1,6 +1,10 @@
 """What a user starts with: `init`, `schema`, and the files of `demo`."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -87,6 +91,15 @@ def test_the_demos_page_lasts_as_long_as_the_demo(tmp_path, monkeypatch, capsys)
         assert asyncio.run(status(url)) == 200
     with pytest.raises(aiohttp.ClientConnectorError):
         asyncio.run(status(url))
+
+
+def test_ctrl_c_reaches_no_process_of_the_demo(capfd):
+    with demo._running([sys.executable, "-c", "import os; print(os.getpgrp())"]) as process:
+        assert process.wait() == 0
+    assert int(capfd.readouterr().out) != os.getpgrp()
+    with demo._running([sys.executable, "-c", "import time; time.sleep(60)"], subprocess.PIPE) as process:
+        pass
+    assert process.returncode == -signal.SIGTERM
 
 
 def test_the_demo_refuses_a_recording_that_is_not_there_at_once(tmp_path, mistake):

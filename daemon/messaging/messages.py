@@ -271,18 +271,23 @@ def stale_after_s(topic: str) -> float:
 
 
 def wire_map(message: Message, timestamp: float, seq: int) -> dict[str, Any]:
-    """Return a message as the map that is encoded: arrays as little-endian float32 with their shapes."""
-    content: dict[str, Any] = {"timestamp": timestamp, "seq": seq}
-    for item in dataclasses.fields(message):
-        name, value = item.name, getattr(message, item.name)
-        if isinstance(value, np.ndarray | tuple):
+    """Return a message as the map that is encoded."""
+    content = {item.name: getattr(message, item.name) for item in dataclasses.fields(message)}
+    return with_packed_arrays({"timestamp": timestamp, "seq": seq, **content})
+
+
+def with_packed_arrays(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a map with arrays, tuples and lists as bytes of little-endian float32, and their shapes; None is NaN."""
+    packed: dict[str, Any] = {}
+    for key, value in content.items():
+        if isinstance(value, np.ndarray | tuple | list):
             # Values beyond float32 become infinite.
             with np.errstate(over="ignore"):
                 array = np.asarray(value, _FLOAT32)
-            content[name], content[f"{name}_shape"] = array.tobytes(), list(array.shape)
+            packed[key], packed[f"{key}_shape"] = array.tobytes(), list(array.shape)
         else:
-            content[name] = value
-    return content
+            packed[key] = value
+    return packed
 
 
 def encode(content: Mapping[str, Any]) -> bytes:

@@ -23,7 +23,7 @@ from shearloop.bank.estimation import Measured
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFrame, EitHeatmap, LoadTorque, SkinShear
+from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.reader import open_recording, reading
@@ -45,7 +45,8 @@ from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.yaml_files import validated
 
 # Topics that a replay computes. All others are sent as they were recorded.
-COMPUTED_TOPICS = (EitFrame.topic, EitEstimate.topic, EitAdapted.topic, LoadTorque.topic, SkinShear.topic)
+_COMPUTED = messages.EitFrame, messages.EitEstimate, messages.EitAdapted, messages.LoadTorque, messages.SkinShear
+COMPUTED_TOPICS = tuple(kind.topic for kind in _COMPUTED)
 # These depend on the computer, not on the measurement.
 NOT_COMPARED = ("latency_s", "timestamp", "arrival_unix_ns", "seq")
 _MAX_EXAMPLES = 5
@@ -118,8 +119,8 @@ class RecordedRun:
         """Yield the events in recorded order."""
         with open_recording(self.path) as recording:
             # An imported recording has one side after the other, a live one is in order.
-            messages = recording.messages(by_time=not self.has_inputs)
-            for number, (channel, message) in enumerate(messages):
+            recorded = recording.messages(by_time=not self.has_inputs)
+            for number, (channel, message) in enumerate(recorded):
                 content = json.loads(message.data)
                 if self.has_inputs:
                     yield _live_event(channel.topic, content)
@@ -132,10 +133,10 @@ class RecordedRun:
         for event in self.events() if self.has_inputs else ():
             raw, source = event.raw, event.source
             with reading(self.path):
-                if event.topic == EitFrame.topic:
+                if event.topic == messages.EitFrame.topic:
                     arrival_ns = event.content["t_mono_ns"] + round(event.content["age_s"] * 1e9)
                     found.frame_numbers[source][arrival_ns] = event.content["frame"]
-                elif event.topic == SkinShear.topic:
+                elif event.topic == messages.SkinShear.topic:
                     found.sample_numbers[event.t_mono_ns] = event.content["sample"]
                 elif raw is not None and raw.kind is InputKind.TARE and raw.data.isdigit():
                     found.tares[source].add(int(raw.data))
@@ -209,7 +210,7 @@ class ReplayPipeline:
         offset = self._number_offset.get(source, 0)
         return [replace(frame, seq=frame.seq + offset) for frame in frames] if offset else frames
 
-    def _continued(self, message: SkinShear) -> SkinShear:
+    def _continued(self, message: messages.SkinShear) -> messages.SkinShear:
         """Return a message with the number of its sample in the run; the first one takes that of the nearest time."""
         if self._sample_offset is None:
             numbers = self._events.sample_numbers
@@ -347,20 +348,8 @@ class Replay:
             await self._pipeline.process(event.source, event.raw)
         elif self._run.has_inputs and event.topic in COMPUTED_TOPICS and event.source in self._pipeline.sources:
             self.comparison.compare(event)
-        elif event.topic != EitHeatmap.topic:
-            self._publisher.forward(event.topic, restored_wire_map(event.content))
-
-
-def restored_wire_map(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the live map of a recorded message: lists as float32 with their shapes."""
-    restored: dict[str, Any] = {}
-    for key, value in content.items():
-        if isinstance(value, list):
-            array = np.array([np.nan if one is None else one for one in value], "<f4")
-            restored[key], restored[f"{key}_shape"] = array.tobytes(), list(array.shape)
-        else:
-            restored[key] = value
-    return restored
+        elif event.topic != messages.EitHeatmap.topic:
+            self._publisher.forward(event.topic, messages.with_packed_arrays(event.content))
 
 
 def _live_event(topic: str, content: dict[str, Any]) -> RecordedEvent:

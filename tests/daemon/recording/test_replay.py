@@ -18,7 +18,7 @@ from shearloop.bank.estimation import EstimatorSession, Measured
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
-from shearloop.daemon.messaging.messages import EitEstimate, wire_map
+from shearloop.daemon.messaging.messages import EitEstimate, wire_map, with_packed_arrays
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.matlab_import import import_mat
 from shearloop.daemon.recording.replay import (
@@ -27,7 +27,6 @@ from shearloop.daemon.recording.replay import (
     Replay,
     ReplayClock,
     ReplayComparison,
-    restored_wire_map,
 )
 from shearloop.daemon.recording.schema import message_json, with_missing_keys
 from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
@@ -187,7 +186,7 @@ def test_mistakes_end_in_one_sentence(arguments, message, imported, mistake):
 
 
 def test_nan_is_restored():
-    on_wire = restored_wire_map({"seq": 3, "joints_rad": [1.5, None, 2.5], "reason": ""})
+    on_wire = with_packed_arrays({"seq": 3, "joints_rad": [1.5, None, 2.5], "reason": ""})
     assert on_wire["joints_rad_shape"] == [3]
     np.testing.assert_array_equal(np.frombuffer(on_wire["joints_rad"], "<f4"), np.float32([1.5, np.nan, 2.5]))
     assert on_wire["seq"] == 3

@@ -400,8 +400,7 @@ def _rank_choice(
 ) -> DesignChoice:
     """Choose how many directions of all signals' shapes a bank needs."""
     ks, sigmas = (np.unique(np.linspace(*ends, _RANKED)).tolist() for ends in (k, sigma))
-    settings = _positive(forward, model, [Setting(a, b) for a in ks for b in sigmas])
-    signals = np.abs(simulated_signals(forward, model, settings))
+    signals = np.abs(simulated_signals(forward, model, [Setting(a, b) for a in ks for b in sigmas]))
     squares = np.linalg.svd(signals / np.linalg.norm(signals, axis=1, keepdims=True), compute_uv=False) ** 2
     n = signals.shape[1]
     steps = [

@@ -129,11 +129,8 @@ class FiniteStrainSkin:
     def gauge_responses(self, states: Iterable[FiniteState]) -> FloatArray:
         """Return the (states, 2) changes of resistance of both gauges, ΔR/R₀ = mean of λ² − 1."""
         line = self._line
-        return np.array([line.weights @ (self.line_stretch(state) ** 2 - 1) @ line.shares for state in states])
-
-    def line_stretch(self, state: FiniteState) -> FloatArray:
-        """Return the (m, 3) stretches λ at the points of the gauges' depth."""
-        return _stretch(self._line.basis, state.displacement_mm)
+        stretches = (_stretch(line.basis, state.displacement_mm) for state in states)
+        return np.array([line.weights @ (each**2 - 1) @ line.shares for each in stretches])
 
     def strain_map(self, state: FiniteState) -> tuple[FloatArray, FloatArray]:
         """Return a moved grid of places in each element, (2, elements, 3, 3) in mm, and λ − 1 along the skin there."""

@@ -71,7 +71,7 @@ class LoadSample:
     """One line of the board; flags mark values that are not to be trusted.
 
     raw: the decimal as sent; torque_nm: calibrated; t_mid_ns: the middle of the conversion, t_arrival_ns: the line's
-    arrival (both monotonic); seq: counts samples. `saturated`: at an end of the converter's range. `spike`: beyond
+    arrival (both monotonic). `saturated`: at an end of the converter's range. `spike`: beyond
     the cell's capacity, or further from the last good value than the rig can move. `stuck`: the same value for two
     seconds. `partial`: the first line after opening, which may lack its beginning.
     """
@@ -80,7 +80,6 @@ class LoadSample:
     torque_nm: float
     t_mid_ns: int
     t_arrival_ns: int
-    seq: int
     saturated: bool = False
     spike: bool = False
     stuck: bool = False
@@ -133,7 +132,6 @@ class LoadParser(serial_sensor.LineParser[LoadSample]):
             torque_nm=torque_nm,
             t_mid_ns=line.t_mid_ns,
             t_arrival_ns=line.t_arrival_ns,
-            seq=self.count,
             saturated=saturated,
             spike=spike,
             stuck=self._repeats >= self._stuck_after,

@@ -321,7 +321,6 @@ class RobotiqGripper:
     def _state(self, readout: messages.Readout, t_ns: int) -> messages.GripperState:
         state = messages.GripperState(
             t_ns=t_ns,
-            seq=self._seq,
             position_counts=readout.pos,
             width_mm=self._calibration.width_mm(readout.pos),
             width_std_mm=self._calibration.width_std_mm,

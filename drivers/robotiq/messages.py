@@ -156,7 +156,6 @@ class GripperState:
     """
 
     t_ns: int
-    seq: int
     position_counts: int
     width_mm: float
     width_std_mm: float

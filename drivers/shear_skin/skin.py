@@ -76,11 +76,6 @@ class SkinSample:
     missed: int = 0
     faults: tuple[SkinFault, ...] = ()
 
-    @property
-    def trusted(self) -> bool:
-        """Whether there are no faults."""
-        return not self.faults
-
 
 class SampleValidator:
     """Turns readings of voltages and current into samples, one by one. No I/O; times are passed in."""

@@ -40,7 +40,7 @@ class Board:
         self._seq = from_ns or self._seq
         for _ in range(count):
             self._seq += every_ns
-            self.sent.put_nowait(LoadSample(raw, 0.1, self._seq, self._seq, self._seq, **flags))
+            self.sent.put_nowait(LoadSample(raw, 0.1, self._seq, self._seq, **flags))
         await self.sent.join()
 
 
@@ -103,7 +103,7 @@ async def test_readings_that_know_of_the_load_before_are_not_of_the_zero():
         task.tare()
         for number in range(6 + ZERO_SAMPLES):
             arrives_ns = now_ns + number * period_ns
-            board.sent.put_nowait(LoadSample(float(number), 0.1, arrives_ns - period_ns // 2, arrives_ns, number))
+            board.sent.put_nowait(LoadSample(float(number), 0.1, arrives_ns - period_ns // 2, arrives_ns))
         await board.sent.join()
         # That of number 4 began exactly when it was asked for, and took a period.
         assert board.tares == [4 + (ZERO_SAMPLES - 1) / 2]

@@ -60,7 +60,8 @@ def test_the_two_real_corrupted_values_are_flagged_and_nothing_else(shared, name
     assert not parser.errors
     spikes = [sample.raw for sample in samples if sample.spike]
     assert spikes == ([996.0, 38399996.0] if name.startswith("glitch") else [])
-    assert [sample.seq for sample in samples if not sample.trusted] == sorted({0, *(s.seq for s in samples if s.spike)})
+    # The first line may lack its beginning.
+    assert [not one.trusted for one in samples] == [True, *(one.spike for one in samples[1:])]
 
 
 def test_torque_lines_keep_their_values_and_counts_become_torque():
@@ -80,9 +81,7 @@ def test_the_slices_in_which_bytes_come_change_nothing(pieces, cuts):
     whole, sliced = LoadParser(TORQUE_LINES), LoadParser(TORQUE_LINES)
     expected = whole.feed(data, 0)
     got = [sample for part in slices(data, cuts) for sample in sliced.feed(part, 0)]
-    assert [(s.raw, s.seq, s.saturated, s.partial) for s in got] == [
-        (s.raw, s.seq, s.saturated, s.partial) for s in expected
-    ]
+    assert [(s.raw, s.saturated, s.partial) for s in got] == [(s.raw, s.saturated, s.partial) for s in expected]
     assert sliced.errors == whole.errors
     # Every line but the first is either a sample or a counted refusal; only an unfinished one is neither.
     unfinished_but_refused = len(data) - data.rfind(b"\n") - 1 > load_cell.MAX_LINE_BYTES

@@ -29,7 +29,8 @@ async def test_silence_is_a_loss_and_clears_the_state(way, tmp_path):
             await rig.driver.read()
         with pytest.raises(DeviceLostError, match="no connection"):
             await rig.driver.move(GripperCommand(10.0))
-        assert (await rig.driver.connect()).seq > 0
+        await rig.driver.connect()
+        assert rig.driver.connected
 
 
 @WAYS
@@ -47,7 +48,6 @@ async def test_lost_gripper_reconnects_and_reports_it(way, tmp_path):
         await rig.server.restore()
         second = await coming
         assert second.t_ns >= lost_ns
-        assert second.seq > first.seq
         openings = rig.driver.diagnostics()["connections"]
         assert openings == 2
         ups = [event.up for event in rig.link.events]
@@ -88,7 +88,7 @@ async def test_states_are_polled_while_a_command_runs(way, tmp_path):
             seen.append(await anext(states))
         assert ActivationStatus.ACTIVATING in {state.activation for state in seen}
         assert (await activating).activation is ActivationStatus.ACTIVE
-        assert [state.seq for state in seen] == sorted({state.seq for state in seen})
+        assert [state.t_ns for state in seen] == sorted(state.t_ns for state in seen)
 
 
 @WAYS

@@ -101,9 +101,6 @@ class EstimatorSession:
         self._averaging = (average_frames, max_gap_s)
         self._baseline_frames = baseline_frames
         self._matcher = matcher or calibration.matcher(bank)
-        self._position_noise_mm = 0.0
-        if calibration.diameter is not None:
-            self._position_noise_mm = calibration.estimator.position_noise_mm(calibration.diameter.regressor)
         self.set_tool(None)
         self.reset()
 
@@ -266,7 +263,7 @@ class EstimatorSession:
                 dead = _dead_channel_reasons(self.calibration.validators, frame.usable)
             value = value[0], math.hypot(value[1], error), math.hypot(value[2], error)
         if quantity == "diameter":
-            error = self._position_noise_mm / math.sqrt(frame.held_frames)
+            error = estimator.position_noise_mm(model.regressor) / math.sqrt(frame.held_frames)
             value = value[0], math.hypot(value[1], error), math.hypot(value[2], error)
         against = dead or tuple(why for match in reading.matches[:1] for why in model.match_reasons(match))
         return value, against or model.regressor.range_reasons(value[0], features, quantity, _UNITS[quantity])

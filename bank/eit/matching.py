@@ -50,15 +50,9 @@ class Matcher(ABC):
     def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Take (K, S, n) difference signals, (K, S) validity, and the (K,) and (S,) grids.
 
-        Signals are not copied; those of invalid cells are never read. Raises MatchingError when shapes differ, no cell
-        is valid, or a valid cell has no signal.
+        Signals are not copied; those of invalid cells are never read. Raises MatchingError when no cell is valid, or a
+        valid cell has no signal.
         """
-        shape = (len(k_grid), len(sigma_grid))
-        if signals.ndim != 3 or signals.shape[:2] != shape or valid.shape != shape:
-            raise MatchingError(
-                f"a bank of {shape[0]} k × {shape[1]} σ needs signals of shape {shape} × channels and a validity "
-                f"of shape {shape}, not {signals.shape} and {valid.shape}"
-            )
         if not valid.any():
             raise MatchingError("no cell of the bank is valid: choose k and σ where the conductivity stays positive")
         self.k_grid = k_grid

@@ -203,14 +203,6 @@ def test_beyond_half_a_spacing_the_nearest_rising_levels_are_taken(drift, lackin
     assert cost[tuple(found)] == pytest.approx(min(cost.values()), abs=1e-15)
 
 
-def test_in_a_whole_series_noise_moves_no_value_to_another_level():
-    swapped = LEVELS.copy()
-    swapped[[3, 4]] = 0.071, 0.059
-    series = place_in_series(np.concatenate([LEVELS, swapped, LEVELS]))
-    assert series is not None
-    assert series[0].tolist() == 3 * list(range(8))
-
-
 @pytest.mark.parametrize(
     "values",
     [
@@ -226,29 +218,18 @@ def test_what_is_no_repeated_series_is_told(values):
     assert place_in_series(values) is None
 
 
-@given(
-    values=st.lists(st.integers(0, 12), min_size=3, max_size=9).filter(lambda one: len(set(one)) >= 3),
-    n_groups=st.integers(1, 3),
-)
-def test_kmeans_groups_have_the_least_squares_of_all_groups(values, n_groups):
-    ordered = np.sort(np.array(values, dtype=float))
+@given(values=st.lists(st.integers(0, 12), min_size=1, max_size=9), data=st.data())
+def test_kmeans_groups_have_the_least_squares_of_all_groups(values, data):
+    n_groups = data.draw(st.integers(1, len(set(values))))
+    values = np.array(values, dtype=float)
+    ordered = np.sort(values)
 
     def squares(parts) -> float:
         return sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
 
-    groups = kmeans_groups(np.array(values, dtype=float), n_groups)
-    assert sorted(set(groups.tolist())) == list(range(n_groups))
+    groups = kmeans_groups(values, n_groups)
+    assert np.unique(groups).tolist() == list(range(n_groups))
+    assert (np.diff(group_means(values, groups)) > 0).all()
     cuts = combinations(range(1, len(values)), n_groups - 1)
     least = min(squares(np.split(ordered, list(cut))) for cut in cuts)
-    found = squares([np.array(values, dtype=float)[groups == one] for one in range(n_groups)])
-    assert found == pytest.approx(least, abs=1e-9)
-
-
-def test_ten_groups_are_found_where_kmeans_loses_some():
-    """SciPy's k-means ends in ClusterError here, from one of twenty random starts."""
-    values = np.array(
-        [0, 143, 165, 92, 55, 109, 54, 82, 1, 0, 515, 604, 3, 46, 869, 11, 27, 154, 107, 38, 38, 1, 54, 123, 8]
-    )
-    groups = kmeans_groups(values / 100, 10)
-    assert np.unique(groups).tolist() == list(range(10))
-    assert (np.diff(group_means(values / 100, groups)) > 0).all()
+    assert squares([values[groups == one] for one in range(n_groups)]) == pytest.approx(least, abs=1e-9)

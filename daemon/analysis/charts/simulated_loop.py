@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 
@@ -153,16 +153,6 @@ class Plant:
             reading.ends_s += sensor.period_s
 
 
-class LoopController(Protocol):
-    """The common part of the twist controller and the controllers it is compared with."""
-
-    def measure(self, torque_nm: float, t_mid_ns: int, t_ns: int) -> object:
-        """Process a torque."""
-
-    def command(self, t_ns: int, wrist_angle_rad: float) -> WristCommand:
-        """Return the wrist speed to send now."""
-
-
 @dataclass(slots=True)
 class UncompensatedController:
     """The twist controller without its delay compensator: it takes each torque for the present one."""
@@ -196,6 +186,9 @@ class UncompensatedController:
         goal = self._origin_rad + (self._ramp_nm - self._offset_nm) / settings.stiffness_nm_per_rad
         speed = settings.wrist_bandwidth_per_s * (goal - wrist_angle_rad)
         return WristCommand(max(-settings.speed_limit_rad_per_s, min(settings.speed_limit_rad_per_s, speed)))
+
+
+LoopController: TypeAlias = "TorqueController | UncompensatedController | _AveragedLoop"
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -240,7 +240,11 @@ def write(
     content = {
         "machine": f"{platform.machine()}, one thread",
         "bank": {"model": bank.model, "shape": list(bank.signals.shape), "identity": bank.identity},
-        "methods": {split.title: _rows(methods) for split, methods in compared},
+        # The first method is the paper's, where it was run.
+        "methods": {
+            split.title: [asdict(one) | {"latency_ratio": one.latency_ms / methods[0].latency_ms} for one in methods]
+            for split, methods in compared
+        },
         "forward": [asdict(one) for one in solved],
         "loop": {"gain": GAIN, "runs": [asdict(one) for one in loop]},
     }
@@ -263,12 +267,6 @@ def write(
     named = [(one.cell_ms, one.error, f"{one.name}\n{one.triangles} triangles") for one in solved if one.error]
     drawing.write_names(axes[len(compared)], named)
     return drawing.save(made, content, out, "speed-accuracy")
-
-
-def _rows(methods: Sequence[MeasuredMethod]) -> list[dict[str, Any]]:
-    """Return the methods' figures, with times relative to the first method (the paper's, where it was run)."""
-    first = methods[0].latency_ms
-    return [asdict(one) | {"latency_ratio": one.latency_ms / first} for one in methods]
 
 
 def _draw_methods(axes: Axes, split: Split, methods: Sequence[MeasuredMethod]) -> None:

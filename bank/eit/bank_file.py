@@ -114,10 +114,10 @@ class Bank(BankDefinition):
         or channel table.
         """
         path = Path(path)
-        damage = f"its header does not describe a bank ({{}}); {_cure(path)}"
+        damage = f"its header does not describe a bank ({{}}); {how_to_build(path)}"
         # One descriptor: a bank that replaces this one meanwhile does not mix with it.
         with (
-            refusing_damage(path, BankFileError, "the bank", damage, missing=f"; {_cure(path)}"),
+            refusing_damage(path, BankFileError, "the bank", damage, missing=f"; {how_to_build(path)}"),
             open_file(path) as file,
         ):
             header = _read_header(path, file)
@@ -239,8 +239,8 @@ def _sha256(array: NDArray[Any]) -> str:
     return hashlib.sha256(array.data).hexdigest()
 
 
-def _cure(path: Path) -> str:
-    """Return the command that builds a bank, from the definition with its name where there is one."""
+def how_to_build(path: Path) -> str:
+    """Return a sentence with the command that builds a bank, from the definition with its name where there is one."""
     folders = path.parent / "banks", path.parent, path.parent.parent / "config" / "banks"
     definitions = [folder / f"{path.stem}.yaml" for folder in folders]
     named = next((one for one in definitions if one.is_file()), None)
@@ -249,4 +249,4 @@ def _cure(path: Path) -> str:
 
 
 def _unusable(path: Path, why: str) -> BankFileError:
-    return BankFileError(f"{path}: {why}; {_cure(path)}")
+    return BankFileError(f"{path}: {why}; {how_to_build(path)}")

@@ -158,7 +158,8 @@ class Calibration:
         """
         path = Path(path)
         damage = "this is not a calibration, or it is truncated or damaged ({}); calibrate again"
-        with refusing_damage(path, CalibrationError, "the calibration", damage):
+        missing = f"; make one with `shearloop calibrate REC… --out {path}`"
+        with refusing_damage(path, CalibrationError, "the calibration", damage, missing):
             header, arrays = _read_members(path)
         if not isinstance(header, dict) or header.get("kind") != _FILE_KIND:
             raise CalibrationError(f"{path} is not an estimator's calibration: make one with `shearloop calibrate`")

@@ -47,7 +47,7 @@ COMMANDS = {
         ("view", "cli.view", "show a running daemon as a page in the browser, with a stop button"),
         ("calibrate", "cli.calibrate", "calibrate an estimator, a gel's creep, the load cell or the gripper"),
         ("emulate", "cli.emulate", "emulate a device, byte for byte, on a port of its own"),
-        ("bank", "cli.bank", "solve, build, inspect and draw banks of simulated signals"),
+        ("bank", "cli.bank", "solve, build, design and inspect banks of simulated signals"),
         ("doctor", "cli.doctor", "find out what is wrong: files, ports, devices, robot, clock, disk, keys"),
         ("ports", "serial_ports", "list the serial ports with their serial numbers"),
         ("keys", "cli.keys", "make the keys for daemon and clients on a network"),

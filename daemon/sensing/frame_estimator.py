@@ -174,9 +174,10 @@ def open_estimator(config: FingertipConfig, name: str) -> FrameEstimator:
         return _live(config.calibration, calibration, config)
     if config.estimator not in (None, PaperEstimator.name):
         found = "none is configured" if config.calibration is None else f"{config.calibration} does not exist"
+        options = f"--sides {name} --estimator {config.estimator} --out {config.calibration or 'CAL'}"
         raise UserError(
             f"the estimator {config.estimator} of {name} needs a calibration on recordings, and {found}; make one with "
-            f"`shearloop calibrate REC… --estimator {config.estimator} --out CAL`"
+            f"`shearloop calibrate REC… {options}`"
         )
     if config.bank is None:
         raise _without_bank(PaperEstimator.name, name)

@@ -116,6 +116,10 @@ def fingertip(**changes: Any) -> dict[str, Any]:
         (fingertip(device={"path": "eit", "serial_number": "1"}), ["either serial_number or path"]),
         (fingertip(baseline_frames=1), ["fingertips.right.baseline_frames", "from 2 to 1000"]),
         (fingertip(matching="best"), ["matching", "all_lags"]),
+        (
+            fingertip(estimator="motion_regression", calibration="no.cal"),
+            ["no.cal does not exist; make one", "REC… --sides right --estimator motion_regression --out "],
+        ),
         (fingertip(baseline_frames=0, average_frames=0), ["baseline_frames", "average_frames"]),
     ],
 )
@@ -403,7 +407,7 @@ def test_invalid_emulators_and_recordings_are_refused_before_the_start(config, t
     for command in ("check", "run"):
         assert "`emulators[0].device` is 'eit-kitt'; there are eit-kit" in mistake(command, unknown)
     for arguments, part in (
-        (["--bank", "b"], "--bank b: there is no such file; make it with `shearloop bank build`"),
+        (["--bank", "b"], "--bank b: there is no such file; build it with `shearloop bank build --config FILE --out "),
         (["--speed", "fast"], "argument --speed: invalid float value: 'fast'"),
         (["--sped", "2"], "unrecognized arguments: --sped 2"),
         (["--help"], "unrecognized arguments: --help"),

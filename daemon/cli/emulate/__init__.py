@@ -1,6 +1,7 @@
 """`shearloop emulate DEVICE`: plays one device on its own port or socket."""
 
 import argparse
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
@@ -47,5 +48,8 @@ def checked_arguments(device: str, arguments: Sequence[str], folder: Path) -> ar
     args = parser.parse_args(arguments)
     bank = getattr(args, "bank", None)
     if bank is not None and not (folder / bank).exists():
-        raise UserError(f"--bank {bank}: there is no such file; make it with `shearloop bank build`")
+        from shearloop.bank.eit.bank_file import how_to_build
+
+        cure = how_to_build(Path(os.path.normpath(folder / bank)))
+        raise UserError(f"--bank {bank}: there is no such file; {cure}")
     return args

@@ -255,7 +255,7 @@ class Design:
         return self.mesh, self.k_count, self.sigma_count, self.rank, self.channels, self.injections
 
 
-def design_bank(measured: MeasuredFrames, fingertip: Fingertip) -> Design:
+def design_bank(fingertip: Fingertip, measured: MeasuredFrames) -> Design:
     """Return the choices for frames of this fingertip. Raises BankError for a geometry that cannot be solved on."""
     table = fingertip.table
     forward = BatchForwardModel(replace(fingertip, mesh_size_cm=0.2).mesh(), table)

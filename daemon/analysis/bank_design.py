@@ -33,7 +33,7 @@ def designed_for(recording: Path, fingertip: Path | None, side: str | None) -> t
         raise UserError(f"{recording} holds no torque; a design needs frames of a tool that is twisted")
     # Slices have no side.
     one = series[0] if sides is None else series[0].select_sides(sides)
-    return path, design_bank(scene_of(one), load_yaml_model(path, FingertipGeometryConfig).fingertip())
+    return path, design_bank(load_yaml_model(path, FingertipGeometryConfig).fingertip(), scene_of(one))
 
 
 def scene_of(series: FrameSeries) -> MeasuredFrames:

@@ -58,12 +58,12 @@ def scene(clean: np.ndarray, noise_v: float) -> MeasuredFrames:
 
 @pytest.fixture(scope="module")
 def quiet(clean, fingertip):
-    return design_bank(scene(clean, 2e-5), fingertip)
+    return design_bank(fingertip, scene(clean, 2e-5))
 
 
 @pytest.fixture(scope="module")
 def noisy(clean, fingertip):
-    return design_bank(scene(clean, 6e-5), fingertip)
+    return design_bank(fingertip, scene(clean, 6e-5))
 
 
 def test_more_noise_asks_for_less_of_everything(quiet, noisy):
@@ -167,14 +167,14 @@ def test_a_grip_on_another_fingertip_is_designed_for_with_the_same_noise(noisy):
     frames = simulated_frames(noisy, fingertip)
     assert frames.differences.shape[1] == fingertip.table.n_channels == 208
     assert frames.relative_noise == pytest.approx(noisy.relative_noise, rel=0.01)
-    found = design_bank(frames, fingertip)
+    found = design_bank(fingertip, frames)
     assert found.model == noisy.model
     assert all(choice.enough for choice in found.choices)
 
 
 def test_a_model_without_a_sigma_gets_one_cell_along_it(fingertip, forward):
     steps = [Setting(k, 1.0) for k in np.linspace(1.2, 2.2, 10).tolist()]
-    design = design_bank(scene(0.01 * np.abs(simulated_signals(forward, "step", steps)), 4e-4), fingertip)
+    design = design_bank(fingertip, scene(0.01 * np.abs(simulated_signals(forward, "step", steps)), 4e-4))
     assert design.model == "step"
     assert design.sigma_count.chosen.setting == 1
     assert design.sigma_count.enough

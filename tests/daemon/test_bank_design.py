@@ -55,9 +55,8 @@ def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path):
     frames = step_frames()
     # A third of a frame's size: a coarse mesh and few cells, built in no time.
     frames += np.random.default_rng(0).normal(0.0, 8e-4, frames.shape)
-    design = design_bank(
-        MeasuredFrames(frames, 8e-4, None), load_yaml_model(OWN_FINGERTIP, FingertipGeometryConfig).fingertip()
-    )
+    fingertip = load_yaml_model(OWN_FINGERTIP, FingertipGeometryConfig).fingertip()
+    design = design_bank(fingertip, MeasuredFrames(frames, 8e-4, None))
     config = tmp_path / "step.yaml"
     config.write_text(design_yaml(design, OWN_FINGERTIP, tmp_path))
     plan = load_bank_plan(config)
@@ -114,7 +113,7 @@ def test_a_side_is_designed_for_by_its_own_frames_however_few_the_other_one_has(
         for t_ns in (6 * period_ns, 20 * period_ns):
             writer.add_frame("right", t_ns, t_ns, rng.uniform(0.3, 0.4, PAPER_TABLE.n_line_values))
     scenes: list[MeasuredFrames] = []
-    monkeypatch.setattr("shearloop.daemon.analysis.bank_design.design_bank", lambda scene, _: scenes.append(scene))
+    monkeypatch.setattr("shearloop.daemon.analysis.bank_design.design_bank", lambda _, scene: scenes.append(scene))
     designed_for(tmp_path / "one.mcap", None, "left")
     # Of the twelve the first stands in for the idle one.
     assert scenes[0].differences.shape == (11, PAPER_TABLE.n_channels)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from shearloop.bank.eit.design import ALLOWED, Design, DesignChoice, MeasuredFrames, design_bank, simulated_frames
+from shearloop.bank.eit.design import ALLOWED, Design, DesignChoice, design_bank, simulated_frames
 from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.daemon.analysis.bank_design import doubts, scene_of
 from shearloop.daemon.analysis.charts.chart_data import Split, own_fingertip
@@ -29,14 +29,15 @@ def chart(parts: Sequence[Split], out: Path, executor: Executor) -> list[Path]:
     """
     titles = [split.title.split(",", maxsplit=1)[0] for split in parts]
     scenes = [scene_of(split.whole) for split in parts]
-    found = in_order(executor.map(designed_on, own_fingertip(_MESH_SIZE_CM), scenes))
+    found = in_order(executor.map(design_bank, own_fingertip(_MESH_SIZE_CM), scenes))
     written = []
     for title, design in zip(titles, found, strict=True):
         for sentence in doubts(design):
             print(f"shearloop chart: {title}: {sentence}", file=sys.stderr)
         written += write(title, design, out)
     for name, fingertip in other_fingertips().items():
-        elsewhere = in_order(executor.map(designed_elsewhere, fingertip, found))
+        simulated = [simulated_frames(design, fingertip) for design in found]
+        elsewhere = in_order(executor.map(design_bank, fingertip, simulated))
         for title, design in zip(titles, elsewhere, strict=True):
             written += write(f"{title} {name}, simulated", design, out)
     return written
@@ -46,16 +47,6 @@ def other_fingertips() -> dict[str, Fingertip]:
     """Return the fingertips of the configuration that are not the paper's, by name."""
     paths = sorted(path for path in OWN_FINGERTIP.parent.glob("*.yaml") if path != OWN_FINGERTIP)
     return {path.stem: load_yaml_model(path, FingertipGeometryConfig).fingertip() for path in paths}
-
-
-def designed_on(fingertip: Fingertip, scene: MeasuredFrames) -> Design:
-    """Return a design; a task for the workers."""
-    return design_bank(scene, fingertip)
-
-
-def designed_elsewhere(fingertip: Fingertip, design: Design) -> Design:
-    """Return a design's counterpart on another fingertip; a task for the workers."""
-    return design_bank(simulated_frames(design, fingertip), fingertip)
 
 
 def write(title: str, design: Design, out: Path) -> list[Path]:

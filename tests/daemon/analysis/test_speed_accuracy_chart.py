@@ -149,15 +149,13 @@ def test_doubts_about_a_design_are_printed_with_its_chart(monkeypatch, tmp_path,
     t_s, frames = np.arange(12.0), np.random.default_rng(1).normal(0.0, 0.01, (12, 1, PAPER_TABLE.n_channels))
     series = FrameSeries("difference", ("right",), t_s, frames, t_s, t_s, np.full(12, np.nan))
     parts = [Split(f"{name}, slices, first 60%", series, series, series) for name in ("good", "bad")]
-    # One design per recording, with the attributes that the doubts need.
-    found = iter([(0.6, 0.16), (0.9, 0.5)])
-
-    def designed_on(*_: object) -> SimpleNamespace:
-        penalised, noise = next(found)
-        return SimpleNamespace(models=[SimpleNamespace(penalised=penalised)], relative_noise=noise)
-
-    monkeypatch.setattr(scene, "designed_on", designed_on)
-    monkeypatch.setattr(scene, "designed_elsewhere", lambda *_: None)
+    # One design per recording, with the attributes that the doubts need; no other is looked at.
+    found = iter(
+        SimpleNamespace(models=[SimpleNamespace(penalised=penalised)], relative_noise=noise)
+        for penalised, noise in ((0.6, 0.16), (0.9, 0.5))
+    )
+    monkeypatch.setattr(scene, "design_bank", lambda *_: next(found, None))
+    monkeypatch.setattr(scene, "simulated_frames", lambda *_: None)
     monkeypatch.setattr(scene, "write", lambda title, _, out: [out / title])
     titles = ["good", "bad", *(f"{one} {name}, simulated" for name in ("long", "round") for one in ("good", "bad"))]
     assert scene.chart(parts, tmp_path, SerialExecutor()) == [tmp_path / title for title in titles]

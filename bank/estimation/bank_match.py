@@ -16,6 +16,7 @@ from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import ChannelTable, smoothed_along_channels
 from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
+from shearloop.bank.estimation.regressors import parabola_top
 
 if TYPE_CHECKING:
     from shearloop.bank.eit.mesh import Mesh
@@ -151,8 +152,8 @@ class RefinedMatcher:
             width = max(_SCORE_SCALE, _RESOLVED * drop)
             k, sigma, amplitude = self._weighted_mean(scores[self._cells], best, norm, width)
         else:
-            k = _parabola_top(heatmap[:, column], row, self._k_grid)
-            sigma = _parabola_top(heatmap[row], column, self._sigma_grid)
+            k = parabola_top(heatmap[:, column], row, self._k_grid)
+            sigma = parabola_top(heatmap[row], column, self._sigma_grid)
             cell = int(np.searchsorted(self._cells, row * heatmap.shape[1] + column))
             amplitude = float(np.log(norm * best / self._norms[cell]))
         ratio = np.abs(np.log(self._sigma_grid / self._sigma_grid[column]))
@@ -203,12 +204,3 @@ def _drop(heatmap: FloatArray, row: int, column: int) -> float:
     around = np.pad(heatmap, 1, constant_values=-np.inf)[row : row + 3, column : column + 3]
     drops = [around[1, 1] - pair[np.isfinite(pair)] for pair in (around[[0, 2], 1], around[1, [0, 2]])]
     return max((float(drop.mean()) for drop in drops if len(drop)), default=0.0)
-
-
-def _parabola_top(scores: FloatArray, i: int, grid: FloatArray) -> float:
-    """Return the top of a parabola through a maximum and its neighbours."""
-    if i in (0, len(grid) - 1) or not np.isfinite(scores[[i - 1, i + 1]]).all():
-        return float(grid[i])
-    bend = float(scores[i - 1] - 2 * scores[i] + scores[i + 1])
-    shift = 0.5 * float(scores[i - 1] - scores[i + 1]) / bend if bend < 0 else 0.0
-    return float(grid[i] + shift * (grid[1] - grid[0]))

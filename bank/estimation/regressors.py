@@ -125,12 +125,16 @@ class InverseCalibration:
         grid = np.linspace(self.low, self.high, 401)
         powers = np.vander((grid - self.centre) / self.scale, len(b), increasing=True)
         cost = np.einsum("ij,jk,ik->i", powers, weights @ b.T, powers) - 2 * powers @ (weights @ x[keep])
-        i = int(np.argmin(cost))
-        if i in (0, len(grid) - 1):
-            return float(grid[i])
-        before, here, after = cost[i - 1 : i + 2]
-        bend = before - 2 * here + after
-        return float(grid[i] + (0.5 * (before - after) / bend if bend > 0 else 0.0) * (grid[1] - grid[0]))
+        return parabola_top(-cost, int(np.argmin(cost)), grid)
+
+
+def parabola_top(scores: FloatArray, i: int, grid: FloatArray) -> float:
+    """Return the top of a parabola through a maximum and its neighbours."""
+    if i in (0, len(grid) - 1) or not np.isfinite(scores[[i - 1, i + 1]]).all():
+        return float(grid[i])
+    bend = float(scores[i - 1] - 2 * scores[i] + scores[i + 1])
+    shift = 0.5 * float(scores[i - 1] - scores[i + 1]) / bend if bend < 0 else 0.0
+    return float(grid[i] + shift * (grid[1] - grid[0]))
 
 
 def _slope_penalty(frames: FloatArray, columns: FloatArray, penalties: FloatArray) -> float:

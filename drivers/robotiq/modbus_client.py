@@ -86,18 +86,16 @@ class ModbusClient:
         await self.close()
         path = find_port(serial_number=self._serial_number, path=self._path)
         # No retries inside pymodbus: the caller reconnects.
-        client = AsyncModbusSerialClient(
+        self._client = AsyncModbusSerialClient(
             path, baudrate=BAUD_RATE, timeout=self._deadline_s, retries=0, reconnect_delay=0
         )
         try:
-            if not await client.connect():
+            if not await self._client.connect():
                 raise DeviceNotFoundError(f"{path} cannot be opened; is another program using the gripper?")
-            self._client = client
             # The registers are written together, so that the first write has to repeat the gripper's present target.
             readout = await self.read()
         except BaseException:
-            client.close()
-            self._client = None
+            await self.close()
             raise
         self._last = messages.GripperMove(readout.pre, self._last.speed, self._last.force)
         self._act = readout.act
@@ -126,7 +124,6 @@ class ModbusClient:
         client = self._client
         if client is None:
             raise DeviceLostError(f"There is no connection to the gripper at {self.name} at present.")
-        succeeded = False
         try:
             if command is None:
                 request = client.read_holding_registers(
@@ -135,15 +132,14 @@ class ModbusClient:
             else:
                 request = client.write_registers(FIRST_COMMAND_REGISTER, command, device_id=DEVICE_ID)
             response = await request
-            succeeded = not response.isError()
-        except (ModbusException, OSError) as error:
+            if response.isError():
+                raise ProtocolError(f"The gripper at {self.name} refused a Modbus request: {response}.")
+        except BaseException as error:
+            await self.close()
+            if not isinstance(error, ModbusException | OSError):
+                raise
             raise DeviceLostError(
                 f"The gripper at {self.name} did not answer within {self._deadline_s:g} s: "
                 "unplugged, without power, or another program uses the port."
             ) from error
-        finally:
-            if not succeeded:
-                await self.close()
-        if response.isError():
-            raise ProtocolError(f"The gripper at {self.name} refused a Modbus request: {response}.")
         return response

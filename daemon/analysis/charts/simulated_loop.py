@@ -263,11 +263,6 @@ SCENARIOS = (
 )
 
 
-def random_tool(rng: np.random.Generator) -> SimulatedTool:
-    """Return a tool of random stiffness."""
-    return SimulatedTool(stiffness_nm_per_rad=float(rng.uniform(0.2, 0.35)))
-
-
 def identified(plant: Plant, scenario: LoopScenario) -> ToolModel:
     """Return the tool model that the identification step finds; raises RuntimeError where it fails."""
     step = StiffnessExcitation(scenario.excite)
@@ -363,7 +358,7 @@ def tracking_errors(noises_nm: Sequence[float], seeds: int, windows: Sequence[in
 def _identified_plant(scenario: LoopScenario, seed: int) -> tuple[Plant, ToolModel]:
     """Return a plant and its identified tool; an identification that the noise spoils is repeated, as on the rig."""
     rng = np.random.default_rng((31, seed))
-    tool = random_tool(rng)
+    tool = SimulatedTool(stiffness_nm_per_rad=float(rng.uniform(0.2, 0.35)))
     for _ in range(_ATTEMPTS):
         plant = Plant(tool, scenario.sensor, rng, period_s=_COMMAND_PERIOD_S)
         with suppress(RuntimeError):

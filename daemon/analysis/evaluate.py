@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 Figures: TypeAlias = dict[str, float | int | None]
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
+_UNITS = {"torque": "nm", "diameter": "mm"}
 # Of the names of an estimate and of the ends of its interval.
 _ENDS = ("", "_low", "_high")
 
@@ -69,7 +70,7 @@ def figures_of(tracks: Sequence[EstimateTrack]) -> Figures:
     diameters add diameter_rmse_mm, diameter_coverage_95 and diameter_interval_mm. Without a torque, coverage_95 is of
     the diameter.
     """
-    torque, diameter = (_compare(_known_frames(tracks, *one), one[1]) for one in (("torque", "nm"), ("diameter", "mm")))
+    torque, diameter = (_compare(_known_frames(tracks, quantity), unit) for quantity, unit in _UNITS.items())
     valid = [estimate.valid for track in tracks for estimate in track.estimates]
     latency = np.concatenate([track.latency_ms for track in tracks])
     figures = {name: value for name, value in torque.items() if name not in ("n", "gain")} | {
@@ -91,7 +92,7 @@ def figures_by_load(tracks: Sequence[EstimateTrack], loaded_nm: float = LOADED_N
     n frames have a known truth, and valid_fraction of them an estimate. Only these are judged. gain is the mean
     estimate over the mean truth, both along the truth.
     """
-    frames = _known_frames(tracks, "torque", "nm")
+    frames = _known_frames(tracks, "torque")
     is_loaded = np.abs(frames[0]) >= loaded_nm
     found = {"loaded": _compare(frames[:, is_loaded], "nm"), "unloaded": _compare(frames[:, ~is_loaded], "nm")}
     for figures in found.values():
@@ -118,22 +119,22 @@ def invalid_reasons(tracks: Sequence[EstimateTrack]) -> list[InvalidReason]:
     return sorted(found, key=lambda reason: -reason.frames)
 
 
-def values_of(estimates: Sequence[Estimate], quantity: str = "torque", unit: str = "nm") -> FloatArray:
+def values_of(estimates: Sequence[Estimate], quantity: str = "torque") -> FloatArray:
     """Return estimate and the interval's ends (3, n) in N·m or mm, NaN without an estimate."""
-    names = [f"{quantity}{end}_{unit}" for end in _ENDS]
+    names = [f"{quantity}{end}_{_UNITS[quantity]}" for end in _ENDS]
     # None becomes NaN.
     return np.array([[getattr(estimate, name) for estimate in estimates] for name in names], dtype=np.float64)
 
 
-def _frames(track: EstimateTrack, quantity: str, unit: str) -> FloatArray:
+def _frames(track: EstimateTrack, quantity: str) -> FloatArray:
     """Return truth, estimate and the interval's ends (4, n) of all frames, NaN for unknown ones."""
     truth = track.series.torque_at_frames() if quantity == "torque" else track.series.diameter_mm
-    return np.array([truth, *values_of(track.estimates, quantity, unit)])
+    return np.array([truth, *values_of(track.estimates, quantity)])
 
 
-def _known_frames(tracks: Sequence[EstimateTrack], quantity: str, unit: str) -> FloatArray:
+def _known_frames(tracks: Sequence[EstimateTrack], quantity: str) -> FloatArray:
     """Return truth, estimate and the interval's ends (4, n) of the frames with a known truth."""
-    frames = np.concatenate([_frames(track, quantity, unit) for track in tracks], axis=1)
+    frames = np.concatenate([_frames(track, quantity) for track in tracks], axis=1)
     return frames[:, np.isfinite(frames[0])]
 
 
@@ -162,7 +163,7 @@ def _compare(frames: FloatArray, unit: str) -> Figures:
 
 def write_estimates(tracks: Sequence[EstimateTrack], names: Sequence[str], path: Path) -> None:
     """Write a CSV row for every frame of each named series; cells without a truth or an estimate are empty."""
-    values = [f"{quantity}{end}_{unit}" for quantity, unit in (("torque", "nm"), ("diameter", "mm")) for end in _ENDS]
+    values = [f"{quantity}{end}_{unit}" for quantity, unit in _UNITS.items() for end in _ENDS]
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(["recording", "frame", "t_s", "truth_nm", *values, "valid", "reason"])
@@ -187,7 +188,7 @@ def draw_tracks(tracks: Sequence[EstimateTrack], names: Sequence[str], title: st
         slices = track.series.kind == "difference"
         # A stream has one tool: its diameter would be a flat line.
         is_torque = not slices or not np.isfinite(track.series.diameter_mm).any()
-        truth, value, low, high = _frames(track, *(("torque", "nm") if is_torque else ("diameter", "mm")))
+        truth, value, low, high = _frames(track, "torque" if is_torque else "diameter")
         t_s = track.series.t_s
         known = "load cell" if is_torque else "known diameter"
         axes.plot(t_s, truth, "ko" if slices else "k-", linewidth=1.0, markersize=5, label=known)

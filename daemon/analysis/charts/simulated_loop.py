@@ -395,8 +395,6 @@ def _rms_error(plant: Plant, loop: _AveragedLoop) -> float:
     return float(np.sqrt(squares / n))
 
 
-# The loops of the chart of a kicked torque.
-HELD_LOOPS = ("torque filter", "constant gain", "latest estimates alone")
 # One frame's noise, as of the default estimator on both fingertips of the emulated rig.
 _FRAME_NOISE_NM = 0.005
 _KICK_NM, _KICK_AT_S, _KICKED_S = -0.03, 15.0, 15.0
@@ -405,21 +403,22 @@ _KICK_NM, _KICK_AT_S, _KICKED_S = -0.03, 15.0, 15.0
 def held_loops(seeds: int) -> dict[str, list[tuple[Trace, Trace]]]:
     """Return each loop's step to 0.10 N·m, and what follows a kick, for every seed."""
     scenario = replace(SCENARIOS[0], sensor=replace(EIT, noise_nm=_FRAME_NOISE_NM))
-    held: dict[str, list[tuple[Trace, Trace]]] = {name: [] for name in HELD_LOOPS}
+    held: dict[str, list[tuple[Trace, Trace]]] = {}
     for seed in range(seeds):
         gripped, found = _identified_plant(scenario, seed)
         settings = settings_for(found, scenario)
-        # Without the noise, the filter has one gain and no test for jumps.
-        steady = replace(settings, noise_nm=0.0)
-        for name in HELD_LOOPS:
+        loops: dict[str, TorqueController | UncompensatedController] = {
+            "torque filter": started_controller(gripped, found, settings),
+            # Without the noise, the filter has one gain and no test for jumps.
+            "constant gain": started_controller(gripped, found, replace(settings, noise_nm=0.0)),
+            "latest estimates alone": UncompensatedController(settings),
+        }
+        for name, loop in loops.items():
             plant = copy.deepcopy(gripped)
-            loop: TorqueController | UncompensatedController = UncompensatedController(settings)
-            if name != HELD_LOOPS[2]:
-                loop = started_controller(plant, found, settings if name == HELD_LOOPS[0] else steady)
             loop.set_point(_TARGET_NM)
             before = run(plant, loop, _KICK_AT_S)
             plant.disturbance_nm = _KICK_NM
-            held[name].append((before, run(plant, loop, _KICKED_S)))
+            held.setdefault(name, []).append((before, run(plant, loop, _KICKED_S)))
     return held
 
 

@@ -6,10 +6,8 @@ Pseudo-terminals work like any other port. Protocols belong to the device's own 
 import asyncio
 import contextlib
 import errno
-import fcntl
 import os
 import select
-import termios
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -31,8 +29,6 @@ READS_PER_TURN = 8
 # A read shorter than one kernel buffer has emptied the port.
 SHORT_READ_BYTES = 4_000
 WRITE_TIMEOUT_S, WRITE_PAUSE_S = 1.0, 0.01
-# Bytes that lie in the kernel at a read's deadline get this long again and again.
-LATE_S = 0.02
 CONNECT_TIMEOUT_S = 2.0
 
 # The values that a device reports in `health`, by name.
@@ -47,8 +43,8 @@ class Received:
     t_arrival_ns: int
 
 
-# What a read of a port will bring.
-_Arrival: TypeAlias = "asyncio.Future[Received | DeviceLostError]"
+# What a read of a port will bring; None for nothing in time.
+_Arrival: TypeAlias = "asyncio.Future[Received | DeviceLostError | None]"
 
 
 def find_port(*, serial_number: str | None = None, path: str | None = None) -> str:
@@ -98,8 +94,8 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
         # Readable once the port is to be closed.
         self._closing = os.eventfd(0)
         self._arrival: _Arrival | None = None
-        # Each arrival that a loop waits for; None ends the thread.
-        self._awaited: SimpleQueue[tuple[asyncio.AbstractEventLoop, _Arrival] | None] = SimpleQueue()
+        # Each arrival that a loop waits for, and until when (monotonic, s); None ends the thread.
+        self._awaited: SimpleQueue[tuple[asyncio.AbstractEventLoop, _Arrival, float] | None] = SimpleQueue()
         self._reader = threading.Thread(target=self._receive, name=f"read {path}", daemon=True)
         self._reader.start()
 
@@ -127,24 +123,12 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
         if self._arrival is None:
             loop = asyncio.get_running_loop()
             self._arrival = loop.create_future()
-            self._awaited.put((loop, self._arrival))
-        await asyncio.wait({self._arrival}, timeout=timeout_s)
-        # Loop or thread may have been late.
-        while not self._arrival.done() and self._holds_bytes():
-            await asyncio.wait({self._arrival}, timeout=LATE_S)
-        if not self._arrival.done():
-            return None
+            self._awaited.put((loop, self._arrival, time.monotonic() + timeout_s))
+        await asyncio.wait({self._arrival})
         result, self._arrival = self._arrival.result(), None
         if isinstance(result, DeviceLostError):
             raise result
         return result
-
-    def _holds_bytes(self) -> bool:
-        try:
-            count = fcntl.ioctl(self._descriptor, termios.FIONREAD, bytes(4))
-        except OSError:
-            return False
-        return any(count)
 
     def _receive(self) -> None:
         """Read in the thread, each time that a loop waits for it, until the port is to be closed."""
@@ -152,12 +136,13 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
         ready.register(self._descriptor, select.POLLIN)
         ready.register(self._closing, select.POLLIN)
         while (awaited := self._awaited.get()) is not None:
+            loop, arrival, until_s = awaited
             result = None
-            while result is None:
-                if any(descriptor == self._closing for descriptor, _ in ready.poll()):
+            # A late thread finds what has arrived meanwhile.
+            while result is None and (found := ready.poll(max(0.0, 1e3 * (until_s - time.monotonic())))):
+                if any(descriptor == self._closing for descriptor, _ in found):
                     return
                 result = self._drain()
-            loop, arrival = awaited
             # The loop may have ended.
             with contextlib.suppress(RuntimeError):
                 loop.call_soon_threadsafe(_finish, arrival, result)
@@ -201,7 +186,7 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
         return DeviceLostError(f"{self.path} has gone ({reason}): unplugged, or without power.")
 
 
-def _finish(arrival: _Arrival, result: Received | DeviceLostError) -> None:
+def _finish(arrival: _Arrival, result: Received | DeviceLostError | None) -> None:
     if not arrival.done():
         arrival.set_result(result)
 

@@ -75,7 +75,8 @@ class UrRobot:
         self._replies: dict[int, asyncio.Future[messages.CommandReply]] = {}
         self._number = 0
         self._version = ""
-        self._next: asyncio.Future[messages.RobotState] | None = None
+        # Those who wait for the next state.
+        self._waiting: list[asyncio.Future[messages.RobotState]] = []
 
     def diagnostics(self) -> Diagnostics:
         """Return the robot's values for `health`; counts are since the process began."""
@@ -88,9 +89,9 @@ class UrRobot:
 
     async def next_state(self) -> messages.RobotState:
         """Return the next state; waits through losses of the connection."""
-        if self._next is None:
-            self._next = asyncio.get_running_loop().create_future()
-        return await asyncio.shield(self._next)
+        waiting: asyncio.Future[messages.RobotState] = asyncio.get_running_loop().create_future()
+        self._waiting.append(waiting)
+        return await waiting
 
     def send(self, command: messages.Command) -> asyncio.Future[messages.CommandReply]:
         """Send a command at once and return its reply; when the worker dies first, the reply is a refusal."""
@@ -150,9 +151,10 @@ class UrRobot:
                     connected = f"The robot at {self.settings.host} is connected."
                     said = (connected, untested, self.settings.warning, message.blocked)
                     self.monitor.connected(" ".join(filter(None, said)), time.monotonic_ns())
-                if self._next is not None:
-                    self._next.set_result(message)
-                    self._next = None
+                waiting, self._waiting = self._waiting, []
+                for one in waiting:
+                    if not one.done():
+                        one.set_result(message)
             case messages.CommandReply():
                 replied = self._replies.pop(number, None)
                 if replied is not None and not replied.done():

@@ -239,7 +239,8 @@ class ControlLoop:
         """Return the commands for now; the loop is `late_s` late, and `died` has the error of each dead task."""
         experiment, arm, gripped = self.experiment, self.inputs.arm, self._gripped
         active = experiment is not None and experiment.running
-        watched = replace(self._watched, late_s=late_s, died=died)
+        self.inputs.late_s, self.inputs.died = late_s, died
+        watched = self._watched
         if experiment is not None:
             watched = replace(watched, limits=experiment.limits)
         if experiment is not None and active:

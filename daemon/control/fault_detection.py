@@ -50,6 +50,9 @@ class LatestInputs:
     gripper: GripperStatus | None = None
     lost: dict[str, str] = field(default_factory=dict)
     recording_error: str = ""
+    # How late the loop is, and the error of each dead task.
+    late_s: float = 0.0
+    died: Mapping[str, str] = field(default_factory=dict)
 
     def add_torque(self, torque: TorqueSample) -> None:
         """Store a torque, unless it is older than the latest one of its source."""
@@ -86,9 +89,6 @@ class Watched:
     twisted_rad: float = 0.0
     expected_nm: float | None = None
     overdue: str = ""
-    # How late the loop is, and the error of each dead task.
-    late_s: float = 0.0
-    died: Mapping[str, str] = field(default_factory=dict)
 
 
 def fresh_for_s(sources: Iterable[TorqueSource], config: LoopConfig) -> dict[str, float]:
@@ -120,12 +120,12 @@ def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_
         turned = f"turned by {watched.twisted_rad:+.3f} rad since the grip, the limit is {limit_rad:g} rad"
         found.append(Fault(FaultCode.ANGLE_LIMIT, turned, t_ns=inputs.arm.t_ns if inputs.arm is not None else None))
     found += _device_faults(inputs, watched, t_ns)
-    for name, reason in watched.died.items():
+    for name, reason in inputs.died.items():
         found.append(Fault(FaultCode.TASK_DIED, f"{name}: {reason}"))
-    if watched.late_s > AWAY_S:
-        found.append(Fault(FaultCode.DAEMON_PAUSED, f"it stood still for {watched.late_s:.1f} s"))
-    elif watched.late_s > LATEST_LOOP_S:
-        found.append(Fault(FaultCode.LOOP_LATE, f"the loop ran {watched.late_s * 1e3:.0f} ms late"))
+    if inputs.late_s > AWAY_S:
+        found.append(Fault(FaultCode.DAEMON_PAUSED, f"it stood still for {inputs.late_s:.1f} s"))
+    elif inputs.late_s > LATEST_LOOP_S:
+        found.append(Fault(FaultCode.LOOP_LATE, f"the loop ran {inputs.late_s * 1e3:.0f} ms late"))
     if inputs.recording_error:
         found.append(Fault(FaultCode.RECORDING_FAILED, inputs.recording_error))
     if watched.overdue:

@@ -190,8 +190,8 @@ def test_a_sensor_that_was_never_there_is_not_gone():
 def test_a_loop_that_was_away_for_long_was_not_too_slow():
     senses = LatestInputs(10.0, arm=ArmStatus(0.0, NOW_NS))
     for late_s, event in ((0.2, FaultCode.LOOP_LATE), (3.0, FaultCode.DAEMON_PAUSED)):
-        away = replace(watched(EIT, ()), torque_needed=False, late_s=late_s)
-        (trouble,) = detect_faults(senses, away, LoopConfig(), NOW_NS)
+        senses.late_s = late_s
+        (trouble,) = detect_faults(senses, replace(watched(EIT, ()), torque_needed=False), LoopConfig(), NOW_NS)
         assert trouble.code is event
     assert "the daemon itself was not running: it stood still for 3.0 s" in trouble.sentence
     assert "overload" in trouble.rule.cure, "what follows from it is not told, and may be all that would say so"

@@ -55,7 +55,7 @@ def add_json(parser: argparse._ActionsContainer) -> None:
 
 def add_cluster(parser: argparse.ArgumentParser) -> None:
     """Add `--cluster`, which runs heavy work on other processes or computers."""
-    text = "run on the Dask scheduler at this address, such as tcp://host:8786; without one on processes here"
+    text = "run on the Dask scheduler at this address, such as tcp://host:8786; as the last word, on processes here"
     parser.add_argument("--cluster", nargs="?", const="local", metavar="ADDRESS", help=text)
 
 

@@ -15,8 +15,9 @@ from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.messaging.command_server import CommandServer
-from shearloop.daemon.messaging.keys import ClientAuthenticator, Refusals, load_server_keys
+from shearloop.daemon.messaging.keys import ClientAuthenticator, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
+from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.recording.recorder import Recorder, daemon_identity

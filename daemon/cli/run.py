@@ -62,7 +62,7 @@ def _run(args: argparse.Namespace, out: "NonBlockingWriter", on_ready: Callable[
     from shearloop.daemon.cli import EXIT_OK, EXIT_UNFINISHED
     from shearloop.daemon.cli.emulator_processes import EmulatedDevices
     from shearloop.daemon.cli.terminal import StatusLine, print_estimate
-    from shearloop.daemon.messaging.keys import Refusals
+    from shearloop.daemon.messaging.refusals import Refusals
     from shearloop.daemon.messaging.stop_socket import StopSocket
     from shearloop.daemon.process import lock_memory, raise_descriptor_limit, raise_priority
     from shearloop.daemon.run_summary import RunSummary

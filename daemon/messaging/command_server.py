@@ -15,8 +15,9 @@ import zmq
 import zmq.asyncio
 
 from shearloop.daemon.messaging.bound_sockets import bind
-from shearloop.daemon.messaging.keys import KeyPair, Refusals, TokenBucket
+from shearloop.daemon.messaging.keys import KeyPair
 from shearloop.daemon.messaging.messages import decode, encode
+from shearloop.daemon.messaging.refusals import Refusals, TokenBucket
 
 # Of each frame. libzmq has no limit for the number of frames; more than one are refused.
 LARGEST_REQUEST_BYTES = 4096

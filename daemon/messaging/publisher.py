@@ -10,8 +10,9 @@ import zmq.asyncio
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.bound_sockets import bind
-from shearloop.daemon.messaging.keys import KeyPair, Refusals
+from shearloop.daemon.messaging.keys import KeyPair
 from shearloop.daemon.messaging.messages import TOPICS, Message, encode, wire_map
+from shearloop.daemon.messaging.refusals import Refusals
 
 # Messages kept for a slow subscriber. It loses later ones; others are not delayed.
 HIGH_WATER_MARK = 1000

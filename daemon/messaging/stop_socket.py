@@ -13,8 +13,8 @@ from typing import Any
 
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.command_server import Handler, Reply, RequestExecutor
-from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import encode
+from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_client import stop_name
 
 LARGEST_DATAGRAM_BYTES = 1024

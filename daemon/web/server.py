@@ -30,7 +30,8 @@ from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S, needs_keys
 from shearloop.daemon.messaging.client import ask, connect
-from shearloop.daemon.messaging.keys import ClientKeys, Refusals, TokenBucket
+from shearloop.daemon.messaging.keys import ClientKeys
+from shearloop.daemon.messaging.refusals import Refusals, TokenBucket
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.web.message_store import MessageStore

@@ -28,8 +28,8 @@ from shearloop.daemon.cli.completion import full_parser
 from shearloop.daemon.cli.terminal import StatusLine, loop_line, message_json, message_line, table, task_row
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.loop_runner import WRENCH
-from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import EitEstimate, RobotStateMessage, decode, encode, wire_map
+from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.frame_estimator import COMBINED

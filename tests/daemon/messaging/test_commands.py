@@ -24,9 +24,9 @@ from shearloop.daemon.messaging.command_server import (
     CommandServer,
     RequestExecutor,
 )
-from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.messaging.refusals import Refusals
 from tests.running import running
 
 

@@ -27,8 +27,8 @@ from shearloop.daemon.messaging.command_server import (
     Reply,
     Request,
 )
-from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import encode
+from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket, stop_name
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import MAX_DESCRIPTORS

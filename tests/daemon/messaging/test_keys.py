@@ -14,15 +14,9 @@ from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import has_valid_port, is_local, needs_keys
 from shearloop.daemon.messaging.bound_sockets import bind
 from shearloop.daemon.messaging.client import Subscriber
-from shearloop.daemon.messaging.keys import (
-    ClientKeys,
-    KeyPair,
-    Refusals,
-    load_key_pair,
-    load_public_key,
-    load_server_keys,
-)
+from shearloop.daemon.messaging.keys import ClientKeys, KeyPair, load_key_pair, load_public_key, load_server_keys
 from shearloop.daemon.messaging.messages import decode, encode
+from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from tests.daemon.conftest import DEADLINE_S, running_daemon
 

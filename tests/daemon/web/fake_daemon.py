@@ -21,9 +21,9 @@ import zmq.asyncio
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer
-from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import TOPICS, Message
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.messaging.refusals import Refusals
 
 # Estimates and heatmaps come twice a second, all else ten times.
 PUMP_S, SLOW_TURNS = 0.1, 5

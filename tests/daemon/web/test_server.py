@@ -24,9 +24,9 @@ from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer
-from shearloop.daemon.messaging.keys import Refusals
 from shearloop.daemon.messaging.messages import EitHeatmap, LoadTorque
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.web import server as server_module
 from shearloop.daemon.web.message_store import MessageStore
 from shearloop.daemon.web.server import HEADERS, NEEDS_TOKEN, Bridge, DaemonAddress, listen, make_app, serve

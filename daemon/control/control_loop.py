@@ -26,7 +26,6 @@ from shearloop.daemon.control.experiment_schema import (
 )
 from shearloop.daemon.control.fault_detection import (
     Grasp,
-    LatestInputs,
     Watched,
     compared_for_s,
     detect_faults,
@@ -36,6 +35,7 @@ from shearloop.daemon.control.loop_inputs import (
     ArmStatus,
     Creep,
     GripperStatus,
+    LatestInputs,
     LoopConfig,
     TorqueSample,
     TorqueSource,

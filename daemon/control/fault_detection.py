@@ -1,13 +1,12 @@
 """Fault detection: from the loop's inputs to the faults of the safety table, with their present numbers."""
 
 from bisect import bisect_left, bisect_right
-from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
-from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopConfig, TorqueSample, TorqueSource
+from shearloop.daemon.control.loop_inputs import LatestInputs, LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, stale_after_s
 
@@ -21,8 +20,6 @@ LATEST_LOOP_S = ARM_STALE_S - LONGEST_TICK_S
 # A longer absence is a paused process rather than a slow loop. CLOCK_MONOTONIC stands while the computer is suspended;
 # the devices that were lost report that case.
 AWAY_S = 1.0
-# Torques between two ticks; more come only while the loop stands still.
-MOST_UNJUDGED = 256
 
 
 class Grasp(Enum):
@@ -31,46 +28,6 @@ class Grasp(Enum):
     NONE = "none"
     CHANGING = "changing"  # they open or close: a fingertip measures their motion, and no torque
     HELD = "held"
-
-
-@dataclass(slots=True)
-class LatestInputs:
-    """The latest inputs; `lost` maps missing devices to a sentence.
-
-    Valid torques are kept for `kept_s`, to compare sources at the same time: the times of measurement of each
-    source, ascending, and the torques.
-    """
-
-    kept_s: float
-    torques: dict[str, TorqueSample] = field(default_factory=dict)
-    history: dict[str, tuple[list[int], list[float]]] = field(default_factory=dict)
-    # Valid torques since the latest tick, which may be several of one source.
-    unjudged: deque[TorqueSample] = field(default_factory=lambda: deque(maxlen=MOST_UNJUDGED))
-    arm: ArmStatus | None = None
-    gripper: GripperStatus | None = None
-    lost: dict[str, str] = field(default_factory=dict)
-    recording_error: str = ""
-    # How late the loop is, and the error of each dead task.
-    late_s: float = 0.0
-    died: Mapping[str, str] = field(default_factory=dict)
-
-    def add_torque(self, torque: TorqueSample) -> None:
-        """Store a torque, unless it is older than the latest one of its source."""
-        known = self.torques.get(torque.source)
-        if known is not None and torque.t_mid_ns <= known.t_mid_ns:
-            return
-        self.torques[torque.source] = torque
-        if torque.torque_nm is None:
-            return
-        self.unjudged.append(torque)
-        times_ns, torques_nm = self.history.setdefault(torque.source, ([], []))
-        times_ns.append(torque.t_mid_ns)
-        torques_nm.append(torque.torque_nm)
-        kept_ns = round(self.kept_s * 1e9)
-        # Trimmed rarely, because it moves the whole lists.
-        if times_ns[0] < torque.t_mid_ns - 2 * kept_ns:
-            old = bisect_left(times_ns, torque.t_mid_ns - kept_ns)
-            del times_ns[:old], torques_nm[:old]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

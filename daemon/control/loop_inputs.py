@@ -1,11 +1,17 @@
-"""Inputs of the control loop: its settings, torques and device states with their times, and the gel's creep."""
+"""Inputs of the control loop: its settings, the latest torques and device states with times, and the creep of a gel."""
 
 import math
-from dataclasses import dataclass
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from pydantic import Field
 
 from shearloop.daemon.config_file import ConfigModel
+
+# Torques between two ticks; more come only while the loop stands still.
+MOST_UNJUDGED = 256
 
 
 class LoopConfig(ConfigModel):
@@ -131,3 +137,43 @@ class TorqueSource:
     measures_torque: bool = True
     warm_up_s: float = 0.0
     has_gain: bool = False
+
+
+@dataclass(slots=True)
+class LatestInputs:
+    """The latest inputs; `lost` maps missing devices to a sentence.
+
+    Valid torques are kept for `kept_s`, to compare sources at the same time: the times of measurement of each
+    source, ascending, and the torques.
+    """
+
+    kept_s: float
+    torques: dict[str, TorqueSample] = field(default_factory=dict)
+    history: dict[str, tuple[list[int], list[float]]] = field(default_factory=dict)
+    # Valid torques since the latest tick, which may be several of one source.
+    unjudged: deque[TorqueSample] = field(default_factory=lambda: deque(maxlen=MOST_UNJUDGED))
+    arm: ArmStatus | None = None
+    gripper: GripperStatus | None = None
+    lost: dict[str, str] = field(default_factory=dict)
+    recording_error: str = ""
+    # How late the loop is, and the error of each dead task.
+    late_s: float = 0.0
+    died: Mapping[str, str] = field(default_factory=dict)
+
+    def add_torque(self, torque: TorqueSample) -> None:
+        """Store a torque, unless it is older than the latest one of its source."""
+        known = self.torques.get(torque.source)
+        if known is not None and torque.t_mid_ns <= known.t_mid_ns:
+            return
+        self.torques[torque.source] = torque
+        if torque.torque_nm is None:
+            return
+        self.unjudged.append(torque)
+        times_ns, torques_nm = self.history.setdefault(torque.source, ([], []))
+        times_ns.append(torque.t_mid_ns)
+        torques_nm.append(torque.torque_nm)
+        kept_ns = round(self.kept_s * 1e9)
+        # Trimmed rarely, because it moves the whole lists.
+        if times_ns[0] < torque.t_mid_ns - 2 * kept_ns:
+            old = bisect_left(times_ns, torque.t_mid_ns - kept_ns)
+            del times_ns[:old], torques_nm[:old]

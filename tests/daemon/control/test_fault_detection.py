@@ -6,7 +6,6 @@ from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.fault_detection import (
     ARM_STALE_S,
     Grasp,
-    LatestInputs,
     Watched,
     compared_for_s,
     detect_faults,
@@ -15,6 +14,7 @@ from shearloop.daemon.control.fault_detection import (
 from shearloop.daemon.control.loop_inputs import (
     ArmStatus,
     GripperStatus,
+    LatestInputs,
     LoopConfig,
     TorqueSample,
     TorqueSource,

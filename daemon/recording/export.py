@@ -16,8 +16,8 @@ from shearloop.daemon.recording.tables import Rows, arrays, columns_of, read_row
 
 # Numbers of a Parquet table that are written at once.
 _BATCH = 200_000
-# Size of the messages in one MATLAB file, in numbers of eight bytes, where each key takes the memory of some. It bounds
-# the memory and keeps each variable below the format's 2 GB.
+# Largest size of the messages in one MATLAB file, in numbers of eight bytes; a key of a message counts as ten. It
+# bounds the memory and keeps each variable below the format's 2 GB.
 _MAT_SIZE, _KEY_SIZE = 12_000_000, 10
 
 
@@ -37,13 +37,18 @@ def export(path: Path, form: str, out: Path, topics: list[str], progress: Progre
 
 
 def _export_mat(path: Path, out: Path, topics: list[str], progress: Progress) -> list[Path]:
+    def part(number: int) -> Path:
+        return out.with_name(f"{out.stem}_{number}{out.suffix}") if number > 1 else out
+
+    if part(2).exists():
+        raise UserError(f"{part(2)} exists and would look like a part of this export; remove it, or use another --out")
     written: list[Path] = []
     waiting: dict[str, Rows] = {topic: [] for topic in topics}
     size = 0
 
     def write() -> None:
         structs = {topic.replace(".", "_").replace("-", "_"): arrays(rows) for topic, rows in waiting.items() if rows}
-        target = out.with_name(f"{out.stem}_{len(written) + 1}{out.suffix}") if written else out
+        target = part(len(written) + 1)
         # savemat changes names and hides the reason if it opens the file itself.
         with target.open("xb" if written else "wb") as file:
             # The stubs allow only names.

@@ -130,7 +130,7 @@ def test_a_large_recording_continues_in_further_matlab_files(tmp_path, monkeypat
     scores = np.concatenate([np.atleast_2d(one["eit_heatmap_right"]["scores"]) for one in structs])
     np.testing.assert_array_equal(scores, [SCORES.ravel()] * 4)
     assert main(arguments) == 2
-    assert "a_2.mat: the export cannot be written: File exists" in capsys.readouterr().err
+    assert "a_2.mat exists and would look like a part of this export; remove it" in capsys.readouterr().err
 
 
 def test_a_dataset_holds_what_was_known_and_names_its_origin(tmp_path):

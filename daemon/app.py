@@ -77,8 +77,8 @@ class Daemon:
             self.sensors, self._rig = _build_rig(config, self.publisher, clock, self.recorder, self.supervisor)
             self._experiment: ConfiguredExperiment | None = None
             if config.experiment is not None and self._rig is not None:
-                stop = self._end if config.stop_when_done else None
-                self._experiment = ConfiguredExperiment(config.experiment, self._rig, stop)
+                daemon_end = self._end if config.stop_when_done else None
+                self._experiment = ConfiguredExperiment(config.experiment, self._rig, daemon_end)
             self.commands = Commands(self._rig, self.sensors, self._experiment, self.health, self._end)
             server = CommandServer(context, config.commands, self.commands.handlers(), refusals, keys)
             opened.callback(server.close)

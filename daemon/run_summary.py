@@ -28,7 +28,7 @@ TORQUES = ("eit.estimate", "load.torque", "skin.shear")
 # The name of the emulated tool's torque, which no sensor measures.
 TRUE = "true torque"
 _ENDS = ("done", "stopped")
-# Emulated devices have these faults only if they are told to, or if their computer is too busy for them.
+# Emulated devices have these faults on command, or because their computer is too busy for them.
 _LATE_FAULTS = (
     FaultCode.ESTIMATE_STALE,
     FaultCode.STATE_STALE,

@@ -257,8 +257,8 @@ def test_known_diameters_have_figures_of_their_own():
     assert not any(line.startswith("diameter_interval_mm") for line in _lines({"all": without}))
 
 
-@pytest.mark.parametrize(("unsure_s", "delay_s", "told"), [(0.0, -0.16, "0.16 s before"), (0.4, 0.16, "0.16 s after")])
-def test_a_time_that_could_not_be_checked_is_told_as_probable(unsure_s, delay_s, told):
+@pytest.mark.parametrize(("unsure_s", "delay_s", "when"), [(0.0, -0.16, "0.16 s before"), (0.4, 0.16, "0.16 s after")])
+def test_a_time_that_could_not_be_checked_is_called_probable(unsure_s, delay_s, when):
     t = np.arange(4.0)
     series = FrameSeries("raw", ("right",), t, np.zeros((4, 1, 896)), t, np.zeros(4), np.full(4, np.nan))
     found = LoadDelay(delay_s=delay_s, error_s=0.2, explained=0.5)
@@ -268,7 +268,7 @@ def test_a_time_that_could_not_be_checked_is_told_as_probable(unsure_s, delay_s,
     calibration = Calibration(Regression(np.ones((1, 896))), "raw", ("right",), "ramp", "", torque=model)
     result = CalibrationResult(calibration, 4, LoadTiming([series], [found], [""], unsure_s))
     _, late, *sentences, _ = sentences_of(result)
-    assert late == f"The load is {'probably ' if unsure_s else ''}stamped {told} the frames move."
+    assert late == f"The load is {'probably ' if unsure_s else ''}stamped {when} the frames move."
     assert ("widening" in result.figures()) == bool(unsure_s) == bool(sentences)
     assert all("so the intervals are wider, for loads 1.9 times. Record more" in one for one in sentences)
     *_, common, few = sentences_of(replace(result, tools=[Measured(15.0, 0.0), Measured(30.0, 0.0)]))

@@ -29,7 +29,7 @@ def controller(controller_process) -> Iterator[ControllerProcess]:
 
 @pytest.fixture
 def link() -> LinkEvents:
-    """What a robot's link tells."""
+    """The events of a robot's link."""
     return LinkEvents()
 
 

@@ -55,8 +55,14 @@ def add_json(parser: argparse._ActionsContainer) -> None:
 
 def add_cluster(parser: argparse.ArgumentParser) -> None:
     """Add `--cluster`, which runs heavy work on other processes or computers."""
-    text = "run on the Dask scheduler at this address, such as tcp://host:8786; as the last word, on processes here"
-    parser.add_argument("--cluster", nargs="?", const="local", metavar="ADDRESS", help=text)
+    text = "run on the Dask scheduler at this address, such as tcp://host:8786; without one on processes here"
+    parser.add_argument("--cluster", type=_address, nargs="?", const="local", metavar="ADDRESS", help=text)
+
+
+def _address(text: str) -> str:
+    if text != "local" and os.path.exists(text):
+        raise argparse.ArgumentTypeError(f"{text} is a file and no address; write `--cluster local`")
+    return text
 
 
 def add_connection(parser: argparse.ArgumentParser, default: str, purpose: str) -> None:

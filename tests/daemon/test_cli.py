@@ -463,3 +463,11 @@ def test_a_missing_robot_library_is_one_sentence(config, command, monkeypatch, m
     said = mistake(command, str(config(robot=str(Path("config/ur.yaml").resolve()))))
     assert "the robot needs the package ur-rtde, which is not installed for Python 3." in said
     assert "-m pip install ur-rtde" in said
+
+
+def test_a_file_after_cluster_is_no_address(tmp_path, capsys):
+    recording = tmp_path / "a.mcap"
+    recording.touch()
+    with pytest.raises(SystemExit):
+        main(["evaluate", "a.cal", "--cluster", str(recording)])
+    assert f"{recording} is a file and no address; write `--cluster local`" in capsys.readouterr().err

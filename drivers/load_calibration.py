@@ -114,10 +114,7 @@ def fit_levels(levels: Sequence[Level], lever_arm_m: float = LEVER_ARM_M, sign: 
     means = np.array([level.mean for level in levels])
     counts_per_n, tare_counts = (float(value) for value in np.polyfit(forces_n, means, 1))
     calibration = LoadCalibration(
-        tare_counts=tare_counts,
-        scale_n_per_count=1 / counts_per_n,
-        lever_arm_m=lever_arm_m,
-        sign=-1 if sign < 0 else 1,
+        tare_counts=tare_counts, scale_n_per_count=1 / counts_per_n, lever_arm_m=lever_arm_m, sign=-1 if sign < 0 else 1
     )
     residuals = means - (tare_counts + counts_per_n * forces_n)
     worst = int(np.argmax(np.abs(residuals)))

@@ -24,11 +24,7 @@ from shearloop.bank.estimation.estimator import (
     Reading,
 )
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator, segment_grip
-from shearloop.bank.estimation.interval_regressor import (
-    CensoredRidge,
-    IntervalRegressor,
-    fit_interval_regressor,
-)
+from shearloop.bank.estimation.interval_regressor import CensoredRidge, IntervalRegressor, fit_interval_regressor
 from shearloop.bank.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
 from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.bank.estimation.regressors import later_origins

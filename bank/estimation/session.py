@@ -18,12 +18,7 @@ from shearloop.bank.estimation.calibration import Calibration
 from shearloop.bank.estimation.estimator import NO_ERRORS, OutputModel, Quantity, Reading
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.novelty import FAMILIAR, Novelty
-from shearloop.bank.estimation.session_state import (
-    PaperState,
-    ProcessedFrame,
-    SessionState,
-    SliceState,
-)
+from shearloop.bank.estimation.session_state import PaperState, ProcessedFrame, SessionState, SliceState
 from shearloop.bank.estimation.values import Estimate, Measured, TactileFrame
 from shearloop.bank.gain import GainCorrection, find_twists
 from shearloop.words import counted

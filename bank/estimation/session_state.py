@@ -252,11 +252,7 @@ class SessionState:
     """State of one session of raw frames; every frame goes through `process` in order."""
 
     def __init__(
-        self,
-        validators: tuple[FingertipValidator, ...],
-        motion: Motion,
-        period_s: float = np.inf,
-        idle_frames: int = 0,
+        self, validators: tuple[FingertipValidator, ...], motion: Motion, period_s: float = np.inf, idle_frames: int = 0
     ) -> None:
         """Begin a session; the operator guarantees that its first `idle_frames` usable frames are untouched."""
         self._fingertips = FingertipSet(validators)

@@ -25,14 +25,7 @@ from scipy.special import stdtrit
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.skin.membrane import (
-    PAPER_SECTION,
-    UNSTRETCHED,
-    Belt,
-    Direction,
-    ShearInterval,
-    direction_of,
-)
+from shearloop.bank.skin.membrane import PAPER_SECTION, UNSTRETCHED, Belt, Direction, ShearInterval, direction_of
 from shearloop.words import counted
 from shearloop.yaml_files import read_yaml, save_yaml, validated
 

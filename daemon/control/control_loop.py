@@ -7,14 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from shearloop.daemon.control.experiment import (
-    Action,
-    Experiment,
-    ExperimentPhase,
-    Hold,
-    StepCommand,
-    TrackTorque,
-)
+from shearloop.daemon.control.experiment import Action, Experiment, ExperimentPhase, Hold, StepCommand, TrackTorque
 from shearloop.daemon.control.experiment_schema import (
     AdaptStep,
     ExperimentFile,
@@ -24,13 +17,7 @@ from shearloop.daemon.control.experiment_schema import (
     TareStep,
     first_turn_before_grip,
 )
-from shearloop.daemon.control.fault_detection import (
-    Grasp,
-    Watched,
-    compared_for_s,
-    detect_faults,
-    fresh_for_s,
-)
+from shearloop.daemon.control.fault_detection import Grasp, Watched, compared_for_s, detect_faults, fresh_for_s
 from shearloop.daemon.control.loop_inputs import (
     ArmStatus,
     Creep,

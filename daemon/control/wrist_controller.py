@@ -3,13 +3,7 @@
 import math
 from collections import deque
 
-from shearloop.daemon.control.experiment import (
-    ConstantVelocity,
-    Hold,
-    MoveToAngle,
-    TrackTorque,
-    WristSetpoint,
-)
+from shearloop.daemon.control.experiment import ConstantVelocity, Hold, MoveToAngle, TrackTorque, WristSetpoint
 from shearloop.daemon.control.experiment_schema import IdentifyStep
 from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSample, TorqueSource

@@ -125,10 +125,7 @@ def schemas() -> Mapping[str, dict[str, Any]]:
     raw = {
         INPUT: {
             "t_mono_ns": _TIME,
-            "kind": {
-                "type": "string",
-                "description": "opened or started (board), asked, data, tare, tool or adapt",
-            },
+            "kind": {"type": "string", "description": "opened or started (board), asked, data, tare, tool or adapt"},
             "data": {"type": "string", "description": "the bytes as Latin-1 text, or the argument of another input"},
         },
         CLOCK_TOPIC: {

@@ -158,11 +158,7 @@ class RecordingWriter:
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        source: str,
-        notes: Mapping[str, str] | None = None,
-        table: ChannelTable = PAPER_TABLE,
+        self, path: str | Path, source: str, notes: Mapping[str, str] | None = None, table: ChannelTable = PAPER_TABLE
     ) -> None:
         """Create `path`.partial; `source` describes the origin of the data."""
         self.path = Path(path)

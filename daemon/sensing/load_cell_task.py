@@ -26,12 +26,7 @@ class LoadCellTask:
     """Connects the load cell's board to the publisher and the control loop."""
 
     def __init__(
-        self,
-        board: LoadCell,
-        publisher: Publisher,
-        clock: Clock,
-        loop: ControlLoop | None,
-        rate_hz: float,
+        self, board: LoadCell, publisher: Publisher, clock: Clock, loop: ControlLoop | None, rate_hz: float
     ) -> None:
         self._period_s = 1.0 / rate_hz
         self._timeout_s = max(ZERO_TIMEOUT_S, 2.0 * (ZERO_SAMPLES + SETTLING_PERIODS) / rate_hz)

@@ -267,10 +267,7 @@ def _gauge_ohm(calibration: SkinCalibration) -> float:
 
 def _estimator(config: SkinConfig, calibration: SkinCalibration) -> SkinEstimator:
     return SkinEstimator(
-        calibration,
-        normal_n=config.normal_n,
-        zero_samples=config.zero_samples,
-        drift_per_hour=config.drift_per_hour,
+        calibration, normal_n=config.normal_n, zero_samples=config.zero_samples, drift_per_hour=config.drift_per_hour
     )
 
 

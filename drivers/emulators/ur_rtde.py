@@ -40,10 +40,7 @@ _VARIABLES: dict[str, tuple[str, Callable[[Robot], Value]]] = {
     "safety_mode": ("INT32", lambda robot: robot.safety_mode),
     "safety_status_bits": ("UINT32", lambda robot: _SAFETY_BITS[robot.safety_mode]),
     "runtime_state": ("UINT32", lambda robot: robot.runtime_state),
-    "robot_status_bits": (
-        "UINT32",
-        lambda robot: int(robot.robot_mode == MODE_RUNNING) | robot.program_running << 1,
-    ),
+    "robot_status_bits": ("UINT32", lambda robot: int(robot.robot_mode == MODE_RUNNING) | robot.program_running << 1),
     "speed_scaling": ("DOUBLE", lambda _: 1.0),
     "external_force_torque": ("VECTOR6D", lambda _: (0.0,) * 6),
     "payload": ("DOUBLE", lambda robot: robot.spec.payload_kg),

@@ -62,11 +62,7 @@ class ModbusClient:
     """One serial connection. Any failure closes it: Modbus RTU does not distinguish a late answer from the next one."""
 
     def __init__(
-        self,
-        *,
-        serial_number: str | None = None,
-        path: str | None = None,
-        reply_deadline_s: float = REPLY_DEADLINE_S,
+        self, *, serial_number: str | None = None, path: str | None = None, reply_deadline_s: float = REPLY_DEADLINE_S
     ) -> None:
         """Name the adapter by its USB serial number or by a path; nothing is opened yet."""
         self._serial_number = serial_number

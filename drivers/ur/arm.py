@@ -14,13 +14,7 @@ import rtde_control
 import script_client
 
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.ur.control_box import (
-    ProbeError,
-    RtdeReceiver,
-    SampleAge,
-    ScriptReadiness,
-    ask_dashboard,
-)
+from shearloop.drivers.ur.control_box import ProbeError, RtdeReceiver, SampleAge, ScriptReadiness, ask_dashboard
 from shearloop.drivers.ur.messages import MoveLinear, RtdeOutputs, RtdeSample, WristSpeed
 from shearloop.drivers.ur.script import NO_MOTION_S, guard_script
 from shearloop.drivers.ur.settings import UrSettings

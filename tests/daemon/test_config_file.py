@@ -122,10 +122,7 @@ ALIAS_BOMB = "a: &a [x]\n" + "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n"
         ("- 1\n- 2\n", "expected keys and values such as `torque_limit_nm: …`"),
         ("torque_limit_nm: 1\nmode: [slow\n", ":3:1: a list is not closed"),
         ("torque_limit_nm: 1\n\tmode: slow\n", ":2:1: a tab indents this line; use spaces"),
-        (
-            "torque_limit_nm: 1\nmode: slow\ntorque_limit_nm: 2\n",
-            ":3:1: the key `torque_limit_nm` is given",
-        ),
+        ("torque_limit_nm: 1\nmode: slow\ntorque_limit_nm: 2\n", ":3:1: the key `torque_limit_nm` is given"),
         ("spare: {hold_s: 1, hold_s: 2}\n", ":1:20: the key `hold_s` is given twice"),
         ("mode: !!python/object/apply:os.system [ls]\n", ":1:7: the type tag tag:yaml.org,2002:python/"),
         ("torque_limit_nm: !!int 1:1\n", ":1:18: the type tag tag:yaml.org,2002:int is not supported"),

@@ -127,10 +127,7 @@ IDENTIFY = {"do": "identify"}
             [IDENTIFY, {**ADAPT, "fingertip": "left", "reference": "wrench"}],
             "steps[1]: adapt corrects `left`, which has no",
         ),
-        (
-            [IDENTIFY, {"do": "tare"}, {**ADAPT, "reference": "wrench"}],
-            "steps[2]: adapt needs a twisted tool",
-        ),
+        ([IDENTIFY, {"do": "tare"}, {**ADAPT, "reference": "wrench"}], "steps[2]: adapt needs a twisted tool"),
         (
             [IDENTIFY, {**ADAPT, "reference": "wrench"}, {"do": "hold_torque", "torque_nm": 0.1}],
             "steps[2]: hold_torque needs an identified tool",

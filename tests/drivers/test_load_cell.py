@@ -12,14 +12,7 @@ from shearloop.drivers import load_cell
 from shearloop.drivers.calibration_files import load_calibration, save_calibration
 from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ
 from shearloop.drivers.errors import DeviceCalibrationError
-from shearloop.drivers.load_cell import (
-    COUNTS_MAX,
-    COUNTS_MIN,
-    PERIOD_NS,
-    STUCK_AFTER,
-    LoadCalibration,
-    LoadParser,
-)
+from shearloop.drivers.load_cell import COUNTS_MAX, COUNTS_MIN, PERIOD_NS, STUCK_AFTER, LoadCalibration, LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.slices import slices
 

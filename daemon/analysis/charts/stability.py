@@ -15,15 +15,7 @@ from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.errors import BankError
-from shearloop.bank.estimation import (
-    Calibration,
-    EstimatorSession,
-    FrameSeries,
-    Physics,
-    TactileFrame,
-    bank_match,
-    fit,
-)
+from shearloop.bank.estimation import Calibration, EstimatorSession, FrameSeries, Physics, TactileFrame, bank_match, fit
 from shearloop.bank.estimation.bank_match import NOT_TURNED
 from shearloop.bank.estimator_names import EstimatorName
 from shearloop.daemon.analysis.charts import skin_loop

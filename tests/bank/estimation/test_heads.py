@@ -4,18 +4,8 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.interval_regressor import (
-    CensoredRidge,
-    Ridge,
-    best_strength,
-    fit_interval_regressor,
-)
-from shearloop.bank.estimation.regressors import (
-    InverseCalibration,
-    later_origins,
-    later_splits,
-    left_out_blocks,
-)
+from shearloop.bank.estimation.interval_regressor import CensoredRidge, Ridge, best_strength, fit_interval_regressor
+from shearloop.bank.estimation.regressors import InverseCalibration, later_origins, later_splits, left_out_blocks
 
 
 def test_a_ridge_without_strength_is_least_squares():

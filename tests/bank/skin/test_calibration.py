@@ -23,15 +23,7 @@ from shearloop.bank.skin.calibration import (
     turned_rad,
 )
 from shearloop.bank.skin.characterisation import loading, loop, responses
-from shearloop.bank.skin.membrane import (
-    PAPER_SECTION,
-    THICK_SECTION,
-    UNSTRETCHED,
-    Belt,
-    BeltState,
-    Direction,
-    Membrane,
-)
+from shearloop.bank.skin.membrane import PAPER_SECTION, THICK_SECTION, UNSTRETCHED, Belt, BeltState, Direction, Membrane
 
 BELT = Belt(0.04, PAPER_SECTION.gauge_angle_rad)
 R1, R2 = 24.6, 25.3

@@ -5,12 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from shearloop.bank.skin.characterisation import (
-    fit_line,
-    loading,
-    loop,
-    responses,
-)
+from shearloop.bank.skin.characterisation import fit_line, loading, loop, responses
 from shearloop.bank.skin.membrane import THICK_SECTION, Membrane
 
 

@@ -267,11 +267,7 @@ def test_pivoting_finds_newton_s_forces():
     before = np.random.default_rng(3).normal(0, 0.1, len(skin.contact_deg))
     for load_n in [(1.0, 0.0), (1.0, 1.0), (0.5, -2.0)]:
         problem = _Problem(
-            skin.compliance,
-            skin.load_displacement @ load_n,
-            before,
-            SECTION.friction,
-            1 / np.diag(skin.compliance),
+            skin.compliance, skin.load_displacement @ load_n, before, SECTION.friction, 1 / np.diag(skin.compliance)
         )
         newton, converged = problem.newton(np.zeros(2 * len(before)))
         assert converged

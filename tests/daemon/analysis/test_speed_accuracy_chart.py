@@ -13,13 +13,7 @@ from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import FrameSeries
 from shearloop.daemon.analysis.charts import scene
 from shearloop.daemon.analysis.charts.chart_data import Split, own_fingertip, splits, synthetic_stream
-from shearloop.daemon.analysis.charts.drawing import (
-    figure,
-    frontier,
-    lay_out,
-    plain_log,
-    write_names,
-)
+from shearloop.daemon.analysis.charts.drawing import figure, frontier, lay_out, plain_log, write_names
 from shearloop.daemon.analysis.charts.forward_methods import converged, direct, error_of, forward_methods
 from shearloop.daemon.analysis.charts.simulated_loop import tracking_errors
 from shearloop.daemon.analysis.charts.speed_accuracy import (

@@ -186,13 +186,7 @@ class Cell:
         self.died: dict[str, str] = {}
 
         self.runner = ControlLoopRunner(
-            self.control_loop,
-            self.robot,
-            self.gripper,
-            {},
-            self.published,
-            StepClock(self.robot.flight),
-            self.died,
+            self.control_loop, self.robot, self.gripper, {}, self.published, StepClock(self.robot.flight), self.died
         )
         self.task: asyncio.Task[None] | None = None
 

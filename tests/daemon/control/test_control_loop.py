@@ -69,8 +69,7 @@ def test_loop_state_has_the_filtered_torque_and_its_standard_deviation():
 
 
 @pytest.mark.parametrize(
-    ("adapted", "drive", "refused"),
-    [(None, "right", True), ("right", "right", True), ("right", "load_cell", False)],
+    ("adapted", "drive", "refused"), [(None, "right", True), ("right", "right", True), ("right", "load_cell", False)]
 )
 def test_a_set_point_without_identification_at_its_gain_is_refused_with_the_cure(adapted, drive, refused):
     first = [{"do": "identify"}, {"do": "adapt", "fingertip": adapted}] if adapted else []

@@ -8,12 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.daemon.control.torque_controller import (
-    AngleHistory,
-    ControllerReason,
-    JumpDetector,
-    TorqueController,
-)
+from shearloop.daemon.control.torque_controller import AngleHistory, ControllerReason, JumpDetector, TorqueController
 from shearloop.daemon.errors import UserError
 
 from .conftest import Bench
@@ -324,11 +319,7 @@ def history_of(angles: list[float], span_ns: int = 10**12) -> AngleHistory:
     return history
 
 
-@given(
-    st.lists(st.floats(-7.0, 7.0), min_size=2, max_size=40),
-    st.floats(0.0, 1.0),
-    st.floats(0.0, 1.0),
-)
+@given(st.lists(st.floats(-7.0, 7.0), min_size=2, max_size=40), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
 def test_the_mean_is_that_of_the_line_through_the_samples(angles, one, other):
     last_ns = (len(angles) - 1) * STEP_NS
     low, high = sorted((int(one * last_ns), int(other * last_ns)))

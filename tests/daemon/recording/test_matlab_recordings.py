@@ -14,12 +14,7 @@ from scipy.io import loadmat, savemat
 
 from shearloop.bank.matlab_file import MatFileError, read_variables
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.matlab_import import (
-    read_diameter_slices,
-    read_line,
-    read_stream,
-    read_torque_slices,
-)
+from shearloop.daemon.recording.matlab_import import read_diameter_slices, read_line, read_stream, read_torque_slices
 
 # 2024-12-03 16:09:38 on MATLAB's count of days.
 DATENUM = 739589 + (16 * 3600 + 9 * 60 + 38) / 86400

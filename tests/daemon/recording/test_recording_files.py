@@ -71,10 +71,7 @@ def test_foreign_and_outdated_files_are_refused(tmp_path, monkeypatch, read):
         other.start()
         other.finish()
     # The digest is cached in the table once it is read.
-    for name, owner, key, value in (
-        ("stale", PAPER_TABLE, "digest", "0" * 64),
-        ("old", schema, "FORMAT_VERSION", "1"),
-    ):
+    for name, owner, key, value in (("stale", PAPER_TABLE, "digest", "0" * 64), ("old", schema, "FORMAT_VERSION", "1")):
         with monkeypatch.context() as outdated:
             outdated.setitem(vars(owner), key, value)
             written(tmp_path / f"{name}.mcap")

@@ -21,13 +21,7 @@ from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.messaging.messages import EitEstimate, wire_map, with_packed_arrays
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.matlab_import import import_mat
-from shearloop.daemon.recording.replay import (
-    RecordedEvent,
-    RecordedRun,
-    Replay,
-    ReplayClock,
-    ReplayComparison,
-)
+from shearloop.daemon.recording.replay import RecordedEvent, RecordedRun, Replay, ReplayClock, ReplayComparison
 from shearloop.daemon.recording.schema import message_json, with_missing_keys
 from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.sensing.fingertip_task import FingertipPipeline

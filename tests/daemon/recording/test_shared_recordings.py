@@ -119,8 +119,7 @@ def test_cylinders_that_turn_differently_give_a_diameter_and_a_gain_for_each(cyl
 
 
 @pytest.mark.parametrize(
-    ("sides", "r", "rmse_nm"),
-    [(("right",), 0.85, 0.008), (("left",), 0.85, 0.008), (("right", "left"), 0.93, 0.0055)],
+    ("sides", "r", "rmse_nm"), [(("right",), 0.85, 0.008), (("left",), 0.85, 0.008), (("right", "left"), 0.93, 0.0055)]
 )
 def test_later_twists(twists, sides, r, rmse_nm):
     series = twists.select_sides(sides)

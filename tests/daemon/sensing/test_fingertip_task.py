@@ -13,11 +13,7 @@ from shearloop.bank.estimation import Estimate
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import FingertipConfig
 from shearloop.daemon.messaging.messages import Message
-from shearloop.daemon.sensing.fingertip_task import (
-    CombinedFingertips,
-    FingertipPipeline,
-    FingertipTask,
-)
+from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipPipeline, FingertipTask
 from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import Frame

@@ -7,14 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.daemon.service import (
-    EXAMPLE,
-    PLACES,
-    REAL_TIME,
-    find_program,
-    install_steps,
-    service_file,
-)
+from shearloop.daemon.service import EXAMPLE, PLACES, REAL_TIME, find_program, install_steps, service_file
 
 PROGRAM = "/usr/bin/true"
 

@@ -80,19 +80,11 @@ ADC = {"adc": {"device": {"path": "skin-daq"}}}
 
 @contextlib.asynccontextmanager
 async def played(
-    folder: Path,
-    *,
-    socket: bool = False,
-    average_s: float = 0.0,
-    daemon: dict[str, Any] | None = None,
-    **changes: Any,
+    folder: Path, *, socket: bool = False, average_s: float = 0.0, daemon: dict[str, Any] | None = None, **changes: Any
 ) -> AsyncIterator[Played]:
     skin = SyntheticSkin()
     instruments = SkinInstruments(
-        skin,
-        folder / "skin-source",
-        ("127.0.0.1", 0) if socket else folder / "skin-daq",
-        speed=RATE_HZ / 10,
+        skin, folder / "skin-source", ("127.0.0.1", 0) if socket else folder / "skin-daq", speed=RATE_HZ / 10
     )
     async with running(instruments.run()):
         await instruments.source_port.get()
@@ -213,10 +205,7 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
         ({"skin": section(ADC, normal_n=-1)}, "skin.normal_n: -1 is too small"),
         ({"skin": section(ADC, normal_N=1)}, "skin.normal_N: is not a known key; did you mean normal_n?"),
         ({"skin": section(ADC, tool_radius_mm=-15)}, "skin.tool_radius_mm: -15 is too small"),
-        (
-            {"skin": section(ADC, source={**SOURCE, "current_ma": 50})},
-            "skin.source.current_ma: 50 is too large",
-        ),
+        ({"skin": section(ADC, source={**SOURCE, "current_ma": 50})}, "skin.source.current_ma: 50 is too large"),
         (
             {"skin": section(ADC, source={**SOURCE, "current_ma": 7})},
             "`skin.source.current_ma`: 7 mA warm a gauge of 25.3 Ω by 5.9 K, more than the 5 K that are allowed",

@@ -124,11 +124,7 @@ def test_frames_are_the_manuals_byte_for_byte():
 
 @given(st.lists(st.integers(0, 100)))
 def test_modbus_requests_come_in_any_slices(cuts):
-    requests = [
-        framed(READ_STATUS),
-        framed(bytes.fromhex("0910 03E8 0003 06 0900 0064 FF32")),
-        framed(READ_STATUS),
-    ]
+    requests = [framed(READ_STATUS), framed(bytes.fromhex("0910 03E8 0003 06 0900 0064 FF32")), framed(READ_STATUS)]
     whole, sliced = ModbusSlave(active_gripper()), ModbusSlave(active_gripper())
     expected = b"".join(whole.feed(request) for request in requests)
     assert b"".join(sliced.feed(part) for part in slices(b"".join(requests), cuts)) == expected

@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shearloop.drivers.emulators.ur_robot import (
-    MODE_IDLE,
-    MODE_POWER_OFF,
-    MODE_RUNNING,
-    PAUSED,
-    ControllerSpec,
-    Robot,
-)
+from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, PAUSED, ControllerSpec, Robot
 from tests.drivers.ur.robots import control_script
 
 DT_S = 0.002

@@ -11,13 +11,7 @@ from hypothesis import strategies as st
 
 from shearloop.drivers.emulators import ur_controller
 from shearloop.drivers.emulators.ur_robot import Robot
-from shearloop.drivers.emulators.ur_rtde import (
-    RtdeSession,
-    pack,
-    package,
-    unpack,
-    variable,
-)
+from shearloop.drivers.emulators.ur_rtde import RtdeSession, pack, package, unpack, variable
 from tests.slices import slices
 
 GREETING = package(ord("V"), b"\x00\x02") + package(ord("v"), b"")

@@ -48,9 +48,7 @@ def test_wrist_command_is_within_the_limits_and_reports_clipping(asked, now):
 
 
 @given(
-    st.lists(st.tuples(commands, st.integers(1, 60)), min_size=1, max_size=12),
-    st.floats(-1.9, 1.9),
-    st.integers(0, 3),
+    st.lists(st.tuples(commands, st.integers(1, 60)), min_size=1, max_size=12), st.floats(-1.9, 1.9), st.integers(0, 3)
 )
 @example([(WristSpeed(1e9, 0.01), 400), (WristSpeed(-0.01, 1e-6), 60)], 1.0, 3)
 @example([(WristSpeed(0.8, 4.0), 60), (WristSpeed(0.79, 1e-6), 60), (WristSpeed(0.0, 1e-6), 60)], 1.7, 3)

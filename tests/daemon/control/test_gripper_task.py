@@ -34,9 +34,9 @@ def task_of(rig: Rig, felt: Felt | None = None, *, measures_diameters: bool = Tr
 
 
 @asynccontextmanager
-async def reading(way: str, folder: Path) -> AsyncIterator[tuple[Rig, GripperTask, Felt]]:
+async def reading(way: str, folder: Path, **settings: float) -> AsyncIterator[tuple[Rig, GripperTask, Felt]]:
     """Yield a rig and a task that reads its gripper."""
-    async with a_rig(way, folder) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
+    async with a_rig(way, folder, **settings) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
         felt = Felt()
         task = task_of(rig, felt)
         read = tasks.create_task(task.run())
@@ -86,7 +86,7 @@ async def test_cancelled_grip_is_halted_and_stays_connected(way, tmp_path):
 
 @WAYS
 async def test_halt_stops_the_fingers_after_a_reconnection(way, tmp_path):
-    async with reading(way, tmp_path) as (rig, task, _):
+    async with reading(way, tmp_path, reply_deadline_s=0.2) as (rig, task, _):
         assert await task.release() == ""
         grip = asyncio.create_task(task.grip(GRIP))
         while rig.model.width_mm > 120.0:  # noqa: ASYNC110 - the model is looked at, as it moves

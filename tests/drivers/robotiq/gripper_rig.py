@@ -48,19 +48,22 @@ class Rig:
 
 
 @contextlib.asynccontextmanager
-async def a_rig(way: str, tmp_path: Path, *, connected: bool = False, active: bool = False) -> AsyncIterator[Rig]:
+async def a_rig(
+    way: str, tmp_path: Path, *, connected: bool = False, active: bool = False, reply_deadline_s: float = 20.0
+) -> AsyncIterator[Rig]:
+    """A gripper and its driver; `reply_deadline_s` is long, because a busy computer delays replies."""
     model = Gripper()
     server: Server
     client: RobotiqConnection
     if way == "socket":
         socket = server = SocketServer(UrcapSession(model))
         await socket.restore()
-        client = SocketClient("127.0.0.1", socket.port, reply_deadline_s=0.2)
+        client = SocketClient("127.0.0.1", socket.port, reply_deadline_s=reply_deadline_s)
     else:
         link = tmp_path / "gripper"
         server = PtyServer(ModbusSlave(model), link)
         await server.restore()
-        client = ModbusClient(path=str(link), reply_deadline_s=0.2)
+        client = ModbusClient(path=str(link), reply_deadline_s=reply_deadline_s)
     rig = Rig(model, server)
     driver = RobotiqGripper(client, CALIBRATION, poll_s=0.0, monitor=LinkMonitor(rig.link, 0.001, 0.002))
     rig.driver = driver

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.real_time
 
 @WAYS
 async def test_silence_is_a_loss_and_clears_the_state(way, tmp_path):
-    async with a_rig(way, tmp_path, connected=True) as rig:
+    async with a_rig(way, tmp_path, reply_deadline_s=0.2, connected=True) as rig:
         assert rig.driver.latest is not None
         rig.silence(True)
         with pytest.raises(DeviceLostError, match=r"within 0\.2 s"):
@@ -62,7 +62,11 @@ async def test_lost_gripper_reconnects_and_reports_it(way, tmp_path):
 
 @WAYS
 async def test_loss_during_a_command_is_reported(way, tmp_path):
-    async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
+    async with (
+        a_rig(way, tmp_path, reply_deadline_s=0.2) as rig,
+        contextlib.aclosing(rig.driver.states()) as states,
+        asyncio.timeout(20),
+    ):
         await anext(states)
         await rig.driver.activate()
         rig.silence(True)
@@ -93,7 +97,7 @@ async def test_states_are_polled_while_a_command_runs(way, tmp_path):
 
 @WAYS
 async def test_cancelled_call_leaves_no_stale_answer(way, tmp_path):
-    async with a_rig(way, tmp_path, connected=True) as rig:
+    async with a_rig(way, tmp_path, reply_deadline_s=0.2, connected=True) as rig:
         rig.silence(True)
         reading = asyncio.create_task(rig.driver.read())
         await asyncio.sleep(0)
@@ -128,7 +132,7 @@ async def test_damaged_modbus_reply_is_rejected(tmp_path, monkeypatch):
         *reply, last = feed(slave, data)
         return bytes([*reply, last ^ 0xFF])
 
-    async with a_rig("modbus", tmp_path, connected=True) as rig:
+    async with a_rig("modbus", tmp_path, reply_deadline_s=0.2, connected=True) as rig:
         with monkeypatch.context() as patched:
             patched.setattr(ModbusSlave, "feed", damaged)
             with pytest.raises(DeviceLostError):

@@ -190,20 +190,21 @@ async def test_clients_with_topics_that_do_not_exist_do_not_hold_the_daemon(conf
     address, gaps_s = f"tcp://127.0.0.1:{free_port()}", []
     async with running_daemon(config(publish=address)) as daemon:
         code = f"from {__name__} import subscribe_and_leave; subscribe_and_leave({address!r})"
-        process = await asyncio.create_subprocess_exec(sys.executable, "-c", code)
+        process = await asyncio.create_subprocess_exec(sys.executable, "-c", code, stdin=asyncio.subprocess.PIPE)
         attack = asyncio.create_task(process.wait())
         while not attack.done() or daemon.publisher._unknown:
             begun_s = time.monotonic()
             await asyncio.sleep(0.01)
             gaps_s.append(time.monotonic() - begun_s)
+            errors = {**daemon.publisher.diagnostics()["errors"], **daemon.health.tasks()["commands"]["errors"]}
+            if errors.keys() >= {"too many unknown topics", "too many new clients"}:
+                process.stdin.close()
         assert attack.result() == 0
-        assert daemon.publisher.diagnostics()["errors"]["too many unknown topics"] >= 1
-        assert daemon.health.tasks()["commands"]["errors"]["too many new clients"] >= 1
     assert max(gaps_s) < 1.0
 
 
 def subscribe_and_leave(address: str) -> None:
-    """Connect many subscribers at once, each with some long topics that do not exist, and close them at once."""
+    """Connect many subscribers at once, each with some long topics that do not exist; close them when stdin is."""
     with zmq.Context() as context, ExitStack() as stack:
         for number in range(250):
             client = stack.enter_context(context.socket(zmq.SUB))
@@ -211,7 +212,7 @@ def subscribe_and_leave(address: str) -> None:
             client.connect(address)
             for topic in range(15):
                 client.subscribe(f"{number:03}{topic:02}" + 45 * "y")
-        time.sleep(2.0)
+        sys.stdin.read()
 
 
 async def test_requests_of_many_frames_do_not_fill_the_memory():

@@ -131,7 +131,7 @@ class Daemon:
             await self._end.wait()
             notify("STOPPING=1")
             if self._rig is not None:
-                self._rig.close()
+                self._rig.runner.close()
                 if self._experiment is not None and self._experiment.has_begun.is_set():
                     await asyncio.wait({running["experiment"]}, timeout=REPORTED_WITHIN_S)
                 await self._rig.runner.halt_and_wait()
@@ -167,12 +167,12 @@ def _build_rig(
     combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
     sources = torque_sources(config, estimators, combined)
     check_experiment(config, sources)
-    loop = make_loop(config, sources)
+    loop = make_loop(config, sources, supervisor.dead)
     gripper = make_gripper(config, loop, publisher) if loop is not None else None
     sensors = build_sensors(config, publisher, clock, recorder, loop, estimators, combined, gripper)
     if loop is None:
         return sensors, None
-    return sensors, Rig(config, loop, gripper, sensors.tareable(), publisher, clock, supervisor, recorder)
+    return sensors, Rig(config, loop, gripper, sensors.tareable(), publisher, clock, recorder)
 
 
 async def run_daemon(

@@ -66,7 +66,7 @@ class Commands:
         return {}
 
     async def _unlock(self, _request: Request) -> Reply:
-        _refuse_if(await required_rig(self.rig).unlock())
+        _refuse_if(await required_rig(self.rig).runner.unlock())
         return {}
 
     async def _tare(self, request: Request) -> Reply:
@@ -75,8 +75,8 @@ class Commands:
         if source is not None and not (isinstance(source, str) and source in sensors):
             raise CommandRefusedError(f"there is no sensor {source!r} to tare; there are {', '.join(sensors)}")
         names = list(sensors) if source is None else [source]
-        experiment = self.rig.control_loop.experiment if self.rig is not None else None
-        if experiment is not None and experiment.running:
+        experiment = self.rig.control_loop.running if self.rig is not None else None
+        if experiment is not None:
             raise CommandRefusedError(
                 f"the experiment {experiment.file.name!r} is running, and a new zero would change its "
                 "torques; stop it first, or give it a step `tare`"
@@ -93,9 +93,9 @@ class Commands:
         return {"tasks": tasks, "loop": {key: getattr(state, key) for key in LOOP_KEYS}}
 
     async def _stop(self, request: Request) -> Reply:
-        stopped = self.rig.stop() if self.rig is not None else ""
+        stopped = self.rig.runner.stop() if self.rig is not None else None
         waiting = self.experiment.call_off() if self.experiment is not None else None
-        if stopped:
+        if stopped is not None:
             return {"stopped": stopped}
         if request.get("spare_daemon"):
             # The live page's stop button stops motion, but not the daemon.

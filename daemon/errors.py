@@ -8,6 +8,10 @@ class UserError(Exception):
     """Something in a configuration, a file or a command line that its author can mend; the message says how."""
 
 
+class ActionError(Exception):
+    """An action of the devices that cannot be carried out; the message says why, and what to do."""
+
+
 def require(module: str, extra: str, what: str) -> None:
     """Raise UserError if a module is not installed that `what` needs, and that `extra` of shearloop brings."""
     if find_spec(module) is None:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
+from types import MappingProxyType
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig
@@ -20,7 +21,7 @@ from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.daemon.sensor_protocols import Tareable
-from shearloop.daemon.supervisor import Supervisor, Task
+from shearloop.daemon.supervisor import Task
 from shearloop.drivers.calibration_files import load_calibration
 from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.errors import DriverError
@@ -31,8 +32,6 @@ from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.yaml_files import located, read_yaml
-
-ENDING = "the daemon ends; start it again"
 
 
 def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
@@ -70,8 +69,13 @@ def robot_settings(path: Path) -> UrSettings:
     return settings
 
 
-def make_loop(config: DaemonConfig, sources: Mapping[str, TorqueSource]) -> ControlLoop | None:
-    """Return the control loop of the configured robot, if there is one; `sources` are all torques but the robot's."""
+def make_loop(
+    config: DaemonConfig, sources: Mapping[str, TorqueSource], dead_tasks: Mapping[str, str] = MappingProxyType({})
+) -> ControlLoop | None:
+    """Return the control loop of the configured robot, if there is one.
+
+    `sources` are all torques but the robot's; `dead_tasks` has the error of each task that is dead at present.
+    """
     if config.robot is None:
         return None
     robot = robot_settings(config.robot)
@@ -88,7 +92,7 @@ def make_loop(config: DaemonConfig, sources: Mapping[str, TorqueSource]) -> Cont
         for name, fingertip in (*config.fingertips.items(), (COMBINED, config.combined))
         if fingertip is not None and fingertip.creep is not None
     }
-    return ControlLoop(loop, sources, required, gels)
+    return ControlLoop(loop, sources, required, gels, dead_tasks)
 
 
 def make_gripper(config: DaemonConfig, loop: ControlLoop, publisher: Publisher) -> GripperTask | None:
@@ -112,7 +116,6 @@ class Rig:
         sensors: Mapping[str, Tareable],
         publisher: Publisher,
         clock: Clock,
-        supervisor: Supervisor,
         recorder: Recorder | None = None,
     ) -> None:
         """Read the robot's settings; it is not connected yet. An experiment tares or adapts the `sensors`."""
@@ -121,11 +124,8 @@ class Rig:
         self.control_loop = loop
         self.gripper = gripper
         self.robot = UrRobot(robot_settings(config.robot), LinkMonitor(LinkReporter("robot", loop)))
-        self.runner = ControlLoopRunner(loop, self.robot, gripper, sensors, publisher, clock, supervisor.dead)
+        self.runner = ControlLoopRunner(loop, self.robot, gripper, sensors, publisher, clock)
         self._recorder = recorder
-        # Counts the stops, also while an experiment starts.
-        self._stop_count = 0
-        self._closed = False
 
     def tasks(self) -> dict[str, Task]:
         """Return the tasks to run, by their names in `health`."""
@@ -134,39 +134,12 @@ class Rig:
 
     async def start(self, path: Path) -> str | None:
         """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file."""
-        if self._closed:
-            return ENDING
         attached = AttachedFile.read(path) if self._recorder is not None else ()
-        stops_before, file = self._stop_count, read_experiment(path)
+        file = read_experiment(path)
         reason = await self.runner.start(file)
-        if reason is None and self._stop_count != stops_before:
-            self.runner.stop("the operator stopped it")
-            return "it was stopped during its start"
         if reason is None and self._recorder is not None:
             self._recorder.record_experiment(file.name, attached, file.tool_mm)
         return reason
-
-    async def unlock(self) -> str | None:
-        """Enable robot and gripper after a stop; return None, or why not."""
-        return ENDING if self._closed else await self.runner.unlock()
-
-    def stop(self) -> str:
-        """End the experiment, also during its start, or the unlocking; return its name, or an empty string."""
-        self._stop_count += 1
-        experiment = self.control_loop.experiment
-        if experiment is None or not experiment.running:
-            return "unlock" if self.runner.stop_unlocking() else ""
-        self.runner.stop("the operator stopped it")
-        return experiment.file.name
-
-    def close(self) -> None:
-        """Stop the running experiment at the daemon's end, and start nothing more."""
-        self._stop_count, self._closed = self._stop_count + 1, True
-        experiment = self.control_loop.experiment
-        if experiment is not None and experiment.running:
-            self.runner.stop("the daemon ended: the wrist is stopped, a gripped tool stays gripped")
-            # The loop is cancelled before the next state.
-            self.runner.decide_now()
 
 
 def read_experiment(path: Path) -> experiment_schema.ExperimentFile:

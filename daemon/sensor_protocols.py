@@ -4,6 +4,8 @@ import asyncio
 from collections.abc import Iterable
 from typing import Protocol, runtime_checkable
 
+from shearloop.daemon.errors import ActionError
+
 # The paper's ten frames take 5.4 s.
 LONGEST_TARE_S = 30.0
 
@@ -14,18 +16,20 @@ class Tareable(Protocol):
     def tare(self) -> None:
         """Take a new zero from what is measured from now on."""
 
-    async def tare_and_wait(self, within_s: float) -> str:
-        """Take a new zero and wait until it is done; return the reason of a failure, else an empty text."""
+    async def tare_and_wait(self, within_s: float) -> str | None:
+        """Take a new zero and wait until it is done; return None, or why it was not taken."""
 
 
 @runtime_checkable
 class Adaptable(Protocol):
     """A sensor whose gain can be corrected by another sensor's torque."""
 
-    async def adapt(self, reference: str) -> str:
-        """Correct the gain by this source's torque during this grip; return why not, else an empty text."""
+    async def adapt(self, reference: str) -> None:
+        """Correct the gain by this source's torque during this grip; raises ActionError."""
 
 
-async def tare_all(sensors: Iterable[Tareable], within_s: float = LONGEST_TARE_S) -> str:
-    """Zero every sensor at the same time; return the reasons of failures, or an empty text."""
-    return " ".join(filter(None, await asyncio.gather(*(sensor.tare_and_wait(within_s) for sensor in sensors))))
+async def tare_all(sensors: Iterable[Tareable], within_s: float = LONGEST_TARE_S) -> None:
+    """Zero every sensor at the same time; raises ActionError with the reason of each one that was not zeroed."""
+    reasons = await asyncio.gather(*(sensor.tare_and_wait(within_s) for sensor in sensors))
+    if any(reasons):
+        raise ActionError(" ".join(filter(None, reasons)))

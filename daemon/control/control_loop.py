@@ -71,7 +71,7 @@ class _GrippedTool:
     expected: bool = False
     # A stop has opened the gripper, or why it did not open, until the operator acknowledges it.
     released: bool = False
-    release_error: str = ""
+    release_error: str | None = None
 
 
 class ControlLoop:
@@ -83,13 +83,15 @@ class ControlLoop:
         sources: Mapping[str, TorqueSource],
         required: tuple[str, ...],
         creep: Mapping[str, Creep] = MappingProxyType({}),
+        dead_tasks: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         """Take all torque sources by name, the required devices, and the creep of sources that measure shear.
 
-        Each source that measures torque may drive.
+        Each source that measures torque may drive. `dead_tasks` has the error of each task that is dead at present.
         """
         fresh_s = fresh_for_s(sources.values(), config)
-        self.inputs = LatestInputs(kept_s=max(ADAPTED_OVER_S, compared_for_s(sources.values(), fresh_s)))
+        kept_s = max(ADAPTED_OVER_S, compared_for_s(sources.values(), fresh_s))
+        self.inputs = LatestInputs(kept_s=kept_s, died=dead_tasks)
         self.safety = SafetyMonitor()
         self.experiment: Experiment | None = None
         self.status = LoopStatus("idle", "", WristCommand(), SafetyDecision(Response.NOTE))
@@ -111,6 +113,11 @@ class ControlLoop:
         self._gripped = _GrippedTool()
         # Faults that were reported since the latest tick.
         self._reported: list[Fault] = []
+
+    @property
+    def running(self) -> Experiment | None:
+        """The experiment while it may still move something."""
+        return self.experiment if self.experiment is not None and self.experiment.running else None
 
     def on_torque(self, torque: TorqueSample) -> None:
         """Take a torque of any source."""
@@ -150,8 +157,8 @@ class ControlLoop:
         """Take the wrist speed that was sent, after all clipping."""
         self.wrist.on_speed_sent(wrist_rad_per_s)
 
-    def on_action_ended(self, error: str = "") -> None:
-        """Take the end of the present action, with its error if it failed."""
+    def on_action_ended(self, error: str | None = None) -> None:
+        """Take the end of the present action, and why it failed, if it did."""
         experiment, arm, gripped = self.experiment, self.inputs.arm, self._gripped
         action = experiment.command.action if experiment is not None else None
         if experiment is None or not experiment.end_action(error) or error:
@@ -170,14 +177,14 @@ class ControlLoop:
             # An unexpected object is watched as well.
             gripped.expected = action.expect_object or (gripper is not None and gripper.holding)
 
-    def on_release_ended(self, error: str = "") -> None:
-        """Take the end of the release after a stop, with its error if the gripper did not open."""
+    def on_release_ended(self, error: str | None = None) -> None:
+        """Take the end of the release after a stop, and why the gripper did not open, if it did not."""
         self._gripped.release_error = error
 
     def start(self, file: ExperimentFile, t_ns: int) -> str | None:
         """Begin an experiment; return None, or why it cannot begin."""
-        if self.experiment is not None and self.experiment.running:
-            return f"the experiment {self.experiment.file.name!r} is still running; stop it first"
+        if (running := self.running) is not None:
+            return f"the experiment {running.file.name!r} is still running; stop it first"
         if file.torque_source not in self._wrists:
             known = ", ".join(self._wrists)
             return f"`torque_source: {file.torque_source}` is not a measured torque; choose one of {known}"
@@ -219,55 +226,54 @@ class ControlLoop:
 
     def acknowledge(self) -> None:
         """Clear a stop on the operator's command."""
-        self._gripped.release_error = ""
+        self._gripped.release_error = None
         self.safety.acknowledge()
 
-    def tick(self, t_ns: int, late_s: float = 0.0, died: Mapping[str, str] = MappingProxyType({})) -> ControlOutput:
-        """Return the commands for now; the loop is `late_s` late, and `died` has the error of each dead task."""
-        experiment, arm, gripped = self.experiment, self.inputs.arm, self._gripped
-        active = experiment is not None and experiment.running
-        self.inputs.late_s, self.inputs.died = late_s, died
+    def tick(self, t_ns: int, late_s: float = 0.0) -> ControlOutput:
+        """Return the commands for now; the loop is `late_s` late."""
+        running, arm, gripped = self.running, self.inputs.arm, self._gripped
+        self.inputs.late_s = late_s
         watched = self._watched
-        if experiment is not None:
-            watched = replace(watched, limits=experiment.limits)
-        if experiment is not None and active:
-            command, controller = experiment.command, self.wrist.controller
+        if self.experiment is not None:
+            watched = replace(watched, limits=self.experiment.limits)
+        if running is not None:
+            command, controller = running.command, self.wrist.controller
             grasp = Grasp.HELD if gripped.expected else Grasp.NONE
             grasp = Grasp.CHANGING if isinstance(command.action, GripStep) else grasp
-            needed = grasp is Grasp.HELD and _turns(command) and not self._awaited_torques(experiment, t_ns)
+            needed = grasp is Grasp.HELD and _turns(command) and not self._awaited_torques(running, t_ns)
             watched = replace(
                 watched,
                 grasp=grasp,
-                torque_needed=needed and experiment.phase is ExperimentPhase.RUNNING,
+                torque_needed=needed and running.phase is ExperimentPhase.RUNNING,
                 twisted_rad=0.0 if arm is None or gripped.origin_rad is None else arm.wrist_rad - gripped.origin_rad,
                 expected_nm=controller.torque_nm if controller is not None else None,
-                overdue=experiment.overdue,
+                overdue=running.overdue,
             )
         found = [*detect_faults(self.inputs, watched, self.config, t_ns), *self._reported]
         self._reported.clear()
         self.inputs.unjudged.clear()
-        if gripped.release_error:
+        if gripped.release_error is not None:
             found.append(Fault(FaultCode.NOT_RELEASED, gripped.release_error))
-        if experiment is None or not active:
+        if running is None:
             # Nothing moves: faults are reported, and only a stop of an experiment waits for the operator.
             if arm is not None and arm.enabled_by_start:
                 found = [fault for fault in found if fault.code is not FaultCode.ROBOT_BLOCKED]
             return self._ended(self.safety.report(found))
         decision = self.safety.judge(found, t_ns)
         if decision.response >= Response.STOP_AND_KEEP_GRIP:
-            experiment.stop(" ".join(decision.reasons))
+            running.stop(" ".join(decision.reasons))
         if arm is None or decision.response >= Response.STOP_AND_KEEP_GRIP:
             return self._ended(decision)
-        return self._run_step(experiment, decision, arm.wrist_rad, t_ns)
+        return self._run_step(running, decision, arm.wrist_rad, t_ns)
 
     def _others(self, driving: TorqueSource) -> tuple[TorqueSource, ...]:
         return tuple(source for source in self._sources.values() if source is not driving)
 
-    def _why_uncertain(self) -> str:
-        """Return why the gripper cannot say whether it holds a tool, or an empty string."""
+    def _why_uncertain(self) -> str | None:
+        """Return why the gripper cannot say whether it holds a tool, or None."""
         hand = self.inputs.gripper
         if "gripper" not in self._watched.required or hand is None or not (hand.uncertain or hand.moving):
-            return ""
+            return None
         doubt = "are moving" if hand.moving else "stand where a stop, an activation or a lack of power has left them"
         return f"the gripper does not say whether it holds a tool: its fingers, {hand.width_mm:.1f} mm apart, {doubt}"
 
@@ -277,14 +283,14 @@ class ControlLoop:
         origin_rad = gripped.origin_rad = wrist_rad if gripped.origin_rad is None else gripped.origin_rad
         latest = self.inputs.torques.get(experiment.file.torque_source)
         torque_nm = latest.torque_nm if latest is not None and not held else None
-        stands = held or bool(self._awaited_torques(experiment, t_ns))
+        stands = held or self._awaited_torques(experiment, t_ns) is not None
         experiment.update(t_ns, wrist_rad - origin_rad, torque_nm, gripped_at_rad=origin_rad, held=stands)
         command = experiment.command
         # A tool that the gripper holds is watched. After a stop, the gripper's doubt may arrive only now.
         if _turns(command) and not gripped.expected and (uncertain := self._why_uncertain()):
             experiment.fail(f"{uncertain}; put a `grip` or a `release` before it")
         awaited = self._awaited_torques(experiment, t_ns)
-        still = held or bool(awaited) or experiment.phase is ExperimentPhase.PAUSED
+        still = held or awaited is not None or experiment.phase is ExperimentPhase.PAUSED
         if isinstance(command.wrist, TrackTorque) and wrist.tracked != command.wrist and not still:
             reason = wrist.close_loop(command.wrist, t_ns, wrist_rad, experiment.limits.torque_nm)
             if reason:
@@ -297,10 +303,10 @@ class ControlLoop:
             action = None
         if still:
             velocity = wrist.hold()
-        elif isinstance(command.action, IdentifyStep) and wrist.excitation is not None:
-            velocity, ended = wrist.identify(wrist.excitation, t_ns, wrist_rad)
-            if ended is not None:
-                self.on_action_ended(ended)
+        elif isinstance(command.action, IdentifyStep) and (excitation := wrist.excitation) is not None:
+            velocity = wrist.identify(excitation, t_ns, wrist_rad)
+            if excitation.done:
+                self.on_action_ended(excitation.failure)
                 if not experiment.running:
                     return self._ended(decision)
         else:
@@ -309,14 +315,14 @@ class ControlLoop:
         self.status = LoopStatus(phase, awaited or command.activity, velocity, decision)
         return ControlOutput(velocity.speed_rad_per_s, interrupts_motion=still, action=action)
 
-    def _awaited_torques(self, experiment: Experiment, t_ns: int) -> str:
-        """Return which torques a step that turns the tool waits for after a grip or a tare, or an empty string.
+    def _awaited_torques(self, experiment: Experiment, t_ns: int) -> str | None:
+        """Return which torques a step that turns the tool waits for after a grip or a tare, or None.
 
         An estimator needs some frames of the new grip; a source without a torque after its `warm_up_s` is a fault.
         """
         since_ns = self._gripped.unmeasured_since_ns
         if since_ns is None or not (self._gripped.expected and _turns(experiment.command)):
-            return ""
+            return None
         awaited, reason = [], ""
         for name, source in self._sources.items():
             latest = self.inputs.torques.get(name)
@@ -327,7 +333,7 @@ class ControlLoop:
                 reason = latest.reason if latest is not None else ""
         if not awaited:
             self._gripped.unmeasured_since_ns = None
-            return ""
+            return None
         return f"waiting for the first torque of {', '.join(awaited)}{f': {reason}' if reason else ''}"
 
     def _forget_tool(self) -> None:

@@ -107,7 +107,7 @@ class Experiment:
         # The number of the present step, or of the last one, from 1.
         self.step_number = 0
         # A sentence when the step has exceeded its timeout.
-        self.overdue = ""
+        self.overdue: str | None = None
         self._t_ns = t_ns
         self._elapsed_s = self._step_began_s = 0.0
         self._program: StepProgram
@@ -166,10 +166,10 @@ class Experiment:
         begins, self._acting = not self._acting, True
         return begins
 
-    def end_action(self, error: str = "") -> bool:
+    def end_action(self, error: str | None = None) -> bool:
         """End the step with its action, or the experiment with an error; return whether an action was under way."""
         ends, self._acting = self._acting, False
-        if ends and error:
+        if ends and error is not None:
             self.stop(f"step {self.step_number} ({self.step.do}) failed: {error}")
         elif ends:
             self._begin_next()
@@ -201,7 +201,7 @@ class Experiment:
         self.stop(f"step {self.step_number} ({self.step.do}) cannot be done: {reason}")
 
     def _begin_next(self) -> None:
-        self.overdue, self._acting = "", False
+        self.overdue, self._acting = None, False
         while self.step_number < len(self.file.steps):
             self.step_number += 1
             self._step_began_s = self._elapsed_s

@@ -45,7 +45,7 @@ class Watched:
     grasp: Grasp = Grasp.NONE
     twisted_rad: float = 0.0
     expected_nm: float | None = None
-    overdue: str = ""
+    overdue: str | None = None
 
 
 def fresh_for_s(sources: Iterable[TorqueSource], config: LoopConfig) -> dict[str, float]:
@@ -85,7 +85,7 @@ def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_
         found.append(Fault(FaultCode.LOOP_LATE, f"the loop ran {inputs.late_s * 1e3:.0f} ms late"))
     if inputs.recording_error:
         found.append(Fault(FaultCode.RECORDING_FAILED, inputs.recording_error))
-    if watched.overdue:
+    if watched.overdue is not None:
         found.append(Fault(FaultCode.STEP_OVERDUE, watched.overdue))
     return found
 

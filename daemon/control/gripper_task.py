@@ -11,6 +11,7 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment_schema import GripStep, opening
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.loop_inputs import GripperStatus
+from shearloop.daemon.errors import ActionError
 from shearloop.daemon.messaging.messages import GripperStateMessage, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
@@ -45,43 +46,34 @@ class GripperTask:
                 self._publish(state)
                 self.control_loop.on_gripper(_status(state))
 
-    async def grip(self, target: GripStep) -> str:
-        """Move to a width and wait for the end; return an error, or an empty string."""
-        try:
-            await self.gripper.activate()
-            sent = await self.gripper.move(GripperCommand(target.width_mm, target.speed_mm_per_s, target.force_n))
-            state = await self.gripper.finish(sent)
-        except DriverError as error:
-            return str(error)
+    async def grip(self, target: GripStep) -> None:
+        """Move to a width and wait for the end; raises DriverError and ActionError."""
+        await self.gripper.activate()
+        sent = await self.gripper.move(GripperCommand(target.width_mm, target.speed_mm_per_s, target.force_n))
+        state = await self.gripper.finish(sent)
         # The loop needs the state before the end of the action.
         self.control_loop.on_gripper(_status(state))
         if state.object is ObjectStatus.CONTACT_OPENING and state.width_mm < target.width_mm - OPEN_WITHIN_MM:
-            return f"the fingers met something as they opened, and stopped at {state.width_mm:.1f} mm; clear their way"
+            stopped = f"the fingers met something as they opened, and stopped at {state.width_mm:.1f} mm"
+            raise ActionError(f"{stopped}; clear their way")
         if target.expect_object and state.diameter_mm is None:
-            return (
-                f"the fingers closed to {state.width_mm:.1f} mm and met nothing; "
-                "put the tool between them, or correct `width_mm`"
-            )
-        return ""
+            closed = f"the fingers closed to {state.width_mm:.1f} mm and met nothing"
+            raise ActionError(f"{closed}; put the tool between them, or correct `width_mm`")
 
-    async def release(self) -> str:
-        """Open wide; return an error, or an empty string."""
-        return await _tried(lambda: self.grip(OPENING))
+    async def release(self) -> None:
+        """Open wide; raises DriverError and ActionError."""
+        await _tried(lambda: self.grip(OPENING))
 
-    async def halt(self) -> str:
-        """Stop the fingers; return an error, or an empty string."""
-        return await _tried(self.gripper.halt)
+    async def halt(self) -> None:
+        """Stop the fingers; raises DriverError."""
+        await _tried(self.gripper.halt)
 
-    async def unlock(self) -> str:
-        """Activate again after a fault, once the operator says that the fingers are clear."""
-        try:
-            # Read now: the latest state may be older than the fault, and activating opens the fingers.
-            state = await self.gripper.read()
-            if state.fault.needs_activation:
-                await self.gripper.activate(operator_confirmed=True)
-        except DriverError as error:
-            return str(error)
-        return ""
+    async def unlock(self) -> None:
+        """Activate again after a fault, once the operator says that the fingers are clear; raises DriverError."""
+        # Read now: the latest state may be older than the fault, and activating opens the fingers.
+        state = await self.gripper.read()
+        if state.fault.needs_activation:
+            await self.gripper.activate(operator_confirmed=True)
 
     def held_tool(self, t_ns: int) -> Measured | None:
         """Return the diameter in mm of the held tool at t_ns, or None."""
@@ -115,16 +107,15 @@ class GripperTask:
         )
 
 
-async def _tried(act: Callable[[], Awaitable[str | None]]) -> str:
-    """Repeat an action until it succeeds; return its last error after a while, or an empty string."""
+async def _tried(act: Callable[[], Awaitable[None]]) -> None:
+    """Repeat an action until it succeeds; raises its last error after a while."""
     tries_until_s = asyncio.get_running_loop().time() + TRIED_FOR_S
     while True:
         try:
-            error = await act()
-        except DriverError as raised:
-            error = str(raised)
-        if not error or asyncio.get_running_loop().time() > tries_until_s:
-            return error or ""
+            return await act()
+        except (ActionError, DriverError):
+            if asyncio.get_running_loop().time() > tries_until_s:
+                raise
         await asyncio.sleep(TRIED_AGAIN_S)
 
 

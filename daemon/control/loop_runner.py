@@ -3,8 +3,9 @@
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
+from typing import Any
 
 import structlog
 
@@ -24,10 +25,12 @@ from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.control.stop_timeline import StopTimeline
+from shearloop.daemon.errors import ActionError
 from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateMessage
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensor_protocols import LONGEST_TARE_S, Adaptable, Tareable, tare_all
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH
+from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import (
     ARRIVED,
@@ -42,6 +45,7 @@ from shearloop.drivers.ur.messages import (
     ZeroForceTorque,
     tool_axis,
 )
+from shearloop.drivers.ur.settings import Six
 
 WRENCH = "wrench"
 # Without a new state the loop decides after this time, half of the time after which the arm's state is stale.
@@ -62,6 +66,9 @@ LINEAR_ACCELERATION_M_PER_S2 = 0.3
 COMES_TO_REST_S = 2.0
 # A tare gives up this much before its step is overdue, so that the sensors' reasons are reported.
 GIVES_UP_BEFORE_S = 0.1
+ENDING = "the daemon ends; start it again"
+# The columns of `robot.state` that the robot's state has under the same name.
+_SAME = {column.name for column in fields(RobotStateMessage)} - {"source", "joints_rad", "age_s"}
 
 
 def wrench_source(rate_hz: float) -> TorqueSource:
@@ -70,7 +77,7 @@ def wrench_source(rate_hz: float) -> TorqueSource:
 
 
 class ControlLoopRunner:
-    """Connects control loop, robot and gripper."""
+    """Connects control loop, robot and gripper, and carries out the operator's commands."""
 
     def __init__(
         self,
@@ -80,14 +87,11 @@ class ControlLoopRunner:
         sensors: Mapping[str, Tareable],
         publisher: Publisher,
         clock: Clock,
-        dead_tasks: Mapping[str, str],
     ) -> None:
-        """`sensors` are those that an experiment tares or adapts; `dead_tasks` has the error of each dead task."""
+        """`sensors` are those that an experiment tares or adapts."""
         self._control_loop = control_loop
         self._robot = robot
         self._clock = clock
-        self._dead_tasks = dead_tasks
-        self._acceleration_rad_per_s2 = control_loop.config.wrist_acceleration_rad_per_s2
         self._timeline = StopTimeline()
         self._sender = CommandSender(robot, control_loop, self._timeline, clock)
         self._actions = ActionExecutor(robot, gripper, sensors, self._sender, control_loop)
@@ -95,6 +99,9 @@ class ControlLoopRunner:
         self._running = False
         self._stopped = True
         self._decided_ns = 0
+        # Counts the stops, also while an experiment starts.
+        self._stop_count = 0
+        self._closed = False
 
     async def run(self) -> None:
         """Decide on each state until cancelled; the robot stands still afterwards.
@@ -126,8 +133,23 @@ class ControlLoopRunner:
             self._states.publish_stop(self._timeline.end())
             await self._actions.close()
 
-    def stop(self, reason: str) -> None:
-        """End the experiment on request, at the next decision."""
+    def stop(self) -> str | None:
+        """End the experiment, also during its start, or the unlocking; return its name, or None."""
+        self._stop_count += 1
+        if (experiment := self._control_loop.running) is None:
+            return "unlock" if self.stop_unlocking() else None
+        self._request_stop("the operator stopped it")
+        return experiment.file.name
+
+    def close(self) -> None:
+        """Stop the running experiment at the daemon's end, and start nothing more."""
+        self._stop_count, self._closed = self._stop_count + 1, True
+        if self._control_loop.running is not None:
+            self._request_stop("the daemon ended: the wrist is stopped, a gripped tool stays gripped")
+            # The loop is cancelled before the next state.
+            self.decide_now()
+
+    def _request_stop(self, reason: str) -> None:
         self._timeline.request(self._clock.now_ns())
         self._control_loop.stop(reason)
 
@@ -142,18 +164,21 @@ class ControlLoopRunner:
 
     async def start(self, file: ExperimentFile) -> str | None:
         """Begin an experiment; return None, or why it cannot begin."""
-        experiment = self._control_loop.experiment
-        if experiment is not None and experiment.running:
-            # The control loop refuses it; a stopped arm must not be enabled on the way.
-            return self._control_loop.start(file, self._clock.now_ns())
-        reply = await self._robot.send(Enable())
-        if not reply.accepted:
-            return reply.refusal
-        with suppress(TimeoutError):
-            async with asyncio.timeout(ENABLED_WITHIN_S):
-                while (state := await self._robot.next_state()).blocked:
-                    pass
-                self._take_state(state)
+        if self._closed:
+            return ENDING
+        stops_before = self._stop_count
+        # While an experiment runs the control loop refuses; a stopped arm must not be enabled on the way.
+        if self._control_loop.running is None:
+            reply = await self._robot.send(Enable())
+            if not reply.accepted:
+                return reply.refusal
+            with suppress(TimeoutError):
+                async with asyncio.timeout(ENABLED_WITHIN_S):
+                    while (state := await self._robot.next_state()).blocked:
+                        pass
+                    self._take_state(state)
+        if self._stop_count != stops_before:
+            return "it was stopped during its start"
         if self._actions.unlocking:
             return "robot and gripper are being unlocked; wait for the end"
         return self._control_loop.start(file, self._clock.now_ns())
@@ -182,11 +207,14 @@ class ControlLoopRunner:
 
     async def unlock(self) -> str | None:
         """Enable robot and gripper after a stop, on the operator's command; return None, or why not."""
-        experiment = self._control_loop.experiment
-        if experiment is not None and experiment.running:
+        if self._closed:
+            return ENDING
+        if (experiment := self._control_loop.running) is not None:
             return f"the experiment {experiment.file.name!r} is running; stop it first"
-        if error := await self._actions.unlock():
-            return error
+        try:
+            await self._actions.unlock()
+        except (ActionError, DriverError) as error:
+            return str(error)
         self._control_loop.acknowledge()
         return None
 
@@ -195,7 +223,7 @@ class ControlLoopRunner:
         stopped = self._actions.stop_unlocking()
         if stopped:
             # The robot's process ends its part.
-            self._robot.send(Stop(self._acceleration_rad_per_s2))
+            self._robot.send(self._sender.stop_command)
         return stopped
 
     def _take_state(self, state: RobotState) -> None:
@@ -222,7 +250,7 @@ class ControlLoopRunner:
         # From decision to decision, so that a slow decision is late as well.
         late_s = (now_ns - self._decided_ns) / 1e9 - (LONGEST_REST_S if self._stopped else LONGEST_TICK_S)
         self._decided_ns = now_ns
-        output = self._control_loop.tick(now_ns, max(0.0, late_s), self._dead_tasks)
+        output = self._control_loop.tick(now_ns, max(0.0, late_s))
         if output.ends_motion:
             self._stop(output, now_ns)
         else:
@@ -230,10 +258,10 @@ class ControlLoopRunner:
             if not output.interrupts_motion:
                 self._actions.may_move.set()
             elif self._actions.interrupt():
-                self._sender.send(Stop(self._acceleration_rad_per_s2))
+                self._sender.stop()
             if output.action is not None:
                 self._actions.begin(output.action)
-            self._sender.send(WristSpeed(output.wrist_rad_per_s, self._acceleration_rad_per_s2, now_ns))
+            self._sender.turn(output.wrist_rad_per_s, now_ns)
             self._robot.keep_moving()
         self._states.publish_loop(self._sender.sent_rad_per_s, now_ns)
         self._states.publish_stop(self._timeline.update(self._robot.state, now_ns))
@@ -245,7 +273,7 @@ class ControlLoopRunner:
             if experiment is not None and experiment.phase is ExperimentPhase.STOPPED:
                 self._timeline.begin(experiment.file.name, status.activity, status.decision, now_ns)
             self._actions.cancel()
-            self._sender.send(Stop(self._acceleration_rad_per_s2))
+            self._sender.stop()
         if output.release:
             self._actions.release()
 
@@ -254,7 +282,7 @@ class ControlLoopRunner:
         self._stopped = False
         try:
             async with asyncio.timeout(BRAKE_S):
-                await self._robot.send(Stop(self._acceleration_rad_per_s2))
+                await self._robot.send(self._sender.stop_command)
         except Exception:  # noqa: BLE001 - the loop's own error is raised
             structlog.get_logger().exception("the arm could not be stopped")
 
@@ -272,13 +300,22 @@ class CommandSender:
     # Commands that wait for their replies.
     unanswered: int = 0
 
-    def send(self, command: WristSpeed | Stop) -> None:
-        """Send a stop of the arm, or a wrist speed.
+    @property
+    def stop_command(self) -> Stop:
+        """The stop of the arm, including a straight move."""
+        return Stop(self.control_loop.config.wrist_acceleration_rad_per_s2)
 
-        A speed is dropped if the wrist stands still already, or if a command waits for its reply.
-        """
-        if isinstance(command, WristSpeed) and (self.unanswered or not (command.rad_per_s or self.sent_rad_per_s)):
-            return
+    def stop(self) -> None:
+        """Stop the arm."""
+        self._send(self.stop_command)
+
+    def turn(self, rad_per_s: float, decided_ns: int) -> None:
+        """Turn the wrist, unless it stands still already or a command waits for its reply."""
+        if not self.unanswered and (rad_per_s or self.sent_rad_per_s):
+            acceleration_rad_per_s2 = self.control_loop.config.wrist_acceleration_rad_per_s2
+            self._send(WristSpeed(rad_per_s, acceleration_rad_per_s2, decided_ns))
+
+    def _send(self, command: WristSpeed | Stop) -> None:
         self.unanswered += 1
         try:
             self.robot.send(command).add_done_callback(self._on_reply)
@@ -324,7 +361,7 @@ class ActionExecutor:
     _task: asyncio.Task[None] | None = None
     # The last action of a stop: to open the gripper, or to halt its fingers.
     _final_task: asyncio.Task[None] | None = None
-    _unlocking: asyncio.Task[str] | None = None
+    _unlocking: asyncio.Task[None] | None = None
 
     @property
     def unlocking(self) -> bool:
@@ -333,40 +370,38 @@ class ActionExecutor:
 
     def begin(self, action: Action) -> None:
         """Carry out an action, and report its end to the control loop."""
-        self._start(partial(self._run, action), self.control_loop.on_action_ended)
+        self._start(action.do, partial(self._run, action), self.control_loop.on_action_ended)
 
     def release(self) -> None:
         """Open the gripper after a stop."""
         if self.gripper is not None:
-            self._start(self.gripper.release, self._on_released)
-            self._final_task = self._task
+            self._final_task = self._start("open", self.gripper.release, self.control_loop.on_release_ended)
 
     def cancel(self) -> None:
         """Cancel the present action; moving fingers are halted."""
         fingers_move, self.fingers_move = self.fingers_move, False
         if fingers_move and self.gripper is not None:
-            self._start(self.gripper.halt, self._on_halted)
-            self._final_task = self._task
+            self._final_task = self._start("halt", self.gripper.halt, self._on_halted)
         elif self._task is not None:
             self._task.cancel()
 
-    async def unlock(self) -> str:
-        """Enable robot and gripper while no experiment runs; return why not, or an empty string."""
+    async def unlock(self) -> None:
+        """Enable robot and gripper while no experiment runs; raises DriverError and ActionError."""
         if self.unlocking:
-            return "unlocking is under way"
+            raise ActionError("unlocking is under way")
         task = self._unlocking = asyncio.create_task(self._unlock(), name="unlock")
         await asyncio.wait([task])
-        return "unlocking was stopped; send `unlock` again" if task.cancelled() else task.result()
+        if task.cancelled():
+            raise ActionError("unlocking was stopped; send `unlock` again")
+        task.result()
 
-    async def _unlock(self) -> str:
-        reply = await self.robot.send(Unlock())
-        if not reply.accepted or self.gripper is None:
-            return reply.refusal
-        # An activation opens and closes the fingers.
-        self.fingers_move = True
-        error = await self.gripper.unlock()
-        self.fingers_move = bool(error)
-        return error
+    async def _unlock(self) -> None:
+        _accepted(await self.robot.send(Unlock()))
+        if self.gripper is not None:
+            # An activation opens and closes the fingers; after a failure they may still move.
+            self.fingers_move = True
+            await self.gripper.unlock()
+            self.fingers_move = False
 
     def stop_unlocking(self) -> bool:
         """End an unlocking, and halt the fingers that it moves; return whether one was under way."""
@@ -402,64 +437,61 @@ class ActionExecutor:
         self._interrupted = self._interrupted or stop
         return stop
 
-    def _start(self, act: Callable[[], Awaitable[str]], on_ended: Callable[[str], None]) -> None:
-        """Run an action in a task; `on_ended` receives its error, or an empty string."""
+    def _start(
+        self, name: str, act: Callable[[], Awaitable[None]], on_ended: Callable[[str | None], None]
+    ) -> asyncio.Task[None]:
+        """Run an action in a task; `on_ended` receives None, or why it failed."""
         if self._task is not None:
             self._task.cancel()
 
         async def run_action() -> None:
+            error = None
             try:
-                error = await act()
+                await act()
+            except (ActionError, DriverError) as refused:
+                error = str(refused)
+                structlog.get_logger().error("an action of the devices failed", action=name, reason=error)
             except Exception as exception:  # noqa: BLE001 - any error fails the step
-                structlog.get_logger().exception("an action of the devices crashed")
+                structlog.get_logger().exception("an action of the devices crashed", action=name)
                 error = f"it crashed with {error_text(exception)}; the log has more"
             on_ended(error)
 
         self._task = asyncio.create_task(run_action(), name="action")
+        return self._task
 
-    def _on_released(self, error: str) -> None:
-        if error:
-            structlog.get_logger().error("the gripper did not open", reason=error)
-        self.control_loop.on_release_ended(error)
-
-    def _on_halted(self, error: str) -> None:
-        if error:
-            structlog.get_logger().error("the fingers did not stop", reason=error)
+    def _on_halted(self, error: str | None) -> None:
+        if error is not None:
             detail = f"the fingers did not stop, keep clear of them: {error}"
             self.control_loop.on_fault(FaultCode.COMMAND_REFUSED, detail)
 
-    async def _run(self, action: Action) -> str:
-        """Carry out an action; return an error, or an empty string."""
+    async def _run(self, action: Action) -> None:
+        """Carry out an action; raises DriverError and ActionError."""
         match action:
             case ApproachStep():
-                return await self._move(action)
+                await self._move(action)
             case GripStep():
                 if self.gripper is None:
-                    return "no gripper is configured; add a `gripper` section to the configuration"
-                self.fingers_move = True
+                    raise ActionError("no gripper is configured; add a `gripper` section to the configuration")
                 # After a failure, such as a lost connection, the fingers may still move.
-                error = await self.gripper.grip(action)
-                self.fingers_move = bool(error)
-                return error
+                self.fingers_move = True
+                await self.gripper.grip(action)
+                self.fingers_move = False
             case TareStep():
                 loop, longest_s = asyncio.get_running_loop(), action.timeout_s or LONGEST_TARE_S
                 until_s = loop.time() + longest_s - GIVES_UP_BEFORE_S
-                if error := await self._rest():
-                    return error
-                reply = await self.robot.send(ZeroForceTorque())
-                if not reply.accepted:
-                    return reply.refusal
-                return await tare_all(self.sensors.values(), until_s - loop.time())
+                await self._rest()
+                _accepted(await self.robot.send(ZeroForceTorque()))
+                await tare_all(self.sensors.values(), until_s - loop.time())
             case AdaptStep():
                 sensor = self.sensors.get(action.fingertip)
                 if not isinstance(sensor, Adaptable):
-                    return f"{action.fingertip} is not a fingertip; name one that is calibrated on recordings"
-                return await sensor.adapt(action.reference)
+                    raise ActionError(f"{action.fingertip} is not a fingertip; name one calibrated on recordings")
+                await sensor.adapt(action.reference)
             case IdentifyStep():
                 raise TypeError("the control loop identifies by itself")
 
-    async def _rest(self) -> str:
-        """Wait until no motion is under way; return an error, or an empty string.
+    async def _rest(self) -> None:
+        """Wait until no motion is under way; raises ActionError.
 
         Resting joints are not enough: after a stop the robot's process is busy a little longer, and refuses a move.
         """
@@ -470,35 +502,35 @@ class ActionExecutor:
                 while sender.sent_rad_per_s or sender.unanswered or state.motion != "idle" or not state.rests:
                     state = await self.robot.next_state()
         except TimeoutError:
-            return f"the arm did not come to rest within {COMES_TO_REST_S:g} s; check what moves it"
-        return ""
+            what = f"the arm did not come to rest within {COMES_TO_REST_S:g} s"
+            raise ActionError(f"{what}; check what moves it") from None
 
-    async def _move(self, action: ApproachStep) -> str:
-        pose: tuple[float, ...] | None = action.pose_m_rad
+    async def _move(self, action: ApproachStep) -> None:
+        pose = action.pose_m_rad
         while True:
             await self.may_move.wait()
-            if error := await self._rest():
-                return error
+            await self._rest()
             # The loop may have interrupted the move during the wait.
             if not self.may_move.is_set():
                 continue
             here = self.robot.state
             if here is None:
-                return "the robot is not connected"
+                raise ActionError("the robot is not connected")
             # The goal is fixed at the first start, so that an interruption does not lengthen the move.
             pose = pose or along_tool(here.tcp_pose, action.along_tool_m or 0.0)
-            x, y, z, rx, ry, rz = pose
-            command = MoveLinear((x, y, z, rx, ry, rz), action.speed_m_per_s, LINEAR_ACCELERATION_M_PER_S2)
+            command = MoveLinear(pose, action.speed_m_per_s, LINEAR_ACCELERATION_M_PER_S2)
             self._moving, self._interrupted = True, False
             try:
                 error = await self._move_once(command, here.motion_id)
             finally:
                 self._moving = False
-            if not (error and self._interrupted):
-                return error
+            if error is None:
+                return
+            if not self._interrupted:
+                raise ActionError(error)
 
-    async def _move_once(self, command: MoveLinear, previous_id: int) -> str:
-        """Send a straight move and wait for its end; return an error, or an empty string."""
+    async def _move_once(self, command: MoveLinear, previous_id: int) -> str | None:
+        """Send a straight move and wait for its end; return None, or why it did not arrive."""
         reply = await self.robot.send(command)
         if not reply.accepted:
             return reply.refusal
@@ -510,14 +542,20 @@ class ActionExecutor:
                 if state.end_reason not in (ARRIVED, STOPPED_ON_COMMAND):
                     # It ended by itself, just before an interruption; do not repeat it.
                     self._interrupted = False
-                return "" if state.end_reason == ARRIVED else f"the move ended early: {state.end_reason}"
+                return None if state.end_reason == ARRIVED else f"the move ended early: {state.end_reason}"
 
 
-def along_tool(pose: tuple[float, ...], distance_m: float) -> tuple[float, ...]:
+def _accepted(reply: CommandReply) -> None:
+    """Raise ActionError for a command that the robot's process refused."""
+    if not reply.accepted:
+        raise ActionError(reply.refusal)
+
+
+def along_tool(pose: Six, distance_m: float) -> Six:
     """Return the pose (x, y, z in m, rotation vector in rad) at a distance along the tool's axis."""
-    x, y, z, *turned = pose
+    x, y, z, rx, ry, rz = pose
     dx, dy, dz = tool_axis(pose)
-    return (x + dx * distance_m, y + dy * distance_m, z + dz * distance_m, *turned)
+    return x + dx * distance_m, y + dy * distance_m, z + dz * distance_m, rx, ry, rz
 
 
 @dataclass(slots=True)
@@ -539,28 +577,9 @@ class StatePublisher:
         if (block := state.cycle // PUBLISH_EVERY) == self._block:
             return False
         self._block = block
-        message = RobotStateMessage(
-            source="robot",
-            t_mono_ns=state.t_mono_ns,
-            joints_rad=state.q_rad,
-            tcp_pose=state.tcp_pose,
-            tcp_speed_m_per_s=state.tcp_speed_m_per_s,
-            wrench=state.wrench,
-            wrist_rad=state.wrist_rad,
-            wrist_speed_rad_per_s=state.wrist_speed_rad_per_s,
-            wrist_torque_nm=state.wrist_torque_nm,
-            robot_mode=state.robot_mode,
-            safety_mode=state.safety_mode,
-            speed_scaling=state.speed_scaling,
-            payload_kg=state.payload_kg,
-            payload_cog_m=state.payload_cog_m,
-            tcp_offset=state.tcp_offset,
-            protective_stop=state.protective_stop,
-            emergency_stop=state.emergency_stop,
-            blocked=state.blocked,
-            age_s=state.age_ns / 1e9,
-        )
-        self.publisher.publish(message)
+        same: dict[str, Any] = {name: getattr(state, name) for name in _SAME}
+        age_s = state.age_ns / 1e9
+        self.publisher.publish(RobotStateMessage(source="robot", joints_rad=state.q_rad, age_s=age_s, **same))
         return True
 
     def publish_loop(self, sent_rad_per_s: float, now_ns: int) -> None:

@@ -113,13 +113,13 @@ class WristController:
             )
         )
 
-    def identify(self, excitation: StiffnessExcitation, t_ns: int, wrist_rad: float) -> tuple[WristCommand, str | None]:
-        """Return the identification's speed, and at its end "" or an error."""
+    def identify(self, excitation: StiffnessExcitation, t_ns: int, wrist_rad: float) -> WristCommand:
+        """Return the identification's speed, and take its result once it is done."""
         speed_rad_per_s = excitation.command(t_ns, wrist_rad)
         if not excitation.done:
-            return WristCommand(speed_rad_per_s), None
+            return WristCommand(speed_rad_per_s)
         self.tool, self.excitation = excitation.result, None
-        return WristCommand(), excitation.failure or ""
+        return WristCommand()
 
     def hold(self) -> WristCommand:
         """Stand still; the next `turn` continues without a jump."""

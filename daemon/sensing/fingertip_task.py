@@ -16,6 +16,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import TorqueSample
+from shearloop.daemon.errors import ActionError
 from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFrame, EitHeatmap
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.fingertip_diameters import tool_as_bytes
@@ -124,7 +125,7 @@ class FingertipPipeline:
     _tare: _Tare = field(default_factory=_Tare)
     _held: Measured | None = None
     # The source of the known torque of a correction that waits for the next frame, and its result.
-    _adapting: tuple[str, asyncio.Future[str]] | None = None
+    _adapting: tuple[str, asyncio.Future[None]] | None = None
 
     async def process(self, *frames: Frame) -> None:
         """Estimate from the frames of one time, hand the estimate to the control loop, and publish it."""
@@ -141,7 +142,11 @@ class FingertipPipeline:
         if self._adapting is not None:
             reference, ended = self._adapting
             if not ended.done():
-                ended.set_result(self._adapt(reference, frames, now_ns))
+                try:
+                    self._adapt(reference, frames, now_ns)
+                    ended.set_result(None)
+                except CalibrationError as error:
+                    ended.set_exception(error)
         estimate = await self.estimator.estimate(*frames)
         now_ns = self.clock.now_ns()
         message = estimate_message(self.name, frames, estimate, now_ns)
@@ -158,8 +163,8 @@ class FingertipPipeline:
         """Take a new idle frame from frames acquired entirely after now."""
         self._tare.begin(self.clock.now_ns())
 
-    async def tare_and_wait(self, within_s: float) -> str:
-        """Take a new idle frame and wait until it is complete; return why it is not, or an empty text."""
+    async def tare_and_wait(self, within_s: float) -> str | None:
+        """Take a new idle frame and wait until it is complete; return None, or why it is not."""
         self.tare()
         try:
             async with asyncio.timeout(within_s):
@@ -170,30 +175,28 @@ class FingertipPipeline:
         finally:
             # Frames that come later could be of any load.
             self._tare.give_up()
-        return ""
+        return None
 
-    async def adapt(self, reference: str) -> str:
-        """Correct the gain by this source's torque during this grip; return why not, or an empty text."""
-        ended: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+    async def adapt(self, reference: str) -> None:
+        """Correct the gain by this source's torque during this grip; raises ActionError."""
+        ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._adapting = reference, ended
         try:
             async with asyncio.timeout(_LONGEST_WAIT_S):
-                return await ended
+                await ended
         except TimeoutError:
-            return f"{self.name} sent no frame within {_LONGEST_WAIT_S:g} s; check its board"
+            raise ActionError(f"{self.name} sent no frame within {_LONGEST_WAIT_S:g} s; check its board") from None
+        except CalibrationError as error:
+            raise ActionError(f"{self.name} against {reference}: {error}") from error
         finally:
             self._adapting = None
 
-    def _adapt(self, reference: str, frames: tuple[Frame, ...], now_ns: int) -> str:
+    def _adapt(self, reference: str, frames: tuple[Frame, ...], now_ns: int) -> None:
         times_ns, torques_nm = self.loop.inputs.history.get(reference, ([], [])) if self.loop else ([], [])
         torque_nm = torque_at(self.estimator.session.grip_t_s, np.array(times_ns) / 1e9, np.array(torques_nm))
-        try:
-            adaptation = self.estimator.session.adapt(torque_nm)
-        except CalibrationError as error:
-            return f"{self.name} against {reference}: {error}"
+        adaptation = self.estimator.session.adapt(torque_nm)
         self._record(InputKind.ADAPT, now_ns, torques_as_bytes(frames[0].seq, reference, torque_nm))
         self.publisher.publish(adapted_message(self.name, frames, reference, adaptation))
-        return ""
 
     def _record(self, kind: InputKind, t_ns: int, data: bytes) -> None:
         if self.inputs is not None:

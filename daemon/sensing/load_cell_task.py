@@ -37,7 +37,7 @@ class LoadCellTask:
         # The raw values of a zero in progress, and the times between which it is taken.
         self._zeroing: list[float] | None = None
         self._zero_from_ns = self._zero_until_ns = 0
-        self._zero_error = ""
+        self._zero_error: str | None = None
         self._sampled = asyncio.Event()
         self._reason = ""
 
@@ -57,14 +57,14 @@ class LoadCellTask:
 
     def tare(self) -> None:
         """Make the mean of samples measured from now on the zero; samples under way belong to the load before."""
-        self._zeroing, self._zero_error = [], ""
+        self._zeroing, self._zero_error = [], None
         now_ns = self._clock.now_ns()
         # The middle of the first settled reading.
         self._zero_from_ns = now_ns + round((SETTLING_PERIODS - 0.5) * self._period_s * 1e9)
         self._zero_until_ns = now_ns + round(self._timeout_s * 1e9)
 
-    async def tare_and_wait(self, within_s: float) -> str:
-        """Take a new zero and wait until it is done; return the reason of a failure, else an empty text."""
+    async def tare_and_wait(self, within_s: float) -> str | None:
+        """Take a new zero and wait until it is done; return None, or why it was not taken."""
         self.tare()
         own, within_s = self._zeroing, min(self._timeout_s, within_s)
         try:
@@ -83,7 +83,7 @@ class LoadCellTask:
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the board's values for `health`."""
         found = self._board.diagnostics()
-        error = self._zero_error if found["connected"] else found["last_loss"]
+        error = (self._zero_error or "") if found["connected"] else found["last_loss"]
         return {**found, "expected_hz": 1.0 / self._period_s, "error": error}
 
     def _not_taken(self, within_s: float) -> str:

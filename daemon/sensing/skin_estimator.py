@@ -169,7 +169,7 @@ class SkinEstimator:
         self._zero_from_ns = from_ns
         self._taker = SkinZeroTaker(self._zero_samples, self._calibration.rest_ohm, self._calibration.slope_per_n)
         self.zero: SkinZero | None = None
-        self.refused = ""
+        self.refused: str | None = None
 
     @property
     def drift_per_hour(self) -> float:
@@ -185,8 +185,10 @@ class SkinEstimator:
             # The measurement lasts as long before its middle as after it.
             if 2 * sample.t_mid_ns - sample.t_arrival_ns < self._zero_from_ns:
                 return SkinReading(reasons=("measured before the zero was asked for",))
-            if (waiting := self._take_zero(sample.r1_ohm, sample.r2_ohm, sample.t_mid_ns)) or self.zero is None:
-                return SkinReading(reasons=(waiting,))
+            self._take_zero(sample.r1_ohm, sample.r2_ohm, sample.t_mid_ns)
+        if self.zero is None:
+            refused = f"the zero was refused and is taken again: {self.refused}"
+            return SkinReading(reasons=(refused if self.refused else f"taking the zero, {self._taker.progress}",))
         if sample.missed:
             self._forget_direction()
         response_1, response_2 = self.zero.changes(sample.r1_ohm, sample.r2_ohm)
@@ -204,20 +206,16 @@ class SkinEstimator:
         interval = ShearInterval(band.shear_n, min(interval.low_n, band.shear_n), max(interval.high_n, band.shear_n))
         return SkinReading(response_1, response_2, band, interval, direction)
 
-    def _take_zero(self, r1_ohm: float, r2_ohm: float, t_mid_ns: int) -> str:
-        """Use a sample for the zero; return the reason to wait, empty once the zero is there."""
+    def _take_zero(self, r1_ohm: float, r2_ohm: float, t_mid_ns: int) -> None:
+        """Use a sample for the zero, which may be complete then, or refused."""
         found = self._taker.add(r1_ohm, r2_ohm)
         if isinstance(found, SkinZero):
-            self.zero, self._zero_s, self.refused = found, t_mid_ns / 1e9, ""
+            self.zero, self._zero_s, self.refused = found, t_mid_ns / 1e9, None
             self._learn_drift(found)
             self._finder = DirectionFinder(found.noise)
             self._follower = ForceFollower(self._calibration, self._finder.threshold)
-            return ""
-        if found is not None:
+        elif found is not None:
             self.refused = found
-        if self.refused:
-            return f"the zero was refused and is taken again: {self.refused}"
-        return f"taking the zero, {self._taker.progress}"
 
     def _learn_drift(self, zero: SkinZero) -> None:
         """Compare with the last zero: loads come and go in between, a drift stays."""

@@ -114,8 +114,8 @@ class SkinTask:
         self._skin.restart_average()
         self._estimator.tare(now_ns)
 
-    async def tare_and_wait(self, within_s: float) -> str:
-        """Take a new zero and wait until it is done; return the reason of a failure, else an empty text."""
+    async def tare_and_wait(self, within_s: float) -> str | None:
+        """Take a new zero and wait until it is done; return None, or why it was not taken."""
         self.tare()
         within_s = min(self._zero_timeout_s, within_s)
         try:
@@ -125,7 +125,7 @@ class SkinTask:
         except TimeoutError:
             reason = self._reason or "nothing came"
             return f"the skin's zero could not be taken within {within_s:.3g} s: {reason}"
-        return f"the skin's zero was refused: {self._estimator.refused}" if self._estimator.refused else ""
+        return f"the skin's zero was refused: {self._estimator.refused}" if self._estimator.refused else None
 
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the values of voltages, zero and force for `health`."""

@@ -52,7 +52,7 @@ async def reading(rate_hz: float = 10.9) -> AsyncIterator[tuple[LoadCellTask, Bo
         yield task, board
 
 
-async def asked(task: LoadCellTask) -> asyncio.Task[str]:
+async def asked(task: LoadCellTask) -> asyncio.Task[str | None]:
     zero = asyncio.create_task(task.tare_and_wait(60.0))
     await asyncio.sleep(0)
     return zero
@@ -65,7 +65,7 @@ async def test_whoever_waits_for_a_zero_is_told_though_another_asks_meanwhile():
         second = await asked(task)
         await board.send(7.0)
         async with asyncio.timeout(10):
-            assert await asyncio.gather(first, second) == ["", ""]
+            assert await asyncio.gather(first, second) == [None, None]
         assert board.tares == [7.0], "a zero is of the samples after it was asked for"
 
 

@@ -131,31 +131,28 @@ class StepClock(Clock):
 
 
 class Gripper:
-    """A gripper's task as the loop knows it; `answers` is what it says, or raises, once it is `there`."""
+    """A gripper's task as the loop knows it; `error` is what it raises, if anything, once it is `there`."""
 
     def __init__(self) -> None:
-        self.answers: str | Exception = ""
+        self.error: Exception | None = None
         self.there = asyncio.Event()
         self.there.set()
         self.asked: list[str] = []
 
-    async def grip(self, _wish: GripStep) -> str:
+    async def grip(self, _wish: GripStep) -> None:
         self.asked.append("grip")
         await self.there.wait()
-        if isinstance(self.answers, Exception):
-            raise self.answers
-        return self.answers
+        if self.error is not None:
+            raise self.error
 
-    async def halt(self) -> str:
+    async def halt(self) -> None:
         self.asked.append("halt")
-        return ""
 
-    async def release(self) -> str:
-        return await self.grip(OPENING)
+    async def release(self) -> None:
+        await self.grip(OPENING)
 
-    async def unlock(self) -> str:
+    async def unlock(self) -> None:
         await self.there.wait()
-        return ""
 
 
 class Published:
@@ -182,12 +179,10 @@ class Cell:
     def __init__(self) -> None:
         self.robot, self.gripper, self.published = Robot(), Gripper(), Published()
         source = wrench_source(SETTINGS.rate_hz)
-        self.control_loop = ControlLoop(LoopConfig(), {WRENCH: source}, ("robot",))
         self.died: dict[str, str] = {}
-
-        self.runner = ControlLoopRunner(
-            self.control_loop, self.robot, self.gripper, {}, self.published, StepClock(self.robot.flight), self.died
-        )
+        self.control_loop = ControlLoop(LoopConfig(), {WRENCH: source}, ("robot",), dead_tasks=self.died)
+        clock = StepClock(self.robot.flight)
+        self.runner = ControlLoopRunner(self.control_loop, self.robot, self.gripper, {}, self.published, clock)
         self.task: asyncio.Task[None] | None = None
 
     def drive(self) -> None:

@@ -46,7 +46,6 @@ class Rig:
         self.begun: list[Action] = []
         self.orders = ControlOutput()
         self.true_nm: list[float] = []
-        self.died: dict[str, str] = {}
 
     @property
     def t_ns(self) -> int:
@@ -63,7 +62,7 @@ class Rig:
             if self.tick >= due:
                 self.pending.remove((due, action))
                 self._finish(action)
-        orders = self.orders = self.control_loop.tick(self.t_ns, 0.0, self.died)
+        orders = self.orders = self.control_loop.tick(self.t_ns)
         self.speed = 0.0 if orders.ends_motion else orders.wrist_rad_per_s
         self.control_loop.on_speed_sent(self.speed)
         if orders.release:

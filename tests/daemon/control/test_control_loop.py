@@ -302,7 +302,7 @@ def test_a_supervising_sensor_that_is_gone_holds_the_wrist_at_once_and_says_whic
 
 def test_a_task_that_died_stops_the_wrist_and_says_of_what():
     rig = twisting()
-    rig.died = {"right": "ValueError: no number"}
+    rig.control_loop.inputs.died = {"right": "ValueError: no number"}
     rig.step()
     assert phase(rig) is ExperimentPhase.STOPPED
     assert "right: ValueError: no number" in rig.control_loop.status.decision.reasons[0]

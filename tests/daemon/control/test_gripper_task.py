@@ -14,7 +14,9 @@ from shearloop.daemon.control.experiment_schema import GripStep
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import GripperStatus
+from shearloop.daemon.errors import ActionError
 from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
+from shearloop.drivers.errors import DriverError
 from tests.daemon.conftest import DEADLINE_S
 from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
 
@@ -56,7 +58,7 @@ async def test_cancelled_grip_can_be_released(way, tmp_path):
             for _ in range(turns):
                 await asyncio.sleep(0)
             grip.cancel()
-            assert await task.release() == ""
+            await task.release()
             assert rig.model.width_mm > 130.0
 
 
@@ -66,13 +68,13 @@ async def test_cancelled_grip_is_halted_and_stays_connected(way, tmp_path):
         assert felt[-1].uncertain, "a gripper without power may hold a tool"
         await rig.driver.activate()
         for turns in range(1, 40, 3):
-            assert await task.release() == ""
+            await task.release()
             assert not felt[-1].uncertain
             grip = asyncio.create_task(task.grip(GRIP))
             for _ in range(turns):
                 await asyncio.sleep(0)
             grip.cancel()
-            assert await task.halt() == ""
+            await task.halt()
             halted_mm = rig.model.width_mm
             for _ in range(200):
                 await asyncio.sleep(0)
@@ -87,17 +89,18 @@ async def test_cancelled_grip_is_halted_and_stays_connected(way, tmp_path):
 @WAYS
 async def test_halt_stops_the_fingers_after_a_reconnection(way, tmp_path):
     async with reading(way, tmp_path, reply_deadline_s=0.2) as (rig, task, _):
-        assert await task.release() == ""
+        await task.release()
         grip = asyncio.create_task(task.grip(GRIP))
         while rig.model.width_mm > 120.0:  # noqa: ASYNC110 - the model is looked at, as it moves
             await asyncio.sleep(0)
         rig.silence(True)
         rig.stopped = True
-        assert await grip, "the error"
+        with pytest.raises(DriverError):
+            await grip
         halt = asyncio.create_task(task.halt())
         await rig.link.down(len(rig.link.losses) + 1)
         rig.silence(False)
-        assert await halt == ""
+        await halt
         rig.model.step(STEP_S)
         assert not rig.model.taken.gto
         assert rig.model.width_mm > 110.0
@@ -111,16 +114,14 @@ async def test_cancelled_activation_stops_the_fingers(way, tmp_path):
         while rig.model.width_mm < 100.0:  # noqa: ASYNC110 - the model is looked at, as it moves
             await asyncio.sleep(0)
         grip.cancel()
-        assert await task.halt() == ""
+        await task.halt()
         rig.model.step(STEP_S)
         halted_mm = rig.model.width_mm
         for _ in range(200):
             await asyncio.sleep(0)
         assert rig.model.width_mm == halted_mm
-        assert (
-            await task.grip(GRIP) == "the fingers closed to 0.0 mm and met nothing; put the tool between them, or "
-            "correct `width_mm`"
-        )
+        with pytest.raises(ActionError, match=r"closed to 0\.0 mm and met nothing; put the tool between them"):
+            await task.grip(GRIP)
 
 
 @WAYS
@@ -129,11 +130,12 @@ async def test_fingers_that_meet_something_as_they_open_are_not_released(way, tm
     async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
         rig.model.object_mm = 40.0
         task = task_of(rig)
-        assert await task.grip(GRIP) == ""
+        await task.grip(GRIP)
         rig.model.widest_mm = 40.0
-        assert "met something as they opened, and stopped at 40.1 mm" in await task.release()
+        with pytest.raises(ActionError, match=r"met something as they opened, and stopped at 40\.1 mm"):
+            await task.release()
         rig.model.widest_mm = 139.0
-        assert await task.release() == "", "their own stop"
+        await task.release()
 
 
 @WAYS
@@ -141,16 +143,16 @@ async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way, tmp_pat
     async with a_rig(way, tmp_path, connected=True) as rig, asyncio.timeout(DEADLINE_S):
         rig.model.object_mm = 40.0
         task = task_of(rig)
-        assert await task.grip(GRIP) == ""
+        await task.grip(GRIP)
         held_mm = rig.model.width_mm
         rig.driver.latest = None
-        assert await task.unlock() == ""
+        await task.unlock()
         for _ in range(200):
             await asyncio.sleep(0)
         assert rig.model.width_mm == held_mm
         rig.model.fail(12)
         assert "internal fault" in gripper_task._status(await rig.driver.read()).fault
-        assert await task.unlock() == ""
+        await task.unlock()
         assert not (await rig.driver.read()).fault.needs_activation
 
 
@@ -159,7 +161,7 @@ async def test_unlock_handles_a_fault_newer_than_the_state(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
         assert not (await rig.driver.read()).fault.needs_activation
         rig.model.fail(12)
-        assert await task_of(rig).unlock() == ""
+        await task_of(rig).unlock()
         assert not (await rig.driver.read()).fault.needs_activation
 
 
@@ -169,18 +171,19 @@ async def test_held_tool_has_a_diameter_while_states_are_new(tmp_path):
         task = task_of(rig)
         assert task.held_tool(0) is None, "nothing was read yet"
         await rig.driver.connect()
-        assert await task.grip(GRIP) == ""
+        await task.grip(GRIP)
         state = await rig.driver.read()
         tool = task.held_tool(state.t_ns)
         assert tool.half_width == pytest.approx(TWO_SIDED_95 * state.width_std_mm)
         assert abs(tool.value - 40.0) < tool.half_width
         assert task.held_tool(state.t_ns + round(HAND_STALE_S * 1e9) + 1) is None
         assert task_of(rig, measures_diameters=False).held_tool(state.t_ns) is None, "the maker's widths are no gauge"
-        assert await task.release() == ""
+        await task.release()
         assert task.held_tool((await rig.driver.read()).t_ns) is None
 
 
 async def test_absent_gripper_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(gripper_task, "TRIED_FOR_S", 0.2)
     async with a_rig("socket", tmp_path) as rig:
-        assert "There is no connection to the gripper" in await task_of(rig).release()
+        with pytest.raises(DriverError, match="There is no connection to the gripper"):
+            await task_of(rig).release()

@@ -7,9 +7,11 @@ import pytest
 
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.loop_runner import WRENCH
+from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner
 from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.errors import ActionError
 from shearloop.daemon.messaging.messages import LoopStop
+from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.messages import MoveLinear, Stop, WristSpeed
 from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, driven, experiment, no_tick
 from tests.drivers.ur.flight import SETTINGS
@@ -17,16 +19,16 @@ from tests.drivers.ur.flight import SETTINGS
 
 async def test_an_action_that_dies_fails_its_step_and_is_told():
     async with driven() as cell:
-        cell.gripper.answers = RuntimeError("no such register")
+        cell.gripper.error = RuntimeError("no such register")
         await cell.start(GRIP)
         await cell.until_ended(50)
         assert "step 1 (grip) failed: it crashed with RuntimeError: no such register" in cell.why
 
 
-@pytest.mark.parametrize("answer", ["the gripper does not answer", OSError("the gripper does not answer")])
-async def test_a_gripper_that_does_not_open_after_a_stop_is_told_until_the_operator_says_unlock(answer):
+@pytest.mark.parametrize("kind", [ActionError, DriverError, OSError])
+async def test_a_gripper_that_does_not_open_after_a_stop_is_told_until_the_operator_says_unlock(kind):
     async with driven({"do": "wait", "wait_s": 60}) as cell:
-        cell.gripper.answers = answer
+        cell.gripper.error = kind("the gripper does not answer")
         cell.exceed_torque()
         await cell.until_ended(10)
         await cell.cycles(50)
@@ -141,10 +143,10 @@ async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch
     async with driven({"do": "wait", "wait_s": 60}) as cell:
         heard, answered = asyncio.Event(), asyncio.Event()
 
-        async def at_length() -> str:
+        async def at_length() -> None:
             heard.set()
             await answered.wait()
-            return "it did not open"
+            raise ActionError("it did not open")
 
         monkeypatch.setattr(cell.gripper, "release", at_length)
         cell.exceed_torque()
@@ -183,6 +185,25 @@ async def test_a_loop_that_dies_as_a_straight_move_is_to_begin_leaves_the_arm_at
             await cell.cycles(5)
             await cell.loop_died()
             assert cell.state.motion == "idle", cell.robot.commands
+
+
+@pytest.mark.parametrize("how", [ControlLoopRunner.stop, ControlLoopRunner.close])
+async def test_a_stop_during_the_start_of_an_experiment_counts(how):
+    async with driven() as cell:
+        starting = asyncio.create_task(cell.runner.start(experiment(TWIST)))
+        await asyncio.sleep(0)
+        how(cell.runner)
+        await cell.cycles(10)
+        assert await starting == "it was stopped during its start"
+        assert cell.control_loop.experiment is None
+
+
+async def test_a_daemon_that_ends_starts_and_unlocks_nothing():
+    async with driven(TWIST, cycles=10) as cell:
+        cell.runner.close()
+        assert cell.phase is ExperimentPhase.STOPPED
+        assert "the daemon ends" in await cell.runner.start(experiment(TWIST))
+        assert "the daemon ends" in await cell.runner.unlock()
 
 
 async def test_what_stopped_the_arm_is_not_enabled_again_by_a_start_that_is_refused():
@@ -308,7 +329,7 @@ async def test_times_of_a_stop_are_published_once():
 async def test_cause_of_a_requested_stop_is_the_request():
     async with driven(TWIST, cycles=50) as cell:
         asked_ns = cell.robot.flight.now_ns
-        cell.runner.stop("the operator stopped it")
+        assert cell.runner.stop() == "test"
         await cell.cycles(60)
         (stop,) = stops(cell)
         assert (stop.t_mono_ns, stop.cause) == (asked_ns, "the operator stopped it")

@@ -7,6 +7,7 @@ from contextlib import asynccontextmanager
 import pytest
 
 from shearloop.daemon.control.loop_inputs import LoopConfig
+from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.messages import Stop
 from tests.daemon.control.cell import GRIP, Cell, driven, experiment, no_tick
 
@@ -29,15 +30,15 @@ async def test_a_stop_in_the_middle_of_a_grip_stops_the_fingers_once():
         assert cell.gripper.asked == ["grip", "halt"]
 
 
-@pytest.mark.parametrize("answer", ["the connection to the gripper broke", RuntimeError("no such register")])
-async def test_a_grip_that_has_failed_stops_the_fingers_once(answer):
+@pytest.mark.parametrize("error", [DriverError("the connection to the gripper broke"), RuntimeError("no register")])
+async def test_a_grip_that_has_failed_stops_the_fingers_once(error):
     """Where its connection is lost in the middle, the experiment ends, and they go on to where they were sent."""
     async with driven() as cell:
-        cell.gripper.answers = answer
+        cell.gripper.error = error
         await cell.start(GRIP)
         await cell.cycles(20)
         assert cell.gripper.asked == ["grip", "halt"]
-        cell.gripper.answers = ""
+        cell.gripper.error = None
         await cell.start(GRIP, {"do": "wait", "wait_s": 60})
         await cell.cycles(20)
         cell.control_loop.stop("the operator said stop")
@@ -93,8 +94,8 @@ async def test_a_stop_ends_unlocking_and_stops_the_fingers():
 async def test_fingers_that_could_not_be_stopped_are_told_of(monkeypatch):
     async with gripping() as cell:
 
-        async def does_not() -> str:
-            return "the gripper does not answer"
+        async def does_not() -> None:
+            raise DriverError("the gripper does not answer")
 
         monkeypatch.setattr(cell.gripper, "halt", does_not)
         cell.control_loop.stop("the operator said stop")

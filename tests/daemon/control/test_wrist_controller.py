@@ -12,7 +12,7 @@ from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSample, Torqu
 from shearloop.daemon.control.loop_runner import CommandSender
 from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.control.wrist_controller import WristController
-from shearloop.drivers.ur.messages import Command, CommandReply, WristSpeed
+from shearloop.drivers.ur.messages import Command, CommandReply
 from tests.drivers.ur.flight import SETTINGS, flying
 
 CYCLE_NS = 8_000_000
@@ -80,7 +80,7 @@ async def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500
         return replies[-1][0]
 
     robot = SimpleNamespace(settings=SETTINGS, state=None, send=send)
-    brain = SimpleNamespace(on_speed_sent=wrist.on_speed_sent, on_fault=pytest.fail)
+    brain = SimpleNamespace(on_speed_sent=wrist.on_speed_sent, on_fault=pytest.fail, config=config)
     commands = CommandSender(robot, brain, StopTimeline(), Clock())
     origin_rad, errors = flight.state.wrist_rad, []
     for _ in range(cycles):
@@ -93,7 +93,7 @@ async def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500
             replied.set_result(reply)
         await asyncio.sleep(0)
         turn = wrist.turn(MoveToAngle(angle_rad, 0.5), flight.now_ns, state.wrist_rad, origin_rad)
-        commands.send(WristSpeed(turn.speed_rad_per_s, 4.0))
+        commands.turn(turn.speed_rad_per_s, 0)
     return errors
 
 

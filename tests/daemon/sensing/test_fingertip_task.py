@@ -12,6 +12,7 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Estimate
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import FingertipConfig
+from shearloop.daemon.errors import ActionError
 from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipPipeline, FingertipTask
 from shearloop.daemon.sensing.frame_estimator import COMBINED
@@ -173,7 +174,8 @@ async def test_a_gain_that_no_twist_shows_is_left_with_the_reason():
     adapting = asyncio.create_task(task.adapt("load_cell"))
     await asyncio.sleep(0)
     await task.process(frame(1))
-    assert await adapting == "right against load_cell: no twist in 0 frames"
+    with pytest.raises(ActionError, match="right against load_cell: no twist in 0 frames"):
+        await adapting
     assert publisher.messages == [("eit.estimate", "right", 1)]
 
 

@@ -1,12 +1,13 @@
 """Identification: small twists excite the tool, and its stiffness, delay and noise are fitted to the record."""
 
 import math
-from collections import deque
 from dataclasses import dataclass
+from statistics import fmean
 
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
+from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
 from shearloop.daemon.errors import UserError
 
 # The grid of the torque's lag behind its stamp.
@@ -251,13 +252,8 @@ class ExciteSettings:
     """
 
     amplitude_rad: float
-    sample_period_s: float
-    window_s: float
     torque_limit_nm: float
     stiffness_share: float = 0.03
-    speed_rad_per_s: float
-    acceleration_rad_per_s2: float
-    bandwidth_per_s: float
     dwell_s: float = 2.5
     most_cycles: int = 8
 
@@ -268,8 +264,10 @@ class StiffnessExcitation:
     `command` returns the speed to send until `done`; then `result` has the tool model, or `failure` the reason.
     """
 
-    def __init__(self, settings: ExciteSettings) -> None:
-        self.settings = settings
+    def __init__(self, settings: ExciteSettings, source: TorqueSource, config: LoopConfig) -> None:
+        self._settings = settings
+        self._source = source
+        self._config = config
         self.result: ToolModel | None = None
         self.failure: str | None = None
         self._origin_ns = 0
@@ -277,7 +275,6 @@ class StiffnessExcitation:
         # The speed that was sent at each angle.
         self._speeds: list[float] = []
         self._torques: list[tuple[float, float, float]] = []
-        self._latest: deque[float] = deque(maxlen=3)
         self._leg = 0  # even: at the first angle; odd: away
         self._arrived_s: float | None = None
         self._speed = 0.0
@@ -295,13 +292,12 @@ class StiffnessExcitation:
         if self._torques and t_mid_s <= self._torques[-1][0]:
             return
         self._torques.append((t_mid_s, (t_ns - self._origin_ns) / 1e9, torque_nm))
-        self._latest.append(torque_nm)
         # The mean of three: the noise of one must not end the step.
-        mean = sum(self._latest) / len(self._latest)
-        if abs(mean) > self.settings.torque_limit_nm and len(self._latest) == self._latest.maxlen:
+        mean = fmean(latest_nm for *_, latest_nm in self._torques[-3:])
+        if abs(mean) > self._settings.torque_limit_nm and len(self._torques) >= 3:
             self.failure = (
                 f"identify: the torque has reached {mean:.3g} N·m and the limit of the step is "
-                f"{self.settings.torque_limit_nm:g} N·m; turn less than {self.settings.amplitude_rad:g} rad"
+                f"{self._settings.torque_limit_nm:g} N·m; turn less than {self._settings.amplitude_rad:g} rad"
             )
 
     def command(self, t_ns: int, wrist_angle_rad: float) -> float:
@@ -331,32 +327,34 @@ class StiffnessExcitation:
         first = self._angles[0][1]
         if self._leg % 2 == 0:
             return first
-        return first + self.settings.amplitude_rad * (0.5 if self._leg == 1 else 1.0)
+        return first + self._settings.amplitude_rad * (0.5 if self._leg == 1 else 1.0)
 
     def _towards(self, missing_rad: float, now_s: float, elapsed_s: float) -> float:
-        own = self.settings
         if abs(missing_rad) < _ARRIVED_RAD:
             if self._arrived_s is None:
                 self._arrived_s = now_s
             # Dwells of different lengths sample the swings at different phases. The first one is twice as long: it is
             # the reference for slip.
-            dwell_s = own.dwell_s * (1.0 if self._leg else 2.0) + (self._leg % 4) * 0.25 * own.sample_period_s
+            dwell_s = self._settings.dwell_s * (1.0 if self._leg else 2.0)
+            dwell_s += (self._leg % 4) * 0.25 * self._source.period_s
             if now_s - self._arrived_s >= dwell_s:
                 self._end_leg()
             return 0.0
-        speed = max(-own.speed_rad_per_s, min(own.speed_rad_per_s, own.bandwidth_per_s * missing_rad))
+        own = self._config
+        fastest = own.wrist_speed_rad_per_s
+        speed = max(-fastest, min(fastest, own.angle_bandwidth_per_s * missing_rad))
         turning = abs(self._speed) if self._speed * speed > 0.0 else 0.0
-        return math.copysign(min(abs(speed), turning + own.acceleration_rad_per_s2 * elapsed_s), speed)
+        return math.copysign(min(abs(speed), turning + own.planned_acceleration_rad_per_s2 * elapsed_s), speed)
 
     def _end_leg(self) -> None:
         self._leg, self._arrived_s = self._leg + 1, None
         cycles, rests = divmod(self._leg - 1, 2)
         if self._leg % 2 == 0 or cycles < _FEWEST_CYCLES or rests:
             return
-        last = cycles >= self.settings.most_cycles
-        share = _WORST_STIFFNESS_SHARE if last else self.settings.stiffness_share
+        last = cycles >= self._settings.most_cycles
+        share = _WORST_STIFFNESS_SHARE if last else self._settings.stiffness_share
         try:
-            self.result = identify(self.record(), self.settings.window_s, share)
+            self.result = identify(self.record(), self._source.window_s, share)
         except NotYetKnownError as error:
             self.failure = str(error) if last else None
         except IdentifyError as error:

@@ -101,17 +101,8 @@ class WristController:
     def begin_identification(self, action: IdentifyStep, torque_limit_nm: float) -> None:
         """Begin the small twists that identify the tool."""
         self.reset()
-        self.excitation = StiffnessExcitation(
-            ExciteSettings(
-                amplitude_rad=action.amplitude_rad,
-                sample_period_s=self.source.period_s,
-                window_s=self.source.window_s,
-                torque_limit_nm=torque_limit_nm,
-                speed_rad_per_s=self._config.wrist_speed_rad_per_s,
-                acceleration_rad_per_s2=self._config.planned_acceleration_rad_per_s2,
-                bandwidth_per_s=self._config.angle_bandwidth_per_s,
-            )
-        )
+        settings = ExciteSettings(amplitude_rad=action.amplitude_rad, torque_limit_nm=torque_limit_nm)
+        self.excitation = StiffnessExcitation(settings, self.source, self._config)
 
     def identify(self, excitation: StiffnessExcitation, t_ns: int, wrist_rad: float) -> WristCommand:
         """Return the identification's speed, and take its result once it is done."""

@@ -128,4 +128,5 @@ def test_the_wrists_acceleration_reaches_controller_identification_and_robot(whe
     assert tuned.acceleration_limit_rad_per_s2 == 0.75
     wrist = WristController(source, loop.config)
     wrist.begin_identification(IdentifyStep(do="identify"), 0.5)
-    assert wrist.excitation.settings.acceleration_rad_per_s2 == 0.75
+    wrist.excitation.command(0, 0.0)
+    assert wrist.excitation.command(50_000_000, 1.0) == pytest.approx(-0.75 * 0.05)

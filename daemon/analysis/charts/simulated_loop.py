@@ -249,23 +249,25 @@ class LoopScenario:
     excite: ExciteSettings
     hold_s: float
 
+    @property
+    def source(self) -> TorqueSource:
+        """The sensor as the control loop knows it."""
+        return TorqueSource(name=self.name, period_s=self.sensor.period_s, window_s=self.sensor.period_s)
 
-def _excite(sensor: SimulatedSensor, dwell_s: float, share: float) -> ExciteSettings:
-    return ExciteSettings(
-        amplitude_rad=0.35, sample_period_s=sensor.period_s, window_s=sensor.period_s, torque_limit_nm=0.17,
-        stiffness_share=share, speed_rad_per_s=0.5, acceleration_rad_per_s2=2.0, bandwidth_per_s=5.0, dwell_s=dwell_s,
-    )  # fmt: skip
+
+def _excite(dwell_s: float, share: float) -> ExciteSettings:
+    return ExciteSettings(amplitude_rad=0.35, torque_limit_nm=0.17, stiffness_share=share, dwell_s=dwell_s)
 
 
 SCENARIOS = (
-    LoopScenario("eit", EIT, 6.0, 0.035, 4.0, _excite(EIT, 2.5, 0.04), 40.0),
-    LoopScenario("load_cell", LOAD_CELL, 2.0, 0.1, 6.0, _excite(LOAD_CELL, 0.8, 0.02), 15.0),
+    LoopScenario("eit", EIT, 6.0, 0.035, 4.0, _excite(2.5, 0.04), 40.0),
+    LoopScenario("load_cell", LOAD_CELL, 2.0, 0.1, 6.0, _excite(0.8, 0.02), 15.0),
 )
 
 
 def identified(plant: Plant, scenario: LoopScenario) -> ToolModel:
     """Return the tool model that the identification step finds; raises RuntimeError where it fails."""
-    step = StiffnessExcitation(scenario.excite)
+    step = StiffnessExcitation(scenario.excite, scenario.source, LoopConfig())
     while not step.done:
         now_ns = nanoseconds(plant.t_s)
         for sample in plant.collect():
@@ -282,8 +284,9 @@ def settings_for(found: ToolModel, scenario: LoopScenario) -> ControllerSettings
         allowed_noise_nm=ALLOWED_NOISE_NM, torque_bandwidth_per_s=scenario.wrist_bandwidth_per_s,
         wrist_speed_rad_per_s=0.8, wrist_acceleration_rad_per_s2=6.0,
     )  # fmt: skip
-    source = TorqueSource(name=scenario.name, period_s=scenario.sensor.period_s, window_s=scenario.sensor.period_s)
-    return controller_settings(config, found, source, TrackTorque(0.0, scenario.ramp_nm_per_s), torque_limit_nm=0.2)
+    return controller_settings(
+        config, found, scenario.source, TrackTorque(0.0, scenario.ramp_nm_per_s), torque_limit_nm=0.2
+    )
 
 
 def started_controller(plant: Plant, found: ToolModel, settings: ControllerSettings) -> TorqueController:

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from shearloop.daemon.control.identification import (
     StiffnessExcitation,
     identify,
 )
+from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
 
 WINDOW_S = 0.5412
 
@@ -126,21 +128,13 @@ def test_a_torque_that_is_no_springs_is_refused():
 
 # --- the step with its wrist programme
 
-SETTINGS: dict[str, Any] = {
-    "amplitude_rad": 0.4,
-    "sample_period_s": 0.5,
-    "window_s": 0.5,
-    "torque_limit_nm": 0.15,
-    "stiffness_share": 0.05,
-    "speed_rad_per_s": 0.5,
-    "acceleration_rad_per_s2": 2.0,
-    "bandwidth_per_s": 5.0,
-}
+SETTINGS = ExciteSettings(amplitude_rad=0.4, torque_limit_nm=0.15, stiffness_share=0.05)
+SOURCE = TorqueSource(name="right", period_s=0.5, window_s=0.5)
 
 
 def step_on(stiffness: float, noise_nm: float, **changes: Any) -> tuple[StiffnessExcitation, list[float], list[float]]:
     """Run the step on a wrist that does what it is told at once; return it with all angles and speeds."""
-    step = StiffnessExcitation(ExciteSettings(**(SETTINGS | changes)))
+    step = StiffnessExcitation(replace(SETTINGS, **changes), SOURCE, LoopConfig())
     rng, angle, angles, speeds, since = np.random.default_rng(3), 1.0, [], [], []
     for number in range(40_000):
         now_ns = 10**9 + number * 8_000_000
@@ -183,7 +177,7 @@ def test_the_step_gives_up_when_it_cannot_know_better():
 
 
 def test_nonsense_does_not_reach_the_record():
-    step = StiffnessExcitation(ExciteSettings(**SETTINGS))
+    step = StiffnessExcitation(SETTINGS, SOURCE, LoopConfig())
     step.measure(0.1, 0, 1)
     assert step.command(0, math.nan) == 0.0
     step.command(0, 1.0)

@@ -40,7 +40,14 @@ LONGEST = (
     *("test_with_keys.py", "test_memory.py", "test_emulate.py", "test_bank_design.py"),
     *("test_cylinders.py", "test_calibrate.py", "test_speed_accuracy_chart.py", "test_step_response.py"),
     *("test_plane_strain.py", "test_recorder.py", "test_fuzz.py", "test_physics.py", "test_skin_loop_chart.py"),
-    *("test_newcomer.py", "test_closed_loop.py", "test_client.py", "test_soak.py", "test_stop_times.py"),
+    *(
+        "test_demo.py",
+        "test_own_calibration.py",
+        "test_closed_loop.py",
+        "test_client.py",
+        "test_soak.py",
+        "test_stop_times.py",
+    ),
 )
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 

@@ -15,7 +15,7 @@ import script_client
 
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.control_box import ProbeError, RtdeReceiver, SampleAge, ScriptReadiness, ask_dashboard
-from shearloop.drivers.ur.messages import MoveLinear, RtdeOutputs, RtdeSample, WristSpeed
+from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, WristSpeed
 from shearloop.drivers.ur.script import NO_MOTION_S, guard_script
 from shearloop.drivers.ur.settings import UrSettings
 
@@ -62,7 +62,7 @@ class UrArm:
         sample = self._receiver.latest()
         now_ns = time.monotonic_ns()
         return RtdeSample(
-            **{name: getattr(sample, name) for name in RtdeOutputs.__dataclass_fields__},
+            **vars(sample),
             t_mono_ns=now_ns,
             age_ns=self._age.age_ns(sample.timestamp_s, now_ns),
             connected=self._receiver.connected and self._accepts_scripts and self._control.isConnected(),

@@ -50,17 +50,22 @@ class Recovery:
     unlocked only on the operator's request (UR's own rule). Without one, only the control program is started.
     """
 
-    def __init__(self, arm: "UrArm", now_ns: int, timeout_s: float, *, operator_asked: bool) -> None:
-        """Begin. `operator_asked` allows unlocking, powering and stopping any program."""
+    def __init__(self, arm: "UrArm", now_ns: int, timeout_s: float, unlock_number: int | None = None) -> None:
+        """Begin. The number of an operator's `Unlock` allows unlocking, powering and stopping any program."""
+        self.unlock_number = unlock_number
         self._arm = arm
         self._deadline_ns = now_ns + int(timeout_s * 1e9)
         self._timeout_s = timeout_s
-        self._operator_asked = operator_asked
         self._asked_ns: dict[str, int] = {}
         self._cleared = self._uploaded = False
         # Whether the attempt has succeeded, or why it has ended otherwise.
         self.ready = False
         self.refusal: str | None = None
+
+    @property
+    def operator_asked(self) -> bool:
+        """Whether the attempt is an operator's."""
+        return self.unlock_number is not None
 
     def give_up(self, reason: str) -> None:
         """End the attempt."""
@@ -90,7 +95,7 @@ class Recovery:
             # The control connection may see the program a sample later; then try again in the next cycle.
             self.ready = self._arm.arm_watchdog()
         elif sample.runtime_state != RUNTIME_STOPPED:
-            if self._operator_asked:
+            if self.operator_asked:
                 self._ask_dashboard(now_ns, "stop")
             elif now_ns > self._asked_ns.setdefault("end", now_ns) + int(ENDS_ITSELF_S * 1e9):
                 # Not ours to stop. After the death of its daemon its watchdog would have ended it.
@@ -108,7 +113,7 @@ class Recovery:
             self._uploaded = True
 
     def _make_safe(self, sample: RtdeSample, now_ns: int, safe: bool) -> None:
-        if not self._operator_asked:
+        if not self.operator_asked:
             self.refusal = ""
         elif sample.emergency_stop:
             self.refusal = "The emergency stop is still pressed: make the cell safe, release it, and unlock again."
@@ -126,7 +131,7 @@ class Recovery:
                 self._ask_dashboard(now_ns, "brake release")
 
     def _close_popups(self, now_ns: int) -> None:
-        if self._operator_asked and "close popup" not in self._asked_ns:
+        if self.operator_asked and "close popup" not in self._asked_ns:
             self._ask_dashboard(now_ns, "close popup", "close safety popup")
 
     def _ask_dashboard(self, now_ns: int, *requests: str) -> None:
@@ -149,8 +154,7 @@ class CommandHandler:
         self._settings = settings
         self._arm = arm
         self._executor = MotionExecutor(settings, arm, now_ns)
-        self._recovery: Recovery | None = Recovery(arm, now_ns, settings.recover_timeout_s, operator_asked=False)
-        self._unlock_number: int | None = None
+        self._recovery: Recovery | None = Recovery(arm, now_ns, settings.recover_timeout_s)
         self._held_reason = NOT_ENABLED
         self._daemon_alive_ns = now_ns
         # Whether the daemon disconnects: only stops are accepted from then on.
@@ -194,13 +198,12 @@ class CommandHandler:
                 refusal = LEAVING
             case WristSpeed() | MoveLinear():
                 refusal = self._why_blocked(sample) or self._executor.begin(number, command, sample, now_ns)
-            case Unlock() if self._unlock_number is not None:
+            case Unlock() if self._recovery is not None and self._recovery.operator_asked:
                 refusal = "Unlocking is under way."
             case Unlock() if unfit:
                 if not self._executor.disabled_reason:
                     self._executor.disable(unfit)
-                self._unlock_number = number
-                self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, operator_asked=True)
+                self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, number)
                 return None
             case _ if self._recovery is not None:
                 refusal = BEING_MADE_READY
@@ -217,7 +220,7 @@ class CommandHandler:
 
     def _stop(self, number: int, command: Stop, sample: RtdeSample, now_ns: int) -> str:
         """Stop on command; return why not, or an empty string."""
-        if self._recovery is not None and self._unlock_number is not None:
+        if self._recovery is not None and self._recovery.operator_asked:
             self._recovery.give_up("Unlocking was ended by a stop.")
         if command.deceleration_rad_per_s2 <= 0:
             return f"A deceleration of {command.deceleration_rad_per_s2:g} rad/s² is not above 0."
@@ -297,13 +300,12 @@ class CommandHandler:
         self._recovery = None
         if recovery.ready:
             self._executor.enable()
-        number, self._unlock_number = self._unlock_number, None
-        if number is None:
+        if recovery.unlock_number is None:
             self._held_reason = recovery.refusal or self._held_reason
             return None
         if recovery.ready:
             self._held_reason = ""
-        return number, CommandReply(refusal=recovery.refusal or "")
+        return recovery.unlock_number, CommandReply(refusal=recovery.refusal or "")
 
     def end_program(self, sample: RtdeSample) -> None:
         """End our program. One that has no heartbeats now ends by its watchdog, also when it starts or is resumed."""

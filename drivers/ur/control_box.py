@@ -80,15 +80,6 @@ class ControllerInfo:
     registers_free: bool
 
 
-@dataclass(frozen=True)
-class ReceivedSample(RtdeOutputs):
-    """The outputs in one package, with those of the control script."""
-
-    # 1 when ready, 2 when done with a command; and the script's own clock.
-    script_state: int
-    script_s: float = 0.0
-
-
 def probe_controller(host: str, timeout_s: float) -> str:
     """Return the controller's version, as 5.17.3.0, after agreeing on protocol 2.
 
@@ -233,7 +224,7 @@ class SampleParser:
     def __init__(self) -> None:
         self._buffer = b""
 
-    def feed(self, data: bytes) -> ReceivedSample | None:
+    def feed(self, data: bytes) -> RtdeOutputs | None:
         """Return the newest sample that `data` completes, or None.
 
         Raises:
@@ -257,7 +248,7 @@ class SampleParser:
         v = _VALUES.unpack_from(data, start)
         tool = _NO_TOOL if size == _PACKAGE_BYTES else _TOOL_VALUES.unpack_from(data, start + _VALUES.size)
         motion = v[0], v[1:7], v[7:13], v[13:19], v[19:25], v[25:31]
-        return ReceivedSample(*motion, v[31], v[32], v[33], v[34], tool[0], tool[1:4], tool[4:], v[35], v[36])
+        return RtdeOutputs(*motion, v[31], v[32], v[33], v[34], v[35], v[36], tool[0], tool[1:4], tool[4:])
 
 
 class RtdeReceiver:
@@ -290,7 +281,7 @@ class RtdeReceiver:
         self.connected = False
         self._connection.close()
 
-    def _first_sample(self, rate_hz: float) -> ReceivedSample:
+    def _first_sample(self, rate_hz: float) -> RtdeOutputs:
         _agree_on_protocol(self._connection)
         for outputs in (_TYPES | _TOOL_TYPES, _TYPES):
             answer = _request(self._connection, _OUTPUTS, struct.pack(">d", rate_hz) + ",".join(outputs).encode())
@@ -311,7 +302,7 @@ class RtdeReceiver:
                 return sample
         raise OSError("it closed the connection on which it was to send its state")
 
-    def latest(self) -> ReceivedSample:
+    def latest(self) -> RtdeOutputs:
         """Return the newest sample received, without waiting."""
         if self.connected:
             self._sample = self._receive() or self._sample
@@ -329,7 +320,7 @@ class RtdeReceiver:
         """Wait for data, at most this long, and return whether there is any."""
         return self.connected and bool(select.select([self._connection], [], [], max(0.0, seconds))[0])
 
-    def _receive(self) -> ReceivedSample | None:
+    def _receive(self) -> RtdeOutputs | None:
         newest, more = None, True
         while more:
             try:

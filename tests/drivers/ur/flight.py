@@ -9,7 +9,6 @@ import pytest
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.control_box import ReceivedSample
 from shearloop.drivers.ur.settings import Bound, JointRange, UrLimits, UrSettings, Workspace
 
 LIMITS = UrLimits(
@@ -37,6 +36,8 @@ AT_REST = messages.RtdeSample(
     safety_mode=1,
     runtime_state=2,
     speed_scaling=1.0,
+    script_state=1,
+    script_s=0.0,
     payload_kg=1.0,
     payload_cog_m=(0.0, 0.0, 0.06),
     tcp_offset=(0.0,) * 6,
@@ -48,11 +49,12 @@ POSE = (-0.5, -0.1, 0.45, 0.0, math.pi, 0.0)
 
 def received(
     timestamp_s: float, runtime_state: int = 2, script_state: int = 1, script_s: float = 0.0
-) -> ReceivedSample:
+) -> messages.RtdeOutputs:
     """Return a sample as the controller sends it."""
-    outputs = {name: getattr(AT_REST, name) for name in messages.RtdeOutputs.__dataclass_fields__}
-    changes = {"timestamp_s": timestamp_s, "runtime_state": runtime_state}
-    return ReceivedSample(**{**outputs, **changes}, script_state=script_state, script_s=script_s)
+    sample = dataclasses.replace(
+        AT_REST, timestamp_s=timestamp_s, runtime_state=runtime_state, script_state=script_state, script_s=script_s
+    )
+    return messages.RtdeOutputs(*map(vars(sample).get, messages.RtdeOutputs.__dataclass_fields__))
 
 
 class FakeArm:

@@ -11,8 +11,8 @@ from typing import ClassVar
 
 import pytest
 
-from shearloop.drivers.ur.control_box import ProbeError, ReceivedSample
-from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
+from shearloop.drivers.ur.control_box import ProbeError
+from shearloop.drivers.ur.messages import MoveLinear, RtdeOutputs, WristSpeed
 from shearloop.drivers.ur.script import NO_MOTION_S
 from tests.drivers.ur.flight import SETTINGS, received
 
@@ -47,7 +47,7 @@ class Receiver:
         # Of a program that ended during a command.
         self.sample = received(1.0, runtime_state=1, script_state=2)
 
-    def latest(self) -> ReceivedSample:
+    def latest(self) -> RtdeOutputs:
         return self.sample
 
     def write_deadline(self, script_s: float) -> None:

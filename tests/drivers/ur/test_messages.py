@@ -29,6 +29,7 @@ mode, time_ns = st.integers(-(2**31), 2**31 - 1), st.integers(-(2**63), 2**63 - 
 states = st.builds(
     RobotState,
     t_mono_ns=time_ns, age_ns=time_ns, robot_mode=mode, safety_mode=mode, runtime_state=mode,
+    script_state=mode,
     motion_id=st.integers(0, 2**32 - 1), cycle=st.integers(0, 2**64 - 1),
     q_rad=six, qd_rad_per_s=six, tcp_pose=six, tcp_speed=six, wrench=six, tcp_offset=six, payload_kg=finite,
     payload_cog_m=st.tuples(*[finite] * 3), sent=sent, clipped=reasons,

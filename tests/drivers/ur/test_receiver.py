@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from shearloop.drivers.errors import ProtocolError
 from shearloop.drivers.ur import control_box as receiver_module
-from shearloop.drivers.ur.control_box import ProbeError, ReceivedSample, RtdeReceiver, SampleParser
+from shearloop.drivers.ur.control_box import ProbeError, RtdeReceiver, SampleParser
+from shearloop.drivers.ur.messages import RtdeOutputs
 
 TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,INT32,DOUBLE"
 TOOL_TYPES = TYPES + b",DOUBLE,VECTOR3D,VECTOR6D"
@@ -41,7 +42,7 @@ def text(length: int) -> bytes:
 
 def test_sample_has_the_values_in_their_order():
     sample = SampleParser().feed(data(3))
-    assert sample == ReceivedSample(
+    assert sample == RtdeOutputs(
         timestamp_s=3.0,
         q_rad=(3.0, 3.01, 3.02, 3.03, 3.04, 3.05),
         qd_rad_per_s=(3.06, 3.07, 3.08, 3.09, 3.1, 3.11),

@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import pytest
 
 from shearloop.drivers.ur import control_box as ready_module
-from shearloop.drivers.ur.control_box import ReceivedSample, ScriptReadiness
+from shearloop.drivers.ur.control_box import ScriptReadiness
+from shearloop.drivers.ur.messages import RtdeOutputs
 from tests.drivers.ur.flight import received
 
 READY, DONE = 1, 2
@@ -21,7 +22,7 @@ class Samples:
         self.taken, self.now_s = 0, 5.0
         monkeypatch.setattr(ready_module, "time", SimpleNamespace(monotonic=lambda: self.now_s))
 
-    def latest(self) -> ReceivedSample:
+    def latest(self) -> RtdeOutputs:
         script_state, runtime_state = self._said[min(self.taken, len(self._said) - 1)]
         return received(50.0 + 0.008 * self.taken, runtime_state, script_state)
 

@@ -58,9 +58,10 @@ LONGEST_GAP = 2.5
 PLAUSIBLE = 0.05
 
 _SEPARATOR = b", "
-_VALUE, _LINE = re.compile(rb"\d\.\d{4}"), re.compile(rb"(\d\.\d{4}, )*")
-# The places of a cell's digits, and their values in 0.0001 V.
+_VALUE = re.compile(rb"\d\.\d{4}")
+# Of a cell: the places of the digits with their values in 0.0001 V, and the other bytes.
 _DIGITS, _STEPS = [0, 2, 3, 4, 5], np.array([10_000, 1_000, 100, 10, 1])
+_OTHERS, _PUNCTUATION = [1, 6, 7], np.frombuffer(b"., ", np.uint8)
 
 
 class FrameErrorKind(Enum):
@@ -98,9 +99,13 @@ def read_line(line: bytes, zero_slots: NDArray[np.bool_]) -> NDArray[np.float64]
 
     `zero_slots` (v,) is true where the board writes 0. Values must have the board's own form, `d.dddd`.
     """
-    if len(line) != zero_slots.size * CELL_BYTES or not _LINE.fullmatch(line):
+    if len(line) != zero_slots.size * CELL_BYTES:
         return _find_error(line, zero_slots.size)
-    digits = np.frombuffer(line, np.uint8).reshape(-1, CELL_BYTES)[:, _DIGITS] - np.uint8(ord("0"))
+    cells = np.frombuffer(line, np.uint8).reshape(-1, CELL_BYTES)
+    # Bytes below "0" wrap around to large numbers.
+    digits = cells[:, _DIGITS] - np.uint8(ord("0"))
+    if (digits > 9).any() or (cells[:, _OTHERS] != _PUNCTUATION).any():
+        return _find_error(line, zero_slots.size)
     # The quotient of whole numbers is the float nearest to the decimal.
     values: NDArray[np.float64] = digits @ _STEPS / 10_000
     zeros = values == 0.0

@@ -4,10 +4,11 @@ All limits are magnitudes. A measured value beyond a `hard` limit stops the moti
 limit, so that no command reaches the hard one.
 """
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
+
+from pydantic import Field
 
 from shearloop.drivers.errors import DriverError
 
@@ -21,19 +22,9 @@ _CLIENT_BOUNDS = {
     "linear_speed_m_per_s": 3.0,
     "linear_acceleration_m_per_s2": 150.0,
 }
-
-_ALONE, _WAITING = "the robot goes on that long alone", "the operator waits that long for an answer"
-# The longest times that a file may set, and why.
-_LONGEST_S = {
-    "command_timeout_s": (1.0, _ALONE),
-    "silence_timeout_s": (1.0, _ALONE),
-    "state_timeout_s": (1.0, _ALONE),
-    "reaction_s": (0.5, _ALONE),
-    "connect_timeout_s": (60.0, _WAITING),
-    "hang_timeout_s": (10.0, _WAITING),
-    "recover_timeout_s": (300.0, _WAITING),
-}
-_LEAST_WATCHDOG_HZ = 1.0
+# The robot goes on alone for so long.
+_Alone = Annotated[float, Field(gt=0, le=1)]
+_Positive = Annotated[float, Field(gt=0)]
 # The wrist stands this long after the last decision (docs/safety.md).
 _PROMISED_S = 0.2
 
@@ -49,15 +40,15 @@ class _Checked:
 class Bound(_Checked):
     """A limit: commands stay at or below `inner`, measured values below `hard`."""
 
-    inner: float
+    inner: _Positive
     """Commands are clipped to it."""
     hard: float
     """A measured value beyond it stops the motion."""
 
     def __post_init__(self) -> None:
         """Refuse limits in the wrong order."""
-        if not 0 < self.inner < self.hard:
-            raise ValueError(f"inner ({self.inner:g}) must be above 0 and below hard ({self.hard:g})")
+        if self.inner >= self.hard:
+            raise ValueError(f"inner ({self.inner:g}) must be below hard ({self.hard:g})")
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +59,7 @@ class JointRange(_Checked):
     """Lowest angle of each joint."""
     upper_rad: Six
     """Highest angle of each joint."""
-    margin_rad: float
+    margin_rad: _Positive
     """Distance that commands keep from both."""
 
     def __post_init__(self) -> None:
@@ -84,7 +75,7 @@ class Workspace(_Checked):
     """Lowest x, y and z of the tool centre point in the base frame."""
     upper_m: Three
     """Highest x, y and z."""
-    margin_m: float
+    margin_m: _Positive
     """Distance that commands keep from both."""
 
     def __post_init__(self) -> None:
@@ -127,17 +118,12 @@ class UrLimits(_Checked):
 class InstalledTool(_Checked):
     """Payload and tool centre point that the pendant must have for motion; a key that is absent is not compared."""
 
-    payload_kg: float | None = None
+    payload_kg: Annotated[float, Field(ge=0)] | None = None
     """Mass of the load."""
     payload_cog_m: Three | None = None
     """Centre of gravity of the load, from the flange."""
     tcp_offset: Six | None = None
     """Tool centre point from the flange: position in m, rotation vector in rad."""
-
-    def __post_init__(self) -> None:
-        """Refuse a negative load."""
-        if self.payload_kg is not None and self.payload_kg < 0:
-            raise ValueError(f"payload_kg must be at least 0, not {self.payload_kg:g}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,46 +136,33 @@ class UrSettings(_Checked):
     """Limits on commands and on measured states."""
     tool: InstalledTool = InstalledTool()
     """What the pendant must have for motion."""
-    rate_hz: float = 125.0
+    rate_hz: _Positive = 125.0
     """Robot states per second."""
-    watchdog_hz: float = 10.0
+    watchdog_hz: Annotated[float, Field(ge=1)] = 10.0
     """The robot ends its program when it receives nothing for 1/watchdog_hz."""
-    command_timeout_s: float = 0.1
-    """A wrist speed holds for this long after it was decided; then the wrist stops. At most 1 s."""
-    silence_timeout_s: float = 0.1
-    """Other motion stops when the daemon sends nothing for this long. At most 1 s."""
-    state_timeout_s: float = 0.25
-    """An older state blocks motion; at three times this age the connection counts as lost. At most 1 s."""
-    connect_timeout_s: float = 10.0
+    command_timeout_s: _Alone = 0.1
+    """A wrist speed holds for this long after it was decided; then the wrist stops."""
+    silence_timeout_s: _Alone = 0.1
+    """Other motion stops when the daemon sends nothing for this long."""
+    state_timeout_s: _Alone = 0.25
+    """An older state blocks motion; at three times this age the connection counts as lost."""
+    connect_timeout_s: Annotated[float, Field(gt=0, le=60)] = 10.0
     """Time for connecting."""
-    hang_timeout_s: float = 1.5
+    hang_timeout_s: Annotated[float, Field(gt=0, le=10)] = 1.5
     """A longer cycle is a hang, and the worker is ended: calls of ur-rtde block for up to 301 s."""
-    recover_timeout_s: float = 30.0
+    recover_timeout_s: Annotated[float, Field(gt=0, le=300)] = 30.0
     """Time for one attempt to make the robot ready."""
-    reaction_s: float = 0.04
-    """Delay until a commanded speed takes effect; distances to the joint limits include it. At most 0.5 s."""
+    reaction_s: Annotated[float, Field(gt=0, le=0.5)] = 0.04
+    """Delay until a commanded speed takes effect; distances to the joint limits include it."""
 
     def __post_init__(self) -> None:
-        """Refuse a host that is none, and deadlines that contradict each other."""
+        """Refuse a host that is none, and rates that contradict each other."""
         if not self.host.strip():
             raise ValueError("host is empty; give the robot's address")
         try:
             self.host.encode("idna")
         except UnicodeError:
             raise ValueError("host is no name or address of a computer; give the robot's address") from None
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if isinstance(value, float | int) and not 0 < value < math.inf:
-                raise ValueError(f"{name} must be above 0, not {value:g}")
-        for name, (longest_s, reason) in _LONGEST_S.items():
-            value = getattr(self, name)
-            if value > longest_s:
-                raise ValueError(f"{name} must be at most {longest_s:g} s, not {value:g}: {reason}")
-        if self.watchdog_hz < _LEAST_WATCHDOG_HZ:
-            raise ValueError(
-                f"watchdog_hz must be at least {_LEAST_WATCHDOG_HZ:g}, not {self.watchdog_hz:g}: "
-                "without its daemon the robot goes on for 1/watchdog_hz"
-            )
         if self.rate_hz < 3 * self.watchdog_hz:
             raise ValueError(
                 f"rate_hz ({self.rate_hz:g}) must be at least three times watchdog_hz ({self.watchdog_hz:g}), "
@@ -215,8 +188,6 @@ class UrSettings(_Checked):
 
 
 def _check_range(lower: tuple[float, ...], upper: tuple[float, ...], margin: float) -> None:
-    if margin <= 0:
-        raise ValueError(f"the margin must be above 0, not {margin:g}")
     for number, (low, high) in enumerate(zip(lower, upper, strict=True), start=1):
         if low + 2 * margin >= high:
             raise ValueError(f"entry {number}: no room between {low:g} and {high:g} with a margin of {margin:g}")

@@ -25,13 +25,14 @@ def test_all_mistakes_are_reported_together(tmp_path):
         tmp_path,
         ("torque_nm: {inner: 4.0, hard: 6.0}", "torque_nm: {inner: 7.0, hard: 6.0}"),
         ("margin_m: 0.02", "margin_m: 0.02\n    colour: red"),
-        ("host: 192.168.1.10", "host: 192.168.1.10\nwatchdog_hz: -1"),
+        ("host: 192.168.1.10", "host: 192.168.1.10\nwatchdog_hz: -1\nreaction_s: 0.6"),
         ("upper_m: [0.8, 0.8, 0.9]", "upper_m: [0.8, .inf, 0.9]"),
     )
     with pytest.raises(DriverError) as caught:
         read_settings(path)
     message = str(caught.value)
-    for part in (str(path), "limits.torque_nm", "inner (7) must be above 0 and below hard (6)",
+    for part in (str(path), "limits.torque_nm", "inner (7) must be below hard (6)",
+                 ":5: watchdog_hz: -1 is too small", ":6: reaction_s: 0.6 is too large; allowed: above 0 to 0.5",
                  "limits.workspace.colour", "limits.workspace.upper_m[1]"):  # fmt: skip
         assert part in message
 
@@ -40,23 +41,27 @@ def test_all_mistakes_are_reported_together(tmp_path):
     ("old", "new", "said"),
     [
         ("host: 192.168.1.10", "host: 192.168.1.10\nwatchdog_hz: 60", "three times"),
-        ("host: 192.168.1.10", "host: 192.168.1.10\nhang_timeout_s: 0", "above 0"),
-        ("host: 192.168.1.10", "host: 192.168.1.10\nwatchdog_hz: 0.5", "at least 1, not 0.5"),
-        ("host: 192.168.1.10", "host: 192.168.1.10\ncommand_timeout_s: 3", "at most 1 s, not 3"),
-        ("host: 192.168.1.10", "host: 192.168.1.10\nsilence_timeout_s: 30", "at most 1 s, not 30"),
-        ("host: 192.168.1.10", "host: 192.168.1.10\nconnect_timeout_s: 1.0e+300", "at most 60 s, not 1e.300"),
-        ("host: 192.168.1.10", "host: 192.168.1.10\nhang_timeout_s: 1.0e+12", "at most 10 s, not 1e.12"),
+        ("host: 192.168.1.10", "host: 192.168.1.10\nhang_timeout_s: 0", "0 is too small; allowed: above 0"),
+        ("host: 192.168.1.10", "host: 192.168.1.10\nwatchdog_hz: 0.5", "0.5 is too small; allowed: from 1"),
+        (
+            "host: 192.168.1.10",
+            "host: 192.168.1.10\ncommand_timeout_s: 3",
+            "ur.yaml:5: command_timeout_s: 3 is too large",
+        ),
+        ("host: 192.168.1.10", "host: 192.168.1.10\nsilence_timeout_s: 30", "allowed: above 0 to 1"),
+        ("host: 192.168.1.10", "host: 192.168.1.10\nconnect_timeout_s: 1.0e+300", "allowed: above 0 to 60"),
+        ("host: 192.168.1.10", "host: 192.168.1.10\nhang_timeout_s: 1.0e+12", "allowed: above 0 to 10"),
         ("host: 192.168.1.10", "host: a..b", "host is no name or address of a computer"),
         ("host: 192.168.1.10", f"host: {'a' * 300}", "host is no name or address of a computer"),
         ("host: 192.168.1.10", 'host: "\\ud800"', "host is no name or address of a computer"),
-        ("host: 192.168.1.10", "host: 192.168.1.10\ntool: {payload_kg: -1}", "payload_kg must be at least 0, not -1"),
+        ("host: 192.168.1.10", "host: 192.168.1.10\ntool: {payload_kg: -1}", "tool.payload_kg: -1 is too small"),
         ("margin_rad: 0.1", "margin_rad: 3.2", "no room"),
         ("{inner: 4.0, hard: 8.0}", "{inner: 4.0, hard: 50.0}", "more than ur-rtde takes, which is 40"),
-        ("margin_m: 0.02", "margin_m: 0", "above 0"),
+        ("margin_m: 0.02", "margin_m: 0", "limits.workspace.margin_m: 0 is too small; allowed: above 0"),
         ("host: 192.168.1.10\n", "", r"ur.yaml:\d+: host: is missing"),
         ("host: 192.168.1.10", "host: ' '", r"ur.yaml:1: host is empty; give the robot's address"),
         ("host: 192.168.1.10", "host: 192.168.1.10\nhots: 1", "hots: is not a known key; did you mean host"),
-        ("margin_rad: 0.1", "margin_rad: -1", "limits.joints: the margin must be above 0, not -1"),
+        ("margin_rad: 0.1", "margin_rad: -1", "limits.joints.margin_rad: -1 is too small"),
     ],
 )
 def test_mistake_is_reported(tmp_path, old, new, said):

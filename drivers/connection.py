@@ -8,12 +8,11 @@ import contextlib
 import errno
 import os
 import select
-import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from queue import SimpleQueue
 from typing import Protocol, Self, TypeAlias
 
 import serial
@@ -41,10 +40,6 @@ class Received:
 
     data: bytes
     t_arrival_ns: int
-
-
-# What a read of a port will bring; None for nothing in time.
-_Arrival: TypeAlias = "asyncio.Future[Received | DeviceLostError | None]"
 
 
 def find_port(*, serial_number: str | None = None, path: str | None = None) -> str:
@@ -91,13 +86,11 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
         except serial.SerialException as error:
             raise _open_error(path, error) from error
         self._descriptor: int = self._serial.fileno()
-        # Readable once the port is to be closed.
+        # Readable once the port is to be closed; -1 afterwards.
         self._closing = os.eventfd(0)
-        self._arrival: _Arrival | None = None
-        # Each arrival that a loop waits for, and until when (monotonic, s); None ends the thread.
-        self._awaited: SimpleQueue[tuple[asyncio.AbstractEventLoop, _Arrival, float] | None] = SimpleQueue()
-        self._reader = threading.Thread(target=self._receive, name=f"read {path}", daemon=True)
-        self._reader.start()
+        self._reader = ThreadPoolExecutor(1, f"read {path}")
+        # What the thread's read will bring; None for nothing in time.
+        self._arrival: asyncio.Future[Received | DeviceLostError | None] | None = None
 
     def __exit__(self, *_: object) -> None:
         """Close the port."""
@@ -105,13 +98,13 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
 
     def close(self) -> None:
         """Close the port, also if it is gone already."""
-        if not self._reader.is_alive():
+        if self._closing < 0:
             return
-        self._awaited.put(None)
-        # Joined first: the number of a closed descriptor may soon be another file's.
+        # The thread ends first: the number of a closed descriptor may soon be another file's.
         os.eventfd_write(self._closing, 1)
-        self._reader.join()
+        self._reader.shutdown()
         os.close(self._closing)
+        self._closing = -1
         with contextlib.suppress(OSError):
             self._serial.close()
 
@@ -121,52 +114,39 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
         Raises DeviceLostError if the port is gone.
         """
         if self._arrival is None:
-            loop = asyncio.get_running_loop()
-            self._arrival = loop.create_future()
-            self._awaited.put((loop, self._arrival, time.monotonic() + timeout_s))
+            until_s = time.monotonic() + timeout_s
+            self._arrival = asyncio.get_running_loop().run_in_executor(self._reader, self._receive, until_s)
         await asyncio.wait({self._arrival})
         result, self._arrival = self._arrival.result(), None
         if isinstance(result, DeviceLostError):
             raise result
         return result
 
-    def _receive(self) -> None:
-        """Read in the thread, each time that a loop waits for it, until the port is to be closed."""
+    def _receive(self, until_s: float) -> Received | DeviceLostError | None:
+        """Return what has arrived, or the loss, in the thread; None for neither and when the port is to be closed."""
         ready = select.poll()
         ready.register(self._descriptor, select.POLLIN)
         ready.register(self._closing, select.POLLIN)
-        while (awaited := self._awaited.get()) is not None:
-            loop, arrival, until_s = awaited
-            result = None
-            # A late thread finds what has arrived meanwhile.
-            while result is None and (found := ready.poll(max(0.0, 1e3 * (until_s - time.monotonic())))):
-                if any(descriptor == self._closing for descriptor, _ in found):
-                    return
-                result = self._drain()
-            # The loop may have ended.
-            with contextlib.suppress(RuntimeError):
-                loop.call_soon_threadsafe(_finish, arrival, result)
+        result = None
+        # A late thread finds what has arrived meanwhile.
+        while result is None and (found := ready.poll(max(0.0, 1e3 * (until_s - time.monotonic())))):
+            if any(descriptor == self._closing for descriptor, _ in found):
+                break
+            result = self._drain()
+        return result
 
-    def _drain(self) -> "Received | DeviceLostError | None":
+    def _drain(self) -> Received | DeviceLostError | None:
         """Return what has arrived, or the loss; None for neither."""
         parts: list[bytes] = []
-        lost: DeviceLostError | None = None
-        for _ in range(READS_PER_TURN):
-            try:
-                part = os.read(self._descriptor, READ_BYTES)
-            except BlockingIOError:
-                break
-            except OSError as error:
-                lost = self._lost(error.strerror)
-                break
-            if not part:
-                lost = self._lost("hung up")
-                break
-            parts.append(part)
-            if len(part) < SHORT_READ_BYTES:
-                break
-        # Bytes before a hang-up come first; the next read meets the hang-up again.
-        return Received(b"".join(parts), time.monotonic_ns()) if parts else lost
+        try:
+            while len(parts) < READS_PER_TURN and (not parts or len(parts[-1]) >= SHORT_READ_BYTES):
+                parts.append(os.read(self._descriptor, READ_BYTES))
+        except OSError as error:
+            # Bytes before a hang-up come first; the next read meets the hang-up again.
+            if not parts:
+                return None if isinstance(error, BlockingIOError) else self._lost(error.strerror)
+        data = b"".join(parts)
+        return Received(data, time.monotonic_ns()) if data else self._lost("hung up")
 
     async def write(self, data: bytes) -> None:
         """Write all of `data`; DeviceLostError if the port is gone or accepts nothing for a second."""
@@ -184,11 +164,6 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
 
     def _lost(self, reason: str | None) -> DeviceLostError:
         return DeviceLostError(f"{self.path} has gone ({reason}): unplugged, or without power.")
-
-
-def _finish(arrival: _Arrival, result: Received | DeviceLostError | None) -> None:
-    if not arrival.done():
-        arrival.set_result(result)
 
 
 def _open_error(path: str, error: serial.SerialException) -> DriverError:

@@ -1,17 +1,17 @@
-"""The messages between the daemon and the robot's worker process, and their bytes in msgpack.
+"""The messages between the daemon and the robot's worker process, and their bytes.
 
-On the pipe each message is `[number, message]`. A dataclass is an extension type with its fields in order.
+On the pipe each message is a line: its number, its type's name, and its fields in JSON, which pydantic checks.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import ClassVar, Final, Literal, get_args
 
-import msgpack
+from pydantic import TypeAdapter
 
 from shearloop.drivers.errors import ProtocolError
-from shearloop.drivers.ur.settings import Bound, InstalledTool, JointRange, Six, Three, UrLimits, UrSettings, Workspace
+from shearloop.drivers.ur.settings import Six, Three, UrSettings
 
 MotionKind = Literal["idle", "wrist", "linear", "stopping"]
 FailureKind = Literal["unreachable", "silent", "protocol", "version", "registers-in-use", "local-control", "lost"]
@@ -38,8 +38,15 @@ SAFETY_PROTECTIVE_STOP: Final = 3
 SAFETY_EMERGENCY_STOPS: Final = (6, 7)
 
 
+class _Finite:
+    """Makes pydantic refuse numbers that are not finite."""
+
+    __slots__ = ()
+    __pydantic_config__: ClassVar = {"allow_inf_nan": False}
+
+
 @dataclass(frozen=True, slots=True)
-class WristSpeed:
+class WristSpeed(_Finite):
     """Turn the tool about its axis. It holds for `command_timeout_s` after it was decided (monotonic, ns).
 
     A `decided_ns` of 0 stands for its arrival.
@@ -51,7 +58,7 @@ class WristSpeed:
 
 
 @dataclass(frozen=True, slots=True)
-class MoveLinear:
+class MoveLinear(_Finite):
     """Move the tool on a straight line to a pose: x, y, z in m and a rotation vector in rad, in the base frame."""
 
     pose: Six
@@ -60,7 +67,7 @@ class MoveLinear:
 
 
 @dataclass(frozen=True, slots=True)
-class Stop:
+class Stop(_Finite):
     """Slow every joint down to rest."""
 
     deceleration_rad_per_s2: float
@@ -107,6 +114,7 @@ class CommandReply:
 class RtdeOutputs:
     """The controller's outputs at one time (SI units, base frame, joints from base to wrist 3)."""
 
+    __pydantic_config__: ClassVar = {"ser_json_inf_nan": "constants"}
     # By the controller's clock.
     timestamp_s: float
     q_rad: Six
@@ -254,43 +262,20 @@ Message = Command | CommandReply | RobotState | UrSettings | Heartbeat | WorkerP
 
 # The largest message, a state with every reason for clipping, has about 2 kB.
 LARGEST_MESSAGE: Final = 1 << 16
-
-_MOTIONS: Final = (WristSpeed, MoveLinear, Stop)
-_TYPES: Final[tuple[Any, ...]] = (
-    *_MOTIONS, ZeroForceTorque, Enable, Unlock, Disconnect, CommandReply, RobotState, Heartbeat, WorkerPhase,
-    ControllerVersion, Failed, UrSettings, UrLimits, Bound, InstalledTool, JointRange, Workspace,
-)  # fmt: skip
-_CODES: Final = {kind: code for code, kind in enumerate(_TYPES)}
+_ADAPTERS: Final = {kind.__name__: TypeAdapter[Message](kind) for kind in get_args(Message)}
 
 
 def encode(message: Message, number: int = 0) -> bytes:
-    """Return the bytes of a message; `number` pairs a command with its reply."""
-    packed: bytes = msgpack.packb((number, message), default=_packed, buf_size=4096)
-    return packed
-
-
-def _packed(value: Any) -> msgpack.ExtType:
-    content = list(map(value.__getattribute__, value.__dataclass_fields__))
-    return msgpack.ExtType(_CODES[type(value)], msgpack.packb(content, default=_packed, buf_size=4096))
-
-
-def _unpacked(code: int, data: bytes) -> Any:
-    content = msgpack.unpackb(data, use_list=False, ext_hook=_unpacked)
-    kind = _TYPES[code]
-    if kind in _MOTIONS and not _is_finite(content):
-        raise ValueError(f"{kind.__name__} {content} is not finite")
-    return kind(*content)
-
-
-def _is_finite(value: Any) -> bool:
-    return all(map(_is_finite, value)) if isinstance(value, tuple) else math.isfinite(value)
+    """Return the line of a message; `number` pairs a command with its reply."""
+    name = type(message).__name__
+    return b"%d %s %s\n" % (number, name.encode(), _ADAPTERS[name].dump_json(message))
 
 
 class MessageDecoder:
     """Splits a byte stream into messages."""
 
     def __init__(self) -> None:
-        self._unpacker = msgpack.Unpacker(use_list=False, ext_hook=_unpacked, max_buffer_size=2 * LARGEST_MESSAGE)
+        self._partial = b""
 
     def feed(self, data: bytes) -> list[tuple[int, Message]]:
         """Return the (number, message) pairs that are complete now.
@@ -298,14 +283,15 @@ class MessageDecoder:
         Raises:
             ProtocolError: the stream holds something else, or a motion command that is not finite.
         """
-        try:
-            self._unpacker.feed(data)
-            pairs = list(self._unpacker)
-        except (ValueError, TypeError, IndexError, RecursionError, msgpack.UnpackException) as error:
-            raise ProtocolError(f"The pipe to the robot's worker carries an invalid message: {error}.") from error
-        for pair in pairs:
-            match pair:
-                case (int(), message) if isinstance(message, Message):
-                    continue
-            raise ProtocolError(f"The pipe to the robot's worker carries {pair!r}, which is no message.")
-        return pairs
+        *lines, self._partial = (self._partial + data).split(b"\n")
+        if len(self._partial) > LARGEST_MESSAGE:
+            raise ProtocolError("The pipe to the robot's worker carries a message without an end.")
+        return [_decode(line) for line in lines]
+
+
+def _decode(line: bytes) -> tuple[int, Message]:
+    try:
+        number, name, content = line.split(b" ", 2)
+        return int(number), _ADAPTERS[name.decode()].validate_json(content, strict=True)
+    except (ValueError, KeyError) as error:
+        raise ProtocolError(f"The pipe to the robot's worker carries an invalid message: {error}.") from error

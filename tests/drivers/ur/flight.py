@@ -54,7 +54,7 @@ def received(
     sample = dataclasses.replace(
         AT_REST, timestamp_s=timestamp_s, runtime_state=runtime_state, script_state=script_state, script_s=script_s
     )
-    return messages.RtdeOutputs(*map(vars(sample).get, messages.RtdeOutputs.__dataclass_fields__))
+    return messages.RtdeOutputs(*(getattr(sample, field.name) for field in dataclasses.fields(messages.RtdeOutputs)))
 
 
 class FakeArm:

@@ -3,9 +3,7 @@
 import contextlib
 import dataclasses
 import math
-from itertools import pairwise
 
-import msgpack
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,6 +13,7 @@ from shearloop.drivers.ur import messages as wire
 from shearloop.drivers.ur.messages import MessageDecoder, MoveLinear, RobotState, Stop, WristSpeed, encode
 from shearloop.drivers.ur.settings import UrSettings
 from tests.drivers.ur.flight import LIMITS, Flight
+from tests.slices import slices
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 six = st.tuples(*[finite] * 6)
@@ -50,35 +49,39 @@ numbered = st.lists(st.tuples(st.integers(0, 2**32 - 1), messages), max_size=5)
 def test_messages_arrive_as_sent_in_any_pieces(entries, cuts):
     stream = b"".join(encode(message, number) for number, message in entries)
     decoder = MessageDecoder()
-    edges = sorted({0, len(stream), *(cut for cut in cuts if cut < len(stream))})
-    assert [entry for a, b in pairwise(edges) for entry in decoder.feed(stream[a:b])] == entries
+    assert [entry for part in slices(stream, cuts) for entry in decoder.feed(part)] == entries
 
 
 @given(st.binary(max_size=200))
 def test_foreign_bytes_are_refused_or_waited_on(data):
     decoder = MessageDecoder()
     with contextlib.suppress(ProtocolError):
-        for _, message in decoder.feed(data):
-            assert MessageDecoder().feed(encode(message)) == [(0, message)]
-
-
-@pytest.mark.parametrize("fields", [(), ("0.1",), (math.nan,), (math.inf,), (0.1, 1.0), (None,), ((0.1, math.nan),)])
-def test_malformed_command_is_refused(fields):
-    stop = encode(Stop(0.1))
-    code = msgpack.unpackb(stop)[1].code
+        assert decoder.feed(data) == []
     with pytest.raises(ProtocolError):
-        MessageDecoder().feed(msgpack.packb((0, msgpack.ExtType(code, msgpack.packb(fields)))))
+        decoder.feed(data.replace(b"\n", b"") + b"\n")
 
 
-@pytest.mark.parametrize("message", [7, (1, 2), (0, "stop"), (0, LIMITS), ("0", Stop(0.1)), (0, Stop(0.1), 0)])
-def test_only_numbered_messages_are_accepted(message):
-    with pytest.raises(ProtocolError, match="no message"):
-        MessageDecoder().feed(msgpack.packb(message, default=wire._packed))
-
-
-def test_message_of_an_unknown_type_is_refused():
+@pytest.mark.parametrize("value", ["", '"0.1"', "NaN", "-Infinity", "null", "[0.1]", "0.1]", "true", "{}"])
+def test_malformed_command_is_refused(value):
+    line = encode(Stop(0.1))
+    assert MessageDecoder().feed(line) == [(0, Stop(0.1))]
     with pytest.raises(ProtocolError):
-        MessageDecoder().feed(msgpack.packb((0, msgpack.ExtType(100, msgpack.packb(())))))
+        MessageDecoder().feed(line.replace(b"0.1", value.encode()))
+
+
+@pytest.mark.parametrize(
+    "line", ["7", "0 Enable", "0 Go {}", "x Enable {}", "0 Enable []", "0 Stop {}", "Enable {}", ""]
+)
+def test_only_numbered_messages_are_accepted(line):
+    with pytest.raises(ProtocolError, match="invalid message"):
+        MessageDecoder().feed(f"{line}\n".encode())
+
+
+def test_message_without_an_end_is_refused():
+    decoder = MessageDecoder()
+    assert decoder.feed(bytes(wire.LARGEST_MESSAGE)) == []
+    with pytest.raises(ProtocolError, match="without an end"):
+        decoder.feed(b"x")
 
 
 def test_states_carry_values_that_are_not_finite():

@@ -15,7 +15,6 @@ from shearloop.bank.eit.mesh import Mesh, load_mesh
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import GeometryError
 from shearloop.daemon.config_file import ConfigModel, load_yaml_model
-from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
     ModelName: TypeAlias = str
@@ -146,17 +145,12 @@ class BankPlan(NamedTuple):
 def load_bank_plan(path: Path) -> BankPlan:
     """Read a bank's configuration and its mesh; raises UserError and GeometryError with the file and key to mend."""
     config = load_yaml_model(path, BankConfig)
-    mesh, table = _mesh_of(path, config)
-    return BankPlan(mesh, BankDefinition(mesh.digest, config.model, config.k.values(), config.sigma.values(), table))
-
-
-def _mesh_of(path: Path, config: BankConfig) -> Geometry:
-    if config.mesh is not None:
+    if config.fingertip is not None:
+        mesh, table = _fingertip_geometry(path.parent / config.fingertip, config.mesh_size_cm)
+    elif config.mesh is not None:
         mesh = load_mesh(path.parent / config.mesh.file)
-        return Geometry(mesh, ChannelTable(mesh.n_electrodes, config.mesh.injection))
-    if config.fingertip is None:
-        raise UserError(f"{path}: give either `mesh` or `fingertip`")
-    return _fingertip_mesh(path.parent / config.fingertip, config.mesh_size_cm)
+        table = ChannelTable(mesh.n_electrodes, config.mesh.injection)
+    return BankPlan(mesh, BankDefinition(mesh.digest, config.model, config.k.values(), config.sigma.values(), table))
 
 
 def load_geometry(path: Path) -> Geometry:
@@ -165,17 +159,20 @@ def load_geometry(path: Path) -> Geometry:
     A file of a mesh alone is taken for a fingertip with opposite injections.
     """
     if path.suffix in (".yaml", ".yml"):
-        return _fingertip_mesh(path)
+        return _fingertip_geometry(path)
     mesh = load_mesh(path)
     return Geometry(mesh, ChannelTable(mesh.n_electrodes))
 
 
-def _fingertip_mesh(path: Path, mesh_size_cm: float | None = None) -> Geometry:
-    config = load_yaml_model(path, FingertipGeometryConfig)
+def load_fingertip(path: Path, mesh_size_cm: float | None = None) -> Fingertip:
+    """Return the fingertip of a description, with another mesh size if given; raises UserError and GeometryError."""
+    fingertip = load_yaml_model(path, FingertipGeometryConfig).fingertip()
+    return fingertip if mesh_size_cm is None else replace(fingertip, mesh_size_cm=mesh_size_cm)
+
+
+def _fingertip_geometry(path: Path, mesh_size_cm: float | None = None) -> Geometry:
     try:
-        fingertip = config.fingertip()
-        if mesh_size_cm is not None:
-            fingertip = replace(fingertip, mesh_size_cm=mesh_size_cm)
+        fingertip = load_fingertip(path, mesh_size_cm)
         return Geometry(fingertip.mesh(), fingertip.table)
     except GeometryError as error:
         raise GeometryError(f"{path}: {error}") from error

@@ -22,14 +22,13 @@ from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import FrameSeries, Physics, fit, measure_timing
 from shearloop.bank.estimator_names import DEFAULT, EstimatorName
-from shearloop.daemon.analysis.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of
+from shearloop.daemon.analysis.evaluate import EstimateTrack, Figures, estimate_series, figures_by_load, figures_of
 from shearloop.daemon.analysis.frame_series import part_of, read_series, series_of
 from shearloop.daemon.cli.emulated_calibration import calibrate, record
 from shearloop.daemon.recording.matlab_import import import_mat
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.drivers.emulators.rig import SIDES
 
-Figures = dict[str, float | int | None]
 # Columns of the tables: figures of loaded frames, then two of all frames.
 LOADED = {
     "loaded": "n", "RMSE, N·m": "rmse_nm", "saying 0": "zero_rmse_nm", "gain": "gain", "coverage": "coverage_95",

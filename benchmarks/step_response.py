@@ -184,7 +184,6 @@ def judge_steps(rows: Sequence[FloatArray], settled_s: float) -> dict[str, float
         "time_in_band_worst_seed": float(inside.mean(axis=1).min()),
         "time_in_band_mean": float(inside.mean()),
         "overshoot_worst_seed": float(error.max()),
-        "overshoot_median": float(np.median(error.max(axis=1))),
         "mean_error": float(late.mean()),
         "mean_error_worst_seed": float(np.abs(late.mean(axis=1)).max()),
     }

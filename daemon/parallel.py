@@ -9,10 +9,11 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing import active_children, get_context
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Protocol, TypeVar
@@ -36,8 +37,8 @@ FIRST_WORKER_S = 30
 class Executor(Protocol):
     """Runs a function of shared data and of each item."""
 
-    def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[tuple[int, R]]:
-        """Yield (item number, function(shared, item)) as results arrive, in any order.
+    def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[R]:
+        """Yield function(shared, item) of each item in turn, as soon as it is known.
 
         The function must be importable. Raises what the function raises.
         """
@@ -46,10 +47,9 @@ class Executor(Protocol):
 class SerialExecutor:
     """Runs tasks in this process."""
 
-    def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[tuple[int, R]]:
-        """Yield the results in order."""
-        for number, item in enumerate(items):
-            yield number, function(shared, item)
+    def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[R]:
+        """Yield the results."""
+        return (function(shared, item) for item in items)
 
 
 class ProcessExecutor:
@@ -58,20 +58,18 @@ class ProcessExecutor:
     def __init__(self, count: int) -> None:
         self._count = count
 
-    def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[tuple[int, R]]:
-        """Yield results as they arrive; end the processes at once if the results are no longer wanted."""
-        others = active_children()
-        tasks: dict[Future[R], int] = {}
+    def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[R]:
+        """Yield the results; end the processes at once if they are no longer wanted."""
+        others, wanted = active_children(), True
         count = min(self._count, max(len(items), 1))
         pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_ignore_terminal)
         try:
-            tasks |= {pool.submit(function, shared, item): number for number, item in enumerate(items)}
-            for task in as_completed(list(tasks)):
-                yield tasks.pop(task), task.result()
+            yield from pool.map(partial(function, shared), items)
+            wanted = False
         except BrokenProcessPool as error:
             raise UserError("a process was killed, perhaps for lack of memory; run again with fewer --jobs") from error
         finally:
-            if tasks:
+            if wanted:
                 _unblock_queue(pool)
                 for process in active_children():
                     if process not in others:
@@ -98,19 +96,19 @@ class DaskExecutor:
     def __init__(self, client: "Client") -> None:
         self._client = client
 
-    def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[tuple[int, R]]:
-        """Yield results as they arrive."""
+    def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[R]:
+        """Yield the results."""
         from dask import config
-        from distributed import CancelledError, KilledWorker, as_completed
+        from distributed import CancelledError, KilledWorker
 
         # Dask warns about large tasks and suggests scatter; scattered data is lost with its worker.
         with config.set({"distributed.admin.large-graph-warning-threshold": sys.maxsize}):
             # A task's result: Dask computes it again if its workers die.
             sent = self._client.submit(_identity, shared, pure=False)
-            tasks = {self._client.submit(function, sent, item, pure=False): i for i, item in enumerate(items)}
+            tasks = [self._client.submit(function, sent, item, pure=False) for item in items]
         try:
-            for task in as_completed(list(tasks)):
-                yield tasks[task], task.result()
+            for task in tasks:
+                yield task.result()
         except KilledWorker as error:
             cure = "give the workers more memory, or run without --cluster"
             raise UserError(f"one task killed several workers, perhaps for lack of memory; {cure}") from error
@@ -121,16 +119,11 @@ class DaskExecutor:
         finally:
             # The generator may be closed after its client.
             if self._client.status == "running":
-                self._client.cancel(list(tasks))
+                self._client.cancel(tasks)
 
 
 def _identity(shared: S) -> S:
     return shared
-
-
-def in_order(results: Iterable[tuple[int, R]]) -> list[R]:
-    """Return the results of a `map` in the order of their items."""
-    return [result for _, result in sorted(results, key=lambda pair: pair[0])]
 
 
 @contextmanager

@@ -62,12 +62,12 @@ def build_bank(
     path: Path,
     *,
     jobs: int = 1,
-    elsewhere: Iterator[tuple[int, BankRow]] | None = None,
+    elsewhere: Iterator[BankRow] | None = None,
     on_row: Callable[[int], None] = lambda _: None,
 ) -> None:
     """Build a bank file on the mesh of its definition.
 
-    Rows are solved in `jobs` threads, or come from `elsewhere` in any order, with the same bytes. `on_row(done)` is
+    Rows are solved in `jobs` threads, or come in order from `elsewhere`, with the same bytes. `on_row(done)` is
     called after each. An existing bank is replaced only by a finished one. Raises GeometryError, ModelError where no
     cell is valid, and BankFileError where the bank cannot be written.
     """
@@ -78,11 +78,10 @@ def build_bank(
     if not path.parent.is_dir():
         raise BankFileError(f"{path}: there is no folder {path.parent}; make it or choose another --out")
     solver, total = RowSolver(mesh, definition), len(definition.k_grid)
-    found: dict[int, BankRow] = {}
-    for row, cells in elsewhere or _solve(solver, total, jobs):
-        found[row] = cells
-        on_row(len(found))
-    rows = [found[row] for row in range(total)]
+    rows: list[BankRow] = []
+    for cells in elsewhere or _solve(solver, total, jobs):
+        rows.append(cells)
+        on_row(len(rows))
     if not any(cells.valid.any() for cells in rows):
         why = f"no signal has a norm of {MIN_SIGNAL_NORM:g} or more"
         if (highest := max(float(cells.min_conductivity.max()) for cells in rows)) <= 0:
@@ -110,10 +109,10 @@ def solve_row(task: tuple[Mesh, BankDefinition], row: int) -> BankRow:
 _solvers: dict[str, RowSolver] = {}
 
 
-def _solve(solver: RowSolver, rows: int, jobs: int) -> Iterator[tuple[int, BankRow]]:
+def _solve(solver: RowSolver, rows: int, jobs: int) -> Iterator[BankRow]:
     """Yield rows in order; the solver releases the interpreter's lock."""
     with ThreadPoolExecutor(min(jobs, rows)) as pool:
         try:
-            yield from enumerate(pool.map(solver.solve, range(rows)))
+            yield from pool.map(solver.solve, range(rows))
         finally:
             pool.shutdown(cancel_futures=True)

@@ -10,8 +10,7 @@ from shearloop.bank.estimation.fingertip_validator import channel_noise, segment
 from shearloop.bank.estimation.values import FrameSeries
 from shearloop.daemon.analysis.frame_series import read_series
 from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP
-from shearloop.daemon.bank_config import FingertipGeometryConfig
-from shearloop.daemon.config_file import load_yaml_model
+from shearloop.daemon.bank_config import load_fingertip
 from shearloop.daemon.errors import UserError
 
 # The principal directions of one contact's frames; the rest is noise.
@@ -33,7 +32,7 @@ def designed_for(recording: Path, fingertip: Path | None, side: str | None) -> t
         raise UserError(f"{recording} holds no torque; a design needs frames of a tool that is twisted")
     # Slices have no side.
     one = series[0] if sides is None else series[0].select_sides(sides)
-    return path, design_bank(load_yaml_model(path, FingertipGeometryConfig).fingertip(), scene_of(one))
+    return path, design_bank(load_fingertip(path), scene_of(one))
 
 
 def scene_of(series: FrameSeries) -> MeasuredFrames:

@@ -2,6 +2,7 @@
 
 import argparse
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from shearloop.daemon.cli.options import add_cluster, add_option, checked_jobs
 from shearloop.daemon.errors import UserError, require
@@ -35,10 +36,11 @@ def run(args: argparse.Namespace) -> int:
     require("matplotlib", "plot", "a chart")
     from shearloop.daemon.analysis.charts import scene, simulated_loop, speed_accuracy, stability
     from shearloop.daemon.analysis.charts.chart_data import bank_of, mesh_of, splits
-    from shearloop.daemon.analysis.charts.drawing import check_takes_pictures
+    from shearloop.daemon.analysis.charts.drawing import chart_folder
     from shearloop.daemon.parallel import open_executor
 
-    check_takes_pictures(args.out)
+    with chart_folder(args.out), TemporaryFile(dir=args.out):
+        pass
     if args.name == "loop":
         print(*simulated_loop.chart(args.out), sep="\n")
         return 0

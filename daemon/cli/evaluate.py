@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     )
     from shearloop.daemon.analysis.frame_series import check_no_copies, check_paths_differ, part_of, read_series
     from shearloop.daemon.cli.options import check_kind, check_overwrite, load_calibration, parse_time_range
-    from shearloop.daemon.parallel import in_order, open_executor
+    from shearloop.daemon.parallel import open_executor
 
     if args.out is not None and args.out.suffix not in _FIGURES:
         raise UserError(f"--out {args.out} is not the name of a figure; give one that ends in {', '.join(_FIGURES)}")
@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
     with open_executor(args.cluster) as pool:
         # Frames before the part show the idle fingertip, as live.
         whole = [part_of(one, 0.0, stop) for _, one in named]
-        estimated = in_order(pool.map(estimate_in_worker, shared, whole))
+        estimated = list(pool.map(estimate_in_worker, shared, whole))
     tracks = [track.since(part.first_frame) for track, part in zip(estimated, parts, strict=True)]
     if args.estimates is not None:
         with writing(args.estimates, "the estimates"):

@@ -56,8 +56,7 @@ def test_threads_and_workers_elsewhere_build_the_same_bytes(finished, fingertip,
     definition = defined(fingertip)
     build_bank(fingertip, definition, tmp_path / "two.bank", jobs=2, on_row=progress.append)
     assert progress == list(range(1, len(K) + 1))
-    # Rows arrive in any order.
-    rows = ((row, solve_row((fingertip, definition), row)) for row in (3, 0, 4, 1, 2))
+    rows = (solve_row((fingertip, definition), row) for row in range(len(K)))
     build_bank(fingertip, definition, tmp_path / "there.bank", elsewhere=rows)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == dict.fromkeys(
         ("two.bank", "there.bank"), finished.read_bytes()

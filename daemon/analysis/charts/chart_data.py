@@ -16,8 +16,7 @@ from shearloop.bank.estimation import Calibration, FrameSeries, Physics, fit, me
 from shearloop.bank.estimator_names import EstimatorName
 from shearloop.daemon.analysis.frame_series import part_of, read_series
 from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP, Grid, cached_bank
-from shearloop.daemon.bank_config import FingertipGeometryConfig, load_geometry
-from shearloop.daemon.config_file import load_yaml_model
+from shearloop.daemon.bank_config import load_fingertip, load_geometry
 from shearloop.daemon.synthetic_frames import LARGEST_TORQUE_NM, Synthesiser, TwistProgramme
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 
@@ -45,8 +44,7 @@ class Split:
 
 def own_fingertip(mesh_size_cm: float) -> Fingertip:
     """Return the paper's fingertip by its dimensions, with another mesh size."""
-    config = load_yaml_model(OWN_FINGERTIP, FingertipGeometryConfig)
-    return config.model_copy(update={"mesh_size_cm": mesh_size_cm}).fingertip()
+    return load_fingertip(OWN_FINGERTIP, mesh_size_cm)
 
 
 def mesh_of(path: Path | None) -> Mesh:
@@ -92,8 +90,8 @@ def fitted(
     return found
 
 
-def sigma_of(torque_nm: float) -> float:
-    """Return the σ in cm of a torque in synthetic frames: it falls with rising torque, as measured."""
+def sigma_of(torque_nm: FloatArray) -> FloatArray:
+    """Return the σ in cm of torques in synthetic frames: it falls with rising torque, as measured."""
     return 1.9 - 0.7 * torque_nm / LARGEST_TORQUE_NM
 
 
@@ -107,31 +105,33 @@ def played_bank(scratch: Path, grid: Grid = _PLAYED_GRID) -> Bank:
     return cached_bank("played", grid, own_fingertip(_PLAYED_MESH_SIZE_CM).mesh(), scratch)
 
 
-def mean_frame(synthesiser: Synthesiser, k: float, sigma: float, grip: float) -> FloatArray:
-    """Return the mean of nine frames (896,) in volts, like the paper's smoothed slices."""
-    lines = [synthesiser.line(k, sigma, grip) for _ in range(_AVERAGED_FRAMES)]
-    return np.asarray(np.mean([PAPER_TABLE.channels_of_line(line) for line in lines], axis=0))
+class SyntheticSlices:
+    """Makes differences from one idle frame; each frame is the mean of nine, like the paper's smoothed slices."""
 
+    def __init__(self, bank: Bank) -> None:
+        self._synthesiser = Synthesiser(bank)
+        self._idle = self._mean_frame(3.2, 1.5, 0.0)
 
-def homogeneous_of(synthesiser: Synthesiser) -> FloatArray:
-    """Return the homogeneous frame of synthetic slices; call it first after seeding."""
-    return mean_frame(synthesiser, 3.2, 1.5, 0.0)
+    def series(self, places: Sequence[tuple[float, float, float]], torque_nm: FloatArray) -> FrameSeries:
+        """Return the slices of n places (k and σ in cm, grip from 0 to 1) with these torques (n,)."""
+        n = len(places)
+        frames = np.array([np.abs(self._mean_frame(*place) - self._idle) for place in places])
+        t_s = np.arange(float(n))
+        return FrameSeries("difference", ("right",), t_s, frames[:, None], t_s, torque_nm, np.full(n, np.nan))
+
+    def _mean_frame(self, k: float, sigma: float, grip: float) -> FloatArray:
+        lines = [self._synthesiser.line(k, sigma, grip) for _ in range(_AVERAGED_FRAMES)]
+        return np.asarray(np.mean([PAPER_TABLE.channels_of_line(line) for line in lines], axis=0))
 
 
 def synthetic_slices(scratch: Path) -> FrameSeries:
-    """Return 49 differences like the paper's slices: five repeats of ten torques, means of nine frames."""
-    synthesiser, rng = Synthesiser(played_bank(scratch)), np.random.default_rng((0, 1))
-    homogeneous = homogeneous_of(synthesiser)
+    """Return 49 differences like the paper's slices: five repeats of ten torques."""
     levels = np.tile(np.linspace(0.01, LARGEST_TORQUE_NM, 10), 5)[1:]
-    torque = np.clip(levels + rng.normal(0.0, 0.003, len(levels)), 0.0, LARGEST_TORQUE_NM)
+    torque = np.clip(levels + np.random.default_rng((0, 1)).normal(0.0, 0.003, 49), 0.0, LARGEST_TORQUE_NM)
     # In every repeat the tool sits a little elsewhere in the grip, a little more firmly.
-    repeat = np.arange(1, 50) // 10
-    frames = [
-        np.abs(mean_frame(synthesiser, 3.2 + 0.03 * r, sigma_of(nm), 1.0 + 0.03 * r) - homogeneous)
-        for r, nm in zip(repeat, torque, strict=True)
-    ]
-    t_s = np.arange(49.0)
-    return FrameSeries("difference", ("right",), t_s, np.array(frames)[:, None], t_s, torque, np.full(49, np.nan))
+    shift = 0.03 * (np.arange(1, 50) // 10)
+    places = zip(3.2 + shift, sigma_of(torque), 1.0 + shift, strict=True)
+    return SyntheticSlices(played_bank(scratch)).series(list(places), torque)
 
 
 def synthetic_stream(scratch: Path) -> FrameSeries:
@@ -142,10 +142,10 @@ def synthetic_stream(scratch: Path) -> FrameSeries:
     t_s = np.arange(0.5 * FRAME_PERIOD_S, end_s, FRAME_PERIOD_S)
     # A rest after the grip, before the first twist.
     moments = [programme.at(t if t < gripped_s else max(t - _REST_S, gripped_s)) for t in t_s.tolist()]
+    grips, torque = np.array(moments).T
     channels = np.empty((len(t_s), 2, PAPER_TABLE.n_channels))
     for side, k in enumerate((3.2, 3.35)):
         synthesiser = Synthesiser(played_bank(scratch), seed=100 * side)
-        for i, (grip, torque_nm) in enumerate(moments):
-            channels[i, side] = PAPER_TABLE.channels_of_line(synthesiser.line(k, sigma_of(torque_nm), grip))
-    torque = np.array([torque_nm for _, torque_nm in moments])
+        for i, (sigma, grip) in enumerate(zip(sigma_of(torque), grips, strict=True)):
+            channels[i, side] = PAPER_TABLE.channels_of_line(synthesiser.line(k, sigma, grip))
     return FrameSeries("raw", ("right", "left"), t_s, channels, t_s, torque, np.full(len(t_s), np.nan))

@@ -1,9 +1,9 @@
 """Common parts of all charts: figures without a window, marks that differ in grey too, names of points, and files."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -90,23 +90,17 @@ def write_names(axes: Axes, points: Sequence[tuple[float, float, str]]) -> None:
         taken.append(legend.get_window_extent().padded(_GAP_PX))
     inside = axes.get_window_extent()
     for point in sorted(points):
-        tried: list[tuple[float, int, Annotation, Bbox]] = []
-        for offset in _BESIDE:
-            note = _note(axes, point, offset)
-            # This places the text; its own extent is without the line.
-            note.get_window_extent()
-            box = Text.get_window_extent(note)
-            within = Bbox.intersection(box, inside)
-            outside = _area(box) - (_area(within) if within is not None else 0.0)
-            covered = sum(_area(both) for other in taken if (both := Bbox.intersection(box, other)) is not None)
-            tried.append((covered + 10 * outside, len(tried), note, box))
-            if tried[-1][0] == 0:
-                break
-        _, _, chosen, box = min(tried, key=lambda one: one[:2])
-        taken.append(box.padded(_GAP_PX))
-        for _, _, note, _ in tried:
-            if note is not chosen:
-                note.remove()
+        notes = [_note(axes, point, offset) for offset in _BESIDE]
+        # The text's own extent is without the line.
+        boxes = [Text.get_window_extent(note) for note in notes]
+        costs = [
+            sum(_common_px(box, other) for other in taken) + 10 * (_common_px(box, box) - _common_px(box, inside))
+            for box in boxes
+        ]
+        best = costs.index(min(costs))
+        taken.append(boxes[best].padded(_GAP_PX))
+        for note in notes[:best] + notes[best + 1 :]:
+            note.remove()
 
 
 def _note(axes: Axes, point: tuple[float, float, str], offset: tuple[float, float]) -> Annotation:
@@ -118,11 +112,15 @@ def _note(axes: Axes, point: tuple[float, float, str], offset: tuple[float, floa
         arrowprops=_LEADER if max(abs(dx), abs(dy)) > _NEAR else None,
     )  # fmt: skip
     note.set_in_layout(False)
+    # This places the text.
+    note.get_window_extent()
     return note
 
 
-def _area(box: Bbox) -> float:
-    return float(box.width * box.height)
+def _common_px(one: Bbox, other: Bbox) -> float:
+    """Return the area that two boxes have in common, in square pixels."""
+    both = Bbox.intersection(one, other)
+    return float(both.width * both.height) if both is not None else 0.0
 
 
 def plain_log(axes: Axes) -> None:
@@ -140,31 +138,24 @@ def slug(title: str) -> str:
     return "-".join(title.split(",", maxsplit=1)[0].replace(".", " ").replace("_", " ").split()).lower()
 
 
-def check_takes_pictures(directory: Path) -> None:
-    """Raise UserError where no chart can be written into a directory; make it if it is new."""
+@contextmanager
+def chart_folder(directory: Path) -> Iterator[None]:
+    """Make a folder for charts; raise UserError where that, or writing into it, fails."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=directory):
-            pass
+        yield
     except OSError as error:
-        raise _unwritable(directory, error) from error
+        raise UserError(f"{directory}: the chart cannot be written: {error.strerror}; choose another --out") from error
 
 
 def save(made: Figure, content: Mapping[str, Any], directory: Path, name: str) -> list[Path]:
     """Write NAME.json, .svg and .png into a directory and return the paths; raises UserError where that fails."""
     paths = [directory / f"{name}.{suffix}" for suffix in ("json", "svg", "png")]
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
+    with chart_folder(directory):
         paths[0].write_text(json.dumps(content, indent=1, default=_plain) + "\n", encoding="utf-8")
         for path in paths[1:]:
             made.savefig(path, dpi=130)
-    except OSError as error:
-        raise _unwritable(directory, error) from error
     return paths
-
-
-def _unwritable(directory: Path, error: OSError) -> UserError:
-    return UserError(f"{directory}: the chart cannot be written: {error.strerror}; choose another --out")
 
 
 def _plain(value: object) -> object:

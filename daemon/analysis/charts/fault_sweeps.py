@@ -19,7 +19,7 @@ from shearloop.daemon.analysis.bank_design import residual_noise
 from shearloop.daemon.analysis.charts.chart_data import Split, fitted
 from shearloop.daemon.analysis.charts.drawing import figure, look
 from shearloop.daemon.analysis.evaluate import values_of
-from shearloop.daemon.parallel import Executor, in_order
+from shearloop.daemon.parallel import Executor
 from shearloop.daemon.synthetic_frames import MEAN_V
 from shearloop.drivers.eit_kit import ADC_STEP_V
 
@@ -285,9 +285,8 @@ def sweeps(
     split: Split, names: Sequence[EstimatorName], physics: Physics, bank: Bank, executor: Executor
 ) -> list[FaultCurve]:
     """Return the curves of all estimators through all faults; each estimator is one task for the workers."""
-    tasks = fitted(split, names, physics)
-    found = in_order(executor.map(sweep_estimator, (scene_for(split, bank), str(bank.path.resolve())), tasks))
-    return [one for curves in found for one in curves]
+    shared = scene_for(split, bank), str(bank.path.resolve())
+    return [one for curves in executor.map(sweep_estimator, shared, fitted(split, names, physics)) for one in curves]
 
 
 def sweep_estimator(shared: tuple[FaultScene, str], calibration: Calibration) -> list[FaultCurve]:
@@ -297,36 +296,32 @@ def sweep_estimator(shared: tuple[FaultScene, str], calibration: Calibration) ->
     return [sweep(tracker, scene, fault) for fault in FAULTS]
 
 
-def sweeps_figure(title: str, curves: Sequence[FaultCurve]) -> Figure:
-    """Draw bias, valid and false-valid share of every estimator, one row per fault."""
+def sweeps_figure(title: str, curves: Sequence[FaultCurve], panels: int = 3) -> Figure:
+    """Draw bias, valid and false-valid share of every estimator, one row per fault; more panels stay empty."""
     faults = list(dict.fromkeys((one.fault, one.unit) for one in curves))
-    made = figure(15, 2.75 * len(faults) + 1.0)
-    axes = made.subplots(len(faults), 3, squeeze=False)
-    for row, fault in zip(axes, faults, strict=True):
-        draw_fault(row, *fault, curves)
-    axes[0, 2].legend(fontsize=8, loc="upper left", handlelength=3.5)
+    names = list(dict.fromkeys(one.estimator for one in curves))
+    made = figure(5 * panels, 2.75 * len(faults) + 1.0)
+    rows = made.subplots(len(faults), panels, squeeze=False)
+    for row, (fault, unit) in zip(rows, faults, strict=True):
+        for panel, heading in zip(
+            row, ("bias, and spread as bars, mN·m", "valid share", "FALSE-VALID share"), strict=False
+        ):
+            label_panel(panel, unit, heading)
+        row[0].set_title(fault, fontsize=10.5, loc="left", fontweight="bold")
+        row[0].axhline(0, color="#999999", linewidth=0.8)
+        row[2].axhline(BROKEN_SHARE, color="#999999", linewidth=1.2, linestyle=(0, (1, 2)))
+        for panel in row[1:3]:
+            panel.set_ylim(-0.04, 1.04)
+        for one in curves:
+            if one.fault == fault:
+                _draw_curve(row, one, names.index(one.estimator), len(names))
+    made.legend(*rows[0, 2].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=len(names))
     made.suptitle(
-        f"Estimators under faults: {title}\n× breaks silently: more than {BROKEN_SHARE:.0%} of the frames are "
-        "called valid and miss their 95 % interval",
+        f"{title}\n× breaks silently: more than {BROKEN_SHARE:.0%} of the frames are called valid and miss their 95 % "
+        "interval",
         fontsize=12,
     )  # fmt: skip
     return made
-
-
-def draw_fault(row: Sequence[Axes], fault: str, unit: str, curves: Sequence[FaultCurve]) -> None:
-    """Draw one fault's curves into three panels: bias, valid and false-valid share."""
-    for panel, heading in zip(row, ("bias, and spread as bars, mN·m", "valid share", "FALSE-VALID share"), strict=True):
-        label_panel(panel, unit, heading)
-    row[0].set_title(fault, fontsize=10.5, loc="left", fontweight="bold")
-    row[0].axhline(0, color="#999999", linewidth=0.8)
-    names = list(dict.fromkeys(one.estimator for one in curves))
-    for number, name in enumerate(names):
-        for one in curves:
-            if one.fault == fault and one.estimator == name:
-                _draw_curve(row, one, number, len(names))
-    row[2].axhline(BROKEN_SHARE, color="#999999", linewidth=1.2, linestyle=(0, (1, 2)))
-    for panel in row[1:]:
-        panel.set_ylim(-0.04, 1.04)
 
 
 def label_panel(panel: Axes, unit: str, heading: str) -> None:
@@ -354,6 +349,6 @@ def _draw_curve(row: Sequence[Axes], one: FaultCurve, number: int, count: int) -
     for i, level in enumerate(one.levels):
         if level.level == one.breaks_at:
             row[2].plot(x[i], false[i], "x", color="black", markersize=13, markeredgewidth=2.5, zorder=5)
-    for panel in row:
+    for panel in row[:3]:
         panel.set_xticks(range(len(labels)), labels, fontsize=8)
         panel.set_xlim(-0.6, len(labels) - 0.4)

@@ -40,17 +40,6 @@ class SolvedForward:
     cited: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class _Solver:
-    name: str
-    family: str
-    mesh: Mesh
-    solve: Callable[[], FloatArray]
-    truth: FloatArray
-    # How often one call solves all cells.
-    repeats: int = 1
-
-
 def forward_methods(
     rounds: int,
     mesh: Mesh | None,
@@ -67,19 +56,22 @@ def forward_methods(
     if mesh is not None:
         once = mesh.refined()
         meshes.append(("--mesh", ", the given mesh", mesh, converged(once, once.refined(), 2.0)))
-    solvers = []
-    for name, given, own, true in meshes:
-        solvers.append(_Solver(f"direct, {name}", f"direct{given}", own, direct(own), true))
-        solvers.append(_Solver(f"batch, {name}", f"{BATCH}{given}", own, batch(own), true, BATCHES))
-    times_ms = np.empty((rounds, len(solvers)))
-    for row in times_ms:
-        for i, one in enumerate(solvers):
+    solvers = [
+        (f"{kind}, {name}", f"{family}{given}", own, solver(own), true)
+        for name, given, own, true in meshes
+        for kind, family, solver in (("direct", "direct", direct), ("batch", BATCH, batch))
+    ]
+    times_ms: dict[str, list[float]] = {name: [] for name, *_ in solvers}
+    for _ in range(rounds):
+        for name, _, _, solve, _ in solvers:
             begun = time.perf_counter()
-            one.solve()
-            row[i] = 1e3 * (time.perf_counter() - begun) / (len(CELLS) * one.repeats)
+            solved = len(solve())
+            times_ms[name].append(1e3 * (time.perf_counter() - begun) / solved)
     found = [
-        SolvedForward(one.name, one.family, len(one.mesh.triangles), float(ms), error_of(one.solve(), one.truth))
-        for one, ms in zip(solvers, np.median(times_ms, axis=0), strict=True)
+        SolvedForward(
+            name, family, len(own.triangles), float(np.median(times_ms[name])), error_of(solve()[: len(CELLS)], true)
+        )
+        for name, family, own, solve, true in solvers
     ]
     # EIDORS solves the same model: its error is known where the paper's mesh is given. pyEIT's electrodes are points.
     paper = next((one.error for one in found if one.triangles == PAPER_TRIANGLES), None)
@@ -91,13 +83,13 @@ def _cited(name: str, family: str, cell_s: float, error: float | None) -> Solved
 
 
 def batch(mesh: Mesh) -> Callable[[], FloatArray]:
-    """Return a function that solves the same signals in one batch, as `bank build` does."""
+    """Return a function that solves the same cells several times in one batch, as `bank build` does."""
     model, of = BatchForwardModel(mesh), ConductivityModel(mesh)
     (homogeneous,) = model.voltages(np.ones((1, len(mesh.triangles))))
     # The elimination takes several cells at once; six alone would leave lanes empty.
     cells = np.array([of.conductivity(MODEL, k, s) for k, s in CELLS])
     many = np.resize(np.arange(len(CELLS)), BATCHES * len(CELLS))
-    return lambda: (model.voltages(cells[many]) - homogeneous)[: len(CELLS)]
+    return lambda: model.voltages(cells[many]) - homogeneous
 
 
 def direct(mesh: Mesh) -> Callable[[], FloatArray]:

@@ -14,9 +14,8 @@ from shearloop.daemon.analysis.bank_design import doubts, scene_of
 from shearloop.daemon.analysis.charts.chart_data import Split, own_fingertip
 from shearloop.daemon.analysis.charts.drawing import SHADES, figure, save, slug
 from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP
-from shearloop.daemon.bank_config import FingertipGeometryConfig
-from shearloop.daemon.config_file import load_yaml_model
-from shearloop.daemon.parallel import Executor, in_order
+from shearloop.daemon.bank_config import load_fingertip
+from shearloop.daemon.parallel import Executor
 
 _MESH_SIZE_CM = 0.07
 _LEAST_SHOWN, _MOST_TICKS = 1e-3, 12
@@ -29,7 +28,7 @@ def chart(parts: Sequence[Split], out: Path, executor: Executor) -> list[Path]:
     """
     titles = [split.title.split(",", maxsplit=1)[0] for split in parts]
     scenes = [scene_of(split.whole) for split in parts]
-    found = in_order(executor.map(design_bank, own_fingertip(_MESH_SIZE_CM), scenes))
+    found = list(executor.map(design_bank, own_fingertip(_MESH_SIZE_CM), scenes))
     written = []
     for title, design in zip(titles, found, strict=True):
         for sentence in doubts(design):
@@ -37,8 +36,7 @@ def chart(parts: Sequence[Split], out: Path, executor: Executor) -> list[Path]:
         written += write(title, design, out)
     for name, fingertip in other_fingertips().items():
         simulated = [simulated_frames(design, fingertip) for design in found]
-        elsewhere = in_order(executor.map(design_bank, fingertip, simulated))
-        for title, design in zip(titles, elsewhere, strict=True):
+        for title, design in zip(titles, executor.map(design_bank, fingertip, simulated), strict=True):
             written += write(f"{title} {name}, simulated", design, out)
     return written
 
@@ -46,7 +44,7 @@ def chart(parts: Sequence[Split], out: Path, executor: Executor) -> list[Path]:
 def other_fingertips() -> dict[str, Fingertip]:
     """Return the fingertips of the configuration that are not the paper's, by name."""
     paths = sorted(path for path in OWN_FINGERTIP.parent.glob("*.yaml") if path != OWN_FINGERTIP)
-    return {path.stem: load_yaml_model(path, FingertipGeometryConfig).fingertip() for path in paths}
+    return {path.stem: load_fingertip(path) for path in paths}
 
 
 def write(title: str, design: Design, out: Path) -> list[Path]:
@@ -86,23 +84,14 @@ def _draw_choice(axes: Axes, choice: DesignChoice) -> None:
     axes.plot(chosen.setting, ring, "o", markersize=15, markerfacecolor="none", color="black")
     if settings[0] > settings[-1]:
         axes.invert_xaxis()
-    ticks = settings[:: max(1, len(settings) // _MOST_TICKS)] if scale == "log" else _spaced(settings)
-    axes.set_xticks(ticks, [f"{value:g}" for value in ticks], fontsize=8, rotation=60 if scale == "log" else 0)
-    axes.minorticks_off()
+    if scale == "log":
+        ticks = settings[:: max(1, len(settings) // _MOST_TICKS)]
+        axes.set_xticks(ticks, [f"{value:g}" for value in ticks], fontsize=8, rotation=60)
+        axes.minorticks_off()
     axes.set_ylim(0.5 * min(shown), 3.0 * max(*shown, ALLOWED))
     axes.grid(alpha=0.25)
     cost = chosen.cost.split(";", maxsplit=1)[0]
     axes.set_title(f"{chosen.setting:g} {choice.unit}: {cost}", fontsize=9.5)
-
-
-def _spaced(settings: Sequence[float]) -> list[float]:
-    """Return settings, from the last one back, far enough apart for readable ticks on a linear axis."""
-    apart = (max(settings) - min(settings)) / (1.3 * _MOST_TICKS)
-    kept = [settings[-1]]
-    for one in reversed(settings):
-        if kept[-1] - one >= apart:
-            kept.append(one)
-    return kept
 
 
 def _draw_models(axes: Axes, design: Design) -> None:

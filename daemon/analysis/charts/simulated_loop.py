@@ -188,7 +188,7 @@ class UncompensatedController:
         return WristCommand(max(-settings.speed_limit_rad_per_s, min(settings.speed_limit_rad_per_s, speed)))
 
 
-LoopController: TypeAlias = "TorqueController | UncompensatedController | _AveragedLoop"
+LoopController: TypeAlias = TorqueController | UncompensatedController
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,15 +221,24 @@ def run(
     duration_s: float,
     keep: Callable[[int], bool] = lambda _: True,
     bound_nm: float = np.inf,
+    latest: deque[PlantSample] | None = None,
 ) -> Trace:
-    """Close the loop for a time, or until the torque leaves the bound; `keep` drops measurements by their number."""
+    """Close the loop for a time, or until the torque leaves the bound.
+
+    `keep` drops measurements by their number. The controller gets the mean of the `latest` measurements, by default of
+    a single one, stamped with the mean of their times.
+    """
     rows: list[tuple[float, float]] = []
     end_s, count = plant.t_s + duration_s, 0
+    latest = deque(maxlen=1) if latest is None else latest
     while plant.t_s < end_s and abs(plant.torque_nm) <= bound_nm:
         now_ns = nanoseconds(plant.t_s)
         for sample in plant.collect():
             if keep(count):
-                controller.measure(sample.torque_nm, nanoseconds(sample.t_mid_s), now_ns)
+                latest.append(sample)
+                middles_ns = [nanoseconds(one.t_mid_s) for one in latest]
+                torque_nm = float(np.mean([one.torque_nm for one in latest]))
+                controller.measure(torque_nm, round(float(np.mean(middles_ns))), now_ns)
             count += 1
         command = controller.command(now_ns, plant.angle_rad)
         plant.step(command.speed_rad_per_s)
@@ -320,24 +329,6 @@ class TrackingError:
     rms_high_nm: float
 
 
-@dataclass(slots=True)
-class _AveragedLoop:
-    """A controller fed with the mean of the latest frames, stamped with the mean of their times."""
-
-    controller: TorqueController | UncompensatedController
-    latest: deque[tuple[float, int]]
-
-    def measure(self, torque_nm: float, t_mid_ns: int, t_ns: int) -> None:
-        """Process one frame's torque."""
-        self.latest.append((torque_nm, t_mid_ns))
-        torques, times = zip(*self.latest, strict=True)
-        self.controller.measure(float(np.mean(torques)), round(float(np.mean(times))), t_ns)
-
-    def command(self, t_ns: int, wrist_angle_rad: float) -> WristCommand:
-        """Return the wrist speed to send now."""
-        return self.controller.command(t_ns, wrist_angle_rad)
-
-
 def tracking_errors(noises_nm: Sequence[float], seeds: int, windows: Sequence[int] = WINDOWS) -> list[TrackingError]:
     """Return the tracking error of every loop and window, for every noise of a single frame."""
     rms: dict[tuple[str, float, int], list[float]] = {}
@@ -348,8 +339,8 @@ def tracking_errors(noises_nm: Sequence[float], seeds: int, windows: Sequence[in
             for name in LOOPS:
                 for frames in windows if name != LOOPS[2] else (1,):
                     plant = copy.deepcopy(gripped)
-                    loop = _averaged_loop(name, frames, plant, found, settings_for(found, scenario))
-                    rms.setdefault((name, noise, frames), []).append(_rms_error(plant, loop))
+                    controller = _controller(name, frames, plant, found, settings_for(found, scenario))
+                    rms.setdefault((name, noise, frames), []).append(_rms_error(plant, controller, frames))
     tracked = []
     for (name, noise, frames), errors in rms.items():
         # From the middle of the mean until it is known.
@@ -369,30 +360,26 @@ def _identified_plant(scenario: LoopScenario, seed: int) -> tuple[Plant, ToolMod
     raise RuntimeError(f"the tool cannot be identified at {scenario.sensor.noise_nm:g} N·m of noise")
 
 
-def _averaged_loop(
-    name: str, frames: int, plant: Plant, found: ToolModel, settings: ControllerSettings
-) -> _AveragedLoop:
-    latest: deque[tuple[float, int]] = deque(maxlen=frames)
+def _controller(name: str, frames: int, plant: Plant, found: ToolModel, settings: ControllerSettings) -> LoopController:
     if name != LOOPS[2]:
         settings = replace(
             settings, kp=GAIN, ki=integral_gain(GAIN), noise_nm=settings.noise_nm / float(np.sqrt(frames)),
             window_s=settings.window_s + (frames - 1) * found.sample_period_s,
             age_limit_s=settings.age_limit_s + frames * found.sample_period_s,
         )  # fmt: skip
-    if name == LOOPS[1]:
-        return _AveragedLoop(UncompensatedController(settings), latest)
-    return _AveragedLoop(started_controller(plant, found, settings), latest)
+    return UncompensatedController(settings) if name == LOOPS[1] else started_controller(plant, found, settings)
 
 
-def _rms_error(plant: Plant, loop: _AveragedLoop) -> float:
+def _rms_error(plant: Plant, controller: LoopController, frames: int) -> float:
     """Return the RMS of true torque − set point in N·m, after settling."""
     begun, squares, n = plant.t_s, 0.0, 0
+    latest: deque[PlantSample] = deque(maxlen=frames)
     while plant.t_s - begun < _RUN_S:
         t_s = plant.t_s - begun
         wanted = _TARGET_NM + _SWING_NM * float(np.sin(2 * np.pi * t_s / _SWING_PERIOD_S))
         plant.disturbance_nm = _LOAD_NM * float(np.sin(2 * np.pi * t_s / _LOAD_PERIOD_S))
-        loop.controller.set_point(wanted)
-        torque = run(plant, loop, _CHUNK_S).torque_nm
+        controller.set_point(wanted)
+        torque = run(plant, controller, _CHUNK_S, latest=latest).torque_nm
         if t_s >= _SETTLING_S:
             squares, n = squares + float(((torque - wanted) ** 2).sum()), n + len(torque)
     return float(np.sqrt(squares / n))
@@ -410,7 +397,7 @@ def held_loops(seeds: int) -> dict[str, list[tuple[Trace, Trace]]]:
     for seed in range(seeds):
         gripped, found = _identified_plant(scenario, seed)
         settings = settings_for(found, scenario)
-        loops: dict[str, TorqueController | UncompensatedController] = {
+        loops: dict[str, LoopController] = {
             "torque filter": started_controller(gripped, found, settings),
             # Without the noise, the filter has one gain and no test for jumps.
             "constant gain": started_controller(gripped, found, replace(settings, noise_nm=0.0)),

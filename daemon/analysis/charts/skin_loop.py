@@ -22,7 +22,7 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
 from shearloop.daemon.control.loop_inputs import ArmStatus, LoopConfig, TorqueSample, TorqueSource
-from shearloop.daemon.parallel import Executor, in_order
+from shearloop.daemon.parallel import Executor
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
 from shearloop.daemon.synthetic_skin import SyntheticSkin
@@ -230,7 +230,7 @@ def chart(out: Path, executor: Executor) -> list[Path]:
     """Measure all cases, draw and write `stability-skin`."""
     calibration = load_calibration(CALIBRATION)
     gains, delays = over_gains(), over_delays()
-    found = in_order(executor.map(worst, calibration, [*gains, *delays]))
+    found = list(executor.map(worst, calibration, [*gains, *delays]))
     shown = judge(SkinLoopCase(name="shown"), calibration)[1]
     made = limit_cycle_figure(found[: len(gains)], found[len(gains) :], shown)
     return save(made, {"held": [asdict(held) for held in found]}, out, "stability-skin")

@@ -71,21 +71,15 @@ def measure(methods: list[TorqueMethod], truth_nm: FloatArray, rounds: int) -> l
         for method in methods:
             torques[method.name], latency_ms = method.run()
             times[method.name].append(float(np.median(latency_ms)))
-    found = []
+    known, found = np.isfinite(truth_nm), []
     for method in methods:
-        known = np.isfinite(truth_nm)
-        judged = known & np.isfinite(torques[method.name])
-        if judged.sum() < 2:
-            continue
-        value, truth = torques[method.name][judged], truth_nm[judged]
-        own = times[method.name]
-        found.append(
-            MeasuredMethod(
-                method.name, method.family, float(np.median(own)), min(own), max(own),
-                float(np.sqrt(((value - truth) ** 2).mean())),
-                float(judged.sum() / known.sum()),
-            )
-        )  # fmt: skip
+        value, own = torques[method.name], times[method.name]
+        judged = known & np.isfinite(value)
+        if judged.sum() >= 2:
+            rmse_nm = float(np.sqrt(((value - truth_nm)[judged] ** 2).mean()))
+            latency = float(np.median(own)), min(own), max(own)
+            valid_fraction = float(judged.sum() / known.sum())
+            found.append(MeasuredMethod(method.name, method.family, *latency, rmse_nm, valid_fraction))
     return found
 
 
@@ -102,30 +96,14 @@ def estimators(split: Split, physics: Physics, sides: tuple[str, ...]) -> Iterat
         yield TorqueMethod(f"{calibration.estimator.name}{count}", family, partial(run, calibration))
 
 
-def matchers(split: Split, bank: Bank) -> Iterator[TorqueMethod]:
-    """Yield every way to find σ in the bank; the paper's parabola then turns σ into torque."""
-
-    def method(name: str, family: str, sigma_of: Callable[[FloatArray], float]) -> TorqueMethod:
-        return TorqueMethod(name, family, _timed(split, parabola(split, sigma_of)))
-
-    for name, family, kind in (
-        ("paper: all lags, reference", "all lags", ReferenceMatcher),
-        ("all lags, fast and exact", "all lags", PrunedMatcher),
-        ("zero lag, reference", "zero lag", ZeroLagMatcher),
-        ("zero lag, fast and exact", "zero lag", PrunedZeroLagMatcher),
-    ):
-        yield method(name, family, partial(matched_sigma, kind.from_bank(bank)))
-    nearest = RefinedMatcher(bank, NOT_TURNED)
-    yield method("zero lag, smoothed, sub-grid", "zero lag", partial(matched_sigma, nearest))
-    cells = np.flatnonzero(bank.valid)
-    shapes = np.abs(bank.signals.reshape(-1, bank.signals.shape[-1])[cells])
+def matchers(split: Split, bank: Bank) -> list[TorqueMethod]:
+    """Return every way to find σ in the bank; the paper's parabola then turns σ into torque."""
+    shapes = np.abs(bank.signals[bank.valid])
     shapes /= np.linalg.norm(shapes, axis=1, keepdims=True)
-    column = bank.sigma_grid[cells % len(bank.sigma_grid)]
+    half, column = shapes.astype(np.float16), bank.sigma_grid[np.nonzero(bank.valid)[1]]
 
     def best_of(scores: Callable[[Float32Array], Float32Array]) -> Callable[[FloatArray], float]:
         return lambda x: float(column[np.argmax(scores((x / np.linalg.norm(x)).astype(np.float32)))])
-
-    half = shapes.astype(np.float16)
 
     def half_scores(frame: Float32Array) -> Float32Array:
         # The products are float32, for BLAS.
@@ -135,13 +113,21 @@ def matchers(split: Split, bank: Bank) -> Iterator[TorqueMethod]:
     def compressed_scores(directions: Float32Array, numbers: Float32Array, frame: Float32Array) -> Float32Array:
         return numbers @ (directions @ frame)
 
-    yield method("zero lag, float32", "precision", best_of(partial(np.matmul, shapes)))
-    yield method("zero lag, float16", "precision", best_of(half_scores))
+    ways: dict[tuple[str, str], Callable[[FloatArray], float]] = {
+        ("paper: all lags, reference", "all lags"): partial(matched_sigma, ReferenceMatcher.from_bank(bank)),
+        ("all lags, fast and exact", "all lags"): partial(matched_sigma, PrunedMatcher.from_bank(bank)),
+        ("zero lag, reference", "zero lag"): partial(matched_sigma, ZeroLagMatcher.from_bank(bank)),
+        ("zero lag, fast and exact", "zero lag"): partial(matched_sigma, PrunedZeroLagMatcher.from_bank(bank)),
+        ("zero lag, smoothed, sub-grid", "zero lag"): partial(matched_sigma, RefinedMatcher(bank, NOT_TURNED)),
+        ("zero lag, float32", "precision"): best_of(partial(np.matmul, shapes)),
+        ("zero lag, float16", "precision"): best_of(half_scores),
+    }
     basis = np.linalg.svd(shapes[:: max(1, len(shapes) // _ENOUGH_CELLS)], full_matrices=False)[2]
     for rank in RANKS:
         directions = np.ascontiguousarray(basis[:rank])
         scores = partial(compressed_scores, directions, np.ascontiguousarray(shapes @ directions.T))
-        yield method(f"rank {rank}", "zero lag, bank of rank r", best_of(scores))
+        ways[f"rank {rank}", "zero lag, bank of rank r"] = best_of(scores)
+    return [TorqueMethod(*named, _timed(split, parabola(split, sigma_of))) for named, sigma_of in ways.items()]
 
 
 def matched_sigma(matcher: Matcher | BankMatcher, difference: FloatArray) -> float:

@@ -19,21 +19,12 @@ from shearloop.bank.estimation import Calibration, EstimatorSession, FrameSeries
 from shearloop.bank.estimation.bank_match import NOT_TURNED
 from shearloop.bank.estimator_names import EstimatorName
 from shearloop.daemon.analysis.charts import skin_loop
-from shearloop.daemon.analysis.charts.chart_data import (
-    Split,
-    fitted,
-    homogeneous_of,
-    mean_frame,
-    played_bank,
-    splits,
-    torque_of,
-)
+from shearloop.daemon.analysis.charts.chart_data import Split, SyntheticSlices, fitted, played_bank, splits, torque_of
 from shearloop.daemon.analysis.charts.drawing import figure, look, save, slug
 from shearloop.daemon.analysis.charts.fault_sweeps import (
     BROKEN_SHARE,
     FaultCurve,
     FaultLevel,
-    draw_fault,
     estimate_frames,
     fault_curve,
     judge_level,
@@ -47,8 +38,7 @@ from shearloop.daemon.analysis.charts.speed_accuracy import matched_sigma, parab
 from shearloop.daemon.analysis.evaluate import values_of
 from shearloop.daemon.analysis.reproduce.banks import Grid
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.parallel import Executor, in_order
-from shearloop.daemon.synthetic_frames import Synthesiser
+from shearloop.daemon.parallel import Executor
 
 STEPS = 25
 SLICE_NAMES: tuple[EstimatorName, ...] = ("paper", "bank", "regression", "reconstruction", "motion_regression")
@@ -101,7 +91,7 @@ def _of_slices(split: Split, bank: Bank, mesh: Mesh, out: Path, executor: Execut
 
 def _written(name: str, title: str, curves: Sequence[FaultCurve], out: Path) -> list[Path]:
     content = {"broken_share": BROKEN_SHARE, "title": title, "curves": [asdict(one) for one in curves]}
-    return save(sweeps_figure(title, curves), content, out, name)
+    return save(sweeps_figure(f"Estimators under faults: {title}", curves), content, out, name)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,7 +192,7 @@ def extrapolate(
     for which, extreme in ((SMALLER, np.max), (LARGER, np.min)):
         beyond[which].insert(0, (float(extreme(known.torque_nm[~later])), later))
     tasks = [(which, name, part) for which, parts in beyond.items() for name in names for part in parts]
-    outcomes = in_order(executor.map(judge_others, (known, str(bank.path.resolve()), mesh), tasks))
+    outcomes = executor.map(judge_others, (known, str(bank.path.resolve()), mesh), tasks)
     found = []
     for (which, name), steps in groupby(zip(tasks, outcomes, strict=True), key=lambda one: one[0][:2]):
         levels, slices, widths = [], [], []
@@ -263,11 +253,10 @@ def sweep_rims(calibrations: Sequence[Calibration], bank: Bank, scratch: Path) -
     )  # fmt: skip
     k_grid, sigma_grid = (np.unique(each) for each in np.array([place for *_, places in rims for place in places]).T)
     # The same idle frame as the slices': its noise is in every difference.
-    synthesiser = Synthesiser(played_bank(scratch, Grid(k_grid, sigma_grid)))
-    homogeneous = homogeneous_of(synthesiser)
+    slices = SyntheticSlices(played_bank(scratch, Grid(k_grid, sigma_grid)))
     trackers = [EstimatorSession(calibration, bank) for calibration in calibrations]
     for name, unit, settings, places in rims:
-        series = [_series(synthesiser, homogeneous, k, sigma) for k, sigma in places]
+        series = [slices.series([(k, s, 1.0)] * _FRAMES, np.full(_FRAMES, torque_of(s))) for k, s in places]
         for tracker in trackers:
             levels = [
                 judge_level(estimate_frames(tracker, one), one.torque_nm, level)
@@ -276,23 +265,16 @@ def sweep_rims(calibrations: Sequence[Calibration], bank: Bank, scratch: Path) -
             yield fault_curve(name, unit, tracker.calibration.estimator.name, levels)
 
 
-def _series(synthesiser: Synthesiser, homogeneous: FloatArray, k: float, sigma: float) -> FrameSeries:
-    frames = np.array([np.abs(mean_frame(synthesiser, k, sigma, 1.0) - homogeneous) for _ in range(_FRAMES)])[:, None]
-    t_s = np.arange(float(_FRAMES))
-    return FrameSeries(
-        "difference", ("right",), t_s, frames, t_s, np.full(_FRAMES, torque_of(sigma)), np.full(_FRAMES, np.nan)
-    )
-
-
 def extrapolation_figure(title: str, found: Sequence[Extrapolation]) -> Figure:
     """Draw the estimators beyond the torques they were calibrated on, and the width of their intervals."""
-    faults = list(dict.fromkeys((one.curve.fault, one.curve.unit) for one in found))
-    made = figure(19, 4.2 * len(faults) + 1.0)
-    axes = made.subplots(len(faults), 4, squeeze=False)
-    for row, (fault, unit) in zip(axes, faults, strict=True):
-        here = [one for one in found if one.curve.fault == fault]
-        draw_fault(row[:3], fault, unit, [one.curve for one in here])
-        label_panel(row[3], unit, "median width, times that of good later slices")
+    made = sweeps_figure(
+        f"Torques beyond the calibrated ones: {title}\nat “all”: calibrated on the earlier slices, judged on the later "
+        "ones; else all other slices are judged; below each limit: number of calibrated slices",
+        [one.curve for one in found], panels=4,
+    )  # fmt: skip
+    for first, (_, group) in enumerate(groupby(found, key=lambda one: one.curve.fault)):
+        here, row = list(group), made.axes[4 * first : 4 * first + 4]
+        label_panel(row[3], here[0].curve.unit, "median width, times that of good later slices")
         row[3].axhline(1.0, color="#999999", linewidth=0.8)
         for number, one in enumerate(here):
             times = np.array(one.times_good, dtype=float)
@@ -303,14 +285,6 @@ def extrapolation_figure(title: str, found: Sequence[Extrapolation]) -> Figure:
         for panel in row:
             panel.set_xticks(range(len(labels)), ["all\n" + labels[0].split("\n")[1], *labels[1:]], fontsize=8)
             panel.set_xlim(-0.6, len(labels) - 0.4)
-    # This panel has room for the names.
-    axes[0, 1].legend(*axes[0, 2].get_legend_handles_labels(), fontsize=8, handlelength=3.5)
-    made.suptitle(
-        f"Torques beyond the calibrated ones: {title}\nat “all”: calibrated on the earlier slices, judged on the later "
-        "ones; else all other slices are judged; below each limit: number of calibrated slices\n× breaks "
-        f"silently: more than {BROKEN_SHARE:.0%} of the slices are called valid and miss their 95 % interval",
-        fontsize=12,
-    )  # fmt: skip
     return made
 
 

@@ -29,7 +29,7 @@ def ignored_signals(_: None, __: int) -> set[int]:
 
 
 def test_worker_processes_ignore_the_terminals_signals():
-    assert list(ProcessExecutor(1).map(ignored_signals, None, [0])) == [(0, {signal.SIGINT, signal.SIGHUP})]
+    assert list(ProcessExecutor(1).map(ignored_signals, None, [0])) == [{signal.SIGINT, signal.SIGHUP}]
 
 
 @pytest.fixture

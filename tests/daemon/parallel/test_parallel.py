@@ -46,10 +46,10 @@ def dies_once(folder: str, item: int) -> int:
 
 def test_all_executors_give_the_same_numbers(scheduler):
     items, shared = list(range(12)), {"factor": 0.37}
-    alone = dict(SerialExecutor().map(square, shared, items))
-    assert dict(ProcessExecutor(2).map(square, shared, items)) == alone
+    alone = list(SerialExecutor().map(square, shared, items))
+    assert list(ProcessExecutor(2).map(square, shared, items)) == alone
     with open_executor(scheduler) as cluster:
-        assert dict(cluster.map(square, shared, items)) == alone
+        assert list(cluster.map(square, shared, items)) == alone
 
 
 @pytest.mark.parametrize(
@@ -79,8 +79,8 @@ def test_a_tasks_error_is_raised(scheduler):
 
 def test_a_killed_worker_costs_only_its_own_tasks(scheduler, tmp_path):
     with open_executor(scheduler) as cluster:
-        results = dict(cluster.map(dies_once, str(tmp_path), range(12)))
-    assert results == {item: item * item for item in range(12)}
+        results = list(cluster.map(dies_once, str(tmp_path), range(12)))
+    assert results == [item * item for item in range(12)]
     assert (tmp_path / "killed").exists()
     runs = [int(line) for line in (tmp_path / "runs").read_text().split()]
     # Twice ran the task that it died of, and what it had done but not yet handed over; all else once.
@@ -103,7 +103,7 @@ def size(_: None, item: Any) -> int:
 
 def test_a_large_recording_is_sent_to_a_cluster_without_a_warning(scheduler):
     with open_executor(scheduler) as cluster:
-        assert list(cluster.map(size, None, [np.zeros(1_500_000)])) == [(0, 1_500_000)]
+        assert list(cluster.map(size, None, [np.zeros(1_500_000)])) == [1_500_000]
 
 
 def test_a_missing_scheduler_is_one_sentence(tmp_path, mistake):
@@ -140,9 +140,9 @@ def test_a_scheduler_without_workers_or_a_lost_one_is_one_sentence(lonely, monke
     ):
         pass
     monkeypatch.setattr(distributed.Client, "wait_for_workers", lambda *_, **__: None)
-    # As soon as the tasks are waited for.
-    begun = distributed.as_completed
-    monkeypatch.setattr(distributed, "as_completed", lambda tasks: (process.kill(), begun(tasks))[1])
+    # As soon as a task is waited for.
+    begun = distributed.Future.result
+    monkeypatch.setattr(distributed.Future, "result", lambda task: (process.kill(), begun(task))[1])
     with (
         open_executor(address) as cluster,
         pytest.raises(UserError, match="the connection to the Dask scheduler was lost"),
@@ -176,12 +176,12 @@ def killed(scheduler, monkeypatch) -> Iterator[list[int]]:
     found: list[int] = []
     whole = DaskExecutor.map
 
-    def interrupted(self: DaskExecutor, function: Any, shared: Any, items: Sequence[Any]) -> Iterator[tuple[int, Any]]:
-        for number, result in whole(self, function, shared, items):
+    def interrupted(self: DaskExecutor, function: Any, shared: Any, items: Sequence[Any]) -> Iterator[Any]:
+        for result in whole(self, function, shared, items):
             if not found:
                 found.append(next(iter(self._client.run(os.getpid).values())))
                 os.kill(found[0], signal.SIGKILL)
-            yield number, result
+            yield result
 
     monkeypatch.setattr(DaskExecutor, "map", interrupted)
     yield found

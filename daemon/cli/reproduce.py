@@ -10,8 +10,9 @@ from shearloop.daemon.cli.terminal import progress_bar
 from shearloop.daemon.errors import missing
 
 if TYPE_CHECKING:
+    from shearloop.bank.arrays import FloatArray
     from shearloop.bank.eit.bank_file import Bank
-    from shearloop.daemon.analysis.reproduce.banks import Grid
+    from shearloop.daemon.analysis.reproduce.analysis import Matches
     from shearloop.daemon.analysis.reproduce.report import Reproduction
 
 
@@ -51,42 +52,36 @@ def run(args: argparse.Namespace) -> int:
 def _reproduce(args: argparse.Namespace, jobs: int) -> "tuple[Reproduction, dict[str, Bank]]":
     from scipy import fft
 
+    from shearloop.bank.eit.channels import smoothed_along_channels
     from shearloop.daemon.analysis.reproduce import analysis
-    from shearloop.daemon.analysis.reproduce.banks import GRIDS, cached_bank, choose_mesh, focused_grid
+    from shearloop.daemon.analysis.reproduce.banks import GRIDS, cached_bank, choose_mesh
     from shearloop.daemon.analysis.reproduce.dataset import read_twists, regress_on_channels
     from shearloop.daemon.analysis.reproduce.report import Reproduction
 
     inputs = analysis.read_inputs(args.recordings)
     mesh, origin = choose_mesh(args.recordings, args.mesh)
     print(f"mesh: {origin}", file=sys.stderr)
-    notes = list(inputs.notes)
+    notes: list[str] = []
 
-    def build(name: str, grid: "Grid") -> "Bank":
-        with progress_bar(name, grid.k.size, "row") as show:
-            return cached_bank(name, grid, mesh, args.out / "banks", jobs, show)
+    def build(name: str) -> "Bank":
+        with progress_bar(name, GRIDS[name].k.size, "row") as show:
+            return cached_bank(name, GRIDS[name], mesh, args.out / "banks", jobs, show)
+
+    def match(differences: "FloatArray", bank: "Bank") -> "Matches":
+        with progress_bar("matching", len(differences), "slice") as show:
+            return analysis.match_slices(differences, bank, show)
 
     with fft.set_workers(jobs):
-        banks = {"wide": build("wide", GRIDS["wide"])}
+        banks = {"wide": build("wide")}
         torque = diameter = models = None
         if inputs.torque is not None:
-            slices = inputs.torque.differences
-            with progress_bar("matching", len(slices), "slice") as show:
-                on_wide = analysis.match_slices(slices, banks["wide"], show)
-            focus = focused_grid(on_wide.k, on_wide.sigma)
-            if focus is not GRIDS["focused"]:
-                (k_low, *_, k_high), (sigma_low, *_, sigma_high) = focus.k, focus.sigma
-                notes.append(
-                    "Most slices match best outside of the paper's focused bank: this one lies around them, "
-                    f"k {k_low:.2f} to {k_high:.2f} cm, sigma {sigma_low:.2f} to {sigma_high:.2f} cm."
-                )
-            banks["focused"] = build("focused", focus)
-            with progress_bar("matching", len(slices), "slice") as show:
-                on_focused = analysis.match_slices(slices, banks["focused"], show)
+            banks["focused"] = build("focused")
+            on_focused, on_wide = (match(inputs.torque.differences, banks[name]) for name in ("focused", "wide"))
             torque = analysis.analyse_torque(inputs.torque, on_focused, on_wide)
             models = analysis.score_models(inputs.torque, inputs.raw_difference, mesh)
         if inputs.diameter is not None:
-            with progress_bar("matching", len(inputs.diameter.differences), "slice") as show:
-                diameter = analysis.analyse_diameter(inputs.diameter, banks["wide"], show)
+            smooth = smoothed_along_channels(inputs.diameter.differences)
+            diameter = analysis.analyse_diameter(inputs.diameter, match(smooth, banks["wide"]), banks["wide"])
     regressions = regress_on_channels(torque.slices, torque.parts) if torque else ()
     twists = read_twists(args.recordings, notes) if torque else None
     found = Reproduction(mesh, origin, banks["wide"], torque, diameter, models, regressions, twists, tuple(notes))

@@ -10,7 +10,7 @@ from scipy.optimize import linear_sum_assignment
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import PAPER_TABLE, smoothed_along_channels
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.design import (
     PAPER_ENVELOPE,
     EnvelopeSettings,
@@ -45,12 +45,11 @@ _TORQUE_DEGREE, _DIAMETER_DEGREE = 2, 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inputs:
-    """The slices of a folder; `raw_difference` (896,) is of one raw frame, `notes` name missing files."""
+    """The slices of a folder, None where they are missing; `raw_difference` (896,) is of one raw frame."""
 
     torque: Slices | None
     diameter: Slices | None
     raw_difference: FloatArray | None
-    notes: tuple[str, ...]
 
 
 def read_inputs(recordings: Path) -> Inputs:
@@ -61,30 +60,15 @@ def read_inputs(recordings: Path) -> Inputs:
     torque_folder, diameter_folder = recordings / TORQUE_FOLDER, recordings / DIAMETER_FOLDER
     if not torque_folder.is_dir() and not diameter_folder.is_dir():
         raise UserError(f"{recordings} has neither a folder {TORQUE_FOLDER} nor a folder {DIAMETER_FOLDER}")
-    notes: list[str] = []
-    torque = diameter = raw = None
-    if torque_folder.is_dir():
-        torque = read_torque_slices(torque_folder)
-        if len(torque.torque_nm) < FEWEST_SLICES:
-            found = counted(len(torque.torque_nm), "slice")
-            raise UserError(f"{torque_folder} has {found}; a correlation needs at least {FEWEST_SLICES}")
-        raw = _raw_difference(torque_folder, notes)
-    else:
-        notes.append(f"{torque_folder} does not exist: nothing about torque, and no scores of the models.")
-    if diameter_folder.is_dir():
-        diameter = read_diameter_slices(diameter_folder)
-    else:
-        notes.append(f"{diameter_folder} does not exist: nothing about diameter.")
-    return Inputs(torque, diameter, raw, tuple(notes))
-
-
-def _raw_difference(folder: Path, notes: list[str]) -> FloatArray | None:
-    frame, homogeneous = folder / RAW_FRAME, folder / RAW_HOMOGENEOUS
-    absent = [path.name for path in (frame, homogeneous) if not path.exists()]
-    if absent:
-        notes.append(f"{' and '.join(absent)} not found in {folder}: models are scored by the matching alone.")
-        return None
-    return np.abs(PAPER_TABLE.channels_of_line(read_line(frame)) - PAPER_TABLE.channels_of_line(read_line(homogeneous)))
+    torque = read_torque_slices(torque_folder) if torque_folder.is_dir() else None
+    if torque is not None and len(torque.torque_nm) < FEWEST_SLICES:
+        found = counted(len(torque.torque_nm), "slice")
+        raise UserError(f"{torque_folder} has {found}; a correlation needs at least {FEWEST_SLICES}")
+    raw, paths = None, [torque_folder / name for name in (RAW_FRAME, RAW_HOMOGENEOUS)]
+    if all(path.exists() for path in paths):
+        frame, homogeneous = (PAPER_TABLE.channels_of_line(read_line(path)) for path in paths)
+        raw = np.abs(frame - homogeneous)
+    return Inputs(torque, read_diameter_slices(diameter_folder) if diameter_folder.is_dir() else None, raw)
 
 
 FEWEST_SLICES = 3
@@ -123,7 +107,7 @@ class TorqueResult:
     `groups` (n,) are levels of torque. `r_clustered` is between the means of these, and `fit` is the parabola through
     the means. `parts` (n,) are parts of the recording.
     `rmse_nm` is of single slices, each predicted by a parabola that was fitted without its part. `grouping` and
-    `held_out` describe the groups and the parts.
+    `held_out` describe the groups and the parts. What the slices do not determine is None.
     """
 
     slices: Slices
@@ -137,7 +121,6 @@ class TorqueResult:
     fit: Polynomial | None
     rmse_nm: float | None
     held_out: str
-    notes: tuple[str, ...]
 
     @property
     def r_wide(self) -> float | None:
@@ -160,7 +143,8 @@ class DiameterResult:
     """The diameter slices' results: Pearson's correlation between diameter and the best match's k.
 
     `single` is slice by slice. `accumulated` has one match per diameter (d,), of its mean heatmap; `fit` is the line
-    through its k. `running_k` (n,) are of the sum of a cylinder's heatmaps up to each slice.
+    through its k. `running_k` (n,) are of the sum of a cylinder's heatmaps up to each slice. What the slices do not
+    determine is None.
     """
 
     slices: Slices
@@ -172,7 +156,6 @@ class DiameterResult:
     running_k: FloatArray
     r_running_sum: float | None
     fit: Polynomial | None
-    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,12 +204,6 @@ def analyse_torque(slices: Slices, on_focused: Matches, on_wide: Matches) -> Tor
     sigma = on_focused.sigma
     groups, grouping, parts, held_out = _groups(torque)
     group_sigma, group_torque = group_means(sigma, groups), group_means(torque, groups)
-    r_clustered = correlation(group_sigma, group_torque)
-    notes: list[str] = []
-    fit = _fit_or_note(group_sigma, group_torque, _TORQUE_DEGREE, "torque over sigma", notes)
-    rmse_nm = _cross_validated_rmse(sigma, torque, parts, notes)
-    if r_clustered is None:
-        notes.append("the groups of torque slices are too few or too alike for a correlation")
     return TorqueResult(
         slices=slices,
         focused=on_focused,
@@ -234,39 +211,32 @@ def analyse_torque(slices: Slices, on_focused: Matches, on_wide: Matches) -> Tor
         r_focused=correlation(sigma, torque),
         groups=groups,
         grouping=grouping,
-        r_clustered=r_clustered,
+        r_clustered=correlation(group_sigma, group_torque),
         parts=parts,
-        fit=fit,
-        rmse_nm=rmse_nm,
+        fit=_curve(group_sigma, group_torque, _TORQUE_DEGREE),
+        rmse_nm=_cross_validated_rmse(sigma, torque, parts),
         held_out=held_out,
-        notes=tuple(notes),
     )
 
 
-def analyse_diameter(slices: Slices, wide: Bank, progress: Progress) -> DiameterResult:
-    """Match diameter slices, smoothed along the channels, in the wide bank and relate k to diameter."""
-    single = match_slices(smoothed_along_channels(slices.differences), wide, progress)
+def analyse_diameter(slices: Slices, single: Matches, wide: Bank) -> DiameterResult:
+    """Relate k to diameter, from the matches of slices, smoothed along the channels, in the wide bank."""
     diameters = np.unique(slices.diameter_mm)
     heatmaps = np.array([single.heatmaps[slices.diameter_mm == each].mean(axis=0) for each in diameters])
     accumulated = _best_matches(heatmaps, wide)
-    r_accumulated = correlation(accumulated.k, diameters)
     sums = [single.heatmaps[slices.diameter_mm == each].cumsum(axis=0) for each in diameters]
     # Slices stand by rising diameter.
     running_k = _best_matches(np.concatenate(sums), wide).k
-    notes: list[str] = []
-    if r_accumulated is None:
-        notes.append(f"{counted(len(diameters), 'diameter')}, or too few distinct k: no correlation of k with diameter")
     return DiameterResult(
         slices=slices,
         single=single,
         r_single=correlation(single.k, slices.diameter_mm),
         diameters_mm=diameters,
         accumulated=accumulated,
-        r_accumulated=r_accumulated,
+        r_accumulated=correlation(accumulated.k, diameters),
         running_k=running_k,
         r_running_sum=correlation(running_k, slices.diameter_mm),
-        fit=_fit_or_note(accumulated.k, diameters, _DIAMETER_DEGREE, "diameter over k", notes),
-        notes=tuple(notes),
+        fit=_curve(accumulated.k, diameters, _DIAMETER_DEGREE),
     )
 
 
@@ -337,27 +307,21 @@ def _groups(torque: FloatArray) -> tuple[IntArray, str, IntArray, str]:
     )
 
 
-def _cross_validated_rmse(sigma: FloatArray, torque: FloatArray, parts: IntArray, notes: list[str]) -> float | None:
+def _cross_validated_rmse(sigma: FloatArray, torque: FloatArray, parts: IntArray) -> float | None:
     errors = np.empty_like(torque)
     for part in np.unique(parts):
         out = parts == part
-        fit = _fit_or_note(sigma[~out], torque[~out], _TORQUE_DEGREE, "torque over sigma with a part left out", notes)
+        fit = _curve(sigma[~out], torque[~out], _TORQUE_DEGREE)
         if fit is None:
             return None
         errors[out] = fit(sigma[out]) - torque[out]
     return float(np.sqrt(np.mean(errors**2)))
 
 
-def _fit_or_note(x: FloatArray, y: FloatArray, degree: int, what: str, notes: list[str]) -> Polynomial | None:
-    distinct = len(np.unique(x))
-    if distinct > degree and len(x) > degree + 1:
-        return Polynomial.fit(x, y, degree)
-    found = f"{counted(len(x), 'measurement')} at {counted(distinct, 'distinct place')}"
-    notes.append(
-        f"no fit of {what}: {found} cannot determine a curve of degree {degree}: at least {degree + 2} at "
-        f"{degree + 1} places are needed"
-    )
-    return None
+def _curve(x: FloatArray, y: FloatArray, degree: int) -> Polynomial | None:
+    """Return the fit of y over x, None where the points leave nothing to judge it by."""
+    enough = len(np.unique(x)) > degree and len(x) > degree + 1
+    return Polynomial.fit(x, y, degree) if enough else None
 
 
 def place_in_series(values: FloatArray) -> tuple[IntArray, IntArray] | None:

@@ -38,32 +38,6 @@ GRIDS = {
 }
 
 
-# The paper's focused grid stays where this share of the best matches is inside; other tools match elsewhere.
-FEWEST_INSIDE = 0.9
-# Quantiles of the best matches that a moved grid covers, and the number of the wide bank's steps around them.
-_ENDS, _STEPS_AROUND = (0.02, 0.98), 2
-
-
-def focused_grid(k: FloatArray, sigma: FloatArray) -> Grid:
-    """Return the focused grid for the best matches k (n,) and sigma (n,) in the wide bank, in cm.
-
-    It is the paper's where that covers the matches; else an equally large or larger one around the matches.
-    """
-    paper, wide = GRIDS["focused"], GRIDS["wide"]
-    pairs = ((k, paper.k), (sigma, paper.sigma))
-    inside = np.all([(found >= grid[0]) & (found <= grid[-1]) for found, grid in pairs], axis=0)
-    if inside.mean() >= FEWEST_INSIDE:
-        return paper
-    return Grid(_around(k, paper.k, wide.k), _around(sigma, paper.sigma, wide.sigma))
-
-
-def _around(found: FloatArray, paper: FloatArray, wide: FloatArray) -> FloatArray:
-    low, high = np.quantile(found, _ENDS)
-    half = max(high - low + 2 * _STEPS_AROUND * (wide[1] - wide[0]), paper[-1] - paper[0]) / 2
-    middle = (low + high) / 2
-    return np.linspace(max(middle - half, wide[0]), min(middle + half, wide[-1]), len(paper))
-
-
 def choose_mesh(recordings: Path, mesh: Path | None) -> tuple[Mesh, str]:
     """Return the mesh of a file, else the paper's next to the recordings, else our own.
 

@@ -72,33 +72,30 @@ class Twists:
     phase: IntArray
 
 
-def regress_on_channels(slices: Slices, parts: IntArray) -> tuple[ChannelRegression, ChannelRegression]:
+def regress_on_channels(slices: Slices, parts: IntArray) -> list[ChannelRegression]:
     """Return the regressions with channels ranked by all slices, as the paper does, and by the fitted ones only.
 
     The rank of a channel is its correlation with torque; parts (n,) of the slices are left out in turn.
     """
-    n_channels = slices.differences.shape[1]
+    torque, n_channels = slices.torque_nm, slices.differences.shape[1]
     counts = np.unique(
         [*range(1, _EVERY_COUNT), PAPER_CHANNELS, *np.geomspace(_EVERY_COUNT, n_channels, _N_COUNTS).astype(int)]
     )
-    return (
-        _regression("ranked by all slices (paper)", counts, slices, parts, by_all=True),
-        _regression("ranked by the fitted slices", counts, slices, parts, by_all=False),
-    )
-
-
-def _regression(ranking: str, counts: IntArray, slices: Slices, parts: IntArray, *, by_all: bool) -> ChannelRegression:
-    torque, predicted = slices.torque_nm, np.empty((len(counts), len(parts)))
-    for part in np.unique(parts):
-        out = parts == part
-        ranked = np.full_like(out, fill_value=True) if by_all else ~out
-        x = slices.differences[:, ranked_channels(slices.differences[ranked], torque[ranked])]
-        x, mean = x - x[~out].mean(axis=0), torque[~out].mean()
-        for i, count in enumerate(counts):
-            weights = np.linalg.lstsq(x[~out, :count], torque[~out] - mean, rcond=None)[0]
-            predicted[i, out] = x[out, :count] @ weights + mean
-    r = np.array([np.corrcoef(one, torque)[0, 1] for one in predicted])
-    return ChannelRegression(ranking, counts, r, 1.0 - ((predicted - torque) ** 2).mean(axis=1) / torque.var())
+    found = []
+    for ranking, by_all in (("ranked by all slices (paper)", True), ("ranked by the fitted slices", False)):
+        predicted = np.empty((len(counts), len(parts)))
+        for part in np.unique(parts):
+            out = parts == part
+            ranked = by_all | ~out
+            x = slices.differences[:, ranked_channels(slices.differences[ranked], torque[ranked])]
+            x, mean = x - x[~out].mean(axis=0), torque[~out].mean()
+            for i, count in enumerate(counts):
+                weights = np.linalg.lstsq(x[~out, :count], torque[~out] - mean, rcond=None)[0]
+                predicted[i, out] = x[out, :count] @ weights + mean
+        r = np.array([np.corrcoef(one, torque)[0, 1] for one in predicted])
+        r2 = 1.0 - ((predicted - torque) ** 2).mean(axis=1) / torque.var()
+        found.append(ChannelRegression(ranking, counts, r, r2))
+    return found
 
 
 def read_twists(recordings: Path, notes: list[str]) -> Twists | None:

@@ -36,6 +36,7 @@ PAPER = "Trehan, Hardman and Iida 2025, Sensors 25, 5159"
 PAPER_TORQUE_R, PAPER_TORQUE_CLUSTERED_R, PAPER_DIAMETER_R = 0.6552, 0.9588, 0.9746
 # "The model correlates with experimental data for k > 3.5, σ > 0.6", in cm (its section 4).
 PAPER_REGION_CM = (3.5, 0.6)
+_NONE = "none"
 # The bars of figure 5.
 PAPER_MODEL_SCORES = {
     "step": 0.65126,
@@ -56,7 +57,7 @@ class Reproduction:
     torque: TorqueResult | None
     diameter: DiameterResult | None
     models: ModelScores | None
-    regressions: tuple[ChannelRegression, ...]
+    regressions: Sequence[ChannelRegression]
     twists: Twists | None
     notes: tuple[str, ...]
 
@@ -132,6 +133,8 @@ def table(found: Reproduction) -> str:
     ]
     width = max(len(name) for name, *_ in rows)
     lines = [f"{name:<{width}}  {paper:>8}  {here:>9}".rstrip() for name, paper, here in rows]
+    if any(here == _NONE for *_, here in rows):
+        lines += ["", f"{_NONE}: slices are too few, or their matches too alike, for this number"]
     return "\n".join([*lines, "", *explanations(found)])
 
 
@@ -153,8 +156,8 @@ def explanations(found: Reproduction) -> list[str]:
         )
     if found.models:
         sentences += _model_explanations(found.models)
-    results = (found.torque, found.diameter)
-    return [*sentences, *found.notes, *(note for result in results if result for note in result.notes)]
+    absent = [name for name, result in (("torque", found.torque), ("diameter", found.diameter)) if result is None]
+    return [*sentences, *(f"There are no {name} slices: nothing about {name}." for name in absent), *found.notes]
 
 
 def _regression_explanation(regressions: Sequence[ChannelRegression]) -> str:
@@ -189,7 +192,7 @@ def _model_explanations(models: ModelScores) -> list[str]:
 
 
 def _count_range(counts: tuple[int, int] | None) -> str:
-    return "none" if counts is None else f"{counts[0]} to {counts[1]}" if counts[0] < counts[1] else str(counts[0])
+    return _NONE if counts is None else f"{counts[0]} to {counts[1]}" if counts[0] < counts[1] else str(counts[0])
 
 
 def _first(scores: dict[str, float | None]) -> str:
@@ -198,7 +201,7 @@ def _first(scores: dict[str, float | None]) -> str:
 
 
 def _number(value: float | None, digits: int = 5) -> str:
-    return "none" if value is None else f"{value:.{digits}f}"
+    return _NONE if value is None else f"{value:.{digits}f}"
 
 
 _GREY, _BLACK, _PINK, _BLUE, _TEAL, _ORANGE = "#8c8c8c", "#222222", "#d6338a", "#1f5f99", "#2a9d8f", "#d9822b"

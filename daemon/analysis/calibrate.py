@@ -15,22 +15,6 @@ from shearloop.daemon.recording.reader import read_recording
 
 
 @dataclass(frozen=True, slots=True)
-class CalibrationOptions:
-    """What the user says about the recordings.
-
-    time_range are shares (0 to 1) of each recording. Recordings have sides, load_cell_delay_s, which is subtracted from
-    the load cell's times, and then these are not checked, and tool_mm. With assume_full_range no torque will exceed the
-    slices.
-    """
-
-    sides: tuple[str, ...] | None = None
-    time_range: tuple[float, float] = (0.0, 1.0)
-    load_cell_delay_s: float | None = None
-    assume_full_range: bool = False
-    tool_mm: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class CalibrationResult:
     """A calibration, the number of frames behind it, the load cell's timing, named doubts about it, and the tools."""
 
@@ -89,32 +73,48 @@ class CalibrationResult:
 
 
 def calibrate(
-    paths: Sequence[Path], estimator: EstimatorName, physics: Physics, options: CalibrationOptions
+    paths: Sequence[Path],
+    estimator: EstimatorName,
+    physics: Physics,
+    *,
+    time_range: tuple[float, float],
+    sides: tuple[str, ...] | None = None,
+    load_cell_delay_s: float | None = None,
+    assume_full_range: bool = False,
+    tool_mm: float | None = None,
 ) -> CalibrationResult:
-    """Fit an estimator to recordings or folders of slices, oldest first.
+    """Fit an estimator to these shares (0 to 1) of recordings or of folders of slices, oldest first.
 
-    Raises UserError for recordings that are given twice, and CalibrationError for those that determine no calibration.
+    A `load_cell_delay_s` is subtracted from the load cell's times, which are then not checked. With `assume_full_range`
+    no torque will exceed the slices. Raises UserError for recordings that are given twice, and CalibrationError for
+    those that determine no calibration.
     """
     check_paths_differ(paths)
-    delay_s = options.load_cell_delay_s
     chosen: list[tuple[Path, FrameSeries]] = []
     others: list[tuple[str, FrameSeries]] = []
     all_live = True
     for path in paths:
-        own, beside, live = _read(path, options)
-        all_live = all_live and live
-        chosen += [(path, part_of(one, *options.time_range)) for one in own]
-        others += [(f"{path.name}, {one.sides[0]}", part_of(one, *options.time_range)) for one in beside]
+        beside: list[FrameSeries] = []
+        if path.is_dir():
+            own, all_live = read_series(path), False
+        else:
+            recording = read_recording(path)
+            own, all_live = [series_of(recording, sides, tool_mm)], all_live and recording.live
+            if sides is not None and load_cell_delay_s is None:
+                # Other sides may show the load cell's delay better.
+                beside = [series_of(recording, (side,), tool_mm) for side in recording.sides if side not in sides]
+        chosen += [(path, part_of(one, *time_range)) for one in own]
+        others += [(f"{path.name}, {one.sides[0]}", part_of(one, *time_range)) for one in beside]
     parts = [part for _, part in chosen]
     check_no_copies([(str(path), part) for path, part in chosen])
-    if delay_s:
-        parts = [replace(one, torque_t_s=one.torque_t_s - delay_s) for one in parts]
-    timing = TRUSTED if delay_s is not None else measure_timing(parts, [one for _, one in others])
+    if load_cell_delay_s:
+        parts = [replace(one, torque_t_s=one.torque_t_s - load_cell_delay_s) for one in parts]
+    timing = TRUSTED if load_cell_delay_s is not None else measure_timing(parts, [one for _, one in others])
     if all_live:
         # One clock stamped frames and torques as they arrived, whatever the motion shows.
         timing = replace(timing, uncertainty_s=0.0)
-    source = _source(paths, options.time_range, delay_s)
-    calibration = fit(estimator, parts, source, physics, timing=timing, full_range=options.assume_full_range)
+    source = _source(paths, time_range, load_cell_delay_s)
+    calibration = fit(estimator, parts, source, physics, timing=timing, full_range=assume_full_range)
     named = [*((path.name, one) for path, one in chosen), *others]
     warned = [each for each in zip(timing.references, timing.warnings, strict=True) if each[1]]
     doubts = [f"{name}: {why}" for name, one in named for reference, why in warned if one is reference]
@@ -142,21 +142,6 @@ def adapt_to_recordings(
     until = [part_of(replace(one, torque_t_s=one.torque_t_s - load_cell_delay_s), 0.0, stop) for one in series]
     first = [part_of(one, start, stop).first_frame for one in series]
     return adapt(calibration, until, _source(paths, time_range, load_cell_delay_s), physics, first_frames=first)
-
-
-def _read(path: Path, options: CalibrationOptions) -> tuple[list[FrameSeries], list[FrameSeries], bool]:
-    """Return a path's series, those of its other sides, and whether a daemon recorded them.
-
-    Other sides may show the load cell's delay better.
-    """
-    if path.is_dir():
-        return read_series(path), [], False
-    recording, sides = read_recording(path), options.sides
-    own = series_of(recording, sides, options.tool_mm)
-    others = []
-    if sides is not None and options.load_cell_delay_s is None:
-        others = [side for side in recording.sides if side not in sides]
-    return [own], [series_of(recording, (side,), options.tool_mm) for side in others], recording.live
 
 
 def _source(paths: Sequence[Path], time_range: tuple[float, float], delay_s: float | None) -> str:

@@ -48,18 +48,12 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.eit.mesh import load_mesh
     from shearloop.bank.estimation import Physics
     from shearloop.bank.estimation.calibration import ARCHIVE_MAGIC
-    from shearloop.daemon.analysis.calibrate import CalibrationOptions, calibrate
+    from shearloop.daemon.analysis.calibrate import calibrate
     from shearloop.daemon.cli.options import parse_sides, parse_time_range
     from shearloop.daemon.recording.schema import LARGEST_DIAMETER_MM
 
-    options = CalibrationOptions(
-        sides=parse_sides(args.sides),
-        time_range=parse_time_range(args.time_range),
-        load_cell_delay_s=args.load_cell_delay_s,
-        assume_full_range=args.assume_full_range,
-        tool_mm=args.tool_mm,
-    )
-    delay_s, tool_mm = options.load_cell_delay_s, options.tool_mm
+    sides, time_range = parse_sides(args.sides), parse_time_range(args.time_range)
+    delay_s, tool_mm = args.load_cell_delay_s, args.tool_mm
     if delay_s is not None and not abs(delay_s) <= _LARGEST_DELAY_S:
         raise UserError(
             f"--load-cell-delay-s must be from -{_LARGEST_DELAY_S:g} to {_LARGEST_DELAY_S:g} s, not {delay_s:g}"
@@ -71,7 +65,10 @@ def run(args: argparse.Namespace) -> int:
     physics = Physics(
         bank=Bank.open(args.bank) if args.bank else None, mesh=load_mesh(args.mesh) if args.mesh else None
     )
-    result = calibrate(args.recordings, args.estimator, physics, options)
+    result = calibrate(
+        args.recordings, args.estimator, physics, time_range=time_range, sides=sides, load_cell_delay_s=delay_s,
+        assume_full_range=args.assume_full_range, tool_mm=tool_mm,
+    )  # fmt: skip
     if args.assume_full_range and result.calibration.torque is None:
         raise UserError("--assume-full-range is about torques, and these slices have diameters only; leave it out")
     result.calibration.save(args.out)

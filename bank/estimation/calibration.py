@@ -195,7 +195,7 @@ class Calibration:
             if model.k_range.shape not in ((0,), (2,)):
                 raise ValueError(f"k_range has the shape {model.k_range.shape}, expected two values")
             if model.novelty is not None:
-                model.novelty.assess(np.ones(c), np.ones(c, dtype=np.bool_))
+                model.novelty.reasons(np.ones(c), np.ones(c, dtype=np.bool_))
             regressor = model.regressor
             value, below, above = regressor.predict(regressor.mean_feature)
             regressor.range_reasons(value, regressor.mean_feature, "torque", "")

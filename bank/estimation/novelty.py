@@ -74,20 +74,6 @@ class ReciprocityCheck:
         return float(np.median((x - _coordinates(self.directions, x, both) @ self.directions)[both] ** 2))
 
 
-@dataclass(frozen=True, slots=True)
-class Novelty:
-    """The reasons against a difference, none for a familiar one, and the share of the response that may be missing.
-
-    Foreign signals may have replaced this share of the fingertip's own response.
-    """
-
-    reasons: tuple[str, ...]
-    missing_share: float = 0.0
-
-
-FAMILIAR = Novelty(())
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class NoveltyDetector:
     """Mean (c,) and spread (c,) in volts, directions (r, c) in units of spread with their variances (r,).
@@ -173,45 +159,43 @@ class NoveltyDetector:
     def _scale(self, difference: FloatArray) -> FloatArray:
         return np.asarray((difference - self.mean) / self.spread)
 
-    def assess(self, difference: FloatArray, usable: BoolArray) -> Novelty:
-        """Return the novelty of a (c,) difference, by its usable channels."""
+    def reasons(self, difference: FloatArray, usable: BoolArray) -> tuple[str, ...]:
+        """Return the reason against a (c,) difference, by its usable channels, if there is one."""
         if 1.0 - usable.mean() > LARGEST_UNUSABLE_SHARE:
-            return _refused(
-                f"{100 * (1 - usable.mean()):.0f} % of the channels are dead or saturated; check the ribbon cable"
-            )
+            return (f"{100 * (1 - usable.mean()):.0f} % of the channels are dead or saturated; check the ribbon cable",)
         size = float(np.sqrt((difference[usable] ** 2).mean()))
         if size < self.least_norm:
-            return _refused(
+            return (
                 f"no grip: the difference to the idle frame is {1e3 * size:.1f} mV a channel, and gripping "
-                f"makes at least {1e3 * self.least_norm:.1f} mV"
+                f"makes at least {1e3 * self.least_norm:.1f} mV",
             )
         q, outlying = self.q_residual(difference, usable)
         if q > self.largest_q or outlying > self.largest_outlying:
-            return _refused(
+            return (
                 f"outside the calibration: the Q residual is {q:.1f} (limit {self.largest_q:.1f}), with "
-                f"{100 * outlying:.0f} % of the channels far off (limit {100 * self.largest_outlying:.0f} %)"
+                f"{100 * outlying:.0f} % of the channels far off (limit {100 * self.largest_outlying:.0f} %)",
             )
         if self.reciprocity is not None:
             residual = self.reciprocity.residual(difference, usable)
             if residual > self.reciprocity.largest_residual:
-                return _refused(
+                return (
                     f"outside the calibration: two measurements of the same voltages differ by {residual:.2f} (limit "
-                    f"{self.reciprocity.largest_residual:.2f}); part of the frame may be another fingertip's"
+                    f"{self.reciprocity.largest_residual:.2f}); part of the frame may be another fingertip's",
                 )
         t2 = self.t2(difference, usable)
         if t2 > self.largest_t2:
-            return _refused(
+            return (
                 f"outside the calibration: the frame lies {np.sqrt(t2):.1f} standard deviations from the calibrated "
-                f"ones (limit {np.sqrt(self.largest_t2):.1f})"
+                f"ones (limit {np.sqrt(self.largest_t2):.1f})",
             )
+        return ()
+
+    def missing_share(self, difference: FloatArray, usable: BoolArray) -> float:
+        """Return the share of the fingertip's own response that foreign signals may have replaced."""
         if self.typical_response <= 0:
-            return FAMILIAR
+            return 0.0
         left = self.response_share(difference, usable) / self.typical_response
-        return Novelty((), min(max(1.0 - left, 0.0), _MOST_MISSING))
-
-
-def _refused(reason: str) -> Novelty:
-    return Novelty((reason,))
+        return min(max(1.0 - left, 0.0), _MOST_MISSING)
 
 
 def _principal_components(rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

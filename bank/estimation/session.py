@@ -17,7 +17,6 @@ from shearloop.bank.estimation.bank_match import BankMatch, BankMatcher
 from shearloop.bank.estimation.calibration import Calibration
 from shearloop.bank.estimation.estimator import NO_ERRORS, OutputModel, Quantity, Reading
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
-from shearloop.bank.estimation.novelty import FAMILIAR, Novelty
 from shearloop.bank.estimation.session_state import PaperState, ProcessedFrame, SessionState, SliceState
 from shearloop.bank.estimation.values import Estimate, Measured, TactileFrame
 from shearloop.bank.gain import GainCorrection, find_twists
@@ -190,7 +189,7 @@ class EstimatorSession:
             return Estimate(valid=False, reasons=tuple(reasons))
         errors = NO_ERRORS
         if not frame.usable.all():
-            novelty = next((one.novelty for one, _ in outputs.values() if one.novelty is not None), None)
+            novelty = next((one.novelty for one in outputs.values() if one.novelty is not None), None)
             difference, errors = calibration.estimator.impute(frame.difference, frame.usable, novelty)
             self.difference, frame = difference, replace(frame, difference=difference)
         reading = Reading.of(frame, t_s, self._matcher)
@@ -200,8 +199,8 @@ class EstimatorSession:
         if "torque" in outputs:
             self._grip.frames.append((t_s, features[calibration.estimator.columns["torque"]]))
         values: dict[Quantity, _Interval] = {}
-        for quantity, (model, novelty_result) in outputs.items():
-            value, against = self._predict_quantity(quantity, model, novelty_result, reading, features, errors)
+        for quantity, model in outputs.items():
+            value, against = self._predict_quantity(quantity, model, reading, features, errors)
             reasons |= dict.fromkeys(against)
             if not against:
                 values[quantity] = value[0], value[0] - value[1], value[0] + value[2]
@@ -213,37 +212,35 @@ class EstimatorSession:
             values.clear()
         return _estimate(values, reasons, match)
 
-    def _select_outputs(
-        self, frame: ProcessedFrame
-    ) -> tuple[dict[Quantity, tuple[OutputModel, Novelty]], dict[str, None]]:
-        """Return the models to apply to a frame with its novelty, and the reasons against the others, in order."""
-        outputs: dict[Quantity, tuple[OutputModel, Novelty]] = {}
+    def _select_outputs(self, frame: ProcessedFrame) -> tuple[dict[Quantity, OutputModel], dict[str, None]]:
+        """Return the models to apply to a frame, and the reasons against the others, in order."""
+        outputs: dict[Quantity, OutputModel] = {}
         reasons: dict[str, None] = dict.fromkeys(() if self.calibration.outputs else _UNCALIBRATED)
         for quantity, model in (self._calibration.outputs | self._grip.adapted).items():
-            novelty = FAMILIAR
-            if model.novelty is not None:
-                novelty = model.novelty.assess(frame.difference[0], frame.usable[0])
-            against = (*novelty.reasons, *(self._tool_reasons if quantity == "torque" else ()))
             if quantity == "diameter" and not frame.has_baseline:
                 # The gel's position means nothing without its idle position.
                 continue
+            against = self._tool_reasons if quantity == "torque" else ()
+            if model.novelty is not None:
+                against = (*model.novelty.reasons(frame.difference[0], frame.usable[0]), *against)
             reasons |= dict.fromkeys(against)
             if not against:
-                outputs[quantity] = model, novelty
+                outputs[quantity] = model
         return outputs, reasons
 
     def _predict_quantity(
-        self, quantity: Quantity, model: OutputModel, novelty: Novelty, reading: Reading, features: FloatArray,
-        errors: FloatArray,
-    ) -> tuple[_Interval, tuple[str, ...]]:  # fmt: skip
+        self, quantity: Quantity, model: OutputModel, reading: Reading, features: FloatArray, errors: FloatArray
+    ) -> tuple[_Interval, tuple[str, ...]]:
         """Return one quantity with its interval, and the reasons against it.
 
         Imputed channels have the (k, m, c) errors, one standard deviation each.
         """
         frame, estimator = reading.frame, self.calibration.estimator
         features, complete = estimator.inputs(quantity, features, reading), None
-        if quantity == "torque" and novelty.missing_share and estimator.uses_amplitude:
-            complete = self._regressor_inputs(quantity, reading, frame.difference / (1.0 - novelty.missing_share))
+        if quantity == "torque" and model.novelty is not None and estimator.uses_amplitude:
+            missing = model.novelty.missing_share(frame.difference[0], frame.usable[0])
+            if missing:
+                complete = self._regressor_inputs(quantity, reading, frame.difference / (1.0 - missing))
         usable_share = np.count_nonzero(frame.usable) / frame.usable.size
         value = model.regressor.predict(features, usable_share, complete)
         dead: tuple[str, ...] = ()

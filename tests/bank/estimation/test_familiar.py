@@ -26,10 +26,10 @@ def test_a_frame_far_out_along_the_calibrations_own_directions_is_refused(sliced
     series = sliced()
     guard = NoveltyDetector.fit(series.channels[:, 0], PAPER_TABLE)
     near, far = (beyond(series, nm)[0] for nm in (0.01, 0.15))
-    assert guard.assess(near, ALL).reasons == ()
+    assert guard.reasons(near, ALL) == ()
     # Its misfit is as small as any: only how far it lies out tells of it.
     assert guard.q_residual(far, ALL)[0] < guard.largest_q
-    assert "standard deviations from the calibrated ones" in guard.assess(far, ALL).reasons[0]
+    assert "standard deviations from the calibrated ones" in guard.reasons(far, ALL)[0]
 
 
 @pytest.mark.parametrize("share", [0.35, 0.5, 1.0])
@@ -46,8 +46,8 @@ def test_channels_that_vary_much_do_not_drown_the_others():
     guard = NoveltyDetector.fit(frames, PAPER_TABLE)
     # Ten times its own spread on every quiet channel is nothing beside one spread of the loud ones, in volts.
     odd = frames[3] + np.where(np.arange(896) < 90, 0.0, 1e-3) * np.where(np.arange(896) % 2, 1, -1)
-    assert guard.assess(odd, ALL).reasons
-    assert not guard.assess(frames[3], ALL).reasons
+    assert guard.reasons(odd, ALL)
+    assert not guard.reasons(frames[3], ALL)
 
 
 def saturating(value):
@@ -185,11 +185,11 @@ def test_a_judgement_says_how_much_of_the_own_response_may_be_missing(sliced):
     guard = NoveltyDetector.fit(frames, PAPER_TABLE)
     less = 0.8 * frames[35]
     missing = 1 - guard.response_share(less, ALL) / guard.typical_response
-    assert guard.assess(less, ALL).missing_share == pytest.approx(missing)
-    assert missing > 0.15 > guard.assess(frames[35], ALL).missing_share
+    assert guard.missing_share(less, ALL) == pytest.approx(missing)
+    assert missing > 0.15 > guard.missing_share(frames[35], ALL)
     # More than ever is nothing missing, and no frame is made larger than twice.
     for typical, share in ((1e-3, 0.0), (9.0, 0.5)):
-        assert replace(guard, typical_response=typical).assess(frames[35], ALL).missing_share == share
+        assert replace(guard, typical_response=typical).missing_share(frames[35], ALL) == share
     # But for one in twenty of those left out none is larger; so of good ones hardly any is.
     assert np.mean([guard.response_share(one, ALL) <= guard.typical_response for one in frames]) >= 0.9
 

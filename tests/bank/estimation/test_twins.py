@@ -39,7 +39,7 @@ def test_drift_in_a_few_channels_is_familiar_and_a_share_of_a_foreign_frame_is_n
     # The drift hides the foreign frame from the mean of the squares; the median tells them apart.
     assert by_twins[1] / by_twins[0] > 1.5 * by_mean[1] / by_mean[0]
     assert by_twins[0] < guard.reciprocity.largest_residual < by_twins[1]
-    assert any("opposite injections" in why or "Q residual" in why for why in guard.assess(foreign, ALL).reasons)
+    assert any("opposite injections" in why or "Q residual" in why for why in guard.reasons(foreign, ALL))
 
 
 def test_what_one_of_the_two_does_not_say_is_left_out():

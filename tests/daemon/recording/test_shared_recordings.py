@@ -342,5 +342,5 @@ def test_no_later_slice_is_strange_and_a_third_of_a_foreign_one_is(slices, n):
     guard = NoveltyDetector.fit(frames[:n], PAPER_TABLE)
     later = frames[n:]
     foreign = later.mean(axis=0)[np.random.default_rng(7).permutation(896)]
-    assert not any(guard.assess(one, usable).reasons for one in later)
-    assert all(guard.assess(0.65 * one + 0.35 * foreign, usable).reasons for one in later)
+    assert not any(guard.reasons(one, usable) for one in later)
+    assert all(guard.reasons(0.65 * one + 0.35 * foreign, usable) for one in later)

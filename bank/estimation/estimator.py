@@ -5,7 +5,7 @@ An estimator is a subclass of `Estimator`, and a line in `bank/estimator_names.p
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
@@ -153,6 +153,8 @@ class Estimator(ABC):
     # Whether a slice's size matters, and whether the regressor ignores NaN.
     uses_amplitude: ClassVar[bool] = True
     ignores_nan: ClassVar[bool] = False
+    # Whether a session imputes dead channels of raw frames along the motion, or the imputer does.
+    imputes_by_motion: ClassVar[bool] = False
     least_slices: ClassVar[int] = 10
 
     scale: FloatArray
@@ -168,10 +170,6 @@ class Estimator(ABC):
     def motion(self) -> Motion:
         """What a session remembers of the gel's motion."""
         return Motion()
-
-    def with_imputer(self, positions: FloatArray, validators: tuple[FingertipValidator, ...]) -> Self:
-        """Return the estimator with the imputer of (n, m·c) gripped differences in units of noise."""
-        return replace(self, imputer=ChannelImputer.fit(positions, validators))
 
     def matcher(self, _bank: Bank) -> BankMatcher | None:
         """Return the matcher on the bank, None for an estimator without a bank."""
@@ -208,13 +206,12 @@ class Estimator(ABC):
         """Return the least and the largest k of (n, d) features, empty for an estimator without a bank."""
         return np.array([features[:, 0].min(), features[:, 0].max()]) if self.needs == "bank" else np.zeros(0)
 
-    def slices_fit(self, _quantity: Quantity, _values: FloatArray) -> RegressorFit:
-        """Return the fit to slices of (n,) values; raises CalibrationError where they do not determine it."""
-        return self.ridge
+    def slices_fits(self, _quantity: Quantity, _values: FloatArray) -> tuple[RegressorFit, RegressorFit]:
+        """Return the fit to slices of (n,) values, and that of a line, which reads values beyond these.
 
-    def line_fit(self) -> RegressorFit:
-        """Return the fit of a line to slices, which reads torques beyond the calibrated ones."""
-        return self.ridge
+        Raises CalibrationError where the values do not determine the fit.
+        """
+        return self.ridge, self.ridge
 
     def fit_torque(
         self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None, recordings: IntArray

@@ -27,7 +27,7 @@ from shearloop.bank.estimation.fingertip_validator import FingertipValidator, se
 from shearloop.bank.estimation.interval_regressor import CensoredRidge, IntervalRegressor, fit_interval_regressor
 from shearloop.bank.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
 from shearloop.bank.estimation.novelty import NoveltyDetector
-from shearloop.bank.estimation.regressors import later_origins
+from shearloop.bank.estimation.regressors import ChannelImputer, later_origins
 from shearloop.bank.estimation.session_state import ProcessedFrame, SessionState
 from shearloop.bank.estimation.values import FrameSeries, Measured, TactileFrame, check_finite, distinct
 from shearloop.bank.estimator_names import EstimatorName, estimator_class
@@ -134,7 +134,9 @@ def _fit_raw(
         places = zip(rows.recording.tolist(), rows.frame.tolist(), strict=True)
         least_nm, largest_nm = np.array([[end[frame] for end in each[recording]] for recording, frame in places]).T
         bounds = least_nm, largest_nm
-    estimator = calibration.estimator.with_imputer(rows.position, calibration.validators)
+    estimator = calibration.estimator
+    if not estimator.imputes_by_motion:
+        estimator = replace(estimator, imputer=ChannelImputer.fit(rows.position, calibration.validators))
     estimator, regressor, unexplained = estimator.fit_torque(rows.features, rows.torque_nm, bounds, rows.recording)
     # By age within the recordings, so that every part has all tools.
     order = np.argsort(rows.age_s, kind="stable")
@@ -276,13 +278,14 @@ def _fit_slices(
             for one, t_s in zip(differences, times[known].tolist(), strict=True)
         )
         features = np.array([estimator.features(one) for one in readings])
+        of_value, line = estimator.slices_fits(quantity, values[known])
         regressor = fit_interval_regressor(
             features[:, estimator.columns[quantity]],
             values[known],
-            estimator.slices_fit(quantity, values[known]),
+            of_value,
             strengths=estimator.strengths,
             left_out=later_origins(n) if quantity == "torque" else (),
-            fit_line=estimator.line_fit() if quantity == "torque" else None,
+            fit_line=line if quantity == "torque" else None,
             full_range=full_range,
         )
         models[quantity] = OutputModel(regressor, novelty, estimator.k_range(features))

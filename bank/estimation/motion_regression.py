@@ -89,27 +89,20 @@ class TemporalFeatures(Motion):
         found = np.einsum("...mc,mpc->...mp", channels, self.directions)
         return np.asarray(found.reshape(*found.shape[:-2], -1))
 
-    def fill(self, moved: FloatArray, usable: BoolArray, sides: Sequence[FingertipValidator]) -> FloatArray:
-        """Return the motion (m, c) since the last frame, unusable channels along the directions."""
-        imputed = [self._impute(layer, moved[layer], usable[layer], one.noise) for layer, one in enumerate(sides)]
-        return np.where(usable, moved, imputed)
-
-    def complete(self, difference: FloatArray, usable: BoolArray, sides: Sequence[FingertipValidator]) -> FloatArray:
-        """Return a (m, c) difference to the idle frame, unusable channels along the directions and the grip."""
-        imputed = [
-            self._impute(layer, difference[layer], usable[layer], one.noise, one.gripped - one.idle)
-            for layer, one in enumerate(sides)
-        ]
-        return np.where(usable, difference, imputed)
-
-    def _impute(
-        self, layer: int, moved: FloatArray, usable: BoolArray, noise: FloatArray, *grip: FloatArray
+    def impute(
+        self, moved: FloatArray, usable: BoolArray, sides: Sequence[FingertipValidator], *, from_idle: bool
     ) -> FloatArray:
-        alive = np.isfinite(noise)
-        modes = np.vstack([self.directions[layer] * np.where(alive, noise, 0.0) ** 2, *grip])
-        weights = np.where(usable & alive, 1.0 / noise, 0.0)
-        found = np.linalg.lstsq((modes * weights).T, moved * weights, rcond=None)[0]
-        return np.asarray(found @ modes)
+        """Return a motion (m, c), unusable channels along the directions, and from idle along the grip too."""
+        imputed = []
+        for layer, one in enumerate(sides):
+            alive = np.isfinite(one.noise)
+            modes = self.directions[layer] * np.where(alive, one.noise, 0.0) ** 2
+            if from_idle:
+                modes = np.vstack([modes, one.gripped - one.idle])
+            weights = np.where(usable[layer] & alive, 1.0 / one.noise, 0.0)
+            found = np.linalg.lstsq((modes * weights).T, moved[layer] * weights, rcond=None)[0]
+            imputed.append(found @ modes)
+        return np.where(usable, moved, imputed)
 
     def features(self, positions: Sequence[FloatArray], from_idle: FloatArray) -> FloatArray:
         """Return n_lags · m·p features of motion, nearest lag first, and m·p of position where it is used.
@@ -133,6 +126,7 @@ class MotionRegression(Estimator):
     # With a block left out, enough remain for the torque's curve.
     least_slices: ClassVar[int] = 15
     ignores_nan: ClassVar[bool] = True
+    imputes_by_motion: ClassVar[bool] = True
 
     temporal: TemporalFeatures | None = None
 
@@ -147,10 +141,6 @@ class MotionRegression(Estimator):
     def motion(self) -> Motion:
         """What a session remembers of the gel's motion."""
         return self.temporal or Motion()
-
-    def with_imputer(self, _positions: FloatArray, _validators: tuple[FingertipValidator, ...]) -> Self:
-        """Return the estimator itself: its session imputes channels along the motion."""
-        return self
 
     def features(self, reading: Reading) -> FloatArray:
         """Return the features of motion. A slice has its time as a feature, because the gel drifts."""
@@ -205,14 +195,14 @@ class MotionRegression(Estimator):
 
     def fit_diameter(self, rows: CalibrationRows) -> OutputModel:
         """Return the diameter's model from rows of known diameters, by age."""
-        grips = [
-            CylinderGrip(float(own.diameter_mm[0]), own.position, own.mean_position)
-            for own in (rows.where(rows.recording == one) for one in np.unique(rows.recording))
-        ]
+        grips = [rows.where(rows.recording == one) for one in np.unique(rows.recording)]
         return OutputModel(fit_cylinders(grips, self.table), None, np.zeros(0))
 
-    def slices_fit(self, quantity: Quantity, values: FloatArray) -> RegressorFit:
-        """Return the fit of a curve; raises CalibrationError where a part of (n,) values has too few distinct ones."""
+    def slices_fits(self, quantity: Quantity, values: FloatArray) -> tuple[RegressorFit, RegressorFit]:
+        """Return the fits of a curve and of a line.
+
+        Raises CalibrationError where a part of (n,) values has too few distinct ones.
+        """
         degree, n_drift, trend = _CURVES[quantity]
         for rows in fitted_parts(len(values)) if np.ptp(values) > 0 else ():
             n_distinct = len(np.unique(values[rows]))
@@ -221,39 +211,27 @@ class MotionRegression(Estimator):
                     f"{len(rows)} of the {len(values)} slices have too few different {quantity}s for the estimator "
                     f"motion_regression, {n_distinct}; record more of them, in turn"
                 )
-        return lambda frames, known, _: InverseCalibration.fit(frames, known, degree, n_drift, trend=trend)
 
-    def line_fit(self) -> RegressorFit:
-        """Return the fit of a line to slices, which reads torques beyond the calibrated ones."""
-        _, n_drift, trend = _CURVES["torque"]
-        return lambda frames, known, _: InverseCalibration.fit(frames, known, 1, n_drift, trend=trend)
+        def fit_of(degree: int) -> RegressorFit:
+            return lambda frames, known, _: InverseCalibration.fit(frames, known, degree, n_drift, trend=trend)
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CylinderGrip:
-    """A recording of one tool: its diameter, (n, d) differences to the idle frame, and (n, d) means over the grip.
-
-    In units of noise; d runs over the channels of one side, then of the next.
-    """
-
-    diameter_mm: float
-    frames: FloatArray
-    means: FloatArray
+        return fit_of(degree), fit_of(1)
 
 
-def fit_cylinders(grips: Sequence[CylinderGrip], table: ChannelTable) -> IntervalRegressor:
-    """Return the diameter's regressor on the mean of a grip, from grips of three diameters or more.
+def fit_cylinders(grips: Sequence[CalibrationRows], table: ChannelTable) -> IntervalRegressor:
+    """Return the diameter's regressor on the mean of a grip, from recordings of one grip each, of three diameters or
+    more.
 
     Its interval is the error on cylinders left out.
     """
-    diameters = np.array([one.diameter_mm for one in grips])
+    diameters = np.array([one.diameter_mm[0] for one in grips])
     line = fit_line(grips, table)
     squares = []
-    for one in grips:
+    for one, diameter in zip(grips, diameters, strict=True):
         # Leave out all grips of this cylinder: another one would only confirm this diameter.
-        rest = [other for other in grips if other.diameter_mm != one.diameter_mm]
-        if len({other.diameter_mm for other in rest}) >= LEAST_LEFT:
-            squares.append(float(((fit_line(rest, table).predict(one.means) - one.diameter_mm) ** 2).mean()))
+        rest = [other for other in grips if other.diameter_mm[0] != diameter]
+        if len({float(other.diameter_mm[0]) for other in rest}) >= LEAST_LEFT:
+            squares.append(float(((fit_line(rest, table).predict(one.mean_position) - diameter) ** 2).mean()))
     # Each recording counts once, which is too few for a quantile.
     half_width = max(TWO_SIDED_95 * math.sqrt(np.mean(squares)), LEAST_HALF_WIDTH * float(np.ptp(diameters)))
     low, high = float(diameters.min()), float(diameters.max())
@@ -261,7 +239,7 @@ def fit_cylinders(grips: Sequence[CylinderGrip], table: ChannelTable) -> Interva
     return IntervalRegressor(line, intervals, ValueRange(low, high), line.mean, np.zeros(0))
 
 
-def fit_line(grips: Sequence[CylinderGrip], table: ChannelTable) -> Ridge:
+def fit_line(grips: Sequence[CalibrationRows], table: ChannelTable) -> Ridge:
     """Return the line from a position to a diameter through grips of two diameters or more.
 
     The noise of the idle frame is constant within a recording, like the diameter, so a regression on single frames
@@ -270,9 +248,9 @@ def fit_line(grips: Sequence[CylinderGrip], table: ChannelTable) -> Ridge:
     differ without it (errors in variables, Fuller 1987). Averaging channels of one voltage and smoothing along
     neighbours, as the paper did with its cylinders, lowers the noise.
     """
-    diameters = np.array([one.diameter_mm for one in grips])
-    reduction = _noise_reduction(grips[0].frames.shape[1] // table.n_channels, table)
-    frames = [one.frames @ reduction for one in grips]
+    diameters = np.array([one.diameter_mm[0] for one in grips])
+    reduction = _noise_reduction(grips[0].position.shape[1] // table.n_channels, table)
+    frames = [one.position @ reduction for one in grips]
     positions = np.array([one.mean(axis=0) for one in frames])
     moved = np.concatenate([one - position for one, position in zip(frames, positions, strict=True)])
     moved = moved[:: 1 + len(moved) // _MOST_FRAMES]
@@ -294,7 +272,7 @@ def fit_line(grips: Sequence[CylinderGrip], table: ChannelTable) -> Ridge:
     least = _ROUNDING * noise + math.sqrt(np.finfo(np.float64).tiny)
     true = np.maximum(squares - noise, _LEAST_SHARE * squares) + least
     along = centred.T @ (modes @ (modes.T @ (diameters - diameters.mean()) / true))
-    mean = np.mean([one.frames.mean(axis=0) for one in grips], axis=0)
+    mean = np.mean([one.position.mean(axis=0) for one in grips], axis=0)
     return Ridge(mean, reduction @ whitened(along), float(diameters.mean()), 0.0)
 
 

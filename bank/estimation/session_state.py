@@ -81,13 +81,14 @@ class Motion:
         """Return the features of the last n_lags + 1 (p,) positions, and of the newest one's (p,) way from idle."""
         return np.zeros(0)
 
-    def fill(self, moved: FloatArray, usable: BoolArray, _sides: Sequence[FingertipValidator]) -> FloatArray:
-        """Return the motion (m, c) since the last frame with unusable channels imputed."""
-        return np.where(usable, moved, 0.0)
+    def impute(
+        self, moved: FloatArray, usable: BoolArray, _sides: Sequence[FingertipValidator], *, from_idle: bool
+    ) -> FloatArray:
+        """Return the motion (m, c) since the last frame, or since the idle one, with unusable channels imputed.
 
-    def complete(self, difference: FloatArray, _usable: BoolArray, _sides: Sequence[FingertipValidator]) -> FloatArray:
-        """Return a (m, c) difference to the idle frame, unusable channels imputed unless the estimator does that."""
-        return difference
+        Here the estimator imputes those of a motion since the idle frame.
+        """
+        return moved if from_idle else np.where(usable, moved, 0.0)
 
 
 class FrameTimer:
@@ -327,7 +328,7 @@ class SessionState:
         """Return the channels with unusable ones moved on from the last frame as the usable ones moved."""
         if self._before is None:
             return np.where(usable, channels, self._fingertips.gripped)
-        moved = self._motion.fill(channels - self._before, usable, self._fingertips.sides)
+        moved = self._motion.impute(channels - self._before, usable, self._fingertips.sides, from_idle=False)
         return np.where(usable, channels, self._before + moved)
 
     def _bridge(self, channels: FloatArray, missing: int) -> None:
@@ -362,7 +363,7 @@ class SessionState:
         # At the calibration's gain. It does not change while gripped.
         idle, difference, loose = self._idle, channels - self._idle.baselines, []
         if not usable.all():
-            difference = self._motion.complete(difference, usable, self._fingertips.sides)
+            difference = self._motion.impute(difference, usable, self._fingertips.sides, from_idle=True)
         difference = difference / idle.gains
         for layer, (one, grip) in enumerate(zip(self._fingertips.sides, self._grips, strict=True)):
             known = idle.baselines[layer], idle.gains[layer], idle.least_scores[layer]

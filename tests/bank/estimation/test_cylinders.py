@@ -9,8 +9,9 @@ from scipy.ndimage import gaussian_filter1d
 
 from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.estimation import TRUSTED, EstimatorSession, fit
+from shearloop.bank.estimation.estimator import CalibrationRows
 from shearloop.bank.estimation.interval_regressor import Ridge
-from shearloop.bank.estimation.motion_regression import CylinderGrip, fit_cylinders, fit_line
+from shearloop.bank.estimation.motion_regression import fit_cylinders, fit_line
 from tests.bank.estimation.conftest import follow
 
 KNOWN_MM = (10.0, 25.0, 40.0)
@@ -27,7 +28,8 @@ def grip(diameter_mm, seed):
     twist = (rng.uniform(0.0, 1.0) + rng.uniform(0.0, 1.0, (N_FRAMES, 1))) * TWIST
     frames = diameter_mm * PER_MM + twist - idle + rng.normal(size=(N_FRAMES, 2 * PAPER_TABLE.n_channels))
     held = np.cumsum(frames, axis=0) / np.arange(1, N_FRAMES + 1)[:, None]
-    return CylinderGrip(diameter_mm, frames, held)
+    none = np.zeros(N_FRAMES)
+    return CalibrationRows(none, none, none, none, frames, held, none, np.full(N_FRAMES, diameter_mm))
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +40,14 @@ def known():
 def test_another_grip_is_read_without_a_pull_to_the_mean(known):
     """The noise of three idle frames parts three recordings as well as their tools do."""
     head = fit_line(known, PAPER_TABLE)
-    read = {mm: np.mean([head.predict(grip(mm, 100 + seed).means[-1:]) for seed in range(5)]) for mm in (12.0, 38.0)}
+    read = {
+        mm: np.mean([head.predict(grip(mm, 100 + seed).mean_position[-1:]) for seed in range(5)]) for mm in (12.0, 38.0)
+    }
     slope = (read[38.0] - read[12.0]) / 26
     assert slope == pytest.approx(1.0, abs=0.1)
-    frames, diameters = np.concatenate([one.frames for one in known]), np.repeat(KNOWN_MM, N_FRAMES)
+    frames, diameters = np.concatenate([one.position for one in known]), np.repeat(KNOWN_MM, N_FRAMES)
     ridge = Ridge.fit(frames, diameters, 1e-5)
-    assert np.ptp([ridge.predict(grip(mm, 100).frames).mean() for mm in read]) / 26 < 0.6
+    assert np.ptp([ridge.predict(grip(mm, 100).position).mean() for mm in read]) / 26 < 0.6
 
 
 def test_intervals_hold_cylinders_that_the_line_was_not_fitted_to():
@@ -52,7 +56,7 @@ def test_intervals_hold_cylinders_that_the_line_was_not_fitted_to():
     for number in range(4):
         reader = fit_cylinders([grip(mm, 10 * number + seed) for seed, mm in enumerate(KNOWN_MM)], PAPER_TABLE)
         for seed, mm in enumerate((12.0, 15.0, 20.0, 30.0, 35.0)):
-            value, below, above = reader.predict(grip(mm, 200 + 10 * number + seed).means[-1])
+            value, below, above = reader.predict(grip(mm, 200 + 10 * number + seed).mean_position[-1])
             inside.append(-below <= mm - value <= above)
     assert np.mean(inside) >= 0.85
 
@@ -63,31 +67,34 @@ def test_the_interval_tells_how_far_grips_differ_that_the_line_goes_through():
     placed = []
     for mm, place in zip((10.0, 20.0, 30.0, 40.0), 20 * places / np.linalg.norm(places[0]), strict=True):
         one = grip(mm, int(mm))
-        placed.append(replace(one, frames=one.frames + place, means=one.means + place))
+        placed.append(replace(one, position=one.position + place, mean_position=one.mean_position + place))
     # Another grip of the same cylinder vouches for no other.
     reader = fit_cylinders([*placed, *map(replace, placed)], PAPER_TABLE)
-    read = [reader.predict(one.means[-1]) for one in placed]
-    assert max(abs(one.diameter_mm - value) for one, (value, _, _) in zip(placed, read, strict=True)) < 2.0
+    read = [reader.predict(one.mean_position[-1]) for one in placed]
+    assert max(abs(one.diameter_mm[0] - value) for one, (value, _, _) in zip(placed, read, strict=True)) < 2.0
     assert read[0][1] > 10.0
 
 
 def test_fingertips_that_see_no_diameter_say_so_by_their_interval(known):
-    blind = [replace(one, frames=one.frames - one.diameter_mm * PER_MM, means=one.means - 25 * PER_MM) for one in known]
-    value, below, above = fit_cylinders(blind, PAPER_TABLE).predict(blind[0].means[-1])
+    blind = [
+        replace(one, position=one.position - mm * PER_MM, mean_position=one.mean_position - 25 * PER_MM)
+        for one, mm in zip(known, KNOWN_MM, strict=True)
+    ]
+    value, below, above = fit_cylinders(blind, PAPER_TABLE).predict(blind[0].mean_position[-1])
     assert 15.0 < min(below, above) < 150.0
     assert -50.0 < value < 100.0
 
 
 def test_places_that_have_no_noise_still_make_a_line(known):
-    still = [replace(one, frames=np.tile(mm * PER_MM, (5, 1))) for one, mm in zip(known, KNOWN_MM, strict=True)]
+    still = [replace(one, position=np.tile(mm * PER_MM, (5, 1))) for one, mm in zip(known, KNOWN_MM, strict=True)]
     assert fit_line([*still, *still], PAPER_TABLE).predict(20 * PER_MM[None])[0] == pytest.approx(20.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("frames", [1, N_FRAMES])
 def test_one_recording_under_three_diameters_reads_none_of_them_apart(known, frames):
-    one = replace(known[0], frames=known[0].frames[:frames])
-    reader = fit_cylinders([replace(one, diameter_mm=mm) for mm in KNOWN_MM], PAPER_TABLE)
-    value, below, above = reader.predict(one.means[-1])
+    one = replace(known[0], position=known[0].position[:frames])
+    reader = fit_cylinders([replace(one, diameter_mm=np.array([mm])) for mm in KNOWN_MM], PAPER_TABLE)
+    value, below, above = reader.predict(one.mean_position[-1])
     assert value == pytest.approx(25.0, abs=0.1)
     assert min(below, above) > 15.0
 

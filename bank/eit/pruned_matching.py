@@ -19,6 +19,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import count
 from operator import itemgetter
 from typing import Any, NamedTuple
@@ -361,11 +362,10 @@ class PrunedZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
 class PrunedMatcher(_PruningMatcher, ReferenceMatcher):
     """Matches at all lags."""
 
-    def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
-        """Compress the bank; arguments and errors as `Matcher`."""
-        super().__init__(signals, valid, k_grid, sigma_grid)
-        # The conjugate transforms (r, n + 1) of the basis's first directions.
-        self.spectra = np.conj(fft.rfft(self.compressed.basis[:COARSE_RANK], 2 * self.n_channels))
+    @cached_property
+    def spectra(self) -> NDArray[np.complex64]:
+        """The conjugate transforms (r, n + 1) of the basis's first directions."""
+        return np.asarray(np.conj(fft.rfft(self.compressed.basis[:COARSE_RANK], 2 * self.n_channels)))
 
     def _search(self, frame: FloatArray) -> Match:
         bounds = AllLagsBounds(self, frame)

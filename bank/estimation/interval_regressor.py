@@ -349,7 +349,11 @@ def fit_interval_regressor(
     extend to the further one. With the number of each row's recording, `recordings` (n,), intervals allow for the gain
     of another recording of as many `fingertips`. Raises CalibrationError where the data does not determine the fit.
     """
-    _check_values(values)
+    if len(values) < _LEAST_FRAMES or np.ptp(values) == 0:
+        raise CalibrationError(
+            f"{counted(len(values), 'frame')} with values between {np.min(values, initial=np.inf):.3g} and "
+            f"{np.max(values, initial=-np.inf):.3g} cannot determine a calibration; record more, at different loads"
+        )
     strength = strengths[0] if len(strengths) == 1 else best_strength(features, values, fit, strengths)[0]
     blocks = list(left_out or left_out_blocks(len(values)))
 
@@ -388,14 +392,6 @@ def fit_interval_regressor(
     gains = [] if recordings is None else _gains_of_recordings(features, values, recordings, refit)
     gain = GainSpread() if recordings is None else GainSpread.fit(reported, truth, gains, fingertips)
     return IntervalRegressor(point, intervals, span, centre, deviation, misses_loads, widening, gain, line)
-
-
-def _check_values(values: FloatArray) -> None:
-    if len(values) < _LEAST_FRAMES or np.ptp(values) == 0:
-        raise CalibrationError(
-            f"{counted(len(values), 'frame')} with values between {np.min(values, initial=np.inf):.3g} and "
-            f"{np.max(values, initial=-np.inf):.3g} cannot determine a calibration; record more, at different loads"
-        )
 
 
 def _gains_of_recordings(features: FloatArray, values: FloatArray, recordings: IntArray, refit: Refit) -> list[float]:

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import takewhile
 from typing import Self
 
 import numpy as np
@@ -224,9 +225,7 @@ class GripMemory:
         self._skipped_in_a_row = 0
         if missing and self.positions:
             self._repeat_position(missing)
-        between = 0
-        while between < len(self._bridged) and self._bridged[-1 - between]:
-            between += 1
+        between = len(list(takewhile(bool, reversed(self._bridged))))
         if 0 < between < len(self.positions):
             begin = self.positions[-1 - between]
             for i in range(1, between + 1):

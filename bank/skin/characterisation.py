@@ -24,6 +24,7 @@ from shearloop.bank.skin.membrane import (
     warming_change,
 )
 from shearloop.bank.skin.plane_strain import (
+    CondensedSkin,
     ContactState,
     apply_load,
     condense,
@@ -158,22 +159,16 @@ class _Models:
         # Friction acts in the contact alone.
         self.slippery_skin = replace(self.skin, section=replace(PAPER_SECTION, friction=0.0))
 
-    def in_1d(self, shear_n: FloatArray, normal_n: float) -> FloatArray:
-        return responses(self.membrane, shear_n.tolist(), normal_n)
-
-    def in_2d(self, shear_n: FloatArray, normal_n: float) -> FloatArray:
-        return gauge_responses(self.skin, states_along(self.skin, normal_n, shear_n.tolist()))
-
-    def without_friction(self, shear_n: FloatArray, normal_n: float) -> FloatArray:
-        """Return the responses of the linear 2-D model."""
-        return gauge_responses(self.skin, states_along(self.slippery_skin, normal_n, shear_n.tolist()))
-
     def both(self, shear_n: FloatArray, normal_n: float) -> list[FloatArray]:
-        return [self.in_1d(shear_n, normal_n), self.in_2d(shear_n, normal_n)]
+        return [responses(self.membrane, shear_n, normal_n), _responses_2d(self.skin, shear_n, normal_n)]
 
     def curve(self, shear_n: FloatArray, normal_n: float) -> ResponseCurve:
         in_1d, in_2d = self.both(shear_n, normal_n)
-        return ResponseCurve(shear_n, in_1d, in_2d, self.without_friction(shear_n, normal_n))
+        return ResponseCurve(shear_n, in_1d, in_2d, _responses_2d(self.slippery_skin, shear_n, normal_n))
+
+
+def _responses_2d(skin: CondensedSkin, shear_n: FloatArray, normal_n: float) -> FloatArray:
+    return gauge_responses(skin, states_along(skin, normal_n, shear_n))
 
 
 def _model_rows(models: _Models, fully_loaded: ContactState) -> list[FigureOfMerit]:
@@ -191,8 +186,9 @@ def _model_rows(models: _Models, fully_loaded: ContactState) -> list[FigureOfMer
     falls = 100 * (1 - float(np.exp(-models.membrane.belt.friction * np.radians(60))))
     strain_1, strain_2 = skin.gauge_weights @ strain
     up, slippery = loading(1.0), Membrane(replace(THICK_SECTION, friction=0.0))
-    without = [origin_slope(up, found) for found in (responses(slippery, up, 1.0), models.without_friction(up, 1.0))]
-    pressed = models.in_2d(np.zeros(1), 2.0)[0]
+    free = responses(slippery, up, 1.0), _responses_2d(models.slippery_skin, up, 1.0)
+    without = [origin_slope(up, found) for found in free]
+    pressed = _responses_2d(skin, np.zeros(1), 2.0)[0]
     power_w = EXCITATION_A**2 * GAUGE_RESISTANCE_OHM
     return [
         *rows,

@@ -5,7 +5,7 @@ generalised least squares). Unlike a ridge it does not pull estimates towards th
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
+from shearloop.bank.estimation.values import INLINE
 from shearloop.words import counted
 
 N_BLOCKS = 5
@@ -28,12 +29,24 @@ _MOST_DIRECTIONS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Ageing:
+    """Changes (2, q) of offset and slope by e-foldings of the age from last_t on."""
+
+    trend: FloatArray
+    first_t: float
+    last_t: float
+
+    def log_age(self, t: FloatArray) -> FloatArray:
+        """Return the age of frames since last_t in e-foldings of the time since first_t; negative before last_t."""
+        return np.asarray(np.log((1.0 + np.maximum(t - self.first_t, 0.0)) / (1.0 + self.last_t - self.first_t)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class InverseCalibration:
     """Frames as a polynomial of the value, coefficients (degree + 1, q), with drift along `drift` (r, q) and noise.
 
     It uses the q of a frame's d channels that correlate best with the value; others bring more drift. Each is in units
-    of its own `spread` (q,) about the curve, drawn half towards the spread of all. Offset and slope change by `trend`
-    (2, q) with each e-folding of the age from last_t on.
+    of its own `spread` (q,) about the curve, drawn half towards the spread of all. Offset and slope change with age.
 
     The value of a frame minimises (x − curve)ᵀ Σ⁻¹ (x − curve), Σ = driftᵀ diag(drift_variance) drift + noise² I.
     """
@@ -41,9 +54,7 @@ class InverseCalibration:
     channels: IntArray
     spread: FloatArray
     coefficients: FloatArray
-    trend: FloatArray
-    first_t: float
-    last_t: float
+    ageing: Ageing = field(metadata=INLINE)
     drift: FloatArray
     drift_variance: FloatArray
     noise: float
@@ -73,8 +84,8 @@ class InverseCalibration:
         spread = _spread_about_parabola(frames, z)
         channels = np.sort(ranked_channels(frames / spread, values)[:N_RANKED])
         frames, spread = (frames / spread)[:, channels], spread[channels]
-        first_t, last_t = float(t[0]), float(t[-1])
-        age = _log_age(t, first_t, last_t)
+        ageing = Ageing(np.zeros((0, len(channels))), float(t[0]), float(t[-1]))
+        age = ageing.log_age(t)
         powers = np.vander(z, degree + 1, increasing=True)
         columns = np.hstack([powers, powers[:, :n_trend] * age[:, None]])
         # The trend's penalty is in units of its own spread.
@@ -88,7 +99,7 @@ class InverseCalibration:
             raise CalibrationError("the frames have no noise: no real board sent them")
         span = float(np.ptp(values))
         return cls(
-            channels, spread, coefficients[: degree + 1], coefficients[degree + 1 :], first_t, last_t,
+            channels, spread, coefficients[: degree + 1], replace(ageing, trend=coefficients[degree + 1 :]),
             vt[:n_drift], s[:n_drift] ** 2 / freedom, noise, centre, scale,
             float(values.min()) - 0.5 * span, float(values.max()) + 0.5 * span,
         )  # fmt: skip
@@ -106,19 +117,15 @@ class InverseCalibration:
         x, t = frame[self.channels] / self.spread, float(frame[-1])
         keep = np.isfinite(x)
         b, v = self.coefficients[:, keep], self.drift[:, keep]
-        age = float(_log_age(np.array([max(t, self.last_t)]), self.first_t, self.last_t)[0])
-        b[: len(self.trend)] += age * self.trend[:, keep]
+        ageing = self.ageing
+        age = float(ageing.log_age(np.array([max(t, ageing.last_t)]))[0])
+        b[: len(ageing.trend)] += age * ageing.trend[:, keep]
         inner = np.linalg.inv(np.diag(self.noise**2 / self.drift_variance) + v @ v.T)
         weights = (b - (b @ v.T) @ inner @ v) / self.noise**2
         grid = np.linspace(self.low, self.high, 401)
         powers = np.vander((grid - self.centre) / self.scale, len(b), increasing=True)
         cost = np.einsum("ij,jk,ik->i", powers, weights @ b.T, powers) - 2 * powers @ (weights @ x[keep])
         return parabola_top(-cost, int(np.argmin(cost)), grid)
-
-
-def _log_age(t: FloatArray, first_t: float, last_t: float) -> FloatArray:
-    """Return the age of frames since last_t in e-foldings of the time since first_t; negative before last_t."""
-    return np.asarray(np.log((1.0 + np.maximum(t - first_t, 0.0)) / (1.0 + last_t - first_t)))
 
 
 def parabola_top(scores: FloatArray, i: int, grid: FloatArray) -> float:

@@ -13,13 +13,12 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import structlog
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.estimation import Measured
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.errors import UserError
@@ -63,17 +62,14 @@ class RecordedEvent:
     raw: RawEvent | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class ReplayEvents:
-    """Events that the frames do not contain, by source and frame number: tares, tools, and known torques of the grip.
+class ReplayEvents(NamedTuple):
+    """What frames do not contain: tares, tools and known torques of the grip by source, each with its first frame.
 
     `frame_numbers` holds the frames' numbers by source and arrival, `sample_numbers` those of the skin's samples by
     their time; they continue from file to file.
     """
 
-    tares: dict[str, set[int]]
-    tools: dict[str, dict[int, Measured | None]]
-    adaptations: dict[str, dict[int, tuple[str, FloatArray]]]
+    before_frames: dict[str, list[tuple[int, InputKind, Any]]]
     frame_numbers: dict[str, dict[int, int]]
     sample_numbers: dict[int, int]
 
@@ -129,118 +125,25 @@ class RecordedRun:
 
     def replay_events(self) -> ReplayEvents:
         """Return the events that the frames do not contain."""
-        found = ReplayEvents(defaultdict(set), defaultdict(dict), defaultdict(dict), defaultdict(dict), {})
+        found = ReplayEvents(defaultdict(list), defaultdict(dict), {})
         for event in self.events() if self.has_inputs else ():
-            raw, source = event.raw, event.source
+            before = found.before_frames[event.source]
             with reading(self.path):
-                if event.topic == messages.EitFrame.topic:
-                    arrival_ns = event.content["t_mono_ns"] + round(event.content["age_s"] * 1e9)
-                    found.frame_numbers[source][arrival_ns] = event.content["frame"]
-                elif event.topic == messages.SkinShear.topic:
-                    found.sample_numbers[event.t_mono_ns] = event.content["sample"]
-                elif raw is not None and raw.kind is InputKind.TARE and raw.data.isdigit():
-                    found.tares[source].add(int(raw.data))
-                elif raw is not None and raw.kind is InputKind.TOOL:
-                    frame, tool = tool_from_bytes(raw.data)
-                    found.tools[source][frame] = tool
-                elif raw is not None and raw.kind is InputKind.ADAPT:
-                    frame, reference, torque_nm = torques_from_bytes(raw.data)
-                    found.adaptations[source][frame] = reference, torque_nm
+                match event:
+                    case RecordedEvent(topic=messages.EitFrame.topic, content=content):
+                        arrival_ns = event.t_mono_ns + round(content["age_s"] * 1e9)
+                        found.frame_numbers[event.source][arrival_ns] = content["frame"]
+                    case RecordedEvent(topic=messages.SkinShear.topic, content=content):
+                        found.sample_numbers[event.t_mono_ns] = content["sample"]
+                    case RecordedEvent(raw=RawEvent(kind=InputKind.TARE, data=data)) if data.isdigit():
+                        before.append((int(data), InputKind.TARE, None))
+                    case RecordedEvent(raw=RawEvent(kind=InputKind.TOOL, data=data)):
+                        number, tool = tool_from_bytes(data)
+                        before.append((number, InputKind.TOOL, tool))
+                    case RecordedEvent(raw=RawEvent(kind=InputKind.ADAPT, data=data)):
+                        number, *known = torques_from_bytes(data)
+                        before.append((number, InputKind.ADAPT, known))
         return found
-
-
-class ReplayPipeline:
-    """The parsers and estimators of one configuration, fed with one raw input at a time."""
-
-    def __init__(self, config: DaemonConfig, events: ReplayEvents, publisher: Publisher) -> None:
-        """Open all files of the configuration; raises BankError or UserError."""
-        self._publisher = publisher
-        self._events = events
-        # Per source: the difference between recorded and replayed frame numbers, and the latest frame.
-        self._number_offset: dict[str, int] = {}
-        self._latest_frame: dict[str, int] = {}
-        self._sample_offset: int | None = None
-        self._estimators: dict[str, FrameEstimator] = {
-            name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()
-        }
-        self._pairing: FramePairing | None = None
-        if config.combined is not None:
-            self._estimators[COMBINED] = combined = open_combined(config.combined, config.fingertips)
-            sides = combined.calibration.sides
-            self._pairing = FramePairing(sides, config.fingertips[sides[0]].frame_period_s)
-        self._frame_parsers = {
-            name: FrameParser(
-                self._estimators[name].table.zero_slots, nominal_period_ns=round(fingertip.frame_period_s * 1e9)
-            )
-            for name, fingertip in config.fingertips.items()
-        }
-        self._load_parser: LoadParser | None = None
-        if config.load_cell is not None:
-            self._load_parser = LoadParser(load_cell_calibration(config.load_cell), config.load_cell.rate_hz)
-        self._skin = ReplayedSkin(config.skin) if config.skin is not None else None
-
-    @property
-    def sources(self) -> tuple[str, ...]:
-        """The sources of the messages that are computed."""
-        load_cell = (LOAD_CELL,) if self._load_parser is not None else ()
-        return (*self._estimators, *load_cell, *((SKIN,) if self._skin is not None else ()))
-
-    async def process(self, source: str, event: RawEvent) -> None:
-        """Publish the messages that follow from a raw input; an input of another source is ignored."""
-        if source in self._frame_parsers:
-            for frame in self._renumbered(source, self._frame_parsers[source].handle(event)):
-                self._publisher.publish(frame_message(source, frame))
-                await self._estimate(source, frame)
-                pair = self._pairing.add(source, frame) if self._pairing is not None else None
-                if pair is not None:
-                    await self._estimate(COMBINED, *pair)
-        elif source == LOAD_CELL and self._load_parser is not None:
-            for sample in self._load_parser.handle(event):
-                self._publisher.publish(load_message(sample))
-        elif self._skin is not None and source in self._skin.sources:
-            for message in self._skin.handle(source, event):
-                self._publisher.publish(self._continued(message))
-
-    def _renumbered(self, source: str, frames: list[Frame]) -> list[Frame]:
-        """Return frames with their recorded numbers: a later file of a run continues to count."""
-        if frames and source not in self._number_offset:
-            # The first of several frames may have begun in the file before.
-            last, numbers = frames[-1], self._events.frame_numbers.get(source, {})
-            self._number_offset[source] = numbers.get(last.t_arrival_ns, last.seq) - last.seq
-        offset = self._number_offset.get(source, 0)
-        return [replace(frame, seq=frame.seq + offset) for frame in frames] if offset else frames
-
-    def _continued(self, message: messages.SkinShear) -> messages.SkinShear:
-        """Return a message with the number of its sample in the run; the first one takes that of the nearest time."""
-        if self._sample_offset is None:
-            numbers = self._events.sample_numbers
-            nearest = min(numbers, key=lambda t_ns: abs(t_ns - message.t_mono_ns), default=None)
-            self._sample_offset = 0 if nearest is None else numbers[nearest] - message.sample
-        return replace(message, sample=message.sample + self._sample_offset)
-
-    async def _estimate(self, source: str, *frames: Frame) -> None:
-        estimator, number = self._estimators[source], frames[0].seq
-        if number in self._events.tares.get(source, ()):
-            estimator.session.tare()
-        tools = self._events.tools.get(source, {})
-        due = [first for first in tools if self._latest_frame.get(source, -1) < first <= number]
-        if due:
-            estimator.session.set_tool(tools[max(due)])
-        self._latest_frame[source] = number
-        if known := self._events.adaptations.get(source, {}).get(number):
-            self._adapt(source, frames, *known)
-        estimate = await estimator.estimate(*frames)
-        # The replayed latency is 0; the recording holds the live one.
-        arrival_ns = max(frame.t_arrival_ns for frame in frames)
-        self._publisher.publish(estimate_message(source, frames, estimate, arrival_ns))
-
-    def _adapt(self, source: str, frames: tuple[Frame, ...], reference: str, torque_nm: FloatArray) -> None:
-        estimator = self._estimators[source]
-        if len(estimator.session.grip_t_s) != len(torque_nm):
-            reason = "the recording begins in the middle of the grip, so the correction of its gain is left out"
-            structlog.get_logger().warning(reason, source=source, frame=frames[0].seq)
-            return
-        self._publisher.publish(adapted_message(source, frames, reference, estimator.session.adapt(torque_nm)))
 
 
 class ReplayClock(Clock):
@@ -311,17 +214,42 @@ class ReplayComparison:
 
 
 class Replay:
-    """Replays a recording with a configuration; `clock` is the publisher's clock."""
+    """The parsers and estimators of one configuration, fed with a recording; `clock` is the publisher's clock."""
 
     def __init__(self, run: RecordedRun, config: DaemonConfig, publisher: Publisher, clock: ReplayClock) -> None:
         """Open all files of the configuration; raises BankError or UserError."""
         self._run = run
-        self._pipeline = ReplayPipeline(config, run.replay_events(), publisher)
+        self._events = run.replay_events()
         self._publisher = publisher
         self._clock = clock
         self.comparison = ReplayComparison(run.counts)
         if run.has_inputs:
             publisher.add_listener(self.comparison.add_computed)
+        # Per source: the difference between recorded and replayed frame numbers, and the latest frame.
+        self._number_offset: dict[str, int] = {}
+        self._latest_frame: dict[str, int] = {}
+        self._sample_offset: int | None = None
+        self._estimators: dict[str, FrameEstimator] = {
+            name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()
+        }
+        self._frame_parsers = {
+            name: FrameParser(
+                self._estimators[name].table.zero_slots, nominal_period_ns=round(fingertip.frame_period_s * 1e9)
+            )
+            for name, fingertip in config.fingertips.items()
+        }
+        self._pairing: FramePairing | None = None
+        if config.combined is not None:
+            self._estimators[COMBINED] = combined = open_combined(config.combined, config.fingertips)
+            sides = combined.calibration.sides
+            self._pairing = FramePairing(sides, config.fingertips[sides[0]].frame_period_s)
+        self._load_parser: LoadParser | None = None
+        if config.load_cell is not None:
+            self._load_parser = LoadParser(load_cell_calibration(config.load_cell), config.load_cell.rate_hz)
+        self._skin = ReplayedSkin(config.skin) if config.skin is not None else None
+        # The sources of the messages that are computed.
+        optional = {LOAD_CELL: self._load_parser, SKIN: self._skin}
+        self._sources = {*self._estimators, *(name for name, part in optional.items() if part is not None)}
 
     async def play(self, speed: float, progress: Callable[[int], None] = lambda _: None) -> None:
         """Replay all events `speed` times as fast as they happened; math.inf does not wait at all."""
@@ -345,11 +273,68 @@ class Replay:
             self._clock.set(event.t_mono_ns, int(event.content["offset_ns"]))
         elif event.raw is not None:
             self._clock.set(event.t_mono_ns)
-            await self._pipeline.process(event.source, event.raw)
-        elif self._run.has_inputs and event.topic in COMPUTED_TOPICS and event.source in self._pipeline.sources:
+            await self._process_input(event.source, event.raw)
+        elif self._run.has_inputs and event.topic in COMPUTED_TOPICS and event.source in self._sources:
             self.comparison.compare(event)
         elif event.topic != messages.EitHeatmap.topic:
             self._publisher.forward(event.topic, messages.with_packed_arrays(event.content))
+
+    async def _process_input(self, source: str, event: RawEvent) -> None:
+        """Publish the messages that follow from a raw input; an input of another source is ignored."""
+        if source in self._frame_parsers:
+            for frame in self._renumbered(source, self._frame_parsers[source].handle(event)):
+                self._publisher.publish(frame_message(source, frame))
+                await self._estimate(source, frame)
+                pair = self._pairing.add(source, frame) if self._pairing is not None else None
+                if pair is not None:
+                    await self._estimate(COMBINED, *pair)
+        elif source == LOAD_CELL and self._load_parser is not None:
+            for sample in self._load_parser.handle(event):
+                self._publisher.publish(load_message(sample))
+        elif self._skin is not None and source in self._skin.sources:
+            for message in self._skin.handle(source, event):
+                self._publisher.publish(self._continued(message))
+
+    def _renumbered(self, source: str, frames: list[Frame]) -> list[Frame]:
+        """Return frames with their recorded numbers: a later file of a run continues to count."""
+        if frames and source not in self._number_offset:
+            # The first of several frames may have begun in the file before.
+            last, numbers = frames[-1], self._events.frame_numbers.get(source, {})
+            self._number_offset[source] = numbers.get(last.t_arrival_ns, last.seq) - last.seq
+        offset = self._number_offset.get(source, 0)
+        return [replace(frame, seq=frame.seq + offset) for frame in frames] if offset else frames
+
+    def _continued(self, message: messages.SkinShear) -> messages.SkinShear:
+        """Return a message with the number of its sample in the run; the first one takes that of the nearest time."""
+        if self._sample_offset is None:
+            numbers = self._events.sample_numbers
+            nearest = min(numbers, key=lambda t_ns: abs(t_ns - message.t_mono_ns), default=None)
+            self._sample_offset = 0 if nearest is None else numbers[nearest] - message.sample
+        return replace(message, sample=message.sample + self._sample_offset)
+
+    async def _estimate(self, source: str, *frames: Frame) -> None:
+        estimator, number = self._estimators[source], frames[0].seq
+        for first, kind, value in self._events.before_frames.get(source, ()):
+            # Of a later file's tools, the first may be held since the file before.
+            if kind is InputKind.TOOL and self._latest_frame.get(source, -1) < first <= number:
+                estimator.session.set_tool(value)
+            elif kind is InputKind.TARE and first == number:
+                estimator.session.tare()
+            elif kind is InputKind.ADAPT and first == number:
+                self._adapt(source, frames, *value)
+        self._latest_frame[source] = number
+        estimate = await estimator.estimate(*frames)
+        # The replayed latency is 0; the recording holds the live one.
+        arrival_ns = max(frame.t_arrival_ns for frame in frames)
+        self._publisher.publish(estimate_message(source, frames, estimate, arrival_ns))
+
+    def _adapt(self, source: str, frames: tuple[Frame, ...], reference: str, torque_nm: FloatArray) -> None:
+        estimator = self._estimators[source]
+        if len(estimator.session.grip_t_s) != len(torque_nm):
+            reason = "the recording begins in the middle of the grip, so the correction of its gain is left out"
+            structlog.get_logger().warning(reason, source=source, frame=frames[0].seq)
+            return
+        self._publisher.publish(adapted_message(source, frames, reference, estimator.session.adapt(torque_nm)))
 
 
 def _live_event(topic: str, content: dict[str, Any]) -> RecordedEvent:

@@ -25,6 +25,7 @@ from shearloop.daemon.recording.replay import RecordedEvent, RecordedRun, Replay
 from shearloop.daemon.recording.schema import message_json, with_missing_keys
 from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.sensing.fingertip_task import FingertipPipeline
+from shearloop.drivers.serial_sensor import InputKind
 from tests.daemon.conftest import ask, emulated_kit, running_daemon
 from tests.daemon.sample_messages import sample
 
@@ -261,7 +262,8 @@ async def record_experiments(config: Path) -> list[dict[str, Any]]:
 def test_a_later_file_replays_frame_numbers_tares_and_tools(config, tmp_path, monkeypatch):
     live = asyncio.run(record_experiments(config(recording={"folder": "recordings"})))
     (later,) = (path for path in (tmp_path / "recordings").iterdir() if "second" in path.name)
-    ((zeroed,),) = RecordedRun(later).replay_events().tares.values()
+    before = RecordedRun(later).replay_events().before_frames["right"]
+    (zeroed,) = (frame for frame, kind, _ in before if kind is InputKind.TARE)
     assert zeroed >= ZEROED
     held: list[object] = []
     set_tool = EstimatorSession.set_tool

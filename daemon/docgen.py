@@ -2,15 +2,15 @@
 
 import dataclasses
 import json
-import types
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from shearloop.daemon.cli.command import COMMANDS
 from shearloop.daemon.config_schema import MODELS, Section, references, schema_of, schema_text, sections, unit_of
 from shearloop.daemon.control.safety import TABLE, Response
 from shearloop.daemon.messaging.messages import TOPICS, Message
+from shearloop.daemon.recording.schema import json_type
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 EXAMPLES = DOCS / "examples"
@@ -59,13 +59,9 @@ def _keys(kind: type[Message]) -> Iterator[tuple[str, ...]]:
 
 
 def _type_name(hint: Any) -> str:
-    origin = get_origin(hint)
-    if origin in (Union, types.UnionType):
-        names = [_type_name(part) for part in get_args(hint) if part is not type(None)]
-        return " or ".join([*dict.fromkeys(names), *(["nil"] if type(None) in get_args(hint) else [])])
-    # Only arrays are left: NumPy's array type is an alias, and its origin depends on the versions.
-    plain: dict[Any, str] = {float: "number", int: "integer", bool: "boolean", str: "text"}
-    return plain.get(hint, "map" if origin is Mapping else "array")
+    words = {"string": "text", "object": "map"}
+    kind: str = json_type(hint)["type"]
+    return words.get(kind, kind) + (" or nil" if type(None) in get_args(hint) else "")
 
 
 def safety_table() -> str:

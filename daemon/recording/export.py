@@ -26,14 +26,11 @@ def export(path: Path, form: str, out: Path, topics: list[str], progress: Progre
 
     For csv and parquet `out` is a folder. For mat it is a file; a large recording continues in NAME_2.mat, NAME_3.mat,
     and so on, which must not exist. `progress` receives the number of messages so far. Raises UserError for a recording
-    that cannot be read and for files that cannot be written.
+    that cannot be read, and OSError for files that cannot be written.
     """
-    try:
-        if form == "mat":
-            return _export_mat(path, out, topics, progress)
-        return _export_tables(path, form, out, topics, progress)
-    except OSError as error:
-        raise UserError(f"{error.filename or out}: the export cannot be written: {error.strerror or error}") from error
+    if form == "mat":
+        return _export_mat(path, out, topics, progress)
+    return _export_tables(path, form, out, topics, progress)
 
 
 def _export_mat(path: Path, out: Path, topics: list[str], progress: Progress) -> list[Path]:

@@ -53,7 +53,7 @@ _FEATURES: Mapping[str, tuple[str, str]] = {
 _VECTORS = ("joints_rad", "tcp_pose", "wrench")
 
 # When the daemon had a message, its number, topic and content, and when it was measured.
-_Waiting: TypeAlias = tuple[int, int, str, dict[str, Any], int]
+_Known: TypeAlias = tuple[int, int, str, dict[str, Any], int]
 
 
 class _Held:
@@ -166,14 +166,20 @@ class _Dataset:
         import pyarrow.parquet as pq
 
         rows: list[list[NDArray[np.float32]]] = []
+        now_ns = self._started_ns
         with pq.ParquetWriter(self._new(f"data/{_FILE}"), self._schema, compression="zstd") as writer:
-            for now_ns in self._times(path, progress):
-                ages = np.array([one.age_s(now_ns) for one in self._held.values()], dtype=np.float32)
-                rows.append([*(one.vector for one in self._held.values()), ages])
-                if len(rows) == _BATCH:
-                    writer.write_table(self._table(rows))
-                    rows.clear()
-            if rows:
+            for known_ns, _, topic, content, measured_ns in self._known_messages(path, progress):
+                now_ns = now_ns or self._started_ns
+                while now_ns < known_ns:
+                    rows.append(self._row(now_ns))
+                    now_ns += _PERIOD_NS
+                    if len(rows) == _BATCH:
+                        writer.write_table(self._table(rows))
+                        rows.clear()
+                with reading(path):
+                    self._held[topic].hold(content, measured_ns)
+            if now_ns:
+                rows.append(self._row(now_ns))
                 writer.write_table(self._table(rows))
 
     def finish(self, task: str, about: Mapping[str, Any], attachments: Mapping[str, bytes]) -> list[Path]:
@@ -194,33 +200,24 @@ class _Dataset:
         self._write_table(f"meta/episodes/{_FILE}", {**episode, **flat})
         return self._files
 
-    def _times(self, path: Path, progress: Progress) -> Iterator[int]:
-        """Yield the time of each row, while `_held` has the latest messages of that time."""
-        # Messages come in the order of their measurement, and are known then or later.
-        waiting: list[_Waiting] = []
-        now_ns = 0
-        for number, (topic, content, message) in enumerate(read_messages(path, self._held, progress), start=1):
-            if number == 1:
-                now_ns = self._started_ns = message.log_time
+    def _known_messages(self, path: Path, progress: Progress) -> Iterator[_Known]:
+        """Yield the messages in the order in which the daemon had them, which is not that of their measurement."""
+        waiting: list[_Known] = []
+        for number, (topic, content, message) in enumerate(read_messages(path, self._held, progress)):
+            self._started_ns = self._started_ns or message.log_time
             with reading(path):
                 known_ns = max(message.publish_time, message.log_time, content.get("arrival_unix_ns") or 0)
                 if known_ns - self._started_ns > _LONGEST_NS:
                     raise ValueError("its times span more than a day")
             heapq.heappush(waiting, (known_ns, number, topic, content, message.log_time))
-            while now_ns < message.log_time:
-                self._hold_until(path, now_ns, waiting)
-                yield now_ns
-                now_ns += _PERIOD_NS
+            while waiting[0][0] < message.log_time:
+                yield heapq.heappop(waiting)
         while waiting:
-            self._hold_until(path, now_ns, waiting)
-            yield now_ns
-            now_ns += _PERIOD_NS
+            yield heapq.heappop(waiting)
 
-    def _hold_until(self, path: Path, now_ns: int, waiting: list[_Waiting]) -> None:
-        while waiting and waiting[0][0] <= now_ns:
-            _, _, topic, content, measured_ns = heapq.heappop(waiting)
-            with reading(path):
-                self._held[topic].hold(content, measured_ns)
+    def _row(self, now_ns: int) -> list[NDArray[np.float32]]:
+        ages = np.array([one.age_s(now_ns) for one in self._held.values()], dtype=np.float32)
+        return [*(one.vector for one in self._held.values()), ages]
 
     def _table(self, rows: list[list[NDArray[np.float32]]]) -> Any:
         """Return a table of rows, and count them in the statistics."""

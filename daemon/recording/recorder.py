@@ -237,16 +237,8 @@ class Recorder:
             try:
                 self._write()
             finally:
-                current = self._current
-                current.closed = True
-                if current.file.messages or current.experiment:
-                    self._finish_file(current, self._counts.dropped + self._counts.unwritable)
-                else:
-                    # The daemon stopped before its first message.
-                    try:
-                        current.file.discard()
-                    except OSError as error:
-                        self.failure = f"{self.path}: {error.strerror}"
+                self._current.closed = True
+                self._finish_file(self._current, self._counts.dropped + self._counts.unwritable)
 
     @property
     def _waiting_bytes(self) -> int:
@@ -262,7 +254,6 @@ class Recorder:
     def _write(self) -> None:
         self.failure = ""
         if self._current.file.is_removed():
-            self.failure = f"{self.path}: the file was removed while it was written"
             self._change_file(self._queue[0].dropped if self._queue else self._counts.dropped)
             if self._current.file.is_removed():
                 return
@@ -291,8 +282,7 @@ class Recorder:
 
     def _change_file(self, dropped: int) -> None:
         """Begin the next file; on failure continue with the current one. `dropped` counts the drops so far."""
-        removed = self._current.file.is_removed()
-        if not removed and not self._flush():
+        if not self._flush():
             return
         previous, lost = self._current, dropped + self._counts.unwritable
         try:
@@ -300,10 +290,7 @@ class Recorder:
         except OSError as error:
             self.failure = f"{self._folder}: {error.strerror}"
             return
-        if removed:
-            previous.file.discard()
-        else:
-            self._finish_file(previous, lost)
+        self._finish_file(previous, lost)
         for source, event in self._tools.items():
             # The tool is still held, and a replay of this file must know it.
             self._add_input(source, replace(event, t_ns=self._current.began_ns), self._clock.offset_ns)
@@ -337,6 +324,10 @@ class Recorder:
         slug = re.sub(r"[^a-z0-9.]+", "-", current.experiment.lower()).strip("-.")
         path = file.partial.with_name(f"{began}_{slug}.mcap" if slug else f"{began}.mcap")
         try:
+            if not file.messages and not current.experiment:
+                # The daemon stopped before its first message.
+                file.discard()
+                return
             file.add_metadata(schema.END_METADATA, {"dropped": str(lost - current.lost_before)})
             file.close(path)
         except OSError as error:

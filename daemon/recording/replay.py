@@ -225,10 +225,9 @@ class Replay:
         self.comparison = ReplayComparison(run.counts)
         if run.has_inputs:
             publisher.add_listener(self.comparison.add_computed)
-        # Per source: the difference between recorded and replayed frame numbers, and the latest frame.
+        # Per source: the difference between recorded and replayed numbers of frames or samples, and the latest frame.
         self._number_offset: dict[str, int] = {}
         self._latest_frame: dict[str, int] = {}
-        self._sample_offset: int | None = None
         self._estimators: dict[str, FrameEstimator] = {
             name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()
         }
@@ -247,9 +246,12 @@ class Replay:
         if config.load_cell is not None:
             self._load_parser = LoadParser(load_cell_calibration(config.load_cell), config.load_cell.rate_hz)
         self._skin = ReplayedSkin(config.skin) if config.skin is not None else None
-        # The sources of the messages that are computed.
-        optional = {LOAD_CELL: self._load_parser, SKIN: self._skin}
-        self._sources = {*self._estimators, *(name for name, part in optional.items() if part is not None)}
+
+    @property
+    def _sources(self) -> tuple[str, ...]:
+        """The sources of the messages that are computed."""
+        load_cell = (LOAD_CELL,) if self._load_parser is not None else ()
+        return (*self._estimators, *load_cell, *((SKIN,) if self._skin is not None else ()))
 
     async def play(self, speed: float, progress: Callable[[int], None] = lambda _: None) -> None:
         """Replay all events `speed` times as fast as they happened; math.inf does not wait at all."""
@@ -306,11 +308,11 @@ class Replay:
 
     def _continued(self, message: messages.SkinShear) -> messages.SkinShear:
         """Return a message with the number of its sample in the run; the first one takes that of the nearest time."""
-        if self._sample_offset is None:
+        if SKIN not in self._number_offset:
             numbers = self._events.sample_numbers
             nearest = min(numbers, key=lambda t_ns: abs(t_ns - message.t_mono_ns), default=None)
-            self._sample_offset = 0 if nearest is None else numbers[nearest] - message.sample
-        return replace(message, sample=message.sample + self._sample_offset)
+            self._number_offset[SKIN] = 0 if nearest is None else numbers[nearest] - message.sample
+        return replace(message, sample=message.sample + self._number_offset[SKIN])
 
     async def _estimate(self, source: str, *frames: Frame) -> None:
         estimator, number = self._estimators[source], frames[0].seq

@@ -1,5 +1,6 @@
 """Writes MCAP files: each flush is safe against a kill, and a full disk does not damage the file."""
 
+import errno
 import io
 import json
 import os
@@ -117,12 +118,15 @@ class McapFile:
     def close(self, path: Path | None = None) -> None:
         """Write the index, and rename the file to `path` if it is given.
 
-        Raises OSError if the disk is full; the flushed data then stays readable under the old name.
+        Raises OSError if the disk is full, and the flushed data then stays readable under the old name; also if the
+        file is removed.
         """
         try:
             self._writer.finish()  # type: ignore[no-untyped-call]  # mcap has no return annotation here
             self._stream.flush()
             os.fsync(self._file.fileno())
+            if self.is_removed():
+                raise FileNotFoundError(errno.ENOENT, "the file was removed while it was written")
         finally:
             self._file.close()
         if path is not None:

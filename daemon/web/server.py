@@ -178,36 +178,30 @@ async def serve(
     Raises UserError for a port that is in use and for a malformed address.
     """
     loop = asyncio.get_running_loop()
-    signals = ending_signals()
-    with zmq.asyncio.Context() as context:
+    async with contextlib.AsyncExitStack() as opened:
+        context = opened.enter_context(zmq.asyncio.Context())
         bridge = Bridge(context, address, MessageStore(fingertip.height_cm))
+        opened.push_async_callback(bridge.close)
         app = make_app(bridge, token, asdict(fingertip.outline()), address.publish)
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=SHUTDOWN_S, lingering_time=0.0)
-        receiving = asyncio.create_task(bridge.run(), name="messages")
-        listener: asyncio.Server | None = None
+        opened.push_async_callback(runner.cleanup)
+        await runner.setup()
         try:
-            await runner.setup()
-            try:
-                listener = await listen(runner, port)
-            except OSError as error:
-                raise UserError(
-                    f"the page cannot be served on {HOST}:{port} ({error.strerror}); give another --port"
-                ) from error
-            for number in signals:
-                loop.add_signal_handler(number, partial(loop.call_later, LAST_MESSAGES_S, receiving.cancel))
-            on_ready(listener.sockets[0].getsockname()[1])
-            # Without its subscription the page would show stale data: an error there ends the server.
-            with contextlib.suppress(asyncio.CancelledError):
-                await receiving
-        finally:
-            for number in signals:
-                loop.remove_signal_handler(number)
-            receiving.cancel()
-            await asyncio.gather(receiving, return_exceptions=True)
-            if listener is not None:
-                listener.close()
-            await runner.cleanup()
-            await bridge.close()
+            listener = await listen(runner, port)
+        except OSError as error:
+            raise UserError(
+                f"the page cannot be served on {HOST}:{port} ({error.strerror}); give another --port"
+            ) from error
+        opened.callback(listener.close)
+        receiving = asyncio.create_task(bridge.run(), name="messages")
+        opened.callback(receiving.cancel)
+        for number in ending_signals():
+            loop.add_signal_handler(number, partial(loop.call_later, LAST_MESSAGES_S, receiving.cancel))
+            opened.callback(loop.remove_signal_handler, number)
+        on_ready(listener.sockets[0].getsockname()[1])
+        # Without its subscription the page would show stale data: an error there ends the server.
+        with contextlib.suppress(asyncio.CancelledError):
+            await receiving
 
 
 async def listen(runner: web.AppRunner, port: int) -> asyncio.Server:

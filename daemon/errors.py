@@ -3,9 +3,15 @@
 import sys
 from importlib.util import find_spec
 
+from shearloop.bank.errors import BankError
+from shearloop.drivers.errors import DriverError
+
 
 class UserError(Exception):
     """Something in a configuration, a file or a command line that its author can mend; the message says how."""
+
+
+USER_ERRORS = (BankError, DriverError, UserError)
 
 
 class ActionError(Exception):

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from difflib import get_close_matches
 from typing import Any, NamedTuple, NoReturn
 
-from shearloop.daemon.errors import UserError
+from shearloop.daemon.errors import USER_ERRORS, UserError
 from shearloop.daemon.process import raise_ending_signals, report_interrupt
 
 # Our products are small: a BLAS with one thread is faster. Must be set before numpy is imported.
@@ -86,11 +86,14 @@ class Parser(argparse.ArgumentParser):
         return found, extras
 
     def error(self, message: str) -> NoReturn:
-        """Print the sentence and exit with status 2."""
-        self.exit(EXIT_USAGE, f"{self.prog}: {self._plain(message)}; see `{self.prog} --help`\n")
+        """Raise UserError with the sentence."""
+        raise UserError(f"{self._plain(message)}; see `{self.prog} --help`")
 
     def _plain(self, message: str) -> str:
-        """Return argparse's message with the nearest known word."""
+        """Return argparse's message with the nearest known word; that of a value without `argument` before it."""
+        value = re.fullmatch(r"argument (\S+): (.* is .*)", message)
+        if value is not None:
+            return f"{value[1]} {value[2]}"
         choice = re.fullmatch(r"argument (\S+): invalid choice: '(.*)' \(choose from (.*)\)", message)
         if choice is not None:
             name, given, known = choice[1], choice[2], [one.strip("'") for one in choice[3].split(", ")]
@@ -115,33 +118,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] in ([], ["help"]):
         arguments = [*arguments[1:2], "--help"]
-    name = _overview().parse_args(arguments[:1]).command
-    command = COMMANDS[name]
-    module = importlib.import_module(command.module)
-    parser = Parser(prog=f"shearloop {name}", description=command.summary)
-    module.configure(parser)
-    expand = getattr(module, "expand_default_command", list)
-    args = parser.parse_args(expand(arguments[1:]))
+    program = "shearloop"
     try:
+        name = _overview().parse_args(arguments[:1]).command
+        program, command = f"shearloop {name}", COMMANDS[name]
+        module = importlib.import_module(command.module)
+        parser = Parser(prog=program, description=command.summary)
+        module.configure(parser)
+        expand = getattr(module, "expand_default_command", list)
+        args = parser.parse_args(expand(arguments[1:]))
         with raise_ending_signals():
             status: int = module.run(args)
             return status
-    except _user_errors() as error:
-        print(f"shearloop {name}: {error}", file=sys.stderr)
+    except USER_ERRORS as error:
+        print(f"{program}: {error}", file=sys.stderr)
         return EXIT_USAGE
     except BrokenPipeError:
         # The reader of our output (`| head`) has closed the pipe; that is no error.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_OK
     except KeyboardInterrupt as interrupt:
-        return report_interrupt(f"shearloop {name}: interrupted before it was done", interrupt)
-
-
-def _user_errors() -> tuple[type[Exception], ...]:
-    from shearloop.bank.errors import BankError
-    from shearloop.drivers.errors import DriverError
-
-    return (BankError, DriverError, UserError)
+        return report_interrupt(f"{program}: interrupted before it was done", interrupt)
 
 
 def _overview() -> argparse.ArgumentParser:

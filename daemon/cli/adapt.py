@@ -3,7 +3,15 @@
 import argparse
 from pathlib import Path
 
-from shearloop.daemon.cli.options import add_json, add_option, check_overwrite, load_calibration, parse_time_range
+from shearloop.daemon.cli.options import (
+    DELAY_S,
+    TOOL_MM,
+    add_json,
+    add_option,
+    check_overwrite,
+    load_calibration,
+    time_range,
+)
 from shearloop.daemon.cli.terminal import print_result
 
 
@@ -14,10 +22,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--out", Path, "NEW", "calibration to write", required=True)
     add_option(parser, "--bank", Path, "FILE", "the bank of the calibration, if any")
     text = "share of each recording whose twists count, e.g. 0:0.2; earlier frames show the idle fingertip"
-    add_option(parser, "--time-range", str, "FROM:TO", text, default="0:1")
+    add_option(parser, "--time-range", time_range, "FROM:TO", text, default="0:1")
     text = "delay of the load cell's timestamps, which is subtracted"
-    add_option(parser, "--load-cell-delay-s", float, "S", text, default=0.0)
-    add_option(parser, "--tool-mm", float, "MM", "diameter of the tool, if the recording does not name it")
+    add_option(parser, "--load-cell-delay-s", DELAY_S, "S", text, default=0.0)
+    add_option(parser, "--tool-mm", TOOL_MM, "MM", "diameter of the tool, if the recording does not name it")
     add_json(parser)
     parser.epilog = (
         "The gain of each fingertip changes between grips. One twist of known torque corrects most of it; the "
@@ -36,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     physics = Physics(bank=Bank.open(args.bank) if args.bank else None)
     adapted, correction = adapt_to_recordings(
         load_calibration(args.calibration), args.recordings, physics,
-        time_range=parse_time_range(args.time_range), load_cell_delay_s=args.load_cell_delay_s, tool_mm=args.tool_mm,
+        time_range=args.time_range, load_cell_delay_s=args.load_cell_delay_s, tool_mm=args.tool_mm,
     )  # fmt: skip
     adapted.save(args.out)
     factors, errors = correction.factors.tolist(), correction.errors.tolist()

@@ -11,7 +11,8 @@ from shearloop.daemon.cli.options import (
     add_json,
     add_option,
     check_overwrite,
-    checked_jobs,
+    positive,
+    processors,
     run_action,
     writing,
 )
@@ -33,7 +34,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     build = add_action(actions, "build", "build a bank", _build)
     add_option(build, "--config", Path, "FILE", "the bank's configuration (YAML)", required=True)
     add_option(build, "--out", Path, "PATH", "the bank file to write", required=True)
-    add_option(build, "--jobs", int, "N", "threads, or workers of a cluster of this machine (default: one per core)")
+    text = "threads, or workers of a cluster of this machine (default: one per core)"
+    add_option(build, "--jobs", positive(int), "N", text)
     add_cluster(build)
     add_json(build)
     summary = "design the smallest bank that a recording's noise asks for, as a configuration for `build`"
@@ -62,7 +64,7 @@ def _build(args: argparse.Namespace) -> int:
     from shearloop.daemon.bank_config import load_bank_plan
     from shearloop.daemon.parallel import open_executor
 
-    jobs = checked_jobs(args.jobs)
+    jobs = args.jobs or processors()
     plan = load_bank_plan(args.config)
     check_overwrite(args.out, "a bank", BANK_MAGIC)
     rows = len(plan.definition.k_grid)

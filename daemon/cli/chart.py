@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from tempfile import TemporaryFile
 
-from shearloop.daemon.cli.options import add_cluster, add_option, checked_jobs
+from shearloop.daemon.cli.options import add_cluster, add_option, number, positive
 from shearloop.daemon.errors import UserError, require
 
 NAMES = {
@@ -24,10 +24,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--out", Path, "DIR", "folder for the chart and its numbers", required=True)
     add_option(parser, "--bank", Path, "FILE", "bank to match with (default: a small one, built)")
     add_option(parser, "--mesh", Path, "FILE", "mesh or fingertip to reconstruct and solve on (default: our own)")
-    add_option(parser, "--split", float, "SHARE", "earlier part, for the fit (default: 0.6)", default=0.6)
+    add_option(parser, "--split", number(0.1, 0.9), "SHARE", "earlier part, for the fit (default: 0.6)", default=0.6)
     add_cluster(parser)
-    add_option(parser, "--jobs", int, "N", "processes or local workers (default: 1; --cluster alone: one per core)")
-    add_option(parser, "--rounds", int, "N", "rounds of timing (default: 5)", default=5)
+    add_option(
+        parser, "--jobs", positive(int), "N", "processes or local workers (default: 1; --cluster alone: one per core)"
+    )
+    add_option(parser, "--rounds", positive(int), "N", "rounds of timing (default: 5)", default=5)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -62,11 +64,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_arguments(args: argparse.Namespace) -> None:
-    if not 0.1 <= args.split <= 0.9:
-        raise UserError(f"--split must be a share from 0.1 to 0.9, not {args.split:g}")
-    if args.rounds < 1:
-        raise UserError(f"--rounds must be 1 or more, not {args.rounds}")
-    checked_jobs(args.jobs)
     if args.name == "speed-accuracy" and (args.cluster is not None or args.jobs not in (None, 1)):
         raise UserError("speed-accuracy measures times, one thread on this machine: leave out --cluster and --jobs")
     if args.name == "loop" and args.recordings:

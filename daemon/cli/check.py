@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_option
-from shearloop.daemon.errors import UserError
+from shearloop.daemon.errors import USER_ERRORS, UserError
 from shearloop.words import counted
 
 if TYPE_CHECKING:
@@ -56,12 +56,9 @@ class Parts:
     @contextmanager
     def of(self, name: str) -> Iterator[None]:
         """Keep the mistake that ends the context."""
-        from shearloop.bank.errors import BankError
-        from shearloop.drivers.errors import DriverError
-
         try:
             yield
-        except (BankError, DriverError, UserError) as error:
+        except USER_ERRORS as error:
             self.mistakes[name] = str(error)
 
 

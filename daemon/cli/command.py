@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from shearloop.daemon.cli.options import add_connection, add_option, check_timeout_s, client_keys
+from shearloop.daemon.cli.options import TIMEOUT_S, add_connection, add_option, client_keys
 from shearloop.daemon.messaging import addresses, stop_client
 
 COMMANDS = {
@@ -43,7 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--experiment", Path, "FILE", "for start (default: that of the configuration)")
     add_connection(parser, addresses.COMMAND_ADDRESS, "the daemon's command address")
     default = f"{addresses.COMMAND_TIMEOUT_S:g} s, for unlock {addresses.UNLOCK_TIMEOUT_S:g} s"
-    add_option(parser, "--timeout", float, "S", f"time to wait for the reply (default: {default})")
+    add_option(parser, "--timeout", TIMEOUT_S, "S", f"time to wait for the reply (default: {default})")
     parser.add_argument("--json", action="store_true", help="print the reply as JSON")
 
 
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         # The daemon may run in another folder.
         arguments["experiment"] = str(args.experiment.resolve())
     address, keys, request, reply = args.connect, None, {"command": args.name, **arguments}, None
-    timeout_s = addresses.COMMAND_TIMEOUT_S if args.timeout is None else check_timeout_s(args.timeout)
+    timeout_s = args.timeout or addresses.COMMAND_TIMEOUT_S
     if args.name in ("stop", "status") and args.key is None and not addresses.needs_keys(address):
         # These two need no key on the daemon's own machine.
         try:

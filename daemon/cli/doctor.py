@@ -3,12 +3,10 @@
 import argparse
 import json
 import logging
-import math
 from dataclasses import asdict
 from pathlib import Path
 
-from shearloop.daemon.cli.options import add_option
-from shearloop.daemon.errors import UserError
+from shearloop.daemon.cli.options import add_option, positive
 from shearloop.words import counted
 
 MARKS = {"good": "ok   ", "note": "note ", "trouble": "WRONG"}
@@ -18,7 +16,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `doctor`."""
     text = "check its files and devices too (default: none, this computer alone)"
     add_option(parser, "config", Path, "CONFIG", text, nargs="?")
-    add_option(parser, "--seconds", float, "S", "how long to listen to the devices (default: %(default)s)", default=6.0)
+    text = "how long to listen to the devices (default: %(default)s)"
+    add_option(parser, "--seconds", positive(high=600.0), "S", text, default=6.0)
     add_option(parser, "--geometry", Path, "FILE", "the fingertip's geometry, to compare with its bank")
     parser.add_argument("--json", action="store_true", help="print the findings as JSON")
     parser.epilog = "Exit status: 0 nothing is wrong, 1 something is. See also docs/troubleshooting.md."
@@ -30,8 +29,6 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.doctor import examine
     from shearloop.daemon.logs import logging_to_stderr
 
-    if not (math.isfinite(args.seconds) and 0 < args.seconds <= 600):
-        raise UserError(f"--seconds {args.seconds:g} is not a time to listen; give seconds above 0, up to 600")
     findings = []
     with logging_to_stderr(level=logging.ERROR):
         for finding in examine(args.config, args.seconds, args.geometry):

@@ -21,7 +21,7 @@ from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.frame_series import series_of
 from shearloop.daemon.analysis.reproduce.banks import is_built
 from shearloop.daemon.bank_config import load_bank_plan
-from shearloop.daemon.cli.options import checked_jobs, writing
+from shearloop.daemon.cli.options import processors, writing
 from shearloop.daemon.cli.terminal import progress_bar
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.schema import DIAMETER_NOTE
@@ -153,7 +153,7 @@ def emulate_recordings(
     with resources.as_file(resources.files("shearloop") / "config") as config:
         plan = load_bank_plan(config / "banks" / "demo.yaml")
     if not is_built(bank, plan.definition):
-        build_bank(*plan, bank, jobs=checked_jobs(None))
+        build_bank(*plan, bank, jobs=processors())
     return list(write_recordings(bank, folder, diameters_mm, seed))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.bank.defaults import LOADED_NM
-from shearloop.daemon.cli.options import add_cluster, add_json, add_option, writing
+from shearloop.daemon.cli.options import add_cluster, add_json, add_option, number, time_range, writing
 from shearloop.daemon.cli.terminal import table
 from shearloop.daemon.errors import UserError, missing
 from shearloop.words import counted
@@ -44,9 +44,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "recordings", Path, "REC", "recordings (.mcap) or folders of slices", nargs="+")
     add_option(parser, "--bank", Path, "FILE", "the bank of the calibration, if any")
     text = "share of each recording to use, e.g. 0.6:1 after calibrating on 0:0.6 (default: all)"
-    add_option(parser, "--time-range", str, "FROM:TO", text, default="0:1")
+    add_option(parser, "--time-range", time_range, "FROM:TO", text, default="0:1")
     text = "least known torque of a frame that counts as loaded (default: %(default)s N·m)"
-    add_option(parser, "--loaded-nm", float, "NM", text, default=LOADED_NM)
+    add_option(parser, "--loaded-nm", number(0.0, 100.0), "NM", text, default=LOADED_NM)
     add_option(parser, "--estimates", Path, "FILE.csv", "table to write with known torque and estimate of every frame")
     add_cluster(parser)
     add_json(parser)
@@ -70,19 +70,17 @@ def run(args: argparse.Namespace) -> int:
         write_estimates,
     )
     from shearloop.daemon.analysis.frame_series import check_no_copies, check_paths_differ, part_of, read_series
-    from shearloop.daemon.cli.options import check_kind, check_overwrite, load_calibration, parse_time_range
+    from shearloop.daemon.cli.options import check_kind, check_overwrite, load_calibration
     from shearloop.daemon.parallel import open_executor
 
     if args.out is not None and args.out.suffix not in _FIGURES:
         raise UserError(f"--out {args.out} is not the name of a figure; give one that ends in {', '.join(_FIGURES)}")
-    if not args.loaded_nm >= 0:
-        raise UserError(f"--loaded-nm must be 0 N·m or more, not {args.loaded_nm:g}")
     if args.estimates is not None:
         check_overwrite(args.estimates, "a table")
     check_paths_differ(args.recordings)
     calibration = load_calibration(args.calibration)
     bank = Bank.open(args.bank) if args.bank else None
-    start, stop = parse_time_range(args.time_range)
+    start, stop = args.time_range
     sides = calibration.sides if calibration.kind == "raw" else None
     named = [(path, one) for path in args.recordings for one in read_series(path, sides)]
     check_kind(args.calibration, calibration, [one for _, one in named])

@@ -3,7 +3,7 @@
 import argparse
 import sys
 
-from shearloop.daemon.cli.options import add_connection, add_option, check_timeout_s, client_keys
+from shearloop.daemon.cli.options import TIMEOUT_S, add_connection, add_option, client_keys, positive
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.process import interrupt_status
@@ -25,8 +25,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "topics", str, "TOPIC", text, nargs="*", default=[])
     add_connection(parser, PUBLISH_ADDRESS, "where the daemon publishes")
     parser.add_argument("--json", action="store_true", help="one JSON object per line, with arrays")
-    add_option(parser, "--count", int, "N", "stop after N messages")
-    add_option(parser, "--timeout", float, "S", "stop with an error after S seconds without a message")
+    add_option(parser, "--count", positive(int), "N", "stop after N messages")
+    add_option(parser, "--timeout", TIMEOUT_S, "S", "stop with an error after S seconds without a message")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -39,10 +39,6 @@ def run(args: argparse.Namespace) -> int:
     for topic in args.topics:
         if topic not in known:
             raise UserError(f"there is no topic {topic!r}; the topics are {', '.join(TOPICS)}")
-    if args.count is not None and args.count < 1:
-        raise UserError(f"--count {args.count} is not a number of messages; give 1 or more")
-    if args.timeout is not None:
-        check_timeout_s(args.timeout)
     write = message_json if args.json else message_line
 
     def print_hint() -> None:

@@ -2,9 +2,10 @@
 
 import argparse
 import codecs
+import contextlib
+import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,11 +24,56 @@ PAPERS_RECORDINGS = (
 )
 # Longer than the 124 characters of text at the start of a MATLAB file.
 _HEAD_BYTES = 512
-LONGEST_TIMEOUT_S = 86_400
+
+
+def number(low: float, high: float, kind: Callable[[str], float] = float) -> Callable[[str], float]:
+    """Return the type of an option that takes a number from `low` to `high`."""
+    return _number(kind, lambda value: low <= value <= high, f" from {low:g} to {high:g}")
+
+
+def positive(kind: Callable[[str], float] = float, high: float = math.inf) -> Callable[[str], float]:
+    """Return the type of an option that takes a finite number above 0, `high` at the most."""
+    limit = "" if math.isinf(high) else f" and up to {high:g}"
+    return _number(kind, lambda value: 0 < value <= high and value < math.inf, f" above 0{limit}")
+
+
+def _number(kind: Callable[[str], float], accepts: Callable[[float], bool], where: str) -> Callable[[str], float]:
+    def value_of(text: str) -> float:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = math.nan
+        if not accepts(value):
+            raise argparse.ArgumentTypeError(f"{text} is not a {'whole ' if kind is int else ''}number{where}")
+        return value
+
+    return value_of
+
+
+def time_range(text: str) -> tuple[float, float]:
+    """Return the shares of FROM:TO, as the type of an option."""
+    with contextlib.suppress(ValueError):
+        start, stop = map(float, text.split(":"))
+        if 0 <= start < stop <= 1:
+            return start, stop
+    raise argparse.ArgumentTypeError(f"{text} is not two shares that rise from 0 or more to 1 or less, such as 0.5:1")
+
+
+TIMEOUT_S = positive(high=86_400.0)
+# A larger delay belongs to another recording.
+DELAY_S = number(-600.0, 600.0)
+# What fits between the gripper's fingers.
+TOOL_MM = positive(high=140.0)
+PORT = number(0, 65535, int)
 
 
 def add_option(
-    parser: argparse._ActionsContainer, name: str, kind: type, metavar: str | tuple[str, str], text: str, **more: Any
+    parser: argparse._ActionsContainer,
+    name: str,
+    kind: Callable[[str], Any],
+    metavar: str | tuple[str, str],
+    text: str,
+    **more: Any,
 ) -> None:
     """Add an option with a value, or a positional argument, to a parser or a group."""
     parser.add_argument(name, type=kind, metavar=metavar, help=text, **more)
@@ -86,13 +132,6 @@ def load_fingertip(path: Path | None) -> "Fingertip":
         return load_yaml_model(path or paper, FingertipGeometryConfig).fingertip()
 
 
-def check_timeout_s(timeout_s: float) -> float:
-    """Return the value of --timeout; raises UserError if it is out of range."""
-    if not 0 < timeout_s <= LONGEST_TIMEOUT_S:
-        raise UserError(f"--timeout {timeout_s:g} is out of range; give seconds above 0, up to {LONGEST_TIMEOUT_S}")
-    return timeout_s
-
-
 def user_key_folder() -> Path:
     """Return the folder of the user's keys."""
     home = os.environ.get("XDG_CONFIG_HOME")
@@ -119,12 +158,9 @@ def client_keys(args: argparse.Namespace) -> "ClientKeys | None":
     return ClientKeys.load(key, server_key)
 
 
-def checked_jobs(jobs: int | None) -> int:
-    """Return the value of --jobs, by default one per processor; raises UserError for less than 1."""
-    count = len(os.sched_getaffinity(0)) if jobs is None else jobs
-    if count < 1:
-        raise UserError(f"--jobs must be 1 or more, not {count}")
-    return count
+def processors() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0))
 
 
 def check_calibration_file(out: Path) -> None:
@@ -134,36 +170,13 @@ def check_calibration_file(out: Path) -> None:
     check_overwrite(out, "a calibration file")
 
 
-@contextmanager
+@contextlib.contextmanager
 def writing(out: Path, what: str) -> Iterator[None]:
     """Raise UserError where writing `out` raises OSError."""
     try:
         yield
     except OSError as error:
         raise UserError(f"{out}: {what} cannot be written: {error.strerror}; choose another path") from error
-
-
-def parse_time_range(text: str) -> tuple[float, float]:
-    """Return the shares of FROM:TO; raises UserError unless 0 ≤ FROM < TO ≤ 1."""
-    try:
-        start, stop = (float(share) for share in text.split(":"))
-    except ValueError as error:
-        raise UserError(f"--time-range must be two shares such as 0.5:1, not {text!r}") from error
-    if not 0 <= start < stop <= 1:
-        raise UserError(f"--time-range must rise from 0 or more to 1 or less, not {text!r}")
-    return start, stop
-
-
-def parse_sides(text: str | None) -> tuple[str, ...] | None:
-    """Return the sides of SIDE[,SIDE], None for no option; raises UserError for an unknown side."""
-    from shearloop.daemon.recording.schema import SIDES
-
-    if text is None:
-        return None
-    sides = tuple(text.split(","))
-    if not set(sides) <= set(SIDES) or len(set(sides)) < len(sides):
-        raise UserError(f"--sides must be {' or '.join(SIDES)}, or both with a comma between, not {text!r}")
-    return sides
 
 
 def load_calibration(path: Path) -> "Calibration":

@@ -2,16 +2,14 @@
 
 import argparse
 import asyncio
-import math
 import sys
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_json, add_option
 from shearloop.daemon.cli.terminal import print_result
-from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.words import counted
 
@@ -23,7 +21,7 @@ if TYPE_CHECKING:
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     add_option(parser, "recording", Path, "REC", "made by `shearloop run --record` or imported")
-    add_option(parser, "--speed", str, "N", "factor, or max for no waiting (default: %(default)s)", default="1")
+    add_option(parser, "--speed", _speed, "N", "factor, or max for no waiting (default: %(default)s)", default="1")
     add_option(parser, "--publish", str, "ADDRESS", "publish here (default: %(default)s)", default=PUBLISH_ADDRESS)
     add_option(parser, "--config", Path, "FILE", "instead of the configuration in the recording")
     parser.add_argument("--wait", action="store_true", help="begin with the first subscriber")
@@ -40,10 +38,9 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.recording.replay import RecordedRun
     from shearloop.daemon.recording.schema import code_digest
 
-    speed = parse_speed(args.speed)
     run = RecordedRun(args.recording)
     with nullcontext(load_daemon_config(args.config)) if args.config else run.configuration() as config:
-        comparison = asyncio.run(_replay(run, config, speed, args))
+        comparison = asyncio.run(_replay(run, config, args))
     same_code = run.metadata.get("code_sha256") == code_digest()
     for line in _comparison_text(comparison, same_code):
         print(line, file=sys.stderr)
@@ -54,22 +51,14 @@ def run(args: argparse.Namespace) -> int:
     return 1 if args.check and (comparison.different or not comparison.compared) else 0
 
 
-def parse_speed(text: str) -> float:
-    """Return a speed; raises UserError unless it is a number above 0 or max."""
-    if text == "max":
-        return math.inf
-    try:
-        speed = float(text)
-    except ValueError:
-        speed = math.nan
-    if not 0 < speed < math.inf:
-        raise UserError(f"--speed must be a number above 0, or max, not {text!r}")
-    return speed
+def _speed(text: str) -> float:
+    with suppress(ValueError):
+        if (speed := float("inf" if text == "max" else text)) > 0:
+            return speed
+    raise argparse.ArgumentTypeError(f"{text} is not a number above 0, or max")
 
 
-async def _replay(
-    run: "RecordedRun", config: "DaemonConfig", speed: float, args: argparse.Namespace
-) -> "ReplayComparison":
+async def _replay(run: "RecordedRun", config: "DaemonConfig", args: argparse.Namespace) -> "ReplayComparison":
     import zmq.asyncio
 
     from shearloop.daemon.cli.terminal import print_estimate, progress_bar
@@ -86,7 +75,7 @@ async def _replay(
         while args.wait and not publisher.has_subscribers():  # noqa: ASYNC110 - the publisher has no event
             await asyncio.sleep(0.05)
         progress = opened.enter_context(progress_bar(run.path.name, sum(run.counts.values()), "message"))
-        await replay.play(speed, progress)
+        await replay.play(args.speed, progress)
         # The last messages are still being sent.
         await asyncio.sleep(0.1)
     return replay.comparison

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.options import PAPERS_RECORDINGS, add_json, add_option, checked_jobs, writing
+from shearloop.daemon.cli.options import PAPERS_RECORDINGS, add_json, add_option, positive, processors, writing
 from shearloop.daemon.cli.terminal import progress_bar
 from shearloop.daemon.errors import missing
 
@@ -23,20 +23,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
     default = "RECORDINGS/../reference/fingertip_mesh.npz, or a grid of our own if that file is missing"
     add_option(parser, "--mesh", Path, "FILE", f"mesh (.npz, EIDORS .mat) or fingertip (.yaml); by default {default}")
-    add_option(parser, "--jobs", int, "N", "processors to use (default: all)")
+    add_option(parser, "--jobs", positive(int), "N", "processors to use (default: all)")
     parser.epilog = PAPERS_RECORDINGS
 
 
 def run(args: argparse.Namespace) -> int:
     """Compute the numbers, then write, print and draw them."""
-    jobs = checked_jobs(args.jobs)
     try:
         from shearloop.daemon.analysis.reproduce.report import draw_all
     except ModuleNotFoundError as error:
         raise missing(error.name, "plot", "a figure") from error
     from shearloop.daemon.analysis.reproduce.report import json_text, table
 
-    found, banks = _reproduce(args, jobs)
+    found, banks = _reproduce(args, args.jobs or processors())
     numbers = args.out / "reproduce.json"
     with writing(args.out, "the results"):
         numbers.write_text(json_text(found) + "\n", encoding="utf-8")

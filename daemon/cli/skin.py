@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.options import add_action, add_json, add_option, check_overwrite, run_action, writing
+from shearloop.daemon.cli.options import add_action, add_json, add_option, check_overwrite, number, run_action, writing
 from shearloop.daemon.cli.terminal import print_result, table
 from shearloop.daemon.errors import UserError, require
 
@@ -33,7 +33,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     calibrate = add_action(actions, "calibrate", "fit a calibration to a recorded table", _calibrate)
     add_option(calibrate, "table", Path, "TABLE", "CSV with r1_ohm, r2_ohm, shear_n, normal_n")
     add_option(calibrate, "--out", Path, "YAML", "the calibration file to write", required=True)
-    add_option(calibrate, "--friction", float, "MU", "coefficient of friction, if the table does not determine it")
+    text = "coefficient of friction, if the table does not determine it"
+    add_option(calibrate, "--friction", number(0.0, 1.0), "MU", text)
     add_json(calibrate)
 
 
@@ -69,8 +70,6 @@ def _calibrate(args: argparse.Namespace) -> int:
     from shearloop.bank.errors import CalibrationError
     from shearloop.bank.skin.calibration import fit_calibration, read_table, save_calibration
 
-    if args.friction is not None and not 0 <= args.friction <= 1:
-        raise UserError(f"--friction is {args.friction}; a coefficient of friction lies between 0 and 1.")
     check_overwrite(args.out, "a calibration file")
     recorded = read_table(args.table)
     try:

@@ -5,13 +5,13 @@ import asyncio
 import json
 from pathlib import Path
 
-from shearloop.daemon.cli.options import add_connection, add_fingertip, add_option, client_keys, load_fingertip
+from shearloop.daemon.cli.options import PORT, add_connection, add_fingertip, add_option, client_keys, load_fingertip
 from shearloop.daemon.cli.terminal import print_result
-from shearloop.daemon.errors import UserError, require
+from shearloop.daemon.errors import require
 from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS
 from shearloop.daemon.process import interrupt_status
 
-PORT = 7760
+PAGE_PORT = 7760
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -20,9 +20,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     text = "where the daemon takes commands (default: %(default)s)"
     add_option(parser, "--commands", str, "ADDRESS", text, default=COMMAND_ADDRESS)
     text = "the page's port on 127.0.0.1; 0 for any free one (default: %(default)s)"
-    add_option(parser, "--port", int, "PORT", text, default=PORT)
+    add_option(parser, "--port", PORT, "PORT", text, default=PAGE_PORT)
     text = "serve Foxglove at this port of 127.0.0.1 instead of the page; 0 for any free one"
-    add_option(parser, "--foxglove", int, "PORT", text)
+    add_option(parser, "--foxglove", PORT, "PORT", text)
     add_fingertip(parser)
     text = "the token that permits motion (default: ~/.local/state/shearloop/view-token)"
     add_option(parser, "--token-file", Path, "FILE", text)
@@ -33,8 +33,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until SIGINT, SIGTERM or SIGHUP."""
-    if not 0 <= (port := args.port if args.foxglove is None else args.foxglove) <= 65535:
-        raise UserError(f"{port} is not a port; give one from 1 to 65535, or 0 for any free one")
     try:
         return _serve_page(args) if args.foxglove is None else _serve_foxglove(args)
     except KeyboardInterrupt as interrupt:

@@ -103,7 +103,7 @@ def test_solve_refuses_a_conductivity_that_is_not_positive_and_writes_nothing(fo
 @pytest.mark.parametrize(
     ("options", "part"),
     [
-        (["--jobs", "0"], "--jobs must be 1 or more, not 0"),
+        (["--jobs", "0"], "--jobs 0 is not a whole number above 0"),
         (["--out", "{folder}"], "is a directory; give the name of a file"),
         (["--out", "/dev/null"], "/dev/null is no file, and cannot hold a bank; give the name of a file"),
         (["--out", "{folder}/tip.yaml/a.bank"], "there is no folder"),

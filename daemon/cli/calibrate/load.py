@@ -7,9 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.options import add_json, add_option, check_calibration_file
+from shearloop.daemon.cli.options import add_json, add_option, check_calibration_file, positive
 from shearloop.daemon.cli.terminal import Operator, print_result
-from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.drivers.connection import SerialPort
@@ -28,7 +27,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     port.add_argument("--port", metavar="PATH", help="the board's serial port")
     text = "a known mass to put on the cell; give it once per mass: several show whether they agree"
     add_option(parser, "--mass-g", float, "G", text, action="append", required=True)
-    add_option(parser, "--lever-arm-mm", float, "MM", "from the shaft to the cell (default: %(default)s)", default=35.0)
+    text = "from the shaft to the cell (default: %(default)s)"
+    add_option(parser, "--lever-arm-mm", positive(high=1000.0), "MM", text, default=35.0)
     text = "the turn that presses on the cell counts as negative torque"
     parser.add_argument("--reverse", action="store_true", help=text)
     add_option(parser, "--out", Path, "FILE", "the calibration file to write", required=True)
@@ -42,8 +42,6 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.drivers.load_calibration import check_masses, fit_levels
     from shearloop.drivers.load_cell import BAUD_RATE
 
-    if not 0 < args.lever_arm_mm < 1000:
-        raise UserError(f"--lever-arm-mm {args.lever_arm_mm:g} is no lever arm; give millimetres above 0")
     check_calibration_file(args.out)
     check_masses(args.mass_g)
     with SerialPort(find_port(serial_number=args.serial_number, path=args.port), BAUD_RATE) as port:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.bank.estimator_names import DEFAULT, ESTIMATORS
-from shearloop.daemon.cli.options import add_json, add_option, check_overwrite
+from shearloop.daemon.cli.options import DELAY_S, TOOL_MM, add_json, add_option, check_overwrite, time_range
 from shearloop.daemon.cli.terminal import print_result
 from shearloop.daemon.errors import UserError
 
@@ -14,9 +14,6 @@ if TYPE_CHECKING:
     from shearloop.bank.estimation import Calibration
     from shearloop.bank.estimation.interval_regressor import IntervalRegressor
     from shearloop.daemon.analysis.calibrate import CalibrationResult
-
-# A larger delay belongs to another recording.
-_LARGEST_DELAY_S = 600.0
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -27,19 +24,29 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--out", Path, "CAL", "calibration to write", required=True)
     add_option(parser, "--bank", Path, "FILE", "a bank, which the estimators paper and bank need")
     add_option(parser, "--mesh", Path, "FILE", "a mesh, which the estimator reconstruction needs")
-    parser.add_argument("--sides", metavar="SIDE[,SIDE]", help="sides to use, e.g. right (default: all)")
-    add_option(parser, "--time-range", str, "FROM:TO", "share of each recording to use, e.g. 0:0.5", default="0:1")
+    add_option(parser, "--sides", _sides, "SIDE[,SIDE]", "sides to use, e.g. right (default: all)")
+    text = "share of each recording to use, e.g. 0:0.5"
+    add_option(parser, "--time-range", time_range, "FROM:TO", text, default="0:1")
     text = "delay of the load cell's timestamps, which is subtracted; 0 accepts them unchecked"
-    add_option(parser, "--load-cell-delay-s", float, "S", text)
+    add_option(parser, "--load-cell-delay-s", DELAY_S, "S", text)
     text = "no torque will exceed the slices: intervals do not extend beyond them"
     parser.add_argument("--assume-full-range", action="store_true", help=text)
     text = "diameter of the tool in recordings that do not name it; on another tool there is no torque"
-    add_option(parser, "--tool-mm", float, "MM", text)
+    add_option(parser, "--tool-mm", TOOL_MM, "MM", text)
     add_json(parser)
     parser.epilog = (
         "A recording has to hold some seconds idle, the grip, several twists (best ten) with the load cell recorded, "
         "and some seconds idle after the release. docs/estimators.md describes the estimators and their needs."
     )
+
+
+def _sides(text: str) -> tuple[str, ...]:
+    from shearloop.daemon.recording.schema import SIDES
+
+    sides = tuple(text.split(","))
+    if not set(sides) <= set(SIDES) or len(set(sides)) < len(sides):
+        raise argparse.ArgumentTypeError(f"{text} is not {' or '.join(SIDES)}, or both with a comma between")
+    return sides
 
 
 def run(args: argparse.Namespace) -> int:
@@ -49,25 +56,15 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.estimation import Physics
     from shearloop.bank.estimation.calibration import ARCHIVE_MAGIC
     from shearloop.daemon.analysis.calibrate import calibrate
-    from shearloop.daemon.cli.options import parse_sides, parse_time_range
-    from shearloop.daemon.recording.schema import LARGEST_DIAMETER_MM
 
-    sides, time_range = parse_sides(args.sides), parse_time_range(args.time_range)
-    delay_s, tool_mm = args.load_cell_delay_s, args.tool_mm
-    if delay_s is not None and not abs(delay_s) <= _LARGEST_DELAY_S:
-        raise UserError(
-            f"--load-cell-delay-s must be from -{_LARGEST_DELAY_S:g} to {_LARGEST_DELAY_S:g} s, not {delay_s:g}"
-        )
-    if tool_mm is not None and not 0 < tool_mm < LARGEST_DIAMETER_MM:
-        raise UserError(f"--tool-mm must be above 0 and below {LARGEST_DIAMETER_MM:g} mm, not {tool_mm:g}")
     _check_options(args)
     check_overwrite(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
     physics = Physics(
         bank=Bank.open(args.bank) if args.bank else None, mesh=load_mesh(args.mesh) if args.mesh else None
     )
     result = calibrate(
-        args.recordings, args.estimator, physics, time_range=time_range, sides=sides, load_cell_delay_s=delay_s,
-        assume_full_range=args.assume_full_range, tool_mm=tool_mm,
+        args.recordings, args.estimator, physics, time_range=args.time_range, sides=args.sides,
+        load_cell_delay_s=args.load_cell_delay_s, assume_full_range=args.assume_full_range, tool_mm=args.tool_mm,
     )  # fmt: skip
     if args.assume_full_range and result.calibration.torque is None:
         raise UserError("--assume-full-range is about torques, and these slices have diameters only; leave it out")

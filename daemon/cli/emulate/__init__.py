@@ -4,8 +4,8 @@ import argparse
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
+from shearloop.daemon.cli import Parser
 from shearloop.daemon.cli.emulate import devices, rig
 from shearloop.daemon.cli.options import add_action, run_action
 from shearloop.daemon.errors import UserError
@@ -30,19 +30,12 @@ def run(args: argparse.Namespace) -> int:
         return interrupt_status(interrupt)
 
 
-class _RaisingParser(argparse.ArgumentParser):
-    """Raises UserError instead of ending the program."""
-
-    def error(self, message: str) -> NoReturn:
-        raise UserError(message)
-
-
 def checked_arguments(device: str, arguments: Sequence[str], folder: Path) -> argparse.Namespace:
     """Return the parsed arguments of a device, as a configuration in `folder` gives them.
 
     Raises UserError for wrong arguments and for a missing bank.
     """
-    parser = _RaisingParser(prog=device, allow_abbrev=False, add_help=False)
+    parser = Parser(prog=f"shearloop emulate {device}", allow_abbrev=False, add_help=False)
     DEVICES[device].configure(parser)
     parser.set_defaults(device=device)
     args = parser.parse_args(arguments)

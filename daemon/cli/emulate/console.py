@@ -4,7 +4,6 @@ import argparse
 import asyncio
 import contextlib
 import json
-import math
 import sys
 import time
 from collections.abc import Callable, Coroutine, Iterator, Mapping
@@ -12,7 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
-from shearloop.daemon.cli.options import add_option
+from shearloop.daemon.cli.options import add_option, positive
 from shearloop.daemon.cli.terminal import stdin_lines
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.process import ending_signals
@@ -89,17 +88,10 @@ async def _play(
         each.cancel()
 
 
-def checked_port(option: str, port: int) -> int:
-    """Return a port's number; UserError for an impossible one."""
-    if not 0 <= port <= 65535:
-        raise UserError(f"--{option} {port} is no port; give 0 to 65535")
-    return port
-
-
 def add_seed_and_speed(parser: argparse._ActionsContainer, pace: str) -> None:
     """Add `--seed` and `--speed`, which multiplies `pace`."""
     parser.add_argument("--seed", type=int, default=0, help="of all noise and garbage (default: %(default)s)")
-    add_option(parser, "--speed", float, "N", f"times {pace} (default: 1)", default=1.0)
+    add_option(parser, "--speed", positive(), "N", f"times {pace} (default: 1)", default=1.0)
 
 
 def add_sigma(parser: argparse._ActionsContainer) -> None:
@@ -125,18 +117,3 @@ def checked_link(link: Path | None) -> Path | None:
     if link.exists() and not link.is_symlink():
         raise UserError(f"--link {link} cannot be made: a file has this name; choose another")
     return link
-
-
-def check_positive(args: argparse.Namespace, *names: str) -> None:
-    """Raise UserError for an argument that is not a positive number."""
-    for name in names:
-        value = getattr(args, name)
-        if not (math.isfinite(value) and value > 0):
-            raise UserError(f"--{name.replace('_', '-')} {value:g} is not above 0")
-
-
-def check_range(args: argparse.Namespace, name: str, low: float, high: float) -> None:
-    """Raise UserError for an argument outside a range."""
-    value = getattr(args, name)
-    if not low <= value <= high:
-        raise UserError(f"--{name.replace('_', '-')} {value:g} is outside {low:g} to {high:g}")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.emulate import console
-from shearloop.daemon.cli.options import add_option
+from shearloop.daemon.cli.options import PORT, add_option, number, positive
 from shearloop.daemon.errors import UserError
 from shearloop.drivers.defaults import URCAP_PORT
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 # The tool of synthetic frames.
 DIAMETER_MM = 20.0
+RATE_HZ = number(50.0, 1000.0)
 UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standard input:
   protective-stop         stop for safety, pause the program
   emergency-stop          press the button: stop, end the program, power off
@@ -57,7 +58,6 @@ def _run_eit_kit(args: argparse.Namespace) -> int:
     from shearloop.drivers.defaults import FRAME_PERIOD_S
     from shearloop.drivers.emulators.boards import EitKitBoard
 
-    console.check_positive(args, "speed")
     link = console.checked_link(args.link)
     board = EitKitBoard(_frames(args, FRAME_PERIOD_S), period_s=FRAME_PERIOD_S / args.speed, link=link, seed=args.seed)
     return console.play(board.run(), board.command, {"": board.port.appearances})
@@ -94,7 +94,7 @@ def _configure_hx711(parser: argparse.ArgumentParser) -> None:
         "[SECONDS], unplug [SECONDS]; `normal` ends them. `torque NM` sets the torque, `mass G` that of a "
         "mass on the lever."
     )
-    add_option(parser, "--torque-nm", float, "NM", "the torque (default: %(default)s)", default=0.0)
+    add_option(parser, "--torque-nm", number(-1000.0, 1000.0), "NM", "the torque (default: %(default)s)", default=0.0)
     parser.add_argument("--paper-sketch", action="store_true", help="send N·m, as the paper's board did, not counts")
     console.add_seed_and_speed(parser, "the board's 10.9 lines per second")
     console.add_link(parser)
@@ -105,9 +105,6 @@ def _run_hx711(args: argparse.Namespace) -> int:
     from shearloop.drivers.load_calibration import STANDARD_GRAVITY
     from shearloop.drivers.load_cell import LEVER_ARM_M
 
-    console.check_positive(args, "speed")
-    if not math.isfinite(args.torque_nm):
-        raise UserError("--torque-nm must be finite")
     held_nm = args.torque_nm
     sketch, period_s = PAPER_SKETCH if args.paper_sketch else Sketch(), LOAD_PERIOD_S / args.speed
     link = console.checked_link(args.link)
@@ -135,16 +132,15 @@ def _finite(text: str) -> float:
 
 def add_robot(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of every emulated controller."""
-    parser.add_argument("--rate-hz", type=float, default=500.0, help="control cycles per second (default: %(default)s)")
+    add_option(parser, "--rate-hz", RATE_HZ, "HZ", "control cycles per second (default: %(default)s)", default=500.0)
     parser.add_argument("--unlock-wait-s", type=float, default=5.0, help="time in which a stop is not unlocked (5)")
     parser.add_argument("--power-on-s", type=float, default=1.0, help="time of each power-on step (default: 1)")
 
 
 def robot_make(args: argparse.Namespace) -> "ControllerSpec":
-    """Return the controller's make; UserError for a wrong rate."""
+    """Return the controller's make."""
     from shearloop.drivers.emulators.ur_robot import ControllerSpec
 
-    console.check_range(args, "rate_hz", 50, 1000)
     return ControllerSpec(unlock_wait_s=args.unlock_wait_s, power_on_s=args.power_on_s)
 
 
@@ -189,13 +185,13 @@ def _configure_gripper(parser: argparse.ArgumentParser, printed: str) -> None:
         "[SECONDS]` breaks the connection, `silence [SECONDS]` answers nothing; `normal` ends them, and a fault below "
         "10."
     )
-    add_option(parser, "--speed", float, "N", "times the gripper's own pace", default=1.0)
+    add_option(parser, "--speed", positive(), "N", "times the gripper's own pace", default=1.0)
 
 
 def _configure_gripper_socket(parser: argparse.ArgumentParser) -> None:
     _configure_gripper(parser, "its address")
     add_option(parser, "--bind", str, "ADDRESS", "address to listen on (default: %(default)s)", default="127.0.0.1")
-    parser.add_argument("--port", type=int, default=URCAP_PORT, help="0 for a free one (default: %(default)s)")
+    add_option(parser, "--port", PORT, "PORT", "0 for a free one (default: %(default)s)", default=URCAP_PORT)
 
 
 def _configure_gripper_modbus(parser: argparse.ArgumentParser) -> None:
@@ -207,13 +203,12 @@ def _run_gripper(args: argparse.Namespace) -> int:
     from shearloop.drivers.emulators.gripper import Gripper, GripperPlayer, ModbusSlave, UrcapSession
     from shearloop.drivers.emulators.ports import PtyServer, SocketServer
 
-    console.check_positive(args, "speed")
     gripper = Gripper()
     server: SocketServer | PtyServer
     if args.device == "gripper-modbus":
         server = PtyServer(ModbusSlave(gripper), console.checked_link(args.link))
     else:
-        server = SocketServer(UrcapSession(gripper), args.bind, console.checked_port("port", args.port))
+        server = SocketServer(UrcapSession(gripper), args.bind, args.port)
     player = GripperPlayer(gripper, server, args.speed)
     with console.report_busy_address("the gripper cannot be played", "choose another port or bind address"):
         return console.play(player.run(), player.command, {"": server.appearances})

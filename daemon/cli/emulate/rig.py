@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from shearloop.daemon.cli.emulate import console
-from shearloop.daemon.cli.emulate.devices import add_robot, print_robot_event, robot_make
-from shearloop.daemon.cli.options import add_option
+from shearloop.daemon.cli.emulate.devices import RATE_HZ, add_robot, print_robot_event, robot_make
+from shearloop.daemon.cli.options import PORT, TOOL_MM, add_option, positive
 from shearloop.daemon.errors import UserError
 from shearloop.drivers.emulators import number_between
 
@@ -87,8 +87,8 @@ def _configure_rig(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", default="127.0.0.1", help="address of robot and gripper (default: %(default)s)")
     text = "its interface (default: %(default)s)"
     parser.add_argument("--gripper", choices=("socket", "modbus"), default="socket", help=text)
-    add_option(parser, "--diameter-mm", float, "MM", "of the tool (default: 20)", default=20.0)
-    add_option(parser, "--gel-stiffness", float, "NM_PER_RAD", "of both pads (default: %(default)s)", default=0.8)
+    add_option(parser, "--diameter-mm", TOOL_MM, "MM", "of the tool (default: 20)", default=20.0)
+    add_option(parser, "--gel-stiffness", positive(), "NM_PER_RAD", "of both pads (default: %(default)s)", default=0.8)
     console.add_seed_and_speed(parser, "the pace of gel, fingers and boards")
     add_option(parser, "--truth", Path, "FILE", "append the true state, ten times a second, as JSON")
     text = "the load cell sends N·m, as the paper's, not counts"
@@ -103,10 +103,7 @@ def _run_rig(args: argparse.Namespace) -> int:
     from shearloop.drivers.emulators.rig import NOISE_NM, EmulatedRig
     from shearloop.drivers.emulators.scene import TwinSettings
 
-    console.check_positive(args, "speed", "gel_stiffness")
     make = robot_make(args)
-    if not 0 < args.diameter_mm <= 140:
-        raise UserError(f"--diameter-mm {args.diameter_mm:g} does not fit between the fingers; give up to 140")
     try:
         args.run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -185,12 +182,12 @@ def _configure_skin(parser: argparse.ArgumentParser) -> None:
     ):
         addresses = parser.add_mutually_exclusive_group()
         add_option(addresses, f"--{name}-link", Path, "PATH", link_help)
-        add_option(addresses, f"--{name}-port", int, "N", port_help)
+        add_option(addresses, f"--{name}-port", PORT, "N", port_help)
     parser.add_argument("--bind", default="127.0.0.1", metavar="ADDRESS", help="of the sockets (default: %(default)s)")
     console.add_seed_and_speed(parser, "the instruments' own pace")
     robot = parser.add_argument_group("a robot whose wrist turns a tool on the skin")
     robot.add_argument("--robot", metavar="HOST", help="play a UR controller on this address of this machine")
-    robot.add_argument("--rate-hz", type=float, default=500.0, help="control cycles per second (default: %(default)s)")
+    add_option(robot, "--rate-hz", RATE_HZ, "HZ", "control cycles per second (default: %(default)s)", default=500.0)
 
 
 def _run_skin(args: argparse.Namespace) -> int:
@@ -199,8 +196,6 @@ def _run_skin(args: argparse.Namespace) -> int:
     from shearloop.drivers.emulators.ur_controller import Controller
     from shearloop.drivers.emulators.ur_robot import Robot
 
-    console.check_positive(args, "speed")
-    console.check_range(args, "rate_hz", 50, 1000)
     pushed = PushedSkin(SyntheticSkin(seed=args.seed))
     source_at, daq_at = (_address(args, name) for name in ("source", "daq"))
     instruments = SkinInstruments(pushed, source_at, daq_at, speed=args.speed, seed=args.seed)
@@ -228,7 +223,7 @@ def _address(args: argparse.Namespace, name: str) -> "Address | None":
     port = getattr(args, f"{name}_port")
     if port is None:
         return console.checked_link(getattr(args, f"{name}_link"))
-    return args.bind, console.checked_port(f"{name}-port", port)
+    return args.bind, port
 
 
 async def _play_skin(instruments: "SkinInstruments", controller: "Controller | None") -> None:

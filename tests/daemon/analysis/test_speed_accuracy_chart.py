@@ -119,8 +119,8 @@ def test_the_speed_accuracy_chart_holds_every_method_with_its_ratio(parts, bank,
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["--split", "0.95"], "--split must be a share from 0.1 to 0.9"),
-        (["--rounds", "0"], "--rounds must be 1 or more"),
+        (["--split", "0.95"], "--split 0.95 is not a number from 0.1 to 0.9"),
+        (["--rounds", "0"], "--rounds 0 is not a whole number above 0"),
         (["no-such.mcap"], "no-such.mcap"),
     ],
 )

@@ -85,7 +85,10 @@ def test_a_table_that_no_curve_fits_is_refused_by_its_name(tmp_path, mistake):
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
-    [(["none.csv"], "none.csv: the table cannot be read"), (["none.csv", "--friction", "2"], "--friction is 2.0")],
+    [
+        (["none.csv"], "none.csv: the table cannot be read"),
+        (["none.csv", "--friction", "2"], "--friction 2 is not a number from 0 to 1"),
+    ],
 )
 def test_a_mistake_ends_in_one_sentence(arguments, named, tmp_path, mistake, monkeypatch):
     monkeypatch.chdir(tmp_path)

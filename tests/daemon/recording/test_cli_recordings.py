@@ -180,11 +180,17 @@ def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["calibrate", "{slices}", "--time-range", "0.5", "--out", "x"], "--time-range must be two shares"),
-        (["calibrate", "{slices}", "--time-range", "0.9:0.5", "--out", "x"], "--time-range must rise"),
-        (["calibrate", "{slices}", "--sides", "middle", "--out", "x"], "--sides must be right or left"),
+        (
+            ["calibrate", "{slices}", "--time-range", "0.5", "--out", "x"],
+            "--time-range 0.5 is not two shares that rise",
+        ),
+        (
+            ["calibrate", "{slices}", "--time-range", "0.9:0.5", "--out", "x"],
+            "--time-range 0.9:0.5 is not two shares that rise",
+        ),
+        (["calibrate", "{slices}", "--sides", "middle", "--out", "x"], "--sides middle is not right or left"),
         (["calibrate", "{slices}", "--estimator", "bank", "--out", "x"], "needs a bank"),
-        (["calibrate", "{slices}", "--tool-mm", "0", "--out", "x"], "--tool-mm must be above 0 and below 140 mm, not"),
+        (["calibrate", "{slices}", "--tool-mm", "0", "--out", "x"], "--tool-mm 0 is not a number above 0 and up to"),
         (["calibrate", "{slices}", "--load-cell-delay-s", "0", "--out", "x"], "--load-cell-delay-s is for recordings"),
         (["calibrate", "{slices}", "--tool-mm", "20", "--out", "x"], "--tool-mm is for recordings: a calibration of"),
         (["calibrate", "{slices}", "--sides", "left", "--out", "x"], "--sides is for recordings: slices do not name"),
@@ -195,7 +201,7 @@ def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, 
         (["calibrate", "nowhere.mcap", "--out", "x"], "nowhere.mcap: the recording cannot be read"),
         (["evaluate", "nowhere.cal", "{slices}"], "make one with `shearloop calibrate REC… --out nowhere.cal`"),
         (["evaluate", "nowhere.cal", "{slices}", "--out", "x.mcap"], "x.mcap is not the name of a figure"),
-        (["evaluate", "nowhere.cal", "{slices}", "--loaded-nm", "-1"], "--loaded-nm must be 0 N·m or more, not -1"),
+        (["evaluate", "nowhere.cal", "{slices}", "--loaded-nm", "-1"], "--loaded-nm -1 is not a number from 0 to"),
     ],
 )
 def test_mistakes_end_in_one_sentence(arguments, message, slices_folder, mistake, tmp_path, monkeypatch):

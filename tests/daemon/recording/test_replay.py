@@ -172,8 +172,8 @@ def test_a_real_recording_gives_the_stored_estimates(shared, config, tmp_path):
     [
         (["nowhere.mcap"], "nowhere.mcap: the recording cannot be read: No such file"),
         (["{imported}"], "has no configuration because"),
-        (["{imported}", "--speed", "0"], "--speed must be a number above 0, or max, not '0'"),
-        (["{imported}", "--speed", "fast"], "--speed must be a number above 0, or max, not 'fast'"),
+        (["{imported}", "--speed", "0"], "--speed 0 is not a number above 0, or max"),
+        (["{imported}", "--speed", "fast"], "--speed fast is not a number above 0, or max"),
     ],
 )
 def test_mistakes_end_in_one_sentence(arguments, message, imported, mistake):

@@ -110,7 +110,7 @@ def test_mistakes_end_in_one_sentence(make_recordings, tmp_path, mistake):
     assert "has neither a folder torque_slices nor a folder diameter_slices" in refused(tmp_path)
     recordings = make_recordings(diameter=False)
     assert "absent.npz" in refused(recordings, "--mesh", str(tmp_path / "absent.npz"))
-    assert "--jobs must be 1 or more, not 0" in refused(recordings, "--jobs", "0")
+    assert "--jobs 0 is not a whole number above 0" in refused(recordings, "--jobs", "0")
     folder = recordings / "torque_slices"
     for path in sorted(folder.glob("Data_Slice_*.mat"))[2:]:
         path.unlink()

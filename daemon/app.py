@@ -86,7 +86,7 @@ class Daemon:
             opened.callback(stop_socket.close)
             self._close = opened.pop_all().close
         tasks: dict[str, Task | None] = {
-            **self.sensors.tasks(),
+            **self.sensors.tasks,
             **(self._rig.tasks() if self._rig is not None else {}),
             "experiment": self._experiment,
             "recording": RecordingTask(self.recorder, self._rig) if self.recorder is not None else None,
@@ -125,7 +125,7 @@ class Daemon:
                 name: group.create_task(self.supervisor.keep_running(name, task), name=name)
                 for name, task in self._tasks.items()
             }
-            structlog.get_logger().info("running", fingertips=list(self.sensors.fingertips))
+            structlog.get_logger().info("running", sensors=list(self.sensors.tareable))
             on_ready()
             notify("READY=1")
             await self._end.wait()
@@ -172,7 +172,7 @@ def _build_rig(
     sensors = build_sensors(config, publisher, clock, recorder, loop, estimators, combined, gripper)
     if loop is None:
         return sensors, None
-    return sensors, Rig(config, loop, gripper, sensors.tareable(), publisher, clock, recorder)
+    return sensors, Rig(config, loop, gripper, sensors.tareable, publisher, clock, recorder)
 
 
 async def run_daemon(

@@ -70,7 +70,7 @@ class Commands:
         return {}
 
     async def _tare(self, request: Request) -> Reply:
-        sensors = self.sensors.tareable()
+        sensors = self.sensors.tareable
         source = request.get("source")
         if source is not None and not (isinstance(source, str) and source in sensors):
             raise CommandRefusedError(f"there is no sensor {source!r} to tare; there are {', '.join(sensors)}")

@@ -2,7 +2,6 @@
 
 import asyncio
 import os
-from collections.abc import Mapping
 from pathlib import Path
 
 import structlog
@@ -95,9 +94,9 @@ class CrashMarker:
     daemon from starting its experiment. Without a runtime folder, as at a terminal, there is no marker.
     """
 
-    def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
+    def __init__(self) -> None:
         # systemd separates several folders with colons; ours is one.
-        folder = environment.get("RUNTIME_DIRECTORY", "").partition(":")[0]
+        folder = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
         self._path = Path(folder) / "begun" if folder else None
         self.left_behind = self._path is not None and self._path.exists()
 

@@ -25,31 +25,14 @@ from shearloop.drivers.serial_sensor import InputRecorder
 
 @dataclass(frozen=True, slots=True)
 class Sensors:
-    """The tasks of all configured sensors; no device is open yet."""
+    """All configured sensors; no device is open yet.
 
-    fingertips: Mapping[str, FingertipTask]
+    `tasks` are by their names in `health`; `tareable` is everything that has a zero.
+    """
+
+    tasks: Mapping[str, Task]
+    tareable: Mapping[str, Tareable]
     combined: CombinedFingertips | None
-    skin: SkinTask | None
-    load_cell: LoadCellTask | None
-
-    def tareable(self) -> dict[str, Tareable]:
-        """Return everything that has a zero, by its name."""
-        named: dict[str, Tareable | None] = {
-            **{name: task.pipeline for name, task in self.fingertips.items()},
-            COMBINED: self.combined.pipeline if self.combined is not None else None,
-            SKIN: self.skin,
-            LOAD_CELL: self.load_cell,
-        }
-        return {name: sensor for name, sensor in named.items() if sensor is not None}
-
-    def tasks(self) -> dict[str, Task]:
-        """Return the tasks to run, by their names in `health`."""
-        tasks: dict[str, Task] = dict(self.fingertips)
-        if self.skin is not None:
-            tasks |= {SKIN: self.skin, SKIN_CURRENT: self.skin.source}
-        if self.load_cell is not None:
-            tasks[LOAD_CELL] = self.load_cell
-        return tasks
 
 
 def build_sensors(
@@ -80,18 +63,20 @@ def build_sensors(
     if combined is not None:
         period_s = config.fingertips[combined.calibration.sides[0]].frame_period_s
         pairs = CombinedFingertips(pipeline(COMBINED, combined), period_s)
-    fingertips = {}
+    tasks: dict[str, Task] = {}
+    tareable: dict[str, Tareable] = {}
     for name, estimator in estimators.items():
-        own, slots = config.fingertips[name], estimator.table.zero_slots
-        board = EitKit(link(name, own.device), slots, own.frame_period_s, inputs(name))
-        always = own.heatmap == "always"
-        fingertips[name] = FingertipTask(board, pipeline(name, estimator), publisher, pairs, always)
-    skin = load_cell = None
+        own, tareable[name] = config.fingertips[name], (estimates := pipeline(name, estimator))
+        board = EitKit(link(name, own.device), estimator.table.zero_slots, own.frame_period_s, inputs(name))
+        tasks[name] = FingertipTask(board, estimates, publisher, pairs, own.heatmap == "always")
+    if pairs is not None:
+        tareable[COMBINED] = pairs.pipeline
     if config.skin is not None:
         sources = {name: inputs(name) for name in ReplayedSkin.sources}
-        skin = SkinTask(config.skin, publisher, clock, loop, sources)
+        tareable[SKIN] = tasks[SKIN] = skin = SkinTask(config.skin, publisher, clock, loop, sources)
+        tasks[SKIN_CURRENT] = skin.source
     if (cell := config.load_cell) is not None:
         calibration = load_cell_calibration(cell)
         lever = LoadCell(link(LOAD_CELL, cell.device), calibration, cell.rate_hz, inputs(LOAD_CELL))
-        load_cell = LoadCellTask(lever, publisher, clock, loop, cell.rate_hz)
-    return Sensors(fingertips, pairs, skin, load_cell)
+        tareable[LOAD_CELL] = tasks[LOAD_CELL] = LoadCellTask(lever, publisher, clock, loop, cell.rate_hz)
+    return Sensors(tasks, tareable, pairs)

@@ -260,65 +260,55 @@ def _outlined(content: object) -> Step:
 def check_steps(file: ExperimentFile) -> list[Mistake]:
     """Return each step that exceeds its limits or its timeout, and the first `hold_torque` on an unidentified tool."""
     found: list[Mistake] = []
+    identified = False
     for number, step in enumerate(file.steps):
-        limits, (torque_nm, angle_rad) = file.limits_of(step), _reach(step)
+        limits, (torque_nm, angle_rad, least_s) = file.limits_of(step), _asks(step)
         torque = torque_nm, limits.torque_nm, "N·m", "torque_nm"
         for value, limit, unit, key in (torque, (angle_rad, limits.angle_rad, "rad", "angle_rad")):
             if value >= limit:
                 asks = f"{step.do} asks for {value:g} {unit}, and its limit is {limit:g} {unit}"
                 found.append((("steps", number), f"{asks}; raise limits.{key}, or ask for less"))
-        if step.timeout_s is not None and (least_s := _least_s(step)) >= step.timeout_s:
+        if step.timeout_s is not None and least_s >= step.timeout_s:
             asks = f"{step.do} stands still for {least_s:g} s in all, and its timeout is {step.timeout_s:g} s"
             found.append((("steps", number), f"{asks}; raise timeout_s"))
-    if (unidentified := _holds_unidentified(file)) is not None:
-        cure = "put an `identify` step before it, after the last `tare`, `grip`, `release` or `adapt`"
-        found.append((("steps", unidentified), f"hold_torque needs an identified tool; {cure}"))
-    return found
-
-
-def _holds_unidentified(file: ExperimentFile) -> int | None:
-    """Return the index of the first step that closes the loop on an unidentified tool, or None.
-
-    A new grip, a new zero, or another gain of the driving torque invalidates an identification.
-    """
-    identified = False
-    for number, step in enumerate(file.steps):
         match step:
             case IdentifyStep():
                 identified = True
-            case _ if isinstance(step, TareStep | GripperStep):
-                identified = False
-            case AdaptStep(fingertip=fingertip) if fingertip == file.torque_source:
+            case _ if _forgets_tool(step, file.torque_source):
                 identified = False
             case HoldTorqueStep() if not identified:
-                return number
-    return None
+                cure = "put an `identify` step before it, after the last `tare`, `grip`, `release` or `adapt`"
+                found.append((("steps", number), f"hold_torque needs an identified tool; {cure}"))
+                # Told once.
+                identified = True
+    return found
 
 
-def _least_s(step: Step) -> float:
-    """Return how long a step stands still in all; 0 if unknown, as in an outline."""
+def _forgets_tool(step: Step, torque_source: str) -> bool:
+    """Return whether an identification is invalid afterwards: a new grip, zero, or gain of the driving torque."""
     match step:
-        case HoldTorqueStep(hold_s=hold_s):
-            return hold_s
-        case TwistStep(hold_s=hold_s, angles_rad=angles_rad, repeats=repeats):
-            return hold_s * len(angles_rad) * repeats
-        case WaitStep(wait_s=wait_s):
-            return wait_s
-    return 0.0
+        case AdaptStep(fingertip=fingertip):
+            return fingertip == torque_source
+    return isinstance(step, TareStep | GripperStep)
 
 
-def _reach(step: Step) -> tuple[float, float]:
-    """Return the largest torque (N·m) and angle from the grip (rad) of a step; 0 if unknown, as in an outline."""
-    if not isinstance(step, TwistingStep):
-        return 0.0, 0.0
+def _asks(step: Step) -> tuple[float, float, float]:
+    """Return a step's largest torque (N·m) and angle from the grip (rad), and how long it stands still in all (s).
+
+    What is unknown, as in an outline, is 0.
+    """
     match step:
-        case HoldTorqueStep(torque_nm=torque_nm):
-            return abs(torque_nm), 0.0
+        case HoldTorqueStep(torque_nm=torque_nm, hold_s=hold_s):
+            return abs(torque_nm), 0.0, hold_s
         case TightenStep(until_torque_nm=torque_nm, until_angle_rad=angle_rad):
-            return torque_nm, angle_rad
+            return torque_nm, angle_rad, 0.0
         case IdentifyStep(amplitude_rad=angle_rad):
-            return 0.0, angle_rad
-        case TwistStep(absolute=False, angles_rad=angles_rad):
-            return 0.0, max(map(abs, angles_rad))
-        case HoldTorqueStep() | TightenStep() | IdentifyStep() | TwistStep():
-            return 0.0, 0.0
+            return 0.0, angle_rad, 0.0
+        case TwistStep(angles_rad=angles_rad, absolute=absolute, hold_s=hold_s, repeats=repeats):
+            return 0.0, 0.0 if absolute else max(map(abs, angles_rad)), hold_s * len(angles_rad) * repeats
+        case WaitStep(wait_s=wait_s):
+            return 0.0, 0.0, wait_s
+        case HoldTorqueStep() | TightenStep() | IdentifyStep() | TwistStep() | WaitStep() | TurnToStep():
+            return 0.0, 0.0, 0.0
+        case ApproachStep() | GripStep() | ReleaseStep() | TareStep() | AdaptStep():
+            return 0.0, 0.0, 0.0

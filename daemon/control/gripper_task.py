@@ -80,16 +80,14 @@ class GripperTask:
         state = self.gripper.latest
         if state is None or not self.measures_diameters or t_ns - state.t_ns > HAND_STALE_S * 1e9:
             return None
-        if state.diameter_mm is None or state.diameter_std_mm is None:
-            return None
-        return Measured(state.diameter_mm, TWO_SIDED_95 * state.diameter_std_mm)
+        return gripped_diameter(state)
 
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the gripper's part of `health`."""
         return self.gripper.diagnostics()
 
     def _publish(self, state: GripperState) -> None:
-        tool = tool_diameter(state, self.diameters.latest(state.t_ns))
+        tool = combine(own, self.diameters.latest(state.t_ns)) if (own := gripped_diameter(state)) is not None else None
         self.publisher.publish(
             GripperStateMessage(
                 source="gripper",
@@ -119,12 +117,11 @@ async def _tried(act: Callable[[], Awaitable[None]]) -> None:
         await asyncio.sleep(TRIED_AGAIN_S)
 
 
-def tool_diameter(state: GripperState, fingertips: Measured | None) -> Measured | None:
-    """Return the held tool's diameter from gripper and fingertips; None while nothing is held."""
-    if state.diameter_mm is None:
+def gripped_diameter(state: GripperState) -> Measured | None:
+    """Return the held tool's diameter from the gripper alone; None while nothing is held."""
+    if state.diameter_mm is None or state.diameter_std_mm is None:
         return None
-    std_mm = state.diameter_std_mm
-    return combine(Measured(state.diameter_mm, TWO_SIDED_95 * std_mm) if std_mm else None, fingertips)
+    return Measured(state.diameter_mm, TWO_SIDED_95 * state.diameter_std_mm)
 
 
 def _status(state: GripperState) -> GripperStatus:

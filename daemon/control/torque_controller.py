@@ -25,11 +25,13 @@ turn, and i stands still while less was sent than was wanted.
 """
 
 import math
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from statistics import fmean
+
+import numpy as np
 
 from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.errors import UserError
@@ -109,47 +111,37 @@ class WristCommand:
 
 
 class AngleHistory:
-    """Wrist angles of the last `span_ns`, interpolated linearly, with their running integral.
+    """Wrist angles of the last `span_ns`, interpolated linearly.
 
-    A frame acquired over half a second sees the mean torque, so it is compared with the mean angle over that time. The
-    integral makes each mean two look-ups.
+    A frame acquired over half a second sees the mean torque, so it is compared with the mean angle over that time.
     """
 
     def __init__(self, span_ns: int) -> None:
         self.span_ns = span_ns
         self._t_ns: list[int] = []
         self._angle_rad: list[float] = []
-        self._integral: list[float] = []  # rad·ns since the first sample
 
     def add(self, t_ns: int, angle_rad: float) -> bool:
         """Append an angle; return False, and drop it, if it is not later than the last one."""
-        integral = 0.0
-        if self._t_ns:
-            step_ns = t_ns - self._t_ns[-1]
-            if step_ns <= 0:
-                return False
-            integral = self._integral[-1] + 0.5 * (angle_rad + self._angle_rad[-1]) * step_ns
-        self._integral.append(integral)
+        if self._t_ns and t_ns <= self._t_ns[-1]:
+            return False
         self._t_ns.append(t_ns)
         self._angle_rad.append(angle_rad)
         # One sample is kept from before the span, for its beginning.
         old = max(bisect_right(self._t_ns, t_ns - self.span_ns) - 1, 0)
-        del self._t_ns[:old], self._angle_rad[:old], self._integral[:old]
+        del self._t_ns[:old], self._angle_rad[:old]
         return True
 
     def mean(self, from_ns: int, to_ns: int) -> float | None:
         """Return the mean angle in rad between two times; None where the history does not cover the interval."""
         if not self._t_ns or from_ns < self._t_ns[0] or to_ns > self._t_ns[-1] or to_ns < from_ns:
             return None
-        angle, until_now, integral = 0.0, 0.0, 0.0
-        for t_ns in (from_ns, to_ns):
-            last = bisect_right(self._t_ns, t_ns) - 1
-            angle, since_ns = self._angle_rad[last], t_ns - self._t_ns[last]
-            if since_ns:
-                share = since_ns / (self._t_ns[last + 1] - self._t_ns[last])
-                angle += (self._angle_rad[last + 1] - angle) * share
-            until_now, integral = integral, self._integral[last] + 0.5 * (angle + self._angle_rad[last]) * since_ns
-        return angle if to_ns == from_ns else (integral - until_now) / (to_ns - from_ns)
+        inside = slice(bisect_right(self._t_ns, from_ns), bisect_left(self._t_ns, to_ns))
+        times_ns = [from_ns, *self._t_ns[inside], to_ns]
+        angles_rad = np.interp(times_ns, self._t_ns, self._angle_rad)
+        if to_ns == from_ns:
+            return float(angles_rad[0])
+        return float(0.5 * (angles_rad[1:] + angles_rad[:-1]) @ np.diff(times_ns)) / (to_ns - from_ns)
 
 
 class JumpDetector:

@@ -136,6 +136,7 @@ def test_no_crash_marker_without_a_service_manager(monkeypatch):
     assert not CrashMarker().left_behind
 
 
-def test_a_failing_crash_marker_is_reported(tmp_path, capsys):
-    CrashMarker({"RUNTIME_DIRECTORY": str(tmp_path / "nowhere")}).set()
+def test_a_failing_crash_marker_is_reported(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "nowhere"))
+    CrashMarker().set()
     assert "cannot write the crash marker" in capsys.readouterr().out

@@ -107,7 +107,7 @@ async def test_a_flood_of_malformed_frames_and_requests(config, tiny_bank, monke
             asyncio.to_thread(exchange, address, malformed_requests(REQUESTS)),
             asyncio.to_thread(write_all, board, malformed_frames(FRAMES)),
         )
-        while (refused := sum(daemon.sensors.fingertips["right"].diagnostics()["errors"].values())) < FRAMES - 1:
+        while (refused := sum(daemon.sensors.tasks["right"].diagnostics()["errors"].values())) < FRAMES - 1:
             published_one.clear()
             await published_one.wait()
         assert replies == {False: REQUESTS}, "each is answered, and none is carried out"

@@ -248,7 +248,7 @@ HELD, BEGUN, ZEROED, ENOUGH = 6, 12, 18, 40
 async def record_experiments(config: Path) -> list[dict[str, Any]]:
     """Run a daemon through two experiments; return what was published as estimates."""
     async with recording_daemon(config) as (daemon, _, published, until):
-        recorder, right = daemon.recorder, daemon.sensors.fingertips["right"].pipeline
+        recorder, right = daemon.recorder, daemon.sensors.tasks["right"].pipeline
         right.gripper = Gripper(right, OTHER_TOOL, range(HELD, 10 * ENOUGH))
         recorder.record_experiment("first")
         await until(BEGUN)

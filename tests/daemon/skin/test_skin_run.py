@@ -30,7 +30,7 @@ class Played:
 
     @property
     def refused_lines(self) -> int:
-        skin = self.daemon.sensors.skin
+        skin = self.daemon.sensors.tasks["skin"]
         errors = skin.diagnostics()["errors"]
         return int(errors.get("not a number", 0))
 
@@ -160,11 +160,11 @@ async def test_tare_takes_the_zero_anew_and_refuses_a_loaded_one(tmp_path):
         assert await bench.command("tare", source="skin") == {"ok": True, "tared": ["skin"]}
         await bench.says("the zero was refused and is taken again")
         with pytest.raises(ActionError, match="the skin's zero was refused"):
-            await tare_all(bench.daemon.sensors.tareable().values())
+            await tare_all(bench.daemon.sensors.tareable.values())
         bench.skin.push(0.0)
         bench.fresh()
         await bench.valid()
-        await tare_all(bench.daemon.sensors.tareable().values())
+        await tare_all(bench.daemon.sensors.tareable.values())
         refused = await bench.command("tare", source="left")
         assert refused == {"ok": False, "reason": "there is no sensor 'left' to tare; there are skin"}
 
@@ -176,7 +176,7 @@ async def test_a_zero_that_cannot_be_taken_says_why_in_time(tmp_path, monkeypatc
         bench.instruments.command("open 2")
         await bench.says("gauge 2 is open")
         with pytest.raises(ActionError, match=r"could not be taken within 0\.3 s.*gauge 2 is open"):
-            await tare_all(bench.daemon.sensors.tareable().values())
+            await tare_all(bench.daemon.sensors.tareable.values())
 
 
 async def test_one_daemon_carries_a_fingertip_and_a_skin(config):

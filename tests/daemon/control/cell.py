@@ -18,7 +18,7 @@ from shearloop.daemon.control.loop_inputs import GripperStatus, LoopConfig, Torq
 from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, wrench_source
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply, Heartbeat, MoveLinear, RobotState, WristSpeed
-from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, Flight
+from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, FakeArm, Flight
 
 SPEED_M_PER_S = 0.1
 # Steps of experiments.
@@ -30,9 +30,9 @@ TWIST = {"do": "twist", "angles_rad": [1.0], "speed_rad_per_s": 0.3}
 class Robot(UrRobot):
     """The client with the command handler in the same process, and an arm that moves in straight lines too."""
 
-    def __init__(self) -> None:
+    def __init__(self, arm: FakeArm | None = None) -> None:
         super().__init__(SETTINGS)
-        self.flight = Flight()
+        self.flight = Flight(arm=arm)
         self.commands: list[Command] = []
         self.dies_of: Exception | None = None
         self._goal: MoveLinear | None = None
@@ -169,18 +169,22 @@ class Published:
         return next(one.reasons for one in reversed(self.messages) if one.topic == "loop.state")
 
 
-def experiment(*steps: Mapping[str, Any]) -> ExperimentFile:
-    return ExperimentFile.model_validate({"name": "test", "torque_source": WRENCH, "steps": list(steps)})
+def experiment(*steps: Mapping[str, Any], **keys: Any) -> ExperimentFile:
+    return ExperimentFile.model_validate({"name": "test", "torque_source": WRENCH, "steps": list(steps), **keys})
 
 
 class Cell:
     """Robot, gripper and loop, whose time passes in `cycles`."""
 
-    def __init__(self) -> None:
-        self.robot, self.gripper, self.published = Robot(), Gripper(), Published()
+    def __init__(
+        self, control_loop: ControlLoop | None = None, arm: FakeArm | None = None, gripper: Gripper | None = None
+    ) -> None:
+        self.robot, self.gripper, self.published = Robot(arm), gripper or Gripper(), Published()
         source = wrench_source(SETTINGS.rate_hz)
         self.died: dict[str, str] = {}
-        self.control_loop = ControlLoop(LoopConfig(), {WRENCH: source}, ("robot",), dead_tasks=self.died)
+        self.control_loop = control_loop or ControlLoop(
+            LoopConfig(), {WRENCH: source}, ("robot",), dead_tasks=self.died
+        )
         clock = StepClock(self.robot.flight)
         self.runner = ControlLoopRunner(self.control_loop, self.robot, self.gripper, {}, self.published, clock)
         self.task: asyncio.Task[None] | None = None
@@ -193,9 +197,13 @@ class Cell:
         with pytest.raises(ZeroDivisionError):
             await self.task
 
+    def sense(self) -> None:
+        """Take what the sensors measure before a state of the robot."""
+        self.control_loop.on_gripper(GripperStatus(self.robot.flight.now_ns, 30.0, holding=True, moving=False))
+
     async def cycles(self, count: int) -> None:
         for _ in range(count):
-            self.control_loop.on_gripper(GripperStatus(self.robot.flight.now_ns, 30.0, holding=True, moving=False))
+            self.sense()
             self.robot.cycle()
             # A state is read, decided on and answered in a few turns of the event loop: until nothing else is ready.
             await asyncio.sleep(0)
@@ -207,8 +215,8 @@ class Cell:
         now_ns = self.robot.flight.now_ns
         self.control_loop.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
 
-    async def start(self, *steps: Mapping[str, Any]) -> None:
-        starting = asyncio.create_task(self.runner.start(experiment(*steps)))
+    async def start(self, *steps: Mapping[str, Any], **keys: Any) -> None:
+        starting = asyncio.create_task(self.runner.start(experiment(*steps, **keys)))
         while not starting.done():
             await self.cycles(1)
         assert starting.result() is None
@@ -243,9 +251,9 @@ def no_tick(*_: object) -> ControlOutput:
 
 
 @asynccontextmanager
-async def driven(*steps: Mapping[str, Any], cycles: int = 0) -> AsyncIterator[Cell]:
+async def driven(*steps: Mapping[str, Any], cycles: int = 0, cell: Cell | None = None) -> AsyncIterator[Cell]:
     """Yield a cell that has begun an experiment of these steps, if any, so many cycles ago."""
-    cell = Cell()
+    cell = cell or Cell()
     cell.drive()
     await cell.cycles(10)
     try:

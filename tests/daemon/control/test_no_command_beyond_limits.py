@@ -1,22 +1,23 @@
-"""Random experiments, faults and timings through loop and handler: no command to the arm exceeds its limits."""
+"""Random experiments, faults and timings through loop, runner and handler: no command to the arm exceeds its limits."""
 
-import dataclasses
+import asyncio
 import math
+from collections.abc import Callable
 from typing import Any
 
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from shearloop.daemon.control.experiment import Action, ExperimentPhase
-from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, GripStep
-from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, TorqueSample
-from shearloop.daemon.control.loop_runner import along_tool
+from shearloop.daemon.control.control_loop import ControlOutput
+from shearloop.daemon.control.experiment import ExperimentPhase
+from shearloop.daemon.control.experiment_schema import GripStep
+from shearloop.daemon.control.loop_inputs import GripperStatus, TorqueSample
 from shearloop.daemon.control.safety import Response
 from shearloop.drivers.emulators.scene import Twin, TwinSettings
-from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.messages import Enable, Heartbeat, MoveLinear, Stop, Unlock, WristSpeed
+from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
+from tests.daemon.control.cell import GRIP, Cell, Gripper, driven
 from tests.daemon.control.loop_rig import EIT, new_loop
-from tests.drivers.ur.flight import CYCLE_NS, LIMITS, SETTINGS, FakeArm
+from tests.drivers.ur.flight import CYCLE_NS, LIMITS, FakeArm
 
 SPEEDS = st.floats(0.01, 3.14)
 STEPS = st.one_of(
@@ -46,26 +47,17 @@ STEPS = st.one_of(
         lambda v: min(v, 0.5)
     )),
 )  # fmt: skip
-FAULTS = st.sampled_from(
-    [
-        "protective",
-        "emergency",
-        "silent",
-        "gripper",
-        "drop",
-        "kick",
-        "late",
-        "absurd",
-        "pause",
-        "resume",
-        "stop",
-        "unlock",
-    ]
-)
 
 
 class CheckedArm(FakeArm):
-    """Refuses, by failing the test, what is beyond a limit or sent while the robot must not move."""
+    """Notes what is beyond a limit, or sent while the robot must not move."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.wrong: list[object] = []
+
+    def check(self, command: object, *rules: bool) -> None:
+        self.wrong += [] if all(rules) else [command]
 
     def cycle(self) -> None:
         if self.reading.safety_mode != 1:
@@ -74,156 +66,119 @@ class CheckedArm(FakeArm):
         super().cycle()
 
     def wrist(self, command: WristSpeed, left_s: float) -> bool:
-        assert abs(command.rad_per_s) <= LIMITS.wrist_speed_rad_per_s.inner, command
-        assert 0 < command.acceleration_rad_per_s2 <= LIMITS.wrist_acceleration_rad_per_s2.hard, command
-        assert self.reading.safety_mode == 1 or command.rad_per_s == 0, "a robot in a safety stop was told to move"
+        self.check(
+            command,
+            abs(command.rad_per_s) <= LIMITS.wrist_speed_rad_per_s.inner,
+            0 < command.acceleration_rad_per_s2 <= LIMITS.wrist_acceleration_rad_per_s2.hard,
+            self.reading.safety_mode == 1 or command.rad_per_s == 0,
+        )
         return super().wrist(command, left_s)
 
     def move(self, command: MoveLinear) -> bool:
         box = LIMITS.workspace
-        for value, low, high in zip(command.pose, box.lower_m, box.upper_m, strict=False):
-            assert low + box.margin_m <= value <= high - box.margin_m, command
-        assert 0 < command.speed_m_per_s <= LIMITS.linear_speed_m_per_s.inner, command
-        assert self.reading.safety_mode == 1
+        walls = zip(command.pose[:3], box.lower_m, box.upper_m, strict=True)
+        inside = all(low + box.margin_m <= value <= high - box.margin_m for value, low, high in walls)
+        slow = 0 < command.speed_m_per_s <= LIMITS.linear_speed_m_per_s.inner
+        self.check(command, inside, slow, self.reading.safety_mode == 1)
         return super().move(command)
 
 
-class WholeRig:
-    """Control loop and command handler with the twin between them, one cycle at a time."""
+class TwinGripper(Gripper):
+    """Fingers that close at once, and hold with a force if they meet anything."""
+
+    force_n = 0.0
+
+    async def grip(self, wish: GripStep) -> None:
+        self.force_n = wish.force_n if wish.expect_object else 0.0
+        self.on_closed()
+
+
+class WholeRig(Cell):
+    """A cell with the twin in its fingers, whose fingertip and load cell measure it."""
 
     def __init__(self) -> None:
-        self.control_loop, self.arm, self.twin = new_loop(), CheckedArm(), Twin(TwinSettings())
-        self.now_ns, self.number, self.force_n = 10**12, 0, 0.0
-        self.handler = CommandHandler(SETTINGS, self.arm, self.now_ns)
-        self.silent, self.absurd, self.fault = False, False, ""
-        self.sent, self.stopped, self.late = 0.0, True, 0
-        self.action: tuple[int, Action] | None = None
+        self.arm, self.twin = CheckedArm(), Twin(TwinSettings())
+        self.silent = self.absurd = False
+        self.fault, self.number = "", 0
+        super().__init__(new_loop(), self.arm, TwinGripper())
+        self.gripper.on_closed = self.sense_gripper
+        self.tick, self.control_loop.tick = self.control_loop.tick, self.checked_tick
 
-    def cycle(self) -> None:
-        self.now_ns += CYCLE_NS
-        self.arm.cycle()
+    def checked_tick(self, *given: Any) -> ControlOutput:
+        output = self.tick(*given)
+        held = self.control_loop.status.decision.response >= Response.HOLD
+        fastest = 0.0 if held else self.control_loop.config.wrist_speed_rad_per_s
+        self.arm.check((output, held), abs(output.wrist_rad_per_s) <= fastest)
+        return output
+
+    def sense_gripper(self) -> None:
+        holding = self.gripper.force_n > 0
+        status = GripperStatus(self.robot.flight.now_ns, 20.0, holding=holding, moving=False, fault=self.fault)
+        self.control_loop.on_gripper(status)
+
+    def sense(self) -> None:
         self.number += 1
-        torque_nm = self.twin.step(CYCLE_NS / 1e9, self.arm.reading.wrist_rad, self.force_n).torque_nm
+        now_ns, reading = self.robot.flight.now_ns, self.arm.reading
+        torque_nm = self.twin.step(CYCLE_NS / 1e9, reading.wrist_rad, self.gripper.force_n).torque_nm
         self.arm.be(wrench=(0.0, 0.0, 0.0, 0.0, 0.0, torque_nm))
-        self.handler.request(0, Heartbeat(), self.arm.reading, self.now_ns)
-        self.handler.tick(self.arm.reading, self.now_ns)
-        if self.late:
-            self.late -= 1
-            return
-        self._sense(torque_nm)
-        if self.action is not None and self.number >= self.action[0]:
-            self._finish(self.action[1])
-        orders = self.control_loop.tick(self.now_ns)
-        if orders.ends_motion:
-            if not self.stopped:
-                self._ask(Stop(4.0))
-            self.stopped, self.action = True, None
-            self.force_n = 0.0 if orders.release else self.force_n
-            return
-        self.stopped = False
-        if orders.action is not None:
-            self._begin(orders.action)
-        assert abs(orders.wrist_rad_per_s) <= self.control_loop.config.wrist_speed_rad_per_s
-        if self.control_loop.status.decision.response >= Response.HOLD:
-            assert orders.wrist_rad_per_s == 0.0, "held, and yet it turns"
-        if orders.wrist_rad_per_s or self.sent:
-            reply = self._ask(WristSpeed(orders.wrist_rad_per_s, 4.0))
-            self.sent = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
-            self.control_loop.on_speed_sent(self.sent)
-
-    def befall(self, fault: str) -> None:
-        match fault:
-            case "protective" | "emergency":
-                self.arm.be(safety_mode=3 if fault == "protective" else 7)
-            case "silent":
-                self.silent = not self.silent
-            case "absurd":
-                self.absurd = not self.absurd
-            case "gripper":
-                self.fault = "" if self.fault else "fault 14"
-            case "drop":
-                self.force_n = 0.0
-            case "kick":
-                self.twin.kick_nm += 0.3
-            case "late":
-                self.late = 40
-            case "pause":
-                self.control_loop.pause()
-            case "resume":
-                self.control_loop.resume()
-            case "stop":
-                self.control_loop.stop("the operator said so")
-            case "unlock":
-                self.arm.be(safety_mode=1)
-                self._ask(Unlock())
-                self.control_loop.acknowledge()
-
-    def _ask(self, command: Any) -> Any:
-        reply = self.handler.request(self.number, command, self.arm.reading, self.now_ns)
-        return reply if reply is not None else dataclasses.make_dataclass("Later", [("sent", object, None)])()
-
-    def _sense(self, torque_nm: float) -> None:
-        state = self.handler.state(self.arm.reading, self.number)
-        self.control_loop.on_arm(
-            ArmStatus(state.wrist_rad, self.now_ns, state.protective_stop, state.emergency_stop, state.blocked)
-        )
-        holding = self.force_n > 0
-        self.control_loop.on_gripper(GripperStatus(self.now_ns, 20.0, holding=holding, moving=False, fault=self.fault))
+        self.sense_gripper()
         said = 1e30 if self.absurd else torque_nm
         if not self.silent and self.number % 11 == 0:
-            self.control_loop.on_torque(TorqueSample("load_cell", said, "", self.now_ns - CYCLE_NS, self.now_ns))
+            self.control_loop.on_torque(TorqueSample("load_cell", said, "", now_ns - CYCLE_NS, now_ns))
         if not self.silent and self.number % 68 == 0:
-            middle = self.now_ns - round(EIT.window_s * 0.5e9)
-            self.control_loop.on_torque(
-                TorqueSample("right", math.nan if self.absurd else torque_nm, "", middle, self.now_ns)
-            )
+            said, middle = math.nan if self.absurd else torque_nm, now_ns - round(EIT.window_s * 0.5e9)
+            self.control_loop.on_torque(TorqueSample("right", said, "", middle, now_ns))
+        wrist_rad, speed = reading.wrist_rad, reading.qd_rad_per_s[5]
+        inside = LIMITS.joints.lower_rad[5] <= wrist_rad <= LIMITS.joints.upper_rad[5]
+        self.arm.check(reading, inside, abs(speed) <= LIMITS.wrist_speed_rad_per_s.hard)
 
-    def _begin(self, action: Action) -> None:
-        self.action = (self.number + 30, action)
-        if isinstance(action, ApproachStep):
-            pose = action.pose_m_rad or along_tool(self.arm.reading.tcp_pose, action.along_tool_m or 0.0)
-            self._ask(MoveLinear(pose, action.speed_m_per_s, 0.3))
+    async def unlock(self) -> None:
+        self.arm.be(safety_mode=1)
+        unlocking = asyncio.create_task(self.runner.unlock())
+        while not unlocking.done():
+            await self.cycles(1)
 
-    def _finish(self, action: Action) -> None:
-        self.action = None
-        self.arm.be(moving_linearly=False)
-        if isinstance(action, GripStep):
-            self.force_n = action.force_n if action.expect_object else 0.0
-            if self.control_loop.inputs.gripper is not None:
-                self.control_loop.on_gripper(
-                    dataclasses.replace(self.control_loop.inputs.gripper, holding=action.expect_object)
-                )
-        self.control_loop.on_action_ended()
+
+FAULTS: dict[str, Callable[[WholeRig], Any]] = {
+    "protective": lambda rig: rig.arm.be(safety_mode=3),
+    "emergency": lambda rig: rig.arm.be(safety_mode=7),
+    "silent": lambda rig: setattr(rig, "silent", not rig.silent),
+    "absurd": lambda rig: setattr(rig, "absurd", not rig.absurd),
+    "gripper": lambda rig: setattr(rig, "fault", "" if rig.fault else "fault 14"),
+    "drop": lambda rig: setattr(rig.gripper, "force_n", 0.0),
+    "kick": lambda rig: setattr(rig.twin, "kick_nm", rig.twin.kick_nm + 0.3),
+    "late": lambda rig: [rig.robot.cycle(read=False) for _ in range(40)],
+    "pause": lambda rig: rig.control_loop.pause(),
+    "resume": lambda rig: rig.control_loop.resume(),
+    "stop": lambda rig: rig.runner.stop(),
+    "unlock": WholeRig.unlock,
+}
+
+
+async def tell(steps: list[dict[str, Any]], story: list[tuple[int, str]], **keys: Any) -> None:
+    async with driven(cell=WholeRig()) as rig:
+        await rig.cycles(100)
+        await rig.start(GRIP, *steps, **keys)
+        for cycles, fault in [*story, (150, "resume")]:
+            await rig.cycles(cycles)
+            happened = FAULTS[fault](rig)
+            if asyncio.iscoroutine(happened):
+                await happened
+        if rig.phase is ExperimentPhase.STOPPED:
+            await rig.cycles(60)
+            assert abs(rig.arm.reading.qd_rad_per_s[5]) < 1e-9, "stopped, and yet it turns"
+            assert rig.why
+        assert rig.arm.wrong == []
+        assert not rig.task.done()
 
 
 @settings(max_examples=40, deadline=None)
 @given(
     st.lists(STEPS, min_size=1, max_size=5),
-    st.lists(st.tuples(st.integers(1, 150), FAULTS), max_size=6),
+    st.lists(st.tuples(st.integers(1, 150), st.sampled_from([*FAULTS])), max_size=6),
     st.sampled_from(["right", "load_cell"]),
     st.floats(0.05, 2.0),
 )
 @example([{"do": "turn_to", "angle_rad": 1.0, "speed_rad_per_s": 1.0}], [(32, "protective")], "right", 1.0)
 def test_whatever_is_asked_and_whatever_happens_no_command_is_outside_the_limits(steps, story, drive, torque_limit_nm):
-    rig = WholeRig()
-    for _ in range(40):
-        rig.cycle()
-    rig._ask(Enable())
-    for _ in range(70):
-        rig.cycle()
-    begin = [{"do": "grip", "width_mm": 5, "force_n": 60}]
-    content = {"name": "any", "torque_source": drive, "steps": begin + steps, "limits": {"torque_nm": torque_limit_nm}}
-    assert rig.control_loop.start(ExperimentFile.model_validate(content), rig.now_ns) is None
-    for cycles, fault in [*story, (150, "resume")]:
-        for _ in range(cycles):
-            rig.cycle()
-            wrist, speed = rig.arm.reading.wrist_rad, rig.arm.reading.qd_rad_per_s[5]
-            assert LIMITS.joints.lower_rad[5] <= wrist <= LIMITS.joints.upper_rad[5]
-            assert abs(speed) <= LIMITS.wrist_speed_rad_per_s.hard
-        rig.befall(fault)
-    experiment = rig.control_loop.experiment
-    if experiment.phase is ExperimentPhase.STOPPED:
-        for _ in range(60):
-            rig.cycle()
-        assert abs(rig.arm.reading.qd_rad_per_s[5]) < 1e-9, "stopped, and yet it turns"
-        assert experiment.stop_reason
+    asyncio.run(tell(steps, story, torque_source=drive, limits={"torque_nm": torque_limit_nm}))

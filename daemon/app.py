@@ -14,6 +14,8 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
+from shearloop.daemon.control.loop_runner import ControlLoopRunner
+from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import ClientAuthenticator, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
@@ -21,12 +23,14 @@ from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.recording.recorder import Recorder, daemon_identity
-from shearloop.daemon.rig import Rig, check_experiment, make_gripper, make_loop
+from shearloop.daemon.rig import Rig, check_experiment, make_gripper, make_loop, robot_settings
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.frame_estimator import COMBINED, open_combined, open_estimator, torque_sources
 from shearloop.daemon.sensors import Sensors, build_sensors
 from shearloop.daemon.service import notify
 from shearloop.daemon.supervisor import HealthReporter, Reporter, Supervisor, Task, TaskFacts
+from shearloop.drivers.connection import LinkMonitor
+from shearloop.drivers.ur.client import UrRobot
 
 # The end waits this long for the report of an experiment that it has stopped; a dead loop reports none.
 REPORTED_WITHIN_S = 0.2
@@ -87,7 +91,7 @@ class Daemon:
             self._close = opened.pop_all().close
         tasks: dict[str, Task | None] = {
             **self.sensors.tasks,
-            **(self._rig.tasks() if self._rig is not None else {}),
+            **(self._rig.tasks if self._rig is not None else {}),
             "experiment": self._experiment,
             "recording": RecordingTask(self.recorder, self._rig) if self.recorder is not None else None,
             "clients": authenticator,
@@ -167,12 +171,16 @@ def _build_rig(
     combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
     sources = torque_sources(config, estimators, combined)
     check_experiment(config, sources)
-    loop = make_loop(config, sources, supervisor.dead)
-    gripper = make_gripper(config, loop, publisher) if loop is not None else None
+    if config.robot is None:
+        return build_sensors(config, publisher, clock, recorder, None, estimators, combined, None), None
+    settings = robot_settings(config.robot)
+    loop = make_loop(config, settings, sources, supervisor.dead)
+    gripper = make_gripper(config.gripper, loop, publisher) if config.gripper is not None else None
     sensors = build_sensors(config, publisher, clock, recorder, loop, estimators, combined, gripper)
-    if loop is None:
-        return sensors, None
-    return sensors, Rig(config, loop, gripper, sensors.tareable, publisher, clock, recorder)
+    robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)))
+    runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
+    fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
+    return sensors, Rig(loop, runner, {**fingers, "robot": robot, "loop": runner}, recorder)
 
 
 async def run_daemon(

@@ -1,11 +1,11 @@
 """The rig: builds gripper, robot and control loop from the configuration, and checks its experiment."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from types import MappingProxyType
 
-from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control import experiment_schema
@@ -20,7 +20,6 @@ from shearloop.daemon.recording.recorder import AttachedFile, Recorder
 from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
-from shearloop.daemon.sensor_protocols import Tareable
 from shearloop.daemon.supervisor import Task
 from shearloop.drivers.calibration_files import load_calibration
 from shearloop.drivers.connection import LinkMonitor
@@ -29,7 +28,7 @@ from shearloop.drivers.load_cell import LoadCalibration
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.messages import RobotiqConnection
 from shearloop.drivers.robotiq.socket_client import SocketClient
-from shearloop.drivers.ur.client import UrRobot, missing_library
+from shearloop.drivers.ur.client import missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.yaml_files import located, read_yaml
 
@@ -70,15 +69,15 @@ def robot_settings(path: Path) -> UrSettings:
 
 
 def make_loop(
-    config: DaemonConfig, sources: Mapping[str, TorqueSource], dead_tasks: Mapping[str, str] = MappingProxyType({})
-) -> ControlLoop | None:
-    """Return the control loop of the configured robot, if there is one.
+    config: DaemonConfig,
+    robot: UrSettings,
+    sources: Mapping[str, TorqueSource],
+    dead_tasks: Mapping[str, str] = MappingProxyType({}),
+) -> ControlLoop:
+    """Return the control loop of a robot with these settings.
 
     `sources` are all torques but the robot's; `dead_tasks` has the error of each task that is dead at present.
     """
-    if config.robot is None:
-        return None
-    robot = robot_settings(config.robot)
     sources = {**sources, WRENCH: wrench_source(robot.rate_hz)}
     # Controller, identification and commands plan with what the robot's process lets through.
     limited = {
@@ -95,50 +94,33 @@ def make_loop(
     return ControlLoop(loop, sources, required, gels, dead_tasks)
 
 
-def make_gripper(config: DaemonConfig, loop: ControlLoop, publisher: Publisher) -> GripperTask | None:
-    """Return the gripper's task, if a gripper is configured."""
-    if config.gripper is None:
-        return None
-    client, calibration = make_gripper_client(config.gripper), gripper_calibration(config.gripper)
+def make_gripper(config: GripperConfig, loop: ControlLoop, publisher: Publisher) -> GripperTask:
+    """Return the gripper's task; it is not connected yet."""
+    client, calibration = make_gripper_client(config), gripper_calibration(config)
     hand = RobotiqGripper(client, calibration, monitor=LinkMonitor(LinkReporter("gripper", loop)))
-    measures = config.gripper.calibration is not None
+    measures = config.calibration is not None
     return GripperTask(hand, publisher, loop, FingertipDiameters(COMBINED), measures_diameters=measures)
 
 
+@dataclass
 class Rig:
-    """Robot, gripper and the control loop between them, for the operator's experiments; sensors are in `sensors.py`."""
+    """Robot, gripper and the control loop between them, for the operator's experiments; sensors are in `sensors.py`.
 
-    def __init__(
-        self,
-        config: DaemonConfig,
-        loop: ControlLoop,
-        gripper: GripperTask | None,
-        sensors: Mapping[str, Tareable],
-        publisher: Publisher,
-        clock: Clock,
-        recorder: Recorder | None = None,
-    ) -> None:
-        """Read the robot's settings; it is not connected yet. An experiment tares or adapts the `sensors`."""
-        if config.robot is None:
-            raise ValueError("a rig needs a robot")
-        self.control_loop = loop
-        self.gripper = gripper
-        self.robot = UrRobot(robot_settings(config.robot), LinkMonitor(LinkReporter("robot", loop)))
-        self.runner = ControlLoopRunner(loop, self.robot, gripper, sensors, publisher, clock)
-        self._recorder = recorder
+    `tasks` are by their names in `health`.
+    """
 
-    def tasks(self) -> dict[str, Task]:
-        """Return the tasks to run, by their names in `health`."""
-        gripper: dict[str, Task] = {"gripper": self.gripper} if self.gripper is not None else {}
-        return {**gripper, "robot": self.robot, "loop": self.runner}
+    control_loop: ControlLoop
+    runner: ControlLoopRunner
+    tasks: Mapping[str, Task]
+    recorder: Recorder | None
 
     async def start(self, path: Path) -> str | None:
         """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file."""
-        attached = AttachedFile.read(path) if self._recorder is not None else ()
+        attached = AttachedFile.read(path) if self.recorder is not None else ()
         file = read_experiment(path)
         reason = await self.runner.start(file)
-        if reason is None and self._recorder is not None:
-            self._recorder.record_experiment(file.name, attached, file.tool_mm)
+        if reason is None and self.recorder is not None:
+            self.recorder.record_experiment(file.name, attached, file.tool_mm)
         return reason
 
 

@@ -3,8 +3,7 @@
 import argparse
 import json
 import subprocess
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,15 +12,13 @@ from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli import bank, init
 from shearloop.daemon.cli import run as run_command
+from shearloop.daemon.cli.emulator_processes import SHEARLOOP, running
 from shearloop.daemon.cli.options import add_option, writing
 from shearloop.daemon.errors import missing
 from shearloop.daemon.process import interrupt_status
 
 if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig
-
-# A process needs some of it to close its sockets, or to end its workers.
-STOP_S = 2.0
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -64,8 +61,7 @@ def run(args: argparse.Namespace) -> int:
         read_stream(args.recording)
     print("The demo starts …", flush=True)
     # In a process of its own: the daemon would keep the memory of the fits.
-    command = [sys.executable, "-m", "shearloop", "demo", "--prepare", "--folder", str(args.folder)]
-    with _running([*command, *played]) as process:
+    with running([*SHEARLOOP, "demo", "--prepare", "--folder", str(args.folder), *played]) as process:
         status = process.wait()
     if status:
         return status
@@ -114,25 +110,11 @@ def page(config: "DaemonConfig") -> Iterator[None]:
         yield
         return
     options = ("--connect", config.publish, "--commands", config.commands, "--port", "0", "--json")
-    with _running([sys.executable, "-m", "shearloop", "view", *options], subprocess.PIPE) as process:
+    with running([*SHEARLOOP, "view", *options], stdout=subprocess.PIPE) as process:
         # Empty where the page has ended; its own sentence says why.
         if process.stdout is not None and (line := process.stdout.readline()):
             print(f"The live page, for a browser of this computer: {json.loads(line)['url_with_token']}", flush=True)
         yield
-
-
-@contextmanager
-def _running(command: Sequence[str], stdout: int | None = None) -> "Iterator[subprocess.Popen[bytes]]":
-    """Run a command in a process group of its own, which Ctrl-C does not reach, and end it."""
-    with subprocess.Popen(command, stdout=stdout, process_group=0) as process:
-        try:
-            yield process
-        finally:
-            process.terminate()
-            try:
-                process.wait(STOP_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
 
 
 def _call(command: ModuleType, *arguments: str) -> int:

@@ -8,11 +8,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Self
-
-import numpy as np
 
 from shearloop.daemon.errors import UserError
 
@@ -22,8 +20,23 @@ if TYPE_CHECKING:
 
 # An emulator prints a line once its ports are open, which takes about two seconds.
 READY_S, POLL_S = 20.0, 0.02
-# An emulator needs some of it to remove its port's link; a clean stop takes less than a second in all.
-STOP_S = 0.5
+# A process needs some of it to remove its port's link, to close its sockets, or to end its workers.
+STOP_S = 2.0
+SHEARLOOP = (sys.executable, "-m", "shearloop")
+
+
+@contextlib.contextmanager
+def running(command: Sequence[str], **options: Any) -> "Iterator[subprocess.Popen[bytes]]":
+    """Run a command in a process group of its own, which Ctrl-C does not reach, and end it; options are of Popen."""
+    with subprocess.Popen(command, process_group=0, bufsize=0, **options) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+            try:
+                process.wait(STOP_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
 
 
 def check_emulators(emulators: "tuple[EmulatorConfig, ...]", config: Path) -> list[argparse.Namespace]:
@@ -66,14 +79,12 @@ class EmulatedDevices:
                 folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="shearloop-"))
                 self._truth = Path(folder) / "truth.jsonl"
             devices: list[tuple[subprocess.Popen[bytes], IO[bytes]]] = []
-            stack.callback(_stop, devices)
             for emulator in self._emulators:
                 output = stack.enter_context(tempfile.TemporaryFile())
-                # An emulator ends when its standard input is closed. Ctrl-C does not reach a group of its own, so the
-                # robot answers until the daemon has stopped it.
-                process = subprocess.Popen(
-                    self._command(emulator), cwd=self._folder, stdin=subprocess.PIPE, stdout=output, process_group=0
-                )
+                # An emulator ends when its standard input is closed. Without Ctrl-C the robot answers until the daemon
+                # has stopped it.
+                command = self._command(emulator)
+                process = stack.enter_context(running(command, cwd=self._folder, stdin=subprocess.PIPE, stdout=output))
                 devices.append((process, output))
                 self._waiting += [(event, process) for event in emulator.events]
             until_s = time.monotonic() + READY_S
@@ -93,6 +104,8 @@ class EmulatedDevices:
 
     def torques(self) -> "TorqueSeries | None":
         """Return the rig's true torque so far; None if it is unknown."""
+        import numpy as np
+
         from shearloop.daemon.run_summary import TorqueSeries
 
         if self._truth is None or not self._truth.exists():
@@ -109,7 +122,7 @@ class EmulatedDevices:
             source = ("--recording", str(self._recording.resolve()))
         if self._truth is not None and emulator.device == "rig":
             source = (*source, "--truth", str(self._truth))
-        return [sys.executable, "-m", "shearloop", "emulate", emulator.device, *emulator.arguments, *source]
+        return [*SHEARLOOP, "emulate", emulator.device, *emulator.arguments, *source]
 
     def _send_events(self, now_ns: int, step: int) -> None:
         held_s = (now_ns - self._since_ns.setdefault(step, now_ns)) / 1e9
@@ -120,24 +133,8 @@ class EmulatedDevices:
             with contextlib.suppress(BrokenPipeError):
                 if process.stdin is not None and process.poll() is None:
                     process.stdin.write(f"{event.command}\n".encode())
-                    process.stdin.flush()
                     self.sent.append((time.monotonic_ns(), event.command))
 
 
 def _is_starting(process: "subprocess.Popen[bytes]", output: IO[bytes]) -> bool:
     return process.poll() is None and not os.fstat(output.fileno()).st_size
-
-
-def _stop(devices: "list[tuple[subprocess.Popen[bytes], IO[bytes]]]") -> None:
-    for process, _ in devices:
-        process.terminate()
-    for process, _ in devices:
-        try:
-            process.wait(STOP_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        if process.stdin is not None:
-            # Closing flushes unread input to a process that has ended.
-            with contextlib.suppress(BrokenPipeError):
-                process.stdin.close()

@@ -113,19 +113,31 @@ async def test_twists_are_synthesised_from_a_bank(tmp_path):
         ("hx711", "--torque-nm nan", "--torque-nm nan is not a number from -1000 to 1000"),
         ("gripper-socket", "--port 70000", "--port 70000 is not a whole number from 0 to 65535"),
         ("gripper-socket", "--bind 192.0.2.1", "cannot be played"),
-        ("gripper-modbus", "--link /nowhere/at/all", "/nowhere/at/all cannot be made"),
+        (
+            "gripper-modbus",
+            "--link /nowhere/at/all",
+            "gripper-modbus cannot be played: [Errno 2] No such file or directory: '/nowhere/at'",
+        ),
         ("eit-kit", "", "give either --recording FILE to play a recording or --bank FILE"),
         ("eit-kit", "--recording absent.mat", "absent.mat: the recording cannot be read"),
         ("eit-kit", "--bank absent.shb", "absent.shb"),
         ("eit-kit", "--bank absent.shb --once", "--once is for a recording"),
         ("eit-kit", "--recording absent.mat --speed 0", "--speed 0 is not a number above 0"),
-        ("eit-kit", "--recording absent.mat --link /dev/null/eit", "--link /dev/null/eit cannot be made"),
+        (
+            "eit-kit",
+            "--recording absent.mat --link /dev/null/eit",
+            "eit-kit cannot be played: [Errno 17] File exists: '/dev/null'; choose another address, port or path",
+        ),
         ("ur", "--rate-hz 5", "--rate-hz 5 is not a number from 50 to 1000"),
         # An address for documentation (RFC 5737), which no machine has.
-        ("ur", "--host 192.0.2.1", "cannot listen on 192.0.2.1"),
+        (
+            "ur",
+            "--host 192.0.2.1",
+            "ur cannot be played: [Errno 99] error while attempting to bind on address ('192.0.2.1', ",
+        ),
         ("skin", "--speed 0", "--speed 0 is not a number above 0"),
         ("skin", "--source-port 70000", "--source-port 70000 is not a whole number from 0"),
-        ("skin", "--daq-link /dev/null/daq", "--link /dev/null/daq cannot be made"),
+        ("skin", "--daq-link /dev/null/daq", "skin cannot be played: [Errno 17] File exists: '/dev/null'"),
     ],
 )
 def test_a_mistake_is_one_sentence_and_status_two(device, arguments, sentence, mistake):

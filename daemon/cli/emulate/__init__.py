@@ -1,13 +1,13 @@
 """`shearloop emulate DEVICE`: plays one device on its own port or socket."""
 
 import argparse
+import asyncio
 import os
 from collections.abc import Sequence
 from pathlib import Path
 
 from shearloop.daemon.cli import Parser
 from shearloop.daemon.cli.emulate import devices, rig
-from shearloop.daemon.cli.options import add_action, run_action
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.process import interrupt_status
 
@@ -18,16 +18,31 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add a sub-parser per device."""
     parsers = parser.add_subparsers(dest="device", metavar="DEVICE", required=True)
     for name, device in DEVICES.items():
-        device.configure(add_action(parsers, name, device.summary, device.run))
+        subparser = parsers.add_parser(name, help=device.summary, description=device.summary)
+        subparser.set_defaults(play=device.play)
+        device.configure(subparser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Play the device until Ctrl-C, SIGTERM, SIGHUP or the end of standard input."""
     try:
-        return run_action(args)
+        _play(args)
     except KeyboardInterrupt as interrupt:
         # While it starts: nothing is left undone.
         return interrupt_status(interrupt)
+    return 0
+
+
+def _play(args: argparse.Namespace) -> None:
+    """Play the device; raise UserError for an OSError, alone or in a group: an address, port or path is unusable."""
+    try:
+        asyncio.run(args.play(args))
+    except* OSError as errors:
+        error: BaseException = errors
+        while isinstance(error, BaseExceptionGroup):
+            error = error.exceptions[0]
+        cure = "choose another address, port or path, or end what uses it"
+        raise UserError(f"{args.device} cannot be played: {error}; {cure}") from None
 
 
 def checked_arguments(device: str, arguments: Sequence[str], folder: Path) -> argparse.Namespace:

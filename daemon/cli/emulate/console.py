@@ -6,9 +6,8 @@ import contextlib
 import json
 import sys
 import time
-from collections.abc import Callable, Coroutine, Iterator, Mapping
+from collections.abc import Callable, Coroutine
 from pathlib import Path
-from types import MappingProxyType
 from typing import NamedTuple
 
 from shearloop.daemon.cli.options import add_option, positive
@@ -18,11 +17,11 @@ from shearloop.daemon.process import ending_signals
 
 
 class Device(NamedTuple):
-    """The command of one emulated device."""
+    """The command of one emulated device; `play` returns a coroutine that runs until the device ends."""
 
     summary: str
     configure: Callable[[argparse.ArgumentParser], None]
-    run: Callable[[argparse.Namespace], int]
+    play: Callable[[argparse.Namespace], Coroutine[None, None, None]]
 
 
 def print_event(event: str, **fields: object) -> None:
@@ -30,42 +29,18 @@ def print_event(event: str, **fields: object) -> None:
     print(json.dumps({"t_mono_ns": time.monotonic_ns(), "event": event, **fields}), flush=True)
 
 
-def play(
-    device: Coroutine[None, None, None],
-    on_command: Callable[[str], None],
-    ports: "Mapping[str, asyncio.Queue[str]]" = MappingProxyType({}),
-) -> int:
-    """Run `device` until it ends, SIGINT, SIGTERM or SIGHUP comes, or standard input is closed; return 0.
+async def play(
+    device: Coroutine[None, None, None], on_command: Callable[[str], None], **ports: "asyncio.Queue[str]"
+) -> None:
+    """Run `device` until it ends, SIGINT, SIGTERM or SIGHUP comes, or standard input is closed.
 
     Each line of standard input, if that is a pipe or a terminal, goes to `on_command`; a ValueError is printed. What
-    the queues of `ports` get is printed behind their names.
+    the queues of `ports` get is printed, behind the name of the port if there are several.
     """
-    asyncio.run(_play(device, on_command, ports))
-    return 0
-
-
-async def _print_port(name: str, appearances: "asyncio.Queue[str]") -> None:
-    while True:
-        print(f"{name}{await appearances.get()}", flush=True)
-
-
-@contextlib.contextmanager
-def report_busy_address(what: str, cure: str) -> Iterator[None]:
-    """Turn an OSError, alone or in a group, into a UserError: an address or port is not available."""
-    try:
-        yield
-    except* OSError as errors:
-        error: BaseException = errors
-        while isinstance(error, BaseExceptionGroup):
-            error = error.exceptions[0]
-        raise UserError(f"{what}: {error}; {cure}") from None
-
-
-async def _play(
-    device: Coroutine[None, None, None], on_command: Callable[[str], None], ports: "Mapping[str, asyncio.Queue[str]]"
-) -> None:
     task = asyncio.create_task(device)
-    printing = [asyncio.create_task(_print_port(*port)) for port in ports.items()]
+    printing = [
+        asyncio.create_task(_print_port(f"{name} " if len(ports) > 1 else "", queue)) for name, queue in ports.items()
+    ]
 
     def obey(line: str | None) -> None:
         if line is None:
@@ -88,6 +63,11 @@ async def _play(
         each.cancel()
 
 
+async def _print_port(name: str, appearances: "asyncio.Queue[str]") -> None:
+    while True:
+        print(f"{name}{await appearances.get()}", flush=True)
+
+
 def add_seed_and_speed(parser: argparse._ActionsContainer, pace: str) -> None:
     """Add `--seed` and `--speed`, which multiplies `pace`."""
     parser.add_argument("--seed", type=int, default=0, help="of all noise and garbage (default: %(default)s)")
@@ -106,14 +86,11 @@ def add_link(parser: argparse.ArgumentParser) -> None:
 
 
 def checked_link(link: Path | None) -> Path | None:
-    """Return the path for the link, after making its folder; UserError if that fails."""
+    """Return the path for the link, after making its folder; UserError if a file has this name."""
     if link is None:
         return None
-    try:
-        # Only one level: `run/` of a fresh checkout.
-        link.parent.mkdir(exist_ok=True)
-    except OSError as error:
-        raise UserError(f"--link {link} cannot be made: {error.strerror}; choose another folder") from error
+    # Only one level: `run/` of a fresh checkout.
+    link.parent.mkdir(exist_ok=True)
     if link.exists() and not link.is_symlink():
         raise UserError(f"--link {link} cannot be made: a file has this name; choose another")
     return link

@@ -1,8 +1,9 @@
 """The emulated devices that stand alone: `eit-kit`, `hx711`, `ur`, `gripper-socket` and `gripper-modbus`."""
 
 import argparse
+import asyncio
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from itertools import count, cycle, repeat
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,10 +18,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from shearloop.drivers.emulators.ur_controller import Controller
-    from shearloop.drivers.emulators.ur_robot import ControllerSpec, RobotEvent
+    from shearloop.drivers.emulators.ur_robot import ControllerSpec
 
 # The tool of synthetic frames.
 DIAMETER_MM = 20.0
+Playing = Coroutine[None, None, None]
 RATE_HZ = number(50.0, 1000.0)
 UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standard input:
   protective-stop         stop for safety, pause the program
@@ -54,13 +56,13 @@ def _configure_eit_kit(parser: argparse.ArgumentParser) -> None:
     console.add_link(parser)
 
 
-def _run_eit_kit(args: argparse.Namespace) -> int:
+def _play_eit_kit(args: argparse.Namespace) -> Playing:
     from shearloop.drivers.defaults import FRAME_PERIOD_S
     from shearloop.drivers.emulators.boards import EitKitBoard
 
     link = console.checked_link(args.link)
     board = EitKitBoard(_frames(args, FRAME_PERIOD_S), period_s=FRAME_PERIOD_S / args.speed, link=link, seed=args.seed)
-    return console.play(board.run(), board.command, {"": board.port.appearances})
+    return console.play(board.run(), board.command, port=board.port.appearances)
 
 
 def _frames(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.float64]"]:
@@ -100,7 +102,7 @@ def _configure_hx711(parser: argparse.ArgumentParser) -> None:
     console.add_link(parser)
 
 
-def _run_hx711(args: argparse.Namespace) -> int:
+def _play_hx711(args: argparse.Namespace) -> Playing:
     from shearloop.drivers.emulators.boards import LOAD_PERIOD_S, PAPER_SKETCH, Hx711Board, Sketch
     from shearloop.drivers.load_calibration import STANDARD_GRAVITY
     from shearloop.drivers.load_cell import LEVER_ARM_M
@@ -120,7 +122,7 @@ def _run_hx711(args: argparse.Namespace) -> int:
             case _:
                 board.command(line)
 
-    return console.play(board.run(), on_command, {"": board.port.appearances})
+    return console.play(board.run(), on_command, port=board.port.appearances)
 
 
 def _finite(text: str) -> float:
@@ -144,9 +146,13 @@ def robot_make(args: argparse.Namespace) -> "ControllerSpec":
     return ControllerSpec(unlock_wait_s=args.unlock_wait_s, power_on_s=args.power_on_s)
 
 
-def print_robot_event(event: "RobotEvent") -> None:
-    """Print an event of the robot."""
-    console.print_event(event.name, detail=event.detail, time_s=round(event.time_s, 6))
+async def play_robot(controller: "Controller", *beside: Callable[[], Playing]) -> None:
+    """Play a controller and print its events; run the others beside it once it listens."""
+    async with controller.open(), asyncio.TaskGroup() as group:
+        for run in beside:
+            group.create_task(run())
+        async for event in controller.run():
+            console.print_event(event.name, detail=event.detail, time_s=round(event.time_s, 6))
 
 
 def _configure_ur(parser: argparse.ArgumentParser) -> None:
@@ -157,7 +163,7 @@ def _configure_ur(parser: argparse.ArgumentParser) -> None:
     add_robot(parser)
 
 
-def _run_ur(args: argparse.Namespace) -> int:
+def _play_ur(args: argparse.Namespace) -> Playing:
     from shearloop.drivers.emulators.ur_controller import Controller
     from shearloop.drivers.emulators.ur_robot import Robot
 
@@ -167,15 +173,10 @@ def _run_ur(args: argparse.Namespace) -> int:
         controller.command(line)
         console.print_event("obeyed", detail=line)
 
-    with console.report_busy_address(f"the controller cannot listen on {args.host}", "choose another --host"):
-        return console.play(_play_ur(controller, args.host), on_command)
+    async def print_address() -> None:
+        console.print_event("listening", detail=args.host)
 
-
-async def _play_ur(controller: "Controller", host: str) -> None:
-    async with controller.open():
-        console.print_event("listening", detail=host)
-        async for event in controller.run():
-            print_robot_event(event)
+    return console.play(play_robot(controller, print_address), on_command)
 
 
 def _configure_gripper(parser: argparse.ArgumentParser, printed: str) -> None:
@@ -199,7 +200,7 @@ def _configure_gripper_modbus(parser: argparse.ArgumentParser) -> None:
     console.add_link(parser)
 
 
-def _run_gripper(args: argparse.Namespace) -> int:
+def _play_gripper(args: argparse.Namespace) -> Playing:
     from shearloop.drivers.emulators.gripper import Gripper, GripperPlayer, ModbusSlave, UrcapSession
     from shearloop.drivers.emulators.ports import PtyServer, SocketServer
 
@@ -210,14 +211,13 @@ def _run_gripper(args: argparse.Namespace) -> int:
     else:
         server = SocketServer(UrcapSession(gripper), args.bind, args.port)
     player = GripperPlayer(gripper, server, args.speed)
-    with console.report_busy_address("the gripper cannot be played", "choose another port or bind address"):
-        return console.play(player.run(), player.command, {"": server.appearances})
+    return console.play(player.run(), player.command, port=server.appearances)
 
 
 DEVICES = {
-    "eit-kit": console.Device("the EIT board of a fingertip, on a pseudo-terminal", _configure_eit_kit, _run_eit_kit),
-    "hx711": console.Device("the load cell's board, on a pseudo-terminal", _configure_hx711, _run_hx711),
-    "ur": console.Device("a UR robot's controller, on an address of this machine", _configure_ur, _run_ur),
-    "gripper-socket": console.Device("a 2F-140 behind the URCap's socket", _configure_gripper_socket, _run_gripper),
-    "gripper-modbus": console.Device("a 2F-140 on Modbus RTU, on a port", _configure_gripper_modbus, _run_gripper),
+    "eit-kit": console.Device("the EIT board of a fingertip, on a pseudo-terminal", _configure_eit_kit, _play_eit_kit),
+    "hx711": console.Device("the load cell's board, on a pseudo-terminal", _configure_hx711, _play_hx711),
+    "ur": console.Device("a UR robot's controller, on an address of this machine", _configure_ur, _play_ur),
+    "gripper-socket": console.Device("a 2F-140 behind the URCap's socket", _configure_gripper_socket, _play_gripper),
+    "gripper-modbus": console.Device("a 2F-140 on Modbus RTU, on a port", _configure_gripper_modbus, _play_gripper),
 }

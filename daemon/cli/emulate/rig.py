@@ -4,24 +4,22 @@ import argparse
 import asyncio
 import json
 import time
-from contextlib import nullcontext
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.emulate import console
-from shearloop.daemon.cli.emulate.devices import RATE_HZ, add_robot, print_robot_event, robot_make
+from shearloop.daemon.cli.emulate.devices import RATE_HZ, Playing, add_robot, play_robot, robot_make
 from shearloop.daemon.cli.options import PORT, TOOL_MM, add_option, positive
-from shearloop.daemon.errors import UserError
 from shearloop.drivers.emulators import number_between
 
 if TYPE_CHECKING:
     from shearloop.daemon.synthetic_skin import SyntheticSkin
     from shearloop.drivers.emulators.rig import EmulatedRig
     from shearloop.drivers.emulators.scene import Truth
-    from shearloop.drivers.emulators.skin import Address, SkinInstruments
-    from shearloop.drivers.emulators.ur_controller import Controller
+    from shearloop.drivers.emulators.skin import Address
 
 TRUTH_PERIOD_S = 0.1
 # The gauges' drift advances in steps of this.
@@ -42,7 +40,7 @@ Commands, one a line on standard input:
   normal                      end all faults, the robot's included
 With --speed N gel, fingers and boards are N times as fast; the arm stays in real time.
 """
-SKIN_EPILOG = """Prints the addresses of source and DAQ, again each time they appear.
+SKIN_EPILOG = """Prints the addresses of source and DAQ, again each time they appear, and the robot's events.
 Commands, one a line on standard input:
   shear N                        push the skin (not while a robot turns it)
   open 1|2, short 1|2, reversed 1|2, swapped, leads OHM, mend
@@ -97,17 +95,14 @@ def _configure_rig(parser: argparse.ArgumentParser) -> None:
     add_robot(parser)
 
 
-def _run_rig(args: argparse.Namespace) -> int:
+def _play_rig(args: argparse.Namespace) -> Playing:
     from shearloop.daemon.synthetic_frames import RigFrames
     from shearloop.drivers.emulators.boards import PAPER_SKETCH
     from shearloop.drivers.emulators.rig import NOISE_NM, EmulatedRig
     from shearloop.drivers.emulators.scene import TwinSettings
 
     make = robot_make(args)
-    try:
-        args.run_dir.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"--run-dir {args.run_dir} cannot be made ({error.strerror}); choose another") from None
+    args.run_dir.mkdir(parents=True, exist_ok=True)
     rig = EmulatedRig(
         RigFrames(args.bank, args.seed, args.sigma),
         args.run_dir,
@@ -121,24 +116,10 @@ def _run_rig(args: argparse.Namespace) -> int:
         sketch=replace(PAPER_SKETCH, noise_counts=NOISE_NM) if args.paper_sketch else None,
         seed=args.seed,
     )
-    with (
-        nullcontext() if args.truth is None else _open_truth(args.truth) as file,
-        console.report_busy_address(
-            f"the rig cannot be played on {args.host} and in {args.run_dir}",
-            "choose another --host or --run-dir, or end what uses them",
-        ),
-    ):
-        return console.play(_play_rig(rig, args, file), partial(_obey, rig))
-
-
-async def _play_rig(rig: "EmulatedRig", args: argparse.Namespace, truth: TextIO | None) -> None:
-    async with rig.controller.open(), asyncio.TaskGroup() as group:
-        group.create_task(rig.run())
-        group.create_task(_print_ready(rig, args.host))
-        if truth is not None:
-            group.create_task(_write_truths(rig, truth, TRUTH_PERIOD_S / args.speed))
-        async for event in rig.controller.run():
-            print_robot_event(event)
+    beside: list[Callable[[], Playing]] = [rig.run, partial(_print_ready, rig, args.host)]
+    if args.truth is not None:
+        beside.append(partial(_write_truths, rig, args.truth, TRUTH_PERIOD_S / args.speed))
+    return console.play(play_robot(rig.controller, *beside), partial(_obey, rig))
 
 
 async def _print_ready(rig: "EmulatedRig", host: str) -> None:
@@ -146,12 +127,13 @@ async def _print_ready(rig: "EmulatedRig", host: str) -> None:
     print("rig ready", *(f"{name}={place}" for name, place in {"robot": host, **places}.items()), flush=True)
 
 
-async def _write_truths(rig: "EmulatedRig", file: TextIO, period_s: float) -> None:
+async def _write_truths(rig: "EmulatedRig", path: Path, period_s: float) -> None:
     due_s = time.monotonic()
-    while True:
-        file.write(json.dumps({"t_mono_ns": time.monotonic_ns(), **_fields(rig.scene.truth())}) + "\n")
-        due_s = max(due_s + period_s, time.monotonic())
-        await asyncio.sleep(due_s - time.monotonic())
+    with path.open("a", buffering=1, encoding="utf-8") as file:
+        while True:
+            file.write(json.dumps({"t_mono_ns": time.monotonic_ns(), **_fields(rig.scene.truth())}) + "\n")
+            due_s = max(due_s + period_s, time.monotonic())
+            await asyncio.sleep(due_s - time.monotonic())
 
 
 def _obey(rig: "EmulatedRig", line: str) -> None:
@@ -160,13 +142,6 @@ def _obey(rig: "EmulatedRig", line: str) -> None:
     else:
         rig.command(line)
         console.print_event("obeyed", detail=line)
-
-
-def _open_truth(path: Path) -> TextIO:
-    try:
-        return path.open("a", buffering=1, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"--truth {path} cannot be written ({error.strerror}); choose another file") from None
 
 
 def _fields(truth: "Truth") -> dict[str, object]:
@@ -190,7 +165,7 @@ def _configure_skin(parser: argparse.ArgumentParser) -> None:
     add_option(robot, "--rate-hz", RATE_HZ, "HZ", "control cycles per second (default: %(default)s)", default=500.0)
 
 
-def _run_skin(args: argparse.Namespace) -> int:
+def _play_skin(args: argparse.Namespace) -> Playing:
     from shearloop.daemon.synthetic_skin import SyntheticSkin
     from shearloop.drivers.emulators.skin import SkinInstruments
     from shearloop.drivers.emulators.ur_controller import Controller
@@ -213,9 +188,8 @@ def _run_skin(args: argparse.Namespace) -> int:
             case _:
                 instruments.command(line)
 
-    ports = {"source ": instruments.source_port, "daq ": instruments.daq_port}
-    with console.report_busy_address("the skin cannot be played", "choose another port or address"):
-        return console.play(_play_skin(instruments, controller), on_command, ports)
+    running = instruments.run() if controller is None else play_robot(controller, instruments.run)
+    return console.play(running, on_command, source=instruments.source_port, daq=instruments.daq_port)
 
 
 def _address(args: argparse.Namespace, name: str) -> "Address | None":
@@ -226,17 +200,7 @@ def _address(args: argparse.Namespace, name: str) -> "Address | None":
     return args.bind, port
 
 
-async def _play_skin(instruments: "SkinInstruments", controller: "Controller | None") -> None:
-    if controller is None:
-        await instruments.run()
-        return
-    async with controller.open(), asyncio.TaskGroup() as group:
-        group.create_task(instruments.run())
-        async for _ in controller.run():
-            pass
-
-
 DEVICES = {
-    "skin": console.Device("the shear skin, its instruments, the robot that turns it", _configure_skin, _run_skin),
-    "rig": console.Device("all devices of the rig, tied by one physics", _configure_rig, _run_rig),
+    "skin": console.Device("the shear skin, its instruments, the robot that turns it", _configure_skin, _play_skin),
+    "rig": console.Device("all devices of the rig, tied by one physics", _configure_rig, _play_rig),
 }

@@ -13,6 +13,7 @@ from jsonschema import Draft202012Validator
 
 from shearloop.bank.skin.calibration import load_calibration
 from shearloop.daemon.cli import demo
+from shearloop.daemon.cli.emulator_processes import running
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.config_schema import MODELS
@@ -94,10 +95,10 @@ def test_the_demos_page_lasts_as_long_as_the_demo(tmp_path, monkeypatch, capsys)
 
 
 def test_ctrl_c_reaches_no_process_of_the_demo(capfd):
-    with demo._running([sys.executable, "-c", "import os; print(os.getpgrp())"]) as process:
+    with running([sys.executable, "-c", "import os; print(os.getpgrp())"]) as process:
         assert process.wait() == 0
     assert int(capfd.readouterr().out) != os.getpgrp()
-    with demo._running([sys.executable, "-c", "import time; time.sleep(60)"], subprocess.PIPE) as process:
+    with running([sys.executable, "-c", "import time; time.sleep(60)"], stdout=subprocess.PIPE) as process:
         pass
     assert process.returncode == -signal.SIGTERM
 

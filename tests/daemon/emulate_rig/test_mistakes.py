@@ -16,12 +16,21 @@ from shearloop.drivers.emulators.rig import EmulatedRig
         (["--gel-stiffness", "-1"], "--gel-stiffness -1 is not a number above 0"),
         (["--rate-hz", "5"], "--rate-hz 5 is not a number from 50 to 1000"),
         (["--diameter-mm", "150"], "--diameter-mm 150 is not a number above 0 and up to 140"),
-        (["--run-dir", "/dev/null/run"], "--run-dir /dev/null/run cannot be made"),
-        (["--truth", "/nowhere/truth"], "--truth /nowhere/truth cannot be written"),
+        (
+            ["--run-dir", "/dev/null/run"],
+            "rig cannot be played: [Errno 20] Not a directory: '/dev/null/run'; choose another",
+        ),
+        (
+            ["--truth", "/nowhere/truth"],
+            "rig cannot be played: [Errno 2] No such file or directory: '/nowhere/truth'; choose another",
+        ),
         (["--sigma", "1.2", "1.8"], "give the larger one first"),
         (["--sigma", "3.0", "1.8"], "the bank has no signal at sigma = 3"),
         # An address for documentation (RFC 5737), which no machine has.
-        (["--host", "192.0.2.1"], "the rig cannot be played on 192.0.2.1"),
+        (
+            ["--host", "192.0.2.1"],
+            "rig cannot be played: [Errno 99] error while attempting to bind on address ('192.0.2.1', ",
+        ),
     ],
 )
 def test_mistakes_are_told(arguments, sentence, bank, tmp_path, mistake):

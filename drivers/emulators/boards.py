@@ -3,9 +3,8 @@
 import asyncio
 import contextlib
 import math
-from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
@@ -14,7 +13,6 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.ports import PtyPort
 
@@ -46,27 +44,25 @@ def parse_fault(text: str, names: Collection[str]) -> BoardFault:
     return name, number_between(seconds, 0.0, 1e9, no_duration)
 
 
-class EmulatedBoard(ABC):
-    """A board on a pseudo-terminal that sends a line each period, whether or not anyone listens.
+class EmulatedBoard:
+    """A board on a pseudo-terminal that sends the next of `lines` each period, whether or not anyone listens.
 
-    Without a reader the terminal fills up; then the board waits and `port.held_up` is set. Timed faults without a
-    duration last until the next one or `normal`.
+    A line is requested from the iterator when it is due; a silent or unplugged board requests none. Without a reader
+    the terminal fills up; then the board waits and `port.held_up` is set. Timed faults without a duration last until
+    the next one or `normal`.
     """
 
     faults: Collection[str]
 
-    def __init__(self, period_s: float, link: Path | None, seed: int) -> None:
+    def __init__(self, lines: Iterable[bytes], *, period_s: float, link: Path | None = None, seed: int = 0) -> None:
         self.port = PtyPort(link)
+        self._lines = iter(lines)
         self._period_s = period_s
         self._random = Random(seed)
         self._injected: deque[BoardFault] = deque()
         self._lasting: str | None = None
         self._lasts_until_s = math.inf
         self._last_line = b""
-
-    @abstractmethod
-    def _line(self) -> bytes:
-        """Return the next line; StopIteration at the end of the data."""
 
     async def _wait_for_start(self) -> bool:
         """Wait until the board is started; return whether that took time."""
@@ -121,7 +117,7 @@ class EmulatedBoard(ABC):
                 return self._last_line
             case "saturation":
                 return b"%d\r\n" % COUNTS_MAX
-        self._last_line = self._line()
+        self._last_line = next(self._lines)
         return self._changed(fault, self._last_line) if fault else self._last_line
 
     def _changed(self, fault: str, line: bytes) -> bytes:
@@ -152,28 +148,13 @@ def format_line(values: NDArray[np.float64]) -> bytes:
 
 
 class EitKitBoard(EmulatedBoard):
-    """An EIT-kit: waits for a `y`, then sends `frames` ((v,) values in volts each), and then is silent.
+    """An EIT-kit: waits for a `y`, then sends its lines, and then is silent.
 
-    A frame is requested from the iterator at the end of its acquisition. A silent or unplugged board acquires none. A
-    `y` ends a silence without a duration.
+    A `y` ends a silence without a duration.
     """
 
     faults = ("cut-line", "wrong-count", "nan", "garbage", "silence", "unplug")
-
-    def __init__(
-        self,
-        frames: Iterable[NDArray[np.float64]],
-        *,
-        period_s: float = FRAME_PERIOD_S,
-        link: Path | None = None,
-        seed: int = 0,
-    ) -> None:
-        super().__init__(period_s, link, seed)
-        self._frames = iter(frames)
-        self._started = False
-
-    def _line(self) -> bytes:
-        return format_line(next(self._frames))
+    _started = False
 
     async def _wait_for_start(self) -> bool:
         """Wait for the first `y`; without power, when it was unplugged, the board has forgotten it."""
@@ -213,31 +194,19 @@ class Sketch:
     noise_counts: float = 120.0
     decimals: int = 0
 
+    def lines(self, torques_nm: Iterable[float], seed: int = 0) -> Iterator[bytes]:
+        """Yield the line of each torque, requested at the end of its conversion."""
+        random = Random(seed)
+        for torque_nm in torques_nm:
+            counts = self.tare_counts + self.counts_per_nm * torque_nm + random.gauss(0.0, self.noise_counts)
+            yield f"{min(max(counts, COUNTS_MIN), COUNTS_MAX):.{self.decimals}f}\r\n".encode()
+
 
 # The paper's sketch sends N·m, with the noise of its recordings.
 PAPER_SKETCH = Sketch(counts_per_nm=1.0, tare_counts=0.0, noise_counts=2e-5, decimals=12)
 
 
 class Hx711Board(EmulatedBoard):
-    """The load cell's board: converts each of `torques_nm`, requested at the end of its conversion."""
+    """The load cell's board."""
 
     faults = ("garbage", "spike", "torn", "silence", "saturation", "stuck", "unplug")
-
-    def __init__(
-        self,
-        torques_nm: Iterable[float],
-        sketch: Sketch | None = None,
-        *,
-        period_s: float = LOAD_PERIOD_S,
-        link: Path | None = None,
-        seed: int = 0,
-    ) -> None:
-        super().__init__(period_s, link, seed)
-        self._torques_nm = iter(torques_nm)
-        self._sketch = sketch or Sketch()
-
-    def _line(self) -> bytes:
-        sketch = self._sketch
-        counts = sketch.tare_counts + sketch.counts_per_nm * next(self._torques_nm)
-        counts += self._random.gauss(0.0, sketch.noise_counts)
-        return f"{min(max(counts, COUNTS_MIN), COUNTS_MAX):.{sketch.decimals}f}\r\n".encode()

@@ -11,7 +11,7 @@ from typing import Literal, Protocol, TypeAlias
 
 from shearloop.drivers.defaults import FRAME_PERIOD_S, URCAP_PORT
 from shearloop.drivers.emulators import number_between
-from shearloop.drivers.emulators.boards import LOAD_PERIOD_S, EitKitBoard, Hx711Board, Sketch
+from shearloop.drivers.emulators.boards import LOAD_PERIOD_S, EitKitBoard, Hx711Board, Sketch, format_line
 from shearloop.drivers.emulators.gripper import Gripper, GripperPlayer, ModbusSlave, UrcapSession
 from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.drivers.emulators.scene import FloatArray, Joint, Scene, TwinSettings
@@ -80,8 +80,7 @@ class EmulatedRig:
             for number, (side, sign) in enumerate(SIDES.items())
         }
         boards["load"] = Hx711Board(
-            self._torques_nm(),
-            sketch or Sketch(noise_counts=NOISE_NM * Sketch().counts_per_nm),
+            (sketch or Sketch(noise_counts=NOISE_NM * Sketch().counts_per_nm)).lines(self._torques_nm(), seed),
             period_s=LOAD_PERIOD_S / speed,
             link=run_dir / "load-cell",
             seed=seed,
@@ -127,10 +126,10 @@ class EmulatedRig:
             raise ValueError(f"there is no device {name!r}; there are {', '.join(self._commanded)}")
         return self._commanded[name]
 
-    def _frames(self, synthesiser: FrameSynthesiser, sign: float) -> Iterator[FloatArray]:
+    def _frames(self, synthesiser: FrameSynthesiser, sign: float) -> Iterator[bytes]:
         while True:
             grip, shear_nm, width_mm = self.scene.frame(FRAME_PERIOD_S)
-            yield synthesiser.line(grip, sign * shear_nm, width_mm)
+            yield format_line(synthesiser.line(grip, sign * shear_nm, width_mm))
 
     def _torques_nm(self) -> Iterator[float]:
         while True:

@@ -6,7 +6,7 @@ Source and scanner understand the SCPI commands of our driver, in their short fo
 import asyncio
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
@@ -44,6 +44,9 @@ SCANNER_IDENTITY = "Agilent Technologies,34972A,MY49007321,1.16-1.12-02-02"
 SCANNER_NO_ERROR = '+0,"No error"'
 OVERLOAD_V = 9.9e37
 OVERRANGE = 1.2
+
+# 24 bits over ±0.512 V, at gain 4.
+ADC_FULL_SCALE_V, ADC_STEP_V = 0.512, 0.512 / 2**23
 
 MAX_LINE_BYTES = 512
 MAX_ERRORS = 10
@@ -278,22 +281,15 @@ class EmulatedAdcBoard(EmulatedBoard):
     """A converter board, an ADS1220: sends a line `v1,v2` in volts for each conversion."""
 
     faults = ("missing", "garbage", "torn", "silence", "stuck", "unplug")
-    # 24 bits over ±0.512 V, at gain 4.
-    FULL_SCALE_V, STEP_V = 0.512, 0.512 / 2**23
 
-    def __init__(
-        self, circuit: Circuit, *, period_s: float = DAQ_PERIOD_S, link: Path | None = None, seed: int = 0
-    ) -> None:
-        super().__init__(period_s, link, seed)
-        self._circuit = circuit
 
-    def _line(self) -> bytes:
-        v1_v, v2_v = self._circuit.voltages()
-        return f"{self._quantise(v1_v):.6f},{self._quantise(v2_v):.6f}\r\n".encode()
-
-    def _quantise(self, volts: float) -> float:
-        steps = round((volts + self._random.gauss(0.0, NOISE_V)) / self.STEP_V)
-        return min(max(steps * self.STEP_V, -self.FULL_SCALE_V), self.FULL_SCALE_V)
+def adc_lines(circuit: Circuit, seed: int = 0) -> Iterator[bytes]:
+    """Yield a line of the converter board, with its noise and steps, for the voltages at the moment."""
+    random = Random(seed)
+    while True:
+        steps = [round((volts + random.gauss(0.0, NOISE_V)) / ADC_STEP_V) for volts in circuit.voltages()]
+        v1_v, v2_v = (min(max(step * ADC_STEP_V, -ADC_FULL_SCALE_V), ADC_FULL_SCALE_V) for step in steps)
+        yield f"{v1_v:.6f},{v2_v:.6f}\r\n".encode()
 
 
 class SkinInstruments:
@@ -319,7 +315,8 @@ class SkinInstruments:
             self._daq = SocketServer(EmulatedScanner(self.circuit, seed + 1), *daq_at, answer_s)
             self.daq_port = self._daq.appearances
         else:
-            self._daq = EmulatedAdcBoard(self.circuit, period_s=DAQ_PERIOD_S / speed, link=daq_at, seed=seed + 1)
+            lines = adc_lines(self.circuit, seed + 1)
+            self._daq = EmulatedAdcBoard(lines, period_s=DAQ_PERIOD_S / speed, link=daq_at, seed=seed + 1)
             self.daq_port = self._daq.port.appearances
 
     async def run(self) -> None:

@@ -16,7 +16,7 @@ from shearloop.daemon.bank_config import load_bank_plan
 from shearloop.daemon.cli.emulated_calibration import write_recordings
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.drivers.defaults import FRAME_PERIOD_S
-from shearloop.drivers.emulators.boards import EitKitBoard
+from shearloop.drivers.emulators.boards import EitKitBoard, format_line
 from tests.daemon.conftest import collector, running_daemon
 from tests.running import running
 
@@ -57,7 +57,7 @@ async def test_a_fingertip_of_another_kind_gives_its_torque(estimator, bank, twi
     fit(estimator, [series], "emulated twists", Physics(bank=Bank.open(bank))).save(calibration)
     lines = list(read_recording(twists).sides["right"].lines)
     path = config(right={"bank": str(bank), "calibration": str(calibration), "frame_period_s": FRAME_PERIOD_S / SPEED})
-    board = EitKitBoard(cycle(lines), period_s=FRAME_PERIOD_S / SPEED, link=tmp_path / "eit-right")
+    board = EitKitBoard(map(format_line, cycle(lines)), period_s=FRAME_PERIOD_S / SPEED, link=tmp_path / "eit-right")
     truth_nm, errors_nm = series.torque_at_frames(), []
     async with running(board.run()), running_daemon(path) as daemon:
         estimates = collector(daemon, "eit.estimate")

@@ -12,7 +12,7 @@ from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.drivers import eit_kit
 from shearloop.drivers.connection import LinkEvent, LinkMonitor, SerialLink
 from shearloop.drivers.eit_kit import ADC_STEP_V, EitKit, Frame, FrameErrorKind
-from shearloop.drivers.emulators.boards import EitKitBoard
+from shearloop.drivers.emulators.boards import EitKitBoard, format_line
 from tests.running import DEADLINE_S, LinkEvents, running, take
 
 PERIOD_S = 0.003
@@ -34,11 +34,11 @@ async def play(
     """Return the first frames of a board that has a fault after some lines."""
     link, links = tmp_path / "eit", LinkEvents()
 
-    def sent() -> Iterator[NDArray[np.float64]]:
+    def sent() -> Iterator[bytes]:
         for number, line in enumerate(lines, 1):
             if fault and number == after:
                 board.command(fault)
-            yield line
+            yield format_line(line)
 
     board = EitKitBoard(sent(), period_s=period_s, link=link)
     async with running(board.run()):
@@ -65,7 +65,7 @@ async def test_every_frame_arrives_once_and_in_order(tmp_path):
 
 async def test_a_reader_that_stops_for_a_while_loses_nothing(tmp_path):
     lines = some_lines(40)
-    board = EitKitBoard(lines, period_s=PERIOD_S, link=tmp_path / "eit")
+    board = EitKitBoard(map(format_line, lines), period_s=PERIOD_S, link=tmp_path / "eit")
     async with running(board.run()):
         kit = EitKit(SerialLink(path=tmp_path / "eit"), PAPER_TABLE.zero_slots, PERIOD_S)
         frames = []
@@ -119,7 +119,7 @@ async def test_a_board_that_is_unplugged_is_found_again_and_started(tmp_path):
 
 async def test_a_driver_that_begins_while_the_board_sends_takes_up_with_the_next_line(tmp_path):
     lines = some_lines(30)
-    async with running(EitKitBoard(lines, period_s=PERIOD_S, link=tmp_path / "eit").run()):
+    async with running(EitKitBoard(map(format_line, lines), period_s=PERIOD_S, link=tmp_path / "eit").run()):
         first = await take(EitKit(SerialLink(path=tmp_path / "eit"), PAPER_TABLE.zero_slots).readings(), 10)
         kit = EitKit(SerialLink(path=tmp_path / "eit"), PAPER_TABLE.zero_slots)
         second = await take(kit.readings(), 10)
@@ -136,7 +136,7 @@ async def test_a_board_that_is_not_there_is_awaited_and_told_of_once(tmp_path):
     kit = EitKit(SerialLink(path=tmp_path / "eit", monitor=LinkMonitor(links)), PAPER_TABLE.zero_slots)
     taking = asyncio.create_task(take(kit.readings(), 1))
     await links.down(2)
-    async with running(EitKitBoard(some_lines(1), period_s=PERIOD_S, link=tmp_path / "eit").run()):
+    async with running(EitKitBoard(map(format_line, some_lines(1)), period_s=PERIOD_S, link=tmp_path / "eit").run()):
         (frame,) = await taking
     assert frame.seq == 0
     assert kit.diagnostics()["measured_hz"] is None, "a frame has no rate"

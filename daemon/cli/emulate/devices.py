@@ -58,10 +58,11 @@ def _configure_eit_kit(parser: argparse.ArgumentParser) -> None:
 
 def _play_eit_kit(args: argparse.Namespace) -> Playing:
     from shearloop.drivers.defaults import FRAME_PERIOD_S
-    from shearloop.drivers.emulators.boards import EitKitBoard
+    from shearloop.drivers.emulators.boards import EitKitBoard, format_line
 
     link = console.checked_link(args.link)
-    board = EitKitBoard(_frames(args, FRAME_PERIOD_S), period_s=FRAME_PERIOD_S / args.speed, link=link, seed=args.seed)
+    lines = map(format_line, _frames(args, FRAME_PERIOD_S))
+    board = EitKitBoard(lines, period_s=FRAME_PERIOD_S / args.speed, link=link, seed=args.seed)
     return console.play(board.run(), board.command, port=board.port.appearances)
 
 
@@ -110,7 +111,8 @@ def _play_hx711(args: argparse.Namespace) -> Playing:
     held_nm = args.torque_nm
     sketch, period_s = PAPER_SKETCH if args.paper_sketch else Sketch(), LOAD_PERIOD_S / args.speed
     link = console.checked_link(args.link)
-    board = Hx711Board((held_nm for _ in repeat(None)), sketch, period_s=period_s, link=link, seed=args.seed)
+    lines = sketch.lines((held_nm for _ in repeat(None)), args.seed)
+    board = Hx711Board(lines, period_s=period_s, link=link, seed=args.seed)
 
     def on_command(line: str) -> None:
         nonlocal held_nm

@@ -43,7 +43,7 @@ def test_invalid_faults_are_refused(text, sentence):
 async def test_it_says_nothing_before_it_is_started_and_is_silent_after_its_last_frame():
     line = np.where(PAPER_TABLE.zero_slots, 0, 0.25)
     sent = 2 * format_line(line)
-    board = EitKitBoard([line, line], period_s=0.001)
+    board = EitKitBoard([format_line(line)] * 2, period_s=0.001)
     async with running(board.run()):
         with SerialPort(board.port.path) as port:
             assert await port.read(0.05) is None

@@ -42,7 +42,7 @@ async def a_rig(
     calibration: LoadCalibration = CALIBRATION,
 ) -> AsyncIterator[Rig]:
     link = tmp_path / "load"
-    board = Hx711Board(torques_nm, sketch, period_s=0.002, link=link)
+    board = Hx711Board(sketch.lines(torques_nm), period_s=0.002, link=link)
     rig = Rig(board, link, calibration)
     async with running(board.run()):
         await board.port.appearances.get()

@@ -5,9 +5,10 @@ import contextlib
 import os
 import tty
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from copy import copy
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Protocol, Self, TypeAlias
 
 from shearloop.drivers.emulators import number_between
 
@@ -196,6 +197,25 @@ class PtyServer(Server):
         self._port.unplug()
 
 
+# Open connections, by the tasks that serve them.
+Connections: TypeAlias = dict[asyncio.Task[None], asyncio.StreamWriter]
+
+
+@contextlib.contextmanager
+def connected(writer: asyncio.StreamWriter, connections: Connections) -> Iterator[None]:
+    """Register an open connection that this task serves; close it at the end, quietly when the peer breaks it."""
+    task = asyncio.current_task()
+    if task is None:
+        raise RuntimeError("a connection is served by a task")
+    connections[task] = writer
+    try:
+        with contextlib.suppress(ConnectionError):
+            yield
+    finally:
+        del connections[task]
+        writer.close()
+
+
 class SocketServer(Server):
     """A device that answers requests on a socket; each connection gets a copy of `session`."""
 
@@ -204,7 +224,7 @@ class SocketServer(Server):
         self._session = session
         self._host = host
         self._server: asyncio.Server | None = None
-        self._connections: dict[asyncio.Task[None], asyncio.StreamWriter] = {}
+        self._connections: Connections = {}
         self.appearances = asyncio.Queue()
         # With 0, a free port from the first start on.
         self.port = port
@@ -230,11 +250,7 @@ class SocketServer(Server):
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         session = copy(self._session)
-        task = asyncio.current_task()
-        if task is None:
-            raise RuntimeError("a connection is served by a task")
-        self._connections[task] = writer
-        try:
+        with connected(writer, self._connections):
             while data := await reader.read(READ_BYTES):
                 replies = session.feed(data)
                 if replies and self._state != "silence":
@@ -242,8 +258,3 @@ class SocketServer(Server):
                     await asyncio.sleep(self._answer_s)
                     writer.write(replies)
                     await writer.drain()
-        except ConnectionError:
-            pass
-        finally:
-            del self._connections[task]
-            writer.close()

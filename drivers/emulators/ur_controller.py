@@ -3,11 +3,12 @@
 import asyncio
 import re
 import time
-from collections.abc import AsyncIterator, Iterator
-from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import replace
 
 from shearloop.drivers.emulators import number_between
+from shearloop.drivers.emulators.ports import Connections, connected
 from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, Robot, RobotEvent
 from shearloop.drivers.emulators.ur_rtde import RtdeSession
 from shearloop.drivers.emulators.urscript import translate
@@ -41,7 +42,7 @@ class Controller:
         self._rate_hz = rate_hz
         self._silent_until_s = 0.0
         self._rtde: dict[asyncio.StreamWriter, RtdeSession] = {}
-        self._connections: dict[asyncio.Task[None] | None, asyncio.StreamWriter] = {}
+        self._connections: Connections = {}
 
     @asynccontextmanager
     async def open(self) -> AsyncIterator[None]:
@@ -58,7 +59,7 @@ class Controller:
                 stack.callback(server.close)
             yield
         if self._connections:
-            await asyncio.wait([task for task in self._connections if task is not None])
+            await asyncio.wait(self._connections)
 
     async def run(self) -> AsyncIterator[RobotEvent]:
         """Let time pass, and yield the robot's events, until cancelled."""
@@ -126,7 +127,7 @@ class Controller:
             writer.write(data)
 
     async def _serve_rtde(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with self._connection(writer):
+        with connected(writer, self._connections):
             session = RtdeSession(self.robot, self._rate_hz, self.faults)
             self._rtde[writer] = session
             try:
@@ -136,7 +137,7 @@ class Controller:
                 del self._rtde[writer]
 
     async def _serve_scripts(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with self._connection(writer):
+        with connected(writer, self._connections):
             text = bytearray()
             while data := await reader.read(65536):
                 text += data
@@ -149,7 +150,7 @@ class Controller:
                     text.clear()
 
     async def _serve_dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with self._connection(writer):
+        with connected(writer, self._connections):
             if "mute-dashboard" not in self.faults:
                 self._send(writer, BANNER.encode() + b"\n")
             while line := await reader.readline():
@@ -188,16 +189,3 @@ class Controller:
             case "close popup" | "close safety popup":
                 return request.replace("close", "closing")
         return f"could not understand: '{request}'"
-
-    @contextmanager
-    def _connection(self, writer: asyncio.StreamWriter) -> Iterator[None]:
-        """Register an open connection, and end quietly when the peer breaks it."""
-        task = asyncio.current_task()
-        self._connections[task] = writer
-        try:
-            yield
-        except ConnectionError:
-            pass
-        finally:
-            del self._connections[task]
-            writer.close()

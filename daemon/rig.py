@@ -25,8 +25,7 @@ from shearloop.drivers.calibration_files import load_calibration
 from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.load_cell import LoadCalibration
-from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
-from shearloop.drivers.robotiq.messages import RobotiqConnection
+from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.ur.client import missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
@@ -40,7 +39,7 @@ def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
     return load_calibration(config.calibration, LoadCalibration)
 
 
-def make_gripper_client(config: GripperConfig) -> RobotiqConnection:
+def make_gripper_client(config: GripperConfig) -> RobotiqClient:
     """Return the gripper's client, not connected yet."""
     if config.socket is not None:
         return SocketClient(config.socket.host, config.socket.port)

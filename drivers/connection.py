@@ -9,7 +9,7 @@ import errno
 import os
 import select
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -303,7 +303,7 @@ def _without_digits(text: str) -> str:
     return "".join(letter for letter in text if not letter.isdigit())
 
 
-class Link(ABC):
+class Link(contextlib.AbstractContextManager["Link", None]):
     """Keeps a device connected: finds it, opens it, and reopens it after a loss.
 
     Use it as a context, which closes the port at the end. `port` is the open port or None.
@@ -316,10 +316,6 @@ class Link(ABC):
     @abstractmethod
     async def _connect(self) -> Port:
         """Open the port once; DriverError if that fails."""
-
-    def __enter__(self) -> Self:
-        """Return the link, not yet open."""
-        return self
 
     def __exit__(self, *_: object) -> None:
         """Close the port."""

@@ -5,7 +5,7 @@ import math
 import time
 from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
 from functools import partial
-from typing import Self, TypeVar
+from typing import TYPE_CHECKING, Self, TypeAlias, TypeVar
 
 import numpy as np
 from pydantic import model_validator
@@ -15,7 +15,13 @@ from shearloop.drivers.connection import Diagnostics, LinkMonitor
 from shearloop.drivers.errors import DeviceCalibrationError, DriverError
 from shearloop.drivers.robotiq import messages
 
+if TYPE_CHECKING:
+    from shearloop.drivers.robotiq.modbus_client import ModbusClient
+    from shearloop.drivers.robotiq.socket_client import SocketClient
+
 T = TypeVar("T")
+# Each of its calls has a deadline; DeviceLostError closes the connection.
+RobotiqClient: TypeAlias = "SocketClient | ModbusClient"
 
 COUNTS_MAX = 255
 STROKE_MM = 140.0
@@ -116,7 +122,7 @@ class RobotiqGripper:
 
     def __init__(
         self,
-        client: messages.RobotiqConnection,
+        client: RobotiqClient,
         calibration: WidthCalibration,
         *,
         poll_s: float = POLL_S,

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from enum import Enum, IntEnum
-from typing import Protocol
 
 from shearloop.drivers.errors import DriverError
 
@@ -116,26 +115,6 @@ class GripperMove:
 
 
 Request = GripperAction | GripperMove
-
-
-class RobotiqConnection(Protocol):
-    """A connection to the gripper. Each call has a deadline; DeviceLostError closes the connection."""
-
-    @property
-    def name(self) -> str:
-        """The gripper's address, for messages."""
-
-    async def connect(self) -> None:
-        """Open the connection."""
-
-    async def close(self) -> None:
-        """Close the connection; closing twice is allowed."""
-
-    async def read(self) -> Readout:
-        """Return the status registers."""
-
-    async def write(self, request: Request) -> None:
-        """Send a request and wait for its acknowledgement; the status shows its effect."""
 
 
 @dataclass(frozen=True, slots=True)

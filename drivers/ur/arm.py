@@ -14,8 +14,8 @@ import rtde_control
 import script_client
 
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.ur.control_box import ProbeError, RtdeReceiver, SampleAge, ScriptReadiness, ask_dashboard
-from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, WristSpeed
+from shearloop.drivers.ur.control_box import RtdeReceiver, SampleAge, ScriptReadiness, ask_dashboard
+from shearloop.drivers.ur.messages import MoveLinear, RobotLostError, RtdeSample, WristSpeed
 from shearloop.drivers.ur.script import NO_MOTION_S, guard_script
 from shearloop.drivers.ur.settings import UrSettings
 
@@ -33,13 +33,13 @@ class UrArm:
 
         Raises:
             RuntimeError: ur-rtde failed.
-            ProbeError: the controller does not send its state, or ur-rtde's script is unknown.
+            RobotLostError: the controller does not send its state, or ur-rtde's script is unknown.
         """
         self._settings = settings
         major, minor = map(int, version.split(".")[:2])
         self._script = guard_script(script_client.ScriptClient("", major, minor).getScript(), settings)
         if not self._script:
-            raise ProbeError(
+            raise RobotLostError(
                 "version",
                 "The control script of the installed ur-rtde is unknown, so that its limits cannot be added: install "
                 "ur-rtde 1.6.5.",

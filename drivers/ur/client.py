@@ -14,15 +14,14 @@ from collections import Counter
 from collections.abc import Coroutine
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 from shearloop.drivers.connection import Diagnostics, LinkMonitor
-from shearloop.drivers.errors import DeviceLostError, ProtocolError
+from shearloop.drivers.errors import ProtocolError
 from shearloop.drivers.ur import messages
-from shearloop.drivers.ur.control_box import silent_sentence, untested_sentence
+from shearloop.drivers.ur.control_box import silent_sentence
+from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.settings import UrSettings
-
-LossKind = messages.FailureKind | Literal["crashed", "hung", "garbled"]
 
 # A disconnecting worker stops the arm (1 s) and ends the program; after this time it is killed.
 EXIT_S = 3.0
@@ -34,14 +33,6 @@ CONTROLLING = "controlling"
 LAST_WORDS_BYTES, LAST_WORDS_LINES = 1024, 8
 # Interval of the checks for a silent worker.
 WATCH_S = 0.1
-
-
-class LostError(DeviceLostError):
-    """The worker has to be replaced; `kind` says why."""
-
-    def __init__(self, kind: LossKind, sentence: str) -> None:
-        super().__init__(sentence)
-        self.kind: LossKind = kind
 
 
 def missing_library() -> str:
@@ -74,7 +65,7 @@ class UrRobot:
         self._connection: WorkerConnection | None = None
         self._replies: dict[int, asyncio.Future[messages.CommandReply]] = {}
         self._number = 0
-        self._version = ""
+        self._warning = ""
         # Those who wait for the next state.
         self._waiting: list[asyncio.Future[messages.RobotState]] = []
 
@@ -114,7 +105,7 @@ class UrRobot:
         while True:
             try:
                 await self._run_worker()
-            except LostError as loss:
+            except RobotLostError as loss:
                 self.losses[loss.kind] += 1
                 pause_s = self.monitor.failed(loss, time.monotonic_ns())
                 # Only an update of the controller changes its version.
@@ -147,9 +138,8 @@ class UrRobot:
                 before, self.state = self.state, message
                 self.states += 1
                 if before is None:
-                    untested = untested_sentence(self._version) if self._version else ""
                     connected = f"The robot at {self.settings.host} is connected."
-                    said = (connected, untested, self.settings.warning, message.blocked)
+                    said = (connected, self._warning, self.settings.warning, message.blocked)
                     self.monitor.connected(" ".join(filter(None, said)), time.monotonic_ns())
                 waiting, self._waiting = self._waiting, []
                 for one in waiting:
@@ -159,10 +149,10 @@ class UrRobot:
                 replied = self._replies.pop(number, None)
                 if replied is not None and not replied.done():
                     replied.set_result(message)
-            case messages.ControllerVersion():
-                self._version = message.version
+            case messages.WorkerPhase():
+                self._warning = message.warning
             case messages.Failed():
-                raise LostError(message.kind, message.sentence)
+                raise RobotLostError(message.kind, message.sentence)
 
 
 class WorkerConnection(asyncio.SubprocessProtocol):
@@ -212,7 +202,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
                 self._robot.handle_message(number, message)
         except ProtocolError as error:
             self._kill()
-            self._closed.set_result(LostError("garbled", str(error)))
+            self._closed.set_result(RobotLostError("garbled", str(error)))
         except Exception as error:  # noqa: BLE001 - raised again by `listen`
             self._closed.set_result(error)
 
@@ -226,12 +216,12 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         """Wait for the end of the connection; kill a worker that is silent.
 
         Raises:
-            LostError: always, in the end.
+            RobotLostError: always, in the end.
         """
         while not self._closed.done():
             if time.monotonic() - self._received_s > self._timeout_s:
                 self._kill()
-                raise LostError("hung", self._hung_sentence(self._timeout_s))
+                raise RobotLostError("hung", self._hung_sentence(self._timeout_s))
             await asyncio.wait([self._closed], timeout=WATCH_S)
         error = self._closed.result()
         raise error if error is not None else self._died()
@@ -255,14 +245,14 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         with contextlib.suppress(ProcessLookupError):
             self._process.kill()
 
-    def _died(self) -> LostError:
+    def _died(self) -> RobotLostError:
         status = self._process.get_returncode() or 0
         if status == -signal.SIGALRM:
-            return LostError("hung", self._hung_sentence(self._settings.hang_timeout_s))
+            return RobotLostError("hung", self._hung_sentence(self._settings.hang_timeout_s))
         end = f"died of {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
         # ur-rtde crashes like this when it loses the controller.
         cause = ": it lost the controller" if -status in (signal.SIGSEGV, signal.SIGABRT) else ""
-        return LostError(
+        return RobotLostError(
             "crashed",
             f"The robot's process {end} while {self._activity}{cause}. The robot's watchdog ends the motion; the "
             f"process is started again with motion disabled.{self._last_words()}",

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from shearloop.drivers.errors import DriverError, ProtocolError, system_reason
-from shearloop.drivers.ur.messages import RUNTIME_PLAYING, FailureKind, RtdeOutputs
+from shearloop.drivers.ur.messages import RUNTIME_PLAYING, RobotLostError, RtdeOutputs
 from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER
 
 RTDE_PORT, DASHBOARD_PORT = 30004, 29999
@@ -61,14 +61,6 @@ _READ_BYTES = 1 << 15
 _OFFSET_RISE = 1e-2
 
 
-class ProbeError(DriverError):
-    """The controller cannot be used; `kind` says why."""
-
-    def __init__(self, kind: FailureKind, sentence: str) -> None:
-        super().__init__(sentence)
-        self.kind: FailureKind = kind
-
-
 @dataclass(frozen=True, slots=True)
 class ControllerInfo:
     """A controller's mode. `remote` is None where the controller has no remote mode (CB series)."""
@@ -84,7 +76,7 @@ def probe_controller(host: str, timeout_s: float) -> str:
     """Return the controller's version, as 5.17.3.0, after agreeing on protocol 2.
 
     Raises:
-        ProbeError: it is not there, stays silent, refuses the protocol, or its version is not supported.
+        RobotLostError: it is not there, stays silent, refuses the protocol, or its version is not supported.
     """
     with (
         explain_failure(host, timeout_s, "greeting it"),
@@ -95,13 +87,13 @@ def probe_controller(host: str, timeout_s: float) -> str:
         accepted = _agree_on_protocol(connection)
     version = ".".join(map(str, numbers))
     if numbers[0] not in OLDEST or numbers < OLDEST[numbers[0]]:
-        raise ProbeError(
+        raise RobotLostError(
             "version",
             f"The UR controller at {host} has PolyScope {version}, which cannot be driven; install PolyScope 3.10 "
             "(CB3) or 5.4 (e-Series), or a newer 3.x or 5.x, and restart the daemon.",
         )
     if not accepted:
-        raise ProbeError(
+        raise RobotLostError(
             "protocol",
             f"The UR controller at {host} refuses version 2 of the RTDE protocol. Restart the controller; the daemon "
             "tries again.",
@@ -160,23 +152,23 @@ def ask_dashboard(host: str, timeout_s: float, requests: tuple[str, ...]) -> lis
 
 @contextmanager
 def explain_failure(host: str, timeout_s: float, activity: str) -> Iterator[None]:
-    """Turn a failed or unanswered exchange with the controller into a ProbeError."""
+    """Turn a failed or unanswered exchange with the controller into a RobotLostError."""
     try:
         yield
     except TimeoutError as error:
-        raise ProbeError("silent", silent_sentence(host, timeout_s, activity)) from error
+        raise RobotLostError("silent", silent_sentence(host, timeout_s, activity)) from error
     except (OSError, struct.error) as error:
         reason = system_reason(error) if isinstance(error, OSError) else "it does not answer as one"
-        raise ProbeError(
+        raise RobotLostError(
             "unreachable",
             f"No UR controller at {host}: {reason}. Check that it is switched on and that this computer is in its "
             "network (Settings → System → Network at the teach pendant).",
         ) from error
 
 
-def registers_in_use(host: str) -> ProbeError:
+def registers_in_use(host: str) -> RobotLostError:
     """Return the error about input registers that another client writes."""
-    return ProbeError(
+    return RobotLostError(
         "registers-in-use",
         f"The input registers of the robot at {host} are already in use by another RTDE client, EtherNet/IP or "
         "PROFINET: end the other program, or disable the adapter under Installation → Fieldbus.",
@@ -262,7 +254,7 @@ class RtdeReceiver:
         """Connect and wait for the first sample.
 
         Raises:
-            ProbeError: the controller is absent or silent, does not send the outputs, or our register is in use.
+            RobotLostError: the controller is absent or silent, does not send the outputs, or our register is in use.
         """
         self._host = host
         self._parser = SampleParser()

@@ -10,11 +10,14 @@ from typing import ClassVar, Final, Literal, get_args
 
 from pydantic import TypeAdapter
 
-from shearloop.drivers.errors import ProtocolError
+from shearloop.drivers.errors import DeviceLostError, ProtocolError
 from shearloop.drivers.ur.settings import Six, Three, UrSettings
 
 MotionKind = Literal["idle", "wrist", "linear", "stopping"]
-FailureKind = Literal["unreachable", "silent", "protocol", "version", "registers-in-use", "local-control", "lost"]
+FailureKind = Literal[
+    "unreachable", "silent", "protocol", "version", "registers-in-use", "local-control", "lost", "crashed", "hung",
+    "garbled",
+]  # fmt: skip
 
 # `RobotState.end_reason` of a motion that ended as commanded; any other reason is a sentence.
 ARRIVED: Final = "arrived"
@@ -36,6 +39,14 @@ SAFETY_NORMAL: Final = 1
 SAFETY_REDUCED: Final = 2
 SAFETY_PROTECTIVE_STOP: Final = 3
 SAFETY_EMERGENCY_STOPS: Final = (6, 7)
+
+
+class RobotLostError(DeviceLostError):
+    """The robot cannot be driven, or its worker has to be replaced; `kind` says why."""
+
+    def __init__(self, kind: FailureKind, sentence: str) -> None:
+        super().__init__(sentence)
+        self.kind: FailureKind = kind
 
 
 class _Finite:
@@ -237,16 +248,13 @@ class Heartbeat:
 
 @dataclass(frozen=True, slots=True)
 class WorkerPhase:
-    """What the worker is about to do; sent first, because it may hang or crash there."""
+    """What the worker is about to do; sent first, because it may hang or crash there.
+
+    `warning` is what the operator has to know of the controller.
+    """
 
     activity: str
-
-
-@dataclass(frozen=True, slots=True)
-class ControllerVersion:
-    """The controller's version, as 5.17.3.0."""
-
-    version: str
+    warning: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,7 +266,7 @@ class Failed:
 
 
 # The settings are the first message to the worker.
-Message = Command | CommandReply | RobotState | UrSettings | Heartbeat | WorkerPhase | ControllerVersion | Failed
+Message = Command | CommandReply | RobotState | UrSettings | Heartbeat | WorkerPhase | Failed
 
 # The largest message, a state with every reason for clipping, has about 2 kB.
 LARGEST_MESSAGE: Final = 1 << 16

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, NoReturn
 
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.control_box import ProbeError, ask_dashboard, probe_controller, registers_in_use
+from shearloop.drivers.ur.control_box import ask_dashboard, probe_controller, registers_in_use, untested_sentence
+from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.motion import why_unfit
 from shearloop.drivers.ur.settings import UrSettings
 
@@ -94,6 +95,9 @@ def main() -> NoReturn:
         if settings is None:
             _exit(EXIT_DONE)
         _control(pipe, settings, _connect(pipe, settings))
+    except RobotLostError as error:
+        pipe.send(messages.Failed(error.kind, str(error)))
+        _exit(EXIT_FAILED)
     except Exception:  # noqa: BLE001 - printed, and the process exits all the same
         traceback.print_exc()
         _exit(EXIT_FAILED)
@@ -117,25 +121,23 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
     try:
         pipe.send(messages.WorkerPhase("greeting the controller"))
         version = probe_controller(host, settings.connect_timeout_s / 4)
-        pipe.send(messages.ControllerVersion(version))
         # To a silent dashboard, ur-rtde says "Operation canceled".
         ask_dashboard(host, settings.connect_timeout_s / 4, ("PolyscopeVersion",))
-        pipe.send(messages.WorkerPhase("connecting"))
+        pipe.send(messages.WorkerPhase("connecting", untested_sentence(version)))
         return UrArm(settings, version)
-    except ProbeError as error:
-        _fail(pipe, error.kind, str(error))
     except RuntimeError as error:
         text = str(error)
         if "already in use" in text:
-            _fail(pipe, "registers-in-use", str(registers_in_use(host)))
+            raise registers_in_use(host) from error
         if "remote control" in text:
-            _fail(
-                pipe,
+            raise RobotLostError(
                 "local-control",
                 f"The robot at {host} is in local control: switch it to remote control, top right on the teach "
                 "pendant.",
-            )
-        _fail(pipe, "unreachable", f"The connection to the robot at {host} failed: ur-rtde says “{text.strip()}”.")
+            ) from error
+        raise RobotLostError(
+            "unreachable", f"The connection to the robot at {host} failed: ur-rtde says “{text.strip()}”."
+        ) from error
 
 
 def _control(pipe: Pipe, settings: UrSettings, arm: "UrArm") -> NoReturn:
@@ -146,7 +148,7 @@ def _control(pipe: Pipe, settings: UrSettings, arm: "UrArm") -> NoReturn:
         _set_alarm(settings.hang_timeout_s)
         sample = arm.read()
         if not sample.connected or sample.age_ns > 3 * settings.state_timeout_s * 1e9:
-            _fail(pipe, "lost", why_unfit(sample, settings))
+            raise RobotLostError("lost", why_unfit(sample, settings))
         _handle_commands(pipe, handler, sample)
         if not pipe.open and not handler.leaving:
             handler.request(0, messages.Disconnect(), sample, time.monotonic_ns())
@@ -186,11 +188,6 @@ def _handle_commands(pipe: Pipe, handler: CommandHandler, sample: messages.RtdeS
 
 def _set_alarm(seconds: float) -> None:
     signal.setitimer(signal.ITIMER_REAL, seconds)
-
-
-def _fail(pipe: Pipe, kind: messages.FailureKind, sentence: str) -> NoReturn:
-    pipe.send(messages.Failed(kind, sentence))
-    _exit(EXIT_FAILED)
 
 
 def _exit(status: int) -> NoReturn:

@@ -37,15 +37,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Grip each object and write the calibration."""
     from shearloop.drivers.calibration_files import save_calibration
-    from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
-    from shearloop.drivers.robotiq.messages import RobotiqConnection
+    from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper, WidthCalibration
     from shearloop.drivers.robotiq.modbus_client import ModbusClient
     from shearloop.drivers.robotiq.socket_client import SocketClient
 
     if len(set(args.diameter_mm)) < 2:
         raise UserError("give at least two different --diameter-mm")
     check_calibration_file(args.out)
-    client: RobotiqConnection
+    client: RobotiqClient
     if args.host is not None:
         client = SocketClient(args.host, args.socket_port)
     else:

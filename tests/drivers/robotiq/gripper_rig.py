@@ -17,7 +17,6 @@ from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.emulators.gripper import Gripper, ModbusSlave, UrcapSession
 from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
-from shearloop.drivers.robotiq.messages import RobotiqConnection
 from shearloop.drivers.robotiq.modbus_client import ModbusClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from tests.running import LinkEvents
@@ -54,7 +53,6 @@ async def a_rig(
     """A gripper and its driver; `reply_deadline_s` is long, because a busy computer delays replies."""
     model = Gripper()
     server: Server
-    client: RobotiqConnection
     if way == "socket":
         socket = server = SocketServer(UrcapSession(model))
         await socket.restore()

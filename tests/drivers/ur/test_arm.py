@@ -11,8 +11,7 @@ from typing import ClassVar
 
 import pytest
 
-from shearloop.drivers.ur.control_box import ProbeError
-from shearloop.drivers.ur.messages import MoveLinear, RtdeOutputs, WristSpeed
+from shearloop.drivers.ur.messages import MoveLinear, RobotLostError, RtdeOutputs, WristSpeed
 from shearloop.drivers.ur.script import NO_MOTION_S
 from tests.drivers.ur.flight import SETTINGS, received
 
@@ -148,7 +147,7 @@ def test_sent_script_arms_its_watchdog(arm, monkeypatch):
 def test_unknown_script_is_refused(arm):
     """Without its deadline the wrist could turn on."""
     Client.answers["getScript"] = "of another form\n"
-    with pytest.raises(ProbeError, match="unknown, so that its limits"):
+    with pytest.raises(RobotLostError, match="unknown, so that its limits"):
         arm.UrArm(SETTINGS, VERSION)
 
 

@@ -12,8 +12,8 @@ import pytest
 
 from shearloop.drivers.connection import LinkObserver
 from shearloop.drivers.ur.client import UrRobot
-from shearloop.drivers.ur.control_box import ProbeError, probe_controller
-from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed, ZeroForceTorque
+from shearloop.drivers.ur.control_box import probe_controller
+from shearloop.drivers.ur.messages import Enable, MoveLinear, RobotLostError, Stop, Unlock, WristSpeed, ZeroForceTorque
 from shearloop.drivers.ur.settings import InstalledTool
 from tests.drivers.ur.robots import ROOT, enable, pid_of, running, settings_for, until
 from tests.emulator_process import EmulatorProcess as ControllerProcess
@@ -238,7 +238,7 @@ async def test_connection_that_is_refused_is_explained(controller, link, fault, 
 async def test_unsupported_controller_does_not_restart_the_worker(controller, link):
     for version in ("5.0.0.0", "3.9.1.0", "10.7.0.0", "5.3.9.0"):
         await controller.fault(f"version {version}")
-        with pytest.raises(ProbeError, match=f"has PolyScope {version}, which cannot be driven"):
+        with pytest.raises(RobotLostError, match=f"has PolyScope {version}, which cannot be driven"):
             await asyncio.to_thread(probe_controller, controller.host, 5.0)
     async with running(settings_for(controller.host), link) as robot:
         await link.down()

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from shearloop.drivers.ur.client import LAST_WORDS_BYTES, LostError, UrRobot, WorkerConnection
-from shearloop.drivers.ur.messages import Failed, Stop, encode
+from shearloop.drivers.ur.client import LAST_WORDS_BYTES, UrRobot, WorkerConnection
+from shearloop.drivers.ur.messages import Failed, RobotLostError, Stop, encode
 from tests.drivers.ur.flight import SETTINGS
 from tests.drivers.ur.robots import ROOT, running, settings_for
 
@@ -125,7 +125,7 @@ async def test_worker_lost_during_shutdown_is_not_restarted(play, monkeypatch):
         assert not listened, "it was started again"
         listened.append(conversation)
         run.cancel()
-        raise LostError("crashed", "The robot's process died.")
+        raise RobotLostError("crashed", "The robot's process died.")
 
     monkeypatch.setattr(WorkerConnection, "listen", listen)
     run = asyncio.create_task(UrRobot(settings_for("127.0.0.254")).run())

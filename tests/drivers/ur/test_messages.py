@@ -38,8 +38,7 @@ states = st.builds(
 messages = st.one_of(
     st.sampled_from([wire.Enable(), wire.Unlock(), wire.ZeroForceTorque(), wire.Disconnect(), wire.Heartbeat()]),
     wrist, line, stop, states, st.just(UrSettings(host="10.0.0.1", limits=LIMITS)),
-    st.builds(wire.CommandReply, st.text(), sent, reasons), st.builds(wire.WorkerPhase, st.text()),
-    st.builds(wire.ControllerVersion, st.text()),
+    st.builds(wire.CommandReply, st.text(), sent, reasons), st.builds(wire.WorkerPhase, st.text(), st.text()),
     st.builds(wire.Failed, st.sampled_from(["lost", "silent"]), st.text()),
 )  # fmt: skip
 numbered = st.lists(st.tuples(st.integers(0, 2**32 - 1), messages), max_size=5)

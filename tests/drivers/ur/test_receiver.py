@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from shearloop.drivers.errors import ProtocolError
 from shearloop.drivers.ur import control_box as receiver_module
-from shearloop.drivers.ur.control_box import ProbeError, RtdeReceiver, SampleParser
-from shearloop.drivers.ur.messages import RtdeOutputs
+from shearloop.drivers.ur.control_box import RtdeReceiver, SampleParser
+from shearloop.drivers.ur.messages import RobotLostError, RtdeOutputs
 
 TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,INT32,DOUBLE"
 TOOL_TYPES = TYPES + b",DOUBLE,VECTOR3D,VECTOR6D"
@@ -215,5 +215,5 @@ def test_network_error_is_a_lost_connection(play, number):
 )
 def test_controller_without_the_needed_outputs_is_refused(play, answers, refusal):
     play(*answers)
-    with pytest.raises(ProbeError, match=refusal):
+    with pytest.raises(RobotLostError, match=refusal):
         RtdeReceiver("127.0.0.1", 125.0, 5.0)

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import os
+import re
 import signal
 import sys
 import time
@@ -17,6 +18,7 @@ from shearloop.drivers.ur.messages import Enable, MoveLinear, RobotLostError, St
 from shearloop.drivers.ur.settings import InstalledTool
 from tests.drivers.ur.robots import ROOT, enable, pid_of, running, settings_for, until
 from tests.emulator_process import EmulatorProcess as ControllerProcess
+from tests.emulator_process import Event
 
 pytestmark = pytest.mark.real_time
 
@@ -46,8 +48,11 @@ async def turning(
         yield robot
 
 
-def stopped_after_s(event: dict[str, int], since_ns: int) -> float:
-    return (event["t_mono_ns"] - since_ns) / 1e9
+async def stops(controller: ControllerProcess, since_ns: int, within_s: float = STOPPED_WITHIN_S) -> Event:
+    """Wait until the motion has stopped, and return when; it has to be in time."""
+    stopped = await controller.event("motion-stopped", since_ns)
+    assert (stopped["t_mono_ns"] - since_ns) / 1e9 <= within_s
+    return stopped
 
 
 async def test_states_arrive_and_replies_hold_the_sent_command(controller):
@@ -108,23 +113,34 @@ async def test_state_comes_125_times_a_second_with_the_controllers_own_time(cont
         assert sorted(states, key=lambda state: state.timestamp_s) == states
 
 
-async def test_twist_stops_when_the_client_is_killed(controller, link):
-    end = signal.SIGSEGV
-    async with turning(controller, link) as robot:
-        killed_ns = time.monotonic_ns()
-        os.kill(pid_of(robot), end)
-        stopped = await controller.event("motion-stopped", killed_ns)
-        assert stopped_after_s(stopped, killed_ns) <= STOPPED_WITHIN_S
-        loss = await link.down()
-        assert end.name in loss.sentence
-        assert "motion disabled" in loss.sentence
-        assert robot.losses == {"crashed": 1}
+@pytest.mark.parametrize(
+    ("cause", "kinds", "said"),
+    [
+        (signal.SIGSEGV, {"crashed"}, "SIGSEGV.*motion disabled"),
+        (signal.SIGSTOP, {"hung"}, "did not answer.*motion disabled"),
+        # What comes first is up to the client: our look at its connection, or its crash or hang in reconnecting.
+        ("drop-rtde", {"lost", "crashed", "hung"}, ""),
+    ],
+    ids=["killed", "hung", "lost"],
+)
+async def test_twist_stops_with_its_worker_and_the_next_worker_moves_nothing(controller, link, cause, kinds, said):
+    async with turning(controller, link, hang_timeout_s=0.3) as robot:
+        since_ns = time.monotonic_ns()
+        if isinstance(cause, str):
+            await controller.fault(cause)
+        else:
+            os.kill(pid_of(robot), cause)
+        stopped = await stops(controller, since_ns)
+        unanswered = robot.send(Stop(1.0)) if cause is signal.SIGSTOP else None
+        assert re.search(said, (await link.down()).sentence)
+        assert robot.losses.keys() <= kinds
+        assert unanswered is None or "ended before it answered" in (await unanswered).refusal
 
         state = await until(robot, lambda state: state.program_running and not state.recovering)
         assert "not been enabled" in state.blocked
         assert "not been enabled" in (await robot.send(WristSpeed(0.1, 1.0))).refusal
         await controller.event("watchdog-armed", stopped["t_mono_ns"])
-        assert not controller.happened("motion-started", killed_ns), "a second motion"
+        assert not controller.happened("motion-started", since_ns), "a second motion"
         await enable(robot)
         await turn(robot, controller)
 
@@ -135,8 +151,7 @@ async def test_stalled_samples_end_the_motion(controller):
         stalled_ns = await controller.fault(f"silence {robot.settings.state_timeout_s + 0.04}")
         # Wanted until the data are no longer believed.
         assert (await robot.send(WristSpeed(0.5, 4.0))).accepted
-        stopped = await controller.event("motion-stopped", stalled_ns)
-        assert stopped_after_s(stopped, stalled_ns) <= robot.settings.state_timeout_s + STOPPED_WITHIN_S
+        await stops(controller, stalled_ns, robot.settings.state_timeout_s + STOPPED_WITHIN_S)
         state = await until(robot, lambda state: state.age_ns < 100_000_000)
         assert state.blocked
         assert (await robot.send(Unlock())).accepted
@@ -174,40 +189,11 @@ async def test_emergency_stop_is_reported_and_recovered_from(controller):
         await turn(robot, controller)
 
 
-async def test_lost_rtde_ends_the_worker_and_the_next_moves_nothing(controller, link):
-    async with turning(controller, link) as robot:
-        dropped_ns = await controller.fault("drop-rtde")
-        stopped = await controller.event("motion-stopped", dropped_ns)
-        assert stopped_after_s(stopped, dropped_ns) <= STOPPED_WITHIN_S
-        # What comes first is up to the client: our look at its connection, or its crash or hang in reconnecting.
-        await link.down()
-        assert robot.losses.keys() <= {"lost", "crashed", "hung"}
-        await until(robot, lambda state: state.program_running and not state.recovering)
-        assert "not been enabled" in (await robot.send(WristSpeed(0.5, 4.0))).refusal
-        await enable(robot)
-        assert not controller.happened("motion-started", dropped_ns)
-
-
-async def test_hung_worker_is_replaced(controller, link):
-    async with turning(controller, link, hang_timeout_s=0.3) as robot:
-        hung_ns = time.monotonic_ns()
-        os.kill(pid_of(robot), signal.SIGSTOP)
-        stopped = await controller.event("motion-stopped", hung_ns)
-        assert stopped_after_s(stopped, hung_ns) <= STOPPED_WITHIN_S
-        unanswered = robot.send(Stop(1.0))
-        await link.down()
-        assert robot.losses == {"hung": 1}
-        assert "ended before it answered" in (await unanswered).refusal
-        await enable(robot)
-        assert not controller.happened("motion-started", hung_ns)
-
-
 async def test_silent_controller_is_reported_and_the_robot_stops(controller, link):
     async with turning(controller, link, connect_timeout_s=1.5) as robot:
         silent_ns = await controller.fault("silence 3600")
-        stopped = await controller.event("motion-stopped", silent_ns)
         # Data is believed for state_timeout_s, then the watchdog is no longer kicked.
-        assert stopped_after_s(stopped, silent_ns) <= robot.settings.state_timeout_s + STOPPED_WITHIN_S
+        await stops(controller, silent_ns, robot.settings.state_timeout_s + STOPPED_WITHIN_S)
         assert "old: check its cable" in (await link.down(1)).sentence
         loss = await link.down(2)
         assert robot.losses["silent"] == 1
@@ -327,16 +313,14 @@ async def test_wrist_stops_when_the_daemon_hangs(controller, worker_hangs):
         daemon.send_signal(signal.SIGSTOP)
         if worker_hangs:
             os.kill(worker, signal.SIGSTOP)
-        stopped = await controller.event("motion-stopped", hung_ns)
-        assert stopped_after_s(stopped, hung_ns) <= STOPPED_WITHIN_S
+        await stops(controller, hung_ns)
 
 
 async def test_killed_daemon_leaves_a_resting_robot_and_no_process(controller):
     async with turning_daemon(controller) as (daemon, pid):
         worker, ended, killed_ns = os.pidfd_open(pid), asyncio.Event(), time.monotonic_ns()
         daemon.kill()
-        stopped = await controller.event("motion-stopped", killed_ns)
-        assert stopped_after_s(stopped, killed_ns) <= STOPPED_WITHIN_S
+        await stops(controller, killed_ns)
         asyncio.get_running_loop().add_reader(worker, ended.set)
         async with asyncio.timeout(5):
             await ended.wait()

@@ -4,9 +4,7 @@ import errno
 import math
 import socket
 import struct
-import threading
 from collections.abc import Callable, Iterator
-from typing import Any
 from unittest import mock
 
 import pytest
@@ -14,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.errors import ProtocolError
-from shearloop.drivers.ur import control_box as receiver_module
 from shearloop.drivers.ur.control_box import RtdeReceiver, SampleParser
 from shearloop.drivers.ur.messages import RobotLostError, RtdeOutputs
 
@@ -83,56 +80,38 @@ def test_invalid_package_is_refused(bad):
         SampleParser().feed(bad + bytes(300))
 
 
-class Controller:
-    """A controller's port with scripted answers."""
-
-    def __init__(
-        self, types: tuple[bytes, ...] = (TOOL_TYPES,), started: bytes = b"\x01", inputs: bytes = b"\x01DOUBLE"
-    ) -> None:
-        self._listening = socket.create_server(("127.0.0.1", 0))
-        self.port = self._listening.getsockname()[1]
-        self._answers = {b"V": [b"\x01"], b"O": [b"\x01" + one for one in types], b"I": [inputs], b"S": [started]}
-        self.asked: dict[bytes, bytes] = {}
-        self._thread = threading.Thread(target=self._serve)
-        self._thread.start()
-
-    def _serve(self) -> None:
-        self._peer, _ = self._listening.accept()
-        while any(self._answers.values()):
-            header = self._peer.recv(3, socket.MSG_WAITALL)
-            if not header:
-                return
-            size, kind = struct.unpack(">Hc", header)
-            self.asked[kind] = self._peer.recv(size - 3, socket.MSG_WAITALL)
-            self._peer.sendall(package(kind, self._answers[kind].pop(0)))
-        self._peer.sendall(data(1, tool=self.asked[b"O"].endswith(b"tcp_offset")))
-
-    def receive(self, size: int) -> bytes:
-        self._thread.join()
-        return self._peer.recv(size, socket.MSG_WAITALL)
-
-    def send(self, stream: bytes) -> None:
-        self._thread.join()
-        self._peer.sendall(stream)
-
-    def close(self) -> None:
-        self._thread.join()
-        self._peer.close()
-        self._listening.close()
+Play = Callable[..., socket.socket]
 
 
 @pytest.fixture
-def play(monkeypatch) -> Iterator[Callable[..., Controller]]:
-    played: list[Controller] = []
+def play(monkeypatch) -> Iterator[Play]:
+    """Begin a controller: its end of the next connection, on which the answers and a sample have been sent."""
+    ends: list[socket.socket] = []
 
-    def begin(*answers: Any) -> Controller:
-        played.append(Controller(*answers))
-        monkeypatch.setattr(receiver_module, "RTDE_PORT", played[-1].port)
-        return played[-1]
+    def begin(
+        types: tuple[bytes, ...] = (TOOL_TYPES,), started: bytes = b"\x01", inputs: bytes = b"\x01DOUBLE"
+    ) -> socket.socket:
+        ends.extend(socket.socketpair())
+        *_, controller, client = ends
+        outputs = b"".join(package(b"O", b"\x01" + one) for one in types)
+        answers = package(b"V", b"\x01") + outputs + package(b"I", inputs) + package(b"S", started)
+        controller.sendall(answers + data(1, tool=types[-1] == TOOL_TYPES))
+        monkeypatch.setattr(socket, "create_connection", lambda *_, timeout: client.settimeout(timeout) or client)
+        return controller
 
     yield begin
-    for controller in played:
-        controller.close()
+    for end in ends:
+        end.close()
+
+
+def asked(controller: socket.socket) -> list[tuple[bytes, bytes]]:
+    """Return the kind and the content of each package that the controller has received."""
+    received, found = controller.recv(1 << 16), []
+    while received:
+        size, kind = struct.unpack_from(">Hc", received)
+        found.append((kind, received[3:size]))
+        received = received[size:]
+    return found
 
 
 def arrived(receiver: RtdeReceiver, timestamp_s: float) -> bool:
@@ -145,13 +124,15 @@ def arrived(receiver: RtdeReceiver, timestamp_s: float) -> bool:
 def test_outputs_are_requested_at_the_rate_and_the_newest_kept(play):
     controller = play()
     receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
-    assert controller.asked[b"O"].startswith(struct.pack(">d", 125.0) + b"timestamp,actual_q,")
+    kinds, contents = zip(*asked(controller), strict=True)
+    assert kinds == (b"V", b"O", b"I", b"S")
+    assert contents[1].startswith(struct.pack(">d", 125.0) + b"timestamp,actual_q,")
     assert receiver.latest().timestamp_s == 1.0
-    controller.send(data(2) + data(3) + data(4)[:100])
+    controller.sendall(data(2) + data(3) + data(4)[:100])
     assert arrived(receiver, 3.0)
     assert receiver.latest().timestamp_s == 3.0
     assert not receiver.wait(0.0)
-    controller.send(data(4)[100:])
+    controller.sendall(data(4)[100:])
     assert receiver.wait(5.0)
     assert arrived(receiver, 4.0)
     receiver.close()
@@ -159,11 +140,11 @@ def test_outputs_are_requested_at_the_rate_and_the_newest_kept(play):
 
 
 def test_deadline_is_written_to_its_register(play):
-    controller = play((TOOL_TYPES,), b"\x01", b"\x05DOUBLE")
+    controller = play(inputs=b"\x05DOUBLE")
     receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
-    assert controller.asked[b"I"] == b"input_double_register_24"
+    assert asked(controller)[2] == (b"I", b"input_double_register_24")
     receiver.write_deadline(20.25)
-    assert controller.receive(12) == package(b"U", b"\x05" + struct.pack(">d", 20.25))
+    assert asked(controller) == [(b"U", b"\x05" + struct.pack(">d", 20.25))]
     receiver.close()
     receiver.write_deadline(20.5)
     assert not receiver.connected
@@ -183,7 +164,7 @@ def test_controller_without_payload_and_tool_centre_point_is_accepted(play):
 def test_closed_or_invalid_stream_is_a_lost_connection(play, last):
     controller = play()
     receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
-    controller.send(data(2) + last)
+    controller.sendall(data(2) + last)
     if not last:
         controller.close()
     while receiver.connected:
@@ -208,12 +189,12 @@ def test_network_error_is_a_lost_connection(play, number):
 @pytest.mark.parametrize(
     ("answers", "refusal"),
     [
-        (((TOOL_TYPES.replace(b"UINT32", b"NOT_FOUND"), TYPES.replace(b"UINT32", b"NOT_FOUND")),), "NOT_FOUND"),
-        (((TOOL_TYPES,), b"\x00"), "does not send its state"),
-        (((TOOL_TYPES,), b"\x01", b"\x00IN_USE"), "already in use by another RTDE client"),
+        ({"types": [one.replace(b"UINT32", b"NOT_FOUND") for one in (TOOL_TYPES, TYPES)]}, "NOT_FOUND"),
+        ({"started": b"\x00"}, "does not send its state"),
+        ({"inputs": b"\x00IN_USE"}, "already in use by another RTDE client"),
     ],
 )
 def test_controller_without_the_needed_outputs_is_refused(play, answers, refusal):
-    play(*answers)
+    play(**answers)
     with pytest.raises(RobotLostError, match=refusal):
         RtdeReceiver("127.0.0.1", 125.0, 5.0)

@@ -1,6 +1,7 @@
 import asyncio
 import json
 import signal
+import socket
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
@@ -198,6 +199,13 @@ def collector(daemon: Daemon, topic: str) -> "asyncio.Queue[dict[str, Any]]":
     queue: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
     daemon.publisher.add_listener(lambda name, content: queue.put_nowait(content) if name == topic else None)
     return queue
+
+
+def free_port() -> int:
+    """Return a TCP port of this machine that nobody uses."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def robot_at(host: str, folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Every mistake ends in one sentence that names the file, the key and the cure, and exit status 2."""
+"""The command line: every mistake is one sentence with its cure and status 2; help and `stop` import little."""
 
 import argparse
 import ctypes
@@ -456,3 +456,73 @@ def test_a_missing_robot_library_is_one_sentence(config, command, monkeypatch, m
     said = mistake(command, str(config(robot=str(Path("config/ur.yaml").resolve()))))
     assert "the robot needs the package ur-rtde, which is not installed for Python 3." in said
     assert "-m pip install ur-rtde" in said
+
+
+def completed(script: Path, *words: str) -> set[str]:
+    """Return what bash would offer at the end of a command line."""
+    line = " ".join(f"'{word}'" for word in words)
+    program = (
+        f'source "{script}"; COMP_WORDS=({line}); COMP_CWORD={len(words) - 1}; '
+        'complete -p shearloop >/dev/null || exit 9; _shtab_shearloop "$1"; printf "%s\\n" "${COMPREPLY[@]}"'
+    )
+    done = subprocess.run(["bash", "-c", program], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    return set(done.stdout.split())
+
+
+def test_bash_completes_commands_and_options(tmp_path, ran):
+    script = tmp_path / "shearloop"
+    script.write_text(ran("completion", "bash").out)
+    assert set(COMMANDS) <= completed(script, "shearloop", "")
+    assert completed(script, "shearloop", "do") == {"doctor"}
+    assert "--geometry" in completed(script, "shearloop", "doctor", "--")
+    assert {"server", "client", "allow", "revoke", "list"} <= completed(script, "shearloop", "keys", "")
+
+
+def test_every_shell_has_its_script(ran):
+    for shell in ("zsh", "tcsh"):
+        assert "doctor" in ran("completion", shell).out
+
+
+def test_file_arguments_complete_file_names():
+    config = next(action for action in _command("check")._actions if action.dest == "config")
+    assert getattr(config, "complete", None)
+
+
+def _command(name: str):
+    return next(action for action in full_parser()._actions if action.dest == "command").choices[name]
+
+
+# Each costs tens of megabytes and tenths of a second, and none is needed to run.
+HEAVY = ("scipy.stats", "scipy.optimize", "scipy.spatial", "scipy.interpolate", "skfem", "numba", "matplotlib")
+
+
+def test_the_daemon_imports_no_heavy_modules():
+    says = f"import sys, shearloop.daemon.app; print([name for name in {HEAVY} if name in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", says], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
+
+
+def test_a_stop_imports_little():
+    """On a busy computer, imports are most of the time that `shearloop command stop` takes."""
+    says = """if True:
+        import os, socket, sys, threading
+        import msgpack
+        from shearloop.daemon.cli import main
+        from shearloop.daemon.messaging.stop_client import stop_name
+
+        address = f"ipc:///lean-{os.getpid()}"
+        daemon = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        daemon.bind(stop_name(address))
+
+        def reply():
+            request, client = daemon.recvfrom(1024)
+            assert msgpack.unpackb(request) == {"command": "stop"}
+            daemon.sendto(msgpack.packb({"ok": True, "stopped": "one"}), client)
+
+        threading.Thread(target=reply, daemon=True).start()
+        main(["command", "stop", "--connect", address])
+        print([name for name in ("numpy", "zmq", "asyncio", "structlog", "tqdm") if name in sys.modules])
+    """
+    found = subprocess.run([sys.executable, "-c", says], capture_output=True, text=True, check=True)
+    assert found.stdout == "stop: stopped one\n[]\n"

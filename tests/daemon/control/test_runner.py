@@ -3,11 +3,15 @@
 import asyncio
 from typing import Any
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner
+from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, along_tool
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.errors import ActionError
 from shearloop.daemon.messaging.messages import LoopStop
@@ -352,3 +356,11 @@ async def test_an_experiment_that_is_done_has_no_stop():
         await cell.cycles(10)
         assert cell.phase is ExperimentPhase.DONE
         assert not stops(cell)
+
+
+@given(st.lists(st.floats(-7, 7), min_size=3, max_size=3), st.floats(-1, 1))
+def test_along_tool_moves_along_the_third_axis(turned, distance_m):
+    found = along_tool((0.1, -0.2, 0.3, *turned), distance_m)
+    axis = Rotation.from_rotvec(turned).as_matrix()[:, 2]
+    assert found[:3] == pytest.approx(np.array([0.1, -0.2, 0.3]) + distance_m * axis, abs=1e-12)
+    assert found[3:] == tuple(turned)

@@ -33,8 +33,7 @@ from shearloop.daemon.messaging.stop_client import send_to_stop_socket, stop_nam
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import MAX_DESCRIPTORS
 from shearloop.daemon.supervisor import resident_memory_mb
-from tests.daemon.conftest import DEADLINE_S, running_daemon
-from tests.daemon.web.test_with_keys import free_port
+from tests.daemon.conftest import DEADLINE_S, free_port, running_daemon
 from tests.running import running
 
 DESCRIPTORS, CONNECTIONS = 512, 1200

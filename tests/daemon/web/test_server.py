@@ -1,4 +1,4 @@
-"""The page's server over real sockets: who is answered, what is passed on, what is never done."""
+"""The page's server over real sockets: who is answered, with keys or without, what is passed on, what is never done."""
 
 import asyncio
 import hashlib
@@ -6,6 +6,8 @@ import json
 import os
 import signal
 import socket
+import stat
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
@@ -17,6 +19,8 @@ import aiohttp
 import pytest
 import zmq.asyncio
 from aiohttp import web
+from hypothesis import given
+from hypothesis import strategies as st
 
 from shearloop.daemon.bank_config import FingertipGeometryConfig
 from shearloop.daemon.clock import Clock
@@ -29,8 +33,23 @@ from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.web import server as server_module
 from shearloop.daemon.web.message_store import MessageStore
-from shearloop.daemon.web.server import HEADERS, NEEDS_TOKEN, Bridge, DaemonAddress, listen, make_app, serve
-from tests.daemon.conftest import DEADLINE_S, shearloop
+from shearloop.daemon.web.server import (
+    HEADERS,
+    NEEDS_TOKEN,
+    WRONG_BURST,
+    Bridge,
+    DaemonAddress,
+    TokenCheck,
+    default_token_path,
+    host_allowed,
+    listen,
+    load_token,
+    make_app,
+    origin_allowed,
+    serve,
+    token_valid,
+)
+from tests.daemon.conftest import DEADLINE_S, free_port, running_daemon, shearloop
 from tests.daemon.sample_messages import sample
 
 TOKEN = "the token of this test, long enough for anybody"  # noqa: S105 - opens nothing but this test's page
@@ -92,7 +111,7 @@ async def until(is_so: Callable[[], bool]) -> None:
         await asyncio.sleep(0.001)
 
 
-async def post(page: Served, path: str, **headers: str) -> tuple[int, dict[str, Any]]:
+async def post(page: "Served | Page", path: str, **headers: str) -> tuple[int, dict[str, Any]]:
     async with page.http.post(page.base + path, headers=headers) as response:
         return response.status, await response.json()
 
@@ -300,3 +319,153 @@ async def test_view_prints_its_address_and_ends_on_a_signal(tmp_path):
             assert message.type is aiohttp.WSMsgType.CLOSE
         assert await view.wait() == 0
         assert token.read_text().strip() not in (await view.stdout.read()).decode()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.1:7760", "localhost:9000", "LOCALHOST:1", "[::1]:7760"])
+def test_loopback_hosts_are_allowed_on_any_port(host):
+    assert host_allowed(host)
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        *(None, "", "evil.example", "127.0.0.1.evil.example:7760", "evil.example@127.0.0.1", "localhost.evil.example"),
+        *("192.168.1.5:7760", "0.0.0.0:7760", "127.0.0.1:99999", "[::1", "127.0.0.1/@evil.example", "127.0.0.1:x"),
+    ],
+)
+def test_foreign_hosts_are_refused(host):
+    assert not host_allowed(host)
+
+
+@given(st.text(max_size=40))
+def test_any_host_header_gives_a_boolean(host):
+    assert isinstance(host_allowed(host), bool)
+
+
+def test_foreign_origins_are_refused():
+    assert origin_allowed(None, "127.0.0.1:7760")
+    assert origin_allowed("http://127.0.0.1:7760", "127.0.0.1:7760")
+    for origin in (
+        "null",
+        "",
+        "http://127.0.0.1:7761",
+        "https://127.0.0.1:7760",
+        "http://localhost:7760",
+        "http://a.b",
+    ):
+        assert not origin_allowed(origin, "127.0.0.1:7760"), origin
+
+
+def test_only_the_complete_token_is_valid():
+    assert token_valid("Bearer abc", "abc")
+    for header in (None, "", "abc", "Bearer", "Bearer ", "Bearer ab", "Bearer abcd", "Basic abc", "Bearer äbc"):
+        assert not token_valid(header, "abc"), header
+
+
+def test_the_token_is_made_once_and_readable_by_its_owner_only(tmp_path):
+    path = tmp_path / "state" / "shearloop" / "view-token"
+    token = load_token(path)
+    assert len(token) >= 43
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert load_token(path) == token
+    assert load_token(path, new=True) != token
+
+
+def test_readable_or_invalid_token_files_are_refused(tmp_path):
+    path = tmp_path / "token"
+    load_token(path)
+    path.chmod(0o640)
+    with pytest.raises(UserError, match="nobody else may read"):
+        load_token(path)
+    for content in ("", "short", "x" * 500, "a token with spaces in it, long enough as it is"):
+        path.write_text(content)
+        path.chmod(0o600)
+        with pytest.raises(UserError, match="holds no token"):
+            load_token(path)
+
+
+def test_links_and_pipes_are_refused_as_token_files(tmp_path):
+    load_token(tmp_path / "other")
+    (tmp_path / "link").symlink_to(tmp_path / "other")
+    os.mkfifo(tmp_path / "pipe", 0o600)
+    for name, why in (("link", "cannot be kept"), ("pipe", "must be a file")):
+        with pytest.raises(UserError, match=why):
+            load_token(tmp_path / name)
+
+
+def test_the_default_token_path_follows_xdg(monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", "/state")
+    assert default_token_path() == Path("/state/shearloop/view-token")
+    monkeypatch.setenv("XDG_STATE_HOME", "not/absolute")
+    monkeypatch.setenv("HOME", "/home/somebody")
+    assert default_token_path() == Path("/home/somebody/.local/state/shearloop/view-token")
+
+
+def test_guessing_the_token_is_slowed_to_one_try_per_second():
+    tokens, guesses = TokenCheck("abc"), 1000
+    statuses = [tokens.refusal("start", f"Bearer {number}", number * 1_000_000)[0] for number in range(guesses)]
+    assert Counter(statuses) == {403: WRONG_BURST, 429: guesses - WRONG_BURST}, "1000 guesses in a second"
+    assert tokens.refusal("start", "Bearer abc", 999_000_000)[0] == 429, "the right one waits too"
+    assert tokens.refusal("start", "Bearer abc", 3 * 10**9) is None
+    assert tokens.refusal("start", "Bearer abc", 3 * 10**9) is None, "the right one is never counted"
+
+
+@dataclass
+class Page:
+    """What `shearloop view` serves, asked as a browser asks."""
+
+    http: aiohttp.ClientSession
+    base: str
+    token: str
+
+    async def hears(self) -> bool:
+        """Return whether a message of the daemon comes to the page within two seconds."""
+        async with self.http.ws_connect(f"{self.base}/stream") as stream:
+            async with asyncio.timeout(2.0):
+                async for batch in stream:
+                    if batch.json()["messages"]:
+                        return True
+        return False
+
+
+@pytest.fixture
+def places(keys, ran) -> dict[str, str]:
+    """A daemon's addresses, on the network; its keys, and those of ada, who is allowed, and of eve, who is not."""
+    ran("keys", "client", "--dir", keys / "eve")
+    return {key: f"tcp://0.0.0.0:{free_port()}" for key in ("publish", "commands")}
+
+
+@asynccontextmanager
+async def page_of(places: dict[str, str], folder: Path, who: str | None) -> AsyncIterator[Page]:
+    """Serve a page with somebody's keys, or with none."""
+    near = {key: address.replace("0.0.0.0", "127.0.0.1") for key, address in places.items()}  # noqa: S104
+    words = ["view", "--connect", near["publish"], "--commands", near["commands"], "--port", "0", "--json"]
+    words += ["--token-file", str(folder / f"token-{who}")]
+    if who is not None:
+        words += ["--key", str(folder / who / "client.key_secret"), "--server-key", str(folder / "keys" / "server.key")]
+    async with shearloop(*words) as view, aiohttp.ClientSession() as http:
+        printed = json.loads(await view.stdout.readline())
+        yield Page(http, printed["url"].rstrip("/"), printed["url_with_token"].partition("#token=")[2])
+
+
+async def test_over_the_network_motion_needs_key_and_token_and_stop_neither(config, places, tmp_path):
+    curve = {"server_key": str(tmp_path / "keys/server.key_secret"), "clients": str(tmp_path / "keys/clients")}
+    async with running_daemon(config(**places, curve=curve)) as daemon:
+        async with page_of(places, tmp_path, "ada") as page:
+            assert await page.hears()
+            for command in ("tare", "start", "pause", "resume", "unlock"):
+                assert (await post(page, f"/commands/{command}"))[0] == 403, command
+            bearer = {"Authorization": f"Bearer {page.token}"}
+            assert await post(page, "/commands/tare", **bearer) == (200, {"ok": True, "tared": ["right"]})
+            # It came to the daemon, which has nothing to start.
+            status, reply = await post(page, "/commands/start", **bearer)
+            assert status == 409
+            assert reply["reason"].startswith("no experiment is given")
+            assert await post(page, "/stop") == (200, {"ok": True, "stopped": ""})
+        for who in ("eve", None):
+            async with page_of(places, tmp_path, who) as page:
+                status, reply = await post(page, "/commands/tare", Authorization=f"Bearer {page.token}")
+                assert (status, reply["ok"]) == (503, False), who
+                assert await post(page, "/stop") == (200, {"ok": True, "stopped": ""}), who
+        assert daemon.health.tasks()["commands"]["errors"]["key is not allowed"] >= 1
+        assert not daemon._end.is_set(), "a stop from a page ends what moves, and not the daemon"

@@ -1,4 +1,4 @@
-"""Text that nobody waits for: in order, and quiet where its reader has gone."""
+"""The log: what a device's link says reaches the loop, and text that nobody waits for blocks nobody."""
 
 import io
 import subprocess
@@ -6,7 +6,10 @@ import sys
 import threading
 from contextlib import closing
 
-from shearloop.daemon.logs import NonBlockingWriter
+from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
+from shearloop.daemon.logs import LinkReporter, NonBlockingWriter
+from shearloop.drivers.connection import LinkEvent
 
 PROGRAM = """
 import os, sys
@@ -73,3 +76,17 @@ def test_what_a_terminal_has_no_letters_for_is_spelt_and_what_follows_comes_out(
         outlet.write("0.10 N·m …\n")
         outlet.write("and on\n")
     assert taken.getvalue().splitlines() == [rb"0.10 N\xb7m \u2026", b"and on"]
+
+
+def test_the_control_loop_hears_of_a_lost_device_until_it_returns():
+    loop = ControlLoop(LoopConfig(), {"right": TorqueSource(name="right", period_s=0.5)}, ("robot",))
+    link = LinkReporter("robot", loop)
+    link.on_link_event(LinkEvent(up=False, sentence="the robot's process died", repeated=False))
+    assert "the robot's process died" in " ".join(loop_reasons(loop))
+    link.on_link_event(LinkEvent(up=True, sentence="it is back", repeated=False))
+    assert "the robot's process died" not in " ".join(loop_reasons(loop))
+
+
+def loop_reasons(loop: ControlLoop) -> tuple[str, ...]:
+    loop.tick(0)
+    return loop.status.decision.reasons

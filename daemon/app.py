@@ -14,8 +14,6 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
-from shearloop.daemon.control.loop_runner import ControlLoopRunner
-from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import ClientAuthenticator, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
@@ -23,14 +21,11 @@ from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.recording.recorder import Recorder, daemon_identity
-from shearloop.daemon.rig import Rig, check_experiment, make_gripper, make_loop, robot_settings
+from shearloop.daemon.rig import Rig, build_rig
 from shearloop.daemon.run_summary import RunSummary
-from shearloop.daemon.sensing.frame_estimator import COMBINED, open_combined, open_estimator, torque_sources
-from shearloop.daemon.sensors import Sensors, build_sensors
+from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.daemon.service import notify
 from shearloop.daemon.supervisor import HealthReporter, Reporter, Supervisor, Task, TaskFacts
-from shearloop.drivers.connection import LinkMonitor
-from shearloop.drivers.ur.client import UrRobot
 
 # The end waits this long for the report of an experiment that it has stopped; a dead loop reports none.
 REPORTED_WITHIN_S = 0.2
@@ -78,7 +73,7 @@ class Daemon:
                 self.publisher.add_listener(self.recorder.record_message)
                 opened.callback(self.recorder.close)
             self.health = HealthReporter(self.publisher, self.supervisor, clock)
-            self.sensors, self._rig = _build_rig(config, self.publisher, clock, self.recorder, self.supervisor)
+            self.sensors, self._rig = build_rig(config, self.publisher, clock, self.recorder, self.supervisor)
             self._experiment: ConfiguredExperiment | None = None
             if config.experiment is not None and self._rig is not None:
                 daemon_end = self._end if config.stop_when_done else None
@@ -161,26 +156,6 @@ class Daemon:
     def finished(self) -> bool:
         """Whether the experiment that ends the daemon is done; True without one."""
         return self._experiment is None or self._experiment.finished
-
-
-def _build_rig(
-    config: DaemonConfig, publisher: Publisher, clock: Clock, recorder: Recorder | None, supervisor: Supervisor
-) -> tuple[Sensors, Rig | None]:
-    """Return all sensors, and robot, gripper and control loop, if there is a robot."""
-    estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
-    combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
-    sources = torque_sources(config, estimators, combined)
-    check_experiment(config, sources)
-    if config.robot is None:
-        return build_sensors(config, publisher, clock, recorder, None, estimators, combined, None), None
-    settings = robot_settings(config.robot)
-    loop = make_loop(config, settings, sources, supervisor.dead)
-    gripper = make_gripper(config.gripper, loop, publisher) if config.gripper is not None else None
-    sensors = build_sensors(config, publisher, clock, recorder, loop, estimators, combined, gripper)
-    robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)))
-    runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
-    fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
-    return sensors, Rig(loop, runner, {**fingers, "robot": robot, "loop": runner}, recorder)
 
 
 async def run_daemon(

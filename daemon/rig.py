@@ -1,4 +1,4 @@
-"""The rig: builds gripper, robot and control loop from the configuration, and checks its experiment."""
+"""The rig: builds sensors, gripper, robot and control loop from the configuration, and checks its experiment."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,7 +6,8 @@ from difflib import get_close_matches
 from pathlib import Path
 from types import MappingProxyType
 
-from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control import experiment_schema
 from shearloop.daemon.control.control_loop import ControlLoop
@@ -18,16 +19,27 @@ from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.recorder import AttachedFile, Recorder
 from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
-from shearloop.daemon.sensing.frame_estimator import COMBINED
-from shearloop.daemon.sensing.skin_task import SKIN
-from shearloop.daemon.supervisor import Task
+from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipPipeline, FingertipTask
+from shearloop.daemon.sensing.frame_estimator import (
+    COMBINED,
+    FrameEstimator,
+    open_combined,
+    open_estimator,
+    torque_sources,
+)
+from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
+from shearloop.daemon.sensing.skin_task import SKIN, SKIN_CURRENT, ReplayedSkin, SkinTask
+from shearloop.daemon.sensor_protocols import Tareable
+from shearloop.daemon.supervisor import Supervisor, Task
 from shearloop.drivers.calibration_files import load_calibration
-from shearloop.drivers.connection import LinkMonitor
+from shearloop.drivers.connection import LinkMonitor, SerialLink
+from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.load_cell import LoadCalibration
+from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.socket_client import SocketClient
-from shearloop.drivers.ur.client import missing_library
+from shearloop.drivers.serial_sensor import InputRecorder
+from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.yaml_files import located, read_yaml
 
@@ -103,7 +115,7 @@ def make_gripper(config: GripperConfig, loop: ControlLoop, publisher: Publisher)
 
 @dataclass
 class Rig:
-    """Robot, gripper and the control loop between them, for the operator's experiments; sensors are in `sensors.py`.
+    """Robot, gripper and the control loop between them, for the operator's experiments.
 
     `tasks` are by their names in `health`.
     """
@@ -121,6 +133,85 @@ class Rig:
         if reason is None and self.recorder is not None:
             self.recorder.record_experiment(file.name, attached, file.tool_mm)
         return reason
+
+
+@dataclass(frozen=True, slots=True)
+class Sensors:
+    """All configured sensors; no device is open yet.
+
+    `tasks` are by their names in `health`; `tareable` is everything that has a zero.
+    """
+
+    tasks: Mapping[str, Task]
+    tareable: Mapping[str, Tareable]
+    combined: CombinedFingertips | None
+
+
+def build_sensors(
+    config: DaemonConfig,
+    publisher: Publisher,
+    clock: Clock,
+    recorder: Recorder | None,
+    loop: ControlLoop | None,
+    estimators: Mapping[str, FrameEstimator],
+    combined: FrameEstimator | None,
+    gripper: GripperTask | None,
+) -> Sensors:
+    """Return all sensors, which publish, are recorded, and drive the control loop, where there is one.
+
+    The gripper gives the held tool, and receives the fingertips' diameters.
+    """
+
+    def inputs(source: str) -> InputRecorder | None:
+        return recorder.input_recorder(source) if recorder is not None else None
+
+    def link(name: str, device: SerialDevice) -> SerialLink:
+        return SerialLink(**device.model_dump(), monitor=LinkMonitor(LinkReporter(name, loop)))
+
+    def pipeline(name: str, estimator: FrameEstimator) -> FingertipPipeline:
+        return FingertipPipeline(name, estimator, publisher, clock, loop, gripper, inputs(name))
+
+    pairs: CombinedFingertips | None = None
+    if combined is not None:
+        period_s = config.fingertips[combined.calibration.sides[0]].frame_period_s
+        pairs = CombinedFingertips(pipeline(COMBINED, combined), period_s)
+    tasks: dict[str, Task] = {}
+    tareable: dict[str, Tareable] = {}
+    for name, estimator in estimators.items():
+        own, tareable[name] = config.fingertips[name], (estimates := pipeline(name, estimator))
+        board = EitKit(link(name, own.device), estimator.table.zero_slots, own.frame_period_s, inputs(name))
+        tasks[name] = FingertipTask(board, estimates, publisher, pairs, own.heatmap == "always")
+    if pairs is not None:
+        tareable[COMBINED] = pairs.pipeline
+    if config.skin is not None:
+        sources = {name: inputs(name) for name in ReplayedSkin.sources}
+        tareable[SKIN] = tasks[SKIN] = skin = SkinTask(config.skin, publisher, clock, loop, sources)
+        tasks[SKIN_CURRENT] = skin.source
+    if (cell := config.load_cell) is not None:
+        calibration = load_cell_calibration(cell)
+        lever = LoadCell(link(LOAD_CELL, cell.device), calibration, cell.rate_hz, inputs(LOAD_CELL))
+        tareable[LOAD_CELL] = tasks[LOAD_CELL] = LoadCellTask(lever, publisher, clock, loop, cell.rate_hz)
+    return Sensors(tasks, tareable, pairs)
+
+
+def build_rig(
+    config: DaemonConfig, publisher: Publisher, clock: Clock, recorder: Recorder | None, supervisor: Supervisor
+) -> tuple[Sensors, Rig | None]:
+    """Return all sensors, and robot, gripper and control loop, if there is a robot."""
+    estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
+    combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
+    sources = torque_sources(config, estimators, combined)
+    check_experiment(config, sources)
+    if config.robot is None:
+        return build_sensors(config, publisher, clock, recorder, None, estimators, combined, None), None
+    settings = robot_settings(config.robot)
+    loop = make_loop(config, settings, sources, supervisor.dead)
+    gripper = make_gripper(config.gripper, loop, publisher) if config.gripper is not None else None
+    sensors = build_sensors(config, publisher, clock, recorder, loop, estimators, combined, gripper)
+    robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)))
+    runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
+    fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
+    return sensors, Rig(loop, runner, {**fingers, "robot": robot, "loop": runner}, recorder)
 
 
 def read_experiment(path: Path) -> experiment_schema.ExperimentFile:

@@ -129,15 +129,15 @@ class Experiment:
         """The approximate remaining time."""
         if not self.running:
             return 0.0
-        here_s = max(0.0, expected_s(self.step) - self._elapsed_s + self._step_began_s)
-        return here_s + sum(map(expected_s, self.file.steps[self.step_number :]))
+        here_s = max(0.0, _expected_s(self.step) - self._elapsed_s + self._step_began_s)
+        return here_s + sum(map(_expected_s, self.file.steps[self.step_number :]))
 
     @property
     def progress(self) -> float:
         """The completed share, 0 to 1."""
         if self.phase is ExperimentPhase.DONE:
             return 1.0
-        return max(0.0, 1.0 - self.remaining_s / max(sum(map(expected_s, self.file.steps)), 1e-9))
+        return max(0.0, 1.0 - self.remaining_s / max(sum(map(_expected_s, self.file.steps)), 1e-9))
 
     def update(
         self, t_ns: int, wrist_rad: float, torque_nm: float | None, *, gripped_at_rad: float = 0.0, held: bool = False
@@ -215,25 +215,10 @@ class Experiment:
         self.phase, self.command = ExperimentPhase.DONE, StepCommand()
 
 
-def expected_s(step: Step) -> float:
+def _expected_s(step: Step) -> float:
     """Return the approximate duration of a step, for the remaining time shown to the operator."""
-    match step:
-        case steps.TwistStep():
-            reach = [abs(angle) for angle in step.angles_rad] if not step.absolute else [0.2] * len(step.angles_rad)
-            ways = (2.0 if step.return_to_start else 1.0) * sum(reach) / step.speed_rad_per_s
-            return step.repeats * (ways + len(reach) * step.hold_s)
-        case steps.HoldTorqueStep():
-            return abs(step.torque_nm) / step.ramp_nm_per_s + step.hold_s
-        case steps.TightenStep():
-            return step.until_angle_rad / step.speed_rad_per_s
-        case steps.WaitStep():
-            return step.wait_s
-        case steps.IdentifyStep():
-            return 20.0
-        case steps.TareStep():
-            return 6.0
-        case steps.ApproachStep() | steps.GripStep() | steps.ReleaseStep() | steps.AdaptStep() | steps.TurnToStep():
-            return 3.0
+    needs = steps.demand(step)
+    return needs.stands_s + needs.moves_s
 
 
 def _program(step: Step, now_s: float) -> StepProgram:

@@ -1,7 +1,7 @@
 """The experiment file: its limits and its steps, as pydantic models with bounds that the rig can keep."""
 
 import math
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias, get_args
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WithJsonSchema
@@ -262,14 +262,14 @@ def check_steps(file: ExperimentFile) -> list[Mistake]:
     found: list[Mistake] = []
     identified = False
     for number, step in enumerate(file.steps):
-        limits, (torque_nm, angle_rad, least_s) = file.limits_of(step), _asks(step)
-        torque = torque_nm, limits.torque_nm, "N·m", "torque_nm"
-        for value, limit, unit, key in (torque, (angle_rad, limits.angle_rad, "rad", "angle_rad")):
+        limits, needs = file.limits_of(step), demand(step)
+        torque = needs.torque_nm, limits.torque_nm, "N·m", "torque_nm"
+        for value, limit, unit, key in (torque, (needs.angle_rad, limits.angle_rad, "rad", "angle_rad")):
             if value >= limit:
                 asks = f"{step.do} asks for {value:g} {unit}, and its limit is {limit:g} {unit}"
                 found.append((("steps", number), f"{asks}; raise limits.{key}, or ask for less"))
-        if step.timeout_s is not None and least_s >= step.timeout_s:
-            asks = f"{step.do} stands still for {least_s:g} s in all, and its timeout is {step.timeout_s:g} s"
+        if step.timeout_s is not None and needs.stands_s >= step.timeout_s:
+            asks = f"{step.do} stands still for {needs.stands_s:g} s in all, and its timeout is {step.timeout_s:g} s"
             found.append((("steps", number), f"{asks}; raise timeout_s"))
         match step:
             case IdentifyStep():
@@ -292,23 +292,39 @@ def _forgets_tool(step: Step, torque_source: str) -> bool:
     return isinstance(step, TareStep | GripperStep)
 
 
-def _asks(step: Step) -> tuple[float, float, float]:
-    """Return a step's largest torque (N·m) and angle from the grip (rad), and how long it stands still in all (s).
+class Demand(NamedTuple):
+    """What a step asks for at most, from the torque source (N·m) and from the angle at the grip (rad); its times.
 
-    What is unknown, as in an outline, is 0.
+    It stands still for `stands_s` in all, and takes about `moves_s` for everything else.
     """
+
+    torque_nm: float = 0.0
+    angle_rad: float = 0.0
+    stands_s: float = 0.0
+    moves_s: float = 0.0
+
+
+def demand(step: Step) -> Demand:
+    """Return what a step asks for; what is unknown, as in an outline, is 0."""
     match step:
-        case HoldTorqueStep(torque_nm=torque_nm, hold_s=hold_s):
-            return abs(torque_nm), 0.0, hold_s
+        case HoldTorqueStep(torque_nm=torque_nm):
+            return Demand(abs(torque_nm), stands_s=step.hold_s, moves_s=abs(torque_nm) / step.ramp_nm_per_s)
         case TightenStep(until_torque_nm=torque_nm, until_angle_rad=angle_rad):
-            return torque_nm, angle_rad, 0.0
+            return Demand(torque_nm, angle_rad, moves_s=angle_rad / step.speed_rad_per_s)
         case IdentifyStep(amplitude_rad=angle_rad):
-            return 0.0, angle_rad, 0.0
-        case TwistStep(angles_rad=angles_rad, absolute=absolute, hold_s=hold_s, repeats=repeats):
-            return 0.0, 0.0 if absolute else max(map(abs, angles_rad)), hold_s * len(angles_rad) * repeats
+            return Demand(angle_rad=angle_rad, moves_s=20.0)
+        case TwistStep(angles_rad=angles_rad):
+            stands_s = step.hold_s * len(angles_rad) * step.repeats
+            # How far an absolute angle is from the grip is known only there.
+            reach = [0.2 if step.absolute else abs(angle_rad) for angle_rad in angles_rad]
+            rounds = (2.0 if step.return_to_start else 1.0) * step.repeats
+            moves_s = rounds * sum(reach) / step.speed_rad_per_s
+            return Demand(0.0, 0.0 if step.absolute else max(reach), stands_s, moves_s)
         case WaitStep(wait_s=wait_s):
-            return 0.0, 0.0, wait_s
-        case HoldTorqueStep() | TightenStep() | IdentifyStep() | TwistStep() | WaitStep() | TurnToStep():
-            return 0.0, 0.0, 0.0
-        case ApproachStep() | GripStep() | ReleaseStep() | TareStep() | AdaptStep():
-            return 0.0, 0.0, 0.0
+            return Demand(stands_s=wait_s)
+        case TareStep():
+            return Demand(moves_s=6.0)
+        case ApproachStep() | GripStep() | ReleaseStep() | AdaptStep() | TurnToStep():
+            return Demand(moves_s=3.0)
+        case HoldTorqueStep() | TightenStep() | IdentifyStep() | TwistStep() | WaitStep():
+            return Demand()

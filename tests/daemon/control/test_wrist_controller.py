@@ -1,21 +1,16 @@
 """The wrist's speed for a set point, and its approach to an angle."""
 
-import asyncio
-from types import SimpleNamespace
-
 import pytest
 
-from shearloop.daemon.clock import Clock
+from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import MoveToAngle, TrackTorque
 from shearloop.daemon.control.identification import ToolModel
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSample, TorqueSource
-from shearloop.daemon.control.loop_runner import CommandSender
-from shearloop.daemon.control.stop_timeline import StopTimeline
+from shearloop.daemon.control.loop_runner import WRENCH, wrench_source
 from shearloop.daemon.control.wrist_controller import WristController
-from shearloop.drivers.ur.messages import Command, CommandReply
-from tests.drivers.ur.flight import SETTINGS, flying
+from tests.daemon.control.cell import Cell, driven
+from tests.drivers.ur.flight import CYCLE_NS, SETTINGS
 
-CYCLE_NS = 8_000_000
 CONFIG = LoopConfig()
 # A tenth of what the wrist resolves.
 CLOSE_RAD = 2e-5
@@ -65,42 +60,15 @@ FASTEST_PER_S = next(
 )
 
 
-async def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> list[float]:
-    """Return how far from the angle the wrist is in each cycle."""
-    flight = flying()
-    config = LoopConfig(angle_bandwidth_per_s=bandwidth_per_s)
-    wrist = WristController(TorqueSource(name="load_cell", period_s=0.1), config)
-    replies: list[tuple[asyncio.Future[CommandReply], CommandReply]] = []
-
-    def send(command: Command) -> asyncio.Future[CommandReply]:
-        reply = flight.ask(command)
-        assert reply.accepted
-        # It comes with the next state.
-        replies.append((asyncio.get_running_loop().create_future(), reply))
-        return replies[-1][0]
-
-    robot = SimpleNamespace(settings=SETTINGS, state=None, send=send)
-    brain = SimpleNamespace(on_speed_sent=wrist.on_speed_sent, on_fault=pytest.fail, config=config)
-    commands = CommandSender(robot, brain, StopTimeline(), Clock())
-    origin_rad, errors = flight.state.wrist_rad, []
-    for _ in range(cycles):
-        flight.fly(1)
-        state = flight.state
-        errors.append(state.wrist_rad - origin_rad - angle_rad)
-        robot.state = state
-        while replies:
-            replied, reply = replies.pop()
-            replied.set_result(reply)
-        await asyncio.sleep(0)
-        turn = wrist.turn(MoveToAngle(angle_rad, 0.5), flight.now_ns, state.wrist_rad, origin_rad)
-        commands.turn(turn.speed_rad_per_s, 0)
-    return errors
-
-
 @pytest.mark.parametrize("angle_rad", [0.01, 0.03, 0.1])
 @pytest.mark.parametrize("bandwidth_per_s", [5.0, FASTEST_PER_S])
 async def test_wrist_comes_to_rest_at_an_angle_however_fast_it_may_be_asked_to(angle_rad, bandwidth_per_s):
-    assert max(map(abs, (await errors_rad(angle_rad, bandwidth_per_s))[-150:])) < 1e-4
+    config, sources = LoopConfig(angle_bandwidth_per_s=bandwidth_per_s), {WRENCH: wrench_source(SETTINGS.rate_hz)}
+    twist = {"do": "twist", "angles_rad": [angle_rad], "speed_rad_per_s": 0.5, "hold_s": 60}
+    async with driven(twist, cell=Cell(ControlLoop(config, sources, ("robot",))), cycles=350) as cell:
+        for _ in range(150):
+            await cell.cycles(1)
+            assert cell.state.wrist_rad == pytest.approx(angle_rad, abs=1e-4)
 
 
 def test_each_torque_has_its_own_ramp_and_limit():

@@ -1,13 +1,17 @@
 """The worker inside the test's process: the daemon's ends of its pipes, fake arms, a fake clock."""
 
 import os
+from collections.abc import Callable
 from typing import NoReturn
 
 import pytest
 
 from shearloop.drivers.ur import worker
-from shearloop.drivers.ur.messages import Message, MessageDecoder, RobotState, RtdeSample, encode
+from shearloop.drivers.ur.messages import Message, MessageDecoder, RobotState, RtdeSample, WristSpeed, encode
 from tests.drivers.ur.flight import SETTINGS, FakeArm
+
+BEGUN_S = 1000.0
+Event = Message | Callable[[], object]
 
 
 class ExitedError(Exception):
@@ -49,11 +53,22 @@ class Daemon:
 
 
 class CyclingArm(FakeArm):
-    """An arm that runs a cycle at each read."""
+    """An arm that runs a cycle at each read; `read_s` and `wrist_s` are the times of its reads and speeds."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.read_s: list[float] = []
+        self.wrist_s: list[float] = []
 
     def read(self) -> RtdeSample:
         self.cycle()
+        self.read_s.append(worker.time.monotonic() - BEGUN_S)
+        self.be(t_mono_ns=worker.time.monotonic_ns())
         return super().read()
+
+    def wrist(self, command: WristSpeed, left_s: float) -> bool:
+        self.wrist_s.append(worker.time.monotonic() - BEGUN_S)
+        return super().wrist(command, left_s)
 
     def end_program(self) -> None:
         self.calls.append("end_program")
@@ -69,7 +84,7 @@ class Time:
     """A clock that only waiting advances."""
 
     def __init__(self) -> None:
-        self.now_s = 1000.0
+        self.now_s = BEGUN_S
 
     def monotonic(self) -> float:
         return self.now_s
@@ -81,44 +96,28 @@ class Time:
         self.now_s += seconds
 
 
-class TimedArm(CyclingArm):
-    """An arm in the worker's time; `read_s` holds the times of its reads."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.read_s: list[float] = []
-
-    def read(self) -> RtdeSample:
-        super().read()
-        self.read_s.append(worker.time.monotonic() - 1000.0)
-        self.be(t_mono_ns=worker.time.monotonic_ns())
-        return self.reading
-
-
 class Timed:
-    """A worker in its own time; the daemon sends the script's messages at their times."""
+    """A worker in its own time. At its time in the script, a message is sent or a function called, between cycles."""
 
     def __init__(
-        self,
-        daemon: Daemon,
-        monkeypatch: pytest.MonkeyPatch,
-        *script: tuple[float, Message],
-        arm: "TimedArm | None" = None,
+        self, daemon: Daemon, monkeypatch: pytest.MonkeyPatch, arm: CyclingArm, *script: tuple[float, Event]
     ) -> None:
         self.time = Time()
-        self.arm = arm or TimedArm()
         self._daemon = daemon
-        self._script = [(1000.0 + at_s, message) for at_s, message in script]
+        self._script = sorted(script, key=lambda entry: entry[0])
         monkeypatch.setattr(worker, "time", self.time)
         monkeypatch.setattr(daemon.pipe, "wait", self._wait)
-        fly(daemon, self.arm)
+        fly(daemon, arm)
         self.states = [message for _, message in daemon.receive() if isinstance(message, RobotState)]
 
     def _wait(self, timeout_s: float) -> bool:
-        if self._script and self._script[0][0] <= self.time.now_s + timeout_s:
-            at_s, message = self._script.pop(0)
-            self.time.now_s = max(self.time.now_s, at_s)
-            self._daemon.send(message)
-            return True
-        self.time.now_s += timeout_s
-        return False
+        if not self._script or self._script[0][0] + BEGUN_S > self.time.now_s + timeout_s:
+            self.time.now_s += timeout_s
+            return False
+        at_s, event = self._script.pop(0)
+        self.time.now_s = max(self.time.now_s, at_s + BEGUN_S)
+        if callable(event):
+            event()
+            return False
+        self._daemon.send(event)
+        return True

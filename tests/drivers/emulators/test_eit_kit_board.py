@@ -1,5 +1,3 @@
-import math
-
 import numpy as np
 import pytest
 
@@ -16,12 +14,6 @@ def test_a_line_is_what_the_board_sends_byte_for_byte():
     assert line.startswith(b"0.0000, 0.0021, 0.5500, 0.0000, ")
     assert line.endswith(b", 0.0000, 1.0162, \n")
     assert len(line) == 1024 * 8 + 1
-
-
-def test_faults_are_parsed():
-    assert parse_fault("cut-line", EitKitBoard.faults) == ("cut-line", math.inf)
-    assert parse_fault(" silence 3\n", EitKitBoard.faults) == ("silence", 3.0)
-    assert parse_fault("unplug:0.5", EitKitBoard.faults) == ("unplug", 0.5)
 
 
 @pytest.mark.parametrize(

@@ -7,41 +7,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, PAUSED, ControllerSpec, Robot
-from tests.drivers.ur.robots import control_script
-
-DT_S = 0.002
-MOVE_L, ZERO_FT, SPEED_J, SPEED_STOP, SET_WATCHDOG = 3, 8, 9, 15, 35
+from tests.drivers.ur import robots
+from tests.drivers.ur.robots import control_script, do, send
 
 
 def wait(robot: Robot, seconds: float) -> None:
-    for _ in range(round(seconds / DT_S)):
-        robot.step(DT_S)
-
-
-def send(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) -> None:
-    for index, number in enumerate(numbers):
-        robot.registers.write(f"input_double_register_{index}", number, robot.time_s)
-    robot.registers.write("input_int_register_1", int(asynchronous), robot.time_s)
-    robot.registers.write("input_int_register_0", command, robot.time_s)
-
-
-def do(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) -> float:
-    """Carry out a command as the client does; return its duration in s."""
-    send(robot, command, *numbers, asynchronous=asynchronous)
-    begun_s = robot.time_s
-    while robot.registers["output_int_register_0"] != 2:
-        robot.step(DT_S)
-        assert robot.program_running, robot._events[-1]
-        assert robot.time_s < begun_s + 20
-    took_s = robot.time_s - begun_s
-    robot.registers.write("input_int_register_0", 0, robot.time_s)
-    wait(robot, DT_S)
-    assert robot.registers["output_int_register_0"] == 1
-    return took_s
+    for _ in range(round(seconds / robots.STEP_S)):
+        robot.step(robots.STEP_S)
 
 
 def turn(robot: Robot, speed: float, acceleration: float = 2.0) -> None:
-    send(robot, SPEED_J, 0, 0, 0, 0, 0, speed, acceleration, 0)
+    send(robot, robots.SPEED_J, 0, 0, 0, 0, 0, speed, acceleration, 0)
 
 
 def down(robot: Robot) -> list[float]:
@@ -53,7 +29,7 @@ def down(robot: Robot) -> list[float]:
 def started(**spec: float) -> Robot:
     robot = Robot(ControllerSpec(**spec))
     robot.upload(control_script())
-    wait(robot, DT_S)
+    wait(robot, robots.STEP_S)
     return robot
 
 
@@ -75,7 +51,7 @@ def moving_asynchronously(robot: Robot) -> bool:
 
 def test_speed_is_reached_with_the_acceleration_and_held():
     # The thread for speeds starts in the cycle after the command's.
-    robot = turning(0.1 + DT_S)
+    robot = turning(0.1 + robots.STEP_S)
     assert robot.arm.qd_rad_per_s[5] == pytest.approx(0.2)
     wait(robot, 0.9)
     # 0.4²/2·2 to get up to speed, then 0.8 s at 0.4 rad/s.
@@ -85,7 +61,7 @@ def test_speed_is_reached_with_the_acceleration_and_held():
 
 def test_watchdog_ends_with_its_program():
     robot = started()
-    do(robot, SET_WATCHDOG, 10.0)
+    do(robot, robots.SET_WATCHDOG, 10.0)
     robot.upload(control_script())
     wait(robot, 1.0)
     assert robot.program_running
@@ -93,8 +69,8 @@ def test_watchdog_ends_with_its_program():
 
 def test_watchdog_ends_the_program_under_a_blocking_move():
     robot = started()
-    do(robot, SET_WATCHDOG, 10.0)
-    send(robot, MOVE_L, *down(robot))
+    do(robot, robots.SET_WATCHDOG, 10.0)
+    send(robot, robots.MOVE_L, *down(robot))
     wait(robot, 0.2)
     assert not robot.program_running
 
@@ -115,7 +91,7 @@ def test_linear_move_arrives_at_the_pose_on_a_straight_line():
     target = begin.copy()
     target[:3] += (0.05, -0.03, -0.1)
     target[3:] = (Rotation.from_rotvec(begin[3:]) * Rotation.from_rotvec([0.2, 0, 0.3])).as_rotvec()
-    do(robot, MOVE_L, *target, 0.1, 0.5, asynchronous=True)
+    do(robot, robots.MOVE_L, *target, 0.1, 0.5, asynchronous=True)
     assert moving_asynchronously(robot)
     way = target[:3] - begin[:3]
     while moving_asynchronously(robot):
@@ -131,7 +107,7 @@ def test_linear_move_arrives_at_the_pose_on_a_straight_line():
 
 def test_linear_move_out_of_reach_ends_in_a_protective_stop():
     robot = started()
-    send(robot, MOVE_L, 2.0, 0.0, 0.5, 0, math.pi, 0, 1.0, 1.0, asynchronous=True)
+    send(robot, robots.MOVE_L, 2.0, 0.0, 0.5, 0, math.pi, 0, 1.0, 1.0, asynchronous=True)
     wait(robot, 4.0)
     assert happened(robot, "protective-stop")
     assert not robot.arm.qd_rad_per_s.any()
@@ -139,8 +115,8 @@ def test_linear_move_out_of_reach_ends_in_a_protective_stop():
 
 def test_after_speed_stop_a_move_is_possible():
     robot = turning(0.3)
-    assert do(robot, SPEED_STOP, 2.0) == pytest.approx(0.2, abs=0.01)
-    do(robot, MOVE_L, *down(robot), asynchronous=True)
+    assert do(robot, robots.SPEED_STOP, 2.0) == pytest.approx(0.2, abs=0.01)
+    do(robot, robots.MOVE_L, *down(robot), asynchronous=True)
     wait(robot, 0.1)
     assert robot.program_running
 
@@ -199,8 +175,8 @@ def test_wrench_is_the_plants_torque_about_the_tool_axis():
     # The tool points down: its axis is -z of the base.
     assert robot.arm.wrench == pytest.approx([0, 0, 0, 0, 0, -expected], abs=1e-9)
     robot.registers.write("input_int_register_0", 0, robot.time_s)
-    do(robot, SPEED_STOP, 10.0)
-    do(robot, ZERO_FT)
+    do(robot, robots.SPEED_STOP, 10.0)
+    do(robot, robots.ZERO_FT)
     assert robot.arm.wrench == pytest.approx(np.zeros(6), abs=1e-9)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from shearloop.drivers.connection import LinkMonitor, LinkObserver
+from shearloop.drivers.emulators.ur_robot import Robot
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, RobotState
 from shearloop.drivers.ur.script import guard_script
@@ -21,6 +22,9 @@ ROOT = Path(__file__).parents[3]
 DELIVERED = read_settings(ROOT / "config" / "ur.yaml")
 # Controllers whose scripts differ.
 VERSIONS = [(3, 10), (5, 4), (5, 17), (5, 25), (10, 10)]
+# The commands of ur-rtde's script, and the cycle of its controller.
+MOVE_L, ZERO_FT, SPEED_J, SPEED_STOP, STOP_J, SET_WATCHDOG = 3, 8, 9, 15, 34, 35
+STEP_S = 0.002
 
 
 def control_script(settings: UrSettings | None = None, version: tuple[int, int] = (5, 17)) -> str:
@@ -30,6 +34,27 @@ def control_script(settings: UrSettings | None = None, version: tuple[int, int] 
     script = guard_script(text, settings) if settings is not None else f"def rtde_control():\n{text}end\n"
     # ur-rtde inserts the registers' numbers when it sends it.
     return re.sub(r"(# (?:float|int) register offset\n)", r"\g<1>0", script)
+
+
+def send(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) -> None:
+    """Write a command's registers as ur-rtde does."""
+    for index, number in enumerate(numbers):
+        robot.registers.write(f"input_double_register_{index}", number, robot.time_s)
+    robot.registers.write("input_int_register_1", int(asynchronous), robot.time_s)
+    robot.registers.write("input_int_register_0", command, robot.time_s)
+
+
+def do(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) -> float:
+    """Run a command until the script is ready for the next; return its duration in s."""
+    begun_s, took_s = robot.time_s, 0.0
+    for written, state in ((command, 2), (0, 1)):
+        send(robot, written, *numbers, asynchronous=asynchronous)
+        while robot.registers["output_int_register_0"] != state:
+            robot.step(STEP_S)
+            assert robot.program_running, robot._events[-1]
+            assert robot.time_s < begun_s + 20
+        took_s = took_s or robot.time_s - begun_s
+    return took_s
 
 
 def settings_for(host: str, **changes: object) -> UrSettings:

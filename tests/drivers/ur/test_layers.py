@@ -8,15 +8,15 @@ import pytest
 from shearloop.drivers.emulators.ur_robot import PLAYING, Robot
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
 from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER, NO_MOTION_S
+from tests.drivers.ur import robots
 from tests.drivers.ur.flight import AT_REST, CYCLE_NS, FakeArm, Flight, flying
-from tests.drivers.ur.robots import DELIVERED, VERSIONS, control_script
+from tests.drivers.ur.robots import DELIVERED, VERSIONS, control_script, do, send
 
 LIMITS, TIMEOUT_S = DELIVERED.limits, DELIVERED.command_timeout_s
 FASTEST = LIMITS.wrist_speed_rad_per_s.inner
 HARDEST = LIMITS.wrist_acceleration_rad_per_s2.hard
 PROMISED_S = 0.2
-STEP_S, STEPS = 0.002, 4
-MOVE_L, SPEED_J, SPEED_STOP, STOP_J, SET_WATCHDOG = 3, 9, 15, 34, 35
+STEPS = 4
 
 
 class ScriptedArm(FakeArm):
@@ -28,7 +28,7 @@ class ScriptedArm(FakeArm):
 
     def cycle(self) -> None:
         for _ in range(STEPS):
-            self.robot.step(STEP_S)
+            self.robot.step(robots.STEP_S)
         arm = self.robot.arm
         self.reading = dataclasses.replace(
             AT_REST,
@@ -42,9 +42,7 @@ class ScriptedArm(FakeArm):
         )
 
     def _write(self, command: int, *values: float) -> bool:
-        for number, value in enumerate(values):
-            self.robot.registers.write(f"input_double_register_{number}", value, self.robot.time_s)
-        self.robot.registers.write("input_int_register_0", command, self.robot.time_s)
+        send(self.robot, command, *values)
         return True
 
     def _write_deadline(self, left_s: float) -> None:
@@ -60,26 +58,21 @@ class ScriptedArm(FakeArm):
 
     def repeat(self, command: WristSpeed) -> bool:
         """Send a speed without another deadline, as a worker does that decides nothing."""
-        return self._write(SPEED_J, 0, 0, 0, 0, 0, command.rad_per_s, command.acceleration_rad_per_s2, 0)
+        return self._write(robots.SPEED_J, 0, 0, 0, 0, 0, command.rad_per_s, command.acceleration_rad_per_s2, 0)
 
     def end_speed(self, deceleration_rad_per_s2: float) -> bool:
-        return self._write(SPEED_STOP, deceleration_rad_per_s2)
+        return self._write(robots.SPEED_STOP, deceleration_rad_per_s2)
 
     def _run_once(self, command: int, *values: float) -> bool:
-        """Run an asynchronous command as ur-rtde does: until it is done, and until the script is ready again."""
-        self.robot.registers.write("input_int_register_1", 1, self.robot.time_s)
-        for written, state in ((command, 2), (0, 1)):
-            self._write(written, *values)
-            while self.robot.registers["output_int_register_0"] != state:
-                self.robot.step(STEP_S)
+        do(self.robot, command, *values, asynchronous=True)
         return True
 
     def move(self, command: MoveLinear) -> bool:
         self._write_deadline(DELIVERED.silence_timeout_s)
-        return self._run_once(MOVE_L, *command.pose, command.speed_m_per_s, command.acceleration_m_per_s2)
+        return self._run_once(robots.MOVE_L, *command.pose, command.speed_m_per_s, command.acceleration_m_per_s2)
 
     def stop_move(self, deceleration_rad_per_s2: float) -> bool:
-        return self._run_once(STOP_J, deceleration_rad_per_s2)
+        return self._run_once(robots.STOP_J, deceleration_rad_per_s2)
 
     def send_heartbeat(self, left_s: float | None = None) -> bool:
         if left_s is not None:
@@ -94,7 +87,7 @@ class ScriptedArm(FakeArm):
         return True
 
     def arm_watchdog(self) -> bool:
-        return self._write(SET_WATCHDOG, DELIVERED.watchdog_hz)
+        return self._write(robots.SET_WATCHDOG, DELIVERED.watchdog_hz)
 
 
 def guarded_arm() -> ScriptedArm:
@@ -109,7 +102,7 @@ def guarded_arm() -> ScriptedArm:
 def turn(arm: ScriptedArm, command: WristSpeed, seconds: float) -> list[RtdeSample]:
     """Decide on a speed in each cycle, and return the samples."""
     found = []
-    for _ in range(round(seconds / (STEPS * STEP_S))):
+    for _ in range(round(seconds / (STEPS * robots.STEP_S))):
         arm.wrist(command, TIMEOUT_S)
         arm.cycle()
         found.append(arm.reading)
@@ -239,7 +232,7 @@ def test_decision_that_comes_late_does_not_turn_the_wrist(delay_s):
     """The deadline counts from the sample before the decision, so that a slow network does not prolong it."""
     arm = guarded_arm()
     until_s = arm.robot.registers[CLOCK_REGISTER] + TIMEOUT_S
-    for _ in range(round(delay_s / STEP_S / STEPS)):
+    for _ in range(round(delay_s / robots.STEP_S / STEPS)):
         arm.send_heartbeat()
         arm.cycle()
     arm.robot.registers.write(DEADLINE_REGISTER, until_s, arm.robot.time_s)

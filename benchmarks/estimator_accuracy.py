@@ -27,7 +27,7 @@ from shearloop.daemon.analysis.frame_series import part_of, read_series, series_
 from shearloop.daemon.cli.emulated_calibration import calibrate, record
 from shearloop.daemon.recording.matlab_import import import_mat
 from shearloop.daemon.recording.reader import read_recording
-from shearloop.drivers.emulators.rig import SIDES
+from shearloop.drivers.emulators.emulated_rig import SIDES
 
 # Columns of the tables: figures of loaded frames, then two of all frames.
 LOADED = {

@@ -29,8 +29,8 @@ from shearloop.daemon.control.torque_controller import TorqueController
 from shearloop.daemon.run_summary import BAND
 from shearloop.daemon.synthetic_frames import RigFrames
 from shearloop.drivers.defaults import FRAME_PERIOD_S
+from shearloop.drivers.emulators.emulated_rig import SIDES
 from shearloop.drivers.emulators.gripper import Gripper
-from shearloop.drivers.emulators.rig import SIDES
 from shearloop.drivers.emulators.scene import Joint, Scene, Twin, TwinSettings
 
 PlantOf = Callable[[sim.SimulatedSensor, np.random.Generator], sim.Plant]

@@ -31,7 +31,7 @@ from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
 from shearloop.daemon.sensing.skin_task import SKIN, SKIN_CURRENT, ReplayedSkin, SkinTask
 from shearloop.daemon.sensor_protocols import Tareable
 from shearloop.daemon.supervisor import Supervisor, Task
-from shearloop.drivers.calibration_files import load_calibration
+from shearloop.drivers.calibration_files import load_device_calibration
 from shearloop.drivers.connection import LinkMonitor, SerialLink
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.errors import DriverError
@@ -48,7 +48,7 @@ def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
     """Return the load cell's calibration; raises DriverError if it cannot be used."""
     if config.calibration is None:
         return LoadCalibration.of_torque_lines()
-    return load_calibration(config.calibration, LoadCalibration)
+    return load_device_calibration(config.calibration, LoadCalibration)
 
 
 def make_gripper_client(config: GripperConfig) -> RobotiqClient:
@@ -68,7 +68,7 @@ def gripper_calibration(config: GripperConfig) -> WidthCalibration:
     """Return the gripper's calibration, or the maker's data; raises DriverError if it cannot be used."""
     if config.calibration is None:
         return WidthCalibration.nominal()
-    return load_calibration(config.calibration, WidthCalibration)
+    return load_device_calibration(config.calibration, WidthCalibration)
 
 
 def robot_settings(path: Path) -> UrSettings:

@@ -21,7 +21,7 @@ class CalibrationModel(BaseModel):
 ModelT = TypeVar("ModelT", bound=CalibrationModel)
 
 
-def load_calibration(path: Path, model: type[ModelT]) -> ModelT:
+def load_device_calibration(path: Path, model: type[ModelT]) -> ModelT:
     """Return the calibration in a file; DeviceCalibrationError names the file and every wrong key."""
     return load_model(path, model, DeviceCalibrationError, "calibration", "; make it with `shearloop calibrate`")
 

@@ -29,8 +29,8 @@ from shearloop.daemon.recording.writer import RecordingWriter
 from shearloop.daemon.synthetic_frames import RigFrames
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.emulators.boards import LOAD_PERIOD_S
+from shearloop.drivers.emulators.emulated_rig import NOISE_NM, SIDES
 from shearloop.drivers.emulators.gripper import Gripper, GripperRegisters
-from shearloop.drivers.emulators.rig import NOISE_NM, SIDES
 from shearloop.drivers.emulators.scene import Scene
 
 # Three diameters are enough to interpolate; five halve the interval.

@@ -9,7 +9,7 @@ from typing import Self
 
 import pytest
 
-from shearloop.drivers.calibration_files import load_calibration
+from shearloop.drivers.calibration_files import load_device_calibration
 from shearloop.drivers.load_cell import LoadCalibration
 from shearloop.drivers.robotiq.gripper import WidthCalibration
 
@@ -83,7 +83,7 @@ def test_the_load_cell_is_calibrated_step_by_step_and_a_step_can_be_refused(tmp_
         assert "there is no fault 'nonsense'" in board.end()[2]
     assert status == 0
     assert "Refused: The reading did not change with 100 g" in "\n".join([*calibrate.said, refused])
-    calibration = load_calibration(out, LoadCalibration)
+    calibration = load_device_calibration(out, LoadCalibration)
     if script:
         result = json.loads(said)
         assert result["path"] == str(out)
@@ -124,7 +124,7 @@ def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path, way):
         assert [gauge["diameter_mm"] for gauge in json.loads(said)["gauges"]] == [10, 40]
     else:
         assert "without meeting anything" in refused
-    found = load_calibration(out, WidthCalibration)
+    found = load_device_calibration(out, WidthCalibration)
     # Two positions, each rounded to a count: the true gripper goes from 3 to 230 counts over 140 mm.
     assert found.width_mm(3) == pytest.approx(140, abs=5)
     assert found.width_mm(230) == pytest.approx(0, abs=1)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.io import loadmat
 
 from shearloop.drivers import load_cell
-from shearloop.drivers.calibration_files import load_calibration, save_calibration
+from shearloop.drivers.calibration_files import load_device_calibration, save_calibration
 from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ
 from shearloop.drivers.errors import DeviceCalibrationError
 from shearloop.drivers.load_cell import COUNTS_MAX, COUNTS_MIN, PERIOD_NS, STUCK_AFTER, LoadCalibration, LoadParser
@@ -171,7 +171,7 @@ def test_a_calibration_survives_its_file(tmp_path):
     path = tmp_path / "load.yaml"
     calibration = LoadCalibration(tare_counts=-81234.5, scale_n_per_count=-2.3e-5, lever_arm_m=0.035, sign=-1)
     save_calibration(path, calibration)
-    assert load_calibration(path, LoadCalibration) == calibration
+    assert load_device_calibration(path, LoadCalibration) == calibration
 
 
 @pytest.mark.parametrize(
@@ -189,12 +189,12 @@ def test_a_calibration_file_that_is_wrong_is_refused_by_name_and_key(tmp_path, t
     path = tmp_path / "load.yaml"
     path.write_text(text)
     with pytest.raises(DeviceCalibrationError, match=said) as refused:
-        load_calibration(path, LoadCalibration)
+        load_device_calibration(path, LoadCalibration)
     assert str(path) in str(refused.value)
 
 
 def test_a_missing_calibration_file_says_how_to_make_one(tmp_path):
     with pytest.raises(DeviceCalibrationError, match="shearloop calibrate"):
-        load_calibration(tmp_path / "none.yaml", LoadCalibration)
+        load_device_calibration(tmp_path / "none.yaml", LoadCalibration)
     with pytest.raises(DeviceCalibrationError, match="cannot be written"):
         save_calibration(tmp_path / "no/such/folder.yaml", TORQUE_LINES)

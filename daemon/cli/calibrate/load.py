@@ -12,7 +12,7 @@ from shearloop.daemon.cli.terminal import Operator, print_result
 
 if TYPE_CHECKING:
     from shearloop.drivers.connection import SerialPort
-    from shearloop.drivers.load_calibration import Level
+    from shearloop.drivers.load_cell_calibration import Level
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -39,8 +39,8 @@ def run(args: argparse.Namespace) -> int:
     """Measure each load and write the calibration."""
     from shearloop.drivers.calibration_files import save_calibration
     from shearloop.drivers.connection import SerialPort, find_port
-    from shearloop.drivers.load_calibration import check_masses, fit_levels
     from shearloop.drivers.load_cell import BAUD_RATE
+    from shearloop.drivers.load_cell_calibration import check_masses, fit_levels
 
     check_calibration_file(args.out)
     check_masses(args.mass_g)
@@ -60,14 +60,14 @@ def run(args: argparse.Namespace) -> int:
 
 async def _measure(port: "SerialPort", masses_g: list[float], operator: Operator) -> list["Level"]:
     from shearloop.drivers.errors import DeviceCalibrationError, DeviceLostError
-    from shearloop.drivers.load_calibration import (
+    from shearloop.drivers.load_cell import LoadParser, LoadSample
+    from shearloop.drivers.load_cell_calibration import (
         SAMPLES_PER_STEP,
         SKIP_SAMPLES,
         UNCALIBRATED,
         check_levels,
         measure_level,
     )
-    from shearloop.drivers.load_cell import LoadParser, LoadSample
     from shearloop.drivers.serial_sensor import BOOT_S
 
     samples: asyncio.Queue[LoadSample] = asyncio.Queue()

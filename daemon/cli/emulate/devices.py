@@ -105,8 +105,8 @@ def _configure_hx711(parser: argparse.ArgumentParser) -> None:
 
 def _play_hx711(args: argparse.Namespace) -> Playing:
     from shearloop.drivers.emulators.boards import LOAD_PERIOD_S, PAPER_SKETCH, Hx711Board, Sketch
-    from shearloop.drivers.load_calibration import STANDARD_GRAVITY
     from shearloop.drivers.load_cell import LEVER_ARM_M
+    from shearloop.drivers.load_cell_calibration import STANDARD_GRAVITY
 
     held_nm = args.torque_nm
     sketch, period_s = PAPER_SKETCH if args.paper_sketch else Sketch(), LOAD_PERIOD_S / args.speed

@@ -17,7 +17,7 @@ from shearloop.drivers.emulators import number_between
 
 if TYPE_CHECKING:
     from shearloop.daemon.synthetic_skin import SyntheticSkin
-    from shearloop.drivers.emulators.rig import EmulatedRig
+    from shearloop.drivers.emulators.emulated_rig import EmulatedRig
     from shearloop.drivers.emulators.scene import Truth
     from shearloop.drivers.emulators.skin import Address
 
@@ -98,7 +98,7 @@ def _configure_rig(parser: argparse.ArgumentParser) -> None:
 def _play_rig(args: argparse.Namespace) -> Playing:
     from shearloop.daemon.synthetic_frames import RigFrames
     from shearloop.drivers.emulators.boards import PAPER_SKETCH
-    from shearloop.drivers.emulators.rig import NOISE_NM, EmulatedRig
+    from shearloop.drivers.emulators.emulated_rig import NOISE_NM, EmulatedRig
     from shearloop.drivers.emulators.scene import TwinSettings
 
     make = robot_make(args)

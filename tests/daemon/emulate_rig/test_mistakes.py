@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shearloop.drivers.emulators.rig import EmulatedRig
+from shearloop.drivers.emulators.emulated_rig import EmulatedRig
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ import yaml
 from shearloop.bank.eit.build import build_bank
 from shearloop.daemon.bank_config import load_bank_plan
 from shearloop.daemon.cli.emulated_calibration import SEED, calibrate, record
-from shearloop.drivers.emulators.rig import SIDES
+from shearloop.drivers.emulators.emulated_rig import SIDES
 from tests.daemon.conftest import DEADLINE_S
 from tests.emulator_process import own_address
 

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers import load_calibration
+from shearloop.drivers import load_cell_calibration
 from shearloop.drivers.errors import DeviceCalibrationError
-from shearloop.drivers.load_calibration import (
+from shearloop.drivers.load_cell import COUNTS_MAX, LoadParser, LoadSample
+from shearloop.drivers.load_cell_calibration import (
     STANDARD_GRAVITY,
     Level,
     check_levels,
@@ -17,14 +18,13 @@ from shearloop.drivers.load_calibration import (
     fit_levels,
     measure_level,
 )
-from shearloop.drivers.load_cell import COUNTS_MAX, LoadParser, LoadSample
 
-STEP = load_calibration.SKIP_SAMPLES + load_calibration.SAMPLES_PER_STEP
+STEP = load_cell_calibration.SKIP_SAMPLES + load_cell_calibration.SAMPLES_PER_STEP
 
 
 def samples(raws: Iterable[float]) -> list[LoadSample]:
     """Return what the parser makes of lines with these decimals, after the first line that may be torn."""
-    parser = LoadParser(load_calibration.UNCALIBRATED)
+    parser = LoadParser(load_cell_calibration.UNCALIBRATED)
     return parser.feed(b"0\n" + b"".join(b"%.6f\n" % raw for raw in raws), 0)[1:]
 
 
@@ -83,7 +83,7 @@ def test_a_signal_that_is_not_fit_is_refused(rest, signal, reason):
 
 
 def test_the_first_samples_of_a_step_do_not_count():
-    settling = samples([1e6] * load_calibration.SKIP_SAMPLES)
+    settling = samples([1e6] * load_cell_calibration.SKIP_SAMPLES)
     assert measure_level([*settling, *noisy(8000.0)[-30:]], 0.0) == measure_level(noisy(8000.0), 0.0)
 
 
@@ -98,7 +98,7 @@ def test_masses_off_the_line_or_in_the_wrong_order_are_refused():
 def test_too_many_corrupted_values_are_refused_and_few_are_left_out():
     raws = 8000 + 100 * np.random.default_rng(2).standard_normal(STEP)
     raws[20] = 9e12
-    assert measure_level(samples(raws), 0.0).n == load_calibration.SAMPLES_PER_STEP - 1
+    assert measure_level(samples(raws), 0.0).n == load_cell_calibration.SAMPLES_PER_STEP - 1
     raws[20:25] = 9e12
     with pytest.raises(DeviceCalibrationError, match="Only 25 of the 30"):
         measure_level(samples(raws), 0.0)

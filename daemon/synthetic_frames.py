@@ -56,12 +56,11 @@ class TwistProgramme:
 class Synthesiser:
     """Makes lines of RMS magnitudes, as the board's ADC reads them, at and between a bank's cells."""
 
-    def __init__(self, bank: Bank, *, seed: int = 0, amplitude: float = AMPLITUDE, noise_v: float = NOISE_V) -> None:
+    def __init__(self, bank: Bank, *, seed: int = 0, noise_v: float = NOISE_V) -> None:
         self._bank = bank
         # (n,) the injection, in order of time, of each channel.
         self.injections: NDArray[np.int64] = bank.table.electrodes[:, 0]
         self._gain = MEAN_V / float(np.abs(bank.homogeneous).mean())
-        self._amplitude = amplitude
         self._noise_v = noise_v
         self._random = np.random.default_rng(seed)
 
@@ -70,7 +69,7 @@ class Synthesiser:
 
         σ and grip may be (n,), with a value per channel. Raises UserError outside the bank's valid cells.
         """
-        volts = self._bank.homogeneous + grip * self._amplitude * self.signal(k, sigma)
+        volts = self._bank.homogeneous + grip * AMPLITUDE * self.signal(k, sigma)
         volts = self._gain * np.abs(volts) + self._random.normal(0.0, self._noise_v, volts.shape)
         # The board rounds its RMS down to a whole step; no live channel reads 0.
         steps = np.maximum(np.floor(np.abs(volts) / ADC_STEP_V), 1.0)

@@ -37,8 +37,9 @@ def run(args: argparse.Namespace) -> int:
     _check_arguments(args)
     require("matplotlib", "plot", "a chart")
     from shearloop.daemon.analysis.charts import scene, simulated_loop, speed_accuracy, stability
-    from shearloop.daemon.analysis.charts.chart_data import bank_of, mesh_of, splits
+    from shearloop.daemon.analysis.charts.chart_data import MESH_SIZE_CM, bank_of, own_fingertip, splits
     from shearloop.daemon.analysis.charts.drawing import chart_folder
+    from shearloop.daemon.bank_config import load_geometry
     from shearloop.daemon.parallel import open_executor
 
     with chart_folder(args.out), TemporaryFile(dir=args.out):
@@ -53,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
             # The synthetic stream's single frames are too noisy to design a bank by.
             paths = scene.chart(parts if args.recordings else parts[:1], args.out, executor)
         else:
-            mesh = mesh_of(args.mesh)
+            mesh = load_geometry(args.mesh).mesh if args.mesh else own_fingertip(MESH_SIZE_CM).mesh()
             bank = bank_of(args.bank, mesh, scratch)
             if args.name == "stability":
                 paths = stability.chart(parts, bank, mesh, scratch, args.out, executor)

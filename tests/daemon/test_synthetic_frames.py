@@ -57,9 +57,9 @@ def test_no_live_channel_reads_nothing():
 
 def test_without_noise_a_frame_is_the_magnitude_of_homogeneous_and_scaled_signal():
     bank = small_bank()
-    synthesiser = Synthesiser(bank, amplitude=0.2, noise_v=0.0)
+    synthesiser = Synthesiser(bank, noise_v=0.0)
     gain = 0.13 / np.abs(bank.homogeneous).mean()
-    expected = gain * np.abs(bank.homogeneous + 0.5 * 0.2 * bank.signals[0, 1].astype(float))
+    expected = gain * np.abs(bank.homogeneous + 0.5 * 0.17 * bank.signals[0, 1].astype(float))
     found = PAPER_TABLE.channels_of_line(synthesiser.line(3.0, 1.5, grip=0.5))
     assert ((expected - found >= -1e-12) & (expected - found < ADC_STEP_V + 1e-12)).all(), "rounded down to a step"
 

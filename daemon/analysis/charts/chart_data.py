@@ -16,7 +16,7 @@ from shearloop.bank.estimation import Calibration, FrameSeries, Physics, fit, me
 from shearloop.bank.estimator_names import EstimatorName
 from shearloop.daemon.analysis.frame_series import part_of, read_series
 from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP, Grid, cached_bank
-from shearloop.daemon.bank_config import load_fingertip, load_geometry
+from shearloop.daemon.bank_config import load_fingertip
 from shearloop.daemon.synthetic_frames import LARGEST_TORQUE_NM, Synthesiser, TwistProgramme
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 
@@ -45,11 +45,6 @@ class Split:
 def own_fingertip(mesh_size_cm: float) -> Fingertip:
     """Return the paper's fingertip by its dimensions, with another mesh size."""
     return load_fingertip(OWN_FINGERTIP, mesh_size_cm)
-
-
-def mesh_of(path: Path | None) -> Mesh:
-    """Return the mesh of a file, or the own fingertip's."""
-    return load_geometry(path).mesh if path is not None else own_fingertip(MESH_SIZE_CM).mesh()
 
 
 def bank_of(path: Path | None, mesh: Mesh, scratch: Path, grid: Grid = GRID) -> Bank:

@@ -34,7 +34,7 @@ def draw(found: Characterisation, out: Path) -> list[Path]:
     return written
 
 
-def _new(title: str, xlabel: str, ylabel: str) -> tuple[Figure, Axes]:
+def _new(title: str, xlabel: str = "shear force, N", ylabel: str = "normalised response") -> tuple[Figure, Axes]:
     made = figure(7.0, 4.6)
     axes = made.add_subplot()
     axes.set(title=title, xlabel=xlabel, ylabel=ylabel)
@@ -93,7 +93,7 @@ def _both_sides(curve: ResponseCurve, response: FloatArray) -> tuple[FloatArray,
 
 
 def _figure_6(found: Characterisation) -> Figure:
-    made, axes = _new("Figure 6: response to shear, Fn = 1 N", "shear force, N", "normalised response")
+    made, axes = _new("Figure 6: response to shear, Fn = 1 N")
     axes.plot(*_both_sides(found.wide, found.wide.two_d), color=TWO_D, label="2-D, 0.70 mm")
     axes.plot(*_both_sides(found.wide, found.wide.membrane), color=ONE_D, ls="--", label="1-D, 0.88 mm")
     ends = np.array([-1.0, 1.0])
@@ -114,7 +114,7 @@ def _figure_6(found: Characterisation) -> Figure:
 
 
 def _figure_7(found: Characterisation) -> Figure:
-    made, axes = _new("Figure 7: response under different normal forces", "shear force, N", "normalised response")
+    made, axes = _new("Figure 7: response under different normal forces")
     for normal_n, curve in found.wide_by_normal.items():
         (marks,) = axes.plot(*_both_sides(curve, curve.two_d), MARKERS[normal_n], label=f"2-D, Fn = {normal_n} N")
         marks.set(mfc="none", color=TWO_D, ms=5)
@@ -129,7 +129,7 @@ def _figure_7(found: Characterisation) -> Figure:
 
 
 def _figure_8(found: Characterisation) -> Figure:
-    made, axes = _new("Figure 8: response at 25 °C and 40 °C, Fn = 1 N", "shear force, N", "normalised response")
+    made, axes = _new("Figure 8: response at 25 °C and 40 °C, Fn = 1 N")
     curve, change = found.wide, warming_change(WARM_K)
     shear_n, cold = _both_sides(curve, curve.two_d)
     # Equation (1): what changes both gauges' resistance by the same factor cancels against a zero at that temperature.
@@ -142,7 +142,7 @@ def _figure_8(found: Characterisation) -> Figure:
 
 
 def _deadband(found: Characterisation) -> Figure:
-    made, axes = _new("Slope of the response within the deadband, Fn = 1 N", "shear force, N", "slope, 1/N")
+    made, axes = _new("Slope of the response within the deadband, Fn = 1 N", ylabel="slope, 1/N")
     near = found.near_zero
     shear_n = np.concatenate([[0.0], near.shear_n])
     for response, style, color, label in (

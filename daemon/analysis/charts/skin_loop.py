@@ -6,7 +6,7 @@ time. The width of the true force over each hold's end is compared with 2 μFₙ
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib import resources
 from itertools import pairwise
@@ -240,31 +240,30 @@ def limit_cycle_figure(gains: Sequence[SkinHold], delays: Sequence[SkinHold], sh
     """Draw one run, then width and offset of all cases over the gain, and the width over the delay."""
     made = figure(12.0, 7.5)
     grid = made.add_gridspec(2, 3, height_ratios=(1.0, 1.3))
-    over = made.add_subplot(grid[0, :])
-    width, offset, delay = (made.add_subplot(grid[1, i]) for i in range(3))
-    _draw_run(over, shown)
-    bound = "2 μFn"
-    _draw_curves(width, gains, lambda case: case.kp, lambda held: held.width_n)
-    width.set(title="Limit cycle over the gain", xlabel="gain kp", ylabel=f"peak to peak / {bound}")
-    _draw_curves(offset, gains, lambda case: case.kp, lambda held: held.offset_n)
-    offset.set(title="Accuracy over the gain", xlabel="gain kp", ylabel=f"mean distance from the set point / {bound}")
-    for axes in (width, offset):
-        axes.set_xscale("log")
-        axes.set_xticks(GAINS, [f"{kp:g}" for kp in GAINS])
+    _draw_run(made.add_subplot(grid[0, :]), shown)
+    width, distance = "peak to peak / 2 μFn", "mean distance from the set point / 2 μFn"
+    panels = (
+        ("Limit cycle over the gain", "gain kp", width, gains, "kp", "width_n"),
+        ("Accuracy over the gain", "gain kp", distance, gains, "kp", "offset_n"),
+        ("Limit cycle over the delay", "age of a reading, s", width, delays, "age_s", "width_n"),
+    )
+    for column, (title, xlabel, ylabel, held, over, value) in enumerate(panels):
+        axes = made.add_subplot(grid[1, column])
+        _draw_curves(axes, held, over, value)
+        axes.set(title=title, xlabel=xlabel, ylabel=ylabel, ylim=(-0.05, max(1.2, axes.get_ylim()[1])))
+        places = GAINS if over == "kp" else AGES_S
+        axes.set_xscale("log" if over == "kp" else "linear")
+        axes.set_xticks(places, [f"{place:g}" for place in places])
         axes.minorticks_off()
-    _draw_curves(delay, delays, lambda case: case.age_s, lambda held: held.width_n)
-    delay.set_xticks(AGES_S, [f"{age_s:g}" for age_s in AGES_S])
-    delay.set(title="Limit cycle over the delay", xlabel="age of a reading, s", ylabel=f"peak to peak / {bound}")
-    for axes in (width, delay, offset):
-        axes.set_ylim(-0.05, max(1.2, axes.get_ylim()[1]))
         axes.axhline(1.0, color="black", lw=1, ls=":")
-    for axes in (width, delay):
-        axes.axhspan(-0.05, 1.0, color="#55a868", alpha=0.08, lw=0)
-        axes.annotate(f"allowed: up to {bound}", (0.02, 0.96), xycoords=("axes fraction", "data"), fontsize=8, va="top")
-    handles, labels = width.get_legend_handles_labels()
+        if value == "width_n":
+            axes.axhspan(-0.05, 1.0, color="#55a868", alpha=0.08, lw=0)
+            beside = axes.get_yaxis_transform()
+            axes.text(0.02, 0.96, "allowed: up to 2 μFn", transform=beside, fontsize=8, va="top")
+    handles, labels = made.axes[1].get_legend_handles_labels()
     made.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
-    delay.legend(fontsize=8)
-    for axes in (over, width, offset, delay):
+    made.axes[3].legend(fontsize=8)
+    for axes in made.axes:
         axes.grid(alpha=0.25)
     return made
 
@@ -280,11 +279,9 @@ def _draw_run(axes: Axes, shown: SkinTrace) -> None:
     axes.legend(loc="upper left", fontsize=8)
 
 
-def _draw_curves(
-    axes: Axes, found: Sequence[SkinHold], over: Callable[[SkinLoopCase], float], value: Callable[[SkinHold], float]
-) -> None:
+def _draw_curves(axes: Axes, found: Sequence[SkinHold], over: str, value: str) -> None:
     for number, name in enumerate(dict.fromkeys(held.case.name for held in found)):
         mine = [held for held in found if held.case.name == name]
         style = look(number) | {"markersize": 5, "linewidth": 1.2}
-        shares = [value(held) / held.bound_n for held in mine]
-        axes.plot([over(held.case) for held in mine], shares, label=name, **style)
+        shares = [getattr(held, value) / held.bound_n for held in mine]
+        axes.plot([getattr(held.case, over) for held in mine], shares, label=name, **style)

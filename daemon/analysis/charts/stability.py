@@ -274,7 +274,7 @@ def extrapolation_figure(title: str, found: Sequence[Extrapolation]) -> Figure:
     )  # fmt: skip
     for first, (_, group) in enumerate(groupby(found, key=lambda one: one.curve.fault)):
         here, row = list(group), made.axes[4 * first : 4 * first + 4]
-        label_panel(row[3], here[0].curve.unit, "median width, times that of good later slices")
+        label_panel(row[3], here[0].curve.unit, "median width ÷ that at “all”")
         row[3].axhline(1.0, color="#999999", linewidth=0.8)
         for number, one in enumerate(here):
             times = np.array(one.times_good, dtype=float)

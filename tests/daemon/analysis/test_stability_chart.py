@@ -93,21 +93,21 @@ def test_a_recording_that_no_estimator_can_be_calibrated_on_is_one_sentence(
     assert "motion_regression is left out" in capsys.readouterr().out
 
 
-def test_limits_are_quantiles_and_each_slice_is_either_calibrated_on_or_judged():
-    torque_nm = np.random.default_rng(3).permutation(np.linspace(0.0, 0.1, 101))
+@pytest.mark.parametrize(
+    ("torque_nm", "smaller_nm", "larger_nm"),
+    [
+        (np.random.default_rng(3).permutation(np.linspace(0.0, 0.1, 101)), [8, 6.5, 5, 4, 3], [2, 3.5, 5, 6, 7]),
+        # Of few torques each limit is there once, and none leaves nothing to judge.
+        (np.repeat([0.02, 0.06, 0.1], [20, 2, 40]), [2], [6, 10]),
+    ],
+)
+def test_limits_are_quantiles_and_each_slice_is_either_calibrated_on_or_judged(torque_nm, smaller_nm, larger_nm):
     found = stability.calibration_parts(torque_nm)
-    assert [limit_nm for limit_nm, _ in found[stability.SMALLER]] == pytest.approx([0.08, 0.065, 0.05, 0.04, 0.03])
-    assert [limit_nm for limit_nm, _ in found[stability.LARGER]] == pytest.approx([0.02, 0.035, 0.05, 0.06, 0.07])
-    for which, sign in ((stability.SMALLER, 1), (stability.LARGER, -1)):
+    for which, sign, expected in ((stability.SMALLER, 1, smaller_nm), (stability.LARGER, -1, larger_nm)):
+        assert [100 * limit_nm for limit_nm, _ in found[which]] == pytest.approx(expected)
         for limit_nm, judged in found[which]:
             assert (sign * torque_nm[~judged]).max() == sign * limit_nm
             assert (sign * torque_nm[judged] > sign * limit_nm).all()
-
-
-def test_of_few_torques_each_limit_is_there_once_and_none_leaves_nothing_to_judge():
-    found = stability.calibration_parts(np.repeat([0.02, 0.06, 0.1], [20, 2, 40]))
-    assert [limit_nm for limit_nm, _ in found[stability.SMALLER]] == [0.02]
-    assert [limit_nm for limit_nm, _ in found[stability.LARGER]] == [0.06, 0.1]
 
 
 def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(slices, bank, monkeypatch, capsys):

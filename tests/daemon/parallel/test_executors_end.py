@@ -3,18 +3,13 @@
 import os
 import signal
 import threading
-from collections.abc import Callable
 from multiprocessing import active_children
 from pathlib import Path
-from typing import TypeAlias
 
 import pytest
 
 from shearloop.daemon.parallel import ProcessExecutor
 from shearloop.daemon.process import raise_ending_signals
-
-# From a signal and what it interrupts to the process in which a task was.
-Interrupted: TypeAlias = Callable[[signal.Signals, Callable[[], object]], int]
 
 
 def waits(shared: tuple[str, str], _: int) -> None:
@@ -32,33 +27,23 @@ def test_worker_processes_ignore_the_terminals_signals():
     assert list(ProcessExecutor(1).map(ignored_signals, None, [0])) == [{signal.SIGINT, signal.SIGHUP}]
 
 
-@pytest.fixture
-def interrupted_once_it_works(tmp_path) -> Interrupted:
-    """Interrupts this process as soon as a task `waits`, and returns the process that the task was in."""
-    os.mkfifo(tmp_path / "pids")
-    running: list[int] = []
-
-    def interrupt(number: signal.Signals) -> None:
-        running.append(int((tmp_path / "pids").read_text()))
-        os.kill(os.getpid(), number)
-
-    def during(number: signal.Signals, work: Callable[[], object]) -> int:
-        thread = threading.Thread(target=interrupt, args=(number,))
-        thread.start()
-        with pytest.raises(KeyboardInterrupt), raise_ending_signals():
-            work()
-        thread.join()
-        return running[0]
-
-    return during
-
-
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("more", ["", "x" * (1 << 20)], ids=["small", "large"])
-def test_worker_processes_end_on_an_interrupt(number, more, interrupted_once_it_works, tmp_path):
-    shared = str(tmp_path / "pids"), more
-    process = interrupted_once_it_works(number, lambda: list(ProcessExecutor(1).map(waits, shared, [0, 1, 2])))
+def test_worker_processes_end_on_an_interrupt(number, more, tmp_path):
+    os.mkfifo(tmp_path / "pids")
+    running: list[int] = []
+
+    def interrupt() -> None:
+        """Interrupt this process as soon as a task waits."""
+        running.append(int((tmp_path / "pids").read_text()))
+        os.kill(os.getpid(), number)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    with pytest.raises(KeyboardInterrupt), raise_ending_signals():
+        list(ProcessExecutor(1).map(waits, (str(tmp_path / "pids"), more), [0, 1, 2]))
+    thread.join()
     assert active_children() == []
     with pytest.raises(ProcessLookupError):
-        os.kill(process, 0)
+        os.kill(running[0], 0)

@@ -3,7 +3,6 @@
 import os
 import signal
 import socket
-import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -115,39 +114,26 @@ def test_a_server_that_is_no_scheduler_times_out(monkeypatch):
     monkeypatch.setattr("shearloop.daemon.parallel.CONNECT_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as deaf:
         address = f"tcp://127.0.0.1:{deaf.getsockname()[1]}"
-        with (
-            pytest.raises(UserError, match=f"no Dask scheduler answers at {address} within 0.5 s"),
-            open_executor(address),
-        ):
+        refusal = f"no Dask scheduler answers at {address} within 0.5 s"
+        with pytest.raises(UserError, match=refusal), open_executor(address):
             pass
 
 
-@pytest.fixture
-def lonely(tmp_path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """Start a scheduler without workers, and return its address and its process."""
-    with dask(tmp_path) as found:
-        yield found
-
-
-def test_a_scheduler_without_workers_or_a_lost_one_is_one_sentence(lonely, monkeypatch):
+def test_a_scheduler_without_workers_or_a_lost_one_is_one_sentence(tmp_path, monkeypatch):
     import distributed
 
-    address, (process,) = lonely
-    monkeypatch.setattr("shearloop.daemon.parallel.FIRST_WORKER_S", 0.5)
-    with (
-        pytest.raises(UserError, match=f"at {address} has no worker; start some with `dask worker"),
-        open_executor(address),
-    ):
-        pass
-    monkeypatch.setattr(distributed.Client, "wait_for_workers", lambda *_, **__: None)
-    # As soon as a task is waited for.
-    begun = distributed.Future.result
-    monkeypatch.setattr(distributed.Future, "result", lambda task: (process.kill(), begun(task))[1])
-    with (
-        open_executor(address) as cluster,
-        pytest.raises(UserError, match="the connection to the Dask scheduler was lost"),
-    ):
-        list(cluster.map(square, {"factor": 1.0}, range(3)))
+    with dask(tmp_path) as (address, (process,)):
+        monkeypatch.setattr("shearloop.daemon.parallel.FIRST_WORKER_S", 0.5)
+        lonely = f"at {address} has no worker; start some with `dask worker"
+        with pytest.raises(UserError, match=lonely), open_executor(address):
+            pass
+        monkeypatch.setattr(distributed.Client, "wait_for_workers", lambda *_, **__: None)
+        # As soon as a task is waited for.
+        begun = distributed.Future.result
+        monkeypatch.setattr(distributed.Future, "result", lambda task: (process.kill(), begun(task))[1])
+        lost = "the connection to the Dask scheduler was lost"
+        with open_executor(address) as cluster, pytest.raises(UserError, match=lost):
+            list(cluster.map(square, {"factor": 1.0}, range(3)))
 
 
 def test_a_cluster_address_needs_the_extra(monkeypatch):

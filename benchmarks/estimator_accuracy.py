@@ -2,7 +2,7 @@
 
     python -m benchmarks.estimator_accuracy RECORDINGS --bank run/demo.bank --mesh fingertip_mesh.npz --out DIR
 
-Three tables, led by the loaded frames (truth of 0.005 N·m or more): every estimator fitted to the earlier part of each
+A table, led by the loaded frames (truth of 0.005 N·m or more): every estimator fitted to the earlier part of each
 of the paper's recordings and judged on the later part; the default estimator fitted to one stream and judged on the
 others, of the same and of another day; and with `--rig` the default estimator on the emulated rig, calibrated on three
 to seven cylinders and judged on other tools. RECORDINGS holds torque_slices, diameter_slices and streams. Writes
@@ -11,7 +11,7 @@ estimators.json.
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +48,9 @@ STREAMS = {
     "2 December, 17:17": "20241202_171704",
 }
 FINGERTIPS: tuple[tuple[str, ...], ...] = (("right",), ("left",), ("right", "left"))
+ESTIMATORS: tuple[EstimatorName, ...] = ("paper", "bank", "regression", DEFAULT, "reconstruction")
+# What was fitted to, the estimator, and the estimates that are judged, or why there are none.
+Judged = tuple[str, EstimatorName, EstimateTrack | str]
 # Sets of cylinders to calibrate on, and the tools to judge.
 CYLINDERS_MM = [tuple(np.linspace(10.0, 40.0, n).tolist()) for n in (3, 4, 5, 7)]
 TOOLS_MM = (12.0, 18.0, 22.0, 28.0, 38.0)
@@ -79,24 +82,22 @@ def splits(recordings: Path, scratch: Path) -> Iterator[tuple[str, FrameSeries, 
         yield f"stream, {' and '.join(sides)}, first {TWIST_SHARE:.0%}", past, future, timed_by
 
 
-def later_frames(
-    recordings: Path, scratch: Path, names: list[EstimatorName], physics: Physics
-) -> Iterator[tuple[str, EstimatorName, EstimateTrack]]:
-    """Yield the estimates of every estimator on every split; print why one cannot be fitted."""
-    for (title, past, future, timed_by), name in product(splits(recordings, scratch), names):
+def later_frames(recordings: Path, scratch: Path, physics: Physics) -> Iterator[Judged]:
+    """Yield the estimates of every estimator on every split, or why one cannot be fitted."""
+    for (title, past, future, timed_by), name in product(splits(recordings, scratch), ESTIMATORS):
         # A heatmap over all lags takes most of a second: the paper's method is judged on slices alone.
         if name == "paper" and past.kind == "raw":
             continue
         try:
             calibration = fit(name, [past], title, physics, timing=measure_timing([past], timed_by))
         except BankError as error:
-            print(f"{title}, {name}: {error}")
+            yield title, name, str(error)
             continue
         yield title, name, estimate_series(calibration, future, physics.bank)
 
 
-def other_recordings(recordings: Path, scratch: Path) -> Iterator[tuple[str, dict[str, Figures] | str]]:
-    """Yield the default estimator's figures on each other stream, or the reason of a refused calibration.
+def other_recordings(recordings: Path, scratch: Path) -> Iterator[Judged]:
+    """Yield the default estimator's estimates on each other stream, or the reason of a refused calibration.
 
     The fingertips changed sides between the days, so sides of another day are exchanged.
     """
@@ -107,12 +108,12 @@ def other_recordings(recordings: Path, scratch: Path) -> Iterator[tuple[str, dic
             chosen = [streams[name].select_sides(sides)]
             calibration = fit(DEFAULT, chosen, name, timing=measure_timing(chosen, [streams[name]]))
         except BankError as error:
-            yield title, str(error)
+            yield title, DEFAULT, str(error)
             continue
         for other in (each for each in streams if each != name):
             order = 1 if other[0] == name[0] else -1
             judge = replace(streams[other], channels=streams[other].channels[:, ::order].copy())
-            yield f"{title}: {other}", judged(estimate_series(calibration, judge.select_sides(sides)))
+            yield f"{title}: {other}", DEFAULT, estimate_series(calibration, judge.select_sides(sides))
 
 
 def other_tools(bank: Path, seed: int, repeats: int) -> Iterator[tuple[int, tuple[str, ...], Figures]]:
@@ -149,19 +150,16 @@ def main() -> None:
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     physics = Physics(Bank.open(args.bank), load_mesh(args.mesh))
-    names: list[EstimatorName] = ["paper", "bank", "regression", DEFAULT, "reconstruction"]
     found: dict[str, dict[str, dict[str, Figures]]] = {}
-    print(table_head("fitted to", "estimator", *LOADED, *ALL))
-    for title, name, track in later_frames(args.recordings, args.out, names, physics):
+    columns = [*LOADED, *ALL]
+    print(table_head("fitted to", "estimator", *columns))
+    tracks = chain(later_frames(args.recordings, args.out, physics), other_recordings(args.recordings, args.out))
+    for title, name, track in tracks:
+        if isinstance(track, str):
+            print(table_row(title, name, track, *[None] * (len(columns) - 1)))
+            continue
         result = found.setdefault(title, {})[name] = judged(track)
         print(table_row(title, name, *row_of(result)), flush=True)
-    print(table_head("fitted to", "estimator", *LOADED, *ALL))
-    for title, figures_or_reason in other_recordings(args.recordings, args.out):
-        if isinstance(figures_or_reason, str):
-            print(table_row(title, figures_or_reason, *[None] * len([*LOADED, *ALL])))
-            continue
-        found[title] = {DEFAULT: figures_or_reason}
-        print(table_row(title, DEFAULT, *row_of(figures_or_reason)))
     if args.rig:
         print(table_head("cylinders", "fingertips", "diameter RMSE, mm", "coverage"))
         for count, sides, figures in other_tools(args.bank, 5000, 4):

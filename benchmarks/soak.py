@@ -24,24 +24,27 @@ from shearloop.daemon.recording.reader import read_recording
 FAULTS = [cause for cause in CAUSES if cause.command]
 
 
-def usage(pid: int) -> tuple[float, int]:
-    """Return the memory in MB and the number of descriptors of a process."""
-    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    resident_kb = next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:"))
-    return resident_kb / 1024, len(list(Path(f"/proc/{pid}/fd").iterdir()))
+def usage(rig: RunningRig) -> dict[str, float]:
+    """Return the memory in MB and the number of descriptors of the daemon and of the robot's process."""
+    found = {}
+    for name, pid in (("daemon", rig.daemon.pid), ("worker", rig.worker_pid())):
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        found[f"{name}_mb"] = next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:")) / 1024
+        found[f"{name}_descriptors"] = len(list(Path(f"/proc/{pid}/fd").iterdir()))
+    return found
 
 
 def soak(speed: int, seed: int, goes_on: Callable[[int], bool]) -> dict[str, Any]:
     """Cause faults while `goes_on(number)`; return their counts, the usage before each, and what was recorded."""
     chosen, counts = random.Random(seed), Counter[str]()
-    used: list[tuple[float, int, float, int]] = []
+    used: list[dict[str, float]] = []
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name)
         rig = RunningRig(folder, stack, speed, recording={"folder": str(folder / "recordings")})
         while goes_on(len(used)):
             cause = chosen.choice(FAULTS)
             rig.turn()
-            used.append((*usage(rig.daemon.pid), *usage(rig.worker_pid())))
+            used.append(usage(rig))
             rig.stood_ns(rig.cause(cause))
             rig.recover(cause)
             counts[cause.name] += 1
@@ -50,16 +53,16 @@ def soak(speed: int, seed: int, goes_on: Callable[[int], bool]) -> dict[str, Any
         recordings = sorted((folder / "recordings").iterdir())
         torques = sum(len(read_recording(path).torque_nm) for path in recordings if path.suffix == ".mcap")
     quarter = max(1, len(used) // 4)
-    ends = [[median(column) for column in zip(*part, strict=True)] for part in (used[:quarter], used[-quarter:])]
-    names = ("daemon_mb", "daemon_descriptors", "worker_mb", "worker_descriptors")
+    first, last = (
+        {name: median(one[name] for one in part) for name in used[0]} for part in (used[:quarter], used[-quarter:])
+    )
     return {
         "faults": dict(sorted(counts.items())),
-        "first_quarter": dict(zip(names, ends[0], strict=True)),
-        "last_quarter": dict(zip(names, ends[1], strict=True)),
+        "first_quarter": first,
+        "last_quarter": last,
         "recordings": len(recordings),
         "incomplete_recordings": [path.name for path in recordings if path.suffix != ".mcap"],
         "recorded_torques": torques,
-        "usage": used,
     }
 
 

@@ -74,10 +74,9 @@ CASES = (
 
 def boundary(case: LoopCase, age_s: float, lost: int) -> dict[str, float | None]:
     """Return the simulated gain at the boundary, and without losses the computed one; None above HIGHEST."""
-    computed = gain_limit(case.model(age_s), HIGHEST) if not lost else np.inf
-    simulated = simulated_boundary(case, age_s, lost)
-    found = {"computed": computed, "simulated": simulated}
-    return {"age_s": age_s, "lost": lost} | {name: gain if gain < np.inf else None for name, gain in found.items()}
+    gains = {"computed": np.inf if lost else gain_limit(case.model(age_s), HIGHEST)}
+    gains["simulated"] = simulated_boundary(case, age_s, lost)
+    return {"age_s": age_s, "lost": lost} | {name: gain if gain < np.inf else None for name, gain in gains.items()}
 
 
 def simulated_boundary(case: LoopCase, age_s: float, lost: int) -> float:

@@ -106,7 +106,8 @@ class RunningRig:
         os.mkfifo(folder / "cause")
         self._causes = stack.enter_context((folder / "cause").open("r+b", buffering=0))
         options = f"--paper-sketch --unlock-wait-s 0.5 --power-on-s 0.2 --gel-stiffness 0.02 --speed {speed}"
-        self._rig = stack.enter_context(emulated_rig(folder, folder / "rig.bank", *options.split()))
+        rig: Any = stack.enter_context(emulated_rig(folder, folder / "rig.bank", *options.split()))
+        self._orders, self._events = rig.stdin, rig.stdout
         os.set_blocking(self._events.fileno(), False)
         right = {"device": {"path": "eit-right"}, "bank": "rig.bank", "frame_period_s": FRAME_PERIOD_S / speed}
         load_cell = {"device": {"path": "load-cell"}, "rate_hz": LOAD_CELL_RATE_HZ * speed}
@@ -118,10 +119,6 @@ class RunningRig:
         self._daemons = stack.enter_context(ExitStack())
         self._start_daemon()
         self._messages = stack.enter_context(subscription(folder, "robot.state", "loop.state"))
-
-    @property
-    def _events(self) -> Any:
-        return self._rig.stdout
 
     def _start_daemon(self) -> None:
         self._daemons.close()
@@ -140,8 +137,8 @@ class RunningRig:
     def order(self, command: str) -> int:
         """Send the rig a command; return the time in ns."""
         now_ns = time.monotonic_ns()
-        self._rig.stdin.write(f"{command}\n".encode())  # type: ignore[union-attr]  # it has a pipe
-        self._rig.stdin.flush()  # type: ignore[union-attr]
+        self._orders.write(f"{command}\n".encode())
+        self._orders.flush()
         return now_ns
 
     def send(self, name: str, **arguments: Any) -> dict[str, Any]:

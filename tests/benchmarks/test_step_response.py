@@ -17,7 +17,6 @@ def test_the_step_on_the_rigs_physics_is_held_and_a_screw_ends_at_its_target(tmp
     assert set(numbers) == {"eit", "load_cell", "tighten"}
     assert numbers["eit"]["time_in_band_mean"] > 0.95
     assert max(numbers[name]["overshoot_worst_seed"] for name in ("eit", "load_cell")) <= 0.15
-    assert numbers["eit"]["refused_by_margins"] == numbers["load_cell"]["refused_by_margins"] == 0
     assert numbers["load_cell"]["in_band_at_settling_time_share"] == 1.0
     assert numbers["load_cell"]["mean_error_worst_seed"] < 0.02
     assert numbers["tighten"]["within_share"] == 1.0

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from functools import partial
 from multiprocessing import active_children, get_context
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from shearloop.daemon.errors import UserError, missing
 
@@ -34,21 +34,14 @@ CONNECT_S = 20
 FIRST_WORKER_S = 30
 
 
-class Executor(Protocol):
-    """Runs a function of shared data and of each item."""
-
-    def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[R]:
-        """Yield function(shared, item) of each item in turn, as soon as it is known.
-
-        The function must be importable. Raises what the function raises.
-        """
-
-
 class SerialExecutor:
     """Runs tasks in this process."""
 
     def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[R]:
-        """Yield the results."""
+        """Yield function(shared, item) of each item in turn, as soon as it is known, as every executor does.
+
+        The function must be importable. Raises what the function raises.
+        """
         return (function(shared, item) for item in items)
 
 
@@ -126,8 +119,11 @@ def _identity(shared: S) -> S:
     return shared
 
 
+Executor: TypeAlias = SerialExecutor | ProcessExecutor | DaskExecutor
+
+
 @contextmanager
-def open_executor(cluster: str | None, jobs: int | None = None) -> "Iterator[Executor]":
+def open_executor(cluster: str | None, jobs: int | None = None) -> Iterator[Executor]:
     """Open the executor for a `--cluster` option: None, `local`, or the address of a Dask scheduler.
 
     `jobs` is the number of processes; the default is 1 without a cluster, and one per processor for `local`.

@@ -36,9 +36,11 @@ def run(args: argparse.Namespace) -> int:
     """Draw one chart and print its paths."""
     _check_arguments(args)
     require("matplotlib", "plot", "a chart")
+    from shearloop.bank.eit.bank_file import Bank
     from shearloop.daemon.analysis.charts import scene, simulated_loop, speed_accuracy, stability
-    from shearloop.daemon.analysis.charts.chart_data import MESH_SIZE_CM, bank_of, own_fingertip, splits
+    from shearloop.daemon.analysis.charts.chart_data import GRID, MESH_SIZE_CM, own_fingertip, splits
     from shearloop.daemon.analysis.charts.drawing import chart_folder
+    from shearloop.daemon.analysis.reproduce.banks import cached_bank
     from shearloop.daemon.bank_config import load_geometry
     from shearloop.daemon.parallel import open_executor
 
@@ -55,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
             paths = scene.chart(parts if args.recordings else parts[:1], args.out, executor)
         else:
             mesh = load_geometry(args.mesh).mesh if args.mesh else own_fingertip(MESH_SIZE_CM).mesh()
-            bank = bank_of(args.bank, mesh, scratch)
+            bank = Bank.open(args.bank) if args.bank else cached_bank("chart", GRID, mesh, scratch)
             if args.name == "stability":
                 paths = stability.chart(parts, bank, mesh, scratch, args.out, executor)
             else:

@@ -10,7 +10,6 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.eit.fingertip import Fingertip
-from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import Calibration, FrameSeries, Physics, fit, measure_timing
 from shearloop.bank.estimator_names import EstimatorName
@@ -45,11 +44,6 @@ class Split:
 def own_fingertip(mesh_size_cm: float) -> Fingertip:
     """Return the paper's fingertip by its dimensions, with another mesh size."""
     return load_fingertip(OWN_FINGERTIP, mesh_size_cm)
-
-
-def bank_of(path: Path | None, mesh: Mesh, scratch: Path, grid: Grid = GRID) -> Bank:
-    """Return the bank of a file, or a small one of this mesh, kept in the scratch folder."""
-    return Bank.open(path) if path is not None else cached_bank("chart", grid, mesh, scratch)
 
 
 def splits(paths: Sequence[Path], share: float, scratch: Path) -> list[Split]:

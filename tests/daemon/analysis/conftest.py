@@ -7,8 +7,8 @@ import pytest
 
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.mesh import Mesh
-from shearloop.daemon.analysis.charts.chart_data import Split, bank_of, own_fingertip, splits
-from shearloop.daemon.analysis.reproduce.banks import Grid
+from shearloop.daemon.analysis.charts.chart_data import Split, own_fingertip, splits
+from shearloop.daemon.analysis.reproduce.banks import Grid, cached_bank
 
 
 @pytest.fixture(scope="session")
@@ -38,4 +38,4 @@ def coarse_mesh() -> Mesh:
 
 @pytest.fixture(scope="session")
 def bank(scratch, coarse_mesh) -> Bank:
-    return bank_of(None, coarse_mesh, scratch, Grid(np.linspace(3.0, 3.6, 13), np.linspace(1.0, 2.1, 30)))
+    return cached_bank("chart", Grid(np.linspace(3.0, 3.6, 13), np.linspace(1.0, 2.1, 30)), coarse_mesh, scratch)

@@ -4,7 +4,8 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Iterator, Sequence
+import threading
+from multiprocessing import active_children
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ import pytest
 
 from shearloop.daemon.cli import main
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.parallel import LOCAL, DaskExecutor, ProcessExecutor, SerialExecutor, open_executor
-from tests.daemon.parallel.conftest import STARTED_S, dask
+from shearloop.daemon.parallel import LOCAL, ProcessExecutor, SerialExecutor, open_executor
+from shearloop.daemon.process import raise_ending_signals
+from tests.daemon.parallel.conftest import dask
 from tests.daemon.test_bank_config import write_bank_config
 
 # Every worker imports this module for its tasks: what takes long to import is imported by the test that needs it.
@@ -69,6 +71,43 @@ def test_without_an_address_tasks_run_in_processes_of_this_computer(cluster, job
         else:
             assert isinstance(executor, ProcessExecutor)
             assert executor._count == count
+
+
+def waits(shared: tuple[str, str], _: int) -> None:
+    """Tell that this runs, and for whom the process works; be in the middle of a task then."""
+    Path(shared[0]).write_text(str(os.getpid()))
+    threading.Event().wait(600)
+
+
+def ignored_signals(_: None, __: int) -> set[int]:
+    """Return which of a terminal's signals this process ignores."""
+    return {number for number in (signal.SIGINT, signal.SIGHUP) if signal.getsignal(number) is signal.SIG_IGN}
+
+
+def test_worker_processes_ignore_the_terminals_signals():
+    assert list(ProcessExecutor(1).map(ignored_signals, None, [0])) == [{signal.SIGINT, signal.SIGHUP}]
+
+
+@pytest.mark.usefixtures("default_signals")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("more", ["", "x" * (1 << 20)], ids=["small", "large"])
+def test_worker_processes_end_on_an_interrupt(number, more, tmp_path):
+    os.mkfifo(tmp_path / "pids")
+    running: list[int] = []
+
+    def interrupt() -> None:
+        """Interrupt this process as soon as a task waits."""
+        running.append(int((tmp_path / "pids").read_text()))
+        os.kill(os.getpid(), number)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    with pytest.raises(KeyboardInterrupt), raise_ending_signals():
+        list(ProcessExecutor(1).map(waits, (str(tmp_path / "pids"), more), [0, 1, 2]))
+    thread.join()
+    assert active_children() == []
+    with pytest.raises(ProcessLookupError):
+        os.kill(running[0], 0)
 
 
 def test_a_tasks_error_is_raised(scheduler):
@@ -151,33 +190,7 @@ def bank(tmp_path_factory) -> Path:
     return folder / "here.bank"
 
 
-@pytest.fixture
-def killed(scheduler, monkeypatch) -> Iterator[list[int]]:
-    """Kill a worker as soon as the first result of anything is here, and give the numbers of those killed.
-
-    Its nanny starts another one, which is waited for at the end.
-    """
-    from distributed import Client
-
-    found: list[int] = []
-    whole = DaskExecutor.map
-
-    def interrupted(self: DaskExecutor, function: Any, shared: Any, items: Sequence[Any]) -> Iterator[Any]:
-        for result in whole(self, function, shared, items):
-            if not found:
-                found.append(next(iter(self._client.run(os.getpid).values())))
-                os.kill(found[0], signal.SIGKILL)
-            yield result
-
-    monkeypatch.setattr(DaskExecutor, "map", interrupted)
-    yield found
-    with Client(scheduler, timeout=STARTED_S) as client:
-        client.wait_for_workers(2, timeout=STARTED_S)
-
-
-def test_evaluate_gives_the_same_figures_on_a_cluster_with_a_killed_worker(
-    scheduler, shared, tmp_path, ran, result_of, killed
-):
+def test_evaluate_gives_the_same_figures_on_a_cluster(scheduler, shared, tmp_path, ran, result_of):
     slices, cylinders = (str(shared / "recordings" / name) for name in ("torque_slices", "diameter_slices"))
     calibration = str(tmp_path / "slices.cal")
     ran("calibrate", slices, "--estimator", "regression", "--time-range", "0:0.6", "--out", calibration)
@@ -185,24 +198,23 @@ def test_evaluate_gives_the_same_figures_on_a_cluster_with_a_killed_worker(
     for options in ([], ["--cluster", scheduler]):
         found = result_of("evaluate", calibration, slices, cylinders, "--time-range", "0.6:1", *options)
         figures.append({name: value for name, value in found.items() if not name.startswith("latency")})
-    assert killed
     assert figures[0] == figures[1]
 
 
-def test_a_bank_has_the_same_bytes_after_a_killed_worker(bank, scheduler, killed):
-    again, config = bank.with_name("killed.bank"), str(bank.with_name("bank.yaml"))
+def test_a_bank_of_a_cluster_has_the_same_bytes(bank, scheduler):
+    again, config = bank.with_name("there.bank"), str(bank.with_name("bank.yaml"))
     assert main(["bank", "build", "--config", config, "--out", str(again), "--cluster", scheduler]) == 0
-    assert killed
     assert again.read_bytes() == bank.read_bytes()
 
 
-def test_a_chart_has_the_same_numbers_after_a_killed_worker(scheduler, killed, tmp_path):
+def test_a_chart_of_a_cluster_has_the_same_numbers(scheduler, tmp_path):
     from shearloop.bank.estimation import Physics
-    from shearloop.daemon.analysis.charts.chart_data import Split, bank_of, own_fingertip, synthetic_slices
+    from shearloop.daemon.analysis.charts.chart_data import Split, own_fingertip, synthetic_slices
     from shearloop.daemon.analysis.charts.fault_sweeps import FAULTS, sweeps
-    from shearloop.daemon.analysis.reproduce.banks import Grid
+    from shearloop.daemon.analysis.reproduce.banks import Grid, cached_bank
 
-    bank = bank_of(None, own_fingertip(0.4).mesh(), tmp_path, Grid(np.linspace(3.0, 3.6, 5), np.linspace(1.0, 2.1, 8)))
+    grid = Grid(np.linspace(3.0, 3.6, 5), np.linspace(1.0, 2.1, 8))
+    bank = cached_bank("chart", grid, own_fingertip(0.4).mesh(), tmp_path)
     slices = synthetic_slices(tmp_path)
     # Few frames are judged at each level of each fault.
     split = Split("slices", slices.between(0, 29), slices.between(29, 31), slices)
@@ -210,6 +222,5 @@ def test_a_chart_has_the_same_numbers_after_a_killed_worker(scheduler, killed, t
     names = ("regression", "regression")
     with open_executor(scheduler) as cluster:
         there = sweeps(split, names, Physics(bank, None), bank, cluster)
-    assert killed
     assert there == sweeps(split, names[:1], Physics(bank, None), bank, SerialExecutor()) * 2
     assert len(there) == 2 * len(FAULTS)

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -78,8 +78,8 @@ def _of_slices(split: Split, bank: Bank, mesh: Mesh, out: Path, executor: Execut
     """Write the charts of slices: continuity, and torques beyond the calibrated ones."""
     name, physics = slug(split.title), Physics(bank, mesh)
     found = walks(split, bank, fitted(split, ("regression", "motion_regression"), physics))
-    rows = [asdict(one) | {"largest_hop_nm": one.largest_hop_nm, "hops": one.hops} for one in found]
-    written = save(continuity_figure(split.title, found), {"steps": STEPS, "walks": rows}, out, f"continuity-{name}")
+    content: dict[str, Any] = {"steps": STEPS, "walks": [asdict(one) for one in found]}
+    written = save(continuity_figure(split.title, found), content, out, f"continuity-{name}")
     beyond = extrapolate(split, SLICE_NAMES, bank, mesh, executor)
     content = {
         "broken_share": BROKEN_SHARE,
@@ -96,21 +96,17 @@ def _written(name: str, title: str, curves: Sequence[FaultCurve], out: Path) -> 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContinuityWalk:
-    """Torques (n,) in N·m along a path through frames, NaN where not valid; `share_nm` is the fair share of a step."""
+    """Torques (n,) in N·m along a path through frames, NaN where not valid; `share_nm` is the fair share of a step.
+
+    `largest_hop_nm` is the largest change within a step, 0 where nothing was valid; `hops` counts the changes by more
+    than ten fair shares.
+    """
 
     name: str
     torque_nm: FloatArray
     share_nm: float
-
-    @property
-    def largest_hop_nm(self) -> float:
-        """The largest change within one step, 0 where nothing was valid."""
-        return float(np.nan_to_num(np.abs(np.diff(self.torque_nm))).max(initial=0.0))
-
-    @property
-    def hops(self) -> int:
-        """The number of steps that changed it by more than ten fair shares."""
-        return int(np.count_nonzero(np.nan_to_num(np.abs(np.diff(self.torque_nm))) > 10 * self.share_nm))
+    largest_hop_nm: float
+    hops: int
 
 
 def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[ContinuityWalk]:
@@ -128,14 +124,19 @@ def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[Con
         "zero lag: the maximum, refined": bank_match.RefinedMatcher(bank, NOT_TURNED, mean_of_alike=False),
         "zero lag: mean of the cells alike (the fix)": bank_match.RefinedMatcher(bank, NOT_TURNED),
     }
-    found = []
+    torques: dict[str, FloatArray] = {}
     for name, locator in locators.items():
         torque_nm_of = parabola(split, partial(matched_sigma, locator))
-        found.append(ContinuityWalk(name, np.array([torque_nm_of(one) for one in path]), share_nm))
+        torques[name] = np.array([torque_nm_of(one) for one in path])
     for calibration in calibrations:
         tracker = EstimatorSession(calibration, bank)
         estimates = [tracker.estimate(TactileFrame.of(0.0, one[None])) for one in path]
-        found.append(ContinuityWalk(calibration.estimator.name, values_of(estimates)[0], share_nm))
+        torques[calibration.estimator.name] = values_of(estimates)[0]
+    found = []
+    for name, torque in torques.items():
+        change_nm = np.nan_to_num(np.abs(np.diff(torque)))
+        hops = int(np.count_nonzero(change_nm > 10 * share_nm))
+        found.append(ContinuityWalk(name, torque, share_nm, float(change_nm.max(initial=0.0)), hops))
     return found
 
 

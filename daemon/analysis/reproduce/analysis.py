@@ -114,6 +114,7 @@ class TorqueResult:
     focused: Matches
     wide: Matches
     r_focused: float | None
+    r_wide: float | None
     groups: IntArray
     grouping: str
     r_clustered: float | None
@@ -121,11 +122,6 @@ class TorqueResult:
     fit: Polynomial | None
     rmse_nm: float | None
     held_out: str
-
-    @property
-    def r_wide(self) -> float | None:
-        """The correlation on the wide bank."""
-        return correlation(self.wide.sigma, self.slices.torque_nm)
 
     @property
     def group_torque_nm(self) -> FloatArray:
@@ -189,13 +185,8 @@ def match_slices(differences: FloatArray, bank: Bank, progress: Progress) -> Mat
 
 def _best_matches(heatmaps: FloatArray, bank: Bank) -> Matches:
     best = tuple(best_match(heatmap, bank.k_grid, bank.sigma_grid) for heatmap in heatmaps)
-    return Matches(
-        heatmaps=heatmaps,
-        k=np.array([match.k for match in best]),
-        sigma=np.array([match.sigma for match in best]),
-        scores=np.array([match.score for match in best]),
-        best=best,
-    )
+    k, sigma, scores = np.array([(match.k, match.sigma, match.score) for match in best]).T
+    return Matches(heatmaps, k, sigma, scores, best)
 
 
 def analyse_torque(slices: Slices, on_focused: Matches, on_wide: Matches) -> TorqueResult:
@@ -209,6 +200,7 @@ def analyse_torque(slices: Slices, on_focused: Matches, on_wide: Matches) -> Tor
         focused=on_focused,
         wide=on_wide,
         r_focused=correlation(sigma, torque),
+        r_wide=correlation(on_wide.sigma, torque),
         groups=groups,
         grouping=grouping,
         r_clustered=correlation(group_sigma, group_torque),

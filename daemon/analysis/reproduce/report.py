@@ -211,18 +211,13 @@ _HEATMAPS_SHOWN = 4
 
 def draw_all(found: Reproduction, banks: dict[str, Bank], folder: Path) -> list[Path]:
     """Draw the figures of all existing results as PNG and SVG, and return the paths; raises OSError."""
-    figures: dict[str, Figure] = {}
-    if found.torque:
-        figures["figure_3_dataset"] = dataset_figure(
-            found.torque.slices, found.torque.parts, found.regressions, found.twists
-        )
-    figures["figure_4_models"] = models_figure(found.mesh)
-    figures["figure_6_bank"] = signal_figure(found.wide)
+    figures = {"figure_4_models": models_figure(found.mesh), "figure_6_bank": signal_figure(found.wide)}
     if found.models:
         figures["figure_5_models"] = model_figure(found.models)
-    if found.torque:
-        figures["figure_7_heatmap"] = heatmap_figure(found.torque, banks["wide"])
-        figures["figure_8_torque"] = torque_figure(found.torque, banks["focused"])
+    if torque := found.torque:
+        dataset = dataset_figure(torque.slices, torque.parts, found.regressions, found.twists)
+        figures |= {"figure_3_dataset": dataset, "figure_7_heatmap": heatmap_figure(torque, banks["wide"])}
+        figures["figure_8_torque"] = torque_figure(torque, banks["focused"])
     if found.diameter:
         figures["figure_9_diameter"] = diameter_figure(found.diameter, banks["wide"])
     written = []

@@ -37,7 +37,7 @@ LONGEST = (
     *("test_page.py", "test_page_controls.py", "test_under_systemd.py", "test_run.py", "test_runner_any_order.py"),
     *("test_replay.py", "test_other_fingertips.py", "test_finite_strain.py", "test_cli_reproduce.py", "test_flood.py"),
     *("test_fingertip.py", "test_design.py", "test_shared_recordings.py", "test_docs.py", "test_parallel.py"),
-    *("test_server.py", "test_memory.py", "test_emulate.py", "test_bank_design.py"),
+    *("test_server.py", "test_session_state.py", "test_emulate.py", "test_bank_design.py"),
     *("test_cylinders.py", "test_calibrate.py", "test_speed_accuracy_chart.py", "test_step_response.py"),
     *("test_plane_strain.py", "test_recorder.py", "test_fuzz.py", "test_physics.py", "test_skin_loop_chart.py"),
     *(

@@ -11,7 +11,7 @@ from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray
 from shearloop.bank.eit.bank_file import MIN_SIGNAL_NORM, BankDefinition, write_bank
 from shearloop.bank.eit.forward import BatchForwardModel
 from shearloop.bank.eit.mesh import Mesh
-from shearloop.bank.eit.models import ConductivityModel
+from shearloop.bank.eit.models import conductivity
 from shearloop.bank.errors import BankFileError, ModelError
 
 
@@ -33,18 +33,16 @@ class RowSolver:
     def __init__(self, mesh: Mesh, definition: BankDefinition) -> None:
         """Prepare the forward model and solve it for the homogeneous voltages."""
         self._forward = BatchForwardModel(mesh, definition.table)
-        self._conductivities = ConductivityModel(mesh)
-        self._definition = definition
-        self._n_triangles = len(mesh.triangles)
+        self._mesh, self._definition = mesh, definition
         (self.homogeneous,) = self._forward.voltages(np.ones((1, len(mesh.triangles))))
 
     def solve(self, row: int) -> BankRow:
         """Return the cells of the k at `row`. A cell whose conductivity is not positive is not solved."""
         k, sigmas = float(self._definition.k_grid[row]), self._definition.sigma_grid
-        cells, smallest, n_solved = np.empty((len(sigmas), self._n_triangles)), np.empty(len(sigmas)), 0
+        cells, smallest, n_solved = np.empty((len(sigmas), len(self._mesh.triangles))), np.empty(len(sigmas)), 0
         for cell, sigma in enumerate(sigmas.tolist()):
             # The next cell overwrites one that is not positive.
-            cells[n_solved] = self._conductivities.conductivity(self._definition.model, k, sigma)
+            cells[n_solved] = conductivity(self._mesh, self._definition.model, k, sigma)
             smallest[cell] = cells[n_solved].min()
             n_solved += smallest[cell] > 0
         valid = smallest > 0

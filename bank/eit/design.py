@@ -26,7 +26,7 @@ from shearloop.bank.eit.channels import ChannelTable
 from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.bank.eit.forward import BatchForwardModel, ForwardModel
 from shearloop.bank.eit.matching import ReferenceMatcher
-from shearloop.bank.eit.models import MODELS, ConductivityModel, conductivity
+from shearloop.bank.eit.models import MODELS, conductivity
 from shearloop.bank.errors import CalibrationError, MatchingError
 
 # The share of the noise that each choice may add.
@@ -99,8 +99,7 @@ def searched_settings(model: str, height: float, places: FloatArray = _PLACES) -
 
 def simulated_signals(forward: BatchForwardModel, model: str, settings: Sequence[Setting]) -> FloatArray:
     """Return the (m, n) difference signals of the settings with a positive conductivity everywhere."""
-    of = ConductivityModel(forward.mesh)
-    cells = [cell for cell in (of.conductivity(model, *one) for one in settings) if cell.min() > 0]
+    cells = [cell for cell in (conductivity(forward.mesh, model, *one) for one in settings) if cell.min() > 0]
     voltages = forward.voltages(np.array([np.ones(len(forward.mesh.triangles)), *cells]))
     signals: FloatArray = voltages[1:] - voltages[0]
     return signals
@@ -308,8 +307,7 @@ def simulated_frames(design: Design, fingertip: Fingertip, n: int = 49, seed: in
 
 def _positive(forward: BatchForwardModel, model: str, settings: Sequence[Setting]) -> list[Setting]:
     """Return the settings with a positive conductivity."""
-    of = ConductivityModel(forward.mesh)
-    return [one for one in settings if of.conductivity(model, *one).min() > 0]
+    return [one for one in settings if conductivity(forward.mesh, model, *one).min() > 0]
 
 
 def _fit(frames: FloatArray, signals: FloatArray) -> tuple[FloatArray, FloatArray]:

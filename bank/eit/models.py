@@ -5,11 +5,12 @@ Trehan et al. 2025, equations (1) to (5).
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from shearloop.bank.arrays import FloatArray
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.errors import ModelError
 
 if TYPE_CHECKING:
@@ -92,32 +93,30 @@ def averaging_points() -> FloatArray:
 def conductivity(mesh: "Mesh", model: str, k: float, sigma: float) -> FloatArray:
     """Return the (T,) conductivity of a mesh's triangles: 1 + the mean of f over the triangle's averaging points.
 
-    It need not be positive. Raises ModelError for an unknown model, and for σ ≤ 0 where the model divides by it.
+    It need not be positive. Raises ModelError for an unknown model, and for parameters that it does not take.
     """
-    return ConductivityModel(mesh).conductivity(model, k, sigma)
+    basis = model_named(model)
+    if not (np.isfinite(k) and np.isfinite(sigma)):
+        raise ModelError(f"k and sigma must be finite numbers, not k = {k} and sigma = {sigma}")
+    if sigma <= 0 and basis.uses_sigma:
+        raise ModelError(f"sigma must be above 0 for the model {model}, not {sigma}")
+    heights, alike, centre = _averaged_heights(mesh)
+    shape = basis.function(heights, k, sigma, centre).sum(axis=0) / len(heights)
+    values: FloatArray = (1.0 + shape)[alike]
+    return values
 
 
-class ConductivityModel:
-    """The conductivity for many parameters on one mesh; triangles of equal heights are averaged once."""
+@lru_cache(maxsize=4)
+def _averaged_heights(mesh: "Mesh") -> tuple[FloatArray, IntArray, float]:
+    """Return the heights (15, h) of the averaging points, the number (T,) of each triangle's, and the middle height.
 
-    def __init__(self, mesh: "Mesh") -> None:
-        """Find the triangles whose corners have the same heights."""
-        y = mesh.nodes[:, 1]
-        self._centre = float((y.min() + y.max()) / 2)
-        # A triangle's mean does not depend on the order of its corners, nor on rounding.
-        corners = np.sort(y[mesh.triangles], axis=1)
-        rounded = np.round(corners / mesh.height_cm, _DIGITS)
-        _, first, self._alike = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
-        corners = corners[first]
-        self._heights = np.ascontiguousarray((corners @ averaging_points().T).T)
-
-    def conductivity(self, model: str, k: float, sigma: float) -> FloatArray:
-        """Return the (T,) conductivity; errors as `conductivity`."""
-        basis = model_named(model)
-        if not (np.isfinite(k) and np.isfinite(sigma)):
-            raise ModelError(f"k and sigma must be finite numbers, not k = {k} and sigma = {sigma}")
-        if sigma <= 0 and basis.uses_sigma:
-            raise ModelError(f"sigma must be above 0 for the model {model}, not {sigma}")
-        shape = basis.function(self._heights, k, sigma, self._centre).sum(axis=0) / len(self._heights)
-        values: FloatArray = (1.0 + shape)[self._alike]
-        return values
+    Triangles whose corners have the same heights share theirs.
+    """
+    y = mesh.nodes[:, 1]
+    # A triangle's mean does not depend on the order of its corners, nor on rounding.
+    corners = np.sort(y[mesh.triangles], axis=1)
+    _, first, alike = np.unique(
+        np.round(corners / mesh.height_cm, _DIGITS), axis=0, return_index=True, return_inverse=True
+    )
+    heights = np.ascontiguousarray((corners[first] @ averaging_points().T).T)
+    return heights, alike, float((y.min() + y.max()) / 2)

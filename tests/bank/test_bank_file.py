@@ -33,12 +33,16 @@ def path(tmp_path):
     return tmp_path / "small.bank"
 
 
-def rewrite_header(path, change):
-    """Change the header's JSON and put its checksum right again, as an honest writer of another kind would."""
-    content = bytearray(path.read_bytes())
-    text = json.dumps(change(json.loads(content[48:4096]))).encode().ljust(4048)
+def write_header(path, text):
+    """Write another header and put its checksum right again, as an honest writer of another kind would."""
+    content, text = bytearray(path.read_bytes()), text.ljust(4048)
     content[16:48], content[48:4096] = hashlib.sha256(text).digest(), text
     path.write_bytes(content)
+
+
+def rewrite_header(path, change):
+    """Change the header's JSON."""
+    write_header(path, json.dumps(change(json.loads(path.read_bytes()[48:4096]))).encode())
 
 
 def rewrite_array(path, name, change):
@@ -171,9 +175,7 @@ def test_a_header_that_describes_no_bank_is_refused(path, change):
 
 @pytest.mark.parametrize("text", [b"{not JSON", b"[" * 4000, b"\xff\xfe", b"9" * 4048])
 def test_a_header_that_is_no_json_is_refused(path, text):
-    content, text = bytearray(path.read_bytes()), text.ljust(4048)
-    content[16:48], content[48:4096] = hashlib.sha256(text).digest(), text
-    path.write_bytes(content)
+    write_header(path, text)
     with pytest.raises(BankFileError, match="its header does not describe a bank"):
         Bank.open(path)
 

@@ -1,13 +1,10 @@
-"""Many solutions at once against the direct solve of each, and against what a Schur complement is."""
+"""Many solutions at once against the direct solve of each."""
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from shearloop.bank.eit.elimination import LANES, Elimination
+from shearloop.bank.eit.elimination import LANES
 from shearloop.bank.eit.forward import MAX_LEAK, BatchForwardModel, rounding_leaks
-from shearloop.bank.eit.mesh import Terms
 from shearloop.bank.eit.models import MODELS, conductivity
 from shearloop.bank.errors import ConductivityError
 from tests.bank.conftest import relative
@@ -16,34 +13,6 @@ from tests.bank.conftest import relative
 @pytest.fixture(scope="module")
 def batch(fingertip) -> BatchForwardModel:
     return BatchForwardModel(fingertip)
-
-
-def chained(rng: np.random.Generator, n: int, far: int, factors: int) -> Terms:
-    """Return a Laplacian, each unknown linked to some that follow, each link with a factor; and 1 on the diagonal."""
-    diagonal, i = np.arange(n), np.repeat(np.arange(n - 1), 2)
-    j, factor = np.minimum(i + rng.integers(1, far + 1, len(i)), n - 1), np.arange(len(i)) % factors
-    return Terms(
-        np.concatenate([i, j, i, j, diagonal]),
-        np.concatenate([i, j, j, i, diagonal]),
-        np.repeat([1.0, -1.0, 1.0], [2 * len(i), 2 * len(i), n]),
-        np.concatenate([np.tile(factor, 4), np.full(n, factors)]),
-    )
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(2, 200), st.integers(1, 9), st.integers(1, 20))
-@settings(max_examples=40, deadline=None)
-def test_what_is_left_is_the_schur_complement(seed, n, kept, far):
-    rng = np.random.default_rng(seed)
-    kept = min(kept, n - 1)
-    pattern = chained(rng, n, far, 30)
-    factors = rng.uniform(0.1, 10, (LANES + 3, 30))
-    found = Elimination(pattern, n, kept).schur_complements(factors)
-    for each, factor in zip(found, factors, strict=True):
-        matrix = np.zeros((n, n))
-        np.add.at(matrix, (pattern.rows, pattern.columns), pattern.values * np.append(factor, 1.0)[pattern.source])
-        inner, coupling = matrix[:-kept, :-kept], matrix[:-kept, -kept:]
-        expected = matrix[-kept:, -kept:] - coupling.T @ np.linalg.solve(inner, coupling)
-        np.testing.assert_allclose(each, expected, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("model", MODELS)

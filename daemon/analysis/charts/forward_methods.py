@@ -9,7 +9,7 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.forward import BatchForwardModel, ForwardModel
 from shearloop.bank.eit.mesh import Mesh
-from shearloop.bank.eit.models import ConductivityModel, conductivity
+from shearloop.bank.eit.models import conductivity
 from shearloop.daemon.analysis.charts.chart_data import own_fingertip
 
 MODEL = "gaussian_derivative"
@@ -84,10 +84,10 @@ def _cited(name: str, family: str, cell_s: float, error: float | None) -> Solved
 
 def batch(mesh: Mesh) -> Callable[[], FloatArray]:
     """Return a function that solves the same cells several times in one batch, as `bank build` does."""
-    model, of = BatchForwardModel(mesh), ConductivityModel(mesh)
+    model = BatchForwardModel(mesh)
     (homogeneous,) = model.voltages(np.ones((1, len(mesh.triangles))))
     # The elimination takes several cells at once; six alone would leave lanes empty.
-    cells = np.array([of.conductivity(MODEL, k, s) for k, s in CELLS])
+    cells = np.array([conductivity(mesh, MODEL, k, s) for k, s in CELLS])
     many = np.resize(np.arange(len(CELLS)), BATCHES * len(CELLS))
     return lambda: model.voltages(cells[many]) - homogeneous
 

@@ -1,12 +1,14 @@
-"""The default estimator on a rig that is played by formulas, fitted to one recording and tried on another."""
+"""Sessions on a rig that is played by formulas: another recording, tool or board, and frames that are spoilt."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import TRUSTED, EstimatorSession, Measured, TactileFrame, fit, fitting
+from shearloop.bank.estimation import TRUSTED, EstimatorSession, FrameSeries, Measured, TactileFrame, fit, fitting
+from shearloop.bank.estimation.fingertip_validator import mask_saturated
 from tests.bank.estimation.conftest import follow, judged, kept
 
 
@@ -118,28 +120,6 @@ def test_too_many_dead_channels_end_it(motion_calibration, twisting):
     estimates = follow(motion_calibration, twisting(seed=11), usable)
     assert not any(one.valid for one in estimates)
     assert "dead or saturated" in estimates[100].reasons[0]
-
-
-def test_after_a_gap_the_memory_is_filled_anew(motion_calibration, twisting):
-    other = twisting(seed=13)
-    times = other.t_s + np.where(np.arange(len(other.t_s)) >= 150, 3.0, 0.0)
-    torn = replace(other, t_s=times)
-    estimates = follow(motion_calibration, torn)
-    assert estimates[149].valid
-    assert all(one.reasons[0].startswith("gripped too recently") for one in estimates[151:162])
-    assert not estimates[150].valid
-    assert estimates[166].valid
-
-
-def test_frames_that_come_again_later_are_no_motion(motion_calibration, twisting):
-    """Somebody sends two old frames again: what the gel has done since is not told by them."""
-    other = twisting(seed=13)
-    order = [*range(150), 148, 149, *range(150, 220)]
-    tracker = EstimatorSession(motion_calibration)
-    estimates = [tracker.estimate(TactileFrame.of(float(other.t_s[i]), other.channels[i])) for i in order]
-    assert estimates[149].valid
-    assert not any(one.valid for one in estimates[150:162])
-    assert estimates[175].valid
 
 
 def test_one_fingertip_does_too_and_two_do_better(twisting):
@@ -285,3 +265,69 @@ def test_a_frame_that_a_board_sends_again_is_no_new_one(motion_calibration, twis
     number = np.arange(len(whole.t_s))
     without = kept(whole, (number <= hung) | (number >= hung + 30))
     assert estimates[hung + 30 :] == follow(motion_calibration, without)[hung + 1 :]
+
+
+STEP_V = 0.00215
+
+
+def without_electrodes(series: FrameSeries, electrodes: tuple[int, ...], start: int) -> FrameSeries:
+    lost = np.isin(PAPER_TABLE.electrodes, electrodes).any(axis=1)
+    channels = series.channels.copy()
+    channels[start:, :, lost] = STEP_V
+    return replace(series, channels=channels)
+
+
+@pytest.mark.parametrize("electrodes", [(5,), (5, 19)])
+def test_electrodes_that_are_lost_without_a_word_are_done_without(motion_calibration, twisting, electrodes):
+    whole = twisting(seed=31)
+    spoilt = without_electrodes(whole, electrodes, 90)
+    found = follow(motion_calibration, spoilt)
+    before = follow(motion_calibration, whole)
+    assert sum(one.valid for one in found) > 0.9 * sum(one.valid for one in before)
+    assert judged(found, spoilt).rmse < 1.5 * judged(before, whole).rmse
+
+
+def test_many_lost_electrodes_end_it(motion_calibration, twisting):
+    found = follow(motion_calibration, without_electrodes(twisting(seed=32), (1, 4, 8, 12, 20, 25), 90))
+    assert not any(one.valid for one in found[90:])
+
+
+def test_channels_at_a_rail_are_found_and_done_without(motion_calibration, twisting):
+    whole = twisting(seed=33)
+    rail = np.quantile(whole.channels[5], 0.9)
+    clipped = replace(whole, channels=np.minimum(whole.channels, rail))
+    found = follow(motion_calibration, clipped)
+    assert judged(found, clipped).rmse < 0.02 * 0.06
+    # One side is clipped, the other is not.
+    frame, usable = np.array([clipped.channels[100, 0], whole.channels[100, 0]]), np.ones((2, 896), dtype=np.bool_)
+    left = mask_saturated(frame, usable)
+    np.testing.assert_array_equal(left[0], frame[0] < rail)
+    assert (~left[0]).mean() == pytest.approx(0.1, abs=0.05)
+    assert left[1].all()
+    # A channel that is dead already hides nothing by what it reads.
+    frame[0, 3], usable[0, 3] = 5.0, False
+    np.testing.assert_array_equal(mask_saturated(frame, usable), left & usable)
+    assert not mask_saturated(frame, np.zeros_like(usable)).any()
+
+
+def test_an_ordinary_frame_is_at_no_rail(twisting):
+    frame = np.floor(twisting(seed=34).channels[50] / STEP_V) * STEP_V
+    assert mask_saturated(frame, np.ones(frame.shape, dtype=np.bool_)).all()
+
+
+def test_of_as_many_as_are_at_a_rail_one_less_is_chance():
+    frame = np.linspace(0.1, 0.2, 896)[None]
+    for count in range(1, 20):
+        frame[0, :count] = 0.7
+        left = mask_saturated(frame, np.ones((1, 896), dtype=np.bool_))
+        assert np.count_nonzero(left) == (896 if count < 9 else 896 - count)
+
+
+def test_a_drift_does_not_lead_a_regression_astray(twisting):
+    past = twisting(seed=35)
+    calibration = fit("regression", [past], "rig")
+    later = twisting(seed=36)
+    moved = np.random.default_rng(0).normal(0.0, 0.05, 896) * later.channels[5]
+    drift = np.linspace(0, 1, len(later.t_s))[:, None, None] * moved
+    found = follow(calibration, replace(later, channels=later.channels + drift))
+    assert not any(one.valid for one in found[-60:-40])

@@ -20,12 +20,12 @@ from shearloop.bank.skin.membrane import Section
 from shearloop.bank.skin.plane_strain import (
     MESH_112,
     ContactError,
+    ContactProblem,
     MeshSize,
     SkinMesh,
     along,
     angle,
     radial,
-    solve_contact,
 )
 
 MAX_NEWTON_STEPS = 15
@@ -148,7 +148,8 @@ class FiniteStrainSkin:
             step, compliance, way, by_contact = self._linearised(
                 displacement, force, before.contact_rad, (normal_n, shear_n)
             )
-            force = solve_contact(compliance, way, none, self.section.friction, force, self._stiffness).force_n
+            problem = ContactProblem(compliance, way, none, self.section.friction, self._stiffness)
+            force = problem.solution(force).force_n
             step = step + by_contact @ force
             displacement[self.mesh.free] += step
             if abs(step).max() <= TOLERANCE * self.section.thickness_mm:

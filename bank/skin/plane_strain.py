@@ -256,8 +256,9 @@ def unloaded(skin: CondensedSkin) -> ContactState:
 def apply_load(skin: CondensedSkin, before: ContactState, normal_n: float, shear_n: float) -> ContactState:
     """Return the state after one increment of load (N); ContactError where the contact conditions cannot be met."""
     free = skin.load_displacement @ (normal_n, shear_n)
-    found = solve_contact(skin.compliance, free, before.along_mm, skin.section.friction, before.contact_force_n)
-    n = len(before.along_mm)
+    stiffness = 1 / np.diag(skin.compliance)
+    problem = ContactProblem(skin.compliance, free, before.along_mm, skin.section.friction, stiffness)
+    found, n = problem.solution(before.contact_force_n), len(before.along_mm)
     along_mm = skin.compliance[n:] @ found.force_n + free[n:]
     return ContactState(normal_n, shear_n, found.force_n, along_mm, found.steps, found.pivoted)
 
@@ -314,55 +315,48 @@ class ContactSolution(NamedTuple):
     pivoted: bool = False
 
 
-def solve_contact(
-    compliance: FloatArray,
-    displacement: FloatArray,
-    along_before: FloatArray,
-    friction: float,
-    start: FloatArray,
-    stiffness: FloatArray | None = None,
-) -> ContactSolution:
-    """Return the contact forces of one increment.
+@dataclass(frozen=True, slots=True, eq=False)
+class ContactProblem:
+    """One increment of contact at n nodes.
 
     `compliance` (2n, 2n) mm/N; `displacement` (2n,) mm without contact; `along_before` (n,) mm at the previous
-    increment; `start` (2n,) N; `stiffness` (2n,) N/mm, positive, of each node, the compliance's own unless given.
-    There is a solution wherever the compliance is positive definite. Raises ContactError for a load that is not a
-    number.
+    increment; `stiffness` (2n,) N/mm, positive, scales displacements to forces: any numbers give the same solution.
     """
-    if not (np.isfinite(displacement).all() and np.isfinite(start).all()):
-        raise ContactError("The skin's load is not a number; give its normal and shear force in N.")
-    stiffness = 1 / np.diag(compliance) if stiffness is None else stiffness
-    problem = _Problem(compliance, displacement, along_before, friction, stiffness)
-    found, converged = problem.newton(start)
-    if converged:
-        return found
-    pivoted = problem.pivot()
-    # Newton's method removes the rounding of the pivots.
-    polished, converged = problem.newton(pivoted)
-    return ContactSolution(polished.force_n if converged else pivoted, found.steps + polished.steps, True)
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
     compliance: FloatArray
     displacement: FloatArray
     along_before: FloatArray
     friction: float
-    # Scales displacements to forces; any positive numbers give the same solution.
     stiffness: FloatArray
 
-    def newton(self, force: FloatArray) -> tuple[ContactSolution, bool]:
-        """Return where a semismooth Newton method comes from these forces, and whether it converged."""
+    def solution(self, start: FloatArray) -> ContactSolution:
+        """Return the contact forces, from a start (2n,) in N.
+
+        There is a solution wherever the compliance is positive definite. Raises ContactError for a load that is not a
+        number.
+        """
+        if not (np.isfinite(self.displacement).all() and np.isfinite(start).all()):
+            raise ContactError("The skin's load is not a number; give its normal and shear force in N.")
+        force, steps, converged = self.newton(start)
+        if converged:
+            return ContactSolution(force, steps)
+        pivoted = self.pivot()
+        # Newton's method removes the rounding of the pivots.
+        polished, more, converged = self.newton(pivoted)
+        return ContactSolution(polished if converged else pivoted, steps + more, True)
+
+    def newton(self, force: FloatArray) -> tuple[FloatArray, int, bool]:
+        """Return where a semismooth Newton method comes from these forces, its steps, and whether it converged."""
         smallest = np.finfo(np.float64).tiny
         for step in range(MAX_STEPS):
             residual, touching, slipping = self.residual(force)
             if np.linalg.norm(residual) <= max(TOLERANCE * abs(force).max(), smallest):
-                return ContactSolution(force, step), True
+                return force, step, True
             solved = self.solve(touching, slipping)
             if solved is None:
-                return ContactSolution(force, step), False
+                return force, step, False
             force = solved
-        return ContactSolution(force, MAX_STEPS), False
+        return force, MAX_STEPS, False
 
     def residual(self, force: FloatArray) -> tuple[FloatArray, BoolArray, FloatArray]:
         """Return Φ (2n,) in N, and the piece of Φ that contains the forces.

@@ -1,6 +1,5 @@
 """A rig that is played by formulas: fingertips with a pattern of their own, a gel that creeps, a one-sided lever."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -35,7 +34,7 @@ def tip(number: int) -> Tip:
     return Tip(idle, *(idle * rng.normal(0, scale, PAPER_TABLE.n_channels) for scale in (0.06, 0.04, 0.02, 0.01)))
 
 
-def series(
+def twisting(
     cycles: int = 4, tips: tuple[int, ...] = (1, 2), seed: int = 0, peak_nm: float = 0.06, noise_v: float = 0.001
 ) -> FrameSeries:
     """Return idle, gripped and twisted `cycles` times, and idle again; torque is there for a short part of a cycle."""
@@ -71,7 +70,7 @@ def series(
     return FrameSeries("raw", sides, t, channels, fine, torque, np.full(len(t), np.nan))
 
 
-def slices(n_repeats: int = 5, seed: int = 0, noise_v: float = 0.0008) -> FrameSeries:
+def sliced(n_repeats: int = 5, seed: int = 0, noise_v: float = 0.0008) -> FrameSeries:
     """Return |differences| of ten rising torques, repeated, with a drift that grows from repeat to repeat."""
     rng = np.random.default_rng(seed)
     shape = np.random.default_rng(77)
@@ -138,19 +137,9 @@ def follow(
 
 
 @pytest.fixture(scope="session")
-def twisting() -> Callable[..., FrameSeries]:
-    return series
-
-
-@pytest.fixture(scope="session")
-def sliced() -> Callable[..., FrameSeries]:
-    return slices
-
-
-@pytest.fixture(scope="session")
 def recorded() -> FrameSeries:
     """One recording that tests share."""
-    return series()
+    return twisting()
 
 
 @pytest.fixture(scope="session")
@@ -162,7 +151,7 @@ def motion_calibration(recorded) -> Calibration:
 @pytest.fixture(scope="session")
 def sliced_calibration() -> Calibration:
     """An estimator calibrated on fifty slices."""
-    return fit("motion_regression", [slices()], "all")
+    return fit("motion_regression", [sliced()], "all")
 
 
 @pytest.fixture(scope="session")

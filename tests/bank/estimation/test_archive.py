@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.errors import BankError, CalibrationError
 from shearloop.bank.estimation import TRUSTED, Calibration, fit
-from tests.bank.estimation.conftest import follow
+from tests.bank.estimation.conftest import follow, sliced
 from tests.paper_curve import paper_curve
 
 
@@ -131,7 +131,7 @@ def test_values_that_cannot_be_kept_and_files_that_cannot_be_written_are_errors(
         motion_calibration.save(tmp_path / "none" / "x.cal")
 
 
-def test_assumptions_are_kept(motion_calibration, recorded, sliced, tmp_path):
+def test_assumptions_are_kept(motion_calibration, recorded, tmp_path):
     assert motion_calibration.assumptions == ()
     assert motion_calibration.assumption_text == ""
     timed = fit("motion_regression", [recorded], "an emulated rig", timing=TRUSTED)

@@ -12,7 +12,7 @@ from shearloop.bank.estimation import TRUSTED, EstimatorSession, fit
 from shearloop.bank.estimation.estimator import CalibrationRows
 from shearloop.bank.estimation.interval_regressor import Ridge
 from shearloop.bank.estimation.motion_regression import fit_cylinders, fit_line
-from tests.bank.estimation.conftest import follow
+from tests.bank.estimation.conftest import follow, twisting
 
 KNOWN_MM = (10.0, 25.0, 40.0)
 N_FRAMES = 150
@@ -99,7 +99,7 @@ def test_one_recording_under_three_diameters_reads_none_of_them_apart(known, fra
     assert min(below, above) > 15.0
 
 
-def cylinder(twisting, tips, millimetre, mm, seed):
+def cylinder(tips, millimetre, mm, seed):
     """Return a grip of a cylinder on the played rig; a millimetre moves channels by up to that many volts."""
     whole = twisting(cycles=1, tips=tips, seed=seed)
     gripped = (whole.t_s > 20.0) & (whole.t_s < 50.0)
@@ -107,9 +107,9 @@ def cylinder(twisting, tips, millimetre, mm, seed):
     return replace(whole, channels=whole.channels + moved, diameter_mm=np.full(len(whole.t_s), mm))
 
 
-def test_a_diameter_is_of_this_grip_alone(twisting):
+def test_a_diameter_is_of_this_grip_alone():
     """It is read from the mean place of a grip, and each grip has its own."""
-    of = partial(cylinder, twisting, (1,), 2e-4)
+    of = partial(cylinder, (1,), 2e-4)
     calibration = fit("motion_regression", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "rig", timing=TRUSTED)
     tracker, read = EstimatorSession(calibration), []
     for number, mm in enumerate((12.0, 38.0)):
@@ -121,8 +121,8 @@ def test_a_diameter_is_of_this_grip_alone(twisting):
     assert np.abs(found - truth).max() < 6.0
 
 
-def test_the_first_frames_of_a_grip_have_the_interval_of_a_mean_of_few(twisting):
-    of = partial(cylinder, twisting, (1, 2), 2e-5)
+def test_the_first_frames_of_a_grip_have_the_interval_of_a_mean_of_few():
+    of = partial(cylinder, (1, 2), 2e-5)
     calibration = fit("motion_regression", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "rig", timing=TRUSTED)
     inside, widths = [], []
     for seed in range(20, 40):

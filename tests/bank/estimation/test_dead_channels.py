@@ -12,7 +12,7 @@ from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, F
 from shearloop.bank.estimation.regressors import ChannelImputer
 from shearloop.bank.estimation.session_state import Motion, SessionState
 from tests.bank.estimation import conftest
-from tests.bank.estimation.conftest import IDLE_S, PERIOD_S, judged
+from tests.bank.estimation.conftest import IDLE_S, PERIOD_S, judged, twisting
 
 # Some seconds into the first grip.
 DEATH = 60
@@ -39,13 +39,13 @@ def without(channels: np.ndarray, start: int, series: FrameSeries, tracker: Esti
 @cache
 def _n_valid_of_whole(calibration: Calibration, bank: Bank) -> int:
     """Return how many torques of a session of which no channel dies are valid."""
-    series = conftest.series(seed=3, cycles=3)
+    series = twisting(seed=3, cycles=3)
     return judged(without(~ELECTRODE, len(series.t_s), series, EstimatorSession(calibration, bank)), series).n
 
 
 @pytest.mark.parametrize("start", [0, DEATH])
 @pytest.mark.parametrize("dead", list(DEAD))
-def test_what_died_after_the_calibration_is_told_by_the_others(calibration, bank, twisting, dead, start):
+def test_what_died_after_the_calibration_is_told_by_the_others(calibration, bank, dead, start):
     series = twisting(seed=3, cycles=3)
     whole = _n_valid_of_whole(calibration, bank)
     found = judged(without(DEAD[dead], start, series, EstimatorSession(calibration, bank)), series)
@@ -54,7 +54,7 @@ def test_what_died_after_the_calibration_is_told_by_the_others(calibration, bank
     assert found.coverage > 0.88
 
 
-def test_what_an_estimate_was_made_from_holds_nothing_of_dead_channels(calibration, bank, twisting):
+def test_what_an_estimate_was_made_from_holds_nothing_of_dead_channels(calibration, bank):
     series, tracker, seen = twisting(seed=3, cycles=3), EstimatorSession(calibration, bank), []
     for t_s, channels in zip(series.t_s, series.channels, strict=True):
         usable = np.ones(channels.shape, dtype=np.bool_)
@@ -67,7 +67,7 @@ def test_what_an_estimate_was_made_from_holds_nothing_of_dead_channels(calibrati
 
 
 @pytest.mark.parametrize("start", [0, DEATH])
-def test_torques_that_the_dead_channels_alone_told_of_are_refused(twisting, monkeypatch, start):
+def test_torques_that_the_dead_channels_alone_told_of_are_refused(monkeypatch, start):
     tip = conftest.tip
 
     def felt_by_one_electrode(number: int) -> conftest.Tip:
@@ -94,7 +94,7 @@ def test_torques_that_the_dead_channels_alone_told_of_are_refused(twisting, monk
         assert found.coverage > 0.92
 
 
-def test_channels_that_were_dead_at_calibration_refuse_nothing_and_change_nothing(recorded, twisting):
+def test_channels_that_were_dead_at_calibration_refuse_nothing_and_change_nothing(recorded):
     def still(series: FrameSeries) -> FrameSeries:
         return replace(series, channels=np.where(ELECTRODE, 0.2, series.channels))
 
@@ -147,7 +147,7 @@ def torques(estimates: list[Estimate]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["electrode", "a fifth", "lost"])
-def test_channels_that_the_session_began_without_say_nothing_when_they_come_back(motion_calibration, twisting, kind):
+def test_channels_that_the_session_began_without_say_nothing_when_they_come_back(motion_calibration, kind):
     """Their idle voltages are not known: what is measured from made-up ones would be wrong, and pass for certain."""
     series, back = twisting(seed=3, cycles=2), GRIPPED + 30
     trackers = [EstimatorSession(motion_calibration, period_s=PERIOD_S) for _ in range(2)]
@@ -162,7 +162,7 @@ def test_channels_that_the_session_began_without_say_nothing_when_they_come_back
 
 @pytest.mark.parametrize("kind", ["electrode", "a fifth", "lost"])
 @pytest.mark.parametrize("with_motion", [True, False])
-def test_channels_that_come_back_while_idle_are_used_from_then_on(motion_calibration, twisting, with_motion, kind):
+def test_channels_that_come_back_while_idle_are_used_from_then_on(motion_calibration, with_motion, kind):
     calibration, series = motion_calibration, twisting(seed=3, cycles=2)
     motion = calibration.estimator.motion if with_motion else Motion()
     memory = SessionState(calibration.validators, motion, period_s=PERIOD_S)

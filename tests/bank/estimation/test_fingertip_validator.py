@@ -16,6 +16,7 @@ from shearloop.bank.estimation.fingertip_validator import (
     compare_frames,
     segment_grip,
 )
+from tests.bank.estimation.conftest import twisting
 
 ALL = np.ones((1, 896), dtype=bool)
 
@@ -34,7 +35,7 @@ def test_grip_and_release_are_found_in_a_recording(recorded):
     assert 140 < t[released][0] < 144
 
 
-def test_noise_is_what_is_fast(twisting):
+def test_noise_is_what_is_fast():
     series = twisting(noise_v=0.004)
     np.testing.assert_allclose(channel_noise(series.channels[50:250, 0]), 0.004, rtol=0.35)
     still = np.ones((20, 896))

@@ -7,6 +7,7 @@ import pytest
 
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import TRUSTED, fit
+from tests.bank.estimation.conftest import sliced
 
 
 def with_a_nan(series, name):
@@ -37,6 +38,6 @@ NO_NUMBER = "holds 1 value that is not a finite number"
         (lambda raw, _: [of_a_single_frame(raw)], "from the first torque to the last there are 1 frames"),
     ],
 )
-def test_recordings_that_determine_nothing_are_refused(recorded, sliced, recordings_of, message):
+def test_recordings_that_determine_nothing_are_refused(recorded, recordings_of, message):
     with pytest.raises(CalibrationError, match=message):
         fit("motion_regression", recordings_of(recorded, sliced()), "rig", timing=TRUSTED)

@@ -11,7 +11,7 @@ from shearloop.bank.estimation import FrameSeries, fit
 from shearloop.bank.estimation.bank_match import BankMatch
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor, Ridge, fit_interval_regressor
 from shearloop.bank.estimation.novelty import NoveltyDetector, ReciprocityCheck
-from tests.bank.estimation.conftest import follow, judged, mixed
+from tests.bank.estimation.conftest import follow, judged, mixed, sliced
 
 ALL = np.ones(896, dtype=np.bool_)
 
@@ -23,7 +23,7 @@ def beyond(series: FrameSeries, below_nm: float) -> np.ndarray:
     return frames[np.argmin(torque)] - below_nm * slope
 
 
-def test_a_frame_far_out_along_the_calibrations_own_directions_is_refused(sliced):
+def test_a_frame_far_out_along_the_calibrations_own_directions_is_refused():
     series = sliced()
     guard = NoveltyDetector.fit(series.channels[:, 0], PAPER_TABLE)
     near, far = (beyond(series, nm)[0] for nm in (0.01, 0.15))
@@ -34,7 +34,7 @@ def test_a_frame_far_out_along_the_calibrations_own_directions_is_refused(sliced
 
 
 @pytest.mark.parametrize("share", [0.35, 0.5, 1.0])
-def test_a_foreign_frame_mixed_in_is_refused(sliced, sliced_calibration, share):
+def test_a_foreign_frame_mixed_in_is_refused(sliced_calibration, share):
     calibration, later = sliced_calibration, sliced(seed=3)
     assert not any(one.valid for one in follow(calibration, mixed(later, share)))
     assert all(one.valid for one in follow(calibration, later))
@@ -169,7 +169,7 @@ def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
     assert not sighted.misses_loads, "one that sees loads pays no more than the times cost"
 
 
-def test_how_much_is_the_own_response_is_told_whatever_the_torque_does(sliced):
+def test_how_much_is_the_own_response_is_told_whatever_the_torque_does():
     frames = sliced().channels[:, 0]
     guard = NoveltyDetector.fit(frames, PAPER_TABLE)
     own = guard.response_share(frames[35], ALL)
@@ -181,7 +181,7 @@ def test_how_much_is_the_own_response_is_told_whatever_the_torque_does(sliced):
     assert guard.response_share(np.where(some, 0.8 * frames[35], 9.0), some) == pytest.approx(0.8 * own, abs=0.03)
 
 
-def test_a_judgement_says_how_much_of_the_own_response_may_be_missing(sliced):
+def test_a_judgement_says_how_much_of_the_own_response_may_be_missing():
     frames = sliced().channels[:, 0]
     guard = NoveltyDetector.fit(frames, PAPER_TABLE)
     less = 0.8 * frames[35]
@@ -217,7 +217,7 @@ def test_a_match_on_another_ridge_of_the_bank_is_refused(sliced_calibration):
 
 
 @pytest.mark.parametrize("name", ["motion_regression", "regression"])
-def test_a_fifth_of_something_that_hardly_responds_lies_within_the_interval(name, sliced, sliced_calibration):
+def test_a_fifth_of_something_that_hardly_responds_lies_within_the_interval(name, sliced_calibration):
     """It only makes the own response smaller, which is what another torque does: no misfit tells of it."""
     calibration = sliced_calibration if name == "motion_regression" else fit(name, [sliced()], "all")
     later = sliced(seed=3)

@@ -9,10 +9,10 @@ from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import TRUSTED, EstimatorSession, FrameSeries, Measured, TactileFrame, fit, fitting
 from shearloop.bank.estimation.fingertip_validator import mask_saturated
-from tests.bank.estimation.conftest import follow, judged, kept
+from tests.bank.estimation.conftest import follow, judged, kept, twisting
 
 
-def test_another_recording_is_read_with_honest_intervals(motion_calibration, twisting):
+def test_another_recording_is_read_with_honest_intervals(motion_calibration):
     other = twisting(seed=5, peak_nm=0.07)
     _, r, rmse, coverage, _ = judged(follow(motion_calibration, other), other)
     assert r > 0.97
@@ -20,7 +20,7 @@ def test_another_recording_is_read_with_honest_intervals(motion_calibration, twi
     assert 0.90 < coverage <= 1.0
 
 
-def test_a_slow_drift_of_the_baseline_changes_little(motion_calibration, twisting):
+def test_a_slow_drift_of_the_baseline_changes_little(motion_calibration):
     other = twisting(seed=6)
     drifting = other.channels * (1 + 0.03 * np.linspace(0, 1, len(other.t_s)))[:, None, None]
     shifted = replace(other, channels=drifting)
@@ -31,7 +31,7 @@ def test_a_slow_drift_of_the_baseline_changes_little(motion_calibration, twistin
 @pytest.mark.parametrize(
     ("grip", "gain", "shift"), [(0.3, 1.0, 0.0), (2.0, 1.0, 0.0), (1.0, 0.75, 0.0), (1.0, 1.0, 0.03), (0.5, 1.2, 0.03)]
 )
-def test_another_session_takes_its_own_baseline(motion_calibration, twisting, grip, gain, shift):
+def test_another_session_takes_its_own_baseline(motion_calibration, grip, gain, shift):
     """A grip of another strength, a board of another gain, a gel that dried: idle is what the session begins with."""
     other = twisting(seed=20)
     gripped = (other.t_s > 20) & (other.t_s < 140)
@@ -50,7 +50,7 @@ def test_another_session_takes_its_own_baseline(motion_calibration, twisting, gr
 
 
 @pytest.mark.parametrize("tared", [False, True])
-def test_three_idle_frames_are_a_baseline_for_an_outright_grip(motion_calibration, twisting, tared):
+def test_three_idle_frames_are_a_baseline_for_an_outright_grip(motion_calibration, tared):
     other = twisting(seed=22)
     first = int(np.flatnonzero(other.t_s > 20)[0]) - 3
     tracker = EstimatorSession(motion_calibration)
@@ -61,14 +61,14 @@ def test_three_idle_frames_are_a_baseline_for_an_outright_grip(motion_calibratio
     assert np.mean(valid[25:]) > 0.95
 
 
-def test_a_session_that_begins_gripped_is_read_from_its_motion(motion_calibration, twisting):
+def test_a_session_that_begins_gripped_is_read_from_its_motion(motion_calibration):
     later = twisting(seed=21).between(60, 240)
     estimates = follow(motion_calibration, later)
     assert np.mean([one.valid for one in estimates[15:]]) > 0.9
     assert judged(estimates, later).r > 0.95
 
 
-def test_no_idle_frame_is_valid(motion_calibration, twisting):
+def test_no_idle_frame_is_valid(motion_calibration):
     other = twisting(seed=7)
     idle = (other.t_s < 19) | (other.t_s > other.t_s[-1] - 18)
     estimates = follow(motion_calibration, other)
@@ -79,7 +79,7 @@ def test_no_idle_frame_is_valid(motion_calibration, twisting):
 
 
 @pytest.mark.parametrize("amplitude_v", [0.02, 0.1, 0.5])
-def test_frames_with_a_quarter_of_noise_are_not_valid_and_the_others_are(motion_calibration, twisting, amplitude_v):
+def test_frames_with_a_quarter_of_noise_are_not_valid_and_the_others_are(motion_calibration, amplitude_v):
     rng = np.random.default_rng(8)
     other = twisting(seed=8)
     channels, noisy = other.channels.copy(), np.zeros(len(other.t_s), dtype=bool)
@@ -95,14 +95,14 @@ def test_frames_with_a_quarter_of_noise_are_not_valid_and_the_others_are(motion_
     assert rmse < 0.005
 
 
-def test_another_fingertip_is_told_by_its_pattern(motion_calibration, twisting):
+def test_another_fingertip_is_told_by_its_pattern(motion_calibration):
     for tips in ((2, 1), (1, 3), (4, 5)):
         estimates = follow(motion_calibration, twisting(seed=9, tips=tips))
         assert not any(one.valid for one in estimates)
         assert "another fingertip" in " ".join(estimates[80].reasons)
 
 
-def test_dead_channels_are_done_without_and_widen_the_interval(motion_calibration, twisting):
+def test_dead_channels_are_done_without_and_widen_the_interval(motion_calibration):
     other = twisting(seed=10)
     usable = np.random.default_rng(0).random((2, 896)) > 0.2
     damaged = replace(other, channels=np.where(usable, other.channels, 0.0))
@@ -115,14 +115,14 @@ def test_dead_channels_are_done_without_and_widen_the_interval(motion_calibratio
     assert all(b > a for a, b in widths)
 
 
-def test_too_many_dead_channels_end_it(motion_calibration, twisting):
+def test_too_many_dead_channels_end_it(motion_calibration):
     usable = np.random.default_rng(0).random((2, 896)) > 0.4
     estimates = follow(motion_calibration, twisting(seed=11), usable)
     assert not any(one.valid for one in estimates)
     assert "dead or saturated" in estimates[100].reasons[0]
 
 
-def test_one_fingertip_does_too_and_two_do_better(twisting):
+def test_one_fingertip_does_too_and_two_do_better():
     other = twisting(seed=14, noise_v=0.003)
     errors = {}
     for sides in (("right",), ("right", "left")):
@@ -132,7 +132,7 @@ def test_one_fingertip_does_too_and_two_do_better(twisting):
     assert errors["right", "left"] < errors["right",]
 
 
-def test_squeezing_alone_is_no_torque(motion_calibration, twisting):
+def test_squeezing_alone_is_no_torque(motion_calibration):
     other = twisting(seed=15)
     gripped = (other.t_s > 25) & (other.t_s < 135)
     idle, reference = other.channels[[5, 50]]
@@ -150,7 +150,7 @@ def test_a_frame_of_other_sides_is_refused(motion_calibration):
         EstimatorSession(motion_calibration).estimate(TactileFrame.of(0.0, np.zeros((1, 896))))
 
 
-def test_a_session_that_begins_with_a_spoilt_frame_gets_over_it(motion_calibration, twisting):
+def test_a_session_that_begins_with_a_spoilt_frame_gets_over_it(motion_calibration):
     """What the first frame says is believed only when the next one says the same."""
     other = twisting(seed=16).between(60, 200)
     channels = other.channels.copy()
@@ -172,14 +172,14 @@ def test_the_tool_of_a_calibration_is_the_one_that_the_gripper_held(recorded, mo
     assert np.isnan(named(Measured(20.4, 1.2), Measured(10.0, 1.2)))
 
 
-def test_tools_that_turn_differently_give_no_torque_where_their_diameters_are_only_felt(twisting, monkeypatch):
+def test_tools_that_turn_differently_give_no_torque_where_their_diameters_are_only_felt(monkeypatch):
     monkeypatch.setattr(fitting, "_TOOLS_MAY_LEAVE", 0.0)
     short = [replace(twisting(cycles=3, tips=(0,)), gripper_mm=Measured(mm, 1.0)) for mm in (10.0, 20.0)]
     with pytest.raises(CalibrationError, match="the tools of 10 and 20 mm turn so differently"):
         fit("motion_regression", short, "rig", timing=TRUSTED)
 
 
-def test_another_tool_is_refused_for_as_long_as_it_is_held(motion_calibration, twisting):
+def test_another_tool_is_refused_for_as_long_as_it_is_held(motion_calibration):
     twisted = twisting(seed=5)
     calibration = replace(motion_calibration, tool_mm=20.0)
     tracker, plain = EstimatorSession(calibration), EstimatorSession(calibration)
@@ -205,7 +205,7 @@ def test_another_tool_is_refused_for_as_long_as_it_is_held(motion_calibration, t
     assert any(one.valid for one in follow(unknown, twisted))
 
 
-def test_single_lost_frames_cost_little_and_are_not_invented_in_numbers(motion_calibration, twisting):
+def test_single_lost_frames_cost_little_and_are_not_invented_in_numbers(motion_calibration):
     whole = twisting(seed=5)
     number = np.arange(len(whole.t_s))
     some = kept(whole, number % 8 != 7)
@@ -219,7 +219,7 @@ def test_single_lost_frames_cost_little_and_are_not_invented_in_numbers(motion_c
 
 
 @pytest.mark.parametrize("lost", [(2, {1}), (5, {1, 3}), (7, {1, 3, 5})])
-def test_of_a_board_that_leaves_out_half_of_its_frames_no_torque_is_read(motion_calibration, twisting, lost):
+def test_of_a_board_that_leaves_out_half_of_its_frames_no_torque_is_read(motion_calibration, lost):
     whole = twisting(seed=5)
     every, left_out = lost
     part = kept(whole, ~np.isin(np.arange(len(whole.t_s)) % every, list(left_out)))
@@ -229,7 +229,7 @@ def test_of_a_board_that_leaves_out_half_of_its_frames_no_torque_is_read(motion_
     assert any("are missing" in why for one in estimates for why in one.reasons)
 
 
-def test_a_board_that_is_faster_than_configured_is_followed_all_the_same(motion_calibration, twisting):
+def test_a_board_that_is_faster_than_configured_is_followed_all_the_same(motion_calibration):
     whole = twisting(seed=5)
     fast = replace(whole, t_s=whole.t_s / 5, torque_t_s=whole.torque_t_s / 5)
     configured = follow(EstimatorSession(motion_calibration, period_s=0.54), fast)
@@ -237,7 +237,7 @@ def test_a_board_that_is_faster_than_configured_is_followed_all_the_same(motion_
 
 
 @pytest.mark.parametrize("spoilt", [2, 3])
-def test_after_frames_left_out_the_interval_holds_a_load_that_rises_meanwhile(motion_calibration, twisting, spoilt):
+def test_after_frames_left_out_the_interval_holds_a_load_that_rises_meanwhile(motion_calibration, spoilt):
     inside, rng = [], np.random.default_rng(0)
     for seed in range(1, 5):
         series = twisting(seed=seed)
@@ -254,7 +254,7 @@ def test_after_frames_left_out_the_interval_holds_a_load_that_rises_meanwhile(mo
 
 
 @pytest.mark.parametrize("sides", [[0, 1], [1]])
-def test_a_frame_that_a_board_sends_again_is_no_new_one(motion_calibration, twisting, sides):
+def test_a_frame_that_a_board_sends_again_is_no_new_one(motion_calibration, sides):
     whole = twisting(seed=5)
     frozen, expected = whole.channels.copy(), follow(motion_calibration, whole)
     hung = np.flatnonzero([one.valid for one in expected])[10]
@@ -278,7 +278,7 @@ def without_electrodes(series: FrameSeries, electrodes: tuple[int, ...], start: 
 
 
 @pytest.mark.parametrize("electrodes", [(5,), (5, 19)])
-def test_electrodes_that_are_lost_without_a_word_are_done_without(motion_calibration, twisting, electrodes):
+def test_electrodes_that_are_lost_without_a_word_are_done_without(motion_calibration, electrodes):
     whole = twisting(seed=31)
     spoilt = without_electrodes(whole, electrodes, 90)
     found = follow(motion_calibration, spoilt)
@@ -287,12 +287,12 @@ def test_electrodes_that_are_lost_without_a_word_are_done_without(motion_calibra
     assert judged(found, spoilt).rmse < 1.5 * judged(before, whole).rmse
 
 
-def test_many_lost_electrodes_end_it(motion_calibration, twisting):
+def test_many_lost_electrodes_end_it(motion_calibration):
     found = follow(motion_calibration, without_electrodes(twisting(seed=32), (1, 4, 8, 12, 20, 25), 90))
     assert not any(one.valid for one in found[90:])
 
 
-def test_channels_at_a_rail_are_found_and_done_without(motion_calibration, twisting):
+def test_channels_at_a_rail_are_found_and_done_without(motion_calibration):
     whole = twisting(seed=33)
     rail = np.quantile(whole.channels[5], 0.9)
     clipped = replace(whole, channels=np.minimum(whole.channels, rail))
@@ -310,7 +310,7 @@ def test_channels_at_a_rail_are_found_and_done_without(motion_calibration, twist
     assert not mask_saturated(frame, np.zeros_like(usable)).any()
 
 
-def test_an_ordinary_frame_is_at_no_rail(twisting):
+def test_an_ordinary_frame_is_at_no_rail():
     frame = np.floor(twisting(seed=34).channels[50] / STEP_V) * STEP_V
     assert mask_saturated(frame, np.ones(frame.shape, dtype=np.bool_)).all()
 
@@ -323,7 +323,7 @@ def test_of_as_many_as_are_at_a_rail_one_less_is_chance():
         assert np.count_nonzero(left) == (896 if count < 9 else 896 - count)
 
 
-def test_a_drift_does_not_lead_a_regression_astray(twisting):
+def test_a_drift_does_not_lead_a_regression_astray():
     past = twisting(seed=35)
     calibration = fit("regression", [past], "rig")
     later = twisting(seed=36)

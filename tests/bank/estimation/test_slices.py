@@ -7,11 +7,11 @@ import pytest
 
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import FrameSeries, fit
-from tests.bank.estimation.conftest import follow, judged
+from tests.bank.estimation.conftest import follow, judged, sliced
 
 
 @pytest.mark.parametrize("name", ["motion_regression", "regression"])
-def test_later_slices_are_read_through_the_drift(sliced, name):
+def test_later_slices_are_read_through_the_drift(name):
     whole = sliced()
     later = whole.between(30, 50)
     found = judged(follow(fit(name, [whole.between(0, 30)], "earlier"), later), later)
@@ -20,7 +20,7 @@ def test_later_slices_are_read_through_the_drift(sliced, name):
     assert found.coverage >= 0.85
 
 
-def test_what_is_not_familiar_is_not_valid(sliced, sliced_calibration):
+def test_what_is_not_familiar_is_not_valid(sliced_calibration):
     calibration = sliced_calibration
     later = sliced(seed=3)
     assert np.mean([one.valid for one in follow(calibration, later)]) > 0.95
@@ -37,7 +37,7 @@ def test_what_is_not_familiar_is_not_valid(sliced, sliced_calibration):
 
 
 @pytest.mark.parametrize("name", ["motion_regression", "regression"])
-def test_with_a_fifth_of_the_channels_dead_the_rest_say_nearly_as_much(sliced, sliced_calibration, name):
+def test_with_a_fifth_of_the_channels_dead_the_rest_say_nearly_as_much(sliced_calibration, name):
     """A dead channel that was given the calibration's mean would pull the torque towards its mean."""
     later = sliced(seed=4)
     calibration = sliced_calibration if name == "motion_regression" else fit(name, [sliced()], "all")
@@ -48,14 +48,14 @@ def test_with_a_fifth_of_the_channels_dead_the_rest_say_nearly_as_much(sliced, s
     assert left.rmse < 1.25 * whole.rmse
 
 
-def test_slices_of_two_fingertips_are_not_judged_by_one_of_them(sliced):
+def test_slices_of_two_fingertips_are_not_judged_by_one_of_them():
     one = sliced()
     both = replace(one, sides=("right", "left"), channels=np.repeat(one.channels, 2, axis=1))
     with pytest.raises(CalibrationError, match=r"slices of 2 fingertips \(right, left\) do not fit into one"):
         fit("motion_regression", [both], "both")
 
 
-def test_cylinders_give_a_diameter_and_no_torque(sliced):
+def test_cylinders_give_a_diameter_and_no_torque():
     torque = sliced()
     rng = np.random.default_rng(2)
     shape = np.abs(np.random.default_rng(55).normal(0, 4e-3, (2, 896)))
@@ -85,13 +85,13 @@ FEW = "slices have too few different torques .*, {}; record more"
         ("motion_regression", np.repeat([0.01, 0.03, 0.05, 0.07, 0.1], 10), f"40 of the 50 {FEW.format(4)}"),
     ],
 )
-def test_what_cannot_be_calibrated_says_why(sliced, name, torque_nm, message):
+def test_what_cannot_be_calibrated_says_why(name, torque_nm, message):
     with pytest.raises(CalibrationError, match=message):
         fit(name, [replace(sliced(), torque_nm=torque_nm)], "x")
 
 
 @pytest.mark.parametrize(("name", "least"), [("motion_regression", 15), ("regression", 10)])
-def test_as_many_slices_as_an_estimator_asks_for_are_enough(sliced, name, least):
+def test_as_many_slices_as_an_estimator_asks_for_are_enough(name, least):
     whole = sliced()
     for n in (5, least - 1):
         with pytest.raises(CalibrationError, match=f"^too few slices with a torque .* {name}: {n}; record {least} "):
@@ -99,7 +99,7 @@ def test_as_many_slices_as_an_estimator_asks_for_are_enough(sliced, name, least)
     assert fit(name, [whole.between(0, least)], "enough").torque is not None
 
 
-def test_where_few_torques_are_left_without_the_outermost_it_is_they_that_are_asked_for(sliced):
+def test_where_few_torques_are_left_without_the_outermost_it_is_they_that_are_asked_for():
     few = sliced().between(0, 15)
     few = replace(few, torque_t_s=few.t_s, torque_nm=np.resize([0.01, 0.05, 0.08, 0.1, 0.14], 15))
     message = "12 frames at 4 distinct values .* at more values: 5 values and 12 frames must remain"
@@ -122,13 +122,13 @@ LOST = "of the channels never change: .* check the ribbon cable"
         (lambda v: v * ((FIFTY >= 40) | (CHANNEL < 600)), f"in 40 of the 50 slices 33 % {LOST}"),
     ],
 )
-def test_slices_that_no_sound_board_sends_are_refused(sliced, name, spoilt, message):
+def test_slices_that_no_sound_board_sends_are_refused(name, spoilt, message):
     whole = sliced()
     with pytest.raises(CalibrationError, match=message):
         fit(name, [replace(whole, channels=spoilt(whole.channels))], "spoilt")
 
 
-def test_up_to_a_quarter_of_the_channels_may_be_dead_as_in_a_live_frame(sliced):
+def test_up_to_a_quarter_of_the_channels_may_be_dead_as_in_a_live_frame():
     whole = sliced()
     quarter = replace(whole, channels=np.where(np.arange(896) < 224, 0.0, whole.channels))
     assert fit("motion_regression", [quarter], "a quarter is dead").torque is not None

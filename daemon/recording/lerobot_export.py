@@ -90,24 +90,22 @@ class _Held:
 
 
 class _Statistics:
-    """Minimum, maximum, mean and standard deviation of each column over its finite values, for any number of rows."""
+    """Minimum, maximum, mean and standard deviation of each column over its known values, for any number of rows."""
 
     def __init__(self, width: int) -> None:
         self._rows = 0
         self._n, self._sum, self._squares = np.zeros((3, width))
-        self._min, self._max = np.full(width, np.inf), np.full(width, -np.inf)
+        self._min, self._max = np.full((2, width), np.nan)
 
     def add(self, rows: NDArray[Any]) -> None:
-        """Take (n, width) values."""
+        """Take (n, width) values, NaN where they are unknown."""
         values = np.asarray(rows, dtype=np.float64)
-        finite = np.isfinite(values)
-        known = np.where(finite, values, 0.0)
         self._rows += len(rows)
-        self._n += finite.sum(axis=0)
-        self._sum += known.sum(axis=0)
-        self._squares += (known**2).sum(axis=0)
-        self._min = np.minimum(self._min, np.where(finite, values, np.inf).min(axis=0))
-        self._max = np.maximum(self._max, np.where(finite, values, -np.inf).max(axis=0))
+        self._n += np.isfinite(values).sum(axis=0)
+        self._sum += np.nansum(values, axis=0)
+        self._squares += np.nansum(values**2, axis=0)
+        self._min = np.fmin(self._min, np.fmin.reduce(values))
+        self._max = np.fmax(self._max, np.fmax.reduce(values))
 
     def result(self) -> dict[str, list[float]]:
         """Return the statistics by their names; 0 for a column without a value, for NaN is no JSON."""
@@ -115,8 +113,7 @@ class _Statistics:
         mean = self._sum / n
         std = np.sqrt(np.maximum(self._squares / n - mean**2, 0.0))
         named = {"min": self._min, "max": self._max, "mean": mean, "std": std}
-        some = {name: np.where(self._n > 0, values, 0.0).tolist() for name, values in named.items()}
-        return {**some, "count": [self._rows]}
+        return {**{name: np.nan_to_num(values).tolist() for name, values in named.items()}, "count": [self._rows]}
 
 
 def export_lerobot(path: Path, out: Path, topics: list[str], progress: Progress = lambda _: None) -> list[Path]:

@@ -18,7 +18,7 @@ import types
 import typing
 from collections.abc import Mapping
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -79,10 +79,7 @@ def basic_identity(source: str, table: ChannelTable = PAPER_TABLE) -> dict[str, 
 
 def software_version() -> str:
     """Return the installed version of shearloop."""
-    try:
-        return version("shearloop")
-    except PackageNotFoundError:
-        return "not installed"
+    return version("shearloop")
 
 
 @cache

@@ -25,7 +25,7 @@ from shearloop.daemon.cli.options import processors, writing
 from shearloop.daemon.cli.terminal import progress_bar
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.schema import DIAMETER_NOTE
-from shearloop.daemon.recording.writer import RecordingWriter
+from shearloop.daemon.recording.writer import McapFile, new_recording
 from shearloop.daemon.synthetic_frames import RigFrames
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.emulators.boards import LOAD_PERIOD_S
@@ -60,7 +60,7 @@ def lines_of(scene: Scene, frames: RigFrames) -> list[NDArray[np.float64]]:
 class TwistPlayer:
     """One scene with a tool, which is recorded from the Unix time 0 on."""
 
-    def __init__(self, frames: RigFrames, diameter_mm: float, seed: int, writer: RecordingWriter) -> None:
+    def __init__(self, frames: RigFrames, diameter_mm: float, seed: int, writer: McapFile) -> None:
         self._writer = writer
         self._random = np.random.default_rng(seed)
         self._frames = frames
@@ -127,7 +127,7 @@ def write_recordings(bank: Path, folder: Path, diameters_mm: tuple[float, ...], 
     frames = RigFrames(bank, seed)
     for number, diameter_mm in enumerate(diameters_mm):
         path, notes = folder / f"rig-{diameter_mm:g}mm.mcap", {DIAMETER_NOTE: f"{diameter_mm:g}"}
-        with RecordingWriter(path, SOURCE, notes, frames.table) as writer:
+        with new_recording(path, SOURCE, notes, frames.table) as writer:
             TwistPlayer(frames, diameter_mm, seed + number, writer).run()
         yield path
 

@@ -16,7 +16,7 @@ from shearloop.bank.estimation.values import LARGEST_TORQUE_NM
 from shearloop.bank.matlab_file import MatFileError, Variable, read_variables
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, LOAD_DOUBT, LOAD_DOUBT_NOTE, SIDES
-from shearloop.daemon.recording.writer import RecordingWriter
+from shearloop.daemon.recording.writer import new_recording
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import slope_below
 from shearloop.files import open_file
@@ -224,7 +224,7 @@ def import_mat(sources: Sequence[Path], out: Path) -> ImportResult:
         notes["remarks"] = " ".join(remarks)
     if (diameter := _diameter_mm(files)) is not None:
         notes[DIAMETER_NOTE] = diameter
-    with RecordingWriter(out, ", ".join(sorted(path.name for path in files)), notes) as writer:
+    with new_recording(out, ", ".join(sorted(path.name for path in files)), notes) as writer:
         for side in (side for side in SIDES if side in streams):
             rows = zip(middles[side], arrivals[side], streams[side].values, strict=True)
             for middle_ns, arrival_ns, line in rows:

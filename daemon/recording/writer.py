@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Self, cast
+from typing import IO, Any, cast
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -111,6 +111,16 @@ class McapFile:
         self._writer.add_message(self._channels[topic], log_ns, data, publish_ns, self._counts[topic])
         self._counts[topic] += 1
 
+    def add_frame(self, side: str, t_mid_unix_ns: int, arrival_unix_ns: int, line: NDArray[np.float64]) -> None:
+        """Append one imported frame: the (v,) values of its line in volts. Flushes at times; raises OSError."""
+        # The board sends four decimals of a volt.
+        content = {"arrival_unix_ns": arrival_unix_ns, "line": [round(value, 6) for value in line.tolist()]}
+        self._add_imported(schema.recorded_topic(schema.FRAME_TOPIC, side), t_mid_unix_ns, content)
+
+    def add_torque(self, t_unix_ns: int, torque_nm: float) -> None:
+        """Append one imported torque of the load cell in N·m, as `add_frame`."""
+        self._add_imported(schema.LOAD_TOPIC, t_unix_ns, {"torque_nm": torque_nm})
+
     def flush(self) -> None:
         """End the chunk and write it to the disk; raises OSError, after which a later flush tries again."""
         self._writer.flush()  # type: ignore[no-untyped-call]  # mcap has no return annotation here
@@ -147,6 +157,11 @@ class McapFile:
         if not removed:
             self.partial.unlink()
 
+    def _add_imported(self, topic: str, time_ns: int, content: Mapping[str, Any]) -> None:
+        self.add(topic, time_ns, time_ns, schema.as_json(content))
+        if self.messages % _FLUSH_EVERY == 0:
+            self.flush()
+
     def _register(self, topic: str) -> int:
         name = schema.schema_name(topic)
         if name not in self._schemas:
@@ -155,51 +170,21 @@ class McapFile:
         return self._writer.register_channel(topic, "json", self._schemas[name])
 
 
-class RecordingWriter:
-    """Writes frames and torques in any order of time; a context manager that keeps NAME.partial after an error.
+@contextmanager
+def new_recording(
+    path: Path, source: str, notes: Mapping[str, str] | None = None, table: ChannelTable = PAPER_TABLE
+) -> Iterator[McapFile]:
+    """Yield the file of a recording whose data is from `source`; after an error it keeps the name NAME.partial.
 
-    Raises UserError where the file cannot be written.
+    Raises UserError where it cannot be written.
     """
-
-    def __init__(
-        self, path: str | Path, source: str, notes: Mapping[str, str] | None = None, table: ChannelTable = PAPER_TABLE
-    ) -> None:
-        """Create `path`.partial; `source` describes the origin of the data."""
-        self.path = Path(path)
-        with self._errors():
-            self._file = McapFile(io.FileIO(f"{self.path}{PARTIAL}", "wb"))
-        self._file.add_metadata(schema.METADATA, {**schema.basic_identity(source, table), **(notes or {})})
-
-    def add_frame(self, side: str, t_mid_unix_ns: int, arrival_unix_ns: int, line: NDArray[np.float64]) -> None:
-        """Append one frame: the (v,) values of its line in volts."""
-        # The board sends four decimals of a volt.
-        values = [round(value, 6) for value in line.tolist()]
-        content = {"arrival_unix_ns": arrival_unix_ns, "line": values}
-        self._add(schema.recorded_topic(schema.FRAME_TOPIC, side), t_mid_unix_ns, content)
-
-    def add_torque(self, t_unix_ns: int, torque_nm: float) -> None:
-        """Append one torque of the load cell in N·m."""
-        self._add(schema.LOAD_TOPIC, t_unix_ns, {"torque_nm": torque_nm})
-
-    def __enter__(self) -> Self:
-        """Return the writer itself."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Close the file, as complete if there was no error."""
-        with self._errors():
-            self._file.close(self.path if kind is None else None)
-
-    def _add(self, topic: str, time_ns: int, content: dict[str, object]) -> None:
-        self._file.add(topic, time_ns, time_ns, schema.as_json(content))
-        if self._file.messages % _FLUSH_EVERY == 0:
-            with self._errors():
-                self._file.flush()
-
-    @contextmanager
-    def _errors(self) -> Iterator[None]:
+    try:
+        file, name = McapFile(io.FileIO(f"{path}{PARTIAL}", "wb")), None
         try:
-            yield
-        except OSError as error:
-            message = f"{self.path}: the recording cannot be written: {error.strerror}; choose another --out"
-            raise UserError(message) from error
+            file.add_metadata(schema.METADATA, {**schema.basic_identity(source, table), **(notes or {})})
+            yield file
+            name = path
+        finally:
+            file.close(name)
+    except OSError as error:
+        raise UserError(f"{path}: the recording cannot be written: {error.strerror}; choose another --out") from error

@@ -19,7 +19,7 @@ from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP
 from shearloop.daemon.bank_config import FingertipGeometryConfig, load_bank_plan, load_geometry
 from shearloop.daemon.cli import main
 from shearloop.daemon.config_file import load_yaml_model
-from shearloop.daemon.recording.writer import RecordingWriter
+from shearloop.daemon.recording.writer import new_recording
 
 
 @pytest.fixture(scope="session")
@@ -104,7 +104,7 @@ def test_a_recording_that_begins_gripped_is_designed_for_without_the_frame_that_
 
 def test_a_side_is_designed_for_by_its_own_frames_however_few_the_other_one_has(tmp_path, monkeypatch):
     rng, period_ns = np.random.default_rng(5), 540_800_000
-    with RecordingWriter(tmp_path / "one.mcap", "a test") as writer:
+    with new_recording(tmp_path / "one.mcap", "a test") as writer:
         for number in range(12):
             t_ns = number * period_ns
             writer.add_frame("left", t_ns, t_ns, rng.uniform(0.3, 0.4, PAPER_TABLE.n_line_values))

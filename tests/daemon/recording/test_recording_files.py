@@ -22,14 +22,14 @@ from shearloop.daemon.recording.recorder import daemon_identity
 from shearloop.daemon.recording.replay import RecordedRun
 from shearloop.daemon.recording.schema import LOAD_DOUBT_NOTE
 from shearloop.daemon.recording.tables import RecordedTopics, arrays
-from shearloop.daemon.recording.writer import RecordingWriter
+from shearloop.daemon.recording.writer import new_recording
 from tests.daemon.recording.conftest import START_DATENUM
 
 LINES = PAPER_TABLE.line_of_channels(np.round(np.random.default_rng(0).uniform(0, 1, (4, 896)), 4))
 
 
 def written(path: Path) -> Path:
-    with RecordingWriter(path, "a bench", {"tool": "driver"}) as writer:
+    with new_recording(path, "a bench", {"tool": "driver"}) as writer:
         for i, line in enumerate(LINES):
             writer.add_frame("right", 10**18 + i * 541_000_000, 10**18 + i * 541_000_000 + 300_000_000, line)
             writer.add_torque(10**18 + i, 0.01 * i)
@@ -69,7 +69,7 @@ def test_a_torn_recording_is_refused_and_repaired(recording, tmp_path, ran, mist
 def test_a_damaged_chunk_is_left_out_and_counted(tmp_path, ran, result_of, monkeypatch):
     monkeypatch.setattr("shearloop.daemon.recording.writer._FLUSH_EVERY", 1)
     path = tmp_path / "a.mcap"
-    with RecordingWriter(path, "a bench") as writer:
+    with new_recording(path, "a bench") as writer:
         for i in range(100):
             writer.add_torque(10**18 + i, 0.01 * i)
     content = bytearray(path.read_bytes())
@@ -165,8 +165,8 @@ def test_a_topic_of_another_version_is_named(tmp_path, mistake, monkeypatch):
     with monkeypatch.context() as newer:
         newer.setattr("shearloop.daemon.recording.schema.schema_name", lambda _: "load.torque")
         newer.setattr("shearloop.daemon.recording.schema.software_version", lambda: "99.1")
-        with RecordingWriter(path, "a bench") as writer:
-            writer._add("arm.temperature", 10**18, {"torque_nm": 0.5})
+        with new_recording(path, "a bench") as writer:
+            writer.add("arm.temperature", 10**18, 10**18, b'{"torque_nm": 0.5}')
     said = mistake("recording", "export", path)
     assert "has no topic 'arm.temperature'; version 99.1 wrote this recording" in said
     assert "KeyError" not in said
@@ -184,7 +184,7 @@ def test_a_recording_round_trips(recording):
 
 
 def test_messages_out_of_order_are_sorted(tmp_path):
-    with RecordingWriter(tmp_path / "a.mcap", "x") as writer:
+    with new_recording(tmp_path / "a.mcap", "x") as writer:
         for t in (3, 1, 2):
             writer.add_torque(t, float(t))
     np.testing.assert_array_equal(read_recording(tmp_path / "a.mcap").torque_nm, [1, 2, 3])
@@ -192,7 +192,7 @@ def test_messages_out_of_order_are_sorted(tmp_path):
 
 def test_an_unfinished_recording_stays_partial(tmp_path):
     def interrupted():
-        with RecordingWriter(tmp_path / "a.mcap", "x") as writer:
+        with new_recording(tmp_path / "a.mcap", "x") as writer:
             writer.add_torque(1, 1.0)
             raise KeyboardInterrupt
 
@@ -226,8 +226,8 @@ def test_foreign_and_outdated_files_are_refused(tmp_path, monkeypatch, read):
 
 
 def test_an_unwritable_recording_is_an_error(tmp_path):
-    with pytest.raises(UserError, match="choose another --out"):
-        RecordingWriter(tmp_path / "no" / "where.mcap", "x")
+    with pytest.raises(UserError, match="choose another --out"), new_recording(tmp_path / "no" / "where.mcap", "x"):
+        pass
 
 
 def test_a_side_that_no_file_has_is_not_to_be_imported(recording):

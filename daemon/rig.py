@@ -13,7 +13,7 @@ from shearloop.daemon.control import experiment_schema
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import Creep, TorqueSource
-from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, wrench_source
+from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, Tareable, wrench_source
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
@@ -29,7 +29,6 @@ from shearloop.daemon.sensing.frame_estimator import (
 )
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
 from shearloop.daemon.sensing.skin_task import SKIN, SKIN_CURRENT, ReplayedSkin, SkinTask
-from shearloop.daemon.sensor_protocols import Tareable
 from shearloop.daemon.supervisor import Supervisor, Task
 from shearloop.drivers.calibration_files import load_device_calibration
 from shearloop.drivers.connection import LinkMonitor, SerialLink

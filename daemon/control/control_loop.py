@@ -17,7 +17,7 @@ from shearloop.daemon.control.experiment_schema import (
     TareStep,
     first_turn_before_grip,
 )
-from shearloop.daemon.control.fault_detection import Grasp, Watched, compared_for_s, detect_faults, fresh_for_s
+from shearloop.daemon.control.fault_detection import Grasp, Watched, compared_for_s, detect_faults
 from shearloop.daemon.control.loop_inputs import (
     ArmStatus,
     Creep,
@@ -89,8 +89,7 @@ class ControlLoop:
 
         Each source that measures torque may drive. `dead_tasks` has the error of each task that is dead at present.
         """
-        fresh_s = fresh_for_s(sources.values(), config)
-        kept_s = max(ADAPTED_OVER_S, compared_for_s(sources.values(), fresh_s))
+        kept_s = max(ADAPTED_OVER_S, compared_for_s(sources.values(), config))
         self.inputs = LatestInputs(kept_s=kept_s, died=dead_tasks)
         self.safety = SafetyMonitor()
         self.experiment: Experiment | None = None
@@ -106,7 +105,6 @@ class ControlLoop:
         self._watched = Watched(
             driving=self.wrist.source,
             supervising=self._others(self.wrist.source),
-            fresh_s=fresh_s,
             limits=ExperimentLimits(),
             required=required,
         )

@@ -1,14 +1,14 @@
 """Fault detection: from the loop's inputs to the faults of the safety table, with their present numbers."""
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.loop_inputs import LatestInputs, LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.safety import Fault, FaultCode
-from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, stale_after_s
+from shearloop.daemon.messaging.messages import stale_after_s
 
 # 2.5 periods of their topics.
 ARM_STALE_S = stale_after_s("robot.state")
@@ -36,8 +36,6 @@ class Watched:
 
     driving: TorqueSource
     supervising: tuple[TorqueSource, ...]
-    # How long after its arrival a torque of each source is fresh.
-    fresh_s: Mapping[str, float]
     limits: ExperimentLimits
     required: tuple[str, ...] = ()
     # The wrist is driven by the torque, or twists under its limit.
@@ -48,14 +46,9 @@ class Watched:
     overdue: str | None = None
 
 
-def fresh_for_s(sources: Iterable[TorqueSource], config: LoopConfig) -> dict[str, float]:
-    """Return how long after its arrival a torque of each source is fresh."""
-    return {one.name: max(STALE_AFTER_PERIODS * one.period_s, config.stale_after_s) for one in sources}
-
-
-def compared_for_s(sources: Iterable[TorqueSource], fresh_s: Mapping[str, float]) -> float:
+def compared_for_s(sources: Iterable[TorqueSource], config: LoopConfig) -> float:
     """Return the history that comparing two sources takes: the oldest fresh torque with its acquisition."""
-    return max(fresh_s[one.name] + 2.0 * max(one.window_s, one.period_s) for one in sources)
+    return max(one.fresh_s(config) + 2.0 * max(one.window_s, one.period_s) for one in sources)
 
 
 def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_ns: int) -> list[Fault]:
@@ -70,7 +63,7 @@ def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_
             continue
         if watched.grasp is Grasp.CHANGING and source.warm_up_s:
             continue
-        if t_ns - torque.t_ns <= watched.fresh_s[source.name] * 1e9:
+        if t_ns - torque.t_ns <= source.fresh_s(config) * 1e9:
             beyond = f"{source.name} measured {torque.torque_nm:+.3f} N·m, the limit is {limit_nm:g} N·m"
             found.append(Fault(FaultCode.TORQUE_LIMIT, beyond, t_ns=torque.t_mid_ns))
     if watched.grasp is Grasp.HELD and abs(watched.twisted_rad) > limit_rad:
@@ -100,7 +93,7 @@ def _torque_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t
     source = watched.driving
     # The age of a robot's torque is checked with its state.
     judged = (*(one for one in watched.supervising if not one.from_robot), source)
-    faults = [_unusable(inputs, one, watched.fresh_s[one.name], t_ns) for one in judged]
+    faults = [_unusable(inputs, one, one.fresh_s(config), t_ns) for one in judged]
     found = [fault for fault in faults if fault is not None]
     latest = inputs.torques.get(source.name)
     if faults[-1] is not None or latest is None or latest.torque_nm is None:
@@ -149,7 +142,7 @@ def _disagreement(
     if slow.period_s < fast.period_s:
         slow, fast = fast, slow
     latest = inputs.torques.get(slow.name)
-    if latest is None or latest.torque_nm is None or t_ns - latest.t_ns > watched.fresh_s[slow.name] * 1e9:
+    if latest is None or latest.torque_nm is None or t_ns - latest.t_ns > slow.fresh_s(config) * 1e9:
         return []
     half_ns = round(max(slow.window_s, fast.period_s) * 0.5e9)
     times_ns, torques_nm = inputs.history.get(fast.name, ([], []))

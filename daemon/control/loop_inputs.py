@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pydantic import Field
 
 from shearloop.daemon.config_file import ConfigModel
+from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 
 # Torques between two ticks; more come only while the loop stands still.
 MOST_UNJUDGED = 256
@@ -137,6 +138,10 @@ class TorqueSource:
     measures_torque: bool = True
     warm_up_s: float = 0.0
     has_gain: bool = False
+
+    def fresh_s(self, config: LoopConfig) -> float:
+        """Return how long after its arrival a torque is fresh."""
+        return max(STALE_AFTER_PERIODS * self.period_s, config.stale_after_s)
 
 
 @dataclass(slots=True)

@@ -1,11 +1,11 @@
 """The task that runs the control loop: robot states in, commands out, 125 times a second; and its messages."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from functools import partial
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import structlog
 
@@ -28,7 +28,6 @@ from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.errors import ActionError
 from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateMessage
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sensor_protocols import LONGEST_TARE_S, Adaptable, Tareable, tare_all
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import UrRobot
@@ -64,6 +63,8 @@ RELEASED_WITHIN_S = 7.0
 LINEAR_ACCELERATION_M_PER_S2 = 0.3
 # The arm rests within this time after a stop, unless something else moves it.
 COMES_TO_REST_S = 2.0
+# The paper's ten frames take 5.4 s.
+LONGEST_TARE_S = 30.0
 # A tare gives up this much before its step is overdue, so that the sensors' reasons are reported.
 GIVES_UP_BEFORE_S = 0.1
 ENDING = "the daemon ends; start it again"
@@ -74,6 +75,24 @@ _SAME = {column.name for column in fields(RobotStateMessage)} - {"source", "join
 def wrench_source(rate_hz: float) -> TorqueSource:
     """Return the torque source of a robot's wrench, from the robot's rate of states."""
     return TorqueSource(name=WRENCH, period_s=PUBLISH_EVERY / rate_hz, from_robot=True)
+
+
+class Tareable(Protocol):
+    """A sensor with a zero."""
+
+    def tare(self) -> None:
+        """Take a new zero from what is measured from now on."""
+
+    async def tare_and_wait(self, within_s: float) -> str | None:
+        """Take a new zero and wait until it is done; return None, or why it was not taken."""
+
+
+@runtime_checkable
+class Adaptable(Protocol):
+    """A sensor whose gain can be corrected by another sensor's torque."""
+
+    async def adapt(self, reference: str) -> None:
+        """Correct the gain by this source's torque during this grip; raises ActionError."""
 
 
 class ControlLoopRunner:
@@ -543,6 +562,13 @@ class ActionExecutor:
                     # It ended by itself, just before an interruption; do not repeat it.
                     self._interrupted = False
                 return None if state.end_reason == ARRIVED else f"the move ended early: {state.end_reason}"
+
+
+async def tare_all(sensors: Iterable[Tareable], within_s: float = LONGEST_TARE_S) -> None:
+    """Zero every sensor at the same time; raises ActionError with the reason of each one that was not zeroed."""
+    reasons = await asyncio.gather(*(sensor.tare_and_wait(within_s) for sensor in sensors))
+    if any(reasons):
+        raise ActionError(" ".join(filter(None, reasons)))
 
 
 def _accepted(reply: CommandReply) -> None:

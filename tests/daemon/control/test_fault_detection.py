@@ -3,14 +3,7 @@ from dataclasses import replace
 import pytest
 
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
-from shearloop.daemon.control.fault_detection import (
-    ARM_STALE_S,
-    Grasp,
-    Watched,
-    compared_for_s,
-    detect_faults,
-    fresh_for_s,
-)
+from shearloop.daemon.control.fault_detection import ARM_STALE_S, Grasp, Watched, compared_for_s, detect_faults
 from shearloop.daemon.control.loop_inputs import (
     ArmStatus,
     GripperStatus,
@@ -42,7 +35,6 @@ def watched(driving: TorqueSource, supervising: tuple[TorqueSource, ...]) -> Wat
     return Watched(
         driving=driving,
         supervising=supervising,
-        fresh_s=fresh_for_s((driving, *supervising), LoopConfig()),
         limits=ExperimentLimits(),
         torque_needed=True,
         grasp=Grasp.HELD,
@@ -118,7 +110,7 @@ def test_a_torque_that_counts_as_new_is_held_against_its_limit():
 def test_torques_are_compared_for_as_long_as_the_slower_one_counts_as_new(rate_hz):
     """Else a disagreement would come and go with every frame, and a hold would never become a stop."""
     quick = replace(LOAD, period_s=1.0 / rate_hz)
-    kept_s = compared_for_s((EIT, quick), fresh_for_s((EIT, quick), LoopConfig()))
+    kept_s = compared_for_s((EIT, quick), LoopConfig())
     senses = LatestInputs(kept_s, arm=ArmStatus(0.0, NOW_NS))
     frame = torque(EIT, 0.1, came_s=2.4 * EIT.period_s)
     senses.add_torque(frame)

@@ -10,8 +10,8 @@ import pytest
 import yaml
 
 from shearloop.daemon.app import Daemon
+from shearloop.daemon.control.loop_runner import tare_all
 from shearloop.daemon.errors import ActionError
-from shearloop.daemon.sensor_protocols import tare_all
 from shearloop.daemon.synthetic_skin import SyntheticSkin
 from shearloop.drivers.emulators.skin import SkinInstruments
 from tests.daemon.conftest import ask, collector, running_daemon

@@ -163,11 +163,11 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         self._robot = robot
         self._decoder = messages.MessageDecoder()
         self._received_s = time.monotonic()
-        # Done when the worker has ended and all of its output was read.
-        self._ended = asyncio.get_running_loop().create_future()
-        # Done then too (None), or with an error that ends the connection before. The error is a result, because asyncio
-        # complains about exceptions that are never retrieved.
-        self._closed: asyncio.Future[Exception | None] = asyncio.get_running_loop().create_future()
+        # Set when the worker has ended and all of its output was read.
+        self._ended = asyncio.Event()
+        # Set then too, or when an error ends the connection before.
+        self._closed = asyncio.Event()
+        self._error: Exception | None = None
         self._stderr_tail = b""
         self._activity = "starting"
         # A worker that is silent for longer hangs.
@@ -188,7 +188,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
             # After a crash the end of the error output is the only trace.
             self._stderr_tail = (self._stderr_tail + data)[-LAST_WORDS_BYTES:]
             return
-        if self._closed.done():
+        if self._closed.is_set():
             return
         self._received_s = time.monotonic()
         try:
@@ -202,15 +202,16 @@ class WorkerConnection(asyncio.SubprocessProtocol):
                 self._robot.handle_message(number, message)
         except ProtocolError as error:
             self._kill()
-            self._closed.set_result(RobotLostError("garbled", str(error)))
+            self._error = RobotLostError("garbled", str(error))
+            self._closed.set()
         except Exception as error:  # noqa: BLE001 - raised again by `listen`
-            self._closed.set_result(error)
+            self._error = error
+            self._closed.set()
 
     def connection_lost(self, _error: Exception | None) -> None:
         """Note the end of the worker and of its output."""
-        self._ended.set_result(None)
-        if not self._closed.done():
-            self._closed.set_result(None)
+        self._ended.set()
+        self._closed.set()
 
     async def listen(self) -> None:
         """Wait for the end of the connection; kill a worker that is silent.
@@ -218,27 +219,29 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         Raises:
             RobotLostError: always, in the end.
         """
-        while not self._closed.done():
+        while not self._closed.is_set():
             if time.monotonic() - self._received_s > self._timeout_s:
                 self._kill()
                 raise RobotLostError("hung", self._hung_sentence(self._timeout_s))
-            await asyncio.wait([self._closed], timeout=WATCH_S)
-        error = self._closed.result()
-        raise error if error is not None else self._died()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(WATCH_S):
+                    await self._closed.wait()
+        raise self._error or self._died()
 
     async def end(self) -> None:
         """Disconnect the worker, and kill it after `EXIT_S`."""
         # Its last states do not count as a connection.
-        if not self._closed.done():
-            self._closed.set_result(None)
+        self._closed.set()
         if self._process.get_returncode() is None:
             self.send(messages.Disconnect())
         # The end of its input disconnects the worker too.
         self._stdin.close()
-        await asyncio.wait([self._ended], timeout=EXIT_S)
-        if not self._ended.done():
+        try:
+            async with asyncio.timeout(EXIT_S):
+                await self._ended.wait()
+        except TimeoutError:
             self._kill()
-            await self._ended
+            await self._ended.wait()
         self._process.close()
 
     def _kill(self) -> None:

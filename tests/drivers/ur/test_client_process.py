@@ -1,16 +1,13 @@
 """`UrRobot` without a controller: the worker's end, and the message about it."""
 
 import asyncio
-import gc
 import sys
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 
 from shearloop.drivers.ur.client import LAST_WORDS_BYTES, UrRobot, WorkerConnection
-from shearloop.drivers.ur.messages import Failed, RobotLostError, Stop, encode
-from tests.drivers.ur.flight import SETTINGS
+from shearloop.drivers.ur.messages import RobotLostError, Stop
 from tests.drivers.ur.robots import ROOT, running, settings_for
 
 
@@ -83,16 +80,6 @@ async def test_disconnects_and_refuses_what_is_unanswered(play, tmp_path):
         assert "ended before it answered" in (await replied).refusal
     assert robot.state is None
     assert log.read_text() == "True\n", "it exits on Disconnect"
-
-
-async def test_unretrieved_loss_causes_no_asyncio_complaint():
-    complaints: list[dict[str, Any]] = []
-    asyncio.get_running_loop().set_exception_handler(lambda _loop, context: complaints.append(context))
-    connection = WorkerConnection(SETTINGS, UrRobot(SETTINGS))
-    connection.pipe_data_received(1, encode(Failed("lost", "The connection is lost.")))
-    del connection
-    gc.collect()
-    assert complaints == []
 
 
 async def test_worker_that_ends_during_shutdown_is_awaited(play, monkeypatch):

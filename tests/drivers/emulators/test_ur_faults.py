@@ -6,21 +6,6 @@ from shearloop.drivers.emulators.ur_controller import Controller
 from shearloop.drivers.emulators.ur_robot import Robot
 
 
-def test_faults_are_carried_out_and_ended():
-    controller = Controller(Robot())
-    robot = controller.robot
-    for line in (
-        "registers-in-use", "local-control", "refuse-protocol", "mute-dashboard", "protective-stop",
-        "emergency-stop", "version 5.0.0.0", "payload 2.5",
-    ):  # fmt: skip
-        controller.command(line)
-    assert controller.faults == {"registers-in-use", "local-control", "refuse-protocol", "mute-dashboard"}
-    assert (robot.spec.payload_kg, robot.spec.version) == (2.5, (5, 0, 0, 0))
-    assert robot.safety_mode == 7
-    controller.command("normal")
-    assert (controller.faults, robot.safety_mode) == (set(), 1)
-
-
 @pytest.mark.parametrize(
     ("line", "said"),
     [

@@ -49,16 +49,6 @@ def moving_asynchronously(robot: Robot) -> bool:
     return bool(int(robot.registers["output_int_register_2"]) & 1 << 15)
 
 
-def test_speed_is_reached_with_the_acceleration_and_held():
-    # The thread for speeds starts in the cycle after the command's.
-    robot = turning(0.1 + robots.STEP_S)
-    assert robot.arm.qd_rad_per_s[5] == pytest.approx(0.2)
-    wait(robot, 0.9)
-    # 0.4²/2·2 to get up to speed, then 0.8 s at 0.4 rad/s.
-    assert robot.arm.q_rad[5] == pytest.approx(0.04 + 0.8 * 0.4)
-    assert not robot.arm.qd_rad_per_s[:5].any()
-
-
 def test_watchdog_ends_with_its_program():
     robot = started()
     do(robot, robots.SET_WATCHDOG, 10.0)
@@ -111,14 +101,6 @@ def test_linear_move_out_of_reach_ends_in_a_protective_stop():
     wait(robot, 4.0)
     assert happened(robot, "protective-stop")
     assert not robot.arm.qd_rad_per_s.any()
-
-
-def test_after_speed_stop_a_move_is_possible():
-    robot = turning(0.3)
-    assert do(robot, robots.SPEED_STOP, 2.0) == pytest.approx(0.2, abs=0.01)
-    do(robot, robots.MOVE_L, *down(robot), asynchronous=True)
-    wait(robot, 0.1)
-    assert robot.program_running
 
 
 def test_protective_stop_pauses_and_is_not_unlocked_at_once():

@@ -55,59 +55,48 @@ def export_slices(
     """
     with open_recording(path) as recording:
         table = recording.table
-    sweep, folder, missed = _Sweep(table), _SliceFolder(out), Counter[str]()
+    sweep, written, missed = _Sweep(table), list[Path](), Counter[str]()
+    largest: _Slice | None = None
     used = [topic for topic in topics if schema.schema_name(topic) in _TOPICS]
     for topic, content, _ in read_messages(path, used, progress):
         found = sweep.add(schema.schema_name(topic), content)
         if isinstance(found, _Slice):
-            folder.save(found)
+            written.append(_save_slice(out, found))
+            if found.diameter_mm is None and (largest is None or abs(found.torque_nm) > abs(largest.torque_nm)):
+                largest = found
         elif found is not None:
             missed[found] += 1
-    if not folder.written and not missed:
+    if not written and not missed:
         raise UserError(
             f"{path}: nothing to export; slices need an experiment with the key `slices` that holds angles, as "
             "config/experiments/torque_sweep.yaml"
         )
-    return folder.written, missed
+    if largest is not None:
+        written += _save_raw(out / TORQUE_FOLDER, largest)
+    return written, missed
 
 
-class _SliceFolder:
-    """Writes slices under the numbers after those that are there."""
+def _save_slice(out: Path, one: _Slice) -> Path:
+    """Write a slice under the number after the highest of its folder, and return the file."""
+    name, prefix, torque = TORQUE_FOLDER, "Data_Slice_", "torque_value"
+    if one.diameter_mm is not None:
+        name, prefix, torque = DIAMETER_FOLDER, f"{one.diameter_mm:.0f}mm_Data_", "mean_torque"
+    folder = out / name
+    folder.mkdir(parents=True, exist_ok=True)
+    found = (re.fullmatch(rf"{prefix}(\d+)\.mat", path.name) for path in folder.iterdir())
+    number = 1 + max((int(match[1]) for match in found if match), default=0)
+    _save_mat(file := folder / f"{prefix}{number}.mat", data_diff=one.difference[None], **{torque: [[one.torque_nm]]})
+    return file
 
-    def __init__(self, folder: Path) -> None:
-        self.written: list[Path] = []
-        self._folder = folder
-        self._largest_nm = 0.0
-        self._raw, self._raw_homogeneous = (folder / TORQUE_FOLDER / name for name in (RAW_FRAME, RAW_HOMOGENEOUS))
-        self._keeps_raw = self._raw.exists() or self._raw_homogeneous.exists()
 
-    def save(self, one: _Slice) -> None:
-        """Write one slice."""
-        if one.diameter_mm is None:
-            self._save(TORQUE_FOLDER, "Data_Slice_", data_diff=one.difference[None], torque_value=[[one.torque_nm]])
-            self._save_raw(one)
-        else:
-            prefix = f"{one.diameter_mm:.0f}mm_Data_"
-            self._save(DIAMETER_FOLDER, prefix, data_diff=one.difference[None], mean_torque=[[one.torque_nm]])
-
-    def _save(self, folder_name: str, prefix: str, **arrays: Any) -> None:
-        """Write a file with the number after the highest of the folder."""
-        folder = self._folder / folder_name
-        folder.mkdir(parents=True, exist_ok=True)
-        found = (re.fullmatch(rf"{prefix}(\d+)\.mat", path.name) for path in folder.iterdir())
-        number = 1 + max((int(match[1]) for match in found if match), default=0)
-        self.written.append(folder / f"{prefix}{number}.mat")
-        _save_mat(self.written[-1], **arrays)
-
-    def _save_raw(self, one: _Slice) -> None:
-        """Write the frames of the recording's largest torque, clipped like the paper's; an earlier recording's stay."""
-        if self._keeps_raw or abs(one.torque_nm) <= self._largest_nm:
-            return
-        if self._raw not in self.written:
-            self.written += self._raw, self._raw_homogeneous
-        _save_mat(self._raw, clipped_data=np.clip(one.line, 0.0, CLIPPED_V)[None])
-        _save_mat(self._raw_homogeneous, clipped_data_hom=np.clip(one.homogeneous_line, 0.0, CLIPPED_V)[None])
-        self._largest_nm = abs(one.torque_nm)
+def _save_raw(folder: Path, one: _Slice) -> list[Path]:
+    """Write a slice's frames, clipped like the paper's, and return the files; those of an earlier recording stay."""
+    raw, homogeneous = folder / RAW_FRAME, folder / RAW_HOMOGENEOUS
+    if raw.exists() or homogeneous.exists():
+        return []
+    _save_mat(raw, clipped_data=np.clip(one.line, 0.0, CLIPPED_V)[None])
+    _save_mat(homogeneous, clipped_data_hom=np.clip(one.homogeneous_line, 0.0, CLIPPED_V)[None])
+    return [raw, homogeneous]
 
 
 class _Sweep:

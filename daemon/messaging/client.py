@@ -1,8 +1,9 @@
 """Clients of a daemon: receive its messages, send it a command."""
 
 import asyncio
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, Self
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager
+from typing import Any, TypeAlias
 
 import zmq
 import zmq.asyncio
@@ -13,11 +14,12 @@ from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.messages import ENVELOPE, decode, encode
 from shearloop.daemon.messaging.stop_client import foreign_reply
 
+TopicContent: TypeAlias = tuple[str, dict[str, Any]]
 # A running daemon sends `health` every second.
 QUIET_S = 3.0
 
 
-class Subscriber:
+class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicContent], AsyncIterator[TopicContent]):
     """Messages of a daemon as (topic, content), for `for` and for `async for`; close it, or use `with`.
 
     It receives the topics that start with one of `topics`, or all. Raises UserError for a malformed address, for
@@ -54,29 +56,17 @@ class Subscriber:
         self._socket.close()
         self._context.term()
 
-    def __enter__(self) -> Self:
-        """Return the subscriber itself."""
-        return self
-
     def __exit__(self, *_: object) -> None:
         """Disconnect."""
         self.close()
 
-    def __iter__(self) -> Self:
-        """Return the subscriber itself."""
-        return self
-
-    def __next__(self) -> tuple[str, dict[str, Any]]:
+    def __next__(self) -> TopicContent:
         """Wait for the next message and return it."""
         if not self.wait(self._timeout_s):
             raise self._no_message()
         return self._decoded(self._blocking.recv_multipart())
 
-    def __aiter__(self) -> Self:
-        """Return the subscriber itself."""
-        return self
-
-    async def __anext__(self) -> tuple[str, dict[str, Any]]:
+    async def __anext__(self) -> TopicContent:
         """Wait for the next message and return it."""
         if not await self._socket.poll(_milliseconds(self._timeout_s)):
             raise self._no_message()
@@ -89,7 +79,7 @@ class Subscriber:
             f"{keys_hint(self._keys)}"
         )
 
-    def _decoded(self, parts: list[bytes]) -> tuple[str, dict[str, Any]]:
+    def _decoded(self, parts: list[bytes]) -> TopicContent:
         try:
             name, payload = parts
             content = decode(payload)
@@ -113,7 +103,7 @@ def receive_messages(
     timeout_s: float | None = None,
     keys: ClientKeys | None = None,
     on_quiet: Callable[[], None] = lambda: None,
-) -> Iterator[tuple[str, dict[str, Any]]]:
+) -> Iterator[TopicContent]:
     """Yield the messages of a Subscriber; calls `on_quiet` if none arrives in the first QUIET_S."""
     with Subscriber(address, topics, timeout_s, keys) as subscriber:
         if timeout_s is None and not subscriber.wait(QUIET_S):

@@ -6,8 +6,8 @@ Requests and replies are msgpack maps. A request is `{"command": NAME, …}`, a 
 
 import asyncio
 import time
-from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
+from functools import lru_cache
 from typing import Any, TypeAlias
 
 import structlog
@@ -46,18 +46,15 @@ class RateLimit:
 
     def __init__(self) -> None:
         self._total = TokenBucket(TOTAL_BURST, TOTAL_PER_S)
-        self._clients: OrderedDict[bytes, TokenBucket] = OrderedDict()
+        # Of the clients that were last heard.
+        self._bucket_of = lru_cache(MAX_CLIENTS)(lambda _client: TokenBucket(CLIENT_BURST, CLIENT_PER_S))
 
     def allow(self, client: bytes, t_ns: int) -> bool:
         """Return whether a client may send one more request at monotonic time t_ns.
 
         Requests above a client's own limit do not count against the total.
         """
-        bucket = self._clients.setdefault(client, TokenBucket(CLIENT_BURST, CLIENT_PER_S))
-        self._clients.move_to_end(client)
-        if len(self._clients) > MAX_CLIENTS:
-            self._clients.popitem(last=False)
-        return bucket.allow(t_ns) and self._total.allow(t_ns)
+        return self._bucket_of(client).allow(t_ns) and self._total.allow(t_ns)
 
 
 class RequestExecutor:

@@ -2,7 +2,8 @@
 
 import json
 from collections.abc import Mapping
-from typing import Any, Self
+from contextlib import AbstractContextManager
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from shearloop.daemon.messaging.messages import TOPICS
 from shearloop.daemon.recording import schema
 
 
-class FoxgloveServer:
+class FoxgloveServer(AbstractContextManager["FoxgloveServer", None]):
     """Foxglove's WebSocket server on loopback, as a context. A client can read and cannot send."""
 
     def __init__(self, port: int) -> None:
@@ -26,10 +27,6 @@ class FoxgloveServer:
         except (OSError, RuntimeError) as error:
             raise UserError(f"port {port} cannot be used: {error}; give another with --foxglove") from error
         self.port = self._server.port
-
-    def __enter__(self) -> Self:
-        """Return the server, which already runs."""
-        return self
 
     def __exit__(self, *_: object) -> None:
         """Disconnect the clients."""

@@ -1,13 +1,12 @@
 """The latest message of every topic and source, and the last minute of charted values. No I/O: time is passed in."""
 
 import base64
-import json
-import math
 from collections import Counter, deque
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+from pydantic_core import to_json
 
 from shearloop.bank.eit.matching import best_match
 from shearloop.bank.eit.models import MODELS
@@ -73,16 +72,15 @@ class MessageStore:
             self.refused["too many sources"] += 1
         else:
             try:
-                message = {"topic": topic, **self._derived(topic, source, content), "content": json_value(content)}
-                text = json.dumps(message, ensure_ascii=False, allow_nan=False)
-            except (TypeError, ValueError, RecursionError):
+                text = page_json({"topic": topic, **self._derived(topic, source, content), "content": content})
+            except (TypeError, ValueError):
                 self.refused["message without a JSON form"] += 1
                 return
             self.number += 1
             self._ended = topic == DaemonEnd.topic
             self._stored[topic, source] = StoredMessage(self.number, now_s, text.removeprefix("{"))
             if topic in CHARTED:
-                sample = {key: json_value(content.get(key)) for key in ("timestamp", *CHARTED[topic])}
+                sample = {key: content.get(key) for key in ("timestamp", *CHARTED[topic])}
                 self._samples.setdefault((topic, source), deque(maxlen=MAX_SAMPLES)).append((now_s, sample))
 
     def batch(self, after: int, now_s: float, **other: Any) -> str:
@@ -95,7 +93,7 @@ class MessageStore:
             if message.number > after
         )
         state = {"quiet_s": quiet_s, "ended": self._ended, "refused": dict(self.refused)}
-        head = json.dumps({**state, **other}, allow_nan=False)
+        head = page_json({**state, **other})
         return f'{head.removesuffix("}")}, "messages": [{messages}]}}'
 
     def history(self, now_s: float) -> list[dict[str, Any]]:
@@ -116,7 +114,7 @@ class MessageStore:
         if topic == EitEstimate.topic and isinstance(k, float) and isinstance(sigma, float):
             model = self._models.get(source, "")
             offsets, meaning = HEIGHT_MARKS.get(model, ({}, ""))
-            marks = [(json_value(k + offset * sigma), label) for label, offset in offsets.items()]
+            marks = [(k + offset * sigma, label) for label, offset in offsets.items()]
             profile = conductivity_profile(model, k, sigma, self._height_cm)
             return {"conductivity": profile, "marks": marks if profile else [], "meaning": meaning if profile else ""}
         return {}
@@ -147,20 +145,18 @@ def conductivity_profile(model: str, k: float, sigma: float, height_cm: float) -
     return values.tolist() if np.isfinite(values).all() else None
 
 
-def json_value(value: Any) -> Any:
-    """Return a value in JSON's types: arrays as base64 of float32 with their shape, NaN and infinity as None.
+def page_json(content: Mapping[str, Any]) -> str:
+    """Return JSON: arrays as base64 of float32 with their shape, null for numbers that are not finite.
 
-    Raises ValueError for an array that is too large; `json.dumps` raises TypeError for bytes.
+    Raises ValueError or TypeError for arrays that are too large, and for what has no JSON form.
     """
-    if isinstance(value, np.ndarray):
-        if value.size > MAX_ARRAY_SIZE:
-            raise ValueError(f"an array of {value.size} numbers")
+    return to_json(content, inf_nan_mode="null", fallback=_plain).decode()
+
+
+def _plain(value: Any) -> dict[str, Any]:
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, np.ndarray) and value.size <= MAX_ARRAY_SIZE:
         packed = base64.b64encode(np.ascontiguousarray(value, "<f4").tobytes()).decode()
         return {"shape": list(value.shape), "float32": packed}
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(key): json_value(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [json_value(item) for item in value]
-    return value
+    raise TypeError(f"a value of {type(value).__name__} has no place on the page")

@@ -139,7 +139,7 @@ async def test_tare_is_refused_during_an_experiment():
     sensors = {name: SimpleNamespace(tare=partial(tared.append, name)) for name in ("right", "load_cell")}
     commands = Commands(
         rig=SimpleNamespace(control_loop=SimpleNamespace(experiment=experiment)),
-        sensors=SimpleNamespace(tareable=lambda: sensors),
+        sensors=SimpleNamespace(tareable=sensors),
         experiment=None,
         health=None,
         daemon_end=asyncio.Event(),

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from shearloop.bank.eit.models import conductivity as conductivity_of_mesh
 from shearloop.daemon.messaging.messages import decode, encode
-from shearloop.daemon.web.message_store import HEIGHTS, MAX_STREAMS, MessageStore, conductivity_profile, json_value
+from shearloop.daemon.web.message_store import HEIGHTS, MAX_STREAMS, MessageStore, conductivity_profile, page_json
 from tests.bank.conftest import small_fingertip
 
 
@@ -60,7 +60,7 @@ def test_invalid_messages_are_counted_by_kind_and_do_not_end_the_silence():
     latest = MessageStore(3.6)
     latest.add("weather", message(), 1.0)
     latest.add("health", {"source": "daemon"}, 1.0)
-    latest.add("health", message(tasks=b"bytes"), 1.0)
+    latest.add("health", message(tasks=b"\xff"), 1.0)
     latest.add("health", message(tasks=np.zeros(50_000)), 1.0)
     latest.refused["malformed message"] += 1
     for number in range(MAX_STREAMS):
@@ -95,9 +95,8 @@ def test_any_message_becomes_json_or_is_counted(content):
 
 def test_arrays_become_float32_and_nan_becomes_null():
     scores = np.array([[0.25, np.nan], [0.5, 1.0]])
-    value = json_value(
-        decode(encode({"scores": scores.astype("<f4").tobytes(), "scores_shape": [2, 2], "k": float("inf")}))
-    )
+    on_wire = encode({"scores": scores.astype("<f4").tobytes(), "scores_shape": [2, 2], "k": float("inf")})
+    value = json.loads(page_json(decode(on_wire)))
     assert value["k"] is None
     assert value["scores"]["shape"] == [2, 2]
     unpacked = np.frombuffer(base64.b64decode(value["scores"]["float32"]), "<f4").reshape(2, 2)

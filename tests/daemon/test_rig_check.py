@@ -1,7 +1,7 @@
 """An experiment that can never be carried out is refused before anything is opened."""
 
-import json
 import re
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,8 @@ STEPS = [{"do": "tare"}, {"do": "wait", "wait_s": 1}]
 
 def config(folder: Path, experiment: dict[str, Any], **more: Any) -> DaemonConfig:
     # Steps that stand twice in a test stand twice in the file: an alias would be refused.
-    written = json.loads(json.dumps({"name": "one", "steps": STEPS, **experiment}))
-    (folder / "experiment.yaml").write_text(yaml.safe_dump(written))
+    steps = [*map(deepcopy, experiment.get("steps", STEPS))]
+    (folder / "experiment.yaml").write_text(yaml.safe_dump({"name": "one", **experiment, "steps": steps}))
     content = {
         "fingertips": {"right": {"device": {"path": "right"}, "calibration": "right.cal"}, "left": SERIAL},
         "robot": "ur.yaml",

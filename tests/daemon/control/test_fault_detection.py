@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -13,7 +14,7 @@ from shearloop.daemon.control.loop_inputs import (
     TorqueSource,
 )
 from shearloop.daemon.control.loop_runner import PUBLISH_EVERY, wrench_source
-from shearloop.daemon.control.safety import TABLE, FaultCode, Response
+from shearloop.daemon.control.safety import TABLE, Fault, FaultCode, Response
 from shearloop.drivers.ur.control_box import SampleAge
 
 EIT = TorqueSource(name="right", period_s=0.5412, window_s=0.5412)
@@ -31,15 +32,16 @@ def torque(
     return TorqueSample(source.name, torque_nm, why, t_ns - round((acquired_s + way_s) * 1e9), t_ns)
 
 
-def watched(driving: TorqueSource, supervising: tuple[TorqueSource, ...]) -> Watched:
-    return Watched(
-        driving=driving,
-        supervising=supervising,
-        limits=ExperimentLimits(),
-        torque_needed=True,
-        grasp=Grasp.HELD,
-        twisted_rad=0.0,
-    )
+def faults(
+    senses: LatestInputs,
+    driving: TorqueSource = EIT,
+    supervising: tuple[TorqueSource, ...] = (),
+    t_ns: int = NOW_NS,
+    **changes: Any,
+) -> list[Fault]:
+    """Return what is detected while a gripped tool is twisted, unless something else is said."""
+    needs = {"limits": ExperimentLimits(), "torque_needed": True, "grasp": Grasp.HELD, **changes}
+    return detect_faults(senses, Watched(driving=driving, supervising=supervising, **needs), LoopConfig(), t_ns)
 
 
 def found(
@@ -48,8 +50,7 @@ def found(
     senses = LatestInputs(10.0, arm=ArmStatus(0.0, NOW_NS))
     for each in torques:
         senses.add_torque(each)
-    events = detect_faults(senses, watched(driving, supervising), LoopConfig(), NOW_NS)
-    return {each.code: each.sentence for each in events}
+    return {each.code: each.sentence for each in faults(senses, driving, supervising)}
 
 
 def test_nothing_is_wrong_while_all_torques_are_new_valid_and_alike():
@@ -116,7 +117,7 @@ def test_torques_are_compared_for_as_long_as_the_slower_one_counts_as_new(rate_h
     senses.add_torque(frame)
     for number in range(round(60 * rate_hz), 0, -1):
         senses.add_torque(torque(quick, 0.3, came_s=(number - 1) / rate_hz))
-    (trouble,) = detect_faults(senses, watched(EIT, (quick,)), LoopConfig(), NOW_NS)
+    (trouble,) = faults(senses, EIT, (quick,))
     assert trouble.code is FaultCode.TORQUES_DISAGREE
     assert len(senses.history[LOAD.name][0]) <= 10 * rate_hz, "and the rest is forgotten"
 
@@ -129,8 +130,8 @@ def devices(
 ) -> list[tuple[FaultCode, str]]:
     """Return what is said of the devices while nothing moves."""
     senses = LatestInputs(10.0, arm=arm, gripper=hand, lost=lost)
-    idle = replace(watched(EIT, ()), torque_needed=False, grasp=Grasp.NONE, required=("robot", "gripper"))
-    return [(each.code, each.detail) for each in detect_faults(senses, idle, LoopConfig(), NOW_NS)]
+    found = faults(senses, torque_needed=False, grasp=Grasp.NONE, required=("robot", "gripper"))
+    return [(each.code, each.detail) for each in found]
 
 
 def test_devices_that_were_never_there_are_awaited_in_one_sentence():
@@ -158,9 +159,7 @@ def test_a_robot_that_is_gone_or_does_not_move_is_not_plugged_in_again():
         LatestInputs(10.0, arm=ArmStatus(0.0, NOW_NS), lost={"robot": died}),
         LatestInputs(10.0, arm=blocked),
     ):
-        (trouble,) = detect_faults(
-            senses, replace(watched(EIT, ()), torque_needed=False, required=("robot",)), LoopConfig(), NOW_NS
-        )
+        (trouble,) = faults(senses, torque_needed=False, required=("robot",))
         assert trouble.rule.response is Response.STOP_AND_KEEP_GRIP
         assert trouble.sentence.startswith("the robot")
         assert "`shearloop command unlock`" in trouble.rule.cure
@@ -169,13 +168,13 @@ def test_a_robot_that_is_gone_or_does_not_move_is_not_plugged_in_again():
 
 def test_a_sensor_that_was_never_there_is_not_gone():
     senses = LatestInputs(10.0, arm=ArmStatus(0.0, NOW_NS), lost={"right": "There is no port."})
-    (trouble,) = detect_faults(senses, watched(EIT, ()), LoopConfig(), NOW_NS)
+    (trouble,) = faults(senses)
     assert trouble.detail == "right is not connected yet: There is no port."
     senses.add_torque(torque(EIT, 0.1))
-    (trouble,) = detect_faults(senses, watched(EIT, ()), LoopConfig(), NOW_NS)
+    (trouble,) = faults(senses)
     assert trouble.detail == "right is gone: There is no port."
     senses.lost["right"] = ""
-    (trouble,) = detect_faults(senses, watched(EIT, ()), LoopConfig(), NOW_NS)
+    (trouble,) = faults(senses)
     assert trouble.detail == "right is gone: ", "though it does not say why"
 
 
@@ -183,7 +182,7 @@ def test_a_loop_that_was_away_for_long_was_not_too_slow():
     senses = LatestInputs(10.0, arm=ArmStatus(0.0, NOW_NS))
     for late_s, event in ((0.2, FaultCode.LOOP_LATE), (3.0, FaultCode.DAEMON_PAUSED)):
         senses.late_s = late_s
-        (trouble,) = detect_faults(senses, replace(watched(EIT, ()), torque_needed=False), LoopConfig(), NOW_NS)
+        (trouble,) = faults(senses, torque_needed=False)
         assert trouble.code is event
     assert "the daemon itself was not running: it stood still for 3.0 s" in trouble.sentence
     assert "overload" in trouble.rule.cure, "what follows from it is not told, and may be all that would say so"
@@ -216,7 +215,7 @@ def test_each_sample_is_compared_with_a_wrench(rate_hz, slow_hz):
         if t_ns >= NOW_NS + round(sample / slow_hz * 1e9):
             senses.add_torque(TorqueSample("load_cell", 0.3, "", measured_ns, t_ns))
             sample += 1.0
-            events = detect_faults(senses, watched(slow, (wrench,)), LoopConfig(), t_ns)
+            events = faults(senses, slow, (wrench,), t_ns)
             compared.append(FaultCode.TORQUES_DISAGREE in {each.code for each in events})
     assert len(compared) > 150
     assert all(compared[1:])

@@ -24,12 +24,6 @@ def test_every_event_has_a_row_with_a_sentence_and_a_cure():
         assert rule.response is not Response.HOLD or rule.hold_at_most_s is not None, "a hold may not last for ever"
 
 
-def test_a_hold_goes_with_its_cause():
-    gate = SafetyMonitor()
-    assert gate.judge([trouble(FaultCode.ESTIMATE_STALE)], 0).response is Response.HOLD
-    assert gate.judge([], SECOND).response is Response.NOTE
-
-
 @pytest.mark.parametrize("event", [event for event, rule in TABLE.items() if rule.response is Response.HOLD])
 def test_a_hold_that_lasts_too_long_becomes_a_stop(event):
     gate = SafetyMonitor()

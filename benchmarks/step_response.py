@@ -8,7 +8,7 @@ the default estimator also closes the loop on the rig's own frames from both fin
 is kicked by 0.03 N·m up and down, and the tool slips. Simulated time, so the numbers are the same on every machine.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -31,8 +31,6 @@ from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.emulators.emulated_rig import SIDES
 from shearloop.drivers.emulators.gripper import Gripper
 from shearloop.drivers.emulators.scene import Joint, Scene, Twin, TwinSettings
-
-PlantOf = Callable[[sim.SimulatedSensor, np.random.Generator], sim.Plant]
 
 TARGET_NM = 0.10
 # The stiffness of possible gels; the emulated rig's is 0.8.
@@ -141,7 +139,7 @@ class RigPlant(sim.Plant):
         for kick_nm in KICKS_NM:
             sim.run(self, controller, float(self.rng.uniform(0.0, FRAME_PERIOD_S)))
             self.scene.kick(kick_nm)
-            back_s.append(sim.back_after_s(sim.run(self, controller, KICKED_S), TARGET_NM))
+            back_s.append(sim.run(self, controller, KICKED_S).back_after_s(TARGET_NM))
         self.scene.slip(SLIPS_TO_NM)
         slipped_s = self.t_s
         while not controller.filter.slipped and self.t_s < slipped_s + KICKED_S:
@@ -157,12 +155,6 @@ def step(plant: sim.Plant, scenario: sim.LoopScenario) -> tuple[FloatArray, Torq
         sim.run(plant, controller, plant.period_s)
     controller.set_point(TARGET_NM)
     return sim.run(plant, controller, scenario.hold_s).torque_nm, controller
-
-
-def steps(scenario: sim.LoopScenario, seeds: int, plant_of: PlantOf) -> dict[str, float]:
-    """Return the figures of merit of the true torque after the step, over many seeds."""
-    plants = [plant_of(scenario.sensor, np.random.default_rng((20, seed))) for seed in range(seeds)]
-    return judge_steps([step(plant, scenario)[0] for plant in plants], scenario.settled_s)
 
 
 def judge_steps(rows: Sequence[FloatArray], settled_s: float) -> dict[str, float]:
@@ -230,7 +222,10 @@ def tightened(seed: int) -> tuple[float, float]:
 
 def measure(seeds: int) -> dict[str, Any]:
     """Return the figures of the steps by scenario, and of the screws."""
-    numbers: dict[str, Any] = {scenario.name: steps(scenario, seeds, rig_twin) for scenario in TWIN_SCENARIOS}
+    numbers: dict[str, Any] = {}
+    for scenario in TWIN_SCENARIOS:
+        plants = [rig_twin(scenario.sensor, np.random.default_rng((20, seed))) for seed in range(seeds)]
+        numbers[scenario.name] = judge_steps([step(plant, scenario)[0] for plant in plants], scenario.settled_s)
     beyond_nm, travel_nm = np.array([tightened(seed) for seed in range(seeds)]).T
     numbers["tighten"] = {
         "beyond_target_nm_worst": float(np.abs(beyond_nm).max()),

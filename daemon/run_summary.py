@@ -244,14 +244,16 @@ def _held(
     # Judge by the true torque, the load cell or another source, never by the one that drove the loop.
     names = sorted(set(sources) - {driving}, key=lambda name: (name != TRUE, name != LOAD_CELL, name))
     for name in names[:1]:
-        reached_s = _recovery_s(sources[name].between(step.from_ns, step.to_ns), step.from_ns, set_nm)
-        if reached_s is not None:
+        during = sources[name].between(step.from_ns, step.to_ns)
+        reached_s = recovered_s((during.t_ns - step.from_ns) / 1e9, during.torque_nm, set_nm)
+        if reached_s < np.inf:
             yield f"    within ± {BAND:.0%} {reached_s:.1f} s after the set point changed, by {name}"
         for t_ns, description in events:
             after = sources[name].between(t_ns, step.to_ns)
             if after.torque_nm.size:
-                back_s, worst_nm = _recovery_s(after, t_ns, set_nm), np.abs(after.torque_nm - set_nm).max()
-                back = "not back by the end" if back_s is None else f"back within ± {BAND:.0%} after {back_s:.1f} s"
+                worst_nm = np.abs(after.torque_nm - set_nm).max()
+                back_s = recovered_s((after.t_ns - t_ns) / 1e9, after.torque_nm, set_nm)
+                back = "not back by the end" if back_s == np.inf else f"back within ± {BAND:.0%} after {back_s:.1f} s"
                 since_s = (t_ns - from_ns) / 1e9
                 yield f"    disturbed after {since_s:.1f} s ({description}): {worst_nm:.3f} N·m off, {back}"
 
@@ -260,15 +262,12 @@ def _in_band(torque_nm: FloatArray, set_nm: float) -> NDArray[np.bool_]:
     return np.abs(torque_nm - set_nm) <= BAND * abs(set_nm)
 
 
-def _recovery_s(series: TorqueSeries, since_ns: float, set_nm: float) -> float | None:
-    """Return the time until the torque enters the band and stays there; None if it does not."""
-    inside = _in_band(series.torque_nm, set_nm)
-    seen = series.t_ns <= series.t_ns[-1:] - STAYS_S * 1e9
-    for at in np.flatnonzero(inside & seen):
-        stays = inside[(series.t_ns >= series.t_ns[at]) & (series.t_ns <= series.t_ns[at] + STAYS_S * 1e9)]
-        if stays.all():
-            return float(series.t_ns[at] - since_ns) / 1e9
-    return None
+def recovered_s(t_s: FloatArray, torque_nm: FloatArray, set_nm: float) -> float:
+    """Return when a torque (n,) comes into its band for STAYS_S at least; infinite if it does not."""
+    outside = np.flatnonzero(~_in_band(torque_nm, set_nm))
+    came, left_s = np.append(0, outside + 1), np.append(t_s[outside], t_s[-1:])
+    stays = [t_s[at] for at, end_s in zip(came, left_s, strict=False) if at < len(t_s) and end_s - t_s[at] >= STAYS_S]
+    return float(stays[0]) if stays else np.inf
 
 
 def _counted(run: _Run) -> Iterator[str]:

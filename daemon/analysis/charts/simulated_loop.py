@@ -22,7 +22,7 @@ from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
 from shearloop.daemon.control.margins import integral_gain
 from shearloop.daemon.control.torque_controller import ControllerSettings, TorqueController, WristCommand
 from shearloop.daemon.control.wrist_controller import controller_settings
-from shearloop.daemon.run_summary import BAND, STAYS_S
+from shearloop.daemon.run_summary import BAND, recovered_s
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 
 PERIOD_S = 0.008
@@ -198,16 +198,9 @@ class Trace:
     t_s: FloatArray
     torque_nm: FloatArray
 
-
-def back_after_s(trace: Trace, target_nm: float) -> float:
-    """Return the time until the torque comes into its band for STAYS_S at least; infinite if it does not."""
-    outside = np.flatnonzero(np.abs(trace.torque_nm / target_nm - 1.0) > BAND)
-    came = np.concatenate([[0], outside + 1])
-    left_s = np.append(trace.t_s[outside], trace.t_s[-1])
-    stays = [
-        at for at, end_s in zip(came, left_s, strict=True) if at < len(trace.t_s) and end_s - trace.t_s[at] >= STAYS_S
-    ]
-    return float(trace.t_s[stays[0]] - trace.t_s[0]) if stays else np.inf
+    def back_after_s(self, target_nm: float) -> float:
+        """Return the time until the torque is in its band, and stays; infinite if it does not."""
+        return recovered_s(self.t_s, self.torque_nm, target_nm) - float(self.t_s[0])
 
 
 def nanoseconds(time_s: float) -> int:
@@ -421,7 +414,7 @@ def chart(out: Path, seeds: int = 20) -> list[Path]:
     for axes, (name, rows) in zip(made.subplots(1, 3, sharey=True), held_loops(seeds).items(), strict=True):
         settled_nm = [one.torque_nm[one.t_s >= one.t_s[0] + SCENARIOS[0].settled_s] for one, _ in rows]
         share = float(np.mean(np.abs(np.concatenate(settled_nm) / _TARGET_NM - 1.0) <= BAND))
-        back_s = [back_after_s(after, _TARGET_NM) for _, after in rows]
+        back_s = [after.back_after_s(_TARGET_NM) for _, after in rows]
         content[name] = {"time_in_band": share, "kick_back_s": back_s}
         for before, after in rows:
             t_s = np.concatenate([before.t_s, after.t_s]) - before.t_s[0]

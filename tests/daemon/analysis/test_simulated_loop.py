@@ -12,7 +12,6 @@ from shearloop.daemon.analysis.charts.simulated_loop import (
     SimulatedSensor,
     SimulatedTool,
     Trace,
-    back_after_s,
     chart,
     nanoseconds,
     run,
@@ -59,7 +58,7 @@ def test_the_plant_relaxes():
 def test_a_torque_is_back_when_it_stays_for_a_second(away, held, away_again, held_again, steps):
     torque_nm = np.repeat([0.0, 0.1, 0.0, 0.1], [away, held, away_again, held_again])
     trace = Trace(5.0 + PERIOD_S * np.arange(len(torque_nm)), torque_nm)
-    assert back_after_s(trace, 0.1) == pytest.approx(steps * PERIOD_S)
+    assert trace.back_after_s(0.1) == pytest.approx(steps * PERIOD_S)
 
 
 def test_the_chart_shows_that_the_torque_filter_brings_a_kicked_torque_back_sooner(tmp_path):

@@ -35,11 +35,11 @@ def run(args: argparse.Namespace) -> int:
         raise missing(error.name, "plot", "a figure") from error
     from shearloop.daemon.analysis.reproduce.report import json_text, table
 
-    found, banks = _reproduce(args, args.jobs or processors())
+    found = _reproduce(args, args.jobs or processors())
     numbers = args.out / "reproduce.json"
     with writing(args.out, "the results"):
         numbers.write_text(json_text(found) + "\n", encoding="utf-8")
-        written = [numbers, *draw_all(found, banks, args.out)]
+        written = [numbers, *draw_all(found, args.out)]
     if args.json:
         print(json_text(found))
     else:
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _reproduce(args: argparse.Namespace, jobs: int) -> "tuple[Reproduction, dict[str, Bank]]":
+def _reproduce(args: argparse.Namespace, jobs: int) -> "Reproduction":
     from scipy import fft
 
     from shearloop.bank.eit.channels import smoothed_along_channels
@@ -83,5 +83,4 @@ def _reproduce(args: argparse.Namespace, jobs: int) -> "tuple[Reproduction, dict
             diameter = analysis.analyse_diameter(inputs.diameter, match(smooth, banks["wide"]), banks["wide"])
     regressions = regress_on_channels(torque.slices, torque.parts) if torque else ()
     twists = read_twists(args.recordings, notes) if torque else None
-    found = Reproduction(mesh, origin, banks["wide"], torque, diameter, models, regressions, twists, tuple(notes))
-    return found, banks
+    return Reproduction(mesh, origin, banks, torque, diameter, models, regressions, twists, tuple(notes))

@@ -34,8 +34,7 @@ def signal_figure(bank: Bank) -> Figure:
     for row, s in enumerate(reversed(of_sigma)):
         for column, k in enumerate(of_k):
             panel = axes[row, column]
-            panel.set_xticks([])
-            panel.set_yticks([])
+            panel.set(xticks=[], yticks=[])
             if bank.valid[k, s]:
                 signal = bank.signals[k, s]
                 peak = float(np.abs(signal).max())

@@ -75,11 +75,11 @@ def forward_methods(
     ]
     # EIDORS solves the same model: its error is known where the paper's mesh is given. pyEIT's electrodes are points.
     paper = next((one.error for one in found if one.triangles == PAPER_TRIANGLES), None)
-    return [*found, _cited("EIDORS 3.10", "EIDORS", EIDORS_CELL_S, paper), _cited("pyEIT", "pyEIT", PYEIT_CELL_S, None)]
-
-
-def _cited(name: str, family: str, cell_s: float, error: float | None) -> SolvedForward:
-    return SolvedForward(f"{name} (cited)", family, PAPER_TRIANGLES, 1e3 * cell_s, error, cited=True)
+    cited = (("EIDORS 3.10", "EIDORS", EIDORS_CELL_S, paper), ("pyEIT", "pyEIT", PYEIT_CELL_S, None))
+    return found + [
+        SolvedForward(f"{name} (cited)", family, PAPER_TRIANGLES, 1e3 * cell_s, error, cited=True)
+        for name, family, cell_s, error in cited
+    ]
 
 
 def batch(mesh: Mesh) -> Callable[[], FloatArray]:

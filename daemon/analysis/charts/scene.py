@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from shearloop.bank.eit.design import ALLOWED, Design, DesignChoice, design_bank, simulated_frames
-from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.daemon.analysis.bank_design import doubts, scene_of
 from shearloop.daemon.analysis.charts.chart_data import Split, own_fingertip
 from shearloop.daemon.analysis.charts.drawing import SHADES, figure, save, slug
@@ -34,17 +33,14 @@ def chart(parts: Sequence[Split], out: Path, executor: Executor) -> list[Path]:
         for sentence in doubts(design):
             print(f"shearloop chart: {title}: {sentence}", file=sys.stderr)
         written += write(title, design, out)
-    for name, fingertip in other_fingertips().items():
+    for path in sorted(OWN_FINGERTIP.parent.glob("*.yaml")):
+        if path == OWN_FINGERTIP:
+            continue
+        fingertip = load_fingertip(path)
         simulated = [simulated_frames(design, fingertip) for design in found]
         for title, design in zip(titles, executor.map(design_bank, fingertip, simulated), strict=True):
-            written += write(f"{title} {name}, simulated", design, out)
+            written += write(f"{title} {path.stem}, simulated", design, out)
     return written
-
-
-def other_fingertips() -> dict[str, Fingertip]:
-    """Return the fingertips of the configuration that are not the paper's, by name."""
-    paths = sorted(path for path in OWN_FINGERTIP.parent.glob("*.yaml") if path != OWN_FINGERTIP)
-    return {path.stem: load_fingertip(path) for path in paths}
 
 
 def write(title: str, design: Design, out: Path) -> list[Path]:

@@ -53,7 +53,7 @@ class Reproduction:
 
     mesh: Mesh
     mesh_origin: str
-    wide: Bank
+    banks: dict[str, Bank]
     torque: TorqueResult | None
     diameter: DiameterResult | None
     models: ModelScores | None
@@ -63,10 +63,11 @@ class Reproduction:
 
     def region_agreement(self) -> dict[str, float]:
         """Return the share of the wide bank's cells whose validity agrees with the paper's region, by its reading."""
-        in_k, in_sigma = (self.wide.k_grid > PAPER_REGION_CM[0])[:, None], self.wide.sigma_grid > PAPER_REGION_CM[1]
+        wide = self.banks["wide"]
+        in_k, in_sigma = (wide.k_grid > PAPER_REGION_CM[0])[:, None], wide.sigma_grid > PAPER_REGION_CM[1]
         return {
-            "or": float((self.wide.valid == (in_k | in_sigma)).mean()),
-            "and": float((self.wide.valid == (in_k & in_sigma)).mean()),
+            "or": float((wide.valid == (in_k | in_sigma)).mean()),
+            "and": float((wide.valid == (in_k & in_sigma)).mean()),
         }
 
 
@@ -85,7 +86,7 @@ def json_text(found: Reproduction) -> str:
         "torque_rmse_nm_cross_validated": torque and torque.rmse_nm,
         "torque_regression_r_share": regression and regression.r_share_at(PAPER_CHANNELS),
         "torque_regression_channels_for_80_percent_of_r2": regression and regression.counts_reaching(PAPER_SHARE),
-        "bank_valid_cells": int(found.wide.valid.sum()),
+        "bank_valid_cells": int(found.banks["wide"].valid.sum()),
         "paper_region_agreement": found.region_agreement(),
     }
     return json.dumps(numbers, indent=2, allow_nan=False)
@@ -126,7 +127,7 @@ def table(found: Reproduction) -> str:
                 (f"{MODELS[name].title}: matching score, mean over slices", "", _number(score))
                 for name, score in models.matching.items()
             ]
-    rows.append(("cells of the wide bank that are valid", "", str(found.wide.valid.sum())))
+    rows.append(("cells of the wide bank that are valid", "", str(found.banks["wide"].valid.sum())))
     rows += [
         (f"cells where that is the paper's region, k > 3.5 {word} σ > 0.6", "", f"{share:.1%}")
         for word, share in found.region_agreement().items()
@@ -209,17 +210,17 @@ _SLICES: dict[str, Any] = {"color": _GREY, "alpha": 0.6, "markeredgewidth": 0, "
 _HEATMAPS_SHOWN = 4
 
 
-def draw_all(found: Reproduction, banks: dict[str, Bank], folder: Path) -> list[Path]:
+def draw_all(found: Reproduction, folder: Path) -> list[Path]:
     """Draw the figures of all existing results as PNG and SVG, and return the paths; raises OSError."""
-    figures = {"figure_4_models": models_figure(found.mesh), "figure_6_bank": signal_figure(found.wide)}
+    figures = {"figure_4_models": models_figure(found.mesh), "figure_6_bank": signal_figure(found.banks["wide"])}
     if found.models:
         figures["figure_5_models"] = model_figure(found.models)
     if torque := found.torque:
         dataset = dataset_figure(torque.slices, torque.parts, found.regressions, found.twists)
-        figures |= {"figure_3_dataset": dataset, "figure_7_heatmap": heatmap_figure(torque, banks["wide"])}
-        figures["figure_8_torque"] = torque_figure(torque, banks["focused"])
+        figures |= {"figure_3_dataset": dataset, "figure_7_heatmap": heatmap_figure(torque, found.banks["wide"])}
+        figures["figure_8_torque"] = torque_figure(torque, found.banks["focused"])
     if found.diameter:
-        figures["figure_9_diameter"] = diameter_figure(found.diameter, banks["wide"])
+        figures["figure_9_diameter"] = diameter_figure(found.diameter, found.banks["wide"])
     written = []
     for name, made in figures.items():
         lay_out(made)

@@ -53,18 +53,10 @@ def test_all_executors_give_the_same_numbers(scheduler):
         assert list(cluster.map(square, shared, items)) == alone
 
 
-@pytest.mark.parametrize(
-    ("cluster", "jobs", "count"),
-    [
-        (None, None, 1),
-        (None, 1, 1),
-        (None, 3, 3),
-        (LOCAL, None, len(os.sched_getaffinity(0))),
-        (LOCAL, 1, 1),
-        (LOCAL, 5, 5),
-    ],
-)
-def test_without_an_address_tasks_run_in_processes_of_this_computer(cluster, jobs, count):
+@pytest.mark.parametrize("cluster", [None, LOCAL])
+@pytest.mark.parametrize("jobs", [None, 1, 5])
+def test_without_an_address_tasks_run_in_processes_of_this_computer(cluster, jobs):
+    count = jobs or {None: 1, LOCAL: len(os.sched_getaffinity(0))}[cluster]
     with open_executor(cluster, jobs) as executor:
         if count == 1:
             assert isinstance(executor, SerialExecutor)

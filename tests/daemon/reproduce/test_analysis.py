@@ -80,7 +80,7 @@ def test_slices_that_are_no_repeats_are_grouped_by_torque(signals, bank):
 def test_what_the_slices_do_not_determine_is_none_and_said(signals, bank, coarse_mesh):
     found = analysed(signals, bank, [4, 4, 4], [0.01, 0.02, 0.03])
     assert (found.r_focused, found.r_clustered, found.fit, found.rmse_nm) == (None, None, None, None)
-    told = table(Reproduction(coarse_mesh, "here", bank, found, None, None, (), None, ()))
+    told = table(Reproduction(coarse_mesh, "here", {"wide": bank}, found, None, None, (), None, ()))
     assert told.count(" none\n") == 4
     assert "none: slices are too few, or their matches too alike, for this number" in told
 

@@ -1,10 +1,11 @@
 """`shearloop ports`: the serial ports, their USB serial numbers, and whether the user may open them."""
 
 import argparse
-import json
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
+
+from shearloop.daemon.cli.terminal import print_result
 
 # USB vendor numbers, as in systemd/60-shearloop.rules.
 BOARDS = {
@@ -46,19 +47,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """List the ports without opening them."""
     ports = list_serial_ports()
-    if args.json:
-        print(json.dumps([{**asdict(port), "named_by": port.named_by} for port in ports], ensure_ascii=False))
-        return 0
-    if not ports:
-        print("there is no serial port: plug a board in, then look at `sudo dmesg | tail`")
+    sentences = [] if ports else ["there is no serial port: plug a board in, then look at `sudo dmesg | tail`"]
     for port in ports:
-        print(port.path, port.usb, port.likely or port.description, sep="  ")
-        print(f"    device: {port.named_by}")
-        if not port.serial_number:
-            print("    it has no serial number: leave it in the same socket")
-        if port.error:
-            print(f"    {port.error}")
-    return 0
+        sentences += [f"{port.path}  {port.usb}  {port.likely or port.description}", f"    device: {port.named_by}"]
+        sentences += [] if port.serial_number else ["    it has no serial number: leave it in the same socket"]
+        sentences += [f"    {port.error}"] if port.error else []
+    result = [{**asdict(port), "named_by": port.named_by} for port in ports]
+    return print_result(result, sentences, as_json=args.json)
 
 
 def list_serial_ports() -> list[SerialPortInfo]:

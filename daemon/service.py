@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
@@ -116,7 +117,7 @@ def uninstall_steps(root: Path, *, running: bool) -> Iterator[Step]:
     yield from _remove_real_time(root)
     yield _remove(root / EXAMPLE, unless_edited=service_file("shearloop.yaml").encode())
     for folder in ("keys/clients", "keys", ""):
-        yield _remove_empty_folder(root / "etc/shearloop" / folder)
+        yield _remove(root / "etc/shearloop" / folder)
     # The group goes with its user; a missing user is no failure.
     prefix = [] if root == Path("/") else ["--prefix", str(root)]
     yield _program(["userdel", *prefix, "shearloop"], "removes the user and its group", may_fail=True)
@@ -129,7 +130,7 @@ def uninstall_steps(root: Path, *, running: bool) -> Iterator[Step]:
 def _remove_real_time(root: Path) -> Iterator[Step]:
     if (root / REAL_TIME).exists():
         yield _remove(root / REAL_TIME)
-        yield _remove_empty_folder((root / REAL_TIME).parent)
+        yield _remove((root / REAL_TIME).parent)
 
 
 def _write(target: Path, content: bytes, *, keep: bool = False) -> Step:
@@ -147,23 +148,19 @@ def _write(target: Path, content: bytes, *, keep: bool = False) -> Step:
 
 
 def _remove(target: Path, unless_edited: bytes | None = None) -> Step:
-    """Remove a file; with `unless_edited`, only if it has this content."""
+    """Remove an empty folder, or a file; with `unless_edited`, only if it has this content."""
     if not target.exists():
         return Step(f"not there: {target}")
+    if target.is_dir():
+        return Step(f"remove {target} if it is empty", partial(_remove_empty, target))
     if unless_edited not in (None, target.read_bytes()):
         return Step(f"left because it was edited: {target}")
     return Step(f"remove {target}", target.unlink)
 
 
-def _remove_empty_folder(target: Path) -> Step:
-    if not target.is_dir():
-        return Step(f"not there: {target}")
-
-    def remove() -> None:
-        if not any(target.iterdir()):
-            target.rmdir()
-
-    return Step(f"remove {target} if it is empty", remove)
+def _remove_empty(folder: Path) -> None:
+    if not any(folder.iterdir()):
+        folder.rmdir()
 
 
 def _program(arguments: list[str], purpose: str, *, may_fail: bool = False) -> Step:

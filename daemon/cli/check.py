@@ -1,7 +1,6 @@
 """`shearloop check`: check a configuration and the files it names."""
 
 import argparse
-import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.options import add_option
+from shearloop.daemon.cli.terminal import print_result
 from shearloop.daemon.errors import USER_ERRORS, UserError
 from shearloop.words import counted
 
@@ -37,13 +37,8 @@ def run(args: argparse.Namespace) -> int:
             _check_experiment_alone(args.config)
     if parts.mistakes:
         raise UserError("\n".join(dict.fromkeys(parts.mistakes.values())))
-    if args.json:
-        print(json.dumps({"config": str(args.config), "parts": parts.texts}, ensure_ascii=False))
-        return 0
-    for name, text in parts.texts.items():
-        print(f"{name}: {text}")
-    print(f"{args.config} is in order")
-    return 0
+    sentences = [*(f"{name}: {text}" for name, text in parts.texts.items()), f"{args.config} is in order"]
+    return print_result({"config": str(args.config), "parts": parts.texts}, sentences, as_json=args.json)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,6 @@
 """`shearloop evaluate CAL REC…`: compare estimates with the load cell of recordings, in numbers and as a figure."""
 
 import argparse
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.bank.defaults import LOADED_NM
 from shearloop.daemon.cli.options import add_cluster, add_json, add_option, number, time_range, writing
-from shearloop.daemon.cli.terminal import table
+from shearloop.daemon.cli.terminal import print_result, table
 from shearloop.daemon.errors import UserError, missing
 from shearloop.words import counted
 
@@ -103,14 +102,12 @@ def run(args: argparse.Namespace) -> int:
     if args.plot or args.out:
         _draw(tracks, [path for path, _ in named], calibration, args.out or args.calibration.with_suffix(".png"))
     by_load, figures = figures_by_load(tracks, args.loaded_nm), figures_of(tracks)
-    if args.json:
-        print(json.dumps({**by_load, **figures}))
-        return 0
-    print(f"Loaded frames have a known torque of {args.loaded_nm:g} N·m or more, unloaded frames less.")
-    print(*_lines({**by_load, "all": figures}), sep="\n")
+    sentences = [f"Loaded frames have a known torque of {args.loaded_nm:g} N·m or more, unloaded frames less."]
+    sentences += _lines({**by_load, "all": figures})
     for reason in invalid_reasons(tracks):
-        print(f"{counted(reason.frames, 'frame'):>13} not valid{', e.g.' if reason.differ else ''}: {reason.sentence}")
-    return 0
+        frames = f"{counted(reason.frames, 'frame'):>13} not valid{', e.g.' if reason.differ else ''}"
+        sentences.append(f"{frames}: {reason.sentence}")
+    return print_result({**by_load, **figures}, sentences, as_json=args.json)
 
 
 def _lines(columns: "Mapping[str, Figures]") -> list[str]:

@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         counts = {"compared": comparison.compared, "different": comparison.different}
         others = {"unrecorded": comparison.unrecorded, "examples": comparison.examples, "same_code": same_code}
-        print_result({**counts, **others}, (), as_json=True)
+        print_result(counts | others, (), as_json=True)
     return 1 if args.check and (comparison.different or not comparison.compared) else 0
 
 

@@ -1,7 +1,6 @@
 """`shearloop skin`: compare the shear skin's models with its paper, and calibrate a skin from a recorded table."""
 
 import argparse
-import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -49,10 +48,7 @@ def _characterise(args: argparse.Namespace) -> int:
         with writing(args.out, "the figures"):
             args.out.mkdir(parents=True, exist_ok=True)
     found = characterise()
-    if args.json:
-        print(json.dumps([asdict(row) for row in found.rows], indent=1, ensure_ascii=False))
-    else:
-        print(_table(found.rows))
+    print_result([asdict(row) for row in found.rows], [_table(found.rows)], as_json=args.json)
     if args.out is not None:
         with writing(args.out, "the figures"):
             written = draw(found, args.out)

@@ -23,7 +23,7 @@ LINK_ERRORS = ("unreachable", "silent", "lost")
 READ_BYTES = 4096
 
 
-def print_result(result: Mapping[str, object], sentences: Iterable[str], *, as_json: bool) -> int:
+def print_result(result: object, sentences: Iterable[str], *, as_json: bool) -> int:
     """Print a result as one line of JSON for a script, or as sentences for a person; return the exit status 0."""
     if as_json:
         print(json.dumps(result, ensure_ascii=False), flush=True)

@@ -2,7 +2,6 @@
 
 import argparse
 import asyncio
-import json
 from pathlib import Path
 
 from shearloop.daemon.cli.options import PORT, add_connection, add_fingertip, add_option, client_keys, load_fingertip
@@ -52,12 +51,9 @@ def _serve_page(args: argparse.Namespace) -> int:
 
     def print_address(port: int) -> None:
         page = f"http://127.0.0.1:{port}/"
-        if args.json:
-            result = {"url": page, "url_with_token": f"{page}#token={token}", "token_file": str(path)}
-            print(json.dumps(result), flush=True)
-        else:
-            print(f"{page}#token={token}", flush=True)
-            print(f"Without the token the page shows everything and can stop, but moves nothing. Token: {path}")
+        result = {"url": page, "url_with_token": f"{page}#token={token}", "token_file": str(path)}
+        without = f"Without the token the page shows everything and can stop, but moves nothing. Token: {path}"
+        print_result(result, [result["url_with_token"], without], as_json=args.json)
 
     with logging_to_stderr():
         asyncio.run(serve(address, args.port, token, fingertip, print_address))

@@ -21,6 +21,7 @@ from shearloop.drivers.emulators.boards import EitKitBoard
 from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
 from tests.daemon.conftest import DEADLINE_S, recording, shearloop
+from tests.daemon.emulate_rig.rig import write_rig_bank
 from tests.running import pass_on, running, take
 
 PERIOD_S = 0.5408
@@ -108,46 +109,37 @@ async def test_twists_are_synthesised_from_a_bank(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("device", "arguments", "sentence"),
+    ("arguments", "sentence"),
     [
-        (
-            "eit-kit",
-            "--recording a.mat --bank b.shb",
-            "give either --recording FILE to play a recording or --bank FILE",
-        ),
-        ("hx711", "--speed 0", "--speed 0"),
-        ("hx711", "--torque-nm nan", "--torque-nm nan is not a number from -1000 to 1000"),
-        ("gripper-socket", "--port 70000", "--port 70000 is not a whole number from 0 to 65535"),
-        ("gripper-socket", "--bind 192.0.2.1", "cannot be played"),
-        (
-            "gripper-modbus",
-            "--link /nowhere/at/all",
-            "gripper-modbus cannot be played: [Errno 2] No such file or directory: '/nowhere/at'",
-        ),
-        ("eit-kit", "", "give either --recording FILE to play a recording or --bank FILE"),
-        ("eit-kit", "--recording absent.mat", "absent.mat: the recording cannot be read"),
-        ("eit-kit", "--bank absent.shb", "absent.shb"),
-        ("eit-kit", "--bank absent.shb --once", "--once is for a recording"),
-        ("eit-kit", "--recording absent.mat --speed 0", "--speed 0 is not a number above 0"),
-        (
-            "eit-kit",
-            "--recording absent.mat --link /dev/null/eit",
-            "eit-kit cannot be played: [Errno 17] File exists: '/dev/null'; choose another address, port or path",
-        ),
-        ("ur", "--rate-hz 5", "--rate-hz 5 is not a number from 50 to 1000"),
+        ("eit-kit --recording a.mat --bank b.shb", "give either --recording FILE to play a recording or --bank FILE"),
+        ("eit-kit", "give either --recording FILE to play a recording or --bank FILE"),
+        ("eit-kit --recording absent.mat", "absent.mat: the recording cannot be read"),
+        ("eit-kit --bank absent.shb", "absent.shb"),
+        ("eit-kit --bank absent.shb --once", "--once is for a recording"),
+        ("eit-kit --recording absent.mat --speed nan", "--speed nan is not a number above 0"),
+        ("hx711 --torque-nm nan", "--torque-nm nan is not a number from -1000 to 1000"),
+        ("gripper-socket --port 70000", "--port 70000 is not a whole number from 0 to 65535"),
+        ("gripper-socket --speed 0", "--speed 0 is not a number above 0"),
         # An address for documentation (RFC 5737), which no machine has.
-        (
-            "ur",
-            "--host 192.0.2.1",
-            "ur cannot be played: [Errno 99] error while attempting to bind on address ('192.0.2.1', ",
-        ),
-        ("skin", "--speed 0", "--speed 0 is not a number above 0"),
-        ("skin", "--source-port 70000", "--source-port 70000 is not a whole number from 0"),
-        ("skin", "--daq-link /dev/null/daq", "skin cannot be played: [Errno 17] File exists: '/dev/null'"),
+        ("gripper-socket --bind 192.0.2.1", "cannot be played: [Errno 99] error while attempting to bind on address"),
+        ("gripper-modbus --link /nowhere/at/all", "cannot be played: [Errno 2] No such file or directory: '/nowhere"),
+        ("ur --rate-hz 5", "--rate-hz 5 is not a number from 50 to 1000"),
+        ("ur --host 192.0.2.1", "cannot be played: [Errno 99] error while attempting to bind on address"),
+        ("skin --source-port 70000", "--source-port 70000 is not a whole number from 0"),
+        ("skin --daq-link /dev/null/daq", "cannot be played: [Errno 17] File exists: '/dev/null'; choose another"),
+        ("skin --rate-hz 5", "--rate-hz 5 is not a number from 50 to 1000"),
+        ("rig {run} --bank absent.bank", "absent.bank"),
+        ("rig {run} --bank {bank} --gel-stiffness -1", "--gel-stiffness -1 is not a number above 0"),
+        ("rig {run} --bank {bank} --diameter-mm 150", "--diameter-mm 150 is not a number above 0 and up to 140"),
+        ("rig {run} --bank {bank} --run-dir /dev/null/run", "cannot be played: [Errno 20] Not a directory: '/dev/nu"),
+        ("rig {run} --bank {bank} --truth /nowhere/truth", "cannot be played: [Errno 2] No such file or directory: "),
+        ("rig {run} --bank {bank} --sigma 1.2 1.8", "give the larger one first"),
+        ("rig {run} --bank {bank} --sigma 3.0 1.8", "the bank has no signal at sigma = 3"),
     ],
 )
-def test_a_mistake_is_one_sentence_and_status_two(device, arguments, sentence, mistake):
-    complaint = mistake("emulate", device, *arguments.split())
+def test_a_mistake_is_one_sentence_and_status_two(arguments, sentence, tmp_path, mistake):
+    words = arguments.format(run=f"--run-dir {tmp_path}", bank=write_rig_bank(tmp_path / "rig.bank")).split()
+    complaint = mistake("emulate", *words)
     assert sentence in complaint
     assert complaint.count("\n") == 1
 

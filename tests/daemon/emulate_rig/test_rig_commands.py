@@ -1,42 +1,10 @@
-"""The arguments and the commands of `shearloop emulate rig`, and what it says of those that are none."""
+"""The commands of `shearloop emulate rig`, and what it says of those that are none."""
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from shearloop.drivers.emulators.emulated_rig import EmulatedRig
-
-
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (["--bank", "absent.bank"], "absent.bank"),
-        (["--speed", "0"], "--speed 0 is not a number above 0"),
-        (["--speed", "nan"], "--speed nan is not a number above 0"),
-        (["--gel-stiffness", "-1"], "--gel-stiffness -1 is not a number above 0"),
-        (["--rate-hz", "5"], "--rate-hz 5 is not a number from 50 to 1000"),
-        (["--diameter-mm", "150"], "--diameter-mm 150 is not a number above 0 and up to 140"),
-        (
-            ["--run-dir", "/dev/null/run"],
-            "rig cannot be played: [Errno 20] Not a directory: '/dev/null/run'; choose another",
-        ),
-        (
-            ["--truth", "/nowhere/truth"],
-            "rig cannot be played: [Errno 2] No such file or directory: '/nowhere/truth'; choose another",
-        ),
-        (["--sigma", "1.2", "1.8"], "give the larger one first"),
-        (["--sigma", "3.0", "1.8"], "the bank has no signal at sigma = 3"),
-        # An address for documentation (RFC 5737), which no machine has.
-        (
-            ["--host", "192.0.2.1"],
-            "rig cannot be played: [Errno 99] error while attempting to bind on address ('192.0.2.1', ",
-        ),
-    ],
-)
-def test_mistakes_are_told(arguments, sentence, bank, tmp_path, mistake):
-    complaint = mistake("emulate", "rig", "--bank", bank, "--run-dir", tmp_path, *arguments)
-    assert sentence in complaint
-    assert complaint.count("\n") == 1
 
 
 class Blank:

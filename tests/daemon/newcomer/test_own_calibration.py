@@ -22,7 +22,7 @@ def readme_program() -> str:
 
 def only_twists(content: Any) -> None:
     """Let the wrist turn to a few angles in place of the demo's identification and hold."""
-    twist = {"do": "twist", "angles_rad": [0.06, 0.12, 0.03], "speed_rad_per_s": 0.4, "hold_s": 0.5}
+    twist = {"do": "twist", "angles_rad": [0.1, 0.2, 0.05], "speed_rad_per_s": 0.4, "hold_s": 0.5}
     steps = [step for step in content["steps"] if step["do"] != "identify"]
     content["steps"] = [twist if step["do"] == "hold_torque" else step for step in steps]
 

@@ -102,9 +102,9 @@ def measure_timing(recordings: Sequence[FrameSeries], others: Sequence[FrameSeri
         return TRUSTED
     check_finite(recordings)
     timed: Sequence[tuple[FrameSeries, LoadDelay | None]] = [(one, find_load_delay(one)) for one in recordings]
-    if not any(_is_sure(delay) for _, delay in timed):
+    if all(delay is None or delay.few_frames for _, delay in timed):
         timed = _sure_delays(others) or timed
-    sure = [delay if _is_sure(delay) else None for _, delay in timed]
+    sure = [None if delay is None or delay.few_frames else delay for _, delay in timed]
     for delay in sure:
         if delay is not None and delay.late_s:
             raise CalibrationError(
@@ -206,10 +206,6 @@ def is_filtered(torque_nm: FloatArray) -> bool | None:
     if next_one > -0.25 and -0.6 < one_after < -0.15:  # a lever that rings has a lower one_after
         return True
     return False if next_one < -0.35 and one_after > -0.15 else None
-
-
-def _is_sure(found: LoadDelay | None) -> bool:
-    return found is not None and not found.few_frames
 
 
 def _delay_of_side(series: FrameSeries, part: slice, layer: int) -> LoadDelay | None:

@@ -249,7 +249,8 @@ def fit_line(grips: Sequence[CalibrationRows], table: ChannelTable) -> Ridge:
     neighbours, as the paper did with its cylinders, lowers the noise.
     """
     diameters = np.array([one.diameter_mm[0] for one in grips])
-    reduction = _noise_reduction(grips[0].position.shape[1] // table.n_channels, table)
+    n_sides = grips[0].position.shape[1] // table.n_channels
+    reduction = np.kron(np.eye(n_sides), table.twin_means(smoothed_along_channels(np.eye(table.n_channels))))
     frames = [one.position @ reduction for one in grips]
     positions = np.array([one.mean(axis=0) for one in frames])
     moved = np.concatenate([one - position for one, position in zip(frames, positions, strict=True)])
@@ -274,9 +275,3 @@ def fit_line(grips: Sequence[CalibrationRows], table: ChannelTable) -> Ridge:
     along = centred.T @ (modes @ (modes.T @ (diameters - diameters.mean()) / true))
     mean = np.mean([one.position.mean(axis=0) for one in grips], axis=0)
     return Ridge(mean, reduction @ whitened(along), float(diameters.mean()), 0.0)
-
-
-def _noise_reduction(n_sides: int, table: ChannelTable) -> FloatArray:
-    """Return the (m·c, m·c/2) matrix that smooths m sides' channels and averages channels of one voltage."""
-    smoothed = smoothed_along_channels(np.eye(table.n_channels))
-    return np.asarray(np.kron(np.eye(n_sides), table.twin_means(smoothed)))

@@ -243,9 +243,8 @@ class GripMemory:
 
     def _repeat_position(self, times: int) -> None:
         """Repeat the last position for missing frames until the next frame allows interpolation."""
-        for _ in range(times):
-            self.positions.append(self.positions[-1])
-            self._bridged.append(True)
+        self.positions.extend([self.positions[-1]] * times)
+        self._bridged.extend([True] * times)
 
 
 class SessionState:

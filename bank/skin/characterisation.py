@@ -218,15 +218,15 @@ def _upturns(models: _Models) -> list[float]:
 
 def _prediction_rows(models: _Models) -> list[FigureOfMerit]:
     up, around = loading(1.0), loop(1.0)
-
-    def half_width(shear_n: FloatArray, response: FloatArray) -> float:
-        return fit_line(shear_n, response).prediction_half_width_n
-
     both_ways = np.concatenate([-up, up])
-    loaded = [half_width(both_ways, np.concatenate([-y, y])) for y in models.both(up, 1.0)]
-    cycled = [half_width(around, found) for found in models.both(around, 1.0)]
+    loaded = [fit_line(both_ways, np.concatenate([-y, y])) for y in models.both(up, 1.0)]
+    cycled = [fit_line(around, found) for found in models.both(around, 1.0)]
     return [
         FigureOfMerit("95 % prediction interval", "± N", "", "0.0802"),
-        FigureOfMerit("  from friction alone, loading ± 1 N", "± N", "", "", *loaded),
-        FigureOfMerit("  from friction alone, whole loop ± 1 N", "± N", "", "", *cycled),
+        FigureOfMerit(
+            "  from friction alone, loading ± 1 N", "± N", "", "", *(one.prediction_half_width_n for one in loaded)
+        ),
+        FigureOfMerit(
+            "  from friction alone, whole loop ± 1 N", "± N", "", "", *(one.prediction_half_width_n for one in cycled)
+        ),
     ]

@@ -338,15 +338,6 @@ def test_within_the_band_the_force_stays_where_it_was_known_and_the_band_holds_t
     assert low_n == pytest.approx(0.8 - 2 * HOLD_N - 0.07, abs=0.02)
 
 
-def test_after_a_gap_the_direction_is_found_anew():
-    finder = DirectionFinder(NOISE)
-    for number in range(20):
-        finder.update(number / 10, 0.002 * number)
-    assert finder.update(2.0, 0.04) is Direction.LOADING
-    finder.restart()
-    assert finder.update(2.1, 0.02) is Direction.UNKNOWN
-
-
 def test_a_direction_is_remembered_for_a_moment_only():
     finder = DirectionFinder(NOISE)
     for number in range(10):

@@ -15,7 +15,6 @@ import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
-from importlib import resources
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -66,7 +65,7 @@ DEAD_AFTER_S = 1.6
 # Allows for the delay through this process and the browser.
 MIN_STALE_S = 0.5
 
-_TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
+_ASSETS = Path(__file__).with_name("assets")
 HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; "
@@ -224,8 +223,8 @@ def make_app(bridge: Bridge, token: str, fingertip: dict[str, Any], publish: str
     page = _Page(bridge, token, fingertip, publish)
     app = web.Application(middlewares=[page.check_access], client_max_size=MAX_BODY_BYTES)
     app[_BUSY] = page.busy
-    app.router.add_get("/", page.file)
-    app.router.add_get("/assets/{name}", page.file)
+    app.router.add_get("/", page.index)
+    app.router.add_static("/assets", _ASSETS)
     app.router.add_get("/settings.json", page.settings)
     app.router.add_get("/stream", page.stream)
     app.router.add_post("/stop", page.stop)
@@ -270,12 +269,6 @@ class _Page:
         }
         self._open: set[web.WebSocketResponse] = set()
         self.busy: set[web.RequestHandler] = set()
-        # Only these files are ever sent: no name from a request becomes a path.
-        self._files = {
-            item.name: (item.read_bytes(), _TYPES[item.name.rsplit(".", 1)[-1]])
-            for item in (resources.files("shearloop.daemon.web") / "assets").iterdir()
-            if item.name.rsplit(".", 1)[-1] in _TYPES
-        }
 
     @web.middleware
     async def check_access(
@@ -303,12 +296,8 @@ class _Page:
         self._refusals.add(f"status {status}", reason, frequent=status < 500)
         return web.json_response({"ok": False, "reason": reason}, status=status, headers=HEADERS)
 
-    async def file(self, request: web.Request) -> web.Response:
-        name = request.match_info.get("name", "index.html")
-        if name not in self._files:
-            return self._refuse(404, "there is no such file")
-        body, kind = self._files[name]
-        return web.Response(body=body, content_type=kind, charset="utf-8")
+    async def index(self, _request: web.Request) -> web.FileResponse:
+        return web.FileResponse(_ASSETS / "index.html")
 
     async def settings(self, _request: web.Request) -> web.Response:
         return web.json_response(self._settings)

@@ -117,9 +117,10 @@ def check_parts(config: "DaemonConfig", path: Path) -> Parts:
 
 
 def _torque(estimator: "FrameEstimator") -> str:
-    if estimator.measures_torque:
-        return f"with torque{estimator.assumptions}"
-    return "without torque: no calibration is configured"
+    if not estimator.measures_torque:
+        return "without torque: no calibration is configured"
+    assumed = estimator.calibration.assumption_text
+    return f"with torque, assuming that {assumed}" if assumed else "with torque"
 
 
 def _check_rig(config: "DaemonConfig", parts: Parts) -> None:

@@ -78,12 +78,6 @@ class FrameEstimator:
         return self.calibration.torque is not None
 
     @property
-    def assumptions(self) -> str:
-        """The user's guarantees behind the calibration as the end of a sentence, empty without any."""
-        text = self.calibration.assumption_text
-        return f", assuming that {text}" if text else ""
-
-    @property
     def grids(self) -> tuple[FloatArray, FloatArray] | None:
         """The k and the sigma of the bank's cells, None without a bank."""
         return (self._matcher.k_grid, self._matcher.sigma_grid) if self._matcher is not None else None

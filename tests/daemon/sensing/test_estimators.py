@@ -15,7 +15,7 @@ from shearloop.daemon.config import CombinedConfig, FingertipConfig
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.sensing.frame_estimator import FrameEstimator, open_combined, open_estimator
 from shearloop.drivers.eit_kit import Frame
-from tests.bank.estimation.conftest import IDLE_S, PERIOD_S, series
+from tests.bank.estimation.conftest import IDLE_S, PERIOD_S, twisting
 
 NO_CHANNEL = np.zeros(896, bool)
 NAME = "motion_regression"
@@ -23,7 +23,7 @@ NAME = "motion_regression"
 
 @pytest.fixture(scope="module")
 def recorded() -> FrameSeries:
-    return series()
+    return twisting()
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def torques(estimator: FrameEstimator, played: FrameSeries, **flags: NDArray[np.
 
 
 def test_both_fingertips_together_follow_another_session(calibration):
-    played = series(seed=3)
+    played = twisting(seed=3)
     found = torques(FrameEstimator(calibration, fingertip()), played)
     truth = played.torque_at_frames()
     errors = [value - true for value, true in zip(found, truth, strict=True) if value is not None]
@@ -81,7 +81,7 @@ def test_both_fingertips_together_follow_another_session(calibration):
 
 
 def test_a_tare_averages_the_frames_that_follow(calibration):
-    played = series(seed=3)
+    played = twisting(seed=3)
     estimator = FrameEstimator(calibration, fingertip(baseline_frames=5))
     estimator.session.tare()
     for number in range(5):
@@ -93,7 +93,7 @@ def test_a_tare_averages_the_frames_that_follow(calibration):
 
 
 def test_dead_channels_leave_the_rest_at_work_and_a_repeated_frame_is_refused(calibration):
-    played = series(seed=4)
+    played = twisting(seed=4)
     dead = np.random.default_rng(0).uniform(size=896) < 0.1
     found = torques(FrameEstimator(calibration, fingertip()), played, dead=dead)
     assert np.count_nonzero([value is not None for value in found]) > 0.6 * len(found)
@@ -107,7 +107,7 @@ def test_dead_channels_leave_the_rest_at_work_and_a_repeated_frame_is_refused(ca
 
 def test_a_bank_adds_k_sigma_and_heatmaps(calibration, tiny_bank):
     estimator = FrameEstimator(calibration, fingertip(bank=str(tiny_bank), matching="zero_lag"))
-    played = series(seed=3)
+    played = twisting(seed=3)
     gripped = int((IDLE_S + 12.0) / PERIOD_S)
     for number in range(gripped):
         estimate = estimated(estimator, *(frame(number, channels) for channels in played.channels[number]))

@@ -56,7 +56,7 @@ FAST := tests/test_package.py $(addprefix tests/bank/test_,bank_file.py forward.
 	$(wildcard tests/drivers/test_*.py) tests/drivers/shear_skin \
 	$(addprefix tests/drivers/ur/test_,limits.py messages.py settings.py) tests/daemon/messaging \
 	$(addprefix tests/daemon/recording/test_,replay.py schemas.py tools.py) \
-	$(addprefix tests/daemon/cli/test_,json.py start.py) \
+	tests/daemon/cli/test_start.py \
 	$(addprefix tests/daemon/test_,completion.py config_file.py docgen.py garbage_collection.py settings.py)
 test-fast: install-dev
 	$(PYTEST) -n 3 --dist loadfile -m 'not real_time' $(PYTEST_ARGS) $(FAST)

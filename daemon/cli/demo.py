@@ -93,13 +93,10 @@ def _is_calibrated(data: Path, signals: Path) -> bool:
     from shearloop.bank.estimation import Calibration
 
     try:
-        for name in ("rig.cal", "rig-right.cal", "rig-left.cal"):
-            Calibration.load(data / name)
-            if (data / name).stat().st_mtime < signals.stat().st_mtime:
-                return False
+        paths = [data / name for name in ("rig.cal", "rig-right.cal", "rig-left.cal")]
+        return all(Calibration.load(path) and path.stat().st_mtime >= signals.stat().st_mtime for path in paths)
     except CalibrationError:
         return False
-    return True
 
 
 @contextmanager

@@ -68,21 +68,17 @@ def run(args: argparse.Namespace) -> int:
         invalid_reasons,
         write_estimates,
     )
-    from shearloop.daemon.analysis.frame_series import check_no_copies, check_paths_differ, part_of, read_series
-    from shearloop.daemon.cli.options import check_kind, check_overwrite, load_calibration
+    from shearloop.daemon.analysis.frame_series import check_no_copies, part_of
+    from shearloop.daemon.cli.options import check_overwrite, read_judged
     from shearloop.daemon.parallel import open_executor
 
     if args.out is not None and args.out.suffix not in _FIGURES:
         raise UserError(f"--out {args.out} is not the name of a figure; give one that ends in {', '.join(_FIGURES)}")
     if args.estimates is not None:
         check_overwrite(args.estimates, "a table")
-    check_paths_differ(args.recordings)
-    calibration = load_calibration(args.calibration)
+    calibration, named = read_judged(args.calibration, args.recordings)
     bank = Bank.open(args.bank) if args.bank else None
     start, stop = args.time_range
-    sides = calibration.sides if calibration.kind == "raw" else None
-    named = [(path, one) for path in args.recordings for one in read_series(path, sides)]
-    check_kind(args.calibration, calibration, [one for _, one in named])
     parts = [part_of(one, start, stop) for _, one in named]
     check_no_copies([(str(path), part) for (path, _), part in zip(named, parts, strict=True)])
     shared = (calibration, None if bank is None else str(args.bank.resolve()))

@@ -188,15 +188,25 @@ def load_calibration(path: Path) -> "Calibration":
     return Calibration.load(path)
 
 
-def check_kind(path: Path, calibration: "Calibration", series: "Sequence[FrameSeries]") -> None:
-    """Raise UserError for a calibration of slices with raw frames, and for the reverse."""
+def read_judged(path: Path, recordings: "Sequence[Path]") -> "tuple[Calibration, list[tuple[Path, FrameSeries]]]":
+    """Return a calibration, and the series of the recordings, each with its path, that it is to judge.
+
+    Raises UserError for a recording given twice, and for slices with a calibration of raw frames, or the reverse.
+    """
+    from shearloop.daemon.analysis.frame_series import check_paths_differ, read_series
+
+    check_paths_differ(recordings)
+    calibration = load_calibration(path)
+    sides = calibration.sides if calibration.kind == "raw" else None
+    named = [(recording, one) for recording in recordings for one in read_series(recording, sides)]
     kinds = {"raw": "raw frames", "difference": "slices"}
-    other = next((one.kind for one in series if one.kind != calibration.kind), None)
+    other = next((one.kind for _, one in named if one.kind != calibration.kind), None)
     if other is not None:
         raise UserError(
             f"{path} was made from {kinds[calibration.kind]}, and cannot judge {kinds[other]}; "
             "calibrate on recordings of the same kind"
         )
+    return calibration, named
 
 
 def check_overwrite(out: Path, kind: str, begins: bytes | None = None) -> None:

@@ -271,17 +271,40 @@ def test_an_unknown_command_lists_the_known_ones(capsys):
         assert said in capsys.readouterr().err
 
 
-def test_every_argument_has_a_help_text():
-    def arguments(parser: argparse.ArgumentParser) -> Iterator[str]:
-        for action in parser._actions:
-            if isinstance(action, argparse._SubParsersAction):
-                for below in action.choices.values():
-                    yield from arguments(below)
-            else:
-                unsaid = action.help is None or action.help.startswith(("default", "(default"))
-                yield f"{parser.prog} {action.dest}" if unsaid else ""
+def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """Yield the parsers of a command's parts, or its own where it has none."""
+    parts = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    for below in (below for action in parts for below in action.choices.values()):
+        yield from parsers(below)
+    if not parts:
+        yield parser
 
-    assert list(filter(None, arguments(full_parser()))) == []
+
+def test_every_argument_has_a_help_text():
+    for parser in parsers(full_parser()):
+        unsaid = [one.dest for one in parser._actions if not one.help or one.help.startswith(("default", "(default"))]
+        assert unsaid == [], parser.prog
+
+
+# What a script needs no `--json` of, and why.
+WITHOUT_JSON = {
+    "run": "it logs JSON lines with --json-log, and publishes",
+    "emulate": "its events are JSON lines as they are",
+    "completion": "it prints what a shell reads",
+    "demo": "it prints what `run` prints",
+    "init": "it prints the next steps",
+    "schema": "it prints JSON as it is",
+    "bank design": "it prints the YAML that `bank build` takes",
+    "chart": "it prints the files drawn, one a line; its numbers are a JSON file among them",
+}
+
+
+def test_every_command_has_a_json_option_or_a_reason_for_none():
+    every = {parser.prog.removeprefix("shearloop "): parser for parser in parsers(full_parser())}
+    lacking = {name for name, parser in every.items() if "--json" not in parser._option_string_actions}
+    assert {next((known for known in WITHOUT_JSON if name.startswith(known)), name) for name in lacking} == set(
+        WITHOUT_JSON
+    )
 
 
 def test_help_names_all_basis_models():

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from shearloop.daemon.cli.options import add_json, add_option
+from shearloop.daemon.cli.options import add_json, add_option, read_judged
 from shearloop.daemon.cli.terminal import print_result
 from shearloop.words import counted
 
@@ -20,20 +20,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Estimate every frame, fit, and print the line for the configuration."""
     from shearloop.bank.eit.bank_file import Bank
-    from shearloop.bank.estimation import Calibration
     from shearloop.daemon.analysis.creep import fit_creep, grips_of
     from shearloop.daemon.analysis.evaluate import estimate_series
-    from shearloop.daemon.analysis.frame_series import check_no_copies, check_paths_differ, read_series
-    from shearloop.daemon.cli.options import check_kind
+    from shearloop.daemon.analysis.frame_series import check_no_copies
 
-    check_paths_differ(args.recordings)
-    calibration = Calibration.load(args.calibration)
+    calibration, named = read_judged(args.calibration, args.recordings)
+    check_no_copies([(str(path), one) for path, one in named])
     bank = Bank.open(args.bank) if args.bank else None
-    named = [(str(path), one) for path in args.recordings for one in read_series(path, calibration.sides)]
-    series = [one for _, one in named]
-    check_kind(args.calibration, calibration, series)
-    check_no_copies(named)
-    grips = [grip for one in series for grip in grips_of(estimate_series(calibration, one, bank))]
+    grips = [grip for _, one in named for grip in grips_of(estimate_series(calibration, one, bank))]
     found = fit_creep(grips)
     share, time_s = round(found.creep.share, 3), round(found.creep.time_s, 1)
     result = {

@@ -2,7 +2,6 @@
 
 import argparse
 import asyncio
-import math
 from collections.abc import Callable, Coroutine, Iterator
 from itertools import count, cycle, repeat
 from pathlib import Path
@@ -12,6 +11,7 @@ from shearloop.daemon.cli.emulate import console
 from shearloop.daemon.cli.options import PORT, add_option, number, positive
 from shearloop.daemon.errors import UserError
 from shearloop.drivers.defaults import URCAP_PORT
+from shearloop.drivers.emulators import number_between
 
 if TYPE_CHECKING:
     import numpy as np
@@ -118,20 +118,14 @@ def _play_hx711(args: argparse.Namespace) -> Playing:
         nonlocal held_nm
         match line.split():
             case ["torque", number]:
-                held_nm = _finite(number)
+                held_nm = number_between(number, -1000.0, 1000.0, "no torque in N·m")
             case ["mass", number]:
-                held_nm = _finite(number) * 1e-3 * STANDARD_GRAVITY * LEVER_ARM_M
+                mass_g = number_between(number, 0.0, 1e6, "no mass in g")
+                held_nm = mass_g * 1e-3 * STANDARD_GRAVITY * LEVER_ARM_M
             case _:
                 board.command(line)
 
     return console.play(board.run(), on_command, port=board.port.appearances)
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(f"{text} is not a finite number")
-    return value
 
 
 def add_robot(parser: argparse.ArgumentParser) -> None:

@@ -78,10 +78,7 @@ def probe_controller(host: str, timeout_s: float) -> str:
     Raises:
         RobotLostError: it is not there, stays silent, refuses the protocol, or its version is not supported.
     """
-    with (
-        explain_failure(host, timeout_s, "greeting it"),
-        socket.create_connection((host, RTDE_PORT), timeout=timeout_s) as connection,
-    ):
+    with _connected(host, RTDE_PORT, timeout_s, "greeting it") as connection:
         answer = _request(connection, _CONTROLLER_VERSION)
         numbers = struct.unpack(">4I", answer[:16])
         accepted = _agree_on_protocol(connection)
@@ -116,11 +113,8 @@ def query_controller(host: str, timeout_s: float) -> ControllerInfo:
     version = probe_controller(host, timeout_s)
     requests = ("robotmode", "safetymode", "is in remote control")
     robot_mode, safety_mode, remote = ask_dashboard(host, timeout_s, requests)
-    with (
-        explain_failure(host, timeout_s, "asking for its registers"),
-        # A register belongs to a connection: closing it gives the register back.
-        socket.create_connection((host, RTDE_PORT), timeout=timeout_s) as connection,
-    ):
+    # A register belongs to a connection: closing it gives the register back.
+    with _connected(host, RTDE_PORT, timeout_s, "asking for its registers") as connection:
         _agree_on_protocol(connection)
         free = b"IN_USE" not in _request(connection, _INPUTS, ",".join(_REGISTERS).encode())
     return ControllerInfo(
@@ -135,11 +129,8 @@ def query_controller(host: str, timeout_s: float) -> ControllerInfo:
 def ask_dashboard(host: str, timeout_s: float, requests: tuple[str, ...]) -> list[str]:
     """Return the dashboard server's answers; DriverError where it is absent or silent."""
     answers = []
-    with (
-        explain_failure(host, timeout_s, f"asking its dashboard server (port {DASHBOARD_PORT})"),
-        socket.create_connection((host, DASHBOARD_PORT), timeout=timeout_s) as connection,
-        connection.makefile("rb") as lines,
-    ):
+    activity = f"asking its dashboard server (port {DASHBOARD_PORT})"
+    with _connected(host, DASHBOARD_PORT, timeout_s, activity) as connection, connection.makefile("rb") as lines:
         lines.readline(_LONGEST_LINE)  # the banner
         for request in requests:
             connection.sendall(f"{request}\n".encode())
@@ -164,6 +155,13 @@ def explain_failure(host: str, timeout_s: float, activity: str) -> Iterator[None
             f"No UR controller at {host}: {reason}. Check that it is switched on and that this computer is in its "
             "network (Settings → System → Network at the teach pendant).",
         ) from error
+
+
+@contextmanager
+def _connected(host: str, port: int, timeout_s: float, activity: str) -> Iterator[socket.socket]:
+    """Connect to a port of the controller until the end of the block."""
+    with explain_failure(host, timeout_s, activity), socket.create_connection((host, port), timeout_s) as connection:
+        yield connection
 
 
 def registers_in_use(host: str) -> RobotLostError:

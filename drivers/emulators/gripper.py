@@ -133,15 +133,12 @@ class Gripper:
         closing = target > self._position
         # The fingers' own stops count as the target: a real gripper that closes on air reports no object.
         stop = target = min(max(target, OPEN_COUNTS), CLOSED_COUNTS)
-        if closing:
-            if self.object_mm is not None:
-                stop = min(target, CLOSED_COUNTS - self.object_mm / MM_PER_COUNT)
-            # An object wider than the opening pushes the fingers apart.
-            self._position = min(self._position + travel, stop)
-        else:
-            if self.widest_mm is not None:
-                stop = max(target, CLOSED_COUNTS - self.widest_mm / MM_PER_COUNT)
-            self._position = max(self._position - travel, stop)
+        if closing and self.object_mm is not None:
+            stop = min(target, CLOSED_COUNTS - self.object_mm / MM_PER_COUNT)
+        elif not closing and self.widest_mm is not None:
+            stop = max(target, CLOSED_COUNTS - self.widest_mm / MM_PER_COUNT)
+        # An object wider than the opening pushes the fingers apart.
+        self._position = min(self._position + travel, stop) if closing else max(self._position - travel, stop)
         if self._position != stop:
             self.obj, self.current = 0, 15
             return False

@@ -149,6 +149,9 @@ class Program:
             "get_actual_joint_positions": lambda: [*map(float, arm.q_rad)],
             "get_tcp_force": lambda: [*map(float, arm.wrench)],
             "get_steptime": lambda: self._step_s,
+            "movel": lambda pose, a, v: self._move(arm.move_to, np.array(pose), v, a),
+            "stopj": lambda a: self._move(arm.halt, a),
+            "stopl": lambda a: self._move(arm.halt_on_line, a),
             "norm": lambda value: math.hypot(*value) if isinstance(value, list) else abs(value),
             "put": lambda values, index, value: [*values[:index], value, *values[index + 1 :]],
             "sqrt": math.sqrt,
@@ -231,25 +234,10 @@ class Program:
                 yield
         self._mover = 0
 
-    def movel(self, pose: list[float], a: float, v: float) -> Thread:
-        """Move to a pose on a straight line."""
+    def _move(self, begin: Callable[..., None], *values: Any) -> Thread:
+        """Begin a motion of the arm; return at its end."""
         self._claim_arm()
-        self._arm.move_to(np.array(pose), v, a)
-        yield from self._motion()
-
-    def stopj(self, a: float) -> Thread:
-        """Slow every joint down to rest, at `a` rad/s²."""
-        self._claim_arm()
-        self._arm.halt(a)
-        yield from self._motion()
-
-    def stopl(self, a: float) -> Thread:
-        """Slow the tool down to rest on its line, at `a` m/s²."""
-        self._claim_arm()
-        self._arm.halt_on_line(a)
-        yield from self._motion()
-
-    def _motion(self) -> Thread:
+        begin(*values)
         motion = self._arm.motion
         while motion is not None and self._arm.motion is motion:
             yield

@@ -274,7 +274,7 @@ def _estimator(config: SkinConfig, calibration: SkinCalibration) -> SkinEstimato
 def _current_source(config: SkinConfig, inputs: InputRecorder | None) -> Keithley6430:
     source = config.source
     link = _link(source.socket, source.serial, source.baud, LinkMonitor(LinkReporter("skin source")))
-    return Keithley6430(link, source.current_ma * 1e-3, source.compliance_v, SOURCE_PERIOD_S, inputs=inputs)
+    return Keithley6430(link, current_a=source.current_ma * 1e-3, compliance_v=source.compliance_v, inputs=inputs)
 
 
 def _daq(config: SkinConfig, inputs: InputRecorder | None) -> Daq:
@@ -282,7 +282,8 @@ def _daq(config: SkinConfig, inputs: InputRecorder | None) -> Daq:
     monitor = LinkMonitor(LinkReporter("skin daq"))
     if scanner is not None:
         link = _link(scanner.socket, None, DEFAULT_BAUD, monitor)
-        return ScpiScanner(link, scanner.channels, rate_hz, scanner.range_v, inputs=inputs)
+        channels, range_v = scanner.channels, scanner.range_v
+        return ScpiScanner(link, channels=channels, period_s=1.0 / rate_hz, range_v=range_v, inputs=inputs)
     if adc is not None:
         return AdcBoard(_link(None, adc.device, DEFAULT_BAUD, monitor), rate_hz, adc.full_scale_v, inputs)
     raise ValueError("a skin needs an instrument that reads its voltages")

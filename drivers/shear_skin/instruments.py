@@ -9,9 +9,10 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, field
+from functools import partial
 from time import monotonic_ns
-from typing import Generic, TypeAlias, TypeVar
+from typing import ClassVar, Generic, TypeAlias, TypeVar
 
 from shearloop.drivers.connection import Diagnostics, Link, Port
 from shearloop.drivers.defaults import (
@@ -86,22 +87,24 @@ def parse_numbers(text: str, count: int, instrument: str) -> list[float]:
     return [float(part) for part in parts]
 
 
+@dataclass(eq=False)
 class PolledInstrument(ABC, Generic[ReadingT]):
-    """One SCPI instrument behind a link: set up once, then asked at a steady rate, and reconnected when lost."""
+    """One SCPI instrument behind a link: set up once, then asked at a steady rate, and reconnected when lost.
 
+    The link is not yet open; `inputs` keeps queries and their replies.
+    """
+
+    link: Link
+    _: KW_ONLY
+    period_s: float
+    timeout_s: float = REPLY_TIMEOUT_S
+    inputs: InputRecorder | None = None
     # Its name in messages.
-    instrument = ""
-
-    def __init__(self, link: Link, period_s: float, timeout_s: float, inputs: InputRecorder | None) -> None:
-        """Use the link, not yet open; `inputs` keeps queries and their replies."""
-        self.period_s = period_s
-        self._link = link
-        self._timeout_s = timeout_s
-        self._inputs = inputs
-        self._lines = LineSplitter(MAX_REPLY_BYTES)
-        self._count = 0
-        self._errors: Counter[str] = Counter()
-        self._name = ""
+    instrument: ClassVar[str] = ""
+    _lines: LineSplitter = field(default_factory=partial(LineSplitter, MAX_REPLY_BYTES), init=False)
+    _count: int = field(default=0, init=False)
+    _errors: Counter[str] = field(default_factory=Counter, init=False)
+    _name: str = field(default="", init=False)
 
     @abstractmethod
     async def _set_up(self) -> str:
@@ -121,12 +124,12 @@ class PolledInstrument(ABC, Generic[ReadingT]):
         """
         loop = asyncio.get_running_loop()
         due_s = loop.time()
-        with self._link:
+        with self.link:
             try:
                 while True:
                     try:
-                        if self._link.port is None:
-                            await self._link.open()
+                        if self.link.port is None:
+                            await self.link.open()
                             self._name = await self._set_up()
                         # Late polls are skipped: the phase is kept.
                         now_s = loop.time()
@@ -138,7 +141,7 @@ class PolledInstrument(ABC, Generic[ReadingT]):
                     except DriverError as error:
                         self._errors["not understood" if isinstance(error, ProtocolError) else "lost"] += 1
                         self._name = ""
-                        await self._link.lost(error)
+                        await self.link.lost(error)
                         continue
                     self._count += 1
                     yield reading
@@ -148,7 +151,7 @@ class PolledInstrument(ABC, Generic[ReadingT]):
     def diagnostics(self) -> Diagnostics:
         """Return the instrument's values for `health`; counts are since the process began."""
         return {
-            **self._link.diagnostics(),
+            **self.link.diagnostics(),
             "instrument": self._name,
             "readings": self._count,
             "errors": dict(self._errors + Counter({"too long": self._lines.too_long})),
@@ -172,7 +175,7 @@ class PolledInstrument(ABC, Generic[ReadingT]):
         """Return the answer to a query; DeviceSilentError if none comes, DeviceLostError if the port is gone."""
         self._lines.restart()
         asked_ns = arrival_ns = monotonic_ns()
-        until_ns = asked_ns + int(self._timeout_s * 1e9)
+        until_ns = asked_ns + int(self.timeout_s * 1e9)
         await self._send(query)
         replies: list[str] = []
         while not replies:
@@ -180,14 +183,14 @@ class PolledInstrument(ABC, Generic[ReadingT]):
             received = await self._port.read(left_s) if left_s > 0 else None
             if received is None:
                 raise DeviceSilentError(
-                    f"{self.instrument} at {self._port.path} has not answered {query!r} within {self._timeout_s:.2g} "
+                    f"{self.instrument} at {self._port.path} has not answered {query!r} within {self.timeout_s:.2g} "
                     "s; see that it is on, and that baud rate and line end are as configured."
                 )
             replies, arrival_ns = split_replies(self._lines, received.data), received.t_arrival_ns
         reply = Reply(replies[0], asked_ns, arrival_ns)
-        if self._inputs is not None:
-            self._inputs.record(RawEvent(InputKind.ASKED, asked_ns, query.encode()))
-            self._inputs.record(RawEvent(InputKind.DATA, reply.t_arrival_ns, reply.text.encode()))
+        if self.inputs is not None:
+            self.inputs.record(RawEvent(InputKind.ASKED, asked_ns, query.encode()))
+            self.inputs.record(RawEvent(InputKind.DATA, reply.t_arrival_ns, reply.text.encode()))
         return reply
 
     async def _check(self) -> None:
@@ -200,9 +203,9 @@ class PolledInstrument(ABC, Generic[ReadingT]):
 
     @property
     def _port(self) -> Port:
-        if self._link.port is None:
+        if self.link.port is None:
             raise DeviceLostError(f"There is no connection to {self.instrument} at present.")
-        return self._link.port
+        return self.link.port
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,25 +260,16 @@ def read_output(reply: Reply) -> SourceReading | None:
     return SourceReading(reply.t_arrival_ns, output_on=False) if reply.text == "0" else None
 
 
+@dataclass(eq=False, kw_only=True)
 class Keithley6430(PolledInstrument[SourceReading]):
     """The current source: set up, switched on, read until the iteration ends, then switched off."""
 
     instrument = "The current source"
-
-    def __init__(
-        self,
-        link: Link,
-        current_a: float = CURRENT_A,
-        compliance_v: float = SOURCE_COMPLIANCE_V,
-        period_s: float = SOURCE_PERIOD_S,
-        timeout_s: float = REPLY_TIMEOUT_S,
-        inputs: InputRecorder | None = None,
-    ) -> None:
-        super().__init__(link, period_s, timeout_s, inputs)
-        self.current_a = current_a
-        self.compliance_v = compliance_v
-        self._was_reset = False
-        self._may_be_on = False
+    period_s: float = SOURCE_PERIOD_S
+    current_a: float = CURRENT_A
+    compliance_v: float = SOURCE_COMPLIANCE_V
+    _was_reset: bool = field(default=False, init=False)
+    _may_be_on: bool = field(default=False, init=False)
 
     async def _set_up(self) -> str:
         name = await self._identify(*MODELS)
@@ -330,7 +324,7 @@ class Keithley6430(PolledInstrument[SourceReading]):
             self._may_be_on = False
         except (DriverError, TimeoutError) as error:
             self._errors["not switched off"] += 1
-            self._link.give_up(
+            self.link.give_up(
                 DeviceLostError(
                     "The current source has not confirmed that its output is off; press its OUTPUT key, "
                     f"or the current flows on through the gauges. {error}".rstrip()
@@ -366,32 +360,24 @@ def read_scan(reply: Reply) -> Voltages:
     )
 
 
+@dataclass(eq=False, kw_only=True)
 class ScpiScanner(PolledInstrument[Voltages]):
     """A scanning multimeter on a socket (Keysight 34970A/34972A/DAQ970A and compatible): two channels a scan."""
 
     instrument = "The scanner"
-
-    def __init__(
-        self,
-        link: Link,
-        channels: tuple[int, int] = SCANNER_CHANNELS,
-        rate_hz: float = DAQ_RATE_HZ,
-        range_v: float = SCANNER_RANGE_V,
-        timeout_s: float = REPLY_TIMEOUT_S,
-        inputs: InputRecorder | None = None,
-    ) -> None:
-        super().__init__(link, 1.0 / rate_hz, timeout_s, inputs)
-        self._channels = f"(@{channels[0]},{channels[1]})"
-        self._range_v = range_v
+    channels: tuple[int, int] = SCANNER_CHANNELS
+    period_s: float = 1.0 / DAQ_RATE_HZ
+    range_v: float = SCANNER_RANGE_V
 
     async def _set_up(self) -> str:
         name = await self._identify()
+        channels = f"(@{self.channels[0]},{self.channels[1]})"
         await self._send(
             "*CLS",
-            f"CONF:VOLT:DC {self._range_v:g},{self._channels}",
+            f"CONF:VOLT:DC {self.range_v:g},{channels}",
             # One mains period removes its hum.
-            f"VOLT:DC:NPLC 1,{self._channels}",
-            f"ROUT:SCAN {self._channels}",
+            f"VOLT:DC:NPLC 1,{channels}",
+            f"ROUT:SCAN {channels}",
         )
         await self._check()
         return name

@@ -219,7 +219,7 @@ async def test_source_and_scanner_are_played_on_sockets_too():
     arguments = ("--speed", str(SPEED), "--source-port", "0", "--daq-port", "0")
     async with shearloop("emulate", "skin", *arguments, stdin=asyncio.subprocess.PIPE) as process:
         places = dict([(await line(process)).split(), (await line(process)).split()])
-        scanner = ScpiScanner(tcp(places["daq"]), rate_hz=10 * SPEED)
+        scanner = ScpiScanner(tcp(places["daq"]), period_s=0.1 / SPEED)
         async with read(tcp(places["source"]), scanner) as samples:
             await until(samples, r1_ohm=24.6)
             await send(process, "short 2")

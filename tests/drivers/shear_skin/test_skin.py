@@ -70,7 +70,7 @@ async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: f
     async with running(played.run()):
         source_link = bench.link(await played.source_port.get())
         daq_link = bench.link(await played.daq_port.get())
-        daq = AdcBoard(daq_link, RATE_HZ) if adc else ScpiScanner(daq_link, rate_hz=RATE_HZ, timeout_s=deadline_s)
+        daq = AdcBoard(daq_link, RATE_HZ) if adc else ScpiScanner(daq_link, period_s=1 / RATE_HZ, timeout_s=deadline_s)
         bench.skin = ShearSkin(Keithley6430(source_link, period_s=0.01, timeout_s=deadline_s), daq)
         async with running(bench.skin.watch_source(), pass_on(bench.skin.samples(), bench.on_sample)):
             await bench.next_says()

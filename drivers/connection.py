@@ -12,7 +12,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, Self, TypeAlias
 
 import serial
@@ -42,7 +42,7 @@ class Received:
     t_arrival_ns: int
 
 
-def find_port(*, serial_number: str | None = None, path: str | None = None) -> str:
+def find_port(*, serial_number: str | None = None, path: str | os.PathLike[str] | None = None) -> str:
     """Return the path of the port with this USB serial number, or the given path if it exists.
 
     Raises DeviceNotFoundError, which lists the available ports.
@@ -50,7 +50,7 @@ def find_port(*, serial_number: str | None = None, path: str | None = None) -> s
     if path is not None:
         if not os.path.exists(path):
             raise DeviceNotFoundError(f"There is no serial port {path}; {_available_ports()}.")
-        return path
+        return os.fspath(path)
     found = [port.device for port in list_ports.comports() if port.serial_number == serial_number]
     if not found:
         raise DeviceNotFoundError(f"No port has the USB serial number {serial_number}; {_available_ports()}.")
@@ -303,15 +303,15 @@ def _without_digits(text: str) -> str:
     return "".join(letter for letter in text if not letter.isdigit())
 
 
+@dataclass(eq=False, kw_only=True)
 class Link(contextlib.AbstractContextManager["Link", None]):
     """Keeps a device connected: finds it, opens it, and reopens it after a loss.
 
     Use it as a context, which closes the port at the end. `port` is the open port or None.
     """
 
-    def __init__(self, monitor: LinkMonitor | None) -> None:
-        self._monitor = monitor or LinkMonitor()
-        self.port: Port | None = None
+    monitor: LinkMonitor = field(default_factory=LinkMonitor)
+    port: Port | None = field(default=None, init=False)
 
     @abstractmethod
     async def _connect(self) -> Port:
@@ -323,7 +323,7 @@ class Link(contextlib.AbstractContextManager["Link", None]):
 
     def diagnostics(self) -> dict[str, bool | int | str]:
         """Return the connection's part of `health`."""
-        return self._monitor.diagnostics(connected=self.port is not None)
+        return self.monitor.diagnostics(connected=self.port is not None)
 
     async def open(self) -> Port:
         """Return the open port; waits until the device is there."""
@@ -333,7 +333,7 @@ class Link(contextlib.AbstractContextManager["Link", None]):
             except DriverError as error:
                 await self.lost(error)
             else:
-                self._monitor.connected(f"{self.port.path} is open.", time.monotonic_ns())
+                self.monitor.connected(f"{self.port.path} is open.", time.monotonic_ns())
         return self.port
 
     async def lost(self, error: DriverError) -> None:
@@ -343,7 +343,7 @@ class Link(contextlib.AbstractContextManager["Link", None]):
     def give_up(self, error: DriverError) -> float:
         """Close the port and report the error; return the pause before the next attempt in s."""
         self._close()
-        return self._monitor.failed(error, time.monotonic_ns())
+        return self.monitor.failed(error, time.monotonic_ns())
 
     def _close(self) -> None:
         if self.port is not None:
@@ -351,39 +351,30 @@ class Link(contextlib.AbstractContextManager["Link", None]):
             self.port = None
 
 
+@dataclass(eq=False, kw_only=True)
 class SerialLink(Link):
     """Keeps a serial device connected, named by its USB serial number or the path of its port."""
 
-    def __init__(
-        self,
-        *,
-        serial_number: str | None = None,
-        path: str | os.PathLike[str] | None = None,
-        baud: int = DEFAULT_BAUD,
-        monitor: LinkMonitor | None = None,
-    ) -> None:
-        super().__init__(monitor)
-        self._serial_number = serial_number
-        self._path = None if path is None else os.fspath(path)
-        self._baud = baud
+    serial_number: str | None = None
+    path: str | os.PathLike[str] | None = None
+    baud: int = DEFAULT_BAUD
 
     async def _connect(self) -> Port:
-        return SerialPort(find_port(serial_number=self._serial_number, path=self._path), self._baud)
+        return SerialPort(find_port(serial_number=self.serial_number, path=self.path), self.baud)
 
 
+@dataclass(eq=False)
 class TcpLink(Link):
-    """Keeps a TCP connection to an instrument open."""
+    """Keeps a TCP connection to an instrument open, at the port of this number."""
 
-    def __init__(self, host: str, port: int, *, monitor: LinkMonitor | None = None) -> None:
-        super().__init__(monitor)
-        self._host = host
-        self._port = port
+    host: str
+    number: int
 
     async def _connect(self) -> Port:
         try:
-            return await TcpPort.connect(self._host, self._port)
+            return await TcpPort.connect(self.host, self.number)
         except OSError as error:  # includes a timeout
             raise DeviceNotFoundError(
-                f"Nothing answers at {self._host}:{self._port} ({error or 'no answer'}); see that it is on and its "
+                f"Nothing answers at {self.host}:{self.number} ({error or 'no answer'}); see that it is on and its "
                 "address is right."
             ) from error

@@ -4,6 +4,7 @@ import asyncio
 import math
 import time
 from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Self, TypeAlias, TypeVar
 
@@ -112,41 +113,34 @@ class WidthCalibration(CalibrationModel):
         return math.hypot(self.std_mm, self.mm_per_count / math.sqrt(12))
 
 
+@dataclass(eq=False)
 class RobotiqGripper:
-    """One gripper.
+    """One gripper: a connection, not yet open, and the meaning of its counts.
 
     Commands and polling may come from different tasks. Each exchange with the gripper is whole, also when its caller
     is cancelled. A lost connection raises DeviceLostError in the call that meets it; `latest` is None until the next
     read.
     """
 
-    def __init__(
-        self,
-        client: RobotiqClient,
-        calibration: WidthCalibration,
-        *,
-        poll_s: float = POLL_S,
-        monitor: LinkMonitor | None = None,
-    ) -> None:
-        """Take a connection and the meaning of its counts; nothing is opened yet."""
-        self._client = client
-        self._calibration = calibration
-        self._poll_s = poll_s
-        self._monitor = monitor or LinkMonitor()
-        self._lock = asyncio.Lock()
-        self._seq = 0
-        self._last_move: messages.GripperMove | None = None
-        self._loss: DriverError | None = None
-        self.connected = False
-        self.latest: messages.GripperState | None = None
+    client: RobotiqClient
+    calibration: WidthCalibration
+    _: KW_ONLY
+    poll_s: float = POLL_S
+    monitor: LinkMonitor = field(default_factory=LinkMonitor)
+    connected: bool = field(default=False, init=False)
+    latest: messages.GripperState | None = field(default=None, init=False)
+    _lock: asyncio.Lock = field(default_factory=asyncio.Lock, init=False)
+    _seq: int = field(default=0, init=False)
+    _last_move: messages.GripperMove | None = field(default=None, init=False)
+    _loss: DriverError | None = field(default=None, init=False)
 
     def diagnostics(self) -> Diagnostics:
         """Return the gripper's part of `health`; counts are since the process began."""
-        return {**self._monitor.diagnostics(connected=self.connected), "states": self._seq}
+        return {**self.monitor.diagnostics(connected=self.connected), "states": self._seq}
 
     async def connect(self) -> messages.GripperState:
         """Open the connection and return the first state; DeviceNotFoundError or DeviceLostError."""
-        await self._exchange(self._client.connect)
+        await self._exchange(self.client.connect)
         self.connected, self._loss = True, None
         # Another program may have commanded the gripper since.
         self._last_move = None
@@ -156,7 +150,7 @@ class RobotiqGripper:
         """Close the connection; the gripper keeps its grip."""
         async with self._lock:
             self.connected, self.latest = False, None
-            await self._client.close()
+            await self.client.close()
 
     async def read(self) -> messages.GripperState:
         """Return the gripper's present state."""
@@ -237,7 +231,7 @@ class RobotiqGripper:
                 return self._state(readout, t_ns)
             if t_ns - since_ns > deadline_ns:
                 raise messages.GripperFaultError(failure)
-            await asyncio.sleep(self._poll_s)
+            await asyncio.sleep(self.poll_s)
 
     async def halt(self) -> None:
         """Stop the fingers where they are; they keep their grip. An activation is ended by a reset."""
@@ -260,13 +254,13 @@ class RobotiqGripper:
         try:
             while True:
                 # A missed period is skipped.
-                due_s = max(due_s + self._poll_s, loop.time())
+                due_s = max(due_s + self.poll_s, loop.time())
                 try:
                     state = await self._next_state()
                 except DriverError as error:
                     await self.close()
                     self._loss = None
-                    await asyncio.sleep(self._monitor.failed(error, time.monotonic_ns()))
+                    await asyncio.sleep(self.monitor.failed(error, time.monotonic_ns()))
                     continue
                 yield state
                 await asyncio.sleep(due_s - loop.time())
@@ -279,7 +273,7 @@ class RobotiqGripper:
         if self._loss is not None:
             raise self._loss
         state = await self.connect()
-        self._monitor.connected(f"The gripper answers at {self._client.name}.", time.monotonic_ns())
+        self.monitor.connected(f"The gripper answers at {self.client.name}.", time.monotonic_ns())
         return state
 
     def request_of(self, command: messages.GripperCommand) -> messages.GripperMove:
@@ -291,16 +285,16 @@ class RobotiqGripper:
         speeds = messages.SPEED_MIN_MM_S, messages.SPEED_MAX_MM_S
         forces = messages.FORCE_MIN_N, messages.FORCE_MAX_N
         return messages.GripperMove(
-            self._calibration.counts(command.width_mm),
+            self.calibration.counts(command.width_mm),
             round(float(np.interp(command.speed_mm_s, speeds, (0, COUNTS_MAX)))),
             round(float(np.interp(command.force_n, forces, (0, COUNTS_MAX)))),
         )
 
     async def _read(self) -> tuple[messages.Readout, int]:
-        return await self._exchange(self._client.read)
+        return await self._exchange(self.client.read)
 
     async def _write(self, request: messages.Request) -> None:
-        await self._exchange(partial(self._client.write, request))
+        await self._exchange(partial(self.client.write, request))
 
     async def _exchange(self, exchange: Callable[[], Awaitable[T]]) -> tuple[T, int]:
         """Return an exchange's result and its beginning. It goes on when its caller is cancelled.
@@ -328,8 +322,8 @@ class RobotiqGripper:
         state = messages.GripperState(
             t_ns=t_ns,
             position_counts=readout.pos,
-            width_mm=self._calibration.width_mm(readout.pos),
-            width_std_mm=self._calibration.width_std_mm,
+            width_mm=self.calibration.width_mm(readout.pos),
+            width_std_mm=self.calibration.width_std_mm,
             object=object_status(readout, self._last_move),
             activation=readout.sta,
             current_ma=None if readout.current is None else readout.current * messages.MA_PER_COUNT,

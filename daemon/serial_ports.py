@@ -60,24 +60,20 @@ def list_serial_ports() -> list[SerialPortInfo]:
     """Return all USB ports and other ports with a driver."""
     from serial.tools import list_ports
 
-    found = []
-    for port in sorted(list_ports.comports()):
-        usb = f"{port.vid:04x}:{port.pid:04x}" if port.vid is not None and port.pid is not None else ""
-        if not usb and "ttyS" in port.device:
-            # Every computer lists several of these, mostly without a plug.
-            continue
-        found.append(
-            SerialPortInfo(
-                path=port.device,
-                serial_number=port.serial_number or "",
-                usb=usb,
-                description=port.description if port.description != "n/a" else "",
-                likely=BOARDS.get(port.vid or 0, ""),
-                stable_name=_stable_name(port.device, port.serial_number),
-                error=access_error(port.device),
-            )
+    # Every computer lists several ttyS, mostly without a plug.
+    ports = [port for port in sorted(list_ports.comports()) if port.vid is not None or "ttyS" not in port.device]
+    return [
+        SerialPortInfo(
+            path=port.device,
+            serial_number=port.serial_number or "",
+            usb="" if port.vid is None else f"{port.vid:04x}:{port.pid:04x}",
+            description=port.description if port.description != "n/a" else "",
+            likely=BOARDS.get(port.vid or 0, ""),
+            stable_name=_stable_name(port.device, port.serial_number),
+            error=access_error(port.device),
         )
-    return found
+        for port in ports
+    ]
 
 
 def access_error(path: str) -> str:

@@ -12,7 +12,8 @@ import re
 import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
-from typing import Any, NamedTuple, NoReturn
+from types import ModuleType
+from typing import Any, NoReturn
 
 from shearloop.daemon.errors import USER_ERRORS, UserError
 from shearloop.daemon.process import raise_ending_signals, report_interrupt
@@ -21,42 +22,33 @@ from shearloop.daemon.process import raise_ending_signals, report_interrupt
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
-class Command(NamedTuple):
-    """A command's module and its summary for the overview."""
-
-    module: str
-    summary: str
-
-
+# The module of each command below `shearloop.daemon`, and its summary for the overview.
 COMMANDS = {
-    name: Command(f"shearloop.daemon.{module}", summary)
-    for name, module, summary in (
-        ("demo", "cli.demo", "run the whole rig, emulated, in closed loop"),
-        ("init", "cli.init", "write a commented configuration and experiments to start from"),
-        ("run", "cli.run", "run the daemon that a configuration describes"),
-        ("import", "cli.recording", "convert the paper's MATLAB streams into a recording"),
-        ("recording", "cli.recording", "inspect recordings, repair them, and export them as tables"),
-        ("replay", "cli.replay", "send a recording through the same estimators again, as if live"),
-        ("evaluate", "cli.evaluate", "judge a calibrated estimator on recordings or slices"),
-        ("adapt", "cli.adapt", "correct a calibration's gain by one or a few twists of known torque"),
-        ("chart", "cli.chart", "chart speed against accuracy, stability, and how much model is needed"),
-        ("check", "cli.check", "check a configuration and the files it names"),
-        ("schema", "cli.schema", "print the JSON Schema of a configuration, an experiment or another file"),
-        ("listen", "cli.listen", "print what a running daemon publishes"),
-        ("command", "cli.command", "send a command to a running daemon: tare, start, pause, stop, unlock …"),
-        ("view", "cli.view", "show a running daemon as a page in the browser, with a stop button"),
-        ("calibrate", "cli.calibrate", "calibrate an estimator, a gel's creep, the load cell or the gripper"),
-        ("emulate", "cli.emulate", "emulate a device, byte for byte, on a port of its own"),
-        ("bank", "cli.bank", "solve, build, design and inspect banks of simulated signals"),
-        ("doctor", "cli.doctor", "find out what is wrong: files, ports, devices, robot, clock, disk, keys"),
-        ("ports", "serial_ports", "list the serial ports with their serial numbers"),
-        ("keys", "cli.keys", "make the keys for daemon and clients on a network"),
-        ("completion", "cli.completion", "print the completion script for bash, zsh or tcsh"),
-        ("install", "cli.install", "install the daemon as a service of this computer"),
-        ("uninstall", "cli.install", "remove the service"),
-        ("skin", "cli.skin", "compare the shear skin's models with its paper, and calibrate a skin"),
-        ("reproduce", "cli.reproduce", "compute the paper's numbers and figures from recorded slices"),
-    )
+    "demo": ("cli.demo", "run the whole rig, emulated, in closed loop"),
+    "init": ("cli.init", "write a commented configuration and experiments to start from"),
+    "run": ("cli.run", "run the daemon that a configuration describes"),
+    "import": ("cli.recording", "convert the paper's MATLAB streams into a recording"),
+    "recording": ("cli.recording", "inspect recordings, repair them, and export them as tables"),
+    "replay": ("cli.replay", "send a recording through the same estimators again, as if live"),
+    "evaluate": ("cli.evaluate", "judge a calibrated estimator on recordings or slices"),
+    "adapt": ("cli.adapt", "correct a calibration's gain by one or a few twists of known torque"),
+    "chart": ("cli.chart", "chart speed against accuracy, stability, and how much model is needed"),
+    "check": ("cli.check", "check a configuration and the files it names"),
+    "schema": ("cli.schema", "print the JSON Schema of a configuration, an experiment or another file"),
+    "listen": ("cli.listen", "print what a running daemon publishes"),
+    "command": ("cli.command", "send a command to a running daemon: tare, start, pause, stop, unlock …"),
+    "view": ("cli.view", "show a running daemon as a page in the browser, with a stop button"),
+    "calibrate": ("cli.calibrate", "calibrate an estimator, a gel's creep, the load cell or the gripper"),
+    "emulate": ("cli.emulate", "emulate a device, byte for byte, on a port of its own"),
+    "bank": ("cli.bank", "solve, build, design and inspect banks of simulated signals"),
+    "doctor": ("cli.doctor", "find out what is wrong: files, ports, devices, robot, clock, disk, keys"),
+    "ports": ("serial_ports", "list the serial ports with their serial numbers"),
+    "keys": ("cli.keys", "make the keys for daemon and clients on a network"),
+    "completion": ("cli.completion", "print the completion script for bash, zsh or tcsh"),
+    "install": ("cli.install", "install the daemon as a service of this computer"),
+    "uninstall": ("cli.install", "remove the service"),
+    "skin": ("cli.skin", "compare the shear skin's models with its paper, and calibrate a skin"),
+    "reproduce": ("cli.reproduce", "compute the paper's numbers and figures from recorded slices"),
 }
 
 EXIT_OK, EXIT_USAGE = 0, 2
@@ -113,6 +105,11 @@ class Parser(argparse.ArgumentParser):
         return f"{message}; did you mean {near[0]}?" if near else message
 
 
+def command_module(name: str) -> ModuleType:
+    """Import and return the module of a command."""
+    return importlib.import_module(f"shearloop.daemon.{COMMANDS[name][0]}")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; print a user's mistake as one sentence on stderr and return status 2."""
     arguments = list(sys.argv[1:] if argv is None else argv)
@@ -121,9 +118,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     program = "shearloop"
     try:
         name = _overview().parse_args(arguments[:1]).command
-        program, command = f"shearloop {name}", COMMANDS[name]
-        module = importlib.import_module(command.module)
-        parser = Parser(prog=program, description=command.summary)
+        program, module = f"shearloop {name}", command_module(name)
+        parser = Parser(prog=program, description=COMMANDS[name][1])
         module.configure(parser)
         expand = getattr(module, "expand_default_command", list)
         args = parser.parse_args(expand(arguments[1:]))
@@ -143,7 +139,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _overview() -> argparse.ArgumentParser:
     width = max(map(len, COMMANDS))
-    listing = "\n".join(f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items())
+    listing = "\n".join(f"  {name:<{width}}  {summary}" for name, (_, summary) in COMMANDS.items())
     parser = Parser(
         prog="shearloop",
         description="Closed-loop twisting with soft shear-sensing skins.",

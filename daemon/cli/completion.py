@@ -25,16 +25,14 @@ def run(args: argparse.Namespace) -> int:
 
 def full_parser() -> argparse.ArgumentParser:
     """Return one parser with every command and all its options."""
-    import importlib
-
-    from shearloop.daemon.cli import COMMANDS
+    from shearloop.daemon.cli import COMMANDS, command_module
 
     parser = argparse.ArgumentParser(prog="shearloop")
     parser.add_argument("--version", action="store_true", help="show the version and exit")
     commands = parser.add_subparsers(dest="command")
-    for name, command in COMMANDS.items():
-        subparser = commands.add_parser(name, help=command.summary)
-        importlib.import_module(command.module).configure(subparser)
+    for name, (_, summary) in COMMANDS.items():
+        subparser = commands.add_parser(name, help=summary)
+        command_module(name).configure(subparser)
         _mark_files(subparser)
     return parser
 

@@ -80,7 +80,7 @@ class EmulatedDevices:
                 self._truth = Path(folder) / "truth.jsonl"
             devices: list[tuple[subprocess.Popen[bytes], IO[bytes]]] = []
             for emulator in self._emulators:
-                output = stack.enter_context(tempfile.TemporaryFile())
+                output: IO[bytes] = stack.enter_context(tempfile.TemporaryFile())
                 # An emulator ends when its standard input is closed. Without Ctrl-C the robot answers until the daemon
                 # has stopped it.
                 command = self._command(emulator)
@@ -88,8 +88,9 @@ class EmulatedDevices:
                 devices.append((process, output))
                 self._waiting += [(event, process) for event in emulator.events]
             until_s = time.monotonic() + READY_S
-            while time.monotonic() < until_s and any(_is_starting(*device) for device in devices):
-                time.sleep(POLL_S)
+            for process, output in devices:
+                while time.monotonic() < until_s and process.poll() is None and not os.fstat(output.fileno()).st_size:
+                    time.sleep(POLL_S)
             self._stack = stack.pop_all()
         return self
 
@@ -134,7 +135,3 @@ class EmulatedDevices:
                 if process.stdin is not None and process.poll() is None:
                     process.stdin.write(f"{event.command}\n".encode())
                     self.sent.append((time.monotonic_ns(), event.command))
-
-
-def _is_starting(process: "subprocess.Popen[bytes]", output: IO[bytes]) -> bool:
-    return process.poll() is None and not os.fstat(output.fileno()).st_size

@@ -2,7 +2,6 @@
 
 import argparse
 import ctypes
-import importlib
 import os
 import shutil
 import signal
@@ -22,7 +21,7 @@ import zmq.asyncio
 
 from shearloop.bank.eit.models import MODELS
 from shearloop.daemon.app import Daemon
-from shearloop.daemon.cli import COMMANDS, main
+from shearloop.daemon.cli import COMMANDS, command_module, main
 from shearloop.daemon.cli.bank import MODEL_NAMES
 from shearloop.daemon.cli.completion import full_parser
 from shearloop.daemon.cli.terminal import StatusLine, loop_line, message_json, message_line, table, task_row
@@ -187,7 +186,7 @@ def test_a_mistake_in_the_words_names_the_help(arguments, sentence, mistake):
 )
 def test_options_may_stand_between_recordings(arguments, monkeypatch):
     name, *words = arguments.split()
-    module = importlib.import_module(COMMANDS[name].module)
+    module = command_module(name)
     parsed = Mock(return_value=0)
     for where in ("shearloop.daemon.cli.calibrate.recording.run", "shearloop.daemon.cli.recording._info"):
         monkeypatch.setattr(where, parsed)

@@ -15,7 +15,7 @@ import shearloop
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.estimator_names import ESTIMATORS
 from shearloop.daemon.bank_config import load_bank_plan
-from shearloop.daemon.cli import COMMANDS
+from shearloop.daemon.cli import COMMANDS, command_module
 from shearloop.daemon.cli.completion import full_parser
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.experiment_schema import STEP_KINDS
@@ -99,7 +99,7 @@ def check_command(line: str) -> None:
     """Parse a shearloop command with its own parser; of others check that there is such a program."""
     program, *arguments = shlex.split(line.removeprefix("sudo "))
     if program.endswith("shearloop"):
-        module = importlib.import_module(COMMANDS[arguments[0]].module)
+        module = command_module(arguments[0])
         expand = getattr(module, "expand_default_command", list)
         full_parser().parse_args([arguments[0], *expand(arguments[1:])])
     elif program == "make":

@@ -1,4 +1,4 @@
-"""The process: which signals end it in order, and what Python's garbage collector looks through."""
+"""The process: which signals end it in order, what the garbage collector looks through, its priority."""
 
 import gc
 import os
@@ -14,7 +14,7 @@ import pytest
 
 from shearloop.daemon import app, process
 from shearloop.daemon.cli import emulator_processes, main
-from shearloop.daemon.process import ending_signals, without_long_collections
+from shearloop.daemon.process import NICENESS, ending_signals, raise_priority, without_long_collections
 from tests.daemon.conftest import DEADLINE_S
 
 
@@ -118,3 +118,15 @@ def test_daemon_of_the_command_line_is_collected_from_when_it_is_ready(config, m
     monkeypatch.setattr(app, "run_daemon", run_daemon)
     assert main(["run", str(config())]) == 0
     assert collected == [False, True]
+
+
+def test_a_priority_that_is_not_allowed_is_not_raised(monkeypatch):
+    asked: list[int] = []
+
+    def refuse(_kind: int, _who: int, niceness: int) -> None:
+        asked.append(niceness)
+        raise PermissionError
+
+    monkeypatch.setattr(os, "setpriority", refuse)
+    raise_priority()
+    assert asked == [NICENESS]

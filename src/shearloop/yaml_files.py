@@ -24,27 +24,43 @@ Model = TypeVar("Model")
 _LONGEST_VALUE = 60
 # Of Linux.
 _LONGEST_NAME, _LONGEST_PATH = 255, 4096
-# Bounds on what a file may cost: its bytes, and its mistakes that are shown.
-_MOST_BYTES, _MOST_MISTAKES = 1 << 17, 100
+# Bounds on what a file may cost: its bytes, its values with every alias written out, and its mistakes that are shown.
+_MOST_BYTES, _MOST_VALUES, _MOST_MISTAKES = 1 << 17, 20_000, 100
 
 
 class _Loader(yaml.SafeLoader):
-    """A SafeLoader that refuses duplicate keys, type tags and aliases, and knows neither dates nor base 60.
+    """A SafeLoader that refuses duplicate keys and type tags, bounds aliases, and knows neither dates nor base 60.
 
-    Of two equal keys YAML would silently keep the last. A few aliases of aliases can stand for gigabytes.
+    Of two equal keys YAML would silently keep the last.
     """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        # How many values each node holds, its aliases written out.
+        self._sizes: dict[yaml.Node, int] = {}
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         event: yaml.NodeEvent = self.peek_event()  # type: ignore[no-untyped-call]
-        tag, problem = getattr(event, "tag", None), ""
-        if isinstance(event, yaml.AliasEvent):
-            problem = f"the alias *{event.anchor} is not supported; write the value again"
-        elif tag not in (None, "!"):
-            problem = f"the type tag {tag} is not supported"
-        if problem:
-            mark: Any = event.start_mark  # typed as C's marks too
-            raise yaml.composer.ComposerError(None, None, problem, mark)
-        return super().compose_node(parent, index)
+        tag = getattr(event, "tag", None)
+        if tag not in (None, "!"):
+            raise self._refusal(f"the type tag {tag} is not supported", event)
+        node = super().compose_node(parent, index)
+        if node is None:
+            return None
+        if node not in self._sizes:
+            if isinstance(event, yaml.AliasEvent):
+                raise self._refusal("an alias stands within its anchor", event)
+            pairs = node.value if isinstance(node, yaml.MappingNode) else [node.value]
+            inside = [] if isinstance(node, yaml.ScalarNode) else [each for pair in pairs for each in pair]
+            self._sizes[node] = 1 + sum(self._sizes[each] for each in inside)
+        if self._sizes[node] > _MOST_VALUES:
+            raise self._refusal(f"more than {_MOST_VALUES} values, with every alias written out", event)
+        return node
+
+    @staticmethod
+    def _refusal(problem: str, event: yaml.NodeEvent) -> yaml.MarkedYAMLError:
+        mark: Any = event.start_mark  # typed as C's marks too
+        return yaml.composer.ComposerError(None, None, problem, mark)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen: set[Hashable] = set()
@@ -173,6 +189,7 @@ _SYNTAX = (
     ("found unhashable key", "a key is a list or a section; a name is expected"),
     ("could not determine a constructor", "the keys `<<` and `=` are not supported"),
     ("but found another document", "a second document begins here; a file has one"),
+    ("found undefined alias", "an alias `*name` without its anchor `&name`"),
 )
 _WRONG = (
     ("finite_number", "is not a finite number"),

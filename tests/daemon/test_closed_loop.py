@@ -4,7 +4,6 @@ import asyncio
 import math
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
-from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 from io import StringIO
@@ -57,7 +56,7 @@ def rig_config(config, tiny_bank, tmp_path) -> Path:
 def experiment(folder: Path, *steps: Mapping[str, Any]) -> str:
     path = folder / "experiment.yaml"
     begin = [{"do": "release"}, {"do": "tare"}, {"do": "grip", "width_mm": 5, "force_n": 60}]
-    content = {"name": "test", "torque_source": "load_cell", "tool_mm": 20, "steps": [*begin, *map(deepcopy, steps)]}
+    content = {"name": "test", "torque_source": "load_cell", "tool_mm": 20, "steps": [*begin, *map(dict, steps)]}
     path.write_text(yaml.safe_dump(content))
     return str(path)
 
@@ -66,7 +65,7 @@ def ending_with(rig_config: Path, *steps: Mapping[str, Any]) -> Path:
     """Return a configuration whose experiment, of these steps, begins by itself and ends the daemon."""
     path, folder = rig_config.with_name("ending.yaml"), rig_config.parent
     (folder / "own.yaml").write_text(
-        yaml.safe_dump({"name": "own", "torque_source": "wrench", "steps": [*map(deepcopy, steps)]})
+        yaml.safe_dump({"name": "own", "torque_source": "wrench", "steps": [*map(dict, steps)]})
     )
     content = yaml.safe_load(rig_config.read_text())
     path.write_text(yaml.safe_dump({**content, "experiment": "own.yaml", "stop_when_done": True}))

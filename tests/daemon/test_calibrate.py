@@ -5,7 +5,6 @@ import json
 import socket
 import subprocess
 import sys
-from typing import Self
 
 import pytest
 
@@ -17,7 +16,7 @@ SHEARLOOP = (sys.executable, "-m", "shearloop")
 COUNTS_PER_NM = 420e3 / (9.80665 * 0.035)
 
 
-class Process:
+class Process(contextlib.AbstractContextManager["Process", None]):
     """A command with pipes; the end of its input ends it."""
 
     def __init__(self, *arguments: str) -> None:
@@ -25,9 +24,6 @@ class Process:
             [*SHEARLOOP, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         self.said: list[str] = []
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.end()

@@ -5,10 +5,8 @@
 index that is written when a file is closed.
 """
 
-import io
 import json
 import os
-import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -19,9 +17,8 @@ from typing import IO, Any
 import numpy as np
 import zstandard
 from mcap.exceptions import McapError
-from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
@@ -39,10 +36,7 @@ from shearloop.files import open_file, replace_file
 Progress = Callable[[int], None]
 # A recorder makes chunks of 16 MB and attaches files of up to 32 MB.
 _LARGEST_RECORD_BYTES = 64 << 20
-_BLOCK_BYTES = 1 << 20
 _NOTHING_INTACT = "it holds no intact message, so nothing can be saved"
-# Opcode and length, then the places of index and its offsets, and the index's checksum; or the data's checksum.
-_FOOTER, _DATA_END = struct.Struct("<BQQQI"), struct.Struct("<BQI")
 # Metadata of every recording; the other keys are notes of this one.
 _IDENTITY_KEYS = ("format_version", "channel_table_hash", "electrodes", "injection", "software", "code_sha256")
 
@@ -78,9 +72,9 @@ class OpenRecording:
     def __init__(self, path: Path, file: IO[bytes]) -> None:
         """Check that the file was closed, matches its checksums and is usable; raises many types of errors."""
         file.seek(0)
-        _check_checksums(file)
-        file.seek(0)
-        for record in StreamReader(file, emit_chunks=True, record_size_limit=_LARGEST_RECORD_BYTES).records:
+        ends: list[McapRecord] = []
+        reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=_LARGEST_RECORD_BYTES)
+        for record in reader.records:
             match record:
                 case Chunk():
                     _check_size(record)
@@ -89,6 +83,13 @@ class OpenRecording:
                     raise ValueError(f"it has the topic {name[:40]!r}")
                 case Attachment(name=name) if not name.isprintable():
                     raise ValueError(f"it has the attachment {name[:40]!r}")
+                case DataEnd() | Footer():
+                    ends.append(record)
+        match ends:
+            case DataEnd(), Footer() as footer if not file.read(1):
+                _check_index(file, footer)
+            case _:
+                raise McapError("it has no index at its end")
         file.seek(0)
         self._reader = make_reader(file, validate_crcs=True)
         summary = self._reader.get_summary()
@@ -233,28 +234,13 @@ def _side_frames(rows: list[tuple[int, list[float]]]) -> SideFrames:
     return SideFrames(np.array(t_mid_ns, np.int64), np.array(lines, np.float64))
 
 
-def _check_checksums(file: IO[bytes]) -> None:
-    """Raise an error for a file that was not closed or does not match its checksums.
-
-    The mcap library does not check the index, and takes seconds to find the end of the data.
-    """
-    footer_at = file.seek(0, io.SEEK_END) - _FOOTER.size - len(MCAP0_MAGIC)
-    file.seek(max(footer_at, 0))
-    tail = file.read()
-    opcode, _, index_at, _, index_crc = _FOOTER.unpack(tail[: _FOOTER.size])
-    if opcode != Opcode.FOOTER or not tail.endswith(MCAP0_MAGIC) or not index_at:
-        raise McapError("it has no index at its end")
-    data_end_at = file.seek(index_at - _DATA_END.size)
-    _, _, data_crc = _DATA_END.unpack(file.read(_DATA_END.size))
-    # The index's checksum covers the footer up to itself.
-    index_end = footer_at + _FOOTER.size - 4
-    for what, begin, end, expected in (("index", index_at, index_end, index_crc), ("data", 0, data_end_at, data_crc)):
-        file.seek(begin)
-        crc = 0
-        for at in range(begin, end, _BLOCK_BYTES):
-            crc = zlib.crc32(file.read(min(_BLOCK_BYTES, end - at)), crc)
-        if expected and crc != expected:
-            raise ValueError(f"its {what} does not match its checksum")
+def _check_index(file: IO[bytes], footer: Footer) -> None:
+    """Raise ValueError for an index that does not match its checksum, which the mcap library does not check."""
+    # The checksum covers the footer up to itself, four bytes before the magic ones.
+    index_end = file.tell() - len(MCAP0_MAGIC) - 4
+    file.seek(footer.summary_start)
+    if footer.summary_crc and zlib.crc32(file.read(index_end - footer.summary_start)) != footer.summary_crc:
+        raise ValueError("its index does not match its checksum")
 
 
 def _check_size(chunk: Chunk) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from shearloop.drivers.emulators.ur_controller import Controller
 from shearloop.drivers.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, PAUSED, ControllerSpec, Robot
 from tests.drivers.ur import robots
 from tests.drivers.ur.robots import control_script, do, send
@@ -167,3 +168,17 @@ def test_text_that_is_no_program_is_refused():
     robot.upload("def unfinished():\n  while True:\nend\n")
     assert not robot.program_running
     assert "block" in robot._events[-1].detail
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("version 5", "'5' is not a version such as 5.4.0.0"),
+        ("fire", "there are protective-stop, emergency-stop"),
+        ("silence long", "long"),
+        ("silence", "nothing"),
+    ],
+)
+def test_unknown_fault_is_refused(line, said):
+    with pytest.raises(ValueError, match=said):
+        Controller(Robot()).command(line)

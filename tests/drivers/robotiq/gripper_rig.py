@@ -52,19 +52,18 @@ async def a_rig(
 ) -> AsyncIterator[Rig]:
     """A gripper and its driver; `reply_deadline_s` is long, because a busy computer delays replies."""
     model = Gripper()
-    server: Server
     if way == "socket":
-        socket = server = SocketServer(UrcapSession(model))
-        await socket.restore()
-        client = SocketClient("127.0.0.1", socket.port, reply_deadline_s=reply_deadline_s)
+        server = SocketServer(UrcapSession(model))
+        await server.restore()
+        client = SocketClient("127.0.0.1", server.port, reply_deadline_s=reply_deadline_s)
     else:
         link = tmp_path / "gripper"
         server = PtyServer(ModbusSlave(model), link)
         await server.restore()
         client = ModbusClient(path=str(link), reply_deadline_s=reply_deadline_s)
     rig = Rig(model, server)
-    driver = RobotiqGripper(client, CALIBRATION, poll_s=0.0, monitor=LinkMonitor(rig.link, 0.001, 0.002))
-    rig.driver = driver
+    monitor = LinkMonitor(rig.link, 0.001, 0.002)
+    driver = rig.driver = RobotiqGripper(client, CALIBRATION, poll_s=0.0, monitor=monitor)
 
     async def pass_time() -> None:
         while True:

@@ -181,13 +181,9 @@ def bind(
 def _check_ipc_path(address: str, setting: str) -> None:
     """Raise UserError if an ipc path is in use or is another kind of file: libzmq would delete it and bind."""
     path = address.removeprefix("ipc://")
-    if path == address or path.startswith(("@", "*")):
+    if path == address or path.startswith(("@", "*")) or not os.path.lexists(path):
         return
-    try:
-        mode = os.lstat(path).st_mode
-    except OSError:
-        return
-    if not stat.S_ISSOCK(mode):
+    if not stat.S_ISSOCK(os.lstat(path).st_mode):
         raise UserError(
             f"`{setting}: {address}` cannot be bound: {path} exists and is no socket; choose another address"
         )

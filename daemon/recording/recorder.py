@@ -342,7 +342,7 @@ class Recorder:
         name = schema.recorded_topic(topic, content["source"])
         try:
             data = schema.message_json(topic, content, offset_ns)
-        except schema.NoJsonError as error:
+        except ValueError as error:
             self._counts.unwritable += 1
             self._counts.last_unwritable = f"a message of {name} has no JSON form and is left out: {error}"
             return

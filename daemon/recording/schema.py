@@ -60,10 +60,6 @@ class UnknownTopicError(Exception):
     """A recording has a topic that this version does not have."""
 
 
-class NoJsonError(ValueError):
-    """A value cannot be written as JSON."""
-
-
 def basic_identity(source: str, table: ChannelTable = PAPER_TABLE) -> dict[str, str]:
     """Return the metadata of every recording; `source` describes the origin of the data."""
     return {
@@ -173,12 +169,9 @@ def input_event(content: Mapping[str, Any]) -> RawEvent:
 def as_json(content: Mapping[str, Any]) -> bytes:
     """Return compact JSON, with null for numbers that are not finite.
 
-    Raises NoJsonError for text that is not UTF-8, for other objects, and for more than 250 levels.
+    Raises ValueError for text that is not UTF-8, for other objects, and for more than 250 levels.
     """
-    try:
-        return to_json(content, inf_nan_mode="null", fallback=_mapping_as_dict)
-    except (ValueError, TypeError) as error:
-        raise NoJsonError(str(error)) from error
+    return to_json(content, inf_nan_mode="null", fallback=_mapping_as_dict)
 
 
 def _mapping_as_dict(value: Any) -> Any:

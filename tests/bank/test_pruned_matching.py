@@ -49,21 +49,6 @@ def bank_of_noise(*, n_live: int = PAPER_TABLE.n_channels) -> tuple[np.ndarray, 
     return signals, np.ones(SHAPE, dtype=np.bool_)
 
 
-def bank_of_five_alone() -> tuple[tuple[np.ndarray, np.ndarray], dict[str, tuple[int, int]]]:
-    """Return a bank of five cells that have nothing in common with each other nor with the rest, and where they are.
-
-    "above" has the first channels alone, so that it may lie whole in a frame's last ones.
-    """
-    random = np.random.default_rng(0)
-    signals = np.zeros((20, 20, PAPER_TABLE.n_channels), dtype=np.float32)
-    signals[..., 860:] = random.random((20, 20, 2)) @ random.random((2, 36))
-    alone = {"left": (10, 5), "right": (10, 11), "between": (10, 8), "below": (2, 2), "above": (18, 18)}
-    for name, cell in alone.items():
-        signals[cell] = 0.0
-        signals[cell][random.choice(200 if name == "above" else 700, 40, replace=False)] = 1.0
-    return (signals, np.ones((20, 20), dtype=np.bool_)), alone
-
-
 def pair(slow: type[Matcher], fast: type[Matcher], bank: tuple[np.ndarray, np.ndarray]) -> tuple[Matcher, Matcher]:
     grids = np.arange(1.0, bank[1].shape[0] + 1), np.arange(1.0, bank[1].shape[1] + 1)
     return slow(*bank, *grids), fast(*bank, *grids)
@@ -243,23 +228,6 @@ def test_recorded_frames(recorded_frames, slow, fast):
     assert len(recorded_frames) > 60
     for frame in recorded_frames:
         assert_same(fast.match(frame), slow.match(frame))
-
-
-@pytest.mark.parametrize("kind", KINDS[:1])
-@pytest.mark.parametrize("far", [30, 640])
-def test_the_runner_up_may_be_at_a_lag_at_which_nothing_reaches_what_is_known_from_lag_0(kind, far):
-    """Both that are high at lag 0 are in the peak of the best cell, and nothing at its own lag is as high.
-
-    At lag 640 so little of the frame overlaps with the bank that the lag is left out at first.
-    """
-    bank, alone = bank_of_five_alone()
-    slow, fast = pair(*kind, bank)
-    frame = np.zeros(PAPER_TABLE.n_channels)
-    for name, size, lag in (("left", 5, 0), ("right", 4.8, 0), ("between", 6, 7), ("below", 2, 7), ("above", 3.5, far)):
-        frame[lag:] += size * bank[0][alone[name]][: PAPER_TABLE.n_channels - lag]
-    expected = slow.match(frame)
-    assert (expected.cell, expected.runner_up_cell) == (alone["between"], alone["above"])
-    assert_same(fast.match(frame), expected)
 
 
 @both

@@ -15,7 +15,6 @@ from shearloop.bank.skin.membrane import (
     PAPER_SECTION,
     THICK_SECTION,
     UNSTRETCHED,
-    Belt,
     BeltState,
     Direction,
     Membrane,
@@ -101,44 +100,6 @@ def test_a_step_taken_in_parts_ends_where_the_whole_one_does(path, parts):
     for one, other in zip(whole, in_parts, strict=True):
         assert one.gauge_tension_1_n == pytest.approx(other.gauge_tension_1_n, abs=2e-4)
         assert one.gauge_tension_2_n == pytest.approx(other.gauge_tension_2_n, abs=2e-4)
-
-
-def belt_of_sliders(friction: float, angle_rad: float, pulls: list[float]) -> list[tuple[float, float]]:
-    """Tension at the load and at the clamp of a chain of springs over sliders, pulled through the given movements.
-
-    Slow and with no notion of a play: each slider moves until friction, μ Δφ times the mean tension beside it,
-    holds the difference, and so on round the chain until nothing moves.
-    """
-    sliders = 16
-    hold = friction * angle_rad / sliders / 2
-    x, found = [0.0] * (sliders + 2), []
-    for pull in pulls:
-        x[0] = pull
-        moved = 1.0
-        while moved > 1e-13:
-            moved = 0.0
-            for i in range(1, sliders + 1):
-                ahead, behind = max(x[i - 1] - x[i], 0.0), max(x[i] - x[i + 1], 0.0)
-                excess = abs(ahead - behind) - hold * (ahead + behind)
-                if excess > 0:
-                    move = math.copysign(excess / 2 / (1 + hold), ahead - behind)
-                    x[i] += move
-                    moved = max(moved, abs(move))
-        found.append((max(x[0] - x[1], 0.0), max(x[-2] - x[-1], 0.0)))
-    return found
-
-
-def test_tension_at_the_gauge_is_that_of_a_slow_chain_of_springs_and_sliders():
-    friction, angle = 0.3, 1.0
-    pulls = [0.5, 1.0, 0.9, 0.7, 0.75, 1.1, 0.6, 0.3, 0.35, 0.8, 0.0]
-    belt, state = Belt(friction, angle), UNSTRETCHED
-    stuck = 0
-    for at_load, at_clamp in belt_of_sliders(friction, angle, pulls):
-        before = state.gauge_tension_1_n
-        state = belt.step(state, at_load, 0.0, 0.0)
-        assert state.gauge_tension_1_n == pytest.approx(at_clamp, rel=1e-3, abs=1e-9)
-        stuck += state.gauge_tension_1_n == before
-    assert stuck >= 3, "the path must show the gauge standing still while the force turns round"
 
 
 def shear_range(state: BeltState, normal_n: float, direction: Direction = Direction.UNKNOWN) -> tuple[float, float]:

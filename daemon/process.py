@@ -72,14 +72,6 @@ def raise_ending_signals() -> Iterator[None]:
             timer.join()
 
 
-def report_interrupt(sentence: str, interrupt: KeyboardInterrupt) -> int:
-    """Print what an interrupted command left behind, and return its exit status."""
-    # A closed terminal accepts no output.
-    with contextlib.suppress(OSError):
-        print(sentence, file=sys.stderr)
-    return interrupt_status(interrupt)
-
-
 def interrupt_status(interrupt: KeyboardInterrupt) -> int:
     """Return the exit status that shells use: 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP."""
     return 128 + _number(interrupt)

@@ -6,6 +6,7 @@ large libraries inside functions, so that help and errors come at once.
 """
 
 import argparse
+import contextlib
 import importlib
 import os
 import re
@@ -16,12 +17,14 @@ from types import ModuleType
 from typing import Any, NoReturn
 
 from shearloop.daemon.errors import USER_ERRORS, UserError
-from shearloop.daemon.process import raise_ending_signals, report_interrupt
+from shearloop.daemon.process import interrupt_status, raise_ending_signals
 
 # Our products are small: a BLAS with one thread is faster. Must be set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
+# Ctrl-C is their usual end, and nothing is left undone.
+_ENDED_BY_INTERRUPT = ("shearloop listen", "shearloop view", "shearloop emulate")
 # The module of each command below `shearloop.daemon`, and its summary for the overview.
 COMMANDS = {
     "demo": ("cli.demo", "run the whole rig, emulated, in closed loop"),
@@ -134,7 +137,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_OK
     except KeyboardInterrupt as interrupt:
-        return report_interrupt(f"{program}: interrupted before it was done", interrupt)
+        if program not in _ENDED_BY_INTERRUPT:
+            # A closed terminal accepts no output.
+            with contextlib.suppress(OSError):
+                print(f"{program}: interrupted before it was done", file=sys.stderr)
+        return interrupt_status(interrupt)
 
 
 def _overview() -> argparse.ArgumentParser:

@@ -6,7 +6,6 @@ import sys
 from shearloop.daemon.cli.options import TIMEOUT_S, add_connection, add_option, client_keys, positive
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
-from shearloop.daemon.process import interrupt_status
 
 EPILOG = """
 examples:
@@ -46,12 +45,9 @@ def run(args: argparse.Namespace) -> int:
         asked = f"there (`shearloop run CONFIG`), and does it publish {' or '.join(args.topics) or 'anything'}?"
         print(f"{nothing}. Is a daemon running {asked}", file=sys.stderr, flush=True)
 
-    try:
-        received = receive_messages(args.connect, args.topics, args.timeout, client_keys(args), print_hint)
-        for number, (topic, content) in enumerate(received, start=1):
-            print(write(topic, content), flush=True)
-            if number == args.count:
-                break
-    except KeyboardInterrupt as interrupt:
-        return interrupt_status(interrupt)
+    received = receive_messages(args.connect, args.topics, args.timeout, client_keys(args), print_hint)
+    for number, (topic, content) in enumerate(received, start=1):
+        print(write(topic, content), flush=True)
+        if number == args.count:
+            break
     return 0

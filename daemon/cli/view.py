@@ -8,7 +8,6 @@ from shearloop.daemon.cli.options import PORT, add_connection, add_fingertip, ad
 from shearloop.daemon.cli.terminal import print_result
 from shearloop.daemon.errors import require
 from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS
-from shearloop.daemon.process import interrupt_status
 
 PAGE_PORT = 7760
 
@@ -32,11 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until SIGINT, SIGTERM or SIGHUP."""
-    try:
-        return _serve_page(args) if args.foxglove is None else _serve_foxglove(args)
-    except KeyboardInterrupt as interrupt:
-        # It ends by Ctrl-C, and nothing is left undone. At a demo's start the demo itself says that it was interrupted.
-        return interrupt_status(interrupt)
+    return _serve_page(args) if args.foxglove is None else _serve_foxglove(args)
 
 
 def _serve_page(args: argparse.Namespace) -> int:

@@ -9,7 +9,6 @@ from pathlib import Path
 from shearloop.daemon.cli import Parser
 from shearloop.daemon.cli.emulate import devices, rig
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.process import interrupt_status
 
 DEVICES = {**devices.DEVICES, **rig.DEVICES}
 
@@ -24,17 +23,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play the device until Ctrl-C, SIGTERM, SIGHUP or the end of standard input."""
-    try:
-        _play(args)
-    except KeyboardInterrupt as interrupt:
-        # While it starts: nothing is left undone.
-        return interrupt_status(interrupt)
-    return 0
+    """Play the device until Ctrl-C, SIGTERM, SIGHUP or the end of standard input.
 
-
-def _play(args: argparse.Namespace) -> None:
-    """Play the device; raise UserError for an OSError, alone or in a group: an address, port or path is unusable."""
+    Raises UserError for an OSError, alone or in a group: an address, port or path is unusable.
+    """
     try:
         asyncio.run(args.play(args))
     except* OSError as errors:
@@ -43,6 +35,7 @@ def _play(args: argparse.Namespace) -> None:
             error = error.exceptions[0]
         cure = "choose another address, port or path, or end what uses it"
         raise UserError(f"{args.device} cannot be played: {error}; {cure}") from None
+    return 0
 
 
 def checked_arguments(device: str, arguments: Sequence[str], folder: Path) -> argparse.Namespace:

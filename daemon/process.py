@@ -32,11 +32,7 @@ def ending_signals() -> tuple[signal.Signals, ...]:
 
 
 class TerminationInterrupt(KeyboardInterrupt):
-    """SIGTERM or SIGHUP, raised like Ctrl-C so that the same clean-up runs."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-        self.number = number
+    """SIGTERM or SIGHUP, its argument, raised like Ctrl-C so that the same clean-up runs."""
 
 
 @contextlib.contextmanager
@@ -82,7 +78,7 @@ def _raise(number: int, _: FrameType | None) -> NoReturn:
 
 
 def _number(interrupt: BaseException | None) -> int:
-    return interrupt.number if isinstance(interrupt, TerminationInterrupt) else signal.SIGINT
+    return int(interrupt.args[0]) if isinstance(interrupt, TerminationInterrupt) else signal.SIGINT
 
 
 def raise_priority() -> None:

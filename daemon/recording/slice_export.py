@@ -5,7 +5,6 @@ the homogeneous frame, as an absolute value. It comes with the load cell's torqu
 frame is the mean of the frames of the latest `tare` step.
 """
 
-import io
 import re
 from collections import Counter, deque
 from collections.abc import Collection, Mapping
@@ -189,10 +188,8 @@ class _Sweep:
 
 
 def _save_mat(path: Path, **arrays: Any) -> None:
-    content = io.BytesIO()
-    savemat(content, arrays)  # type: ignore[arg-type]  # the stubs allow only names
     with replace_file(path) as file:
-        file.write(content.getbuffer())
+        savemat(file, arrays)  # type: ignore[arg-type]  # the stubs allow only names
 
 
 def _half_period_ns(frames: Collection[tuple[int, FloatArray]]) -> float:

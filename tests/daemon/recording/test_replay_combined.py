@@ -85,7 +85,7 @@ async def record(config: Path, lines: dict[str, list[bytes]], monkeypatch: pytes
     began_ns, both_read = time.monotonic_ns(), asyncio.Barrier(len(SIDES))
 
     async def connect(link: SerialLink) -> Board:
-        path = Path(link._path)
+        path = Path(link.path)
         return Board(path, lines[path.name], began_ns, both_read)
 
     def listen(topic: str, content: dict[str, Any]) -> None:

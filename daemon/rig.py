@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from types import MappingProxyType
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, SerialDevice
@@ -79,10 +78,7 @@ def robot_settings(path: Path) -> UrSettings:
 
 
 def make_loop(
-    config: DaemonConfig,
-    robot: UrSettings,
-    sources: Mapping[str, TorqueSource],
-    dead_tasks: Mapping[str, str] = MappingProxyType({}),
+    config: DaemonConfig, robot: UrSettings, sources: Mapping[str, TorqueSource], dead_tasks: Mapping[str, str]
 ) -> ControlLoop:
     """Return the control loop of a robot with these settings.
 

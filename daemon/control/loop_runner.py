@@ -409,6 +409,8 @@ class ActionExecutor:
         if self.unlocking:
             raise ActionError("unlocking is under way")
         task = self._unlocking = asyncio.create_task(self._unlock(), name="unlock")
+        # Nobody asks for a failure that comes after the caller was cancelled.
+        task.add_done_callback(lambda done: done.cancelled() or done.exception())
         await asyncio.wait([task])
         if task.cancelled():
             raise ActionError("unlocking was stopped; send `unlock` again")

@@ -170,10 +170,12 @@ class CommandHandler:
         """Whether calls may take seconds: to the dashboard, or the first one to a new program."""
         return self._recovery is not None
 
-    @property
-    def rejected(self) -> bool:
-        """Whether the robot rejected a command of this cycle: its connection may see a stop before the sample does."""
-        return self._executor.rejected
+    def take_rejection(self) -> bool:
+        """Return, once, whether the robot rejected a command.
+
+        The control connection may see the end of the program before the sample does. The next sample may say why.
+        """
+        return self._executor.take_rejection()
 
     def request(
         self, number: int, command: Command | Heartbeat, sample: RtdeSample, now_ns: int

@@ -91,8 +91,7 @@ class MotionExecutor:
         self.disabled_reason = NOT_OURS
         # A wrist speed is the one last asked for, with the time of its decision.
         self._motion: WristSpeed | _Move | _Braking | None = None
-        # Whether the robot has rejected a command since the last sample; the next sample may say why.
-        self.rejected = False
+        self._rejected = False
         # The script's thread for speeds runs; it has to be ended before a linear move.
         self._speed_thread = False
         self._rested_ns = now_ns
@@ -109,6 +108,11 @@ class MotionExecutor:
             case _Braking():
                 return "stopping"
         return "idle"
+
+    def take_rejection(self) -> bool:
+        """Return, once, whether the robot rejected a command, in this cycle or before it."""
+        rejected, self._rejected = self._rejected, False
+        return rejected
 
     def begin(self, motion_id: int, asked: WristSpeed | MoveLinear, sample: RtdeSample, now_ns: int) -> str:
         """Turn the wrist at a speed from now on, or begin a linear move; return why not, or the empty string."""
@@ -188,7 +192,6 @@ class MotionExecutor:
         """Note the arm's accelerations, and whether an idle arm rests; call this in every cycle."""
         if self._motion is not None or sample.fastest_rad_per_s < ASTRAY_RAD_PER_S:
             self._rested_ns = now_ns
-        self.rejected = False
         self._accelerations.add(sample)
 
     def violation(self, sample: RtdeSample) -> str:
@@ -266,7 +269,7 @@ class MotionExecutor:
         return accepted
 
     def _reject(self, command: str) -> None:
-        self.rejected = True
+        self._rejected = True
         self.leave_to_watchdog(NOT_ACCEPTED.format(command=command))
 
     def _end_speed_thread(self) -> None:

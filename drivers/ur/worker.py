@@ -161,7 +161,7 @@ def _control(pipe: Pipe, settings: UrSettings, arm: "UrArm") -> NoReturn:
         ended = handler.tick(sample, time.monotonic_ns())
         if ended is not None:
             pipe.send(ended[1], ended[0])
-        if not handler.rejected:
+        if not handler.take_rejection():
             pipe.send_latest(handler.state(sample, cycle))
         if (handler.leaving and handler.at_rest) or time.monotonic() > leave_s:
             _set_alarm(BRAKE_S + settings.hang_timeout_s)

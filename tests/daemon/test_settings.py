@@ -122,9 +122,8 @@ def test_the_wrists_acceleration_reaches_controller_identification_and_robot(whe
     (tmp_path / "ur.yaml").write_text(yaml.safe_dump(settings))
     loop_config = LoopConfig(wrist_acceleration_rad_per_s2=1.5) if where == "loop" else LoopConfig()
     source = TorqueSource(name="right", period_s=0.5)
-    loop = make_loop(
-        DaemonConfig.model_construct(loop=loop_config), robot_settings(tmp_path / "ur.yaml"), {"right": source}
-    )
+    config = DaemonConfig.model_construct(loop=loop_config)
+    loop = make_loop(config, robot_settings(tmp_path / "ur.yaml"), {"right": source}, {})
     assert loop.config.wrist_acceleration_rad_per_s2 == 1.5, "sent to the robot"
     tuned = controller_settings(loop.config, FOUND, source, TrackTorque(0.1, 0.05), 0.5)
     assert tuned.acceleration_limit_rad_per_s2 == 0.75

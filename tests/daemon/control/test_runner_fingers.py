@@ -83,12 +83,12 @@ async def test_a_stop_ends_unlocking_and_stops_the_fingers():
         starting = asyncio.create_task(cell.runner.start(experiment(GRIP)))
         await cell.cycles(5)
         assert "being unlocked" in await starting
-        assert cell.runner.stop_unlocking()
+        assert cell.runner.stop() == "unlock"
         await cell.cycles(5)
         assert "unlocking was stopped" in await unlocking
         assert cell.gripper.asked == ["halt"]
         assert cell.robot.commands[-1] == Stop(LoopConfig().wrist_acceleration_rad_per_s2), "it ends the robot's part"
-        assert not cell.runner.stop_unlocking()
+        assert cell.runner.stop() is None
 
 
 async def test_fingers_that_could_not_be_stopped_are_told_of(monkeypatch):

@@ -44,10 +44,13 @@ def test_wrist_stands_soon_after_the_pipe_has_died(timed, arm, daemon):
     assert arm.calls[-1] == "end_program"
 
 
-@pytest.mark.parametrize("stopped_s", [0.2001, 0.2005, 0.2079])
-def test_protective_stop_seen_late_is_reported_as_such(timed, arm, stopped_s):
-    speeds = [(0.1005 + 0.008 * number, WristSpeed(0.1, 4.0)) for number in range(20)]
+# A command comes at `offset_s` after the beginning of a cycle; the sample shows the stop `lag_s` later.
+@pytest.mark.parametrize("lag_s", [0.002, 0.0065])
+@pytest.mark.parametrize("offset_s", [0.0005, 0.0035, 0.0072])
+def test_protective_stop_seen_late_is_reported_as_such(timed, arm, offset_s, lag_s):
+    speeds = [(0.104 + offset_s + 0.008 * number, WristSpeed(0.1, 4.0)) for number in range(20)]
+    stopped_s = 0.2 + offset_s - 0.0001
     rejects = (stopped_s, lambda: setattr(arm, "accepts", False))
-    run = timed(arm, (0.1, Enable()), *speeds, rejects, (stopped_s + 0.003, arm.protective_stop), (0.3, Disconnect()))
+    run = timed(arm, (0.1, Enable()), *speeds, rejects, (stopped_s + lag_s, arm.protective_stop), (0.3, Disconnect()))
     assert {state.blocked[:15] for state in run.states if state.cycle > 15} == {"", "Protective stop"}
     assert {state.motion for state in run.states if state.blocked} == {"idle"}

@@ -176,7 +176,8 @@ def writing(out: Path, what: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise UserError(f"{out}: {what} cannot be written: {error.strerror}; choose another path") from error
+        file, reason = error.filename or out, error.strerror or error
+        raise UserError(f"{file}: {what} cannot be written: {reason}; choose another path") from error
 
 
 def load_calibration(path: Path) -> "Calibration":

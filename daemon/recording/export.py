@@ -1,8 +1,7 @@
 """Exports topics of a recording as tables: CSV or Parquet, a file per topic, or MATLAB, all topics in a file."""
 
 import csv
-from collections.abc import Iterable, Iterator
-from itertools import chain, count, islice
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -68,67 +67,93 @@ def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress
     if form == "parquet":
         require("pyarrow", "export", "Parquet")
     out.mkdir(parents=True, exist_ok=True)
-    files, number = [], count(1)
-    for topic in topics:
-        messages = read_messages(path, [topic], lambda _: progress(next(number)))
-        rows = (row_of(content, message.log_time) for _, content, message in messages)
-        files.append(out / f"{topic}.{form}")
-        if form == "csv":
-            _write_csv(files[-1], rows)
-        else:
-            _write_parquet(files[-1], topic, rows)
-    return files
+    files = {topic: out / f"{topic}.{form}" for topic in topics}
+    tables: dict[str, _CsvTable | _ParquetTable] = {}
+    with ExitStack() as stack:
+        for topic, content, message in read_messages(path, topics, progress):
+            row = row_of(content, message.log_time)
+            if topic not in tables:
+                made = _CsvTable(files[topic], row) if form == "csv" else _ParquetTable(files[topic], topic, row)
+                stack.callback(made.close)
+                tables[topic] = made
+            tables[topic].add(row)
+    return list(files.values())
 
 
-def _write_csv(path: Path, rows: Iterable[dict[str, Any]]) -> None:
-    """Write a column per array element, after the other columns: channels_0, channels_1, …
+class _CsvTable:
+    """A table with one column per array element, after the other columns: channels_0, channels_1, …"""
 
-    Raises UserError if a row has other columns than the first.
-    """
-    first_width = 0
-    with path.open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file, lineterminator="")
-        for row in rows:
-            arrays = {key: value for key, value in row.items() if isinstance(value, list)}
-            cells = {key: value for key, value in row.items() if key not in arrays}
-            width = len(cells) + sum(map(len, arrays.values()))
-            if not first_width:
-                first_width = width
-                table.writerow([*cells, *(f"{key}_{i}" for key, value in arrays.items() for i in range(len(value)))])
-                file.write("\r\n")
-            if width != first_width:
-                raise UserError(
-                    f"{path}: the first message has {first_width} values and a later one {width}; use --format mat"
-                )
-            table.writerow(cells.values())
-            # The csv module takes ten times as long for numbers.
-            text = b"".join(b"," + to_json(value)[1:-1] for value in arrays.values() if value).replace(b"null", b"")
-            file.write(f"{text.decode()}\r\n")
+    def __init__(self, path: Path, first: dict[str, Any]) -> None:
+        """Write the names of the columns, as in the first row."""
+        self._path = path
+        self._file = path.open("w", newline="", encoding="utf-8")
+        self._table = csv.writer(self._file, lineterminator="")
+        names = [key for key, value in first.items() if not isinstance(value, list)]
+        arrays = {key: value for key, value in first.items() if isinstance(value, list)}
+        names += [f"{key}_{i}" for key, value in arrays.items() for i in range(len(value))]
+        self._width = len(names)
+        self._table.writerow(names)
+        self._file.write("\r\n")
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Write one row; raises UserError if it has other columns than the first."""
+        cells = [value for value in row.values() if not isinstance(value, list)]
+        arrays = [value for value in row.values() if isinstance(value, list)]
+        width = len(cells) + sum(map(len, arrays))
+        if width != self._width:
+            raise UserError(
+                f"{self._path}: the first message has {self._width} values and a later one {width}; use --format mat"
+            )
+        self._table.writerow(cells)
+        # The csv module takes ten times as long for numbers.
+        text = b"".join(b"," + to_json(value)[1:-1] for value in arrays if value).replace(b"null", b"").decode()
+        self._file.write(f"{text}\r\n")
+
+    def close(self) -> None:
+        """End the file."""
+        self._file.close()
 
 
-def _write_parquet(path: Path, topic: str, rows: Iterator[dict[str, Any]]) -> None:
-    """Write a table with the types of the topic's schema in batches; missing elements of arrays are NaN."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
+class _ParquetTable:
+    """A table with the types of the topic's schema, written in batches; missing elements of arrays are NaN."""
 
-    types = {"number": "float64", "integer": "int64", "boolean": "bool", "string": "string", "object": "string"}
+    def __init__(self, path: Path, topic: str, first: dict[str, Any]) -> None:
+        """Begin the file with the columns of the first row."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
 
-    def arrow_type(described: dict[str, Any]) -> Any:
-        if described["type"] == "array":
-            return pa.list_(arrow_type(described["items"]))
-        return pa.type_for_alias(types[described["type"]])
+        types = {"number": "float64", "integer": "int64", "boolean": "bool", "string": "string", "object": "string"}
 
-    first = next(rows)
-    described = {"log_time_ns": {"type": "integer"}, **schema.schemas()[schema.schema_name(topic)]["properties"]}
-    table_schema = pa.schema([(key, arrow_type(described[key])) for key in first])
-    arrays = [field.name for field in table_schema if field.type == pa.list_(pa.float64())]
-    scalars = [field.name for field in table_schema if not pa.types.is_list(field.type)]
-    rows_at_once = 1 + _BATCH // sum(len(value) if isinstance(value, list) else 1 for value in first.values())
-    following = chain([first], rows)
-    # Measured values seldom repeat: a dictionary of them would only cost time, and so would limits of arrays.
-    with pq.ParquetWriter(path, table_schema, use_dictionary=False, write_statistics=scalars) as writer:
-        while batch := list(islice(following, rows_at_once)):
-            for row in batch:
-                # Arrow takes twice as long for a list.
-                row |= {key: np.array(row[key], dtype=np.float64) for key in arrays if row.get(key) is not None}
-            writer.write_table(pa.table(columns_of(batch), schema=table_schema))
+        def arrow_type(described: dict[str, Any]) -> Any:
+            if described["type"] == "array":
+                return pa.list_(arrow_type(described["items"]))
+            return pa.type_for_alias(types[described["type"]])
+
+        described = {"log_time_ns": {"type": "integer"}, **schema.schemas()[schema.schema_name(topic)]["properties"]}
+        self._schema = pa.schema([(key, arrow_type(described[key])) for key in first])
+        self._arrays = [field.name for field in self._schema if field.type == pa.list_(pa.float64())]
+        scalars = [field.name for field in self._schema if not pa.types.is_list(field.type)]
+        # Measured values seldom repeat: a dictionary of them would only cost time, and so would limits of arrays.
+        self._writer = pq.ParquetWriter(path, self._schema, use_dictionary=False, write_statistics=scalars)
+        self._rows: Rows = []
+        self._rows_at_once = 1 + _BATCH // sum(len(value) if isinstance(value, list) else 1 for value in first.values())
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Add one row."""
+        # Arrow takes twice as long for a list.
+        arrays = {key: np.array(row[key], dtype=np.float64) for key in self._arrays if row.get(key) is not None}
+        self._rows.append(row | arrays)
+        if len(self._rows) == self._rows_at_once:
+            self._write()
+
+    def close(self) -> None:
+        """Write what waits, and end the file."""
+        if self._rows:
+            self._write()
+        self._writer.close()
+
+    def _write(self) -> None:
+        import pyarrow as pa
+
+        self._writer.write_table(pa.table(columns_of(self._rows), schema=self._schema))
+        self._rows.clear()

@@ -90,7 +90,7 @@ class _Held:
 
 
 class _Statistics:
-    """Minimum, maximum, mean and standard deviation of each column over its known values, for any number of rows."""
+    """Minimum, maximum, mean and standard deviation of each column over its finite values, for any number of rows."""
 
     def __init__(self, width: int) -> None:
         self._rows = 0
@@ -98,8 +98,8 @@ class _Statistics:
         self._min, self._max = np.full((2, width), np.nan)
 
     def add(self, rows: NDArray[Any]) -> None:
-        """Take (n, width) values, NaN where they are unknown."""
-        values = np.asarray(rows, dtype=np.float64)
+        """Take (n, width) values."""
+        values = np.where(np.isfinite(rows), np.asarray(rows, dtype=np.float64), np.nan)
         self._rows += len(rows)
         self._n += np.isfinite(values).sum(axis=0)
         self._sum += np.nansum(values, axis=0)
@@ -163,10 +163,10 @@ class _Dataset:
         import pyarrow.parquet as pq
 
         rows: list[list[NDArray[np.float32]]] = []
-        now_ns = self._started_ns
+        now_ns = -1
         with pq.ParquetWriter(self._new(f"data/{_FILE}"), self._schema, compression="zstd") as writer:
             for known_ns, _, topic, content, measured_ns in self._known_messages(path, progress):
-                now_ns = now_ns or self._started_ns
+                now_ns = max(now_ns, self._started_ns)
                 while now_ns < known_ns:
                     rows.append(self._row(now_ns))
                     now_ns += _PERIOD_NS
@@ -175,7 +175,7 @@ class _Dataset:
                         rows.clear()
                 with reading(path):
                     self._held[topic].hold(content, measured_ns)
-            if now_ns:
+            if now_ns >= 0:
                 rows.append(self._row(now_ns))
                 writer.write_table(self._table(rows))
 
@@ -201,7 +201,8 @@ class _Dataset:
         """Yield the messages in the order in which the daemon had them, which is not that of their measurement."""
         waiting: list[_Known] = []
         for number, (topic, content, message) in enumerate(read_messages(path, self._held, progress)):
-            self._started_ns = self._started_ns or message.log_time
+            if number == 0:
+                self._started_ns = message.log_time
             with reading(path):
                 known_ns = max(message.publish_time, message.log_time, content.get("arrival_unix_ns") or 0)
                 if known_ns - self._started_ns > _LONGEST_NS:

@@ -7,16 +7,17 @@ index that is written when a file is closed.
 
 import json
 import os
+import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 import zstandard
-from mcap.exceptions import McapError
+from mcap.exceptions import EndOfFile, McapError
 from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
@@ -74,17 +75,19 @@ class OpenRecording:
         file.seek(0)
         ends: list[McapRecord] = []
         reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=_LARGEST_RECORD_BYTES)
-        for record in reader.records:
-            match record:
-                case Chunk():
-                    _check_size(record)
-                # Names of files that an export makes.
-                case Channel(topic=name) if not name.isprintable() or "/" in name:
-                    raise ValueError(f"it has the topic {name[:40]!r}")
-                case Attachment(name=name) if not name.isprintable():
-                    raise ValueError(f"it has the attachment {name[:40]!r}")
-                case DataEnd() | Footer():
-                    ends.append(record)
+        # A file that was cut off ends anywhere.
+        with suppress(EndOfFile, struct.error):
+            for record in reader.records:
+                match record:
+                    case Chunk():
+                        _check_size(record)
+                    # Names of files that an export makes.
+                    case Channel(topic=name) if not name.isprintable() or "/" in name:
+                        raise ValueError(f"it has the topic {name[:40]!r}")
+                    case Attachment(name=name) if not name.isprintable():
+                        raise ValueError(f"it has the attachment {name[:40]!r}")
+                    case DataEnd() | Footer():
+                        ends.append(record)
         match ends:
             case DataEnd(), Footer() as footer if not file.read(1):
                 _check_index(file, footer)

@@ -56,7 +56,8 @@ def export_slices(
         table = recording.table
     sweep, written, missed = _Sweep(table), list[Path](), Counter[str]()
     largest: _Slice | None = None
-    used = [topic for topic in topics if schema.schema_name(topic) in _TOPICS]
+    # Only a control loop holds angles; imported recordings have none.
+    used = [topic for topic in topics if schema.schema_name(topic) in _TOPICS] if LoopState.topic in topics else []
     for topic, content, _ in read_messages(path, used, progress):
         found = sweep.add(schema.schema_name(topic), content)
         if isinstance(found, _Slice):

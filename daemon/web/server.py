@@ -224,7 +224,7 @@ def make_app(bridge: Bridge, token: str, fingertip: dict[str, Any], publish: str
     app = web.Application(middlewares=[page.check_access], client_max_size=MAX_BODY_BYTES)
     app[_BUSY] = page.busy
     app.router.add_get("/", page.index)
-    app.router.add_static("/assets", _ASSETS)
+    app.router.add_static("/assets", _ASSETS, follow_symlinks=True)
     app.router.add_get("/settings.json", page.settings)
     app.router.add_get("/stream", page.stream)
     app.router.add_post("/stop", page.stop)

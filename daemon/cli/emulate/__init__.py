@@ -33,8 +33,9 @@ def run(args: argparse.Namespace) -> int:
         error: BaseException = errors
         while isinstance(error, BaseExceptionGroup):
             error = error.exceptions[0]
+        where, reason = getattr(error, "filename", None), getattr(error, "strerror", None) or error
         cure = "choose another address, port or path, or end what uses it"
-        raise UserError(f"{args.device} cannot be played: {error}; {cure}") from None
+        raise UserError(f"{args.device} cannot be played: {f'{where}: ' if where else ''}{reason}; {cure}") from None
     return 0
 
 

@@ -1,5 +1,6 @@
 """What becomes of a recording whose bytes are spoilt or cut off: a sentence, or all that was in it."""
 
+import io
 import json
 import re
 import time
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from shearloop.bank.eit.channels import PAPER_TABLE
@@ -144,7 +146,19 @@ def test_each_command_exits_with_status_2(arguments, damages, content, tmp_path,
         assert f"{path}: the recording was not closed, or is damaged (" in said, what
         cure = "it holds no intact message" if what == "short" else f"`shearloop recording repair {path}`"
         assert cure in said, what
+        assert what != "cut" or "(it has no index at its end)" in said
         assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("where", ["metadata", "statistics"])
+def test_a_wrong_byte_that_all_readers_would_accept_is_found_by_its_checksum(where, content, tmp_path):
+    path = tmp_path / "x.mcap"
+    first_ns = make_reader(io.BytesIO(content)).get_summary().statistics.message_start_time
+    # The last place of the first time is in the statistics, at the end of the file.
+    at = content.index(b"a test") if where == "metadata" else content.rindex(first_ns.to_bytes(8, "little"))
+    path.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
+    with pytest.raises(UserError, match="is damaged"):
+        read_recording(path)
 
 
 def test_a_check_without_a_comparison_fails(config, imported, tmp_path, ran):
@@ -177,7 +191,9 @@ def recorded(path, *messages, attachments=(), end=None, **options):
 
 
 EVALUATE = ["evaluate", "{calibration}", "{path}"]
-CSV, LEROBOT = (["recording", "export", "{path}", "--format", form, "--out", "{out}"] for form in ("csv", "lerobot"))
+CSV, LEROBOT, SLICES = (
+    ["recording", "export", "{path}", "--format", form, "--out", "{out}"] for form in ("csv", "lerobot", "slices")
+)
 REPLAY = ["replay", "{path}", "--speed", "max", "--publish", "{address}"]
 INFO = ["recording", "info", "{path}"]
 BARE = json.dumps(CONFIGURATION).encode()
@@ -190,6 +206,7 @@ BARE = json.dumps(CONFIGURATION).encode()
         (INFO, [TORQUE], {"end": {"dropped": "abc"}}, "invalid literal"),
         (CSV, [("eit.frame.a\0b", FRAME[1])], {}, r"it has the topic 'eit.frame.a\\x00b'"),
         (CSV, [("eit.frame.../../x", FRAME[1])], {}, "it has the topic 'eit.frame.../../x'"),
+        (SLICES, [FRAME, TORQUE], {}, "nothing to export"),
         (LEROBOT, [(FRAME[0], {**FRAME[1], "arrival_unix_ns": 10**30})], {}, "more than a day"),
         (LEROBOT, [(FRAME[0], {**FRAME[1], "arrival_unix_ns": "noon"})], {}, "not supported between"),
         (LEROBOT, [(FRAME[0], {**FRAME[1], "line": ["x"] * len(LINE)})], {}, "could not convert"),

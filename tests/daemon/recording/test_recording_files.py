@@ -102,6 +102,13 @@ def test_csv_parquet_and_matlab_exports_agree(recording, tmp_path, result_of):
     assert struct["load_torque"]["log_time_ns"].tolist() == [10**18 + i for i in range(4)]
 
 
+def test_csv_is_refused_where_a_later_array_is_longer(tmp_path, mistake):
+    with new_recording(tmp_path / "x.mcap", "a bench") as file:
+        for length in (3, 4):
+            file.add_frame("right", 10**18, 10**18, np.zeros(length))
+    assert "a later one 6; use --format mat" in mistake("recording", "export", tmp_path / "x.mcap", "--format", "csv")
+
+
 def test_a_recording_is_read_into_arrays_and_frames(recording, monkeypatch):
     read = shearloop.read(recording)
     assert dict(read.counts) == {"eit.frame.right": 4, "load.torque": 4}

@@ -5,7 +5,6 @@
 index that is written when a file is closed.
 """
 
-import json
 import os
 import struct
 import zlib
@@ -197,7 +196,7 @@ def read_recording(path: str | Path) -> Recording:
         for channel, message in recording.messages([schema.LOAD_TOPIC, *sides, *inputs]):
             topic, t_ns = channel.topic, message.log_time
             try:
-                content = dict(json.loads(message.data))
+                content = dict(from_json(message.data))
                 if topic == schema.LOAD_TOPIC:
                     if "torque_nm" in content and content.get("valid", True):
                         torques.append((t_ns, float(content["torque_nm"])))

@@ -114,7 +114,7 @@ class McapFile:
     def add_frame(self, side: str, t_mid_unix_ns: int, arrival_unix_ns: int, line: NDArray[np.float64]) -> None:
         """Append one imported frame: the (v,) values of its line in volts. Flushes at times; raises OSError."""
         # The board sends four decimals of a volt.
-        content = {"arrival_unix_ns": arrival_unix_ns, "line": [round(value, 6) for value in line.tolist()]}
+        content = {"arrival_unix_ns": arrival_unix_ns, "line": np.round(line, 6).tolist()}
         self._add_imported(schema.recorded_topic(schema.FRAME_TOPIC, side), t_mid_unix_ns, content)
 
     def add_torque(self, t_unix_ns: int, torque_nm: float) -> None:

@@ -183,6 +183,5 @@ def test_an_unwritable_folder_is_reported(tmp_path, mistake):
     sweep.export(tmp_path)
     out.mkdir()
     (out / "torque_slices").write_text("")
-    assert f"{out}: the export cannot be written: " in mistake(
-        "recording", "export", sweep.path, "--format", "slices", "--out", out
-    )
+    said = mistake("recording", "export", sweep.path, "--format", "slices", "--out", out)
+    assert f"{out}/torque_slices: the export cannot be written: " in said

@@ -43,6 +43,7 @@ LONGEST = (
     *(
         "test_demo.py",
         "test_own_calibration.py",
+        "test_adapt_in_loop.py",
         "test_closed_loop.py",
         "test_client.py",
         "test_soak.py",

@@ -365,7 +365,7 @@ def test_the_status_line_is_redrawn_in_place(monkeypatch):
     running = "running 50 %  step 2 of 3 grip  closing"
     assert (starting, shown, end) == ("starting", [running, f"{running}   right +0.100 N·m", running], "")
     narrow = StringIO()
-    monkeypatch.setattr("shutil.get_terminal_size", lambda: os.terminal_size((50, 24)))
+    monkeypatch.setattr("shutil.get_terminal_size", lambda **_: os.terminal_size((50, 24)))
     line = StatusLine(narrow)
     line("loop.state", {**state, "phase": "running", "activity": "closing on a tool", "torque_source": "right"})
     line("eit.estimate", {"source": "right", "valid": True, "torque_nm": 0.1})

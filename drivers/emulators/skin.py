@@ -51,6 +51,7 @@ MAX_LINE_BYTES = 512
 MAX_ERRORS = 10
 UNDEFINED_HEADER = '-113,"Undefined header"'
 SETTINGS_CONFLICT = '-221,"Settings conflict"'
+OUT_OF_RANGE = '-222,"Parameter data out of range"'
 ILLEGAL_VALUE = '-224,"Illegal parameter value"'
 
 # Returns the answer to a query, or None for a command; the argument is the text after the header.
@@ -166,6 +167,13 @@ class ScpiInterpreter:
         return None
 
 
+def _number(text: str, low: float, high: float) -> float:
+    """Return a command's number; ValueError for other text, and ScpiError for one out of range."""
+    if not low <= (value := float(text)) <= high:
+        raise ScpiError(OUT_OF_RANGE)
+    return value
+
+
 class EmulatedKeithley6430(ScpiInterpreter):
     """The current source; replies as its manual (6430-901-01, sections 13 and 17) gives them."""
 
@@ -197,10 +205,10 @@ class EmulatedKeithley6430(ScpiInterpreter):
         self.circuit.compliance_v = 21.0
 
     def _set_level(self, text: str) -> None:
-        self.circuit.level_a = number_between(text, -MAX_A, MAX_A, "no such current")
+        self.circuit.level_a = _number(text, -MAX_A, MAX_A)
 
     def _set_compliance(self, text: str) -> None:
-        self.circuit.compliance_v = number_between(text, 2e-4, MAX_V, "no such voltage")
+        self.circuit.compliance_v = _number(text, 2e-4, MAX_V)
 
     def _set_measured(self, text: str) -> None:
         self._measured = set(text.upper().replace("'", "").split(","))
@@ -209,7 +217,7 @@ class EmulatedKeithley6430(ScpiInterpreter):
         self._elements = set(text.upper().split(","))
 
     def _switch(self, text: str) -> None:
-        self.circuit.output_on = {"ON": True, "OFF": False}[text.upper()]
+        self.circuit.output_on = {"ON": True, "1": True, "OFF": False, "0": False}[text.upper()]
 
     def _read(self, _: str) -> str:
         if not self.circuit.output_on:
@@ -243,7 +251,7 @@ class EmulatedScanner(ScpiInterpreter):
         )
 
     def _configure(self, text: str) -> None:
-        self._range_v = number_between(text.split(",", 1)[0], 0.0, 300.0, "no such range")
+        self._range_v = _number(text.split(",", 1)[0], 0.0, 300.0)
 
     def _set_scan(self, text: str) -> None:
         if not (text.startswith("(@") and text.endswith(")")):

@@ -57,6 +57,20 @@ class Bench(LinkEvents):
             pytest.fail(f"no sample says {faults}; the last one: {self.samples[-1:]}")
 
 
+@pytest.mark.parametrize(
+    ("command", "error"),
+    [
+        (b"SOUR:CURR 2.0", b'-222,"Parameter data out of range"'),
+        (b"SOUR:CURR much", b'-224,"Illegal parameter value"'),
+        (b"OUTP maybe", b'-224,"Illegal parameter value"'),
+        (b"FIRE", b'-113,"Undefined header"'),
+    ],
+)
+def test_the_source_names_the_error_of_a_command(command, error):
+    source = EmulatedKeithley6430(Circuit(Unstrained()))
+    assert source.feed(command + b"\nSYST:ERR?\n") == error + b"\n"
+
+
 class Unstrained:
     def resistances_ohm(self) -> tuple[float, float]:
         return R1, R2

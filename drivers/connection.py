@@ -365,16 +365,16 @@ class SerialLink(Link):
 
 @dataclass(eq=False)
 class TcpLink(Link):
-    """Keeps a TCP connection to an instrument open, at the port of this number."""
+    """Keeps a TCP connection to an instrument open."""
 
     host: str
-    number: int
+    tcp_port: int
 
     async def _connect(self) -> Port:
         try:
-            return await TcpPort.connect(self.host, self.number)
+            return await TcpPort.connect(self.host, self.tcp_port)
         except OSError as error:  # includes a timeout
             raise DeviceNotFoundError(
-                f"Nothing answers at {self.host}:{self.number} ({error or 'no answer'}); see that it is on and its "
+                f"Nothing answers at {self.host}:{self.tcp_port} ({error or 'no answer'}); see that it is on and its "
                 "address is right."
             ) from error

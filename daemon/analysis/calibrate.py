@@ -94,7 +94,7 @@ def calibrate(
     others: list[tuple[str, FrameSeries]] = []
     all_live = True
     for path in paths:
-        beside: list[FrameSeries] = []
+        not_fitted: list[FrameSeries] = []
         if path.is_dir():
             own, all_live = read_series(path), False
         else:
@@ -102,9 +102,9 @@ def calibrate(
             own, all_live = [series_of(recording, sides, tool_mm)], all_live and recording.live
             if sides is not None and load_cell_delay_s is None:
                 # Other sides may show the load cell's delay better.
-                beside = [series_of(recording, (side,), tool_mm) for side in recording.sides if side not in sides]
+                not_fitted = [series_of(recording, (side,), tool_mm) for side in recording.sides if side not in sides]
         chosen += [(path, part_of(one, *time_range)) for one in own]
-        others += [(f"{path.name}, {one.sides[0]}", part_of(one, *time_range)) for one in beside]
+        others += [(f"{path.name}, {one.sides[0]}", part_of(one, *time_range)) for one in not_fitted]
     parts = [part for _, part in chosen]
     check_no_copies([(str(path), part) for path, part in chosen])
     if load_cell_delay_s:

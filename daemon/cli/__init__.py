@@ -85,7 +85,7 @@ class Parser(argparse.ArgumentParser):
         raise UserError(f"{self._plain(message)}; see `{self.prog} --help`")
 
     def _plain(self, message: str) -> str:
-        """Return argparse's message with the nearest known word; that of a value without `argument` before it."""
+        """Return argparse's message without `argument`, and with the nearest known word."""
         value = re.fullmatch(r"argument (\S+): (.* is .*)", message)
         if value is not None:
             return f"{value[1]} {value[2]}"

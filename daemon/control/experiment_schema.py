@@ -279,7 +279,7 @@ def check_steps(file: ExperimentFile) -> list[Mistake]:
             case HoldTorqueStep() if not identified:
                 cure = "put an `identify` step before it, after the last `tare`, `grip`, `release` or `adapt`"
                 found.append((("steps", number), f"hold_torque needs an identified tool; {cure}"))
-                # Told once.
+                # One sentence is enough.
                 identified = True
     return found
 
@@ -293,7 +293,7 @@ def _forgets_tool(step: Step, torque_source: str) -> bool:
 
 
 class Demand(NamedTuple):
-    """What a step asks for at most, from the torque source (N·m) and from the angle at the grip (rad); its times.
+    """The largest torque (N·m) and angle from the grip (rad) of a step, and its times.
 
     It stands still for `stands_s` in all, and takes about `moves_s` for everything else.
     """
@@ -305,7 +305,7 @@ class Demand(NamedTuple):
 
 
 def demand(step: Step) -> Demand:
-    """Return what a step asks for; what is unknown, as in an outline, is 0."""
+    """Return the demand of a step; unknown values, as in an outline, are 0."""
     match step:
         case HoldTorqueStep(torque_nm=torque_nm):
             return Demand(abs(torque_nm), stands_s=step.hold_s, moves_s=abs(torque_nm) / step.ramp_nm_per_s)

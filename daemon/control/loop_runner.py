@@ -81,7 +81,7 @@ class Tareable(Protocol):
     """A sensor with a zero."""
 
     def tare(self) -> None:
-        """Take a new zero from what is measured from now on."""
+        """Take a new zero from later measurements."""
 
     async def tare_and_wait(self, within_s: float) -> str | None:
         """Take a new zero and wait until it is done; return None, or why it was not taken."""

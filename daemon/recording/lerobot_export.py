@@ -198,7 +198,7 @@ class _Dataset:
         return self._files
 
     def _known_messages(self, path: Path, progress: Progress) -> Iterator[_Known]:
-        """Yield the messages in the order in which the daemon had them, which is not that of their measurement."""
+        """Yield the messages by the time when the daemon had them, not by their measurement."""
         waiting: list[_Known] = []
         for number, (topic, content, message) in enumerate(read_messages(path, self._held, progress)):
             if number == 0:

@@ -302,4 +302,4 @@ def _decode(line: bytes) -> tuple[int, Message]:
         number, name, content = line.split(b" ", 2)
         return int(number), _ADAPTERS[name.decode()].validate_json(content, strict=True)
     except (ValueError, KeyError) as error:
-        raise ProtocolError(f"The pipe to the robot's worker carries an invalid message: {error}.") from error
+        raise ProtocolError(f"The pipe to the robot's worker carries an invalid message: {line[:80]!r}.") from error

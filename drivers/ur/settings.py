@@ -22,8 +22,8 @@ _CLIENT_BOUNDS = {
     "linear_speed_m_per_s": 3.0,
     "linear_acceleration_m_per_s2": 150.0,
 }
-# The robot goes on alone for so long.
-_Alone = Annotated[float, Field(gt=0, le=1)]
+# For so long the arm may move without its daemon.
+_Deadline = Annotated[float, Field(gt=0, le=1)]
 _Positive = Annotated[float, Field(gt=0)]
 # The wrist stands this long after the last decision (docs/safety.md).
 _PROMISED_S = 0.2
@@ -140,11 +140,11 @@ class UrSettings(_Checked):
     """Robot states per second."""
     watchdog_hz: Annotated[float, Field(ge=1)] = 10.0
     """The robot ends its program when it receives nothing for 1/watchdog_hz."""
-    command_timeout_s: _Alone = 0.1
+    command_timeout_s: _Deadline = 0.1
     """A wrist speed holds for this long after it was decided; then the wrist stops."""
-    silence_timeout_s: _Alone = 0.1
+    silence_timeout_s: _Deadline = 0.1
     """Other motion stops when the daemon sends nothing for this long."""
-    state_timeout_s: _Alone = 0.25
+    state_timeout_s: _Deadline = 0.25
     """An older state blocks motion; at three times this age the connection counts as lost."""
     connect_timeout_s: Annotated[float, Field(gt=0, le=60)] = 10.0
     """Time for connecting."""

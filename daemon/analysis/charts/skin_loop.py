@@ -258,8 +258,7 @@ def limit_cycle_figure(gains: Sequence[SkinHold], delays: Sequence[SkinHold], sh
         axes.axhline(1.0, color="black", lw=1, ls=":")
         if value == "width_n":
             axes.axhspan(-0.05, 1.0, color="#55a868", alpha=0.08, lw=0)
-            beside = axes.get_yaxis_transform()
-            axes.text(0.02, 0.96, "allowed: up to 2 μFn", transform=beside, fontsize=8, va="top")
+            axes.text(0.02, 0.96, "allowed: up to 2 μFn", transform=axes.get_yaxis_transform(), fontsize=8, va="top")
     handles, labels = made.axes[1].get_legend_handles_labels()
     made.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
     made.axes[3].legend(fontsize=8)

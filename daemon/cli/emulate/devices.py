@@ -142,10 +142,10 @@ def robot_make(args: argparse.Namespace) -> "ControllerSpec":
     return ControllerSpec(unlock_wait_s=args.unlock_wait_s, power_on_s=args.power_on_s)
 
 
-async def play_robot(controller: "Controller", *beside: Callable[[], Playing]) -> None:
-    """Play a controller and print its events; run the others beside it once it listens."""
+async def play_robot(controller: "Controller", *others: Callable[[], Playing]) -> None:
+    """Play a controller and print its events; run `others` too once it listens."""
     async with controller.open(), asyncio.TaskGroup() as group:
-        for run in beside:
+        for run in others:
             group.create_task(run())
         async for event in controller.run():
             console.print_event(event.name, detail=event.detail, time_s=round(event.time_s, 6))

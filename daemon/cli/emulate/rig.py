@@ -116,10 +116,10 @@ def _play_rig(args: argparse.Namespace) -> Playing:
         sketch=replace(PAPER_SKETCH, noise_counts=NOISE_NM) if args.paper_sketch else None,
         seed=args.seed,
     )
-    beside: list[Callable[[], Playing]] = [rig.run, partial(_print_ready, rig, args.host)]
+    others: list[Callable[[], Playing]] = [rig.run, partial(_print_ready, rig, args.host)]
     if args.truth is not None:
-        beside.append(partial(_write_truths, rig, args.truth, TRUTH_PERIOD_S / args.speed))
-    return console.play(play_robot(rig.controller, *beside), partial(_obey, rig))
+        others.append(partial(_write_truths, rig, args.truth, TRUTH_PERIOD_S / args.speed))
+    return console.play(play_robot(rig.controller, *others), partial(_obey, rig))
 
 
 async def _print_ready(rig: "EmulatedRig", host: str) -> None:

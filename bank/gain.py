@@ -16,9 +16,10 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.confidence import TWO_SIDED_95
 
-# Standard deviation of the logarithm of one fingertip's gain between recordings, and the recordings that it counts as.
-# Cylinders and days recorded twice differ by factors of 0.44 to 1.4.
-PRIOR_SPREAD, _PRIOR_RECORDINGS = 0.28, 3
+# Standard deviation of the logarithm of the gain between recordings, for one fingertip and for two, and the recordings
+# that it counts as. Cylinders and days recorded twice differ by factors of 0.44 to 1.4 for one fingertip, of 0.86 and
+# 1.2 for two (docs/decisions/0044).
+PRIOR_SPREADS, _PRIOR_RECORDINGS = {1: 0.28, 2: 0.16}, 3
 # Twists of a recording differ at least by this; a few alike are chance.
 _LEAST_WITHIN = 0.05
 _LEAST_NOISE, _LEAST_ZERO, _ROUNDS = 1e-3, 1e-6, 200
@@ -56,7 +57,7 @@ class GainSpread:
         noise_nm = float(np.sqrt(np.mean(np.concatenate(residuals) ** 2))) if twists else 0.0
         noise_nm = max(noise_nm, _LEAST_NOISE * float(np.abs(truth).max(initial=0.0)))
         within = float(np.std(np.log(gains))) if twists else 0.0
-        prior = cls(PRIOR_SPREAD / math.sqrt(m), max(within, _LEAST_WITHIN), noise_nm)
+        prior = cls(PRIOR_SPREADS[m], max(within, _LEAST_WITHIN), noise_nm)
         return prior._with_recordings([math.log(one) ** 2 for one in recordings])
 
     def _with_recordings(self, squares: Sequence[float]) -> Self:

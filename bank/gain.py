@@ -20,6 +20,9 @@ from shearloop.bank.confidence import TWO_SIDED_95
 # that it counts as. Cylinders and days recorded twice differ by factors of 0.44 to 1.4 for one fingertip, of 0.86 and
 # 1.2 for two (docs/decisions/0044).
 PRIOR_SPREADS, _PRIOR_RECORDINGS = {1: 0.28, 2: 0.16}, 3
+# The same of a calibration on fewer twists, where nothing shows that the torque repeats. Of two recordings with one
+# twist each the gains differ by factors of 3.0 (right), 2.2 (left) and 1.1 (both).
+_REPEATING_TWISTS, _UNREPEATED_SPREADS = 3, {1: 0.9, 2: 0.24}
 # Twists of a recording differ at least by this; a few alike are chance.
 _LEAST_WITHIN = 0.05
 _LEAST_NOISE, _LEAST_ZERO, _ROUNDS = 1e-3, 1e-6, 200
@@ -57,7 +60,8 @@ class GainSpread:
         noise_nm = float(np.sqrt(np.mean(np.concatenate(residuals) ** 2))) if twists else 0.0
         noise_nm = max(noise_nm, _LEAST_NOISE * float(np.abs(truth).max(initial=0.0)))
         within = float(np.std(np.log(gains))) if twists else 0.0
-        prior = cls(PRIOR_SPREADS[m], max(within, _LEAST_WITHIN), noise_nm)
+        spreads = _UNREPEATED_SPREADS if 0 < len(twists) < _REPEATING_TWISTS else PRIOR_SPREADS
+        prior = cls(spreads[m], max(within, _LEAST_WITHIN), noise_nm)
         return prior._with_recordings([math.log(one) ** 2 for one in recordings])
 
     def _with_recordings(self, squares: Sequence[float]) -> Self:

@@ -352,7 +352,7 @@ def fit_interval_regressor(
     """Fit to (n, d) features and (n,) values in time order.
 
     `left_out` are pairs of rows to fit to and rows to validate on; by default blocks of time in turn. With `twists`
-    instead each pair counts as one error, because the frames of a twist err alike. Torques of slices
+    instead each pair with a load counts as one error, because the frames of a twist err alike. Torques of slices
     come with `fit_line`: they keep their sign, and unless they cover the `full_range` that will ever occur, it fits
     what reads values beyond it. `bounds` are the least and largest value (n,) that each frame may have: intervals
     extend to the further one. With the number of each row's recording, `recordings` (n,), intervals allow for the gain
@@ -378,7 +378,10 @@ def fit_interval_regressor(
     edges = (-point.sigma, 0.0, 0.4 * float(np.abs(values).max())) if isinstance(point, CensoredRidge) else ()
     inflation = 1.0 if isinstance(point, InverseCalibration) else _INFLATION
     if twists or left_out:
-        inflation = student_inflation(len(twists) or len(np.unique(rows)))
+        loads = np.concatenate(find_twists(values)) if twists else rows
+        inflation = student_inflation(
+            sum(bool(np.isin(part, loads).any()) for _, part in twists) or len(np.unique(rows))
+        )
     centre = features.mean(axis=0)
     deviation = np.abs(features - centre).max(axis=0) if limit_features else np.zeros(0)
     least = LEAST_HALF_WIDTH * float(np.ptp(values))

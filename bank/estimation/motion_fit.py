@@ -31,8 +31,8 @@ _STEPS_WITH_POSITION = (6,)
 _NEARLY_AS_GOOD = 1.25
 # Fewest twists that are left out one by one, and most parts; with more twists, neighbours are left out together.
 _LEAST_TWISTS, _MOST_PARTS = 3, 10
-# Fewest parts with a load for a choice; with fewer, one direction serves.
-_LEAST_LOADED_PARTS = 3
+# Where loads are rarer than this share of the frames, few twists are left out by so many frames.
+_RARE_LOAD, _FRAMES_OF_FEW_TWISTS = 0.5, 2
 # The slope is divided out where left-out loads err by less than this share: a poor estimate has no sure slope. On the
 # recorded stream both fingertips have 0.08, right 0.11, left 0.25.
 _SURE_SLOPE = 0.15
@@ -129,14 +129,17 @@ def mean_ridge(members: Sequence[Ridge]) -> Ridge:
 def twists_left_out(torque_nm: FloatArray) -> LeftOut:
     """Return (rest, part) of (n,) torques in time order, where a part is a twist or some, with frames on both sides.
 
-    The list is empty for fewer than three twists.
+    Of fewer than three twists among many frames without a load, a part is two frames: a whole twist left out would
+    leave nothing to learn from. The list is empty for a load that hardly ever ends.
     """
     n, twists = len(torque_nm), find_twists(torque_nm)
-    if len(twists) < _LEAST_TWISTS:
+    if len(twists) >= _LEAST_TWISTS:
+        ends = [(before[-1] + after[0] + 1) // 2 for before, after in itertools.pairwise(twists)]
+        number = np.searchsorted(ends, np.arange(n), side="right")
+        return left_out_groups(number * min(len(twists), _MOST_PARTS) // len(twists))
+    if sum(map(len, twists)) > _RARE_LOAD * n:
         return []
-    ends = [(before[-1] + after[0] + 1) // 2 for before, after in itertools.pairwise(twists)]
-    number = np.searchsorted(ends, np.arange(n), side="right")
-    return left_out_groups(number * min(len(twists), _MOST_PARTS) // len(twists))
+    return left_out_groups(np.arange(n) // _FRAMES_OF_FEW_TWISTS)
 
 
 def choose_motion(
@@ -149,8 +152,10 @@ def choose_motion(
     position: bool,
 ) -> MotionFit:
     """Return the fit of (n, d) features, with all of the layout's columns, to (n,) torques."""
-    loaded = np.concatenate(find_twists(torque_nm))
-    can_choose = sum(bool(np.isin(part, loaded).any()) for _, part in left_out) >= _LEAST_LOADED_PARTS
+    twists = find_twists(torque_nm)
+    loaded = np.concatenate(twists)
+    # A single twist cannot tell which fit another one needs: one direction is the safest.
+    can_choose = len(twists) >= _LEAST_TWISTS or len(loaded) > _RARE_LOAD * len(torque_nm)
     directions, steps = _DIRECTIONS if can_choose else (1,), _STEPS_WITH_POSITION if position else _STEPS
     candidates = tuple(itertools.starmap(Candidate, itertools.product(directions, steps, _PENALTIES)))
     fits = [MotionFit(layout, fit_one, position, (one,)) for one in candidates]

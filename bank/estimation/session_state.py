@@ -87,7 +87,7 @@ class Motion:
         return np.zeros((*channels.shape[:-2], 0))
 
     def features(self, _positions: Sequence[FloatArray], _from_idle: FloatArray) -> FloatArray:
-        """Return the features of the last n_needed to n_lags + 1 (p,) positions, and of the newest one."""
+        """Return the features of the last n_needed to n_lags + 1 (p,) positions, and of the newest one's from idle."""
         return np.zeros(0)
 
     def impute(

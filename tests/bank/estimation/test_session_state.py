@@ -190,9 +190,9 @@ def test_what_is_valid_is_of_one_grip_and_hardly_made_up(motion_calibration):
             account.append(None if spoilt or changed else held)
             before, other = before if spoilt or changed else held, changed
             if not moment.reasons:
-                last = account[-motion.n_lags - 1 :]
+                last = account[-motion.n_needed :]
                 assert not spoilt
-                assert len(last) >= motion.n_needed
+                assert len(last) == motion.n_needed
                 assert last.count(None) <= max(3, motion.n_lags // 4)
                 assert set(last) <= {True, None}
                 for found in (moment.difference, moment.mean_difference):

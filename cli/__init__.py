@@ -17,8 +17,8 @@ from types import ModuleType
 from typing import Any, NoReturn
 
 from shearloop.daemon.errors import USER_ERRORS
-from shearloop.errors import UserError
 from shearloop.daemon.process import interrupt_status, raise_ending_signals
+from shearloop.errors import UserError
 
 # Our products are small: a BLAS with one thread is faster. Must be set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -36,20 +36,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from shearloop.bank.bank_file import Bank
     from shearloop.bank.pruned_matching import PrunedMatcher as Matcher
-    from shearloop.estimation import (
-        Calibration,
-        Estimate,
-        EstimatorSession,
-        FrameSeries,
-        Physics,
-        TactileFrame,
-        fit,
-    )
-    from shearloop.tools.evaluate import estimate_series, figures_by_load
-    from shearloop.tools.frame_series import read_series
-    from shearloop.studies.emulated_calibration import emulate_recordings
     from shearloop.daemon.messaging.client import Subscriber
     from shearloop.daemon.messaging.keys import ClientKeys
+    from shearloop.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, Physics, TactileFrame, fit
+    from shearloop.studies.emulated_calibration import emulate_recordings
+    from shearloop.tools.evaluate import estimate_series, figures_by_load
+    from shearloop.tools.frame_series import read_series
     from shearloop.tools.recordings.tables import read
 
 __all__ = [

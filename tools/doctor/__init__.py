@@ -13,6 +13,8 @@ from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import BankError
 from shearloop.cli.check import check_parts
 from shearloop.daemon.config import CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
+from shearloop.drivers.ur.client import missing_library
+from shearloop.errors import UserError
 from shearloop.tools.doctor.devices import (
     Finding,
     check_daemon,
@@ -25,9 +27,7 @@ from shearloop.tools.doctor.devices import (
     note,
     trouble,
 )
-from shearloop.errors import UserError
 from shearloop.tools.serial_ports import list_serial_ports
-from shearloop.drivers.ur.client import missing_library
 
 __all__ = ["Finding", "examine"]
 

@@ -16,12 +16,10 @@ import numpy as np
 
 from shearloop.cli.terminal import task_row
 from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig, LoadCellConfig, SerialDevice
-from shearloop.errors import UserError
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.rig import make_gripper_client
 from shearloop.daemon.sensing.frame_estimator import fingertip_table
-from shearloop.tools.serial_ports import access_error
 from shearloop.drivers.connection import SerialLink, find_port
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.errors import DriverError
@@ -29,6 +27,8 @@ from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.messages import ActivationStatus
 from shearloop.drivers.ur.control_box import query_controller, untested_sentence
 from shearloop.drivers.ur.settings import read_settings
+from shearloop.errors import UserError
+from shearloop.tools.serial_ports import access_error
 
 # A larger relative difference between measured and configured rate is reported.
 RATE_TOLERANCE = 0.1

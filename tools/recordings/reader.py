@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 from pydantic_core import from_json
 
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
-from shearloop.estimation import Measured
-from shearloop.errors import UserError
+from shearloop.daemon.control.fingertip_diameters import tool_from_bytes
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.writer import PARTIAL, new_writer
-from shearloop.daemon.control.fingertip_diameters import tool_from_bytes
 from shearloop.drivers.serial_sensor import InputKind
+from shearloop.errors import UserError
+from shearloop.estimation import Measured
 from shearloop.files import open_file, replace_file
 
 Progress = Callable[[int], None]

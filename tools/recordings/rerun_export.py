@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.fingertip import Fingertip
-from shearloop.errors import require
 from shearloop.daemon.messaging.messages import ENVELOPE, EitEstimate, EitHeatmap, RobotStateMessage
 from shearloop.daemon.recorder import schema
-from shearloop.tools.recordings.reader import Progress, read_messages
 from shearloop.daemon.web.message_store import conductivity_profile
+from shearloop.errors import require
+from shearloop.tools.recordings.reader import Progress, read_messages
 
 TIMELINE = "time"
 # Values of an entity that are sent at once, and images.

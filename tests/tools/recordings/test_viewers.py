@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.cli import main
-from shearloop.errors import UserError
 from shearloop.daemon.messaging.messages import TOPICS, decode, encode, wire_map
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.writer import McapFile
+from shearloop.errors import UserError
 from tests.sample_messages import sample
 
 CONFIG = Path(__file__).parents[3] / "config"

@@ -1,1 +1,1 @@
-"""The EIT fingertip's physics: channels, mesh, forward models, basis models, bank file, matching. No clock, no network."""
+"""The EIT fingertip's physics: channels, mesh, forward models, basis models, bank file, matching. No clock."""

@@ -11,7 +11,7 @@ from pathlib import Path
 import grimp
 import pytest
 
-FOLDERS = ("bank", "drivers", "daemon")
+FOLDERS = ("bank", "estimation", "drivers", "emulators", "daemon", "tools", "studies", "cli")
 LONGEST_FUNCTION = 60
 MOST_ATTRIBUTES = 12
 MOST_CALLABLES = 0.05

@@ -30,8 +30,9 @@ Follow a running daemon, with `for` or `async for`:
             print(message["torque_nm"])
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from shearloop.faces import importer
 
 if TYPE_CHECKING:
     from shearloop.bank.bank_file import Bank
@@ -63,7 +64,6 @@ __all__ = [
     "read_series",
 ]
 
-# Imported on first use: the command line answers at once.
 _HOMES = {
     "Bank": "shearloop.bank.bank_file:Bank",
     "Calibration": "shearloop.estimation:Calibration",
@@ -82,13 +82,4 @@ _HOMES = {
     "read": "shearloop.tools.recordings.tables:read",
     "read_series": "shearloop.tools.frame_series:read_series",
 }
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'shearloop' has no attribute {name!r}")
-    module, _, attribute = _HOMES[name].partition(":")
-    value = getattr(importlib.import_module(module), attribute)
-    globals()[name] = value
-    return value
+__getattr__ = importer(__name__, globals(), _HOMES)

@@ -9,7 +9,6 @@ from functools import cache
 from pathlib import Path
 
 import grimp
-import pytest
 
 FOLDERS = ("bank", "estimation", "drivers", "emulators", "daemon", "tools", "studies", "cli")
 LONGEST_FUNCTION = 60

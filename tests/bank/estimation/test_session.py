@@ -200,6 +200,9 @@ def test_another_tool_is_refused_for_as_long_as_it_is_held(motion_calibration):
     assert set(refused) <= {*range(70, 80), *range(90, 100)}
     assert len(refused) > 15
     assert all(same), "earlier tools change nothing that it remembers"
+    assert tracker.why_no_torque == ""
+    tracker.set_tool(Measured(14.0, 1.0))
+    assert tracker.why_no_torque.startswith("the tool has 14 mm")
     unknown = EstimatorSession(motion_calibration)
     unknown.set_tool(Measured(14.0, 0.1))
     assert any(one.valid for one in follow(unknown, twisted))

@@ -251,7 +251,7 @@ def test_another_tool_counts_after_a_corrected_gain_too(motion_calibration):
 
 def test_a_gain_without_a_known_diameter_is_not_corrected(motion_calibration):
     (unknown,), _ = adapted_sessions(motion_calibration, None)
-    with pytest.raises(CalibrationError, match="name the held tool's diameter"):
+    with pytest.raises(CalibrationError, match="without the tool's diameter"):
         unknown.adapt(np.ones(len(unknown.grip_t_s)))
 
 

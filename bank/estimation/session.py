@@ -158,6 +158,11 @@ class EstimatorSession:
         self._grip = _Grip()
 
     @property
+    def why_no_torque(self) -> str:
+        """Why the held tool leaves no torque, though there may be a diameter; empty where it does not."""
+        return "; ".join(self._tool_reasons)
+
+    @property
     def taring(self) -> bool:
         """Whether frames are being averaged into the idle frame."""
         return self._state.taring

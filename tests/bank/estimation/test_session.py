@@ -201,6 +201,9 @@ def test_another_tool_is_refused_for_as_long_as_it_is_held(motion_calibration):
     assert set(refused) <= {*range(70, 80), *range(90, 100)}
     assert len(refused) > 15
     assert all(same), "earlier tools change nothing that it remembers"
+    assert tracker.why_no_torque == ""
+    tracker.set_tool(Measured(14.0, 1.0))
+    assert tracker.why_no_torque.startswith("the tool has 14 mm")
     unknown = EstimatorSession(motion_calibration)
     unknown.set_tool(Measured(14.0, 0.1))
     assert any(one.valid for one in follow(unknown, twisted))
@@ -248,7 +251,7 @@ def test_another_tool_counts_after_a_corrected_gain_too(motion_calibration):
 
 def test_a_gain_without_a_known_diameter_is_not_corrected(motion_calibration):
     (unknown,), _ = adapted_sessions(motion_calibration, None)
-    with pytest.raises(CalibrationError, match="name the held tool's diameter"):
+    with pytest.raises(CalibrationError, match="without the tool's diameter"):
         unknown.adapt(np.ones(len(unknown.grip_t_s)))
 
 

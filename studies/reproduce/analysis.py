@@ -26,6 +26,7 @@ from shearloop.bank.matching import Match, ReferenceMatcher, best_match
 from shearloop.bank.mesh import Mesh
 from shearloop.bank.models import MODELS
 from shearloop.errors import UserError
+from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.matlab_import import (
     DIAMETER_FOLDER,
     RAW_FRAME,
@@ -36,7 +37,6 @@ from shearloop.tools.recordings.matlab_import import (
     read_line,
     read_torque_slices,
 )
-from shearloop.tools.recordings.reader import Progress
 from shearloop.words import counted
 
 # Torque is a parabola over σ and diameter a line over k (Trehan et al. 2025, figures 8 and 9).

@@ -11,7 +11,8 @@ from scipy.io import savemat
 
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError, require
-from shearloop.tools.recordings.reader import Progress, read_messages
+from shearloop.tools.recordings.intact_records import Progress
+from shearloop.tools.recordings.reader import read_messages
 from shearloop.tools.recordings.tables import Rows, arrays, columns_of, read_rows, row_of
 
 # Numbers of a Parquet table that are written at once.

@@ -24,7 +24,8 @@ from shearloop.daemon.messaging.messages import (
 )
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError, require
-from shearloop.tools.recordings.reader import Progress, open_recording, read_messages, reading
+from shearloop.tools.recordings.intact_records import Progress
+from shearloop.tools.recordings.reader import open_recording, read_messages, reading
 
 ROWS_PER_S = 25
 _PERIOD_NS = 10**9 // ROWS_PER_S

@@ -12,7 +12,8 @@ from shearloop.daemon.messaging.messages import ENVELOPE, EitEstimate, EitHeatma
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.web.message_store import conductivity_profile
 from shearloop.errors import require
-from shearloop.tools.recordings.reader import Progress, read_messages
+from shearloop.tools.recordings.intact_records import Progress
+from shearloop.tools.recordings.reader import read_messages
 
 TIMELINE = "time"
 # Values of an entity that are sent at once, and images.

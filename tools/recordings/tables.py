@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.errors import missing
-from shearloop.tools.recordings.reader import Progress, open_recording, read_messages
+from shearloop.tools.recordings.intact_records import Progress
+from shearloop.tools.recordings.reader import open_recording, read_messages
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.drivers.emulators.ur_controller import Controller
-from shearloop.drivers.emulators.ur_robot import Robot
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.control_box import (
     SERVICES,
@@ -24,6 +22,8 @@ from shearloop.drivers.ur.control_box import (
 )
 from shearloop.drivers.ur.messages import ROBOT_MODES, RUNTIME_STATES, SAFETY_MODES, RobotLostError, Unlock
 from shearloop.drivers.ur.motion import why_unfit
+from shearloop.emulators.ur_controller import Controller
+from shearloop.emulators.ur_robot import Robot
 from tests.drivers.ur.flight import AT_REST, SETTINGS, flying
 from tests.emulator_process import own_address
 

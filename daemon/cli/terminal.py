@@ -172,20 +172,37 @@ def message_json(topic: str, content: Mapping[str, Any]) -> str:
 def _estimate(content: Mapping[str, Any]) -> str:
     if not content["valid"]:
         return f"no estimate: {content['reason']}"
-    diameter = "" if content["diameter_mm"] is None else f"   diameter {content['diameter_mm']:5.1f} mm"
-    cell = "" if content["k"] is None else f"   k {content['k']:.3f}  sigma {content['sigma']:.3f} cm"
-    score = "" if content["score"] is None else f"   score {content['score']:.3f}"
-    interval = f"[{content['torque_low_nm']:+.4f}, {content['torque_high_nm']:+.4f}]"
-    return f"torque {content['torque_nm']:+.4f} N·m {interval}{diameter}{cell}{score}"
+    torque = _with_interval(content, "torque", "nm", "torque {:+.4f} N·m", "[{:+.4f}, {:+.4f}]")
+    details = (
+        _present("diameter {:5.1f} mm", content["diameter_mm"]),
+        _present("k {:.3f}  sigma {:.3f} cm", content["k"], content["sigma"]),
+        _present("score {:.3f}", content["score"]),
+    )
+    return "   ".join(filter(None, (torque or "no torque", *details)))
 
 
 def _shear(content: Mapping[str, Any]) -> str:
     if not content["valid"]:
         return f"no force: {content['reason']}"
-    interval = f"[{content['shear_low_n']:+.3f}, {content['shear_high_n']:+.3f}]"
-    torque = "" if content["torque_nm"] is None else f"   torque {content['torque_nm']:+.4f} N·m"
-    direction = "within the deadband" if content["deadband"] else content["direction"]
-    return f"shear {content['shear_n']:+.3f} N {interval}{torque}   response {content['response']:+.5f}   {direction}"
+    shear = _with_interval(content, "shear", "n", "shear {:+.3f} N", "[{:+.3f}, {:+.3f}]")
+    details = (
+        _present("torque {:+.4f} N·m", content["torque_nm"]),
+        _present("response {:+.5f}", content["response"]),
+        "within the deadband" if content["deadband"] else content["direction"],
+    )
+    return "   ".join(filter(None, (shear or "no force", *details)))
+
+
+def _with_interval(content: Mapping[str, Any], name: str, unit: str, value: str, interval: str) -> str:
+    """Return a value with its interval, or alone without one end of it; empty without the value."""
+    shown = _present(value, content[f"{name}_{unit}"])
+    ends = _present(interval, content[f"{name}_low_{unit}"], content[f"{name}_high_{unit}"])
+    return f"{shown} {ends}" if shown and ends else shown
+
+
+def _present(pattern: str, *values: float | None) -> str:
+    """Return the values in their pattern, empty if one of them is None."""
+    return "" if any(value is None for value in values) else pattern.format(*values)
 
 
 def loop_line(content: Mapping[str, Any]) -> str:

@@ -7,6 +7,8 @@ import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WithJsonSchema
 
 from shearloop.daemon.config_file import ConfigModel, either, not_of_kind
+from shearloop.drivers import ranges
+from shearloop.drivers.ranges import LARGEST_ANGLE_RAD
 from shearloop.yaml_files import shown
 
 MOST_ANGLES = 1000
@@ -32,11 +34,9 @@ def _angles(given: object) -> object:
     return tuple(np.linspace(start, stop, steps).tolist())
 
 
-LARGEST_ANGLE_RAD = 6.28
-Angle = Annotated[float, Field(ge=-LARGEST_ANGLE_RAD, le=LARGEST_ANGLE_RAD)]
-_ANGLE = {"type": "number", "minimum": -LARGEST_ANGLE_RAD, "maximum": LARGEST_ANGLE_RAD}
+_ANGLE = {"type": "number", "minimum": -LARGEST_ANGLE_RAD, "maximum": LARGEST_ANGLE_RAD, "unit": "rad"}
 Angles = Annotated[
-    tuple[Angle, ...],
+    tuple[ranges.Angle, ...],
     Field(min_length=1),
     BeforeValidator(_angles),
     WithJsonSchema(
@@ -50,22 +50,17 @@ Angles = Annotated[
         }
     ),
 ]
-Seconds = Annotated[float, Field(ge=0, le=24 * 3600)]
-TorqueNm = Annotated[float, Field(ge=-5, le=5)]
-PositiveTorqueNm = Annotated[float, Field(gt=0, le=5)]
-WristSpeed = Annotated[float, Field(gt=0, le=3.14, description="speed of the wrist")]
-Pose = tuple[float, float, float, float, float, float]
 
 
 class ExperimentLimits(ConfigModel):
     """Limits of all steps; a step's limits can only be tighter."""
 
-    torque_nm: PositiveTorqueNm = Field(default=0.5, description="a larger torque stops the motion")
-    angle_rad: Annotated[float, Field(gt=0, le=6.28, description="from the angle at which the tool was gripped")] = 3.2
+    torque_nm: ranges.TorqueLimit = Field(default=0.5, description="a larger torque stops the motion")
+    angle_rad: ranges.Turn = Field(default=3.2, description="from the angle at which the tool was gripped")
 
 
 class _Step(ConfigModel):
-    timeout_s: float | None = Field(None, gt=0, le=24 * 3600, description="a longer step stops the experiment")
+    timeout_s: ranges.Duration | None = Field(None, description="a longer step stops the experiment")
     limits: ExperimentLimits | None = Field(None, description="tighter limits for this step")
 
 
@@ -73,7 +68,7 @@ class ApproachStep(_Step):
     """Move the tool centre in a straight line, to a pose or by a distance along the tool's axis."""
 
     do: Literal["approach"]
-    pose_m_rad: Pose | None = Field(None, description="x, y, z and rotation vector; else `along_tool_m`")
+    pose_m_rad: ranges.Pose | None = Field(None, description="x, y, z and rotation vector; else `along_tool_m`")
     along_tool_m: float | None = Field(None, ge=-0.5, le=0.5, description="along the tool's axis; else `pose_m_rad`")
     speed_m_per_s: float = Field(0.1, gt=0, le=0.5, description="speed of the tool centre")
 
@@ -129,8 +124,8 @@ class TwistStep(_Step):
     do: Literal["twist"]
     angles_rad: Angles
     absolute: bool = Field(False, description="angles of the wrist joint, not from the angle at the grip")
-    speed_rad_per_s: WristSpeed = 0.2
-    hold_s: Seconds = Field(2.0, description="time at each angle")
+    speed_rad_per_s: ranges.WristSpeed = Field(0.2, description="speed of the wrist")
+    hold_s: ranges.Seconds = Field(2.0, description="time at each angle")
     return_to_start: bool = Field(True, description="turn back after each round")
     repeats: int = Field(1, ge=1, le=1000, description="rounds over all angles")
 
@@ -139,26 +134,26 @@ class TurnToStep(_Step):
     """Turn the wrist joint to an angle, before a tool is gripped."""
 
     do: Literal["turn_to"]
-    angle_rad: float = Field(ge=-6.28, le=6.28, description="angle of the wrist joint")
-    speed_rad_per_s: WristSpeed = 0.4
+    angle_rad: ranges.Angle = Field(description="angle of the wrist joint")
+    speed_rad_per_s: ranges.WristSpeed = Field(0.4, description="speed of the wrist")
 
 
 class HoldTorqueStep(_Step):
     """Ramp the torque to a set point, and hold it in closed loop."""
 
     do: Literal["hold_torque"]
-    torque_nm: TorqueNm = Field(description="the set point; counterclockwise is positive")
+    torque_nm: ranges.TorqueSetpoint = Field(description="the set point; counterclockwise is positive")
     ramp_nm_per_s: float = Field(0.05, gt=0, le=1, description="rise of the set point")
-    hold_s: Seconds = Field(10.0, description="time at the set point")
+    hold_s: ranges.Seconds = Field(10.0, description="time at the set point")
 
 
 class TightenStep(_Step):
     """Turn until a torque or an angle is reached."""
 
     do: Literal["tighten"]
-    until_torque_nm: PositiveTorqueNm = Field(description="the turn ends at this torque")
-    until_angle_rad: float = Field(gt=0, le=6.28, description="the turn ends at this angle")
-    speed_rad_per_s: WristSpeed = 0.05
+    until_torque_nm: ranges.TorqueLimit = Field(description="the turn ends at this torque")
+    until_angle_rad: ranges.Turn = Field(description="the turn ends at this angle")
+    speed_rad_per_s: ranges.WristSpeed = Field(0.05, description="speed of the wrist")
     direction: Literal["clockwise", "counterclockwise"] = Field("clockwise", description="direction of the turn")
 
 
@@ -173,7 +168,7 @@ class WaitStep(_Step):
     """Stand still for a time."""
 
     do: Literal["wait"]
-    wait_s: Seconds = Field(description="time to stand still")
+    wait_s: ranges.Seconds = Field(description="time to stand still")
 
 
 # Every step is in one of three groups: it may twist a gripped tool, it may grip another one, or neither.
@@ -204,8 +199,10 @@ class ExperimentFile(ConfigModel):
 
     def limits_of(self, step: Step) -> ExperimentLimits:
         """Return the tighter of the experiment's limits and the step's."""
-        own = step.limits or self.limits
-        torque_nm, angle_rad = min(own.torque_nm, self.limits.torque_nm), min(own.angle_rad, self.limits.angle_rad)
+        own = {} if step.limits is None else step.limits.model_dump(exclude_unset=True)
+        whole = self.limits
+        torque_nm = min(own.get("torque_nm", whole.torque_nm), whole.torque_nm)
+        angle_rad = min(own.get("angle_rad", whole.angle_rad), whole.angle_rad)
         # The limits of an outline may be infinite.
         return ExperimentLimits.model_construct(torque_nm=torque_nm, angle_rad=angle_rad)
 

@@ -292,8 +292,8 @@ def with_packed_arrays(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def encode(content: Mapping[str, Any]) -> bytes:
-    """Return the second frame of a message."""
-    packed: bytes = msgpack.packb(content)
+    """Return the second frame of a message; bytes of a path that are not UTF-8 are written as `\\udcff`."""
+    packed: bytes = msgpack.packb(content, unicode_errors="backslashreplace")
     return packed
 
 

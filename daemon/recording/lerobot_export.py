@@ -24,7 +24,8 @@ from shearloop.daemon.messaging.messages import (
     SkinShear,
 )
 from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.reader import Progress, open_recording, read_messages, reading
+from shearloop.daemon.recording.intact_records import Progress
+from shearloop.daemon.recording.reader import open_recording, read_messages, reading
 
 ROWS_PER_S = 25
 _PERIOD_NS = 10**9 // ROWS_PER_S

@@ -145,14 +145,16 @@ class FingertipPipeline:
                 try:
                     self._adapt(reference, frames, now_ns)
                     ended.set_result(None)
-                except CalibrationError as error:
+                except Exception as error:  # noqa: BLE001 - it fails the step, and the frames go on
                     ended.set_exception(error)
         estimate = await self.estimator.estimate(*frames)
         now_ns = self.clock.now_ns()
         message = estimate_message(self.name, frames, estimate, now_ns)
         if self.loop is not None:
             t_mid_ns = message.t_mono_ns - round(1e9 * estimate.lag_s)
-            self.loop.on_torque(TorqueSample(self.name, estimate.torque_nm, message.reason, t_mid_ns, now_ns))
+            # An estimate is valid also with a diameter alone.
+            reason = message.reason or self.estimator.session.why_no_torque
+            self.loop.on_torque(TorqueSample(self.name, estimate.torque_nm, reason, t_mid_ns, now_ns))
         if self.gripper is not None:
             self.gripper.diameters.update(self.name, estimate, now_ns)
         self.publisher.publish(message)

@@ -231,3 +231,22 @@ def test_the_experiments_that_are_shipped_are_in_order_and_end(path):
     file = load_yaml_model(path, ExperimentFile)
     bench = Bench(Experiment(file, 0), tick_ns=100_000_000)
     bench.run()
+
+
+@pytest.mark.parametrize(
+    ("own", "torque_nm", "angle_rad"),
+    [
+        (None, 1.0, 5.0),
+        ({"angle_rad": 2.0}, 1.0, 2.0),
+        ({"torque_nm": 0.2}, 0.2, 5.0),
+        ({}, 1.0, 5.0),
+        ({"torque_nm": 2.0, "angle_rad": 6.0}, 1.0, 5.0),
+    ],
+)
+def test_a_steps_limits_change_only_what_they_name(own, torque_nm, angle_rad):
+    step = {"do": "wait", "wait_s": 1, **({} if own is None else {"limits": own})}
+    file = ExperimentFile.model_validate(
+        {"name": "one", "limits": {"torque_nm": 1.0, "angle_rad": 5.0}, "steps": [step]}
+    )
+    limits = file.limits_of(file.steps[0])
+    assert (limits.torque_nm, limits.angle_rad) == (torque_nm, angle_rad)

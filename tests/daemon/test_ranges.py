@@ -105,7 +105,7 @@ def test_a_whole_turn_is_a_range_of_a_joint(tmp_path):
         ({"do": "approach", "pose_m_rad": [90, 0.1, 0.4, 0, 3.1, 0]}, "did you mean 0.09, 90 mm in m?"),
         ({"do": "approach", "along_tool_m": 30}, "did you mean 0.03, 30 mm in m?"),
         ({"do": "turn_to", "angle_rad": 360}, "did you mean 6.283, 360 degrees in rad?"),
-        ({"do": "tighten", "until_torque_nm": 120, "until_angle_rad": 1}, "did you mean 0.12, 120 mN·m in N·m?"),
+        ({"do": "hold_torque", "torque_nm": 120}, "did you mean 0.12, 120 mN·m in N·m?"),
         ({"do": "grip", "width_mm": 1e300}, "is too large"),
     ],
 )

@@ -14,7 +14,7 @@ from pathlib import Path
 import structlog
 
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake, check_steps, outline
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 from shearloop.files import read_file
 from shearloop.yaml_files import MOST_BYTES, Document, shown
 

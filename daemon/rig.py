@@ -9,14 +9,14 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.control import experiment_schema
 from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import Creep, TorqueSource
 from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, Tareable, wrench_source
 from shearloop.daemon.experiment_files import ExperimentFiles, read_document, without_mistakes
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.recording.recorder import AttachedFile, Recorder
-from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
+from shearloop.daemon.recorder.recorder import AttachedFile, Recorder
 from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipPipeline, FingertipTask
 from shearloop.daemon.sensing.frame_estimator import (
     COMBINED,

@@ -1,10 +1,11 @@
 """The experiment file: its limits and its steps, as pydantic models with bounds that the rig can keep."""
 
 import math
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
-from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WithJsonSchema
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WithJsonSchema, model_validator
 
 from shearloop.daemon.config_file import ConfigModel, either, not_of_kind
 from shearloop.drivers import ranges
@@ -138,13 +139,36 @@ class TurnToStep(_Step):
     speed_rad_per_s: ranges.WristSpeed = Field(0.4, description="speed of the wrist")
 
 
+# Of a turn, for an eye that faces the gripper.
+Direction = Literal["clockwise", "counterclockwise"]
+# One convention for every number of a file, and for recorded angles and torques.
+SIGNS: Mapping[Direction, int] = {"clockwise": -1, "counterclockwise": 1}
+
+
+def direction_of(number: float) -> Direction | None:
+    """Return the direction of an angle or a torque; None for 0."""
+    return None if number == 0 else "clockwise" if number < 0 else "counterclockwise"
+
+
 class HoldTorqueStep(_Step):
     """Ramp the torque to a set point, and hold it in closed loop."""
 
     do: Literal["hold_torque"]
     torque_nm: ranges.TorqueSetpoint = Field(description="the set point; counterclockwise is positive")
+    direction: Direction | None = Field(None, description="of the torque, which then has no sign")
     ramp_nm_per_s: float = Field(0.05, gt=0, le=1, description="rise of the set point")
     hold_s: ranges.Seconds = Field(10.0, description="time at the set point")
+
+    @model_validator(mode="after")
+    def _one_sign(self) -> "HoldTorqueStep":
+        if self.direction is not None and self.torque_nm < 0:
+            raise ValueError(f"with `direction`, torque_nm has no sign: write {-self.torque_nm:g}")
+        return self
+
+    @property
+    def signed_torque_nm(self) -> float:
+        """The set point; counterclockwise is positive."""
+        return self.torque_nm if self.direction is None else SIGNS[self.direction] * self.torque_nm
 
 
 class TightenStep(_Step):
@@ -154,7 +178,7 @@ class TightenStep(_Step):
     until_torque_nm: ranges.TorqueLimit = Field(description="the turn ends at this torque")
     until_angle_rad: ranges.Turn = Field(description="the turn ends at this angle")
     speed_rad_per_s: ranges.WristSpeed = Field(0.05, description="speed of the wrist")
-    direction: Literal["clockwise", "counterclockwise"] = Field("clockwise", description="direction of the turn")
+    direction: Direction = Field(description="of the turn: the thread's, seen by an eye that faces the gripper")
 
 
 class ReleaseStep(_Step):
@@ -217,6 +241,53 @@ def first_turn_before_grip(file: ExperimentFile) -> int | None:
     return None
 
 
+class Reversal(NamedTuple):
+    """A step that turns a held tool back: the numbers, from 1, of it and of the step before, and both directions."""
+
+    number: int
+    direction: Direction
+    before: int
+    direction_before: Direction
+
+
+def reversals(file: ExperimentFile) -> Iterator[Reversal]:
+    """Yield each step that turns the tool against the turn that the steps before have left in this grip."""
+    # The angles since the grip that are possible, and the last turn that was left.
+    low_rad = high_rad = 0.0
+    left: tuple[int, Direction] | None = None
+    for number, step in enumerate(file.steps, 1):
+        turns: Direction | None = None
+        leaves: Direction | None = None
+        match step:
+            case GripStep() | ReleaseStep():
+                left, low_rad, high_rad = None, 0.0, 0.0
+            case TightenStep(direction=direction):
+                turns = leaves = direction
+                low_rad -= step.until_angle_rad if direction == "clockwise" else 0.0
+                high_rad += step.until_angle_rad if direction == "counterclockwise" else 0.0
+            case HoldTorqueStep(signed_torque_nm=torque_nm):
+                turns = leaves = direction_of(torque_nm)
+                low_rad, high_rad = -math.inf, math.inf
+            case TwistStep(absolute=False, angles_rad=angles_rad):
+                turns = _turn_to(angles_rad[0], low_rad, high_rad)
+                if not step.return_to_start:
+                    leaves = _turn_to(angles_rad[-1], low_rad, high_rad)
+                    low_rad = high_rad = angles_rad[-1]
+            case TwistStep() | TurnToStep():
+                low_rad, high_rad = -math.inf, math.inf
+        if turns is not None and left is not None and turns != left[1]:
+            yield Reversal(number, turns, *left)
+        if leaves is not None:
+            left = number, leaves
+
+
+def _turn_to(angle_rad: float, low_rad: float, high_rad: float) -> Direction | None:
+    """Return the direction from any angle between two ends to another angle; None where it is unknown."""
+    if low_rad <= angle_rad <= high_rad and low_rad < high_rad:
+        return None
+    return direction_of(angle_rad - (low_rad if angle_rad < low_rad else high_rad))
+
+
 # A location in an experiment's file, and what is wrong there.
 Mistake = tuple[tuple[int | str, ...], str]
 _STEP: TypeAdapter[Step] = TypeAdapter(Step)
@@ -256,7 +327,7 @@ def _outlined(content: object) -> Step:
 
 def check_steps(file: ExperimentFile) -> list[Mistake]:
     """Return each step that exceeds its limits or its timeout, and the first `hold_torque` on an unidentified tool."""
-    found: list[Mistake] = []
+    found: list[Mistake] = list(_undoing(file))
     identified = False
     for number, step in enumerate(file.steps):
         limits, needs = file.limits_of(step), demand(step)
@@ -279,6 +350,19 @@ def check_steps(file: ExperimentFile) -> list[Mistake]:
                 # One sentence is enough.
                 identified = True
     return found
+
+
+def _undoing(file: ExperimentFile) -> Iterator[Mistake]:
+    """Yield each torque that undoes a `tighten`, where only its sign says so."""
+    for back in reversals(file):
+        step, before = file.steps[back.number - 1], file.steps[back.before - 1]
+        if isinstance(before, TightenStep) and isinstance(step, HoldTorqueStep) and step.direction is None:
+            yield (
+                ("steps", back.number - 1),
+                f"hold_torque turns {back.direction} by the sign of its torque_nm, and undoes step {back.before}, "
+                f"tighten {back.direction_before}; write `direction: {back.direction_before}`, or "
+                f"`direction: {back.direction}` if it is meant",
+            )
 
 
 def _forgets_tool(step: Step, torque_source: str) -> bool:

@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 import yaml
 
+from shearloop.cli import command, main
 from shearloop.daemon import experiment_files
-from shearloop.daemon.cli import command, main
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.errors import UserError
 from shearloop.daemon.experiment_files import ExperimentFiles
 from shearloop.daemon.rig import Rig
+from shearloop.errors import UserError
 from tests.daemon.conftest import deadline
 
 SECRET = "host:5432:lab:ada:hunter2"  # noqa: S105 - the content that no reply may have

@@ -17,7 +17,7 @@ from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.experiment_files import ExperimentFiles
 from shearloop.daemon.rig import Rig
 from shearloop.errors import UserError
-from tests.daemon.conftest import deadline
+from tests.fixtures.daemons import deadline
 
 SECRET = "host:5432:lab:ada:hunter2"  # noqa: S105 - the content that no reply may have
 VALID = {"name": "one", "steps": [{"do": "wait", "wait_s": 1}]}

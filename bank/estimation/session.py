@@ -203,8 +203,8 @@ class EstimatorSession:
                 f"shape {frame.channels.shape}"
             )
         self.difference = None
-        # Noise makes every side of a new frame differ.
-        repeats = (frame.channels == self._latest).all(axis=1).any()
+        # Noise makes every side of a new frame differ, except where no channel has a signal.
+        repeats = ((frame.channels == self._latest).all(axis=1) & frame.channels.any(axis=1)).any()
         self._latest = frame.channels
         if repeats and self.calibration.kind == "raw":
             return Estimate(valid=False, reasons=REPEATED_FRAME)

@@ -205,6 +205,12 @@ def _present(pattern: str, *values: float | None) -> str:
     return "" if any(value is None for value in values) else pattern.format(*values)
 
 
+def _load(content: Mapping[str, Any]) -> str:
+    if not content["valid"]:
+        return f"no torque: {content['reason']}   raw {content['raw']:.10g}"
+    return f"torque {content['torque_nm']:+.4f} N·m   raw {content['raw']:.10g}"
+
+
 def loop_line(content: Mapping[str, Any]) -> str:
     """Return phase, progress, the reasons for holding or the stop, step, and activity."""
     if not content["experiment"]:
@@ -280,6 +286,7 @@ def _value(value: object) -> str:
 _BODIES: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "eit.estimate": _estimate,
     "skin.shear": _shear,
+    "load.torque": _load,
     "loop.state": loop_line,
     "health": _health,
 }

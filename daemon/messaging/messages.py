@@ -68,7 +68,7 @@ class EitFrame(Message):
     frame: int = column("", "number of the frame since the daemon began")
     age_s: float = column("s", "from the middle of the acquisition to the arrival of the last byte")
     saturated: int = column("", "channels at the converter's full scale")
-    dead: int = column("", "channels unchanged for many frames")
+    dead: int = column("", "channels that read 0, or the same for 200 frames")
     repeated: bool = column("", "whether the line equals the one before it exactly")
 
 

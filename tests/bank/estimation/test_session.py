@@ -8,7 +8,7 @@ import pytest
 from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import TRUSTED, EstimatorSession, FrameSeries, Measured, TactileFrame, fit, fitting
-from shearloop.bank.estimation.fingertip_validator import mask_saturated
+from shearloop.bank.estimation.fingertip_validator import mask_unmeasured
 from shearloop.bank.gain import ToolLaw
 from tests.bank.estimation.conftest import follow, judged, kept, twisting
 
@@ -350,26 +350,26 @@ def test_channels_at_a_rail_are_found_and_done_without(motion_calibration):
     assert judged(found, clipped).rmse < 0.02 * 0.06
     # One side is clipped, the other is not.
     frame, usable = np.array([clipped.channels[100, 0], whole.channels[100, 0]]), np.ones((2, 896), dtype=np.bool_)
-    left = mask_saturated(frame, usable)
+    left = mask_unmeasured(frame, usable)
     np.testing.assert_array_equal(left[0], frame[0] < rail)
     assert (~left[0]).mean() == pytest.approx(0.1, abs=0.05)
     assert left[1].all()
     # A channel that is dead already hides nothing by what it reads.
     frame[0, 3], usable[0, 3] = 5.0, False
-    np.testing.assert_array_equal(mask_saturated(frame, usable), left & usable)
-    assert not mask_saturated(frame, np.zeros_like(usable)).any()
+    np.testing.assert_array_equal(mask_unmeasured(frame, usable), left & usable)
+    assert not mask_unmeasured(frame, np.zeros_like(usable)).any()
 
 
 def test_an_ordinary_frame_is_at_no_rail():
     frame = np.floor(twisting(seed=34).channels[50] / STEP_V) * STEP_V
-    assert mask_saturated(frame, np.ones(frame.shape, dtype=np.bool_)).all()
+    assert mask_unmeasured(frame, np.ones(frame.shape, dtype=np.bool_)).all()
 
 
 def test_of_as_many_as_are_at_a_rail_one_less_is_chance():
     frame = np.linspace(0.1, 0.2, 896)[None]
     for count in range(1, 20):
         frame[0, :count] = 0.7
-        left = mask_saturated(frame, np.ones((1, 896), dtype=np.bool_))
+        left = mask_unmeasured(frame, np.ones((1, 896), dtype=np.bool_))
         assert np.count_nonzero(left) == (896 if count < 9 else 896 - count)
 
 

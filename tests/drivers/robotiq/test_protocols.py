@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers.emulators.gripper import Fingers
+from shearloop.emulators.gripper import Fingers
 from shearloop.drivers.errors import DeviceCalibrationError, DeviceLostError, ProtocolError
 from shearloop.drivers.robotiq import messages, modbus_client
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration

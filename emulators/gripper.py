@@ -13,9 +13,9 @@ from typing import Any
 
 from pymodbus.framer import FramerRTU
 
+from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS, GripperModel
 from shearloop.emulators import number_between
 from shearloop.emulators.ports import Server
-from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS, GripperModel
 
 COUNTS_MAX = 255
 FIRST_MAJOR_FAULT = 10

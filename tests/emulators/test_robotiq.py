@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.emulators.gripper import Fingers, Gripper, GripperRegisters, ModbusSlave, UrcapSession, crc16
 from shearloop.drivers.robotiq.models import MODELS
+from shearloop.emulators.gripper import Fingers, Gripper, GripperRegisters, ModbusSlave, UrcapSession, crc16
 from tests.slices import slices
 
 READ_STATUS = bytes.fromhex("09 03 07D0 0003")

@@ -9,8 +9,8 @@ import numpy as np
 from pydantic_core import to_json
 from scipy.io import savemat
 
-from shearloop.errors import UserError, require
 from shearloop.daemon.recorder import schema
+from shearloop.errors import UserError, require
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.reader import read_messages
 from shearloop.tools.recordings.tables import Rows, arrays, columns_of, read_rows, row_of

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shearloop.errors import UserError
 from shearloop.daemon.recorder import schema
+from shearloop.daemon.recorder.writer import McapFile
+from shearloop.errors import UserError
 from shearloop.tools.recordings.matlab_import import read_diameter_slices, read_line, read_torque_slices
 from shearloop.tools.recordings.slice_export import export_slices
 from shearloop.tools.recordings.tables import RecordedTopics
-from shearloop.daemon.recorder.writer import McapFile
 
 S = 1_000_000_000
 PERIOD_S = 0.5

@@ -86,7 +86,8 @@ def run(args: argparse.Namespace) -> int:
 def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
     """Return an accepted reply as text: of `status` the experiment, and the tasks as a table."""
     if name == "status":
-        from shearloop.cli.terminal import loop_line, table, task_row
+        from shearloop.cli.terminal import loop_line, table
+        from shearloop.tools.task_row import task_row
 
         rows = [task_row(task, facts) for task, facts in reply["tasks"].items()]
         loop = [loop_line(reply["loop"]), ""] if "loop" in reply else []

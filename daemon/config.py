@@ -23,6 +23,7 @@ from shearloop.drivers.defaults import (
     SOURCE_CURRENT_MA,
     URCAP_PORT,
 )
+from shearloop.drivers.robotiq.models import DEFAULT_MODEL, ModelName
 from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator_names import EstimatorName
 
@@ -186,9 +187,10 @@ class GripperSocket(ConfigModel):
 class GripperConfig(ConfigModel):
     """The gripper, on a socket or on Modbus."""
 
+    model: ModelName = Field(DEFAULT_MODEL, description="sets stroke, speeds, forces and counts")
     socket: GripperSocket | None = Field(None, description="through the robot's URCap; else `modbus`")
     modbus: SerialDevice | None = Field(None, description="Modbus RTU by USB; else `socket`")
-    calibration: Path | None = Field(None, description="default: the maker's data")
+    calibration: Path | None = Field(None, description="of `shearloop calibrate gripper`; default: the maker's data")
 
     _one_way_in = either("socket", "modbus")
 

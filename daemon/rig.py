@@ -63,8 +63,14 @@ def make_gripper_client(config: GripperConfig) -> RobotiqClient:
 def gripper_calibration(config: GripperConfig) -> WidthCalibration:
     """Return the gripper's calibration, or the maker's data; raises DriverError if it cannot be used."""
     if config.calibration is None:
-        return WidthCalibration.nominal()
-    return load_device_calibration(config.calibration, WidthCalibration)
+        return WidthCalibration.nominal(config.model)
+    calibration = load_device_calibration(config.calibration, WidthCalibration)
+    if calibration.model != config.model:
+        raise DriverError(
+            f"{config.calibration}: it was measured with a {calibration.model}, and `gripper.model` is {config.model}; "
+            "correct the model, or measure again with `shearloop calibrate gripper --model`"
+        )
+    return calibration
 
 
 def robot_settings(path: Path) -> UrSettings:

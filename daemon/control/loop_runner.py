@@ -68,6 +68,8 @@ LONGEST_TARE_S = 30.0
 # A tare gives up this much before its step is overdue, so that the sensors' reasons are reported.
 GIVES_UP_BEFORE_S = 0.1
 ENDING = "the daemon ends; start it again"
+STOPPED_AT_START = "it was stopped during its start"
+UNLOCKING = "robot and gripper are being unlocked; wait for the end"
 # The columns of `robot.state` that the robot's state has under the same name.
 _SAME = {column.name for column in fields(RobotStateMessage)} - {"source", "joints_rad", "age_s"}
 
@@ -118,8 +120,8 @@ class ControlLoopRunner:
         self._running = False
         self._stopped = True
         self._decided_ns = 0
-        # The starts under way; a stop takes them out.
-        self._starts: set[object] = set()
+        # Counts the stops, also while an experiment starts.
+        self._stop_count = 0
         self._closed = False
 
     async def run(self) -> None:
@@ -157,20 +159,17 @@ class ControlLoopRunner:
 
         The next start waits for `unlock`. `also_idle`: also where nothing moves.
         """
-        starting = bool(self._starts)
-        self._starts.clear()
+        self._stop_count += 1
         experiment, unlocking = self._control_loop.running, self.stop_unlocking()
         stopped = experiment.file.name if experiment is not None else "unlock" if unlocking else None
-        if stopped is not None or starting or also_idle:
-            under_way = f"{stopped!r}" if stopped is not None else "a start" if starting else "nothing"
-            what = f"{under_way} was under way"
+        if stopped is not None or also_idle:
+            what = f"{stopped!r} was under way" if stopped is not None else "nothing was under way"
             self._request_stop("the operator stopped it", Fault(FaultCode.OPERATOR_STOP, what))
         return stopped
 
     def close(self) -> None:
         """Stop the running experiment at the daemon's end, and start nothing more."""
-        self._starts.clear()
-        self._closed = True
+        self._stop_count, self._closed = self._stop_count + 1, True
         if self._control_loop.running is not None:
             ended = "the wrist is stopped, a gripped tool stays gripped"
             self._request_stop(f"the daemon ended: {ended}", Fault(FaultCode.DAEMON_ENDED, ended))
@@ -190,26 +189,39 @@ class ControlLoopRunner:
         except Exception:  # noqa: BLE001 - the robot's process stops the arm as it ends
             structlog.get_logger().exception("the loop crashed at its last decision")
 
-    async def start(self, file: ExperimentFile) -> str | None:
-        """Begin an experiment; return None, or why it cannot begin."""
+    @property
+    def stop_count(self) -> int:
+        """The number of stops so far: one that comes while an experiment is read or starts ends its start."""
+        return self._stop_count
+
+    def start_refusal(self) -> str | None:
+        """Return why no experiment can begin, whichever it is, or None."""
         if self._closed:
             return ENDING
+        if self._actions.unlocking:
+            return UNLOCKING
+        return self._control_loop.start_refusal()
+
+    async def start(self, file: ExperimentFile, stops_before: int | None = None) -> str | None:
+        """Begin an experiment; return None, or why it cannot begin.
+
+        `stops_before` is the `stop_count` at the request, if the file was read since.
+        """
+        if self._closed:
+            return ENDING
+        stops_before = self._stop_count if stops_before is None else stops_before
+        refusal = None
         # The control loop refuses while an experiment runs or a stop waits for the operator; a stopped arm must not be
         # enabled on the way.
-        if self._control_loop.running is None and not self._control_loop.safety.stopped:
-            this_start = object()
-            self._starts.add(this_start)
-            try:
-                refusal = await self._enable()
-            finally:
-                stopped = this_start not in self._starts
-                self._starts.discard(this_start)
-            if stopped:
-                return "it was stopped during its start"
-            if refusal:
-                return refusal
+        if self._stop_count == stops_before and self._control_loop.start_refusal() is None:
+            refusal = await self._enable()
+        if self._stop_count != stops_before:
+            self._control_loop.stop(STOPPED_AT_START, Fault(FaultCode.OPERATOR_STOP, "a start was under way"))
+            return STOPPED_AT_START
+        if refusal:
+            return refusal
         if self._actions.unlocking:
-            return "robot and gripper are being unlocked; wait for the end"
+            return UNLOCKING
         return self._control_loop.start(file, self._clock.now_ns())
 
     async def _enable(self) -> str | None:

@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_experiment_alone(path: Path) -> None:
     """Raise UserError for the mistakes of the experiment that an invalid configuration names."""
-    from shearloop.daemon.rig import read_experiment
+    from shearloop.daemon.experiment_files import read_experiment
     from shearloop.yaml_files import read_yaml
 
     content = read_yaml(path, UserError)

@@ -165,27 +165,47 @@ def message_line(topic: str, content: Mapping[str, Any]) -> str:
 
 
 def message_json(topic: str, content: Mapping[str, Any]) -> str:
-    """Return one line of JSON: the topic and the content, arrays as lists."""
-    return json.dumps({"topic": topic, **content}, default=lambda array: array.tolist(), ensure_ascii=False)
+    """Return one line of JSON: the topic and the content, arrays as lists, null for a number that is not finite."""
+    from pydantic_core import to_json
+
+    def plain(value: Any) -> Any:
+        return value.tolist() if hasattr(value, "tolist") else str(value)
+
+    return to_json({"topic": topic, **content}, inf_nan_mode="null", bytes_mode="base64", fallback=plain).decode()
 
 
 def _estimate(content: Mapping[str, Any]) -> str:
     if not content["valid"]:
         return f"no estimate: {content['reason']}"
-    diameter = "" if content["diameter_mm"] is None else f"   diameter {content['diameter_mm']:5.1f} mm"
-    cell = "" if content["k"] is None else f"   k {content['k']:.3f}  sigma {content['sigma']:.3f} cm"
-    score = "" if content["score"] is None else f"   score {content['score']:.3f}"
-    interval = f"[{content['torque_low_nm']:+.4f}, {content['torque_high_nm']:+.4f}]"
-    return f"torque {content['torque_nm']:+.4f} N·m {interval}{diameter}{cell}{score}"
+    parts = [f"torque {_number(content, 'torque_nm', '+.4f', 'N·m')} {_interval(content, 'torque', 'nm', '+.4f')}"]
+    if content["diameter_mm"] is not None:
+        parts.append(f"diameter {_number(content, 'diameter_mm', '5.1f', 'mm')}")
+    if content["k"] is not None:
+        # The model of the bank decides whether k is a length.
+        parts.append(f"k {_number(content, 'k', '.3f')}  sigma {_number(content, 'sigma', '.3f', 'cm')}")
+    if content["score"] is not None:
+        parts.append(f"score {_number(content, 'score', '.3f')}")
+    return "   ".join(parts)
 
 
 def _shear(content: Mapping[str, Any]) -> str:
     if not content["valid"]:
         return f"no force: {content['reason']}"
-    interval = f"[{content['shear_low_n']:+.3f}, {content['shear_high_n']:+.3f}]"
-    torque = "" if content["torque_nm"] is None else f"   torque {content['torque_nm']:+.4f} N·m"
-    direction = "within the deadband" if content["deadband"] else content["direction"]
-    return f"shear {content['shear_n']:+.3f} N {interval}{torque}   response {content['response']:+.5f}   {direction}"
+    parts = [f"shear {_number(content, 'shear_n', '+.3f', 'N')} {_interval(content, 'shear', 'n', '+.3f')}"]
+    if content["torque_nm"] is not None:
+        parts.append(f"torque {_number(content, 'torque_nm', '+.4f', 'N·m')}")
+    parts.append(f"response {_number(content, 'response', '+.5f')}")
+    parts.append("within the deadband" if content["deadband"] else content["direction"])
+    return "   ".join(parts)
+
+
+def _number(content: Mapping[str, Any], key: str, form: str, unit: str = "") -> str:
+    """Return a value with its unit, or "unknown" where there is none."""
+    return "unknown" if content[key] is None else f"{content[key]:{form}} {unit}".rstrip()
+
+
+def _interval(content: Mapping[str, Any], name: str, unit: str, form: str) -> str:
+    return f"[{_number(content, f'{name}_low_{unit}', form)}, {_number(content, f'{name}_high_{unit}', form)}]"
 
 
 def loop_line(content: Mapping[str, Any]) -> str:

@@ -88,3 +88,14 @@ def small_disk(request, tmp_path) -> Iterator[Path]:
         pytest.skip("only root can mount a file system, and not in every container")
     yield folder
     subprocess.run(["umount", folder], check=True)
+
+
+@pytest.fixture(scope="session")
+def rerun_runtime(tmp_path_factory) -> None:
+    """Start the threads and files of the Rerun SDK, which stay until the process ends."""
+    rerun = pytest.importorskip("rerun", reason="needs the extra `rerun`")
+    path = tmp_path_factory.mktemp("rerun") / "a.rrd"
+    stream = rerun.RecordingStream("test")
+    stream.save(path)
+    stream.disconnect()
+    list(pytest.importorskip("rerun.chunk").RrdReader(path).stream())

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from typing_extensions import TypeAliasType
 
 from shearloop.daemon.messaging.messages import TOPICS, EitFrame, Message, wire_map
+from shearloop.daemon.recording.columns import read_content
 from shearloop.daemon.recording.schema import (
     INPUT,
     as_json,
@@ -21,8 +22,8 @@ from shearloop.daemon.recording.schema import (
     input_json,
     json_type,
     message_json,
+    recorded_topic,
     schemas,
-    with_missing_keys,
 )
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.sample_messages import sample
@@ -71,7 +72,7 @@ def test_each_message_matches_its_schema(topic):
         written = json.loads(message_json(topic, on_wire, 0))
         Draft202012Validator(schemas()[topic]).validate(written)
         assert None not in written.values()
-        restored = with_missing_keys(topic, written)
+        restored = read_content(recorded_topic(topic, message.source), as_json(written))
         for item in dataclasses.fields(message):
             value = getattr(message, item.name)
             if isinstance(value, tuple):
